@@ -1,0 +1,117 @@
+"""A measured scene in memory: tracked points, driven controllers, and what is declared of the object.
+
+SI units, world frame z up, axis order (time, entity, xyz). Reading and checking files is the business of
+``storage``; everything here has passed the validator.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+UNDEFORMED_AT_REST = "undeformed"
+AS_MEASURED = "as measured"
+
+
+@dataclass(frozen=True)
+class Body:
+    """Declared facts of the object; ``None`` means not known.
+
+    Attributes:
+        size_m: bounding box of the rest shape, (3,).
+        box_min_m, box_max_m: corners of a box-shaped rest body in world axes, (3,).
+        length_m: length of a rope, rod or arm.
+        side_m: side of a square sheet.
+        thickness_m: thickness of a sheet.
+        radius_m: radius of a rope or rod.
+        density_kg_m3, mass_kg: density, or total mass.
+        segment_rest_lengths_m: rest distances between consecutive tracked points of a rope.
+        edges: topology, index pairs (E, 2) into the tracked points.
+        grid_shape: (rows, columns) when the tracked points form a grid on a sheet (row-major).
+    """
+
+    size_m: np.ndarray | None = None
+    box_min_m: np.ndarray | None = None
+    box_max_m: np.ndarray | None = None
+    length_m: float | None = None
+    side_m: float | None = None
+    thickness_m: float | None = None
+    radius_m: float | None = None
+    density_kg_m3: float | None = None
+    mass_kg: float | None = None
+    segment_rest_lengths_m: np.ndarray | None = None
+    edges: np.ndarray | None = None
+    grid_shape: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True)
+class Ground:
+    """A horizontal plane at ``height_m`` with Coulomb friction (None: not known)."""
+
+    height_m: float
+    friction: float | None = None
+
+
+@dataclass(frozen=True)
+class Grip:
+    """A rigid gripper: its controllers, the box of undeformed material that it holds, tracked points in it."""
+
+    controllers: tuple[int, ...]
+    region_min_m: np.ndarray | None = None
+    region_max_m: np.ndarray | None = None
+    points: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One recording.
+
+    Attributes:
+        points: measured material points [m], (T, N, 3) float64; meaningless where not visible.
+        visible: (T, N) bool.
+        controllers: driven or clamped points [m], (T, K, 3) float64.
+        times: seconds from the first frame, (T,) float64, strictly increasing, not always even.
+        gravity_m_s2: (3,).
+        noise_sigma_m: tracking noise per axis, or None.
+        train, test: half-open frame ranges.
+        initial_state: UNDEFORMED_AT_REST or AS_MEASURED.
+        control_times, control_points: controllers at a higher rate, (Tc,) and (Tc, K, 3), or None.
+        rest_volume_points: points filling the undeformed body at t = 0, (M, 3), or None.
+        part_features: per-volume-point part features (M or N, F), or None.
+    """
+
+    name: str
+    kind: str
+    points: np.ndarray
+    visible: np.ndarray
+    controllers: np.ndarray
+    times: np.ndarray
+    gravity_m_s2: np.ndarray
+    noise_sigma_m: float | None
+    train: tuple[int, int]
+    test: tuple[int, int]
+    initial_state: str = AS_MEASURED
+    fps: float = 30.0
+    description: str = ""
+    body: Body = field(default_factory=Body)
+    ground: Ground | None = None
+    grips: tuple[Grip, ...] = ()
+    controller_velocities: np.ndarray | None = None
+    control_times: np.ndarray | None = None
+    control_points: np.ndarray | None = None
+    rest_volume_points: np.ndarray | None = None
+    surface_points: np.ndarray | None = None
+    colors: np.ndarray | None = None
+    part_features: np.ndarray | None = None
+
+    @property
+    def frame_count(self) -> int:
+        """T."""
+        return self.points.shape[0]
+
+    def control_track(self) -> tuple[np.ndarray, np.ndarray]:
+        """Times (Tc,) [s] and controller positions (Tc, K, 3) [m] at the best rate at hand."""
+        if self.control_times is not None and self.control_points is not None:
+            return self.control_times, self.control_points
+        return self.times, self.controllers

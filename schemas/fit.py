@@ -1,0 +1,51 @@
+"""Fits: a calibrated twin of a scene."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any, Literal
+
+from pydantic import Field
+
+from schemas.base import Artifact, Lineage, Request, Resource
+
+
+class FitConfig(Request):
+    """Settings of the calibration; a null takes the engine's own choice and is recorded."""
+
+    material: Literal["auto", "neo_hookean"] = "auto"
+    particle_budget: int = Field(default=2000, ge=50, le=200_000)
+    max_simulations: int = Field(default=80, ge=1, le=5000)
+    seed: int = 0
+
+
+class FitCreate(Request):
+    """Body of POST /v1/fits."""
+
+    scene_id: str
+    config: FitConfig = Field(default_factory=FitConfig)
+
+
+class Parameter(Resource):
+    """A calibrated quantity with its 95 % interval; ``identified`` false: held at its prior."""
+
+    value: float
+    unit: str
+    ci95: tuple[float, float] | None = None
+    identified: bool = True
+    note: str = ""
+
+
+class Fit(Resource):
+    """A calibrated twin: parameters, metrics on held-out frames, artifacts ``twin.npz`` and ``report.json``."""
+
+    id: str
+    scene_id: str
+    state: Literal["pending", "ready", "failed"]
+    created_at: datetime
+    job_id: str
+    config: FitConfig
+    parameters: dict[str, Parameter] = Field(default_factory=dict)
+    metrics: dict[str, Any] = Field(default_factory=dict)
+    lineage: Lineage = Field(default_factory=Lineage)
+    artifacts: list[Artifact] = Field(default_factory=list)

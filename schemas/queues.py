@@ -1,0 +1,15 @@
+"""Names of the queues. The API never publishes: the dispatcher reads the database and does."""
+
+from __future__ import annotations
+
+SIMULATION = "sim"
+TRAINING = "train"
+TASK_NAME = "physworld.run_shard"
+
+QUEUE_OF_SHARD = {
+    "fit": SIMULATION,
+    "dataset_plan": SIMULATION,
+    "episode": SIMULATION,
+    "dataset_seal": SIMULATION,
+    "training": TRAINING,
+}
