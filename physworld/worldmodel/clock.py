@@ -1,0 +1,44 @@
+"""The world model's clock: one fixed time step near 1/30 s, whatever the recording's frame rate.
+
+Recordings come at 9 to 125 frames per second and not always evenly. A network that advances by one fixed
+``dt_s`` sees the same dynamics everywhere, so demonstrations are simulated at this clock, controllers are
+interpolated to it, and predictions are interpolated back to the measured times. Times in seconds. NumPy only.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+NOMINAL_RATE_HZ = 30.0
+
+
+def model_dt(fps: float) -> float:
+    """Time step [s] of the model for a recording at ``fps``: a whole number of frames where fps ≥ 30."""
+    if not np.isfinite(fps) or fps <= 0.0:
+        raise ValueError(f"frame rate {fps} Hz is not positive")
+    if fps < NOMINAL_RATE_HZ:
+        return 1.0 / NOMINAL_RATE_HZ
+    return round(fps / NOMINAL_RATE_HZ) / fps
+
+
+def clock_times(duration_s: float, dt_s: float) -> np.ndarray:
+    """Ticks 0, dt, 2 dt … [s], shape (T,): the last one is the first at or after ``duration_s``."""
+    steps = int(np.ceil(duration_s / dt_s - 1e-6))
+    return np.arange(max(steps, 1) + 1) * dt_s
+
+
+def resample(values: np.ndarray, times: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Linear interpolation of ``values`` (T, …) known at ``times`` (T,) to ``at`` (S,); the ends are held."""
+    values = np.asarray(values, dtype=np.float64)
+    times = np.asarray(times, dtype=np.float64)
+    if times.ndim != 1 or values.shape[0] != times.shape[0]:
+        raise ValueError(f"{values.shape[0]} values do not belong to times of shape {times.shape}")
+    if np.any(np.diff(times) <= 0.0):
+        raise ValueError("times do not increase strictly")
+    if times.shape[0] == 1:
+        return np.repeat(values, len(at), axis=0)
+    at = np.clip(np.asarray(at, dtype=np.float64), times[0], times[-1])
+    left = np.clip(np.searchsorted(times, at, side="right") - 1, 0, times.shape[0] - 2)
+    weight = (at - times[left]) / (times[left + 1] - times[left])
+    weight = weight.reshape((-1,) + (1,) * (values.ndim - 1))
+    return (1.0 - weight) * values[left] + weight * values[left + 1]
