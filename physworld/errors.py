@@ -1,0 +1,50 @@
+"""Errors of the library. Every message carries the numbers that broke.
+
+PhysworldError
+├── SceneUnsupported        the scene lacks what a twin needs (a size, a topology), or has what no law covers yet
+├── SimulationError         a simulation cannot be trusted
+│   ├── UnstableSimulation  a state is not finite, or an element inverted
+│   ├── CFLViolation        a forced time step exceeds the stable one
+│   └── ParticlesLeftTheGrid  material left the stated workspace
+├── CalibrationError        no parameter gave a usable simulation
+├── Cancelled               the caller asked to stop
+└── TrainingDiverged        a loss or a weight is not finite
+"""
+
+from __future__ import annotations
+
+
+class PhysworldError(Exception):
+    """Root of the library's errors."""
+
+
+class SceneUnsupported(PhysworldError):
+    """The scene lacks what a twin needs, or has what no formulation covers yet."""
+
+
+class SimulationError(PhysworldError):
+    """A simulation cannot be trusted."""
+
+
+class UnstableSimulation(SimulationError):
+    """A state is not finite, or an element inverted."""
+
+
+class CFLViolation(SimulationError):
+    """A forced time step exceeds the stable one."""
+
+
+class ParticlesLeftTheGrid(SimulationError):
+    """Material left the stated workspace."""
+
+
+class CalibrationError(PhysworldError):
+    """No parameter gave a usable simulation."""
+
+
+class Cancelled(PhysworldError):
+    """The caller asked to stop."""
+
+
+class TrainingDiverged(PhysworldError):
+    """A loss or a weight is not finite."""

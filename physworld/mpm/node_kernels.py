@@ -1,0 +1,103 @@
+"""Device side of the nodes: symplectic time step, prescribed motion, ground contact.
+
+Nodes that gripped material touches follow a cubic Hermite path between the frames of the control track; all others
+obey m dv/dt = f + m g - m c v. The ground pushes on points of the body's surface: a penalty pressure of one cell of
+material a cell's depth, and regularised Coulomb friction.
+
+Legend: clock = (frame interval [s], 1/dt [1/s], dt [s]); counter = (frame, substep, substeps of this frame).
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+
+@wp.kernel
+def advance_nodes(
+    # model
+    mass: wp.array(dtype=wp.float64),
+    slot: wp.array(dtype=wp.int32),
+    path_x: wp.array2d(dtype=wp.float64),
+    path_v: wp.array2d(dtype=wp.float64),
+    gravity: wp.vec3d,
+    drag: wp.float64,
+    clock: wp.array(dtype=wp.float64),
+    counter: wp.array(dtype=wp.int32),
+    # in, out
+    force: wp.array(dtype=wp.float64),
+    x: wp.array(dtype=wp.float64),
+    v: wp.array(dtype=wp.float64),
+):
+    """One symplectic Euler step of a node; its force is read and cleared."""
+    node = wp.tid()
+    dt = clock[2]
+    held = slot[node]
+    if held >= 0:
+        frame = counter[0]
+        span = clock[0]
+        s = wp.float64(counter[1] + 1) / wp.float64(counter[2])
+        s2 = s * s
+        s3 = s2 * s
+        h01 = wp.float64(3.0) * s2 - wp.float64(2.0) * s3
+        h10 = s3 - wp.float64(2.0) * s2 + s
+        h11 = s3 - s2
+        for i in range(3):
+            k = 3 * held + i
+            start = path_x[frame, k]
+            goal = start + h01 * (path_x[frame + 1, k] - start)
+            goal += span * (h10 * path_v[frame, k] + h11 * path_v[frame + 1, k])
+            v[3 * node + i] = (goal - x[3 * node + i]) / dt
+            x[3 * node + i] = goal
+            force[3 * node + i] = wp.float64(0.0)
+    else:
+        for i in range(3):
+            k = 3 * node + i
+            speed = v[k] + dt * (force[k] / mass[node] + gravity[i] - drag * v[k])
+            v[k] = speed
+            x[k] = x[k] + dt * speed
+            force[k] = wp.float64(0.0)
+
+
+@wp.kernel
+def advance_counter(counter: wp.array(dtype=wp.int32)):
+    """Next substep."""
+    counter[1] = counter[1] + 1
+
+
+@wp.kernel
+def ground_contact(
+    # model
+    row_start: wp.array(dtype=wp.int32),
+    columns: wp.array(dtype=wp.int32),
+    weights: wp.array(dtype=wp.float64),
+    area: wp.array(dtype=wp.float64),
+    height: wp.float64,
+    friction: wp.float64,
+    stiffness: wp.float64,
+    impedance: wp.float64,
+    # in
+    x: wp.array(dtype=wp.float64),
+    v: wp.array(dtype=wp.float64),
+    # out
+    force: wp.array(dtype=wp.float64),
+):
+    """Push one surface point out of the ground: ``stiffness`` [Pa/m], ``impedance`` [Pa s/m] bounds the friction."""
+    point = wp.tid()
+    z = wp.float64(0.0)
+    vx = wp.float64(0.0)
+    vy = wp.float64(0.0)
+    for k in range(row_start[point], row_start[point + 1]):
+        node = columns[k]
+        z += weights[k] * x[3 * node + 2]
+        vx += weights[k] * v[3 * node]
+        vy += weights[k] * v[3 * node + 1]
+    depth = height - z
+    if depth > wp.float64(0.0):
+        normal = stiffness * depth * area[point]
+        speed = wp.sqrt(vx * vx + vy * vy) + wp.float64(1.0e-12)
+        tangential = wp.min(friction * normal, impedance * area[point] * speed) / speed
+        for k in range(row_start[point], row_start[point + 1]):
+            node = columns[k]
+            wp.atomic_add(force, 3 * node, -weights[k] * tangential * vx)
+            wp.atomic_add(force, 3 * node + 1, -weights[k] * tangential * vy)
+            wp.atomic_add(force, 3 * node + 2, weights[k] * normal)
