@@ -1,0 +1,221 @@
+"""The model registry: a name, integer versions that only grow, aliases that move.
+
+A version's number is allotted in the transaction that opens its training job and never given twice, also
+when the training fails. Ready versions are immutable.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from schemas.base import Artifact, Lineage, Page
+from schemas.model import Model, ModelVersion, TrainingConfig
+from storage.errors import Conflict, NotFound
+from storage.pages import page_of
+from storage.tables import AliasRow, ModelRow, ModelVersionRow, columns_of, insert_if_absent, utc_now
+
+LATEST = "latest"
+ALIAS_PATTERN = re.compile(r"[a-z][a-z0-9_-]{0,31}")
+
+
+def reference_id(name: str, version: int) -> str:
+    """The id by which lineage and job outputs name a version: ``beam:3``."""
+    return f"{name}:{version}"
+
+
+def allot_version(
+    session: Session,
+    name: str,
+    *,
+    config: TrainingConfig,
+    job_id: str | None = None,
+    scene_id: str | None = None,
+    fit_id: str | None = None,
+    dataset_id: str | None = None,
+    description: str = "",
+    tags: list[str] | None = None,
+) -> ModelVersionRow:
+    """The next version of ``name``, pending. The first one registers the name."""
+    model = _lock_model(session, name)
+    model.last_version += 1
+    row = ModelVersionRow(
+        name=name,
+        version=model.last_version,
+        state="pending",
+        message="",
+        created_at=utc_now(),
+        job_id=job_id,
+        scene_id=scene_id,
+        fit_id=fit_id,
+        dataset_id=dataset_id,
+        description=description,
+        tags=list(tags or []),
+        config=config.model_dump(mode="json"),
+        metrics={},
+        lineage=Lineage(job_id=job_id).model_dump(mode="json"),
+        artifacts=[],
+    )
+    session.add(row)
+    session.flush()
+    return row
+
+
+def publish(
+    session: Session,
+    name: str,
+    version: int,
+    *,
+    artifacts: list[Artifact],
+    sha256: str,
+    metrics: dict[str, Any],
+    lineage: Lineage,
+) -> ModelVersion:
+    """Make a pending version ready. Raises Conflict when it is not pending: versions are immutable."""
+    row = _version_row(session, name, version)
+    if row.state != "pending":
+        raise Conflict(f"version {version} of {name} is {row.state}; only a pending version is published")
+    row.state = "ready"
+    row.artifacts = [artifact.model_dump(mode="json") for artifact in artifacts]
+    row.sha256 = sha256
+    row.metrics = metrics
+    row.lineage = lineage.model_dump(mode="json")
+    session.flush()
+    return _version(row, [])
+
+
+def fail_version(session: Session, name: str, version: int, message: str) -> None:
+    """Mark a pending version failed; a ready one stays as it is."""
+    row = _version_row(session, name, version)
+    if row.state == "pending":
+        row.state = "failed"
+        row.message = message
+
+
+def get_model(session: Session, name: str) -> Model:
+    """The model called ``name``."""
+    return _model(session, _model_row(session, name))
+
+
+def list_models(session: Session, *, limit: int = 50, cursor: str | None = None) -> Page[Model]:
+    """Models, newest first."""
+    keys = (ModelRow.created_at, ModelRow.name)
+    return page_of(
+        session, select(ModelRow), keys, lambda row: _model(session, row), limit=limit, cursor=cursor
+    )
+
+
+def get_version(session: Session, name: str, version: int | str) -> ModelVersion:
+    """A version by number, alias or ``latest`` (the newest that is ready)."""
+    row = _version_row(session, name, resolve(session, name, version))
+    return _version(row, _aliases_of(session, name, row.version))
+
+
+def list_versions(
+    session: Session, name: str, *, limit: int = 50, cursor: str | None = None, state: str | None = None
+) -> Page[ModelVersion]:
+    """Versions of a model, newest first."""
+    _model_row(session, name)
+    statement = select(ModelVersionRow).where(ModelVersionRow.name == name)
+    if state is not None:
+        statement = statement.where(ModelVersionRow.state == state)
+    return page_of(
+        session,
+        statement,
+        (ModelVersionRow.version,),
+        lambda row: _version(row, _aliases_of(session, name, row.version)),
+        limit=limit,
+        cursor=cursor,
+    )
+
+
+def resolve(session: Session, name: str, version: int | str) -> int:
+    """The number behind a number, an alias or ``latest``. Raises NotFound."""
+    if isinstance(version, int) or version.isdecimal():
+        return int(version)
+    _model_row(session, name)
+    if version == LATEST:
+        newest = session.scalar(
+            select(func.max(ModelVersionRow.version)).where(
+                ModelVersionRow.name == name, ModelVersionRow.state == "ready"
+            )
+        )
+        if newest is None:
+            raise NotFound("ready version of model", name)
+        return newest
+    alias = session.get(AliasRow, (name, version))
+    if alias is None:
+        raise NotFound("alias", f"{name}@{version}")
+    return alias.version
+
+
+def set_alias(session: Session, name: str, alias: str, version: int) -> Model:
+    """Point ``alias`` at a ready version; it moves when it exists already."""
+    if alias == LATEST or not ALIAS_PATTERN.fullmatch(alias):
+        raise Conflict(f"{alias!r} cannot be an alias: it is reserved or not [a-z][a-z0-9_-]{{0,31}}")
+    row = _version_row(session, name, version)
+    if row.state != "ready":
+        raise Conflict(f"version {version} of {name} is {row.state}; an alias needs a ready version")
+    _lock_model(session, name)
+    present = session.get(AliasRow, (name, alias))
+    if present is None:
+        session.add(AliasRow(name=name, alias=alias, version=version, updated_at=utc_now()))
+    else:
+        present.version = version
+        present.updated_at = utc_now()
+    session.flush()
+    return get_model(session, name)
+
+
+def delete_alias(session: Session, name: str, alias: str) -> Model:
+    """Remove an alias; the version stays. Raises NotFound."""
+    present = session.get(AliasRow, (name, alias))
+    if present is None:
+        raise NotFound("alias", f"{name}@{alias}")
+    session.delete(present)
+    session.flush()
+    return get_model(session, name)
+
+
+def _lock_model(session: Session, name: str) -> ModelRow:
+    """The row of ``name``, made if absent, locked against other allotments until the transaction ends."""
+    if session.get(ModelRow, name) is None:
+        insert_if_absent(session, ModelRow, {"name": name, "created_at": utc_now(), "last_version": 0})
+    statement = select(ModelRow).where(ModelRow.name == name).with_for_update()
+    return session.scalars(statement.execution_options(populate_existing=True)).one()
+
+
+def _model_row(session: Session, name: str) -> ModelRow:
+    row = session.get(ModelRow, name)
+    if row is None:
+        raise NotFound("model", name)
+    return row
+
+
+def _version_row(session: Session, name: str, version: int) -> ModelVersionRow:
+    row = session.get(ModelVersionRow, (name, version))
+    if row is None:
+        raise NotFound("model version", reference_id(name, version))
+    return row
+
+
+def _aliases_of(session: Session, name: str, version: int) -> list[str]:
+    statement = select(AliasRow.alias).where(AliasRow.name == name, AliasRow.version == version)
+    return list(session.scalars(statement.order_by(AliasRow.alias)))
+
+
+def _model(session: Session, row: ModelRow) -> Model:
+    aliases = session.scalars(select(AliasRow).where(AliasRow.name == row.name).order_by(AliasRow.alias))
+    return Model(
+        name=row.name,
+        created_at=row.created_at,
+        latest_version=row.last_version or None,
+        aliases={alias.alias: alias.version for alias in aliases},
+    )
+
+
+def _version(row: ModelVersionRow, aliases: list[str]) -> ModelVersion:
+    return ModelVersion.model_validate({**columns_of(row), "aliases": aliases})

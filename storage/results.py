@@ -1,0 +1,98 @@
+"""What each kind of shard hands back, checked before anything of it is committed."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from pydantic import Field, ValidationError
+
+from schemas.base import Artifact, Lineage, Resource
+from schemas.fit import Parameter
+from storage.errors import ResultInvalid
+
+MAX_EPISODES = 20_000
+
+
+class ShardResult(Resource):
+    """Common part of every result."""
+
+    lineage: Lineage = Field(default_factory=Lineage)
+
+
+class FitResult(ShardResult):
+    """Of a ``fit`` shard."""
+
+    parameters: dict[str, Parameter]
+    metrics: dict[str, Any]
+    artifacts: list[Artifact]
+    seconds: float | None = None
+
+
+class PlanResult(ShardResult):
+    """Of a ``dataset_plan`` shard: how many episodes follow, and their size."""
+
+    episodes: int = Field(ge=1, le=MAX_EPISODES)
+    frames: int = Field(ge=1)
+    particles: int = Field(ge=1)
+
+
+class EpisodeResult(ShardResult):
+    """Of an ``episode`` shard: where the episode was written and what it holds."""
+
+    index: int = Field(ge=0)
+    path: str = Field(min_length=1)
+    digest: str = Field(pattern=r"^[0-9a-f]{64}$")
+    seed: int = Field(ge=-(2**63), lt=2**63)
+    frames: int = Field(ge=1)
+    particles: int = Field(ge=1)
+    motion: str = ""
+    seconds: float | None = None
+
+
+class SealResult(ShardResult):
+    """Of a ``dataset_seal`` shard: ``digest`` is the manifest's."""
+
+    digest: str = Field(pattern=r"^[0-9a-f]{64}$")
+    statistics: dict[str, Any] = Field(default_factory=dict)
+    artifacts: list[Artifact]
+
+
+class TrainingResult(ShardResult):
+    """Of a ``training`` shard: ``sha256`` is the digest of the version's manifest."""
+
+    artifacts: list[Artifact]
+    sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
+    metrics: dict[str, Any] = Field(default_factory=dict)
+
+
+RESULT_OF_SHARD: dict[str, type[ShardResult]] = {
+    "fit": FitResult,
+    "dataset_plan": PlanResult,
+    "episode": EpisodeResult,
+    "dataset_seal": SealResult,
+    "training": TrainingResult,
+}
+
+
+def parse_result(kind: str, index: int, result: dict[str, Any]) -> ShardResult:
+    """The result of shard ``index`` of its stage. Raises ResultInvalid naming every fault."""
+    faults = [f"{path} is {value}" for path, value in _not_finite(result, "result")]
+    if faults:
+        raise ResultInvalid(f"{kind} result holds numbers that JSON cannot carry: {'; '.join(faults[:10])}")
+    try:
+        parsed = RESULT_OF_SHARD[kind].model_validate(result)
+    except ValidationError as error:
+        details = [f"{'.'.join(map(str, fault['loc']))}: {fault['msg']}" for fault in error.errors()]
+        raise ResultInvalid(f"{kind} result: {'; '.join(details)}") from error
+    if isinstance(parsed, EpisodeResult) and parsed.index != index:
+        raise ResultInvalid(f"episode result carries index {parsed.index}, its shard is number {index}")
+    return parsed
+
+
+def _not_finite(value: Any, path: str) -> list[tuple[str, float]]:
+    if isinstance(value, dict):
+        return [fault for key, item in value.items() for fault in _not_finite(item, f"{path}.{key}")]
+    if isinstance(value, list | tuple):
+        return [fault for key, item in enumerate(value) for fault in _not_finite(item, f"{path}[{key}]")]
+    return [(path, value)] if isinstance(value, float) and not math.isfinite(value) else []

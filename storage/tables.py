@@ -1,0 +1,315 @@
+"""The database's tables. Rows are private to ``storage``; everybody else sees the models of ``schemas``.
+
+Times are UTC with microseconds. A JSON column is replaced, never changed in place. The state machine lives
+in ``jobs`` and ``shards``; ``fits``, ``datasets`` and ``model_versions`` are what a job brings forth.
+"""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Any
+
+from sqlalchemy import (
+    JSON,
+    BigInteger,
+    DateTime,
+    Dialect,
+    ForeignKey,
+    ForeignKeyConstraint,
+    Index,
+    Integer,
+    LargeBinary,
+    MetaData,
+    UniqueConstraint,
+    inspect,
+)
+from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column
+from sqlalchemy.types import TypeDecorator
+
+Json = dict[str, Any]
+JsonList = list[Any]
+
+BIG_KEY = BigInteger().with_variant(Integer, "sqlite")  # SQLite allots only keys declared INTEGER
+
+
+def utc_now() -> datetime:
+    """The present time, aware, in UTC."""
+    return datetime.now(UTC)
+
+
+class UtcDateTime(TypeDecorator[datetime]):
+    """An aware UTC time on every database (SQLite itself keeps no time zone)."""
+
+    impl = DateTime(timezone=True)
+    cache_ok = True
+
+    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        """Refuse a naive time: nobody could say which hour it means."""
+        if value is None:
+            return None
+        if value.tzinfo is None:
+            raise ValueError(f"naive time {value.isoformat()}: pass an aware one, e.g. tables.utc_now()")
+        return value.astimezone(UTC)
+
+    def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        """Attach UTC where the database gave back a naive time."""
+        if value is None:
+            return None
+        return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
+
+
+class Base(DeclarativeBase):
+    """Names of constraints are fixed so that migrations can speak of them."""
+
+    metadata = MetaData(
+        naming_convention={
+            "ix": "ix_%(table_name)s_%(column_0_N_name)s",
+            "uq": "uq_%(table_name)s_%(column_0_N_name)s",
+            "fk": "fk_%(table_name)s_%(column_0_N_name)s",
+            "pk": "pk_%(table_name)s",
+        }
+    )
+    type_annotation_map = {datetime: UtcDateTime, Json: JSON, JsonList: JSON}  # noqa: RUF012 (SQLAlchemy's name)
+
+
+def columns_of(row: Base) -> Json:
+    """The row's values by column name, as the wire models read them."""
+    return {column.key: getattr(row, column.key) for column in inspect(type(row)).column_attrs}
+
+
+def insert_if_absent(session: Session, table: type[Base], values: Json) -> bool:
+    """Insert a row unless its key or a unique column is taken; True when it was inserted.
+
+    On Postgres it waits for another transaction that is inserting the same key.
+    """
+    dialect = session.get_bind().dialect.name
+    insert = postgresql.insert if dialect == "postgresql" else sqlite.insert
+    statement = insert(table).values(values).on_conflict_do_nothing()
+    return session.connection().execute(statement).rowcount == 1
+
+
+class SceneRow(Base):
+    """A measured recording; its arrays are an artifact."""
+
+    __tablename__ = "scenes"
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    name: Mapped[str]
+    kind: Mapped[str]
+    description: Mapped[str]
+    created_at: Mapped[datetime]
+    digest: Mapped[str] = mapped_column(unique=True)
+    frames: Mapped[int]
+    points: Mapped[int]
+    controllers: Mapped[int]
+    fps: Mapped[float]
+    duration_s: Mapped[float]
+    noise_sigma_m: Mapped[float | None]
+    train: Mapped[JsonList]
+    test: Mapped[JsonList]
+    declared: Mapped[Json]
+    warnings: Mapped[JsonList]
+    artifacts: Mapped[JsonList]
+    tags: Mapped[JsonList]
+
+
+class JobRow(Base):
+    """A piece of work; ``stage_done`` of ``stage_total`` shards of stage ``stage`` are done."""
+
+    __tablename__ = "jobs"
+    __table_args__ = (Index(None, "state"), Index(None, "created_at"))
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    kind: Mapped[str]
+    state: Mapped[str]
+    parent_id: Mapped[str | None] = mapped_column(ForeignKey("jobs.id"), index=True)
+    stage: Mapped[int] = mapped_column(default=0)
+    stage_total: Mapped[int] = mapped_column(default=0)
+    stage_done: Mapped[int] = mapped_column(default=0)
+    attempt: Mapped[int] = mapped_column(default=0)
+    progress: Mapped[Json]
+    created_at: Mapped[datetime]
+    started_at: Mapped[datetime | None]
+    finished_at: Mapped[datetime | None]
+    heartbeat_at: Mapped[datetime | None]
+    inputs: Mapped[JsonList]
+    outputs: Mapped[JsonList]
+    config: Mapped[Json]
+    error: Mapped[Json | None] = mapped_column(JSON(none_as_null=True))
+
+
+class ShardRow(Base):
+    """One unit that a worker executes under a lease; ``epoch`` is the fencing token, it only grows."""
+
+    __tablename__ = "shards"
+    __table_args__ = (
+        UniqueConstraint("job_id", "stage", "index"),
+        Index(None, "state", "kind", "published_at"),
+        Index(None, "state", "lease_until"),
+    )
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
+    stage: Mapped[int]
+    index: Mapped[int]
+    kind: Mapped[str]
+    state: Mapped[str]
+    attempt: Mapped[int] = mapped_column(default=0)
+    max_attempts: Mapped[int]
+    epoch: Mapped[int] = mapped_column(default=0)
+    lease_owner: Mapped[str | None]
+    lease_until: Mapped[datetime | None]
+    created_at: Mapped[datetime]
+    published_at: Mapped[datetime | None]
+    not_before: Mapped[datetime | None]
+    finished_at: Mapped[datetime | None]
+    payload: Mapped[Json]
+    result: Mapped[Json | None] = mapped_column(JSON(none_as_null=True))
+    digest: Mapped[str | None]
+    error: Mapped[Json | None] = mapped_column(JSON(none_as_null=True))
+
+
+class EventRow(Base):
+    """The log of all jobs; ``seq`` is never used twice."""
+
+    __tablename__ = "events"
+    __table_args__ = (Index(None, "job_id", "seq"), {"sqlite_autoincrement": True})
+
+    seq: Mapped[int] = mapped_column(BIG_KEY, primary_key=True, autoincrement=True)
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
+    type: Mapped[str]
+    at: Mapped[datetime]
+    data: Mapped[Json]
+
+
+class FitRow(Base):
+    """A calibrated twin."""
+
+    __tablename__ = "fits"
+    __table_args__ = (Index(None, "created_at"),)
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    scene_id: Mapped[str] = mapped_column(ForeignKey("scenes.id"), index=True)
+    state: Mapped[str]
+    created_at: Mapped[datetime]
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
+    config: Mapped[Json]
+    parameters: Mapped[Json]
+    metrics: Mapped[Json]
+    lineage: Mapped[Json]
+    artifacts: Mapped[JsonList]
+
+
+class DatasetRow(Base):
+    """A set of episodes, immutable once sealed."""
+
+    __tablename__ = "datasets"
+    __table_args__ = (Index(None, "created_at"),)
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    fit_id: Mapped[str] = mapped_column(ForeignKey("fits.id"), index=True)
+    scene_id: Mapped[str] = mapped_column(ForeignKey("scenes.id"), index=True)
+    state: Mapped[str]
+    created_at: Mapped[datetime]
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
+    config: Mapped[Json]
+    episodes_done: Mapped[int] = mapped_column(default=0)
+    digest: Mapped[str | None]
+    statistics: Mapped[Json]
+    lineage: Mapped[Json]
+    artifacts: Mapped[JsonList]
+
+
+class EpisodeRow(Base):
+    """A committed episode; the primary key is what makes a second commit of the same one impossible."""
+
+    __tablename__ = "episodes"
+
+    dataset_id: Mapped[str] = mapped_column(ForeignKey("datasets.id"), primary_key=True)
+    index: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    shard_id: Mapped[str] = mapped_column(ForeignKey("shards.id"), unique=True)
+    path: Mapped[str] = mapped_column(unique=True)
+    digest: Mapped[str]
+    seed: Mapped[int] = mapped_column(BigInteger)
+    frames: Mapped[int]
+    particles: Mapped[int]
+    attempt: Mapped[int]
+    motion: Mapped[str]
+    seconds: Mapped[float | None]
+    created_at: Mapped[datetime]
+
+
+class ModelRow(Base):
+    """A registered name; ``last_version`` is the counter that versions are allotted from."""
+
+    __tablename__ = "models"
+
+    name: Mapped[str] = mapped_column(primary_key=True)
+    created_at: Mapped[datetime]
+    last_version: Mapped[int] = mapped_column(default=0)
+
+
+class ModelVersionRow(Base):
+    """One version of a model, immutable once ready."""
+
+    __tablename__ = "model_versions"
+
+    name: Mapped[str] = mapped_column(ForeignKey("models.name"), primary_key=True)
+    version: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    state: Mapped[str]
+    message: Mapped[str]
+    created_at: Mapped[datetime]
+    job_id: Mapped[str | None] = mapped_column(ForeignKey("jobs.id"), index=True)
+    scene_id: Mapped[str | None] = mapped_column(ForeignKey("scenes.id"))
+    fit_id: Mapped[str | None] = mapped_column(ForeignKey("fits.id"))
+    dataset_id: Mapped[str | None] = mapped_column(ForeignKey("datasets.id"))
+    description: Mapped[str]
+    tags: Mapped[JsonList]
+    config: Mapped[Json]
+    metrics: Mapped[Json]
+    sha256: Mapped[str | None]
+    lineage: Mapped[Json]
+    artifacts: Mapped[JsonList]
+
+
+class AliasRow(Base):
+    """A movable name of a version."""
+
+    __tablename__ = "aliases"
+    __table_args__ = (
+        ForeignKeyConstraint(["name", "version"], ["model_versions.name", "model_versions.version"]),
+    )
+
+    name: Mapped[str] = mapped_column(primary_key=True)
+    alias: Mapped[str] = mapped_column(primary_key=True)
+    version: Mapped[int]
+    updated_at: Mapped[datetime]
+
+
+class ApiKeyRow(Base):
+    """An API key: the SHA-256 of its token, never the token."""
+
+    __tablename__ = "api_keys"
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    name: Mapped[str]
+    role: Mapped[str]
+    digest: Mapped[str] = mapped_column(unique=True)
+    created_at: Mapped[datetime]
+    revoked_at: Mapped[datetime | None]
+
+
+class IdempotencyRow(Base):
+    """The first answer given to an Idempotency-Key; ``owner`` is the API key's id."""
+
+    __tablename__ = "idempotency_keys"
+    __table_args__ = (Index(None, "created_at"),)
+
+    owner: Mapped[str] = mapped_column(primary_key=True)
+    key: Mapped[str] = mapped_column(primary_key=True)
+    fingerprint: Mapped[str]
+    created_at: Mapped[datetime]
+    status: Mapped[int | None]
+    headers: Mapped[Json | None] = mapped_column(JSON(none_as_null=True))
+    body: Mapped[bytes | None] = mapped_column(LargeBinary)
