@@ -1,1 +1,66 @@
-"""Python SDK of PhysWorld."""
+"""Python SDK of PhysWorld: the service's resources, typed, and the world model without the service.
+
+    from physworld_client import Client
+
+    with Client("http://127.0.0.1:8000", token="...") as client:
+        scene = client.scenes.create("recordings/beam")
+        job = client.jobs.wait(client.pipelines.create(scene_id=scene.id), on_progress=print)
+        client.models.download(scene.name, "out/")
+
+``physworld_client.world_model`` needs numpy and safetensors only. Neither torch nor warp is ever imported.
+"""
+
+from __future__ import annotations
+
+from physworld_client.async_client import AsyncClient
+from physworld_client.client import Client
+from physworld_client.errors import (
+    ApiError,
+    AuthenticationFailed,
+    BadRequest,
+    BundleUnreadable,
+    Conflict,
+    ConnectionFailed,
+    DigestMismatch,
+    InvalidRequest,
+    JobCancelled,
+    JobFailed,
+    ModelUnreadable,
+    NotFound,
+    PayloadTooLarge,
+    PermissionDenied,
+    PhysWorldError,
+    RateLimited,
+    RequestTimedOut,
+    SceneInvalid,
+    ServerError,
+    WaitTimedOut,
+)
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "ApiError",
+    "AsyncClient",
+    "AuthenticationFailed",
+    "BadRequest",
+    "BundleUnreadable",
+    "Client",
+    "Conflict",
+    "ConnectionFailed",
+    "DigestMismatch",
+    "InvalidRequest",
+    "JobCancelled",
+    "JobFailed",
+    "ModelUnreadable",
+    "NotFound",
+    "PayloadTooLarge",
+    "PermissionDenied",
+    "PhysWorldError",
+    "RateLimited",
+    "RequestTimedOut",
+    "SceneInvalid",
+    "ServerError",
+    "WaitTimedOut",
+    "__version__",
+]

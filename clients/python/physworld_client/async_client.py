@@ -1,0 +1,83 @@
+"""The asynchronous client: the same names as ``Client``, awaited."""
+
+from __future__ import annotations
+
+import asyncio
+from types import TracebackType
+from typing import TypeVar
+
+import httpx
+
+from physworld_client import transport as wire
+from physworld_client.async_resources import (
+    AsyncArtifacts,
+    AsyncDatasets,
+    AsyncFits,
+    AsyncJobs,
+    AsyncModels,
+    AsyncPipelines,
+    AsyncScenes,
+)
+from physworld_client.calls import Call
+
+Answer = TypeVar("Answer")
+
+
+class AsyncClient:
+    """A connection to one PhysWorld service; arguments and attributes as in ``Client``."""
+
+    def __init__(
+        self,
+        base_url: str,
+        token: str | None = None,
+        timeout: float = wire.DEFAULT_TIMEOUT_S,
+        max_retries: int = wire.DEFAULT_MAX_RETRIES,
+        *,
+        transport: httpx.AsyncBaseTransport | None = None,
+    ) -> None:
+        self.timeout = timeout
+        self.max_retries = max_retries
+        self.http = httpx.AsyncClient(transport=transport, **wire.client_options(base_url, token, timeout))
+        self.scenes = AsyncScenes(self)
+        self.fits = AsyncFits(self)
+        self.datasets = AsyncDatasets(self)
+        self.models = AsyncModels(self)
+        self.jobs = AsyncJobs(self)
+        self.pipelines = AsyncPipelines(self)
+        self.artifacts = AsyncArtifacts(self)
+
+    @property
+    def base_url(self) -> str:
+        """Address of the service, without a slash at its end."""
+        return str(self.http.base_url).rstrip("/")
+
+    async def send(self, call: Call[Answer]) -> Answer:
+        """Sends a call with its retries and returns its typed answer, or raises the typed error."""
+        key = wire.new_key()
+        retry = wire.Retry(self.max_retries)
+        while True:
+            request = wire.build_request(self.http, call, key, self.timeout)
+            try:
+                response = await self.http.send(request)
+            except httpx.TransportError as error:
+                if not retry.again():
+                    raise wire.connection_error(error, self.http, retry) from error
+                await asyncio.sleep(retry.delay_s())
+                continue
+            if response.status_code in wire.RETRIED_STATUSES and retry.again():
+                await asyncio.sleep(retry.delay_s(response))
+                continue
+            answer: Answer = wire.read_answer(call, response)
+            return answer
+
+    async def close(self) -> None:
+        """Closes the connections."""
+        await self.http.aclose()
+
+    async def __aenter__(self) -> AsyncClient:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.close()

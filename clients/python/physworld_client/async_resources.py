@@ -1,0 +1,327 @@
+"""The service's resources, asynchronous: the classes of ``resources`` with the same names, awaited."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+import httpx
+
+from physworld_client import calls, transport
+from physworld_client.bundle import open_bundle
+from physworld_client.errors import PhysWorldError, WaitTimedOut
+from physworld_client.manifest import artifacts_of, verify_folder
+from physworld_client.pages import AsyncListPage
+from physworld_client.partial import CHUNK_BYTES, PartialFile
+from physworld_client.stream import HEARTBEAT_S, IDLE_LIMIT_S, EventDecoder, ends_job
+from physworld_client.waiting import Patience, job_id_of, require_success
+from schemas.base import Artifact, Page
+from schemas.dataset import Dataset, DatasetConfig, Episode
+from schemas.fit import Fit, FitConfig
+from schemas.job import TERMINAL_STATES, Event, Job
+from schemas.model import Model, ModelVersion, TrainingConfig
+from schemas.pipeline import PipelineCreate
+from schemas.scene import Scene
+
+if TYPE_CHECKING:
+    from physworld_client.async_client import AsyncClient
+
+Item = TypeVar("Item")
+
+
+class AsyncResource:
+    """What the resources share: the client they send through."""
+
+    def __init__(self, client: AsyncClient) -> None:
+        self._client = client
+
+    async def _page(
+        self, call_at: Callable[[str | None], calls.Call[Page[Item]]], cursor: str | None
+    ) -> AsyncListPage[Item]:
+        page = await self._client.send(call_at(cursor))
+        return AsyncListPage(page.data, page.has_more, page.next_cursor, lambda at: self._page(call_at, at))
+
+
+class AsyncScenes(AsyncResource):
+    """Measured scenes."""
+
+    async def create(self, path: str | Path) -> Scene:
+        """Uploads a scene: a folder (packed to a zip), an archive, a ``final_data.pkl`` or a C3D file."""
+        with open_bundle(path) as upload:
+            return await self._client.send(calls.scene_create(upload))
+
+    async def get(self, scene_id: str) -> Scene:
+        """One scene."""
+        return await self._client.send(calls.scene_get(scene_id))
+
+    async def list(
+        self, *, limit: int | None = None, cursor: str | None = None, kind: str | None = None
+    ) -> AsyncListPage[Scene]:
+        """Scenes, newest first."""
+        return await self._page(lambda at: calls.scene_list(limit=limit, cursor=at, kind=kind), cursor)
+
+
+class AsyncFits(AsyncResource):
+    """Calibrated twins."""
+
+    async def create(self, scene_id: str, config: FitConfig | None = None) -> Job:
+        """Starts a fit; its job's output is the fit."""
+        return await self._client.send(calls.fit_create(scene_id, config))
+
+    async def get(self, fit_id: str) -> Fit:
+        """One fit."""
+        return await self._client.send(calls.fit_get(fit_id))
+
+    async def list(
+        self, *, limit: int | None = None, cursor: str | None = None, state: str | None = None
+    ) -> AsyncListPage[Fit]:
+        """Fits, newest first."""
+        return await self._page(lambda at: calls.fit_list(limit=limit, cursor=at, state=state), cursor)
+
+
+class AsyncDatasets(AsyncResource):
+    """Datasets of demonstration episodes."""
+
+    async def create(self, fit_id: str, config: DatasetConfig | None = None) -> Job:
+        """Starts writing a dataset; its job's output is the dataset."""
+        return await self._client.send(calls.dataset_create(fit_id, config))
+
+    async def get(self, dataset_id: str) -> Dataset:
+        """One dataset."""
+        return await self._client.send(calls.dataset_get(dataset_id))
+
+    async def list(
+        self, *, limit: int | None = None, cursor: str | None = None, state: str | None = None
+    ) -> AsyncListPage[Dataset]:
+        """Datasets, newest first."""
+        return await self._page(lambda at: calls.dataset_list(limit=limit, cursor=at, state=state), cursor)
+
+    async def episodes(
+        self, dataset_id: str, *, limit: int | None = None, cursor: str | None = None
+    ) -> AsyncListPage[Episode]:
+        """The committed episodes of a dataset."""
+        return await self._page(lambda at: calls.dataset_episodes(dataset_id, limit=limit, cursor=at), cursor)
+
+
+class AsyncModels(AsyncResource):
+    """Published world models: names, integer versions, aliases."""
+
+    async def create(
+        self,
+        name: str,
+        dataset_id: str,
+        config: TrainingConfig | None = None,
+        *,
+        description: str = "",
+        tags: tuple[str, ...] = (),
+    ) -> Job:
+        """Trains on a sealed dataset and publishes the next version of ``name``."""
+        return await self._client.send(calls.training_create(name, dataset_id, config, description, [*tags]))
+
+    async def get(self, name: str) -> Model:
+        """One registered name with its newest version and aliases."""
+        return await self._client.send(calls.model_get(name))
+
+    async def list(self, *, limit: int | None = None, cursor: str | None = None) -> AsyncListPage[Model]:
+        """Registered names."""
+        return await self._page(lambda at: calls.model_list(limit=limit, cursor=at), cursor)
+
+    async def versions(
+        self, name: str, *, limit: int | None = None, cursor: str | None = None
+    ) -> AsyncListPage[ModelVersion]:
+        """Versions of a name, newest first."""
+        return await self._page(lambda at: calls.version_list(name, limit=limit, cursor=at), cursor)
+
+    async def version(self, name: str, version: int | str | None = None) -> ModelVersion:
+        """One version: by its number, by an alias, or the newest one."""
+        return await self._client.send(calls.version_get(name, await self._number(name, version)))
+
+    async def set_alias(self, name: str, alias: str, version: int) -> Model:
+        """Moves an alias to a version."""
+        return await self._client.send(calls.alias_set(name, alias, version))
+
+    async def download(self, name: str, folder: str | Path, version: int | str | None = None) -> ModelVersion:
+        """Downloads every file of a version into ``folder`` and verifies them against the manifest.
+
+        Raises:
+            DigestMismatch: a file is not what the manifest promises.
+            ModelUnreadable: the version is not ready or its artifacts are incomplete.
+        """
+        found = await self.version(name, version)
+        target = Path(folder)
+        for artifact in artifacts_of(found):
+            await self._client.artifacts.download(artifact.sha256, target / artifact.name)
+        verify_folder(target, found.sha256)
+        return found
+
+    async def _number(self, name: str, version: int | str | None) -> int:
+        if isinstance(version, int):
+            return version
+        return calls.version_number(await self.get(name), version)
+
+
+class AsyncPipelines(AsyncResource):
+    """The whole chain in one call."""
+
+    async def create(self, body: PipelineCreate | None = None, *, scene_id: str | None = None) -> Job:
+        """Starts fit, dataset and training; from a full body, or with the defaults for a scene."""
+        return await self._client.send(calls.pipeline_create(calls.pipeline_body(body, scene_id)))
+
+
+class AsyncJobs(AsyncResource):
+    """Jobs: their state, events, cancellation, and the wait for their end."""
+
+    async def get(self, job_id: str, *, wait_s: float | None = None) -> Job:
+        """One job; with ``wait_s`` the answer comes at the job's end or after that many seconds."""
+        return await self._client.send(calls.job_get(job_id, wait_s=wait_s))
+
+    async def list(
+        self,
+        *,
+        limit: int | None = None,
+        cursor: str | None = None,
+        state: str | None = None,
+        kind: str | None = None,
+    ) -> AsyncListPage[Job]:
+        """Jobs, newest first."""
+        return await self._page(
+            lambda at: calls.job_list(limit=limit, cursor=at, state=state, kind=kind), cursor
+        )
+
+    async def cancel(self, job_id: str) -> Job:
+        """Asks for the job's end; it is ``cancelling`` until its workers have let go."""
+        return await self._client.send(calls.job_cancel(job_id))
+
+    async def events(self, job_id: str, *, after: int | None = None) -> AsyncIterator[Event]:
+        """The job's events, past and coming, until the one that ends the job.
+
+        A broken stream is resumed after the last event seen; more than ``max_retries`` breaks without an
+        event between them raise ``ConnectionFailed``.
+        """
+        decoder = EventDecoder(after)
+        retry = transport.Retry(self._client.max_retries)
+        while True:
+            seen = decoder.last_id
+            broken: httpx.TransportError | None = None
+            try:
+                async for line in self._lines(job_id, decoder):
+                    event = decoder.feed(line)
+                    if event is not None:
+                        yield event
+                        if ends_job(event, job_id):
+                            return
+            except httpx.TransportError as error:
+                broken = error
+            if decoder.last_id != seen:
+                retry.attempt = 0
+            elif broken is None and (await self.get(job_id)).state in TERMINAL_STATES:
+                return
+            if not retry.again():
+                raise transport.stream_ended(broken, self._client.http, retry) from broken
+            decoder.reset()
+            await asyncio.sleep(retry.delay_s())
+
+    async def wait(
+        self,
+        job: Job | str,
+        timeout: float | None = None,
+        on_progress: Callable[[Job], None] | None = None,
+    ) -> Job:
+        """Waits for the job's end and returns it.
+
+        Follows the event stream; where that is not to be had (a proxy that buffers it, a restart of the
+        service), and near the end of the timeout, it long-polls.
+
+        Args:
+            timeout: seconds, None waits for ever.
+            on_progress: called with the job whenever its state or progress has changed.
+
+        Raises:
+            JobFailed, JobCancelled: the job ended so.
+            WaitTimedOut: the job goes on.
+        """
+        patience = Patience(timeout, on_progress)
+        current = patience.see(await self.get(job_id_of(job)))
+        if current.state not in TERMINAL_STATES and patience.left_s() > HEARTBEAT_S:
+            with contextlib.suppress(httpx.TransportError, PhysWorldError):
+                current = await self._follow(current, patience)
+        while current.state not in TERMINAL_STATES:
+            if patience.left_s() <= 0:
+                raise WaitTimedOut(current, patience.timeout_s)
+            current = patience.see(await self.get(current.id, wait_s=patience.poll_s()))
+        return require_success(current)
+
+    async def _follow(self, job: Job, patience: Patience) -> Job:
+        """Follows the stream until the job ends, the stream does, or the patience is nearly out."""
+        decoder = EventDecoder()
+        async for line in self._lines(job.id, decoder):
+            event = decoder.feed(line)
+            if event is not None:
+                if ends_job(event, job.id):
+                    break
+                if patience.wants_look():
+                    job = patience.see(await self.get(job.id))
+            if patience.left_s() <= HEARTBEAT_S:
+                break
+        return patience.see(await self.get(job.id))
+
+    async def _lines(self, job_id: str, decoder: EventDecoder) -> AsyncIterator[str]:
+        http = self._client.http
+        timeout = httpx.Timeout(self._client.timeout, read=IDLE_LIMIT_S)
+        async with http.stream(
+            "GET", calls.events_path(job_id), headers=decoder.headers(), timeout=timeout
+        ) as response:
+            if response.status_code >= 400:
+                await response.aread()
+                transport.raise_for_problem(response)
+            async for line in response.aiter_lines():
+                yield line
+
+
+class AsyncArtifacts(AsyncResource):
+    """Content-addressed files."""
+
+    async def download(self, artifact: Artifact | str, path: str | Path) -> Path:
+        """Downloads an artifact to ``path``: resumes a part found there, checks the digest, then renames.
+
+        Raises:
+            DigestMismatch: the bytes are not those of the digest; nothing was put at ``path``.
+        """
+        partial = PartialFile(Path(path), artifact.sha256 if isinstance(artifact, Artifact) else artifact)
+        if partial.present():
+            return partial.target
+        retry = transport.Retry(self._client.max_retries)
+        while not partial.complete():
+            offset = partial.offset
+            try:
+                response = await self._fetch(partial)
+            except httpx.TransportError as error:
+                if partial.offset > offset:
+                    retry.attempt = 0
+                if not retry.again():
+                    raise transport.connection_error(error, self._client.http, retry) from error
+                await asyncio.sleep(retry.delay_s())
+                continue
+            if response.is_success:
+                break
+            if partial.refused(response):
+                continue
+            if response.status_code not in transport.RETRIED_STATUSES or not retry.again():
+                transport.raise_for_problem(response)
+            await asyncio.sleep(retry.delay_s(response))
+        return partial.finish()
+
+    async def _fetch(self, partial: PartialFile) -> httpx.Response:
+        """One request for what is missing; the body of a success is in the part when this returns."""
+        path = calls.artifact_path(partial.sha256)
+        async with self._client.http.stream("GET", path, headers=partial.headers()) as response:
+            if response.is_success:
+                partial.accept(response)
+                async for chunk in response.aiter_bytes(CHUNK_BYTES):
+                    partial.write(chunk)
+            else:
+                await response.aread()
+        return response

@@ -1,0 +1,82 @@
+"""Packing a local scene for the upload.
+
+A folder with ``scene.json`` and ``scene.npz`` becomes a zip of exactly these two files, with fixed time
+stamps, so that the same scene always gives the same bytes. A file (archive, PhysTwin ``final_data.pkl``, C3D)
+is sent as it is; the service tells by its content what it is and checks it. Nothing is unpickled here.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import IO
+
+from physworld_client.errors import BundleUnreadable
+
+BUNDLE_FILES = ("scene.json", "scene.npz")
+SPOOL_LIMIT_BYTES = 64 * 2**20
+ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
+MEDIA_TYPES = {".zip": "application/zip", ".gz": "application/gzip", ".tgz": "application/gzip"}
+
+
+@dataclass(frozen=True)
+class Upload:
+    """A file to send: a seekable stream and the name under which it is sent. Closes the stream at exit."""
+
+    stream: IO[bytes]
+    filename: str
+    media_type: str
+
+    def __enter__(self) -> Upload:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stream.close()
+
+
+def open_bundle(path: str | Path) -> Upload:
+    """The scene at ``path``, ready to be sent.
+
+    Raises:
+        BundleUnreadable: nothing is there, or a folder lacks one of the two files.
+    """
+    source = Path(path).expanduser()
+    if source.is_dir():
+        return _pack_folder(source)
+    if not source.is_file():
+        raise BundleUnreadable(f"no scene at {source}: neither a folder nor a file")
+    if source.stat().st_size == 0:
+        raise BundleUnreadable(f"{source} is empty")
+    try:
+        stream = source.open("rb")
+    except OSError as error:
+        raise BundleUnreadable(f"{source} cannot be read: {error.strerror}") from error
+    return Upload(stream, source.name, MEDIA_TYPES.get(source.suffix.lower(), "application/octet-stream"))
+
+
+def _pack_folder(folder: Path) -> Upload:
+    missing = [name for name in BUNDLE_FILES if not (folder / name).is_file()]
+    if missing:
+        present = sorted(entry.name for entry in folder.iterdir())
+        shown = ", ".join(present[:8]) + (f" and {len(present) - 8} more" if len(present) > 8 else "")
+        raise BundleUnreadable(
+            f"{folder} lacks {' and '.join(missing)} (it holds {shown or 'nothing'}); "
+            "a .pkl or .c3d recording is given by its file"
+        )
+    stream = tempfile.SpooledTemporaryFile(max_size=SPOOL_LIMIT_BYTES)  # noqa: SIM115 (the upload closes it)
+    try:
+        with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
+            for name in BUNDLE_FILES:
+                entry = zipfile.ZipInfo(name, ZIP_EPOCH)
+                entry.compress_type = zipfile.ZIP_DEFLATED
+                archive.writestr(entry, (folder / name).read_bytes())
+    except OSError as error:
+        stream.close()
+        raise BundleUnreadable(f"{folder} cannot be read: {error.strerror}") from error
+    stream.seek(0)
+    return Upload(stream, f"{folder.resolve().name}.zip", "application/zip")

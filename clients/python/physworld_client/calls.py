@@ -1,0 +1,222 @@
+"""Every call of the REST API as plain data: method, path, query, body, and the type of the answer.
+
+The synchronous and the asynchronous client send the same calls, so that an endpoint is written down once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
+from urllib.parse import quote
+
+from pydantic import BaseModel, TypeAdapter
+
+from physworld_client.bundle import Upload
+from physworld_client.errors import PhysWorldError
+from schemas.base import Page
+from schemas.dataset import Dataset, DatasetConfig, DatasetCreate, Episode
+from schemas.fit import Fit, FitConfig, FitCreate
+from schemas.job import Job
+from schemas.model import AliasSet, Model, ModelVersion, TrainingConfig, TrainingCreate
+from schemas.pipeline import PipelineCreate
+from schemas.scene import Scene
+
+Answer = TypeVar("Answer")
+
+
+@dataclass(frozen=True)
+class Call(Generic[Answer]):
+    """One request and how to read its answer.
+
+    Attributes:
+        read_timeout_s: seconds that the service may hold the answer back on purpose (long poll).
+    """
+
+    method: str
+    path: str
+    answer: TypeAdapter[Answer]
+    query: Mapping[str, str | int | float] = field(default_factory=dict)
+    body: BaseModel | None = None
+    upload: Upload | None = None
+    read_timeout_s: float = 0.0
+
+
+_SCENE = TypeAdapter(Scene)
+_FIT = TypeAdapter(Fit)
+_DATASET = TypeAdapter(Dataset)
+_MODEL = TypeAdapter(Model)
+_VERSION = TypeAdapter(ModelVersion)
+_JOB = TypeAdapter(Job)
+_SCENES = TypeAdapter(Page[Scene])
+_FITS = TypeAdapter(Page[Fit])
+_DATASETS = TypeAdapter(Page[Dataset])
+_EPISODES = TypeAdapter(Page[Episode])
+_MODELS = TypeAdapter(Page[Model])
+_VERSIONS = TypeAdapter(Page[ModelVersion])
+_JOBS = TypeAdapter(Page[Job])
+
+
+def _given(**values: str | int | float | None) -> dict[str, str | int | float]:
+    """A query without the parameters that were not given."""
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _part(text: str | int) -> str:
+    """A path segment: an id or a name can never leave its place in the path."""
+    return quote(str(text), safe="")
+
+
+def scene_create(upload: Upload) -> Call[Scene]:
+    """POST /v1/scenes, multipart field ``bundle``."""
+    return Call("POST", "/v1/scenes", _SCENE, upload=upload)
+
+
+def scene_get(scene_id: str) -> Call[Scene]:
+    """GET /v1/scenes/{id}."""
+    return Call("GET", f"/v1/scenes/{_part(scene_id)}", _SCENE)
+
+
+def scene_list(*, limit: int | None, cursor: str | None, kind: str | None = None) -> Call[Page[Scene]]:
+    """GET /v1/scenes."""
+    return Call("GET", "/v1/scenes", _SCENES, query=_given(limit=limit, cursor=cursor, kind=kind))
+
+
+def fit_create(scene_id: str, config: FitConfig | None) -> Call[Job]:
+    """POST /v1/fits."""
+    return Call("POST", "/v1/fits", _JOB, body=FitCreate(scene_id=scene_id, config=config or FitConfig()))
+
+
+def fit_get(fit_id: str) -> Call[Fit]:
+    """GET /v1/fits/{id}."""
+    return Call("GET", f"/v1/fits/{_part(fit_id)}", _FIT)
+
+
+def fit_list(*, limit: int | None, cursor: str | None, state: str | None = None) -> Call[Page[Fit]]:
+    """GET /v1/fits."""
+    return Call("GET", "/v1/fits", _FITS, query=_given(limit=limit, cursor=cursor, state=state))
+
+
+def dataset_create(fit_id: str, config: DatasetConfig | None) -> Call[Job]:
+    """POST /v1/datasets."""
+    body = DatasetCreate(fit_id=fit_id, config=config or DatasetConfig())
+    return Call("POST", "/v1/datasets", _JOB, body=body)
+
+
+def dataset_get(dataset_id: str) -> Call[Dataset]:
+    """GET /v1/datasets/{id}."""
+    return Call("GET", f"/v1/datasets/{_part(dataset_id)}", _DATASET)
+
+
+def dataset_list(*, limit: int | None, cursor: str | None, state: str | None = None) -> Call[Page[Dataset]]:
+    """GET /v1/datasets."""
+    return Call("GET", "/v1/datasets", _DATASETS, query=_given(limit=limit, cursor=cursor, state=state))
+
+
+def dataset_episodes(dataset_id: str, *, limit: int | None, cursor: str | None) -> Call[Page[Episode]]:
+    """GET /v1/datasets/{id}/episodes."""
+    path = f"/v1/datasets/{_part(dataset_id)}/episodes"
+    return Call("GET", path, _EPISODES, query=_given(limit=limit, cursor=cursor))
+
+
+def training_create(
+    name: str, dataset_id: str, config: TrainingConfig | None, description: str, tags: list[str]
+) -> Call[Job]:
+    """POST /v1/models."""
+    body = TrainingCreate(
+        name=name,
+        dataset_id=dataset_id,
+        config=config or TrainingConfig(),
+        description=description,
+        tags=tags,
+    )
+    return Call("POST", "/v1/models", _JOB, body=body)
+
+
+def model_get(name: str) -> Call[Model]:
+    """GET /v1/models/{name}."""
+    return Call("GET", f"/v1/models/{_part(name)}", _MODEL)
+
+
+def model_list(*, limit: int | None, cursor: str | None) -> Call[Page[Model]]:
+    """GET /v1/models."""
+    return Call("GET", "/v1/models", _MODELS, query=_given(limit=limit, cursor=cursor))
+
+
+def version_get(name: str, version: int | str) -> Call[ModelVersion]:
+    """GET /v1/models/{name}/versions/{version}: a number or an alias."""
+    return Call("GET", f"/v1/models/{_part(name)}/versions/{_part(version)}", _VERSION)
+
+
+def version_list(name: str, *, limit: int | None, cursor: str | None) -> Call[Page[ModelVersion]]:
+    """GET /v1/models/{name}/versions."""
+    path = f"/v1/models/{_part(name)}/versions"
+    return Call("GET", path, _VERSIONS, query=_given(limit=limit, cursor=cursor))
+
+
+def version_number(model: Model, version: int | str | None) -> int:
+    """The number of a version that was given by number, by alias, or not at all (the newest).
+
+    Raises:
+        PhysWorldError: the model has no such alias, or no version yet.
+    """
+    if isinstance(version, int):
+        return version
+    if version is None:
+        if model.latest_version is None:
+            raise PhysWorldError(f"model {model.name} has no version yet")
+        return model.latest_version
+    if version.isdigit():
+        return int(version)
+    if version not in model.aliases:
+        known = ", ".join(sorted(model.aliases)) or "none"
+        raise PhysWorldError(f"model {model.name} has no alias {version!r} (it has: {known})")
+    return model.aliases[version]
+
+
+def alias_set(name: str, alias: str, version: int) -> Call[Model]:
+    """PUT /v1/models/{name}/aliases/{alias}."""
+    path = f"/v1/models/{_part(name)}/aliases/{_part(alias)}"
+    return Call("PUT", path, _MODEL, body=AliasSet(version=version))
+
+
+def pipeline_create(body: PipelineCreate) -> Call[Job]:
+    """POST /v1/pipelines."""
+    return Call("POST", "/v1/pipelines", _JOB, body=body)
+
+
+def pipeline_body(body: PipelineCreate | None, scene_id: str | None) -> PipelineCreate:
+    """The body given, or the one with the defaults for a scene; exactly one of the two must be given."""
+    if body is None and scene_id is not None:
+        return PipelineCreate(scene_id=scene_id)
+    if body is not None and scene_id is None:
+        return body
+    raise TypeError("pipelines.create takes either a PipelineCreate or scene_id")
+
+
+def job_get(job_id: str, *, wait_s: float | None = None) -> Call[Job]:
+    """GET /v1/jobs/{id}; with ``wait_s`` the service answers at the job's end or after that many seconds."""
+    query = _given(wait=wait_s)
+    return Call("GET", f"/v1/jobs/{_part(job_id)}", _JOB, query=query, read_timeout_s=wait_s or 0.0)
+
+
+def job_list(
+    *, limit: int | None, cursor: str | None, state: str | None = None, kind: str | None = None
+) -> Call[Page[Job]]:
+    """GET /v1/jobs."""
+    return Call("GET", "/v1/jobs", _JOBS, query=_given(limit=limit, cursor=cursor, state=state, kind=kind))
+
+
+def job_cancel(job_id: str) -> Call[Job]:
+    """POST /v1/jobs/{id}/cancel."""
+    return Call("POST", f"/v1/jobs/{_part(job_id)}/cancel", _JOB)
+
+
+def events_path(job_id: str) -> str:
+    """GET /v1/jobs/{id}/events, server-sent events."""
+    return f"/v1/jobs/{_part(job_id)}/events"
+
+
+def artifact_path(sha256: str) -> str:
+    """GET /v1/artifacts/{sha256}."""
+    return f"/v1/artifacts/{_part(sha256)}"

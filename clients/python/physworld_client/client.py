@@ -1,0 +1,86 @@
+"""The synchronous client: connection, retries, and the resources as attributes."""
+
+from __future__ import annotations
+
+import time
+from types import TracebackType
+from typing import TypeVar
+
+import httpx
+
+from physworld_client import transport as wire
+from physworld_client.calls import Call
+from physworld_client.resources import Artifacts, Datasets, Fits, Jobs, Models, Pipelines, Scenes
+
+Answer = TypeVar("Answer")
+
+
+class Client:
+    """A connection to one PhysWorld service; usable as a context manager.
+
+    Args:
+        base_url: address of the service, e.g. ``http://127.0.0.1:8000``.
+        token: API key.
+        timeout: seconds for one answer (a long poll adds its own wait).
+        max_retries: further attempts after the first, see ``physworld_client.transport``.
+        transport: a transport of httpx, for tests or a Unix socket.
+
+    Attributes:
+        scenes, fits, datasets, models, jobs, pipelines, artifacts: the resources.
+    """
+
+    def __init__(
+        self,
+        base_url: str,
+        token: str | None = None,
+        timeout: float = wire.DEFAULT_TIMEOUT_S,
+        max_retries: int = wire.DEFAULT_MAX_RETRIES,
+        *,
+        transport: httpx.BaseTransport | None = None,
+    ) -> None:
+        self.timeout = timeout
+        self.max_retries = max_retries
+        self.http = httpx.Client(transport=transport, **wire.client_options(base_url, token, timeout))
+        self.scenes = Scenes(self)
+        self.fits = Fits(self)
+        self.datasets = Datasets(self)
+        self.models = Models(self)
+        self.jobs = Jobs(self)
+        self.pipelines = Pipelines(self)
+        self.artifacts = Artifacts(self)
+
+    @property
+    def base_url(self) -> str:
+        """Address of the service, without a slash at its end."""
+        return str(self.http.base_url).rstrip("/")
+
+    def send(self, call: Call[Answer]) -> Answer:
+        """Sends a call with its retries and returns its typed answer, or raises the typed error."""
+        key = wire.new_key()
+        retry = wire.Retry(self.max_retries)
+        while True:
+            request = wire.build_request(self.http, call, key, self.timeout)
+            try:
+                response = self.http.send(request)
+            except httpx.TransportError as error:
+                if not retry.again():
+                    raise wire.connection_error(error, self.http, retry) from error
+                time.sleep(retry.delay_s())
+                continue
+            if response.status_code in wire.RETRIED_STATUSES and retry.again():
+                time.sleep(retry.delay_s(response))
+                continue
+            answer: Answer = wire.read_answer(call, response)
+            return answer
+
+    def close(self) -> None:
+        """Closes the connections."""
+        self.http.close()
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

@@ -1,0 +1,98 @@
+"""The manifest of a published model: which files belong to it, with size and SHA-256 of each.
+
+``manifest.json`` is ``{"name", "version", "files": {name: {"sha256", "size"}}}``; a version's ``sha256`` is
+the digest of this file. Nothing of a model is read before its files were verified.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path, PurePosixPath
+
+from pydantic import BaseModel, ValidationError
+
+from physworld_client.errors import DigestMismatch, ModelUnreadable
+from physworld_client.partial import sha256_of
+from schemas.base import Artifact
+from schemas.model import ModelVersion
+
+MANIFEST_NAME = "manifest.json"
+WEIGHTS_NAME = "model.safetensors"
+CARD_NAME = "card.json"
+
+
+class ManifestFile(BaseModel):
+    """Digest and size [bytes] of one file."""
+
+    sha256: str
+    size: int
+
+
+class Manifest(BaseModel):
+    """The content of ``manifest.json``."""
+
+    name: str
+    version: int
+    files: dict[str, ManifestFile]
+
+
+def verify_folder(folder: Path, sha256: str | None = None) -> Manifest:
+    """Checks every file of a model folder against its manifest, and the manifest against ``sha256``.
+
+    Raises:
+        ModelUnreadable: the manifest or a file is missing, or a name leaves the folder.
+        DigestMismatch: a file, or the manifest, is not what was published.
+    """
+    path = folder / MANIFEST_NAME
+    if not path.is_file():
+        raise ModelUnreadable(f"{folder} holds no {MANIFEST_NAME}: not a downloaded model")
+    if sha256 is not None and (found := sha256_of(path)) != sha256:
+        raise DigestMismatch(str(path), sha256, found)
+    try:
+        manifest = Manifest.model_validate_json(path.read_bytes())
+    except ValidationError as error:
+        fault = error.errors()[0]
+        place = ".".join(str(part) for part in fault["loc"])
+        raise ModelUnreadable(f"{path} is not a manifest: {place}: {fault['msg']}") from error
+    for name, entry in manifest.files.items():
+        file = folder / checked_name(name)
+        if not file.is_file():
+            raise ModelUnreadable(f"{folder} lacks {name}, which its manifest lists")
+        size = file.stat().st_size
+        if size != entry.size:
+            raise DigestMismatch(
+                f"{file} ({size} bytes, expected {entry.size})", entry.sha256, sha256_of(file)
+            )
+        if (found := sha256_of(file)) != entry.sha256:
+            raise DigestMismatch(str(file), entry.sha256, found)
+    return manifest
+
+
+def artifacts_of(version: ModelVersion) -> list[Artifact]:
+    """The files of a published version, the manifest among them.
+
+    Raises:
+        ModelUnreadable: the version is not ready, has no manifest, or names a file outside its folder.
+    """
+    label = f"{version.name} version {version.version}"
+    if version.state != "ready":
+        reason = f": {version.message}" if version.message else ""
+        raise ModelUnreadable(f"{label} is {version.state}{reason}")
+    manifest = [artifact for artifact in version.artifacts if artifact.name == MANIFEST_NAME]
+    if not manifest or version.sha256 is None:
+        names = ", ".join(artifact.name for artifact in version.artifacts) or "nothing"
+        raise ModelUnreadable(f"{label} has no {MANIFEST_NAME} (it has {names})")
+    for artifact in version.artifacts:
+        checked_name(artifact.name)
+    return version.artifacts
+
+
+def checked_name(name: str) -> str:
+    """The name, when it stays inside the folder it is put in.
+
+    Raises:
+        ModelUnreadable: it is absolute, climbs, or is empty.
+    """
+    path = PurePosixPath(name)
+    if path.is_absolute() or not path.parts or ".." in path.parts or "\\" in name or "\0" in name:
+        raise ModelUnreadable(f"the file name {name!r} leaves its folder")
+    return name

@@ -1,0 +1,327 @@
+"""The service's resources, synchronous. Every answer is a model of ``schemas``.
+
+``async_resources`` holds the same classes with the same names and arguments, awaited; a test compares them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+import httpx
+
+from physworld_client import calls, transport
+from physworld_client.bundle import open_bundle
+from physworld_client.errors import PhysWorldError, WaitTimedOut
+from physworld_client.manifest import artifacts_of, verify_folder
+from physworld_client.pages import ListPage
+from physworld_client.partial import CHUNK_BYTES, PartialFile
+from physworld_client.stream import HEARTBEAT_S, IDLE_LIMIT_S, EventDecoder, ends_job
+from physworld_client.waiting import Patience, job_id_of, require_success
+from schemas.base import Artifact, Page
+from schemas.dataset import Dataset, DatasetConfig, Episode
+from schemas.fit import Fit, FitConfig
+from schemas.job import TERMINAL_STATES, Event, Job
+from schemas.model import Model, ModelVersion, TrainingConfig
+from schemas.pipeline import PipelineCreate
+from schemas.scene import Scene
+
+if TYPE_CHECKING:
+    from physworld_client.client import Client
+
+Item = TypeVar("Item")
+
+
+class Resource:
+    """What the resources share: the client they send through."""
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+
+    def _page(
+        self, call_at: Callable[[str | None], calls.Call[Page[Item]]], cursor: str | None
+    ) -> ListPage[Item]:
+        page = self._client.send(call_at(cursor))
+        return ListPage(page.data, page.has_more, page.next_cursor, lambda at: self._page(call_at, at))
+
+
+class Scenes(Resource):
+    """Measured scenes."""
+
+    def create(self, path: str | Path) -> Scene:
+        """Uploads a scene: a folder (packed to a zip), an archive, a ``final_data.pkl`` or a C3D file."""
+        with open_bundle(path) as upload:
+            return self._client.send(calls.scene_create(upload))
+
+    def get(self, scene_id: str) -> Scene:
+        """One scene."""
+        return self._client.send(calls.scene_get(scene_id))
+
+    def list(
+        self, *, limit: int | None = None, cursor: str | None = None, kind: str | None = None
+    ) -> ListPage[Scene]:
+        """Scenes, newest first."""
+        return self._page(lambda at: calls.scene_list(limit=limit, cursor=at, kind=kind), cursor)
+
+
+class Fits(Resource):
+    """Calibrated twins."""
+
+    def create(self, scene_id: str, config: FitConfig | None = None) -> Job:
+        """Starts a fit; its job's output is the fit."""
+        return self._client.send(calls.fit_create(scene_id, config))
+
+    def get(self, fit_id: str) -> Fit:
+        """One fit."""
+        return self._client.send(calls.fit_get(fit_id))
+
+    def list(
+        self, *, limit: int | None = None, cursor: str | None = None, state: str | None = None
+    ) -> ListPage[Fit]:
+        """Fits, newest first."""
+        return self._page(lambda at: calls.fit_list(limit=limit, cursor=at, state=state), cursor)
+
+
+class Datasets(Resource):
+    """Datasets of demonstration episodes."""
+
+    def create(self, fit_id: str, config: DatasetConfig | None = None) -> Job:
+        """Starts writing a dataset; its job's output is the dataset."""
+        return self._client.send(calls.dataset_create(fit_id, config))
+
+    def get(self, dataset_id: str) -> Dataset:
+        """One dataset."""
+        return self._client.send(calls.dataset_get(dataset_id))
+
+    def list(
+        self, *, limit: int | None = None, cursor: str | None = None, state: str | None = None
+    ) -> ListPage[Dataset]:
+        """Datasets, newest first."""
+        return self._page(lambda at: calls.dataset_list(limit=limit, cursor=at, state=state), cursor)
+
+    def episodes(
+        self, dataset_id: str, *, limit: int | None = None, cursor: str | None = None
+    ) -> ListPage[Episode]:
+        """The committed episodes of a dataset."""
+        return self._page(lambda at: calls.dataset_episodes(dataset_id, limit=limit, cursor=at), cursor)
+
+
+class Models(Resource):
+    """Published world models: names, integer versions, aliases."""
+
+    def create(
+        self,
+        name: str,
+        dataset_id: str,
+        config: TrainingConfig | None = None,
+        *,
+        description: str = "",
+        tags: tuple[str, ...] = (),
+    ) -> Job:
+        """Trains on a sealed dataset and publishes the next version of ``name``."""
+        return self._client.send(calls.training_create(name, dataset_id, config, description, [*tags]))
+
+    def get(self, name: str) -> Model:
+        """One registered name with its newest version and aliases."""
+        return self._client.send(calls.model_get(name))
+
+    def list(self, *, limit: int | None = None, cursor: str | None = None) -> ListPage[Model]:
+        """Registered names."""
+        return self._page(lambda at: calls.model_list(limit=limit, cursor=at), cursor)
+
+    def versions(
+        self, name: str, *, limit: int | None = None, cursor: str | None = None
+    ) -> ListPage[ModelVersion]:
+        """Versions of a name, newest first."""
+        return self._page(lambda at: calls.version_list(name, limit=limit, cursor=at), cursor)
+
+    def version(self, name: str, version: int | str | None = None) -> ModelVersion:
+        """One version: by its number, by an alias, or the newest one."""
+        return self._client.send(calls.version_get(name, self._number(name, version)))
+
+    def set_alias(self, name: str, alias: str, version: int) -> Model:
+        """Moves an alias to a version."""
+        return self._client.send(calls.alias_set(name, alias, version))
+
+    def download(self, name: str, folder: str | Path, version: int | str | None = None) -> ModelVersion:
+        """Downloads every file of a version into ``folder`` and verifies them against the manifest.
+
+        Raises:
+            DigestMismatch: a file is not what the manifest promises.
+            ModelUnreadable: the version is not ready or its artifacts are incomplete.
+        """
+        found = self.version(name, version)
+        target = Path(folder)
+        for artifact in artifacts_of(found):
+            self._client.artifacts.download(artifact.sha256, target / artifact.name)
+        verify_folder(target, found.sha256)
+        return found
+
+    def _number(self, name: str, version: int | str | None) -> int:
+        if isinstance(version, int):
+            return version
+        return calls.version_number(self.get(name), version)
+
+
+class Pipelines(Resource):
+    """The whole chain in one call."""
+
+    def create(self, body: PipelineCreate | None = None, *, scene_id: str | None = None) -> Job:
+        """Starts fit, dataset and training; from a full body, or with the defaults for a scene."""
+        return self._client.send(calls.pipeline_create(calls.pipeline_body(body, scene_id)))
+
+
+class Jobs(Resource):
+    """Jobs: their state, events, cancellation, and the wait for their end."""
+
+    def get(self, job_id: str, *, wait_s: float | None = None) -> Job:
+        """One job; with ``wait_s`` the answer comes at the job's end or after that many seconds."""
+        return self._client.send(calls.job_get(job_id, wait_s=wait_s))
+
+    def list(
+        self,
+        *,
+        limit: int | None = None,
+        cursor: str | None = None,
+        state: str | None = None,
+        kind: str | None = None,
+    ) -> ListPage[Job]:
+        """Jobs, newest first."""
+        return self._page(lambda at: calls.job_list(limit=limit, cursor=at, state=state, kind=kind), cursor)
+
+    def cancel(self, job_id: str) -> Job:
+        """Asks for the job's end; it is ``cancelling`` until its workers have let go."""
+        return self._client.send(calls.job_cancel(job_id))
+
+    def events(self, job_id: str, *, after: int | None = None) -> Iterator[Event]:
+        """The job's events, past and coming, until the one that ends the job.
+
+        A broken stream is resumed after the last event seen; more than ``max_retries`` breaks without an
+        event between them raise ``ConnectionFailed``.
+        """
+        decoder = EventDecoder(after)
+        retry = transport.Retry(self._client.max_retries)
+        while True:
+            seen = decoder.last_id
+            broken: httpx.TransportError | None = None
+            try:
+                for line in self._lines(job_id, decoder):
+                    event = decoder.feed(line)
+                    if event is not None:
+                        yield event
+                        if ends_job(event, job_id):
+                            return
+            except httpx.TransportError as error:
+                broken = error
+            if decoder.last_id != seen:
+                retry.attempt = 0
+            elif broken is None and self.get(job_id).state in TERMINAL_STATES:
+                return
+            if not retry.again():
+                raise transport.stream_ended(broken, self._client.http, retry) from broken
+            decoder.reset()
+            time.sleep(retry.delay_s())
+
+    def wait(
+        self,
+        job: Job | str,
+        timeout: float | None = None,
+        on_progress: Callable[[Job], None] | None = None,
+    ) -> Job:
+        """Waits for the job's end and returns it.
+
+        Follows the event stream; where that is not to be had (a proxy that buffers it, a restart of the
+        service), and near the end of the timeout, it long-polls.
+
+        Args:
+            timeout: seconds, None waits for ever.
+            on_progress: called with the job whenever its state or progress has changed.
+
+        Raises:
+            JobFailed, JobCancelled: the job ended so.
+            WaitTimedOut: the job goes on.
+        """
+        patience = Patience(timeout, on_progress)
+        current = patience.see(self.get(job_id_of(job)))
+        if current.state not in TERMINAL_STATES and patience.left_s() > HEARTBEAT_S:
+            with contextlib.suppress(httpx.TransportError, PhysWorldError):
+                current = self._follow(current, patience)
+        while current.state not in TERMINAL_STATES:
+            if patience.left_s() <= 0:
+                raise WaitTimedOut(current, patience.timeout_s)
+            current = patience.see(self.get(current.id, wait_s=patience.poll_s()))
+        return require_success(current)
+
+    def _follow(self, job: Job, patience: Patience) -> Job:
+        """Follows the stream until the job ends, the stream does, or the patience is nearly out."""
+        decoder = EventDecoder()
+        for line in self._lines(job.id, decoder):
+            event = decoder.feed(line)
+            if event is not None:
+                if ends_job(event, job.id):
+                    break
+                if patience.wants_look():
+                    job = patience.see(self.get(job.id))
+            if patience.left_s() <= HEARTBEAT_S:
+                break
+        return patience.see(self.get(job.id))
+
+    def _lines(self, job_id: str, decoder: EventDecoder) -> Iterator[str]:
+        http = self._client.http
+        timeout = httpx.Timeout(self._client.timeout, read=IDLE_LIMIT_S)
+        with http.stream(
+            "GET", calls.events_path(job_id), headers=decoder.headers(), timeout=timeout
+        ) as response:
+            if response.status_code >= 400:
+                response.read()
+                transport.raise_for_problem(response)
+            yield from response.iter_lines()
+
+
+class Artifacts(Resource):
+    """Content-addressed files."""
+
+    def download(self, artifact: Artifact | str, path: str | Path) -> Path:
+        """Downloads an artifact to ``path``: resumes a part found there, checks the digest, then renames.
+
+        Raises:
+            DigestMismatch: the bytes are not those of the digest; nothing was put at ``path``.
+        """
+        partial = PartialFile(Path(path), artifact.sha256 if isinstance(artifact, Artifact) else artifact)
+        if partial.present():
+            return partial.target
+        retry = transport.Retry(self._client.max_retries)
+        while not partial.complete():
+            offset = partial.offset
+            try:
+                response = self._fetch(partial)
+            except httpx.TransportError as error:
+                if partial.offset > offset:
+                    retry.attempt = 0
+                if not retry.again():
+                    raise transport.connection_error(error, self._client.http, retry) from error
+                time.sleep(retry.delay_s())
+                continue
+            if response.is_success:
+                break
+            if partial.refused(response):
+                continue
+            if response.status_code not in transport.RETRIED_STATUSES or not retry.again():
+                transport.raise_for_problem(response)
+            time.sleep(retry.delay_s(response))
+        return partial.finish()
+
+    def _fetch(self, partial: PartialFile) -> httpx.Response:
+        """One request for what is missing; the body of a success is in the part when this returns."""
+        path = calls.artifact_path(partial.sha256)
+        with self._client.http.stream("GET", path, headers=partial.headers()) as response:
+            if response.is_success:
+                partial.accept(response)
+                for chunk in response.iter_bytes(CHUNK_BYTES):
+                    partial.write(chunk)
+            else:
+                response.read()
+        return response
