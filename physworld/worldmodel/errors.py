@@ -1,0 +1,44 @@
+"""Errors of the world model.
+
+WorldModelError
+├── GraphInvalid         too few particles or controllers for a graph, shapes that disagree
+├── DatasetUnusable      episodes too short, at another clock, or not numbers
+├── TrainingDiverged     the loss or the gradient stopped being a number (``step`` says when)
+├── TrainingCancelled    the caller's ``cancelled`` said so
+└── CheckpointMismatch   a checkpoint of other settings or other data
+"""
+
+from __future__ import annotations
+
+
+class WorldModelError(Exception):
+    """Base of this package's errors; the message carries the numbers that broke."""
+
+
+class GraphInvalid(WorldModelError):
+    """The particles and controllers make no graph."""
+
+
+class DatasetUnusable(WorldModelError):
+    """The episodes cannot train this model."""
+
+
+class TrainingDiverged(WorldModelError):
+    """Loss or gradient stopped being finite at ``step``."""
+
+    def __init__(self, step: int, loss: float) -> None:
+        super().__init__(f"training diverged at step {step}: loss {loss}")
+        self.step = step
+        self.loss = loss
+
+
+class TrainingCancelled(WorldModelError):
+    """The caller asked to stop at ``step``."""
+
+    def __init__(self, step: int) -> None:
+        super().__init__(f"training cancelled at step {step}")
+        self.step = step
+
+
+class CheckpointMismatch(WorldModelError):
+    """The checkpoint belongs to other settings or other data."""

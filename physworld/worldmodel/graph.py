@@ -1,0 +1,193 @@
+"""The graph: which particles are vertices, which controllers, and who hears whom. NumPy only.
+
+Vertices are the object's particles picked by farthest-point sampling (n of them, smallest separation d_v),
+followed by the control vertices (C). Edges are bidirectional: between object vertices the nearest neighbours
+within d_e = ``edge_radius_spacings`` · d_v, and between each control vertex and its nearest object vertices
+(a marker of the gripper may sit outside the body, so that no radius is asked of these).
+
+Neighbours are *material*: found once on the undeformed body and kept. An elastic solid keeps its neighbours, so
+the force on a vertex comes from the same vertices at all times; parts that merely pass close by (a folded rope)
+exert no elastic force, while a spatial radius would connect them; and a fixed graph trains as one dense batch
+and rolls out without a search. What it cannot express is contact of the object with itself, fracture and flow.
+
+Legend: n object vertices, C control vertices, V = n + C, D slots per vertex (largest degree), K controllers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from physworld.worldmodel.config import WorldModelConfig
+from physworld.worldmodel.errors import GraphInvalid
+
+
+@dataclass(frozen=True)
+class GraphSpec:
+    """A scene's graph at a fixed clock.
+
+    Attributes:
+        dt_s: the model's time step [s].
+        rest_vertices: undeformed places of the object vertices [m], (n, 3).
+        particle_index: the particle that each object vertex is, (n,).
+        control_index: the controller that each control vertex is, (C,).
+        neighbours: senders that each vertex hears, (V, D); V marks an empty slot.
+        rest_relative: undeformed x_sender − x_receiver of each slot [m], (V, D, 3); 0 in empty slots. For
+            edges with a control vertex: as at the start of the recording.
+        vertex_spacing_m: d_v, the smallest separation of object vertices.
+        edge_radius_m: d_e, the longest edge allowed between object vertices, the network's unit of length.
+        ground_height_m: the plane's height, or None.
+    """
+
+    dt_s: float
+    rest_vertices: np.ndarray
+    particle_index: np.ndarray
+    control_index: np.ndarray
+    neighbours: np.ndarray
+    rest_relative: np.ndarray
+    vertex_spacing_m: float
+    edge_radius_m: float
+    ground_height_m: float | None = None
+
+    @property
+    def object_count(self) -> int:
+        """n."""
+        return self.rest_vertices.shape[0]
+
+    @property
+    def control_count(self) -> int:
+        """C."""
+        return self.control_index.shape[0]
+
+    @property
+    def vertex_count(self) -> int:
+        """V = n + C."""
+        return self.object_count + self.control_count
+
+    @property
+    def edge_count(self) -> int:
+        """Directed edges."""
+        return int((self.neighbours < self.vertex_count).sum())
+
+
+def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
+    """Indices (≤ count,) of a farthest-point sampling of ``points`` (P, 3), from the point nearest the middle."""
+    points = np.asarray(points, dtype=np.float64)
+    chosen = [int(np.argmin(((points - points.mean(axis=0)) ** 2).sum(axis=1)))]
+    distance = ((points - points[chosen[0]]) ** 2).sum(axis=1)
+    while len(chosen) < min(count, points.shape[0]):
+        farthest = int(np.argmax(distance))
+        if distance[farthest] <= 0.0:
+            break
+        chosen.append(farthest)
+        distance = np.minimum(distance, ((points - points[farthest]) ** 2).sum(axis=1))
+    return np.asarray(chosen, dtype=np.int64)
+
+
+def choose_control_vertices(
+    controllers: np.ndarray, groups: tuple[np.ndarray, ...], config: WorldModelConfig
+) -> np.ndarray:
+    """Controllers that become vertices, (C,): all of a few, or a spread of each rigid group (K, 3)."""
+    count = controllers.shape[0]
+    if count <= config.control_vertices_all:
+        return np.arange(count, dtype=np.int64)
+    grouped = [np.asarray(group, dtype=np.int64) for group in groups if len(group)]
+    single = np.setdiff1d(np.arange(count), np.concatenate(grouped) if grouped else np.zeros(0, np.int64))
+    if len(single):
+        grouped.append(single)
+    picked = [g[farthest_points(controllers[g], config.control_vertices_per_grip)] for g in grouped]
+    return np.sort(np.concatenate(picked))
+
+
+def build_graph(
+    particles_rest: np.ndarray,
+    particles_start: np.ndarray,
+    controllers_start: np.ndarray,
+    *,
+    dt_s: float,
+    config: WorldModelConfig,
+    control_groups: tuple[np.ndarray, ...] = (),
+    ground_height_m: float | None = None,
+) -> GraphSpec:
+    """The graph of a body.
+
+    Args:
+        particles_rest: undeformed particles [m], (P, 3).
+        particles_start: the same at the start of the recording [m], (P, 3).
+        controllers_start: controllers at that moment [m], (K, 3).
+        dt_s: the model's clock [s].
+        config: number of vertices and neighbours.
+        control_groups: controllers that move as one rigid grip.
+        ground_height_m: height of the ground plane, or None.
+    """
+    if particles_rest.shape != particles_start.shape or particles_rest.shape[0] < 2:
+        raise GraphInvalid(f"rest {particles_rest.shape} and start {particles_start.shape} make no body")
+    index = farthest_points(particles_rest, config.vertices)
+    rest = np.asarray(particles_rest, dtype=np.float64)[index]
+    n = rest.shape[0]
+    distances = np.linalg.norm(rest[:, None] - rest[None], axis=2)
+    np.fill_diagonal(distances, np.inf)
+    spacing = float(distances.min())
+    radius = config.edge_radius_spacings * spacing
+    pairs = _object_pairs(distances, min(config.neighbours, n - 1), radius)
+
+    controllers = np.asarray(controllers_start, dtype=np.float64)
+    control = choose_control_vertices(controllers, control_groups, config)
+    start = np.asarray(particles_start, dtype=np.float64)[index]
+    reach = np.linalg.norm(controllers[control][:, None] - start[None], axis=2)
+    held = np.argsort(reach, axis=1, kind="stable")[:, : min(config.neighbours, n)]
+    for slot, objects in enumerate(held):
+        for vertex in objects:
+            pairs += [(int(vertex), n + slot), (n + slot, int(vertex))]
+
+    vertex_count = n + len(control)
+    neighbours = _slot_table(pairs, vertex_count)
+    reference = np.concatenate([start, controllers[control]])
+    undeformed = np.concatenate([rest, np.zeros((len(control), 3))])
+    return GraphSpec(
+        dt_s=dt_s,
+        rest_vertices=rest,
+        particle_index=index,
+        control_index=control,
+        neighbours=neighbours,
+        rest_relative=_relative(neighbours, undeformed, reference, n),
+        vertex_spacing_m=spacing,
+        edge_radius_m=radius,
+        ground_height_m=ground_height_m,
+    )
+
+
+def _object_pairs(distances: np.ndarray, neighbours: int, radius: float) -> list[tuple[int, int]]:
+    """Directed pairs (receiver, sender): each other's nearest within the radius, made symmetric."""
+    nearest = np.argsort(distances, axis=1, kind="stable")[:, :neighbours]
+    linked = np.zeros(distances.shape, dtype=bool)
+    np.put_along_axis(linked, nearest, True, axis=1)
+    linked &= distances <= radius
+    receivers, senders = np.nonzero(linked | linked.T)
+    return list(zip(receivers.tolist(), senders.tolist(), strict=True))
+
+
+def _slot_table(pairs: list[tuple[int, int]], vertex_count: int) -> np.ndarray:
+    """Senders by receiver, (V, D) int64, empty slots filled with V."""
+    senders: list[list[int]] = [[] for _ in range(vertex_count)]
+    for receiver, sender in pairs:
+        senders[receiver].append(sender)
+    width = max(1, max(len(row) for row in senders))
+    table = np.full((vertex_count, width), vertex_count, dtype=np.int64)
+    for receiver, row in enumerate(senders):
+        table[receiver, : len(row)] = sorted(row)
+    return table
+
+
+def _relative(neighbours: np.ndarray, undeformed: np.ndarray, reference: np.ndarray, n: int) -> np.ndarray:
+    """Undeformed x_sender − x_receiver of each slot, (V, D, 3): at rest, or at the start beside a controller."""
+    vertex_count = neighbours.shape[0]
+    filled = neighbours < vertex_count
+    sender = np.where(filled, neighbours, 0)
+    receiver = np.broadcast_to(np.arange(vertex_count)[:, None], neighbours.shape)
+    with_control = (sender >= n) | (receiver >= n)
+    relative = np.where(
+        with_control[..., None], reference[sender] - reference[receiver], undeformed[sender] - undeformed[receiver]
+    )
+    return np.where(filled[..., None], relative, 0.0)
