@@ -18,7 +18,7 @@ from physworld_client.pages import AsyncListPage
 from physworld_client.partial import CHUNK_BYTES, PartialFile
 from physworld_client.stream import HEARTBEAT_S, IDLE_LIMIT_S, EventDecoder, ends_job
 from physworld_client.waiting import Patience, job_id_of, require_success
-from schemas.base import Artifact, Page
+from schemas.base import Artifact
 from schemas.dataset import Dataset, DatasetConfig, Episode
 from schemas.fit import Fit, FitConfig
 from schemas.job import TERMINAL_STATES, Event, Job
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from physworld_client.async_client import AsyncClient
 
 Item = TypeVar("Item")
+LATEST = "latest"
 
 
 class AsyncResource:
@@ -38,9 +39,7 @@ class AsyncResource:
     def __init__(self, client: AsyncClient) -> None:
         self._client = client
 
-    async def _page(
-        self, call_at: Callable[[str | None], calls.Call[Page[Item]]], cursor: str | None
-    ) -> AsyncListPage[Item]:
+    async def _page(self, call_at: calls.ListCall[Item], cursor: str | None) -> AsyncListPage[Item]:
         page = await self._client.send(call_at(cursor))
         return AsyncListPage(page.data, page.has_more, page.next_cursor, lambda at: self._page(call_at, at))
 
@@ -135,15 +134,15 @@ class AsyncModels(AsyncResource):
         """Versions of a name, newest first."""
         return await self._page(lambda at: calls.version_list(name, limit=limit, cursor=at), cursor)
 
-    async def version(self, name: str, version: int | str | None = None) -> ModelVersion:
-        """One version: by its number, by an alias, or the newest one."""
-        return await self._client.send(calls.version_get(name, await self._number(name, version)))
+    async def version(self, name: str, version: int | str = LATEST) -> ModelVersion:
+        """One version: by its number, by an alias, or the newest that is ready."""
+        return await self._client.send(calls.version_get(name, version))
 
     async def set_alias(self, name: str, alias: str, version: int) -> Model:
         """Moves an alias to a version."""
         return await self._client.send(calls.alias_set(name, alias, version))
 
-    async def download(self, name: str, folder: str | Path, version: int | str | None = None) -> ModelVersion:
+    async def download(self, name: str, folder: str | Path, version: int | str = LATEST) -> ModelVersion:
         """Downloads every file of a version into ``folder`` and verifies them against the manifest.
 
         Raises:
@@ -156,11 +155,6 @@ class AsyncModels(AsyncResource):
             await self._client.artifacts.download(artifact.sha256, target / artifact.name)
         verify_folder(target, found.sha256)
         return found
-
-    async def _number(self, name: str, version: int | str | None) -> int:
-        if isinstance(version, int):
-            return version
-        return calls.version_number(await self.get(name), version)
 
 
 class AsyncPipelines(AsyncResource):

@@ -5,7 +5,7 @@ The synchronous and the asynchronous client send the same calls, so that an endp
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 from urllib.parse import quote
@@ -13,7 +13,6 @@ from urllib.parse import quote
 from pydantic import BaseModel, TypeAdapter
 
 from physworld_client.bundle import Upload
-from physworld_client.errors import PhysWorldError
 from schemas.base import Page
 from schemas.dataset import Dataset, DatasetConfig, DatasetCreate, Episode
 from schemas.fit import Fit, FitConfig, FitCreate
@@ -23,6 +22,7 @@ from schemas.pipeline import PipelineCreate
 from schemas.scene import Scene
 
 Answer = TypeVar("Answer")
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,9 @@ class Call(Generic[Answer]):
     upload: Upload | None = None
     read_timeout_s: float = 0.0
 
+
+ListCall = Callable[[str | None], Call[Page[Item]]]
+"""A list from a cursor on."""
 
 _SCENE = TypeAdapter(Scene)
 _FIT = TypeAdapter(Fit)
@@ -144,7 +147,7 @@ def model_list(*, limit: int | None, cursor: str | None) -> Call[Page[Model]]:
 
 
 def version_get(name: str, version: int | str) -> Call[ModelVersion]:
-    """GET /v1/models/{name}/versions/{version}: a number or an alias."""
+    """GET /v1/models/{name}/versions/{version}: a number, an alias or ``latest``."""
     return Call("GET", f"/v1/models/{_part(name)}/versions/{_part(version)}", _VERSION)
 
 
@@ -152,26 +155,6 @@ def version_list(name: str, *, limit: int | None, cursor: str | None) -> Call[Pa
     """GET /v1/models/{name}/versions."""
     path = f"/v1/models/{_part(name)}/versions"
     return Call("GET", path, _VERSIONS, query=_given(limit=limit, cursor=cursor))
-
-
-def version_number(model: Model, version: int | str | None) -> int:
-    """The number of a version that was given by number, by alias, or not at all (the newest).
-
-    Raises:
-        PhysWorldError: the model has no such alias, or no version yet.
-    """
-    if isinstance(version, int):
-        return version
-    if version is None:
-        if model.latest_version is None:
-            raise PhysWorldError(f"model {model.name} has no version yet")
-        return model.latest_version
-    if version.isdigit():
-        return int(version)
-    if version not in model.aliases:
-        known = ", ".join(sorted(model.aliases)) or "none"
-        raise PhysWorldError(f"model {model.name} has no alias {version!r} (it has: {known})")
-    return model.aliases[version]
 
 
 def alias_set(name: str, alias: str, version: int) -> Call[Model]:

@@ -21,7 +21,7 @@ from physworld_client.pages import ListPage
 from physworld_client.partial import CHUNK_BYTES, PartialFile
 from physworld_client.stream import HEARTBEAT_S, IDLE_LIMIT_S, EventDecoder, ends_job
 from physworld_client.waiting import Patience, job_id_of, require_success
-from schemas.base import Artifact, Page
+from schemas.base import Artifact
 from schemas.dataset import Dataset, DatasetConfig, Episode
 from schemas.fit import Fit, FitConfig
 from schemas.job import TERMINAL_STATES, Event, Job
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from physworld_client.client import Client
 
 Item = TypeVar("Item")
+LATEST = "latest"
 
 
 class Resource:
@@ -41,9 +42,7 @@ class Resource:
     def __init__(self, client: Client) -> None:
         self._client = client
 
-    def _page(
-        self, call_at: Callable[[str | None], calls.Call[Page[Item]]], cursor: str | None
-    ) -> ListPage[Item]:
+    def _page(self, call_at: calls.ListCall[Item], cursor: str | None) -> ListPage[Item]:
         page = self._client.send(call_at(cursor))
         return ListPage(page.data, page.has_more, page.next_cursor, lambda at: self._page(call_at, at))
 
@@ -138,15 +137,15 @@ class Models(Resource):
         """Versions of a name, newest first."""
         return self._page(lambda at: calls.version_list(name, limit=limit, cursor=at), cursor)
 
-    def version(self, name: str, version: int | str | None = None) -> ModelVersion:
-        """One version: by its number, by an alias, or the newest one."""
-        return self._client.send(calls.version_get(name, self._number(name, version)))
+    def version(self, name: str, version: int | str = LATEST) -> ModelVersion:
+        """One version: by its number, by an alias, or the newest that is ready."""
+        return self._client.send(calls.version_get(name, version))
 
     def set_alias(self, name: str, alias: str, version: int) -> Model:
         """Moves an alias to a version."""
         return self._client.send(calls.alias_set(name, alias, version))
 
-    def download(self, name: str, folder: str | Path, version: int | str | None = None) -> ModelVersion:
+    def download(self, name: str, folder: str | Path, version: int | str = LATEST) -> ModelVersion:
         """Downloads every file of a version into ``folder`` and verifies them against the manifest.
 
         Raises:
@@ -159,11 +158,6 @@ class Models(Resource):
             self._client.artifacts.download(artifact.sha256, target / artifact.name)
         verify_folder(target, found.sha256)
         return found
-
-    def _number(self, name: str, version: int | str | None) -> int:
-        if isinstance(version, int):
-            return version
-        return calls.version_number(self.get(name), version)
 
 
 class Pipelines(Resource):
