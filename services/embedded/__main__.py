@@ -1,0 +1,56 @@
+"""``python -m services.embedded --data DIR [--workers 2] [--port 0]``: the whole service on this machine.
+
+Exit codes: 0 ended by a signal, 1 could not start, 3 already running on this folder.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from services.embedded.broker import NoBroker
+from services.embedded.folder import AlreadyRunning, StillAlive
+from services.embedded.supervisor import Options, StartFailed, Stopped, Supervisor
+from storage.errors import StorageError
+from storage.settings import Settings
+
+ALREADY_RUNNING = 3
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the service until Ctrl-C."""
+    parser = argparse.ArgumentParser(prog="python -m services.embedded", description=__doc__)
+    parser.add_argument("--data", type=Path, default=None, help="data folder (default: PHYSWORLD_DATA_DIR)")
+    parser.add_argument("--workers", type=int, default=2, help="simulation worker processes (default: 2)")
+    parser.add_argument(
+        "--port", type=int, default=0, help="web port on 127.0.0.1; 0: last one, or a free one"
+    )
+    parser.add_argument("--no-trainer", action="store_true", help="do not start the trainer")
+    given = parser.parse_args(arguments)
+    if given.workers < 0:
+        parser.error(f"--workers {given.workers} is negative")
+    root = given.data if given.data is not None else Settings().data_dir
+    options = Options(root, given.workers, given.port, trainer=not given.no_trainer)
+    try:
+        Supervisor(options, _say).run()
+    except AlreadyRunning as error:
+        _say(f"PhysWorld is already running on {root} (pid {error.state.get('pid', 'unknown')})")
+        for key in ("dashboard_url", "api_url", "docs_url", "api_key_file"):
+            if key in error.state:
+                _say(f"  {key:<14}{error.state[key]}")
+        return ALREADY_RUNNING
+    except (StartFailed, NoBroker, StillAlive, StorageError) as error:
+        print(f"PhysWorld could not start: {error}", file=sys.stderr)
+        return 1
+    except Stopped:
+        return 0
+    return 0
+
+
+def _say(text: str) -> None:
+    print(text, flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

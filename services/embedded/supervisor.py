@@ -1,0 +1,264 @@
+"""Starts the parts in their order, keeps them running, says when they serve, and ends them all.
+
+Order: folder locks → database at its newest revision → admin key → broker (waited for) → web, dispatcher,
+workers, trainer. A child that ends is started again with growing pauses; the broker comes back on its port
+with its append-only file. The supervisor is one thread that sleeps between looks; its death by any signal
+ends every child (Linux: PR_SET_PDEATHSIG) and the next start carries on from the database.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+import signal
+import socket
+import sys
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from types import FrameType
+
+from schemas.queues import SIMULATION
+from services.embedded import logs
+from services.embedded.broker import Broker, choose_broker
+from services.embedded.child import Child, Program
+from services.embedded.folder import DataFolder, FolderLocks, write_private
+from storage import keys
+from storage.database import open_database
+from storage.settings import Settings
+
+WATCH_S = 0.2
+LOGS_S = 60.0
+START_WITHIN_S = 120.0
+END_WITHIN_S = 8.0
+EARLIER_RUN_WITHIN_S = 15.0
+READY_FILE = "PHYSWORLD_READY_FILE"
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the command line says.
+
+    Attributes:
+        root: the data folder.
+        workers: simulation worker processes.
+        port: of the web process; 0 takes the last one, or any that is free.
+        trainer: whether to run the trainer.
+    """
+
+    root: Path
+    workers: int = 2
+    port: int = 0
+    trainer: bool = True
+
+
+class StartFailed(Exception):
+    """A part did not come up; the message names it and quotes its log."""
+
+
+class Supervisor:
+    """The running service of one data folder. Use ``run``."""
+
+    def __init__(self, options: Options, say: Callable[[str], None] = print) -> None:
+        self._options = options
+        self._say = say
+        self._folder = DataFolder(options.root.expanduser().absolute())
+        self._children: list[Child] = []
+        self._stop = threading.Event()
+        self._started_at = datetime.now(UTC)
+
+    def run(self) -> None:
+        """Start, watch until a signal comes, end everything.
+
+        Raises AlreadyRunning, StartFailed, NoBroker or StillAlive.
+        """
+        self._folder.prepare()
+        locks = FolderLocks(self._folder)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, self._on_signal)
+        try:
+            locks.wait_until_alone(EARLIER_RUN_WITHIN_S)
+            locks.hold_family()
+            with self._listen() as listening:
+                try:
+                    self._start(locks.family_descriptor, listening)
+                    self._watch()
+                finally:
+                    self._end()
+            locks.leave_family()
+            locks.wait_until_alone(END_WITHIN_S)
+        finally:
+            locks.close()
+
+    def _start(self, family: int, listening: socket.socket) -> None:
+        environment = {**os.environ, "PHYSWORLD_DATA_DIR": str(self._folder.root), "PYTHONUNBUFFERED": "1"}
+        broker = choose_broker(self._folder, environment)
+        environment["PHYSWORLD_BROKER_URL"] = broker.url
+        self._prepare_database()
+        self._url = f"http://127.0.0.1:{listening.getsockname()[1]}"
+        if broker.command:
+            self._add(Program("broker", broker.command, environment), family)
+        self._wait_for_broker(broker)
+        for program in self._programs(environment, listening):
+            self._add(program, family)
+        self._write_state(ready=False)
+        self._wait_until_ready()
+        self._write_state(ready=True)
+        self._say(f"PhysWorld is ready at {self._url}/dashboard (Ctrl-C ends it)")
+        self._say(f"  API        {self._url}/v1")
+        self._say(f"  API docs   {self._url}/docs")
+        self._say(f"  API key    {self._folder.api_key}")
+        self._say(f"  data       {self._folder.root}")
+
+    def _programs(self, environment: dict[str, str], listening: socket.socket) -> list[Program]:
+        python = (sys.executable, "-m")
+        programs = [
+            Program(
+                "web",
+                (*python, "services.embedded.web", "--fd", str(listening.fileno())),
+                environment,
+                descriptors=(listening.fileno(),),
+            ),
+            self._python_program("dispatcher", (*python, "workers.dispatcher"), environment),
+        ]
+        for number in range(1, self._options.workers + 1):
+            name = f"worker-{number}"
+            command = (*python, "workers", "--queue", SIMULATION, "--name", name)
+            programs.append(self._python_program(name, command, environment, signal.SIGQUIT))
+        if self._options.trainer:
+            command = (*python, "services.trainer", "--name", "trainer")
+            programs.append(self._python_program("trainer", command, environment, signal.SIGQUIT))
+        return programs
+
+    def _python_program(
+        self,
+        name: str,
+        command: tuple[str, ...],
+        environment: dict[str, str],
+        stop_signal: signal.Signals = signal.SIGTERM,
+    ) -> Program:
+        ready = self._folder.run / f"{name}.ready"
+        own = {**environment, READY_FILE: str(ready)}
+        return Program(name, command, own, stop_signal, ready_file=ready)
+
+    def _add(self, program: Program, family: int) -> None:
+        child = Child(program, self._folder.logs / f"{program.name}.log", family)
+        child.start()
+        self._children.append(child)
+
+    def _prepare_database(self) -> None:
+        settings = Settings(data_dir=self._folder.root)
+        settings.check(broker=False)
+        database = open_database(settings)
+        database.upgrade()
+        if not self._folder.api_key.exists():
+            with database.session() as session:
+                token = keys.create_key(session, name=f"embedded-{secrets.token_hex(3)}", role="admin")
+                write_private(self._folder.api_key, token + "\n")
+        database.dispose()
+
+    def _listen(self) -> socket.socket:
+        """The web process's socket: on the asked port, or on the last one, or on any that is free."""
+        last = str(self._folder.read_state().get("api_url", "")).rpartition(":")[2]
+        candidates = [self._options.port] if self._options.port else [int(last or 0), 0]
+        for port in candidates:
+            listening = socket.socket()
+            listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                listening.bind(("127.0.0.1", port))
+            except OSError as error:
+                listening.close()
+                if port == candidates[-1]:
+                    raise StartFailed(f"port {port} on 127.0.0.1 cannot be had: {error}") from error
+                continue
+            listening.listen(128)
+            return listening
+        raise StartFailed("no port to listen on")
+
+    def _wait_for_broker(self, broker: Broker) -> None:
+        self._wait("the broker", broker.answers)
+
+    def _wait_until_ready(self) -> None:
+        def missing() -> list[str]:
+            files = {child.program.name: child.program.ready_file for child in self._children}
+            return [name for name, file in files.items() if file is not None and not file.exists()]
+
+        self._wait("the web process", self._web_is_ready)
+        self._wait("workers", lambda: not missing())
+
+    def _wait(self, what: str, condition: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + START_WITHIN_S
+        while not condition():
+            if self._stop.wait(WATCH_S):
+                raise Stopped
+            for child in self._children:
+                child.watch()
+                if child.exits >= 3:
+                    raise StartFailed(self._obituary(child))
+            if time.monotonic() > deadline:
+                raise StartFailed(
+                    f"{what} did not answer within {START_WITHIN_S:.0f} s; see {self._folder.logs}"
+                )
+
+    def _web_is_ready(self) -> bool:
+        with suppress(urllib.error.URLError, TimeoutError, ConnectionError):
+            with urllib.request.urlopen(f"{self._url}/health/ready", timeout=2) as answer:
+                return bool(answer.status == 200)
+        return False
+
+    def _watch(self) -> None:
+        logs_at = time.monotonic() + LOGS_S
+        while not self._stop.wait(WATCH_S):
+            changed = [child for child in self._children if child.watch()]
+            if changed:
+                self._write_state(ready=True)
+            if time.monotonic() > logs_at:
+                logs_at = time.monotonic() + LOGS_S
+                for child in self._children:
+                    logs.rotate(child.log)
+
+    def _end(self) -> None:
+        """Everything but the broker at once, then the broker, so that workers can give messages back."""
+        deadline = time.monotonic() + END_WITHIN_S
+        brokers = [child for child in self._children if child.program.name == "broker"]
+        others = [child for child in self._children if child not in brokers]
+        for group in (others, brokers):
+            for child in group:
+                child.ask_to_stop()
+            for child in group:
+                child.wait_or_kill(deadline)
+            deadline = max(deadline, time.monotonic() + 2.0)
+        self._folder.state.unlink(missing_ok=True)
+
+    def _write_state(self, *, ready: bool) -> None:
+        self._folder.write_state(
+            {
+                "pid": os.getpid(),
+                "api_url": self._url,
+                "docs_url": f"{self._url}/docs",
+                "dashboard_url": f"{self._url}/dashboard",
+                "api_key_file": str(self._folder.api_key),
+                "started_at": self._started_at.isoformat(),
+                "ready": ready,
+                "children": {child.program.name: child.pid for child in self._children if child.pid},
+            }
+        )
+
+    def _obituary(self, child: Child) -> str:
+        return (
+            f"{child.program.name} ended {child.exits} times while starting (last with code "
+            f"{child.last_exit}); the end of {child.log}:\n{logs.tail(child.log)}"
+        )
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        self._stop.set()
+
+
+class Stopped(Exception):
+    """A signal came before the service was ready."""

@@ -1,0 +1,52 @@
+"""Which function does which kind of shard; imported when the first shard of its kind arrives.
+
+A handler is ``run(context: TaskContext, stores: Stores) -> HandlerResult``. The table holds import strings,
+so that starting a worker imports neither ``torch`` nor ``warp``, and so that a service can add its own
+kinds (``services.trainer`` registers ``training``) without the workers knowing of it.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from workers.errors import UnknownShardKind
+
+if TYPE_CHECKING:
+    from workers.context import TaskContext
+    from workers.stores import Stores
+
+
+@dataclass(frozen=True)
+class HandlerResult:
+    """What a shard came to: a JSON-able result, and the digest of what it wrote (None: nothing)."""
+
+    result: dict[str, Any] = field(default_factory=dict)
+    digest: str | None = None
+
+
+Handler = Callable[["TaskContext", "Stores"], HandlerResult]
+
+_HANDLERS: dict[str, str] = {
+    "fit": "workers.tasks.fit:run",
+    "dataset_plan": "workers.tasks.dataset:plan",
+    "episode": "workers.tasks.dataset:episode",
+    "dataset_seal": "workers.tasks.dataset:seal",
+}
+
+
+def register(kind: str, target: str) -> None:
+    """Let shards of ``kind`` be done by ``target`` (``module:function``)."""
+    _HANDLERS[kind] = target
+
+
+def handler_of(kind: str) -> Handler:
+    """The handler of ``kind``, its module imported now. Raises UnknownShardKind."""
+    target = _HANDLERS.get(kind)
+    if target is None:
+        raise UnknownShardKind(f"no handler for shard kind {kind!r}; this worker knows {sorted(_HANDLERS)}")
+    module, _, function = target.partition(":")
+    handler: Handler = getattr(importlib.import_module(module), function)
+    return handler
