@@ -7,6 +7,7 @@ SI units, world frame z up, axis order (time, entity, xyz). Reading and checking
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +29,8 @@ class Body:
         density_kg_m3, mass_kg: density, or total mass.
         segment_rest_lengths_m: rest distances between consecutive tracked points of a rope.
         edges: topology, index pairs (E, 2) into the tracked points.
-        grid_shape: (rows, columns) when the tracked points form a grid on a sheet (row-major).
+        grid_shape: (n, n) when the tracked points form a grid on a sheet: point i * n + j is the i-th from the
+            left and the j-th from the top.
     """
 
     size_m: np.ndarray | None = None
@@ -78,7 +80,12 @@ class Scene:
         initial_state: UNDEFORMED_AT_REST or AS_MEASURED.
         control_times, control_points: controllers at a higher rate, (Tc,) and (Tc, K, 3), or None.
         rest_volume_points: points filling the undeformed body at t = 0, (M, 3), or None.
+        surface_points: further points on the surface at t = 0, (S, 3), or None.
+        colors: colours of the tracked points, (T, N, 3) or (N, 3), or None.
         part_features: per-volume-point part features (M or N, F), or None.
+        extra_arrays: measured arrays that no code here reads (base markers and the like), kept as they came.
+        declared: the whole ``scene.json`` as it came, with what no field here holds (notes, topology, tip load,
+            marker design places); where both speak, the fields count.
     """
 
     name: str
@@ -104,6 +111,8 @@ class Scene:
     surface_points: np.ndarray | None = None
     colors: np.ndarray | None = None
     part_features: np.ndarray | None = None
+    extra_arrays: dict[str, np.ndarray] = field(default_factory=dict)
+    declared: dict[str, Any] = field(default_factory=dict)
 
     @property
     def frame_count(self) -> int:

@@ -1,0 +1,317 @@
+"""Reading of archives that strangers send: in memory, by name, within limits, never unpacked to disk.
+
+A zip or a tar (plain, gzip) is read member by member. Refused, each with its name and numbers: a path that
+climbs out of the archive, is absolute or names a drive; a link, a device, a sparse or an encrypted member;
+two members of one name; more members or bytes than the limits, whether declared or met while inflating; a
+compression ratio that only a bomb has; a truncated or damaged archive.
+
+``read_arrays`` reads an ``npz`` the same way. It parses the array headers itself: numpy would allocate what
+a header claims before it looks at the data, and no array of Python objects is ever decoded.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import stat
+import struct
+import tarfile
+import zipfile
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import IO
+
+import numpy as np
+
+GIBIBYTE = 1 << 30
+MEBIBYTE = 1 << 20
+CHUNK_BYTES = MEBIBYTE
+
+ZIP_MAGIC = b"PK\x03\x04"
+EMPTY_ZIP_MAGIC = b"PK\x05\x06"
+GZIP_MAGIC = b"\x1f\x8b"
+TAR_MAGIC_AT = 257
+TAR_MAGIC = b"ustar"
+
+NUMERIC_KINDS = "biuf"
+NPY_HEADER_LIMIT = 10_000
+
+
+class ArchiveRefused(ValueError):
+    """An archive, or a file in it, that is damaged, hostile or too large; the message says which and why."""
+
+
+@dataclass(frozen=True)
+class ArchiveLimits:
+    """What an archive may hold.
+
+    Attributes:
+        total_bytes: sum of the inflated sizes.
+        members: files and folders.
+        ratio: inflated over compressed size; only asked beyond ``ratio_free_bytes``, since a mask that is
+            true everywhere honestly shrinks a thousandfold.
+        ratio_free_bytes: inflated size below which no ratio is asked.
+    """
+
+    total_bytes: int = GIBIBYTE
+    members: int = 256
+    ratio: float = 200.0
+    ratio_free_bytes: int = 64 * MEBIBYTE
+
+
+DEFAULT_LIMITS = ArchiveLimits()
+
+DAMAGED = (
+    zipfile.BadZipFile,
+    tarfile.TarError,
+    zlib.error,
+    struct.error,
+    EOFError,
+    NotImplementedError,
+    ValueError,
+    OverflowError,
+)
+"""What the standard library raises on truncated or malformed archives."""
+
+
+def is_zip(data: bytes) -> bool:
+    """Whether the bytes begin like a zip."""
+    return data[:4] in (ZIP_MAGIC, EMPTY_ZIP_MAGIC)
+
+
+def is_tar(data: bytes) -> bool:
+    """Whether the bytes begin like a tar or like anything gzipped."""
+    return data[:2] == GZIP_MAGIC or data[TAR_MAGIC_AT : TAR_MAGIC_AT + len(TAR_MAGIC)] == TAR_MAGIC
+
+
+def read_archive(
+    data: bytes, wanted: frozenset[str], limits: ArchiveLimits = DEFAULT_LIMITS
+) -> dict[str, bytes]:
+    """Contents of the members whose last path component is in ``wanted``, by their full path in the archive.
+
+    Every member's name, type and size is checked, wanted or not.
+
+    Raises:
+        ArchiveRefused: damaged, hostile, too large, or no archive at all.
+    """
+    if not is_zip(data) and not is_tar(data):
+        raise ArchiveRefused(f"neither a zip nor a tar (it begins with {data[:8].hex(' ') or 'nothing'})")
+    try:
+        if is_zip(data):
+            return _read_zip(data, wanted, limits)
+        return _read_tar(data, wanted, limits)
+    except ArchiveRefused:
+        raise
+    except DAMAGED as error:
+        raise ArchiveRefused(f"the archive of {len(data)} bytes is damaged or truncated: {error}") from error
+
+
+def read_arrays(data: bytes, limits: ArchiveLimits = DEFAULT_LIMITS) -> dict[str, np.ndarray]:
+    """The numeric arrays of an ``npz``, as stored.
+
+    Raises:
+        ArchiveRefused: damaged, too large, or an array that is not plain numbers.
+    """
+    if not is_zip(data):
+        raise ArchiveRefused(f"not an npz (it begins with {data[:8].hex(' ') or 'nothing'})")
+    try:
+        files = _read_zip(data, None, limits)
+    except ArchiveRefused:
+        raise
+    except DAMAGED as error:
+        raise ArchiveRefused(f"the npz of {len(data)} bytes is damaged or truncated: {error}") from error
+    return {name.removesuffix(".npy"): _parse_array(name, content) for name, content in files.items()}
+
+
+def write_arrays(arrays: dict[str, np.ndarray]) -> bytes:
+    """An ``npz`` whose bytes depend on the arrays alone: sorted, stored, no timestamps."""
+    files = {}
+    for name, array in arrays.items():
+        buffer = io.BytesIO()
+        np.lib.format.write_array(buffer, np.ascontiguousarray(array), version=(1, 0), allow_pickle=False)
+        files[f"{name}.npy"] = buffer.getvalue()
+    return write_zip(files)
+
+
+def write_zip(files: dict[str, bytes]) -> bytes:
+    """A zip whose bytes depend on names and contents alone: sorted, stored, the epoch of zip as date."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+        for name in sorted(files):
+            entry = zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))
+            entry.create_system = 3
+            entry.external_attr = (stat.S_IFREG | 0o644) << 16
+            archive.writestr(entry, files[name])
+    return buffer.getvalue()
+
+
+def _read_zip(data: bytes, wanted: frozenset[str] | None, limits: ArchiveLimits) -> dict[str, bytes]:
+    """Wanted members of a zip (all of them for None)."""
+    found: dict[str, bytes] = {}
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        entries = archive.infolist()
+        if len(entries) > limits.members:
+            raise ArchiveRefused(f"{len(entries)} members, at most {limits.members} are allowed")
+        _check_total(sum(entry.file_size for entry in entries), len(data), limits, "declares")
+        seen: set[str] = set()
+        for entry in entries:
+            name = _checked_name(entry.orig_filename, seen)
+            kind = stat.S_IFMT(entry.external_attr >> 16)
+            if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
+                raise ArchiveRefused(f"{name} is a link or a device (mode {kind:#o}), only files are read")
+            if entry.flag_bits & 0x1:
+                raise ArchiveRefused(f"{name} is encrypted")
+            if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise ArchiveRefused(
+                    f"{name} uses compression method {entry.compress_type}, only deflate is read"
+                )
+            if entry.is_dir() or not _is_wanted(name, wanted):
+                continue
+            with archive.open(entry) as stream:
+                found[name] = _read_member(stream, entry.file_size, name)
+    return found
+
+
+def _read_tar(data: bytes, wanted: frozenset[str], limits: ArchiveLimits) -> dict[str, bytes]:
+    """Wanted members of a tar. It is read as a stream, so that nothing in it can make the reader go back."""
+    found: dict[str, bytes] = {}
+    compressed = data[:2] == GZIP_MAGIC
+    metered = _MeteredStream(io.BytesIO(data), len(data), limits, inflate=compressed)
+    with tarfile.open(fileobj=metered, mode="r|") as archive:  # type: ignore[call-overload]
+        seen: set[str] = set()
+        for count, member in enumerate(archive, start=1):
+            if count > limits.members:
+                raise ArchiveRefused(f"more than {limits.members} members")
+            name = _checked_name(member.name, seen)
+            if member.issparse() or not (member.isreg() or member.isdir()):
+                raise ArchiveRefused(
+                    f"{name} is a link, a device or sparse (type {member.type!r}), only files are read"
+                )
+            if member.size < 0:
+                raise ArchiveRefused(f"{name} declares {member.size} bytes")
+            _check_total(member.size, len(data), limits, f"{name} declares")
+            if member.isdir() or not _is_wanted(name, wanted):
+                continue
+            stream = archive.extractfile(member)
+            if stream is None:
+                raise ArchiveRefused(f"{name} cannot be read")
+            found[name] = _read_member(stream, member.size, name)
+    return found
+
+
+class _MeteredStream:
+    """A forward-only stream that inflates if asked and stops at the limits."""
+
+    def __init__(self, raw: IO[bytes], size: int, limits: ArchiveLimits, *, inflate: bool) -> None:
+        self._raw = raw
+        self._size = size
+        self._limits = limits
+        self._inflater = zlib.decompressobj(wbits=31) if inflate else None
+        self._pending = b""
+        self._total = 0
+
+    def read(self, count: int) -> bytes:
+        """Next ``count`` bytes, fewer at the end."""
+        parts, have = [], 0
+        while have < count:
+            part = self._next(count - have)
+            if not part:
+                break
+            parts.append(part)
+            have += len(part)
+        self._total += have
+        _check_total(self._total, self._size, self._limits, "inflates to")
+        return b"".join(parts)
+
+    def _next(self, count: int) -> bytes:
+        if self._inflater is None:
+            return self._raw.read(min(count, CHUNK_BYTES))
+        while not self._inflater.eof:
+            source = self._pending or self._raw.read(CHUNK_BYTES)
+            part = self._inflater.decompress(source, min(count, CHUNK_BYTES))
+            self._pending = self._inflater.unconsumed_tail
+            if part:
+                return part
+            if not source:
+                raise EOFError("the gzip stream ends early")
+        return b""
+
+
+def _read_member(stream: IO[bytes], declared: int, name: str) -> bytes:
+    content = stream.read(declared)
+    if len(content) != declared or stream.read(1):
+        raise ArchiveRefused(f"{name} declares {declared} bytes and holds {len(content)} or more")
+    return content
+
+
+def _is_wanted(name: str, wanted: frozenset[str] | None) -> bool:
+    return wanted is None or name.rpartition("/")[2] in wanted
+
+
+def _checked_name(raw: str, seen: set[str]) -> str:
+    """The member's path without ``./``; refuses what points outside or comes twice."""
+    if "\x00" in raw or "\\" in raw:
+        raise ArchiveRefused(f"the member name {raw!r} has a backslash or a NUL")
+    if raw.startswith("/") or (len(raw) > 1 and raw[1] == ":"):
+        raise ArchiveRefused(f"the member {raw!r} has an absolute path")
+    parts = [part for part in raw.split("/") if part not in ("", ".")]
+    if ".." in parts:
+        raise ArchiveRefused(f"the member {raw!r} climbs out of the archive")
+    name = "/".join(parts)
+    if name and name in seen:
+        raise ArchiveRefused(f"two members are called {name!r}")
+    seen.add(name)
+    return name
+
+
+def _check_total(total: int, packed: int, limits: ArchiveLimits, verb: str) -> None:
+    if total > limits.total_bytes:
+        raise ArchiveRefused(f"{verb} {total} bytes, at most {limits.total_bytes} are allowed")
+    if total > limits.ratio_free_bytes and total > limits.ratio * max(packed, 1):
+        raise ArchiveRefused(
+            f"{verb} {total} bytes out of {packed}: {total / max(packed, 1):.0f} times,"
+            f" at most {limits.ratio:.0f} times are allowed"
+        )
+
+
+def _parse_array(name: str, content: bytes) -> np.ndarray:
+    """One ``npy`` file; plain numbers only."""
+    stream = io.BytesIO(content)
+    try:
+        version = np.lib.format.read_magic(stream)
+        read_header = {
+            (1, 0): np.lib.format.read_array_header_1_0,
+            (2, 0): np.lib.format.read_array_header_2_0,
+        }.get(version)
+        if read_header is None:
+            raise ArchiveRefused(f"{name} has npy version {version[0]}.{version[1]}, 1.0 and 2.0 are read")
+        shape, fortran_order, dtype = read_header(stream, max_header_size=NPY_HEADER_LIMIT)
+    except (ValueError, SyntaxError, TypeError, EOFError, RecursionError, MemoryError) as error:
+        raise ArchiveRefused(f"{name} is not an npy file: {error}") from error
+    if dtype.kind not in NUMERIC_KINDS or dtype.hasobject or dtype.subdtype is not None:
+        raise ArchiveRefused(f"{name} holds {dtype}; only plain numbers are read, never Python objects")
+    if any(length < 0 for length in shape):
+        raise ArchiveRefused(f"{name} claims the shape {shape}")
+    here, claimed = len(content) - stream.tell(), math.prod(shape) * dtype.itemsize
+    if claimed != here:
+        raise ArchiveRefused(f"{name} claims shape {shape} of {dtype}, {claimed} bytes, and holds {here}")
+    flat = np.frombuffer(content, dtype=dtype, offset=stream.tell())
+    return flat.reshape(shape, order="F" if fortran_order else "C").copy()
+
+
+def single_folder(names: Iterator[str] | list[str], file: str) -> str:
+    """The folder that holds ``file``: the archive's top, or its one top folder.
+
+    Raises:
+        ArchiveRefused: the file is missing, deeper, or there more than once.
+    """
+    places = [name for name in names if name.rpartition("/")[2] == file and not name.startswith("__MACOSX/")]
+    if not places:
+        raise ArchiveRefused(f"holds no {file}")
+    if len(places) > 1:
+        raise ArchiveRefused(f"holds {len(places)} files {file}: {', '.join(sorted(places)[:5])}")
+    folder = places[0].rpartition("/")[0]
+    if "/" in folder:
+        raise ArchiveRefused(f"{file} lies at {places[0]}; it belongs at the top or in one top folder")
+    return folder
