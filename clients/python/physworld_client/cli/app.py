@@ -1,0 +1,66 @@
+"""The commands and their common end: an error is one clear line on standard error and an exit code.
+
+Exit codes: 0 done, 1 the work failed or the service said no, 2 the command line is wrong, 3 ``up`` on a data
+folder where the service already runs, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from importlib.metadata import version as installed_version
+from types import FrameType
+from typing import NoReturn
+
+import typer
+
+from physworld_client.cli import lists, run, up
+from physworld_client.cli.output import stderr
+from physworld_client.errors import PhysWorldError
+
+INTERRUPTED = 130
+
+app = typer.Typer(
+    name="physworld",
+    help="From a recording of a deformable object to a world model.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+app.command("up")(up.up)
+app.command("run")(run.run)
+app.add_typer(lists.scenes, name="scenes")
+app.add_typer(lists.fits, name="fits")
+app.add_typer(lists.datasets, name="datasets")
+app.add_typer(lists.models, name="models")
+app.add_typer(lists.jobs, name="jobs")
+
+
+@app.command("version")
+def version() -> None:
+    """Print the version of the client."""
+    print(installed_version("physworld-client"))
+
+
+def main() -> None:
+    """Entry point of the command ``physworld``."""
+    signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        app(standalone_mode=True)
+    except PhysWorldError as error:
+        stderr.print(f"error: {error}", markup=False, highlight=False, soft_wrap=True)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        stderr.print("interrupted")
+        sys.exit(INTERRUPTED)
+    except BrokenPipeError:
+        # The reader of our output has left (``physworld jobs list | head``): not an error of ours.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
+    """SIGTERM ends a command the way Ctrl-C does: jobs are cancelled and the service is stopped."""
+    raise KeyboardInterrupt

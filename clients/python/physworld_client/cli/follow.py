@@ -1,0 +1,143 @@
+"""Following a pipeline: one progress bar per stage on a terminal, plain lines elsewhere.
+
+The pipeline's child jobs are looked at once a second. A service that goes away for less than ``PATIENCE_S``
+(a restart) is waited for; the jobs themselves survive it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Protocol
+
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+from physworld_client.cli.lists import progress_text
+from physworld_client.cli.output import stdout
+from physworld_client.cli.report import STAGES, duration_s
+from physworld_client.client import Client
+from physworld_client.errors import ConnectionFailed
+from schemas.job import TERMINAL_STATES, Job
+
+LOOK_INTERVAL_S = 1.0
+LINE_INTERVAL_S = 5.0
+PATIENCE_S = 90.0
+
+
+class View(Protocol):
+    """Shows the stages; used as a context manager."""
+
+    def __enter__(self) -> View: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+
+    def show(self, stages: dict[str, Job]) -> None:
+        """Shows the child jobs as they are now, by kind."""
+
+
+def follow(client: Client, pipeline_id: str, alive: Callable[[], bool]) -> tuple[Job, dict[str, Job]]:
+    """Follows a pipeline to its end; returns it and its child jobs by kind.
+
+    Args:
+        alive: whether a service that this command started still runs.
+    """
+    ended: dict[str, Job] = {}
+    answered = time.monotonic()
+    with _view() as view:
+        while True:
+            try:
+                pipeline = client.jobs.get(pipeline_id)
+                stages = dict(ended)
+                for child in pipeline.children:
+                    if all(job.id != child for job in ended.values()):
+                        job = client.jobs.get(child)
+                        stages[job.kind] = job
+                        if job.state in TERMINAL_STATES:
+                            ended[job.kind] = job
+                answered = time.monotonic()
+            except ConnectionFailed:
+                if not alive() or time.monotonic() - answered > PATIENCE_S:
+                    raise
+                continue
+            view.show(stages)
+            if pipeline.state in TERMINAL_STATES:
+                return pipeline, stages
+            time.sleep(LOOK_INTERVAL_S)
+
+
+def _view() -> View:
+    return Bars() if stdout.is_terminal else Lines()
+
+
+class Bars:
+    """Rich progress bars, redrawn in place."""
+
+    def __init__(self) -> None:
+        self._progress = Progress(
+            TextColumn("{task.description:<9}"),
+            BarColumn(bar_width=30),
+            TextColumn("{task.fields[state]:<9}"),
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[text]}"),
+            console=stdout,
+        )
+        self._tasks: dict[str, TaskID] = {
+            stage: self._progress.add_task(stage, start=False, total=1.0, state="waiting", text="")
+            for stage in STAGES
+        }
+
+    def __enter__(self) -> Bars:
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._progress.stop()
+
+    def show(self, stages: dict[str, Job]) -> None:
+        """Moves the bars."""
+        for kind, job in stages.items():
+            task = self._tasks[kind]
+            if job.started_at is not None:
+                self._progress.start_task(task)
+            total = job.progress.total or 1.0
+            done = total if job.state == "succeeded" else min(job.progress.done, total)
+            self._progress.update(task, total=total, completed=done, state=job.state, text=progress_text(job))
+            if job.state in TERMINAL_STATES:
+                self._progress.stop_task(task)
+
+
+class Lines:
+    """A line when a stage changes its state, and every few seconds while it moves."""
+
+    def __init__(self) -> None:
+        self._printed: dict[str, str] = {}
+        self._states: dict[str, str] = {}
+        self._last = 0.0
+
+    def __enter__(self) -> Lines:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        return None
+
+    def show(self, stages: dict[str, Job]) -> None:
+        """Prints what is new."""
+        due = time.monotonic() - self._last >= LINE_INTERVAL_S
+        for kind, job in stages.items():
+            changed = self._states.get(kind) != job.state
+            text = progress_text(job)
+            if job.state in TERMINAL_STATES:
+                text = f"{duration_s(job):.1f} s{', ' if text else ''}{text}"
+            line = f"{kind:<9}{job.state:<11}{text}".rstrip()
+            if changed or (due and self._printed.get(kind) != line):
+                stdout.print(line, markup=False, soft_wrap=True)
+                self._printed[kind] = line
+                self._states[kind] = job.state
+                self._last = time.monotonic()

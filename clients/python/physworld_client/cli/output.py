@@ -1,0 +1,60 @@
+"""What the commands print: rich tables for people, JSON for programs."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterable, Sequence
+from datetime import UTC, datetime
+from typing import Any
+
+from pydantic import BaseModel
+from rich.console import Console
+from rich.table import Table
+
+NARROWEST = 110
+
+stdout = Console(highlight=False, width=None if sys.stdout.isatty() else NARROWEST)
+stderr = Console(stderr=True, highlight=False, width=None if sys.stderr.isatty() else NARROWEST)
+
+
+def print_json(value: BaseModel | Sequence[BaseModel]) -> None:
+    """One JSON document: an object, or an array of objects."""
+    if isinstance(value, BaseModel):
+        plain: Any = value.model_dump(mode="json")
+    else:
+        plain = [item.model_dump(mode="json") for item in value]
+    print(json.dumps(plain, indent=2, ensure_ascii=False, allow_nan=False))
+
+
+def print_table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """A table of texts; says so when it is empty."""
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for heading in headings:
+        table.add_column(heading, no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    if table.row_count:
+        stdout.print(table)
+    else:
+        stdout.print("nothing yet")
+
+
+def print_fields(value: BaseModel) -> None:
+    """The fields of one object, one a line; nested values as JSON."""
+    fields = value.model_dump(mode="json")
+    width = max(len(name) for name in fields)
+    for name, content in fields.items():
+        if content in (None, "", [], {}):
+            continue
+        text = content if isinstance(content, str) else json.dumps(content, ensure_ascii=False)
+        stdout.print(f"{name:<{width}}  {text}", markup=False, soft_wrap=True)
+
+
+def ago(moment: datetime) -> str:
+    """How long ago, in one unit: ``12 s``, ``5 min``, ``3 h``, ``2 d``."""
+    seconds = max(0.0, (datetime.now(UTC) - moment).total_seconds())
+    for size, unit in ((86400.0, "d"), (3600.0, "h"), (60.0, "min")):
+        if seconds >= size:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{seconds:.0f} s"

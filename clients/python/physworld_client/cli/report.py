@@ -1,0 +1,150 @@
+"""The report of one main job: gathered from its objects, printed as the results table, written as JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from physworld_client.cli.output import stdout
+from physworld_client.errors import PhysWorldError
+from schemas.fit import Fit
+from schemas.job import Job
+from schemas.model import ModelVersion
+from schemas.pipeline import ModelReference, RunReport
+
+METRICS = {
+    "track_m": "track",
+    "chamfer_phystwin_m": "chamfer (phystwin)",
+    "chamfer_l2_m": "chamfer (l2)",
+}
+ROWS = {
+    "static": "static",
+    "rigid_follow": "rigid-follow",
+    "constant_velocity": "constant velocity",
+    "persistence": "persistence",
+    "twin": "twin",
+    "world_model": "world model",
+    "world_model_finetuned": "world model, fine-tuned",
+}
+OPTIONAL_ROWS = frozenset({"persistence"})
+SPEEDS = {"twin": "twin", "world_model": "world model"}
+STAGES = ("fit", "dataset", "training")
+
+
+def build_report(
+    scene_name: str, pipeline: Job, stages: Mapping[str, Job], fit: Fit, version: ModelVersion, episodes: int
+) -> RunReport:
+    """The figures of a succeeded pipeline.
+
+    Args:
+        stages: the pipeline's child jobs by kind; their times give ``seconds``.
+        episodes: committed episodes of the dataset.
+
+    Raises:
+        PhysWorldError: the published model lacks a figure that every run must have.
+    """
+    metrics = version.metrics
+    held_out = _table(metrics, "held_out", version)
+    for metric in METRICS:
+        missing = [row for row in ROWS if row not in OPTIONAL_ROWS and row not in held_out.get(metric, {})]
+        if missing:
+            raise PhysWorldError(f"{_label(version)} has no held_out.{metric} of {', '.join(missing)}")
+    speeds = _table(metrics, "steps_per_second", version)
+    if version.sha256 is None:
+        raise PhysWorldError(f"{_label(version)} is not published")
+    seconds = {kind: duration_s(stages[kind]) for kind in STAGES if kind in stages}
+    seconds["total"] = duration_s(pipeline)
+    noise_floor = metrics.get("noise_floor_m", held_out.get("noise_floor_m"))
+    return RunReport(
+        scene=scene_name,
+        held_out={metric: {row: held_out[metric].get(row) for row in held_out[metric]} for metric in METRICS},
+        noise_floor_m=noise_floor,
+        steps_per_second={name: float(speeds[name]) for name in SPEEDS if name in speeds},
+        model=ModelReference(name=version.name, version=version.version, sha256=version.sha256),
+        seconds=seconds,
+        episodes=episodes,
+        parameters={name: value.model_dump(mode="json") for name, value in fit.parameters.items()},
+        notes=[str(note) for note in metrics.get("notes", [])],
+    )
+
+
+def print_report(report: RunReport) -> None:
+    """The results table, the speeds and the model."""
+    table = Table(title=f"Held-out error of {report.scene} [mm]", title_justify="left")
+    table.add_column("prediction")
+    for heading in METRICS.values():
+        table.add_column(heading, justify="right")
+    first = report.held_out["track_m"]
+    for row, heading in ROWS.items():
+        if row in first:
+            cells = [_millimetres(report.held_out[metric].get(row)) for metric in METRICS]
+            table.add_row(heading, *cells, end_section=row == _last_baseline(first))
+    stdout.print()
+    stdout.print(table)
+    if report.noise_floor_m is not None:
+        stdout.print(f"noise floor of the track error: {_millimetres(report.noise_floor_m)} mm")
+    speeds = [
+        f"{name} {report.steps_per_second[key]:.4g}"
+        for key, name in SPEEDS.items()
+        if key in report.steps_per_second
+    ]
+    stdout.print(f"steps per second: {', '.join(speeds)}")
+    for name, parameter in report.parameters.items():
+        stdout.print(_parameter_line(name, parameter), markup=False, soft_wrap=True)
+    parts = [f"{kind} {report.seconds[kind]:.0f}" for kind in (*STAGES, "total") if kind in report.seconds]
+    stdout.print(f"seconds: {', '.join(parts)}; episodes: {report.episodes}")
+    for note in report.notes:
+        stdout.print(f"note: {note}", markup=False, soft_wrap=True)
+    model = report.model
+    stdout.print(f"model: {model.name} version {model.version}, sha256 {model.sha256}", soft_wrap=True)
+
+
+def write_report(report: RunReport, path: Path) -> None:
+    """Writes the report as JSON in one piece."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.part")
+    part.write_text(report.model_dump_json(indent=2) + "\n")
+    part.replace(path)
+
+
+def duration_s(job: Job) -> float:
+    """Seconds from a job's start to its end (to its last sign of life while it runs)."""
+    start = job.started_at or job.created_at
+    end = job.finished_at or job.heartbeat_at or start
+    return max(0.0, (end - start).total_seconds())
+
+
+def _table(metrics: Mapping[str, Any], key: str, version: ModelVersion) -> Mapping[str, Any]:
+    table = metrics.get(key)
+    if not isinstance(table, dict):
+        raise PhysWorldError(
+            f"{_label(version)} carries no figures {key!r} (it has: {', '.join(metrics) or 'none'})"
+        )
+    return table
+
+
+def _label(version: ModelVersion) -> str:
+    return f"model {version.name} version {version.version}"
+
+
+def _last_baseline(rows: Mapping[str, object]) -> str:
+    return "persistence" if "persistence" in rows else "constant_velocity"
+
+
+def _millimetres(metres: float | None) -> str:
+    if metres is None:
+        return "n/a"
+    return f"{1000.0 * metres:.2f}"
+
+
+def _parameter_line(name: str, parameter: Mapping[str, Any]) -> str:
+    text = f"{name}: {parameter['value']:.4g} {parameter['unit']}".rstrip()
+    if parameter.get("ci95"):
+        low, high = parameter["ci95"]
+        text += f" (95 %: {low:.4g} to {high:.4g})"
+    if not parameter.get("identified", True):
+        text += ", not identified: held at its prior"
+    return text
