@@ -14,15 +14,16 @@ from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from schemas.base import Page
 from storage.errors import InvalidCursor
+from storage.tables import Base
 
 MAX_LIMIT = 1000
-Row = TypeVar("Row")
+Row = TypeVar("Row", bound=Base)
 Item = TypeVar("Item")
 
 
 def page_of(
     session: Session,
-    statement: Select[tuple[Row]],
+    statement: Select[Row],
     keys: Sequence[InstrumentedAttribute[Any]],
     convert: Callable[[Row], Item],
     *,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from typing import Any
 
@@ -80,6 +81,10 @@ def parse_result(kind: str, index: int, result: dict[str, Any]) -> ShardResult:
     faults = [f"{path} is {value}" for path, value in _not_finite(result, "result")]
     if faults:
         raise ResultInvalid(f"{kind} result holds numbers that JSON cannot carry: {'; '.join(faults[:10])}")
+    try:
+        json.dumps(result)
+    except TypeError as error:
+        raise ResultInvalid(f"{kind} result is not JSON: {error}") from error
     try:
         parsed = RESULT_OF_SHARD[kind].model_validate(result)
     except ValidationError as error:

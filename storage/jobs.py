@@ -1,0 +1,99 @@
+"""Jobs: opened, looked at, cancelled. Every function is part of the caller's one transaction.
+
+States: queued -> running -> succeeded | failed, and queued | running -> cancelling -> cancelled.
+"""
+
+from __future__ import annotations
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from schemas.base import Page
+from schemas.dataset import DatasetConfig
+from schemas.fit import FitConfig
+from schemas.job import Job
+from schemas.model import TrainingCreate
+from schemas.pipeline import PipelineCreate
+from storage.errors import NotFound
+from storage.events import append_event, events_after
+from storage.flow import lock_job, request_cancel
+from storage.opening import open_dataset, open_fit, open_pipeline, open_training
+from storage.pages import page_of
+from storage.tables import JobRow, columns_of, utc_now
+
+__all__ = [
+    "append_event",
+    "cancel_job",
+    "create_dataset",
+    "create_fit",
+    "create_pipeline",
+    "create_training",
+    "events_after",
+    "get_job",
+    "list_jobs",
+]
+
+
+def create_fit(session: Session, scene_id: str, config: FitConfig, parent: JobRow | None = None) -> Job:
+    """Open a fit (its row is pending, its id is in ``outputs``). Raises NotFound."""
+    return _job(session, open_fit(session, scene_id, config, parent))
+
+
+def create_dataset(session: Session, fit_id: str, config: DatasetConfig, parent: JobRow | None = None) -> Job:
+    """Open a dataset. Raises NotFound, or Conflict when the fit is not ready."""
+    return _job(session, open_dataset(session, fit_id, config, parent))
+
+
+def create_training(session: Session, request: TrainingCreate, parent: JobRow | None = None) -> Job:
+    """Open a training and allot its version. Raises NotFound, or Conflict when the dataset is not sealed."""
+    return _job(session, open_training(session, request, parent))
+
+
+def create_pipeline(session: Session, request: PipelineCreate) -> Job:
+    """Open fit, dataset and training as one job. Raises NotFound."""
+    return _job(session, open_pipeline(session, request))
+
+
+def get_job(session: Session, job_id: str) -> Job:
+    """The job, or NotFound."""
+    row = session.get(JobRow, job_id)
+    if row is None:
+        raise NotFound("job", job_id)
+    return _job(session, row)
+
+
+def list_jobs(
+    session: Session,
+    *,
+    limit: int = 50,
+    cursor: str | None = None,
+    state: str | None = None,
+    kind: str | None = None,
+    parent_id: str | None = None,
+) -> Page[Job]:
+    """Jobs, newest first."""
+    statement = select(JobRow)
+    for column, wanted in ((JobRow.state, state), (JobRow.kind, kind), (JobRow.parent_id, parent_id)):
+        if wanted is not None:
+            statement = statement.where(column == wanted)
+    keys = (JobRow.created_at, JobRow.id)
+    return page_of(session, statement, keys, lambda row: _job(session, row), limit=limit, cursor=cursor)
+
+
+def cancel_job(session: Session, job_id: str) -> Job:
+    """Cancel a job with its children and its parent; running work stops at its next heartbeat.
+
+    Raises NotFound, or Conflict when the job has succeeded or failed. Cancelling twice is harmless.
+    """
+    job = lock_job(session, job_id)
+    request_cancel(session, job, utc_now())
+    return _job(session, job)
+
+
+def _job(session: Session, row: JobRow) -> Job:
+    session.flush()
+    children: list[str] = []
+    if row.kind == "pipeline":
+        order = (JobRow.created_at, JobRow.id)
+        children = list(session.scalars(select(JobRow.id).where(JobRow.parent_id == row.id).order_by(*order)))
+    return Job.model_validate({**columns_of(row), "children": children})

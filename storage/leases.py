@@ -1,0 +1,346 @@
+"""Leases: who executes a shard, and for how long. The truth about running work is here, not in the broker.
+
+A shard's life::
+
+    QUEUED --claim--> RUNNING --complete--> DONE
+      ^                 |  |------fail----> QUEUED (again, later) or FAILED (the job with it)
+      |                 |  '--mark_cancelled--> CANCELLED
+      '------reap-------'  the lease ran out: QUEUED, or FAILED after ``max_attempts``
+
+Every change is a compare-and-set on (id, epoch, state). ``claim`` raises the epoch, so a worker that was
+presumed dead and comes back finds that its epoch is no longer the shard's: it cannot commit, renew or fail
+anything. A kill at any instant leaves the shard RUNNING until its lease ends, never half committed.
+``now`` is an aware UTC time; hosts' clocks should agree within a fraction of the lease.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta
+from typing import Any, Literal, cast
+
+from sqlalchemy import CursorResult, func, or_, select, update
+from sqlalchemy.orm import Session
+
+from schemas.base import Problem
+from schemas.job import TERMINAL_STATES, Progress
+from schemas.queues import QUEUE_OF_SHARD
+from storage.errors import NotFound
+from storage.flow import (
+    LONG_SHARDS,
+    fail_job,
+    lock_job,
+    report_progress,
+    settle_cancel,
+    shard_started,
+    shard_succeeded,
+)
+from storage.opening import CANCELLED, DONE, FAILED, QUEUED, RUNNING
+from storage.results import parse_result
+from storage.tables import JobRow, ShardRow, utc_now
+
+BACKOFF_SECONDS = 1.0  # before the second attempt; doubles with each further one
+BACKOFF_LIMIT_SECONDS = 60.0
+REPUBLISH_SECONDS = 60.0
+WINDOW = 256  # messages of one queue in the broker at a time; more would only be duplicates after a loss
+
+LeaseState = Literal["held", "lost", "cancel"]
+
+
+@dataclass(frozen=True)
+class Lease:
+    """The right to execute one shard; ``epoch`` is its fencing token, ``attempt`` counts from 1."""
+
+    shard_id: str
+    job_id: str
+    kind: str
+    epoch: int
+    attempt: int
+    index: int
+    payload: dict[str, Any] = field(hash=False)
+
+
+@dataclass(frozen=True)
+class Publication:
+    """A shard to announce to the broker: the message on ``queue`` carries ``shard_id`` and nothing else."""
+
+    shard_id: str
+    queue: str
+    kind: str
+    epoch: int
+
+
+def claim(session: Session, shard_id: str, owner: str, now: datetime, lease_seconds: float) -> Lease | None:
+    """Take a queued shard, or None: somebody has it, it is done, called off, or must not start yet."""
+    seen = session.execute(
+        select(ShardRow.job_id, ShardRow.state, ShardRow.epoch).where(ShardRow.id == shard_id)
+    ).one_or_none()
+    if seen is None or seen.state != QUEUED:
+        return None
+    job = lock_job(session, seen.job_id)
+    if job.state not in {"queued", "running"}:
+        return None
+    taken = _changed(
+        session,
+        update(ShardRow)
+        .where(
+            ShardRow.id == shard_id,
+            ShardRow.epoch == seen.epoch,
+            ShardRow.state == QUEUED,
+            or_(ShardRow.not_before.is_(None), ShardRow.not_before <= now),
+        )
+        .values(
+            state=RUNNING,
+            epoch=ShardRow.epoch + 1,
+            attempt=ShardRow.attempt + 1,
+            lease_owner=owner,
+            lease_until=now + timedelta(seconds=lease_seconds),
+        ),
+    )
+    if not taken:
+        return None
+    shard = _shard(session, shard_id)
+    shard_started(session, job, shard.attempt, now)
+    return Lease(
+        shard_id=shard.id,
+        job_id=shard.job_id,
+        kind=shard.kind,
+        epoch=shard.epoch,
+        attempt=shard.attempt,
+        index=shard.index,
+        payload=shard.payload,
+    )
+
+
+def renew(
+    session: Session, lease: Lease, now: datetime, lease_seconds: float, progress: Progress | None = None
+) -> LeaseState:
+    """Prolong a lease and report progress.
+
+    "held": carry on. "cancel": stop, then ``mark_cancelled``. "lost": stop at once and write nothing more.
+    """
+    job = lock_job(session, lease.job_id)
+    until = now + timedelta(seconds=lease_seconds)
+    if not _compare_and_set(session, lease, lease_until=until):
+        return "lost"
+    job.heartbeat_at = now
+    if job.state == "cancelling":
+        return "cancel"
+    if progress is not None and lease.kind in LONG_SHARDS:
+        report_progress(session, job, progress)
+    return "held"
+
+
+def complete(session: Session, lease: Lease, result: dict[str, Any], digest: str | None = None) -> bool:
+    """Commit a shard's result with everything that follows from it; False: it was not committed.
+
+    False means that the lease was lost or the job is being cancelled: what was written for this attempt
+    belongs to nobody. Raises ResultInvalid, before anything is changed, for a result of the wrong form.
+    """
+    parsed = parse_result(lease.kind, lease.index, result)
+    now = utc_now()
+    job = lock_job(session, lease.job_id)
+    if job.state == "cancelling":
+        mark_cancelled(session, lease)
+        return False
+    values = {"state": DONE, "result": result, "digest": digest, "finished_at": now, "error": None}
+    if not _compare_and_set(session, lease, **values, lease_owner=None, lease_until=None):
+        return False
+    shard_succeeded(session, job, _shard(session, lease.shard_id), parsed, now)
+    return True
+
+
+def fail(
+    session: Session, lease: Lease, problem: Problem, retry: bool, now: datetime | None = None
+) -> LeaseState:
+    """An attempt went wrong: queue the shard again, later, or fail the job with the problem.
+
+    It is queued again when ``retry`` and fewer than ``max_attempts`` were made. Returns "lost" when the lease
+    was no longer ours, "cancel" when the job was being cancelled (the shard then is), else "held".
+    """
+    now = now or utc_now()
+    job = lock_job(session, lease.job_id)
+    if job.state == "cancelling":
+        return "cancel" if mark_cancelled(session, lease) else "lost"
+    error = problem.model_dump(mode="json")
+    if not _compare_and_set(session, lease, error=error, lease_owner=None, lease_until=None):
+        return "lost"
+    shard = _shard(session, lease.shard_id)
+    if retry and shard.attempt < shard.max_attempts:
+        wait = min(BACKOFF_LIMIT_SECONDS, BACKOFF_SECONDS * 2 ** (shard.attempt - 1))
+        _requeue(shard, not_before=now + timedelta(seconds=wait))
+    else:
+        if retry:
+            reason = problem.detail or problem.title
+            counted = f"attempt {shard.attempt} of {shard.max_attempts} failed: {reason}"
+            problem = problem.model_copy(update={"detail": counted})
+        _fail_shard(session, job, shard, problem, now)
+    session.flush()
+    return "held"
+
+
+def mark_cancelled(session: Session, lease: Lease) -> bool:
+    """The worker has stopped because of a cancel; False when the lease was lost meanwhile."""
+    job = lock_job(session, lease.job_id)
+    now = utc_now()
+    values = {"state": CANCELLED, "lease_owner": None, "lease_until": None, "finished_at": now}
+    if not _compare_and_set(session, lease, **values):
+        return False
+    settle_cancel(session, job, now)
+    return True
+
+
+def release(session: Session, lease: Lease) -> bool:
+    """Give a shard back untried (the worker is shutting down): queued at once, the attempt does not count."""
+    job = lock_job(session, lease.job_id)
+    if job.state == "cancelling":
+        return mark_cancelled(session, lease)
+    if not _compare_and_set(session, lease, attempt=lease.attempt - 1):
+        return False
+    _requeue(_shard(session, lease.shard_id), not_before=None)
+    return True
+
+
+def publishable(
+    session: Session,
+    now: datetime,
+    limit: int = 100,
+    *,
+    republish_seconds: float = REPUBLISH_SECONDS,
+    window: int = WINDOW,
+) -> list[Publication]:
+    """Queued shards that the broker does not know, or was told of so long ago that it may have lost them.
+
+    At most ``limit`` for each queue, oldest first, and so that at most ``window`` are announced at a time.
+    A message too many is harmless: its ``claim`` finds nothing to take.
+    """
+    stale = now - timedelta(seconds=republish_seconds)
+    found: list[Publication] = []
+    for queue in sorted(set(QUEUE_OF_SHARD.values())):
+        kinds = [kind for kind, name in QUEUE_OF_SHARD.items() if name == queue]
+        queued = (ShardRow.state == QUEUED, ShardRow.kind.in_(kinds))
+        announced = session.scalar(
+            select(func.count()).select_from(ShardRow).where(*queued, ShardRow.published_at > stale)
+        )
+        room = min(limit, window - (announced or 0))
+        if room <= 0:
+            continue
+        rows = session.execute(
+            select(ShardRow.id, ShardRow.kind, ShardRow.epoch)
+            .where(
+                *queued,
+                or_(ShardRow.published_at.is_(None), ShardRow.published_at <= stale),
+                or_(ShardRow.not_before.is_(None), ShardRow.not_before <= now),
+            )
+            .order_by(ShardRow.created_at, ShardRow.job_id, ShardRow.index)
+            .limit(room)
+        )
+        found.extend(Publication(row.id, queue, row.kind, row.epoch) for row in rows)
+    return found
+
+
+def mark_published(session: Session, publications: Sequence[Publication], now: datetime) -> None:
+    """Remember that these were handed to the broker; one claimed or requeued meanwhile is left alone."""
+    for publication in publications:
+        session.execute(
+            update(ShardRow)
+            .where(
+                ShardRow.id == publication.shard_id,
+                ShardRow.epoch == publication.epoch,
+                ShardRow.state == QUEUED,
+            )
+            .values(published_at=now)
+        )
+
+
+def reap(session: Session, now: datetime, limit: int = 100) -> list[str]:
+    """Take back shards whose lease ran out: queued again, or failed after ``max_attempts``. Their ids."""
+    root = func.coalesce(JobRow.parent_id, JobRow.id)
+    expired = session.execute(
+        select(ShardRow.id, ShardRow.job_id)
+        .join(JobRow, JobRow.id == ShardRow.job_id)
+        .where(ShardRow.state == RUNNING, ShardRow.lease_until < now)
+        .order_by(root, ShardRow.job_id, ShardRow.index)
+        .limit(limit)
+    ).all()
+    reaped = []
+    for shard_id, job_id in expired:
+        job = lock_job(session, job_id)
+        shard = _shard(session, shard_id)
+        if shard.state == RUNNING and shard.lease_until is not None and shard.lease_until < now:
+            _reap(session, job, shard, now)
+            reaped.append(shard_id)
+    return reaped
+
+
+def recover(session: Session, now: datetime) -> int:
+    """After a restart of the *whole* service: no former worker lives, the broker may have lost messages.
+
+    Ends every lease (``reap`` then queues the shards again) and forgets every announcement. Returns how many
+    shards were running. Only for a caller that knows that it is alone (the embedded supervisor's lock).
+    """
+    ended = update(ShardRow).where(ShardRow.state == RUNNING).values(lease_until=now - timedelta(seconds=1))
+    count = cast("CursorResult[Any]", session.execute(ended)).rowcount
+    session.execute(update(ShardRow).where(ShardRow.state == QUEUED).values(published_at=None))
+    return count
+
+
+def _reap(session: Session, job: JobRow, shard: ShardRow, now: datetime) -> None:
+    if job.state == "cancelling" or job.state in TERMINAL_STATES:
+        _end(shard, CANCELLED, now)
+        session.flush()
+        settle_cancel(session, job, now)
+    elif shard.attempt >= shard.max_attempts:
+        detail = (
+            f"{shard.kind} shard {shard.index} was lost {shard.attempt} times, "
+            f"{shard.max_attempts} attempts are allowed: the last worker, {shard.lease_owner}, "
+            "stopped renewing its lease"
+        )
+        problem = Problem(
+            title="The work was lost too many times",
+            status=500,
+            code="attempts_exhausted",
+            detail=detail,
+            hint="The worker's log or the kernel's says whether it was killed for want of memory.",
+        )
+        shard.error = problem.model_dump(mode="json")
+        _fail_shard(session, job, shard, problem, now)
+    else:
+        _requeue(shard, not_before=None)
+        session.flush()
+
+
+def _fail_shard(session: Session, job: JobRow, shard: ShardRow, problem: Problem, now: datetime) -> None:
+    _end(shard, FAILED, now)
+    session.flush()
+    fail_job(session, job, problem, now)
+
+
+def _requeue(shard: ShardRow, not_before: datetime | None) -> None:
+    shard.state = QUEUED
+    shard.lease_owner = shard.lease_until = shard.published_at = None
+    shard.not_before = not_before
+
+
+def _end(shard: ShardRow, state: str, now: datetime) -> None:
+    shard.state = state
+    shard.lease_owner = shard.lease_until = None
+    shard.finished_at = now
+
+
+def _compare_and_set(session: Session, lease: Lease, **values: Any) -> bool:
+    held = (ShardRow.id == lease.shard_id, ShardRow.epoch == lease.epoch, ShardRow.state == RUNNING)
+    return _changed(session, update(ShardRow).where(*held).values(**values))
+
+
+def _changed(session: Session, statement: Any) -> bool:
+    result = session.execute(statement, execution_options={"synchronize_session": False})
+    return cast("CursorResult[Any]", result).rowcount == 1
+
+
+def _shard(session: Session, shard_id: str) -> ShardRow:
+    row = session.get(ShardRow, shard_id, populate_existing=True)
+    if row is None:
+        raise NotFound("shard", shard_id)
+    return row

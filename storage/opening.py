@@ -1,0 +1,236 @@
+"""What a new job consists of: its row, the pending resource that it will fill, its first shard, one event.
+
+Everything of one job is made in the caller's transaction, so a job without a shard or a shard without a job
+cannot be seen by anybody.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from typing import Any
+
+from sqlalchemy.orm import Session
+
+from schemas.base import Lineage, Reference
+from schemas.dataset import DatasetConfig
+from schemas.fit import FitConfig
+from schemas.ids import new_id
+from schemas.job import JobKind, Progress
+from schemas.model import TrainingCreate
+from schemas.pipeline import PipelineCreate
+from storage.database import DEFAULT_MAX_ATTEMPTS, MAX_ATTEMPTS
+from storage.errors import Conflict, NotFound
+from storage.events import append_event
+from storage.registry import allot_version, reference_id
+from storage.tables import DatasetRow, FitRow, JobRow, SceneRow, ShardRow, utc_now
+
+QUEUED, RUNNING, DONE, FAILED, CANCELLED = "QUEUED", "RUNNING", "DONE", "FAILED", "CANCELLED"
+NAME_LENGTH = 64
+
+
+def open_fit(session: Session, scene_id: str, config: FitConfig, parent: JobRow | None = None) -> JobRow:
+    """A fit of a scene. Raises NotFound."""
+    scene = _scene(session, scene_id)
+    fit_id = new_id("fit")
+    job = _open_job(
+        session,
+        "fit",
+        parent=parent,
+        inputs=[Reference(kind="scene", id=scene_id, digest=scene.digest)],
+        outputs=[Reference(kind="fit", id=fit_id)],
+        config=config.model_dump(mode="json"),
+        progress=Progress(total=config.max_simulations, unit="simulations"),
+    )
+    row = FitRow(
+        id=fit_id,
+        scene_id=scene_id,
+        state="pending",
+        created_at=utc_now(),
+        job_id=job.id,
+        config=job.config,
+        parameters={},
+        metrics={},
+        lineage=_lineage(job),
+        artifacts=[],
+    )
+    session.add(row)
+    add_shards(session, job, "fit", [{"fit_id": fit_id, "scene_id": scene_id, "config": job.config}])
+    return job
+
+
+def open_dataset(
+    session: Session, fit_id: str, config: DatasetConfig, parent: JobRow | None = None
+) -> JobRow:
+    """A dataset of demonstrations in a ready fit. Raises NotFound, or Conflict when the fit is not ready."""
+    fit = session.get(FitRow, fit_id)
+    if fit is None:
+        raise NotFound("fit", fit_id)
+    if fit.state != "ready":
+        raise Conflict(f"fit {fit_id} is {fit.state}; a dataset needs a ready fit")
+    dataset_id = new_id("dataset")
+    job = _open_job(
+        session,
+        "dataset",
+        parent=parent,
+        inputs=[Reference(kind="fit", id=fit_id, digest=fit_digest(fit))],
+        outputs=[Reference(kind="dataset", id=dataset_id)],
+        config=config.model_dump(mode="json"),
+        progress=Progress(total=config.episodes, unit="episodes"),
+    )
+    row = DatasetRow(
+        id=dataset_id,
+        fit_id=fit_id,
+        scene_id=fit.scene_id,
+        state="pending",
+        created_at=utc_now(),
+        job_id=job.id,
+        config=job.config,
+        statistics={},
+        lineage=_lineage(job),
+        artifacts=[],
+    )
+    session.add(row)
+    payload = {"dataset_id": dataset_id, "fit_id": fit_id, "scene_id": fit.scene_id, "config": job.config}
+    add_shards(session, job, "dataset_plan", [payload])
+    return job
+
+
+def open_training(session: Session, request: TrainingCreate, parent: JobRow | None = None) -> JobRow:
+    """The next version of a model. Raises NotFound, or Conflict when the dataset is not sealed."""
+    dataset = session.get(DatasetRow, request.dataset_id)
+    if dataset is None:
+        raise NotFound("dataset", request.dataset_id)
+    if dataset.state != "sealed":
+        raise Conflict(f"dataset {dataset.id} is {dataset.state}; training needs a sealed dataset")
+    job = _open_job(
+        session,
+        "training",
+        parent=parent,
+        inputs=[Reference(kind="dataset", id=dataset.id, digest=dataset.digest)],
+        outputs=[],
+        config=request.model_dump(mode="json"),
+        progress=Progress(total=request.config.steps, unit="steps"),
+    )
+    version = allot_version(
+        session,
+        request.name,
+        config=request.config,
+        job_id=job.id,
+        scene_id=dataset.scene_id,
+        fit_id=dataset.fit_id,
+        dataset_id=dataset.id,
+        description=request.description,
+        tags=request.tags,
+    )
+    version.lineage = _lineage(job)
+    job.outputs = _plain([Reference(kind="model", id=reference_id(version.name, version.version))])
+    payload = {
+        "name": version.name,
+        "version": version.version,
+        "dataset_id": dataset.id,
+        "fit_id": dataset.fit_id,
+        "scene_id": dataset.scene_id,
+        "config": version.config,
+    }
+    add_shards(session, job, "training", [payload])
+    return job
+
+
+def open_pipeline(session: Session, request: PipelineCreate) -> JobRow:
+    """The whole chain; its first child, the fit, is opened with it. Raises NotFound."""
+    scene = _scene(session, request.scene_id)
+    name = request.model_name or model_name_of(scene.name)
+    job = _open_job(
+        session,
+        "pipeline",
+        parent=None,
+        inputs=[Reference(kind="scene", id=scene.id, digest=scene.digest)],
+        outputs=[],
+        config=request.model_copy(update={"model_name": name}).model_dump(mode="json"),
+        progress=Progress(total=100, unit="percent"),
+    )
+    open_fit(session, scene.id, request.fit, parent=job)
+    return job
+
+
+def add_shards(session: Session, job: JobRow, kind: str, payloads: Iterable[dict[str, Any]]) -> None:
+    """Put the job's present stage up for execution, one shard for each payload."""
+    now = utc_now()
+    cap = session.info.get(MAX_ATTEMPTS, DEFAULT_MAX_ATTEMPTS)
+    shards = [
+        ShardRow(
+            id=new_id("shard"),
+            job_id=job.id,
+            stage=job.stage,
+            index=index,
+            kind=kind,
+            state=QUEUED,
+            max_attempts=cap,
+            created_at=now,
+            payload=payload,
+        )
+        for index, payload in enumerate(payloads)
+    ]
+    job.stage_total, job.stage_done = len(shards), 0
+    session.add_all(shards)
+    session.flush()
+
+
+def fit_digest(fit: FitRow) -> str | None:
+    """The digest by which others refer to a fit: that of its twin."""
+    digests = {artifact["name"]: artifact["sha256"] for artifact in fit.artifacts}
+    return digests.get("twin.npz")
+
+
+def model_name_of(scene_name: str) -> str:
+    """A valid model name from a scene's: lower case, other characters become dashes."""
+    plain = re.sub(r"[^a-z0-9._-]+", "-", scene_name.lower()).strip("._-")
+    return plain[:NAME_LENGTH] or "model"
+
+
+def _open_job(
+    session: Session,
+    kind: JobKind,
+    *,
+    parent: JobRow | None,
+    inputs: list[Reference],
+    outputs: list[Reference],
+    config: dict[str, Any],
+    progress: Progress,
+) -> JobRow:
+    job = JobRow(
+        id=new_id("job"),
+        kind=kind,
+        state="queued",
+        parent_id=None if parent is None else parent.id,
+        progress=progress.model_dump(),
+        created_at=utc_now(),
+        inputs=_plain(inputs),
+        outputs=_plain(outputs),
+        config=config,
+    )
+    job.stage = 0
+    session.add(job)
+    session.flush()
+    append_event(session, job.id, "state", {"state": "queued"})
+    if parent is not None:
+        append_event(session, parent.id, "log", {"message": f"{kind} queued", "child": job.id, "kind": kind})
+    return job
+
+
+def _scene(session: Session, scene_id: str) -> SceneRow:
+    scene = session.get(SceneRow, scene_id)
+    if scene is None:
+        raise NotFound("scene", scene_id)
+    return scene
+
+
+def _lineage(job: JobRow) -> dict[str, Any]:
+    return Lineage(inputs=[Reference.model_validate(item) for item in job.inputs], job_id=job.id).model_dump(
+        mode="json"
+    )
+
+
+def _plain(references: list[Reference]) -> list[dict[str, Any]]:
+    return [reference.model_dump(mode="json") for reference in references]

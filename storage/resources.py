@@ -1,0 +1,272 @@
+"""Scenes, fits, datasets and episodes: rows in, wire models out.
+
+A fit, a dataset and a model version are born pending with their job (``storage.opening``) and filled in by
+the commit of its last shard (``storage.flow``); what is ready or sealed never changes again.
+"""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from schemas.base import Artifact, Lineage, Page
+from schemas.dataset import Dataset, Episode
+from schemas.fit import Fit, Parameter
+from schemas.ids import new_id
+from schemas.scene import Scene
+from storage.errors import Conflict, NotFound, ResultInvalid
+from storage.pages import page_of
+from storage.tables import DatasetRow, EpisodeRow, FitRow, SceneRow, columns_of, insert_if_absent, utc_now
+
+Row = TypeVar("Row", SceneRow, FitRow, DatasetRow)
+
+
+def create_scene(
+    session: Session,
+    *,
+    name: str,
+    kind: str,
+    digest: str,
+    frames: int,
+    points: int,
+    controllers: int,
+    fps: float,
+    duration_s: float,
+    noise_sigma_m: float | None,
+    train: tuple[int, int],
+    test: tuple[int, int],
+    description: str = "",
+    declared: dict[str, Any] | None = None,
+    warnings: list[str] | None = None,
+    artifacts: list[Artifact] | None = None,
+    tags: list[str] | None = None,
+) -> Scene:
+    """Register a scene whose canonical bundle has ``digest``; the same digest gives back the same scene."""
+    values = {
+        "id": new_id("scene"),
+        "name": name,
+        "kind": kind,
+        "description": description,
+        "created_at": utc_now(),
+        "digest": digest,
+        "frames": frames,
+        "points": points,
+        "controllers": controllers,
+        "fps": fps,
+        "duration_s": duration_s,
+        "noise_sigma_m": noise_sigma_m,
+        "train": list(train),
+        "test": list(test),
+        "declared": declared or {},
+        "warnings": list(warnings or []),
+        "artifacts": _plain(artifacts or []),
+        "tags": list(tags or []),
+    }
+    insert_if_absent(session, SceneRow, values)
+    row = session.scalars(select(SceneRow).where(SceneRow.digest == digest)).one()
+    return _scene(row)
+
+
+def get_scene(session: Session, scene_id: str) -> Scene:
+    """The scene, or NotFound."""
+    return _scene(_required(session, SceneRow, "scene", scene_id))
+
+
+def list_scenes(
+    session: Session, *, limit: int = 50, cursor: str | None = None, kind: str | None = None
+) -> Page[Scene]:
+    """Scenes, newest first."""
+    statement = select(SceneRow)
+    if kind is not None:
+        statement = statement.where(SceneRow.kind == kind)
+    keys = (SceneRow.created_at, SceneRow.id)
+    return page_of(session, statement, keys, _scene, limit=limit, cursor=cursor)
+
+
+def get_fit(session: Session, fit_id: str) -> Fit:
+    """The fit, or NotFound."""
+    return _fit(_required(session, FitRow, "fit", fit_id))
+
+
+def list_fits(
+    session: Session,
+    *,
+    limit: int = 50,
+    cursor: str | None = None,
+    state: str | None = None,
+    scene_id: str | None = None,
+) -> Page[Fit]:
+    """Fits, newest first."""
+    statement = select(FitRow)
+    if state is not None:
+        statement = statement.where(FitRow.state == state)
+    if scene_id is not None:
+        statement = statement.where(FitRow.scene_id == scene_id)
+    return page_of(session, statement, (FitRow.created_at, FitRow.id), _fit, limit=limit, cursor=cursor)
+
+
+def mark_fit_ready(
+    session: Session,
+    fit_id: str,
+    parameters: dict[str, Parameter],
+    metrics: dict[str, Any],
+    artifacts: list[Artifact],
+    lineage: Lineage,
+) -> Fit:
+    """Fill in a pending fit. Raises Conflict when it is not pending."""
+    row = _required(session, FitRow, "fit", fit_id)
+    if row.state != "pending":
+        raise Conflict(f"fit {fit_id} is {row.state}; only a pending fit can become ready")
+    row.state = "ready"
+    row.parameters = {name: parameter.model_dump(mode="json") for name, parameter in parameters.items()}
+    row.metrics = metrics
+    row.artifacts = _plain(artifacts)
+    row.lineage = lineage.model_dump(mode="json")
+    session.flush()
+    return _fit(row)
+
+
+def fail_fit(session: Session, fit_id: str) -> None:
+    """Mark a pending fit failed; a ready one stays as it is."""
+    row = _required(session, FitRow, "fit", fit_id)
+    if row.state == "pending":
+        row.state = "failed"
+
+
+def get_dataset(session: Session, dataset_id: str) -> Dataset:
+    """The dataset, or NotFound."""
+    return _dataset(_required(session, DatasetRow, "dataset", dataset_id))
+
+
+def list_datasets(
+    session: Session,
+    *,
+    limit: int = 50,
+    cursor: str | None = None,
+    state: str | None = None,
+    fit_id: str | None = None,
+    scene_id: str | None = None,
+) -> Page[Dataset]:
+    """Datasets, newest first."""
+    statement = select(DatasetRow)
+    for column, wanted in (
+        (DatasetRow.state, state),
+        (DatasetRow.fit_id, fit_id),
+        (DatasetRow.scene_id, scene_id),
+    ):
+        if wanted is not None:
+            statement = statement.where(column == wanted)
+    keys = (DatasetRow.created_at, DatasetRow.id)
+    return page_of(session, statement, keys, _dataset, limit=limit, cursor=cursor)
+
+
+def start_writing(session: Session, dataset_id: str) -> None:
+    """The dataset is planned; episodes follow."""
+    row = _required(session, DatasetRow, "dataset", dataset_id)
+    if row.state != "pending":
+        raise Conflict(f"dataset {dataset_id} is {row.state}; only a pending dataset can be planned")
+    row.state = "writing"
+
+
+def add_episode(
+    session: Session, dataset_id: str, shard_id: str, episode: Episode, seconds: float | None = None
+) -> None:
+    """Commit one episode. The primary key (dataset, index) makes a second one impossible."""
+    row = _required(session, DatasetRow, "dataset", dataset_id)
+    if row.state != "writing":
+        raise Conflict(f"dataset {dataset_id} is {row.state}; episodes are added while it is being written")
+    values = episode.model_dump()
+    session.add(
+        EpisodeRow(dataset_id=dataset_id, shard_id=shard_id, seconds=seconds, created_at=utc_now(), **values)
+    )
+    row.episodes_done += 1
+    session.flush()
+
+
+def get_episode(session: Session, dataset_id: str, index: int) -> Episode:
+    """One committed episode, or NotFound."""
+    row = session.get(EpisodeRow, (dataset_id, index))
+    if row is None:
+        raise NotFound("episode", f"{dataset_id}/{index}")
+    return _episode(row)
+
+
+def list_episodes(
+    session: Session, dataset_id: str, *, limit: int = 50, cursor: str | None = None
+) -> Page[Episode]:
+    """Committed episodes of a dataset, by index."""
+    _required(session, DatasetRow, "dataset", dataset_id)
+    statement = select(EpisodeRow).where(EpisodeRow.dataset_id == dataset_id)
+    return page_of(
+        session, statement, (EpisodeRow.index,), _episode, limit=limit, cursor=cursor, ascending=True
+    )
+
+
+def all_episodes(session: Session, dataset_id: str) -> list[Episode]:
+    """Every committed episode of a dataset, by index: what the seal writes into the manifest."""
+    _required(session, DatasetRow, "dataset", dataset_id)
+    statement = select(EpisodeRow).where(EpisodeRow.dataset_id == dataset_id).order_by(EpisodeRow.index)
+    return [_episode(row) for row in session.scalars(statement)]
+
+
+def seal_dataset(
+    session: Session,
+    dataset_id: str,
+    *,
+    digest: str,
+    statistics: dict[str, Any],
+    artifacts: list[Artifact],
+    lineage: Lineage,
+) -> Dataset:
+    """Close a dataset under the digest of its manifest. Raises Conflict when it is not being written."""
+    row = _required(session, DatasetRow, "dataset", dataset_id)
+    if row.state != "writing":
+        raise Conflict(f"dataset {dataset_id} is {row.state}; only one that is being written is sealed")
+    statement = select(func.count()).select_from(EpisodeRow).where(EpisodeRow.dataset_id == dataset_id)
+    committed = session.scalar(statement)
+    if committed != row.episodes_done:
+        counts = f"{committed} episodes, {row.episodes_done} were counted"
+        raise ResultInvalid(f"dataset {dataset_id} holds {counts}")
+    row.state = "sealed"
+    row.digest = digest
+    row.statistics = statistics
+    row.artifacts = _plain(artifacts)
+    row.lineage = lineage.model_dump(mode="json")
+    session.flush()
+    return _dataset(row)
+
+
+def fail_dataset(session: Session, dataset_id: str) -> None:
+    """Mark a dataset failed unless it is sealed."""
+    row = _required(session, DatasetRow, "dataset", dataset_id)
+    if row.state != "sealed":
+        row.state = "failed"
+
+
+def _required(session: Session, table: type[Row], kind: str, identifier: str) -> Row:
+    row = session.get(table, identifier)
+    if row is None:
+        raise NotFound(kind, identifier)
+    return row
+
+
+def _plain(artifacts: list[Artifact]) -> list[dict[str, Any]]:
+    return [artifact.model_dump(mode="json") for artifact in artifacts]
+
+
+def _scene(row: SceneRow) -> Scene:
+    return Scene.model_validate(columns_of(row))
+
+
+def _fit(row: FitRow) -> Fit:
+    return Fit.model_validate(columns_of(row))
+
+
+def _dataset(row: DatasetRow) -> Dataset:
+    return Dataset.model_validate(columns_of(row))
+
+
+def _episode(row: EpisodeRow) -> Episode:
+    return Episode.model_validate(columns_of(row))
