@@ -148,26 +148,34 @@ def random_bezier(
     *,
     bend: float = 0.5,
     curvature_limit: float = 6.0,
+    box: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> CubicBezier:
     """A random curve from ``start`` to ``end`` (3,) with bounded curvature.
 
     Args:
         bend: standard deviation of the inner control points' offsets, in chords.
         curvature_limit: largest allowed κ · chord (6: no turn is tighter than a sixth of the chord).
+        box: lower and upper corner that the curve stays within; it must hold start and end.
     """
-    chord = float(np.linalg.norm(np.asarray(end) - np.asarray(start)))
+    start, end = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
+    chord = float(np.linalg.norm(end - start))
     if not chord > 0.0:
         raise DegenerateCurve("start and end coincide")
     offsets = bend * chord * generator.standard_normal((2, 3))
+
+    def curve(factor: float) -> CubicBezier:
+        """The curve at ``factor`` of the offsets; its control polygon, hence the curve, inside the box."""
+        points = bent(start, end, factor * offsets).points
+        return CubicBezier(points if box is None else np.clip(points, *box))
+
     limit = curvature_limit / chord
-    curve = bent(start, end, offsets)
-    if curve.peak_curvature() <= limit:
-        return curve
+    if curve(1.0).peak_curvature() <= limit:
+        return curve(1.0)
     low, high = 0.0, 1.0  # the factor low always keeps the limit
     for _ in range(SHRINK_STEPS):
         middle = 0.5 * (low + high)
-        if bent(start, end, middle * offsets).peak_curvature() <= limit:
+        if curve(middle).peak_curvature() <= limit:
             low = middle
         else:
             high = middle
-    return bent(start, end, low * offsets)
+    return curve(low)

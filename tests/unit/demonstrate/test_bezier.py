@@ -79,6 +79,17 @@ def test_random_curvature_stays_under_its_limit_and_is_not_always_small(limit):
     assert np.std([random_bezier(start, end, generator).points[1] for _ in range(10)]) > 0.0
 
 
+def test_a_curve_in_a_box_stays_in_it():
+    generator = np.random.default_rng(7)
+    low, high = np.array([-0.1, -0.1, 0.0]), np.array([0.5, 0.1, 0.4])
+    for _ in range(50):
+        start, end = generator.uniform(low, high), generator.uniform(low, high)
+        curve = random_bezier(start, end, generator, bend=1.5, box=(low, high))
+        path = curve.position(np.linspace(0.0, 1.0, 200))
+        assert np.all(path >= low - 1e-12) and np.all(path <= high + 1e-12)
+        assert curve.peak_curvature() * np.linalg.norm(end - start) <= 6.0 * (1.0 + 1e-9)
+
+
 def test_the_same_seed_gives_the_same_curve():
     one = random_bezier(np.zeros(3), np.ones(3), np.random.default_rng(3))
     two = random_bezier(np.zeros(3), np.ones(3), np.random.default_rng(3))
