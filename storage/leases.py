@@ -15,7 +15,7 @@ anything. A kill at any instant leaves the shard RUNNING until its lease ends, n
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from typing import Any, Literal, cast
@@ -272,6 +272,21 @@ def reap(session: Session, now: datetime, limit: int = 100) -> list[str]:
             _reap(session, job, shard, now)
             reaped.append(shard_id)
     return reaped
+
+
+def end_leases_of(session: Session, is_gone: Callable[[str], bool], now: datetime) -> int:
+    """End the leases of owners that are provably dead, so that ``reap`` need not wait for them to run out.
+
+    Returns how many shards they held.
+    """
+    running = (ShardRow.state == RUNNING, ShardRow.lease_until >= now)
+    owners = session.scalars(select(ShardRow.lease_owner).where(*running).distinct())
+    gone = [owner for owner in owners if owner is not None and is_gone(owner)]
+    if not gone:
+        return 0
+    ended = update(ShardRow).where(*running, ShardRow.lease_owner.in_(gone))
+    values = ended.values(lease_until=now - timedelta(seconds=1))
+    return cast("CursorResult[Any]", session.execute(values)).rowcount
 
 
 def recover(session: Session, now: datetime) -> int:
