@@ -62,9 +62,9 @@ from torch import Tensor, nn
 
 from physworld.worldmodel.config import WorldModelConfig
 from physworld.worldmodel.graph import GraphSpec
+from physworld.worldmodel.messages import EdgeList, sum_messages
 
 PROPERTY_COUNT = 2
-EMPTY_SLOT = -1.0e9  # added before the ReLU of a message that nobody sends
 
 
 @dataclass(frozen=True)
@@ -90,12 +90,12 @@ class Normalisation:
 
 @dataclass(frozen=True)
 class EdgeConstants:
-    """Per-layer edge terms that depend on weights and graph only: ``bias`` (L, V, D, 1, H), ``position`` (L,
-    3(h+1), H) for the linear part of the positions, ``length`` (L, H) for |r^t|."""
+    """Per-layer edge terms that depend on weights and graph only: ``bias`` (E, H), ``position`` (3(h+1), H) for the
+    linear part of the positions, ``length`` (H,) for |r^t|."""
 
-    bias: Tensor
-    position: Tensor
-    length: Tensor
+    bias: tuple[Tensor, ...]
+    position: tuple[Tensor, ...]
+    length: tuple[Tensor, ...]
 
 
 class WorldModel(nn.Module):
@@ -121,25 +121,24 @@ class WorldModel(nn.Module):
         self.norm = _Scales(normalisation or Normalisation(), spec, config)
 
     def _set_graph(self, spec: GraphSpec) -> None:
-        vertex_count, n = spec.vertex_count, spec.object_count
-        filled = spec.neighbours < vertex_count
-        receiver = np.broadcast_to(np.arange(vertex_count)[:, None], spec.neighbours.shape)
-        own = np.where(filled, spec.neighbours, receiver)
-        rest_length = np.linalg.norm(spec.rest_relative, axis=2)
-        controlled = (own >= n) | (receiver >= n)
-        reference = _reference_positions(spec)
-        offset = reference[own] - reference[receiver]
+        """Constants of the edges, in the order of the edge list."""
+        n = spec.object_count
+        self.edges = EdgeList.from_neighbours(spec.neighbours)
+        filled = spec.neighbours < spec.vertex_count
+        receivers, senders = np.nonzero(filled)[0], spec.neighbours[filled]
+        reference, rest = _reference_positions(spec), spec.rest_relative[filled]
+        controlled = (senders >= n) | (receivers >= n)
+        offset = reference[senders] - reference[receivers]
         buffers = {
-            "_senders": torch.as_tensor(spec.neighbours.reshape(-1), dtype=torch.int64),
-            "_senders_or_self": torch.as_tensor(own.reshape(-1), dtype=torch.int64),
-            "_reference": torch.as_tensor(reference, dtype=torch.float32),
-            "_offset": torch.as_tensor(offset, dtype=torch.float32),
-            "_excess": torch.as_tensor(offset - spec.rest_relative, dtype=torch.float32),
-            "_rest_length": torch.as_tensor(rest_length, dtype=torch.float32),
-            "_kind": torch.as_tensor(np.stack([~controlled, controlled], axis=2), dtype=torch.float32),
+            "_reference": reference,
+            "_offset": offset,
+            "_constants": np.column_stack(
+                [offset, offset - rest, np.linalg.norm(rest, axis=1), ~controlled, controlled]
+            ),
         }
         for name, value in buffers.items():
-            self.register_buffer(name, value, persistent=False)
+            self.register_buffer(name, torch.as_tensor(value, dtype=torch.float32), persistent=False)
+        self.register_buffer("_senders", torch.as_tensor(senders, dtype=torch.int64), persistent=False)
 
     def forward(
         self, window: Tensor, action: Tensor, phi: Tensor, constants: EdgeConstants | None = None
@@ -153,27 +152,24 @@ class WorldModel(nn.Module):
             constants: ``edge_constants()``, when many steps share the weights.
         """
         constants = constants or self.edge_constants()
-        n, slots = self.spec.object_count, self.spec.neighbours.shape[1]
-        vertex_count, batch, hidden = window.shape[1], window.shape[2], self.config.hidden
+        n, hidden = self.spec.object_count, self.config.hidden
         moves = (window[1:] - window[:-1]).flip(0)
         state = self.encoder(self._vertex_features(window, moves, action, phi))
         shifted = window[-1] - self._reference[:, None]
         places = torch.cat([shifted, *moves.unbind(0)], dim=-1)
-        relative = shifted.index_select(0, self._senders_or_self).view(vertex_count, slots, batch, 3)
-        relative = relative - shifted[:, None] + self._offset[:, :, None]
-        length = torch.linalg.vector_norm(relative, dim=-1, keepdim=True)
-        silent = torch.full((1, batch, hidden), EMPTY_SLOT, dtype=state.dtype, device=state.device)
+        relative = shifted.index_select(0, self._senders) - shifted.index_select(0, self.edges.receivers)
+        length = torch.linalg.vector_norm(relative + self._offset[:, None], dim=-1)
         for layer in range(self.config.message_passing_steps):
             placed = places @ constants.position[layer]
             heard = self.receive[layer](state) - placed
-            sent = torch.cat([self.send[layer](state) + placed, silent])
-            edges = sent.index_select(0, self._senders).view(vertex_count, slots, batch, hidden)
-            edges = edges + constants.bias[layer]
-            edges = torch.addcmul(edges, length, constants.length[layer])
-            received = torch.relu(edges + heard[:, None]).sum(dim=1) / self.norm.degree
+            sent = self.send[layer](state) + placed
+            received = sum_messages(
+                self.edges, heard, sent, constants.bias[layer], length, constants.length[layer]
+            )
             own, other = self.update_in[layer].weight.split(hidden, dim=1)
-            inner = state @ own.T + received @ (other @ self.message[layer].weight).T
-            state = state + self.update_out[layer](torch.relu(inner + self.update_in[layer].bias))
+            other = other @ self.message[layer].weight / self.norm.degree
+            inner = state @ own.T + received @ other.T + self.update_in[layer].bias
+            state = state + self.update_out[layer](torch.relu(inner))
         return self.decoder(state[:n])
 
     def step(
@@ -187,17 +183,17 @@ class WorldModel(nn.Module):
 
     def edge_constants(self) -> EdgeConstants:
         """What of the edge products depends on weights and graph only; valid until the weights change."""
-        h = self.config.history
-        weights = torch.stack([layer.weight.T for layer in self.edge])
-        near, strain = weights[:, 0:3] / self.norm.length, weights[:, 3:6] / self.norm.strain
-        moves = weights[:, 6 : 6 + 3 * h] / self.norm.relative
-        rest, stretch = weights[:, 6 + 3 * h], weights[:, 7 + 3 * h] / self.norm.stretch
-        kind = weights[:, 8 + 3 * h :]
-        bias = torch.einsum("vdx,lxh->lvdh", self._offset, near)
-        bias = bias + torch.einsum("vdx,lxh->lvdh", self._excess, strain)
-        bias = bias + torch.einsum("vdx,lxh->lvdh", self._kind, kind)
-        bias = bias + self._rest_length[..., None] * (rest / self.norm.length - stretch)[:, None, None]
-        return EdgeConstants(bias[:, :, :, None], torch.cat([near + strain, moves], dim=1), stretch)
+        h, norm = self.config.history, self.norm
+        bias, position, length = [], [], []
+        for layer in self.edge:
+            weight = layer.weight.T
+            near, strain = weight[0:3] / norm.length, weight[3:6] / norm.strain
+            moves, rest = weight[6 : 6 + 3 * h] / norm.relative, weight[6 + 3 * h] / norm.length
+            stretch, kind = weight[7 + 3 * h] / norm.stretch, weight[8 + 3 * h :]
+            bias.append(self._constants @ torch.cat([near, strain, (rest - stretch)[None], kind]))
+            position.append(torch.cat([near + strain, moves]))
+            length.append(stretch)
+        return EdgeConstants(tuple(bias), tuple(position), tuple(length))
 
     def _vertex_features(self, window: Tensor, moves: Tensor, action: Tensor, phi: Tensor) -> Tensor:
         """f_i, (V, B, F)."""

@@ -1,0 +1,136 @@
+"""Episodes as training data: the vertices' tracks, their scales, and batches of sub-sequences.
+
+An episode's arrays: ``times`` (T,) [s], ``particles`` (T, P, 3) [m], ``controllers`` (T, K, 3) [m], ``properties``
+(P, 2) = log(E/E_fit), log(ρ/ρ_fit). Everything random comes from the ``torch.Generator`` that is passed in.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from physworld.worldmodel.errors import DatasetUnusable
+from physworld.worldmodel.graph import GraphSpec
+from physworld.worldmodel.messages import EdgeList
+from physworld.worldmodel.model import Normalisation
+
+SCALE_FLOOR_M = 1e-7
+PROPERTY_FLOOR = 0.05
+CLOCK_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True)
+class Track:
+    """One episode seen by the graph: ``positions`` (T, V, 3) float32 from ``graph_origin``, ``phi`` (n, 2)."""
+
+    positions: Tensor
+    phi: Tensor
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Sub-sequences: ``positions`` (h+1+τ, V, B, 3) and ``phi`` (n, B, 2)."""
+
+    positions: Tensor
+    phi: Tensor
+
+
+def graph_origin(spec: GraphSpec, vertices: np.ndarray) -> np.ndarray:
+    """Where single precision counts from, (3,): the vertices' mean (…, n, 3), with z at the ground if there is one."""
+    origin = np.asarray(vertices, dtype=np.float64).reshape(-1, 3).mean(axis=0)
+    if spec.ground_height_m is not None:
+        origin[2] = spec.ground_height_m
+    return origin
+
+
+def read_track(spec: GraphSpec, arrays: dict[str, np.ndarray], history: int) -> Track:
+    """The graph's vertices of an episode. Raises DatasetUnusable with the numbers."""
+    times, particles, controllers = arrays["times"], arrays["particles"], arrays["controllers"]
+    frames = len(times)
+    if frames < history + 2:
+        raise DatasetUnusable(f"an episode of {frames} frames is shorter than history {history} + 2")
+    step = float(times[-1] - times[0]) / (frames - 1)
+    if abs(step - spec.dt_s) > CLOCK_TOLERANCE * spec.dt_s:
+        raise DatasetUnusable(f"an episode's frames are {step:.6g} s apart, the model's clock is {spec.dt_s:.6g} s")
+    if particles.shape[1] <= int(spec.particle_index.max()):
+        raise DatasetUnusable(f"an episode of {particles.shape[1]} particles is of another body")
+    vertices = np.concatenate(
+        [particles[:, spec.particle_index], controllers[:, spec.control_index]], axis=1, dtype=np.float64
+    )
+    phi = np.asarray(arrays["properties"], dtype=np.float64)[spec.particle_index]
+    if not (np.isfinite(vertices).all() and np.isfinite(phi).all()):
+        raise DatasetUnusable("an episode holds values that are not finite")
+    vertices -= graph_origin(spec, vertices[0, : spec.object_count])
+    return Track(torch.as_tensor(vertices, dtype=torch.float32), torch.as_tensor(phi, dtype=torch.float32))
+
+
+def split_tracks(tracks: list[Track], fraction: float, seed: int) -> tuple[list[Track], list[Track]]:
+    """Training and validation episodes, whole; at least one of each, the same one when there is only one."""
+    if len(tracks) == 1:
+        return tracks, tracks
+    held_out = min(max(1, round(fraction * len(tracks))), len(tracks) - 1)
+    order = np.random.default_rng(seed).permutation(len(tracks))
+    return [tracks[i] for i in order[held_out:]], [tracks[i] for i in order[:held_out]]
+
+
+def measure_scales(tracks: list[Track], spec: GraphSpec) -> Normalisation:
+    """Root-mean-square scales over all frames of all object vertices and edges."""
+    n = spec.object_count
+    edges = EdgeList.from_neighbours(spec.neighbours)
+    rest = torch.as_tensor(spec.rest_relative[spec.neighbours < spec.vertex_count], dtype=torch.float32)
+    rest_length = torch.linalg.vector_norm(rest, dim=-1)
+    senders = edges.senders.long()
+    squares = dict.fromkeys(("velocity", "relative", "strain", "stretch", "acceleration"), 0.0)
+    for track in tracks:
+        x = track.positions
+        relative = x[:, senders] - x[:, edges.receivers]
+        stretch = torch.linalg.vector_norm(relative, dim=-1) - rest_length
+        squares["velocity"] += _mean_square(x[1:, :n] - x[:-1, :n])
+        squares["acceleration"] += _mean_square(x[2:, :n] - 2.0 * x[1:-1, :n] + x[:-2, :n])
+        squares["relative"] += _mean_square(relative[1:] - relative[:-1])
+        squares["strain"] += _mean_square(relative - rest)
+        squares["stretch"] += _mean_square(stretch)
+    scales = {name: max((total / len(tracks)) ** 0.5, SCALE_FLOOR_M) for name, total in squares.items()}
+    spread = torch.stack([track.phi for track in tracks]).square().mean(dim=(0, 1)).sqrt()
+    properties = tuple(max(float(value), PROPERTY_FLOOR) for value in spread)
+    return Normalisation(**scales, properties=(properties[0], properties[1]))
+
+
+class WindowSampler:
+    """Draws batches of sub-sequences uniformly over all starts of all episodes."""
+
+    def __init__(self, tracks: list[Track]) -> None:
+        self.positions = torch.cat([track.positions for track in tracks])
+        self.phi = torch.stack([track.phi for track in tracks])
+        self.lengths = [track.positions.shape[0] for track in tracks]
+        self._starts: dict[int, tuple[Tensor, Tensor]] = {}
+
+    def draw(self, frames: int, count: int, generator: torch.Generator) -> Batch:
+        """``count`` sub-sequences of ``frames`` frames."""
+        starts, owners = self._windows(frames)
+        pick = torch.randint(len(starts), (count,), generator=generator)
+        rows = starts[pick][None] + torch.arange(frames)[:, None]
+        positions = self.positions[rows].transpose(1, 2).contiguous()
+        return Batch(positions, self.phi[owners[pick]].transpose(0, 1).contiguous())
+
+    def _windows(self, frames: int) -> tuple[Tensor, Tensor]:
+        """First rows and episodes of all windows of that length."""
+        if frames not in self._starts:
+            starts, owners, offset = [], [], 0
+            for episode, length in enumerate(self.lengths):
+                count = max(0, length - frames + 1)
+                starts.append(offset + torch.arange(count))
+                owners.append(torch.full((count,), episode))
+                offset += length
+            joined = torch.cat(starts)
+            if not len(joined):
+                raise DatasetUnusable(f"no episode is as long as a training window of {frames} frames")
+            self._starts[frames] = (joined, torch.cat(owners))
+        return self._starts[frames]
+
+
+def _mean_square(values: Tensor) -> float:
+    return float(values.double().square().mean())

@@ -1,0 +1,72 @@
+"""Open-loop rollouts of the world model.
+
+A rollout starts from h + 1 known frames of the object (from rest: the same frame h + 1 times, with the
+controllers still) and is driven by controllers on the model's clock. Positions are counted from the start's
+middle, in single precision.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from physworld.worldmodel.dataset import Track, graph_origin
+from physworld.worldmodel.errors import GraphInvalid
+from physworld.worldmodel.graph import GraphSpec
+from physworld.worldmodel.model import WorldModel
+
+
+def rollout(
+    model: WorldModel,
+    spec: GraphSpec,
+    initial_history: np.ndarray,
+    controllers: np.ndarray,
+    phi: np.ndarray,
+) -> np.ndarray:
+    """Object vertices over time [m], (T, n, 3) float64.
+
+    Args:
+        model: the network; ``spec`` its graph.
+        initial_history: object vertices at frames 0 … h of the clock [m], (h+1, n, 3); the result starts so.
+        controllers: all controllers at frames 0 … T-1 [m], (T, K, 3).
+        phi: log property ratios, (n, 2).
+    """
+    frames, n = model.config.history + 1, spec.object_count
+    expected = ((frames, n, 3), (n, 2))
+    if (initial_history.shape, phi.shape) != expected:
+        raise GraphInvalid(f"history and phi of shapes {initial_history.shape}, {phi.shape}, not {expected}")
+    if controllers.shape[0] < frames or controllers.shape[1] <= int(spec.control_index.max(initial=0)):
+        raise GraphInvalid(f"controllers of shape {controllers.shape} do not drive a history of {frames} frames")
+    origin = graph_origin(spec, initial_history[-1])
+    driven = torch.as_tensor(controllers[:, spec.control_index] - origin, dtype=torch.float32)
+    start = torch.as_tensor(initial_history - origin, dtype=torch.float32)
+    predicted = unroll(model, start[:, :, None], driven[:, :, None], torch.as_tensor(phi).float()[:, None])
+    return predicted[:, :n, 0].double().numpy() + origin
+
+
+def rollout_tracks(model: WorldModel, tracks: list[Track]) -> list[Tensor]:
+    """Rollouts (T, V, 3) of episodes from their first h + 1 frames, all in one batch."""
+    n, frames = model.spec.object_count, model.config.history + 1
+    lengths = [track.positions.shape[0] for track in tracks]
+    longest = max(lengths)
+    padded = torch.stack([_held(track.positions, longest) for track in tracks], dim=2)
+    phi = torch.stack([track.phi for track in tracks], dim=1)
+    predicted = unroll(model, padded[:frames, :n], padded[:, n:], phi)
+    return [predicted[:length, :, i] for i, length in enumerate(lengths)]
+
+
+def unroll(model: WorldModel, start: Tensor, driven: Tensor, phi: Tensor) -> Tensor:
+    """All vertices (T, V, B, 3) from object frames (h+1, n, B, 3) and control vertices (T, C, B, 3)."""
+    frames = start.shape[0]
+    with torch.inference_mode():
+        constants = model.edge_constants()
+        path = list(torch.cat([start, driven[:frames]], dim=1))
+        for t in range(frames, driven.shape[0]):
+            path.append(model.step(torch.stack(path[-frames:]), driven[t], phi, constants))
+        return torch.stack(path)
+
+
+def _held(positions: Tensor, frames: int) -> Tensor:
+    """Padded with its last frame to ``frames``."""
+    return torch.cat([positions, positions[-1:].expand(frames - positions.shape[0], -1, -1)])

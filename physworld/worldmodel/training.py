@@ -1,0 +1,242 @@
+"""Training the graph network on demonstration episodes (paper, section Model Training).
+
+    loss = Σ_{i=1..τ} mean ‖x_pred^{t+i} - x^{t+i}‖² / σ_acceleration²
+
+unrolled from a random frame t whose history carries random-walk noise, so that training sees the kind of errors
+that a rollout makes; Φ carries noise too, so that it can be fine-tuned later. τ grows from 1 to ``look_ahead``
+over the first two thirds. A running average of the weights is what is validated (open-loop rollouts of whole held-out
+episodes) and returned; the best one wins. The same seed, data and settings give the same weights, and so does a
+run that was interrupted and resumed from a checkpoint.
+"""
+
+from __future__ import annotations
+
+import copy
+import io
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from physworld.worldmodel.config import TrainingConfig, WorldModelConfig
+from physworld.worldmodel.dataset import Track, WindowSampler, measure_scales, split_tracks
+from physworld.worldmodel.errors import CheckpointMismatch, DatasetUnusable, TrainingCancelled, TrainingDiverged
+from physworld.worldmodel.graph import GraphSpec
+from physworld.worldmodel.model import Normalisation, WorldModel
+from physworld.worldmodel.rollout import rollout_tracks
+
+GROWTH_SHARE = 2.0 / 3.0
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """The best averaged model; ``validation`` holds (step, open-loop error [m]); ``losses`` (step, loss)."""
+
+    model: WorldModel
+    validation: list[tuple[int, float]]
+    losses: list[tuple[int, float]]
+    best_step: int
+    best_error_m: float
+    inertial_error_m: float
+    static_error_m: float
+
+
+@dataclass
+class _Run:
+    """Everything that changes while training; what a checkpoint holds."""
+
+    model: WorldModel
+    average: WorldModel
+    optimiser: torch.optim.Adam
+    generator: torch.Generator
+    step: int = 0
+    best_error_m: float = math.inf
+    best_step: int = 0
+    best_weights: dict[str, Tensor] = field(default_factory=dict)
+    validation: list[tuple[int, float]] = field(default_factory=list)
+    losses: list[tuple[int, float]] = field(default_factory=list)
+
+
+def train(
+    tracks: list[Track],
+    spec: GraphSpec,
+    config: WorldModelConfig,
+    training: TrainingConfig,
+    *,
+    checkpoint: bytes | None = None,
+    save_checkpoint: Callable[[bytes], None] | None = None,
+    progress: Callable[[int, int, float], None] | None = None,
+    cancelled: Callable[[], bool] | None = None,
+) -> TrainingResult:
+    """Train on ``tracks``; see the module's docstring.
+
+    Args:
+        checkpoint: bytes that an earlier, interrupted run gave to ``save_checkpoint``.
+        save_checkpoint: called every ``checkpoint_every`` steps.
+        progress: called after each step with (step, steps, loss).
+        cancelled: asked before each step; true raises TrainingCancelled.
+    """
+    if not tracks:
+        raise DatasetUnusable("no episode to train on")
+    torch.set_num_threads(training.threads)
+    fitting, held_out = split_tracks(tracks, training.validation_fraction, training.seed)
+    scales = measure_scales(fitting, spec)
+    run = _start(config, spec, scales, training)
+    identity = _identity(config, training, scales)
+    if checkpoint is not None:
+        _restore(run, checkpoint, identity)
+    sampler = WindowSampler(fitting)
+    longest = max(sampler.lengths) - config.history - 1
+    while run.step < training.steps:
+        if cancelled is not None and cancelled():
+            raise TrainingCancelled(run.step)
+        loss = _train_step(run, sampler, training, min(_look_ahead(run.step, training), longest))
+        run.step += 1
+        if run.step % training.validation_every == 0 or run.step == training.steps:
+            run.losses.append((run.step, loss))
+            _validate(run, held_out)
+        if save_checkpoint is not None and run.step % training.checkpoint_every == 0:
+            save_checkpoint(_checkpoint(run, identity))
+        if progress is not None:
+            progress(run.step, training.steps, loss)
+    run.average.load_state_dict(run.best_weights)
+    return TrainingResult(
+        model=run.average,
+        validation=run.validation,
+        losses=run.losses,
+        best_step=run.best_step,
+        best_error_m=run.best_error_m,
+        inertial_error_m=_mean_error([_inertial(track, config.history) for track in held_out], held_out, spec),
+        static_error_m=_mean_error([_static(track, config.history) for track in held_out], held_out, spec),
+    )
+
+
+def open_loop_error(model: WorldModel, tracks: list[Track]) -> float:
+    """Mean distance [m] of predicted object vertices over whole episodes, after the given first h + 1 frames."""
+    return _mean_error(rollout_tracks(model, tracks), tracks, model.spec)
+
+
+def _start(
+    config: WorldModelConfig, spec: GraphSpec, scales: Normalisation, training: TrainingConfig
+) -> _Run:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(training.seed)
+        model = WorldModel(config, spec, scales)
+    generator = torch.Generator().manual_seed(training.seed)
+    optimiser = torch.optim.Adam(model.parameters(), lr=training.learning_rate)
+    return _Run(model, copy.deepcopy(model), optimiser, generator)
+
+
+def _look_ahead(step: int, training: TrainingConfig) -> int:
+    """τ at a step: in equal stages from 1 to ``look_ahead``."""
+    grown = 1 + int(step / max(1.0, GROWTH_SHARE * training.steps) * (training.look_ahead - 1) + 0.5)
+    return min(grown, training.look_ahead)
+
+
+def _train_step(run: _Run, sampler: WindowSampler, training: TrainingConfig, look_ahead: int) -> float:
+    """One optimiser step; the loss. Raises TrainingDiverged."""
+    model, h = run.model, run.model.config.history
+    batch = sampler.draw(h + 1 + look_ahead, training.batch_size, run.generator)
+    n, acceleration = model.spec.object_count, model.norm.acceleration
+    window = _with_noise(batch.positions[: h + 1], n, training.noise_history * acceleration, run.generator)
+    noise = torch.randn(batch.phi.shape, generator=run.generator) * model.norm.properties
+    phi = batch.phi + training.noise_properties * noise
+    constants = model.edge_constants()
+    loss = torch.zeros(())
+    for i in range(look_ahead):
+        truth = batch.positions[h + 1 + i]
+        predicted = model.step(window, truth[n:], phi, constants)
+        loss = loss + ((predicted[:n] - truth[:n]) / acceleration).square().sum(dim=-1).mean()
+        window = torch.cat([window[1:], predicted[None]])
+    share = run.step / training.steps
+    floor = training.learning_rate_floor
+    rate = training.learning_rate * (floor + (1.0 - floor) * 0.5 * (1.0 + math.cos(math.pi * share)))
+    for group in run.optimiser.param_groups:
+        group["lr"] = rate
+    run.optimiser.zero_grad(set_to_none=True)
+    loss.backward()
+    norm = torch.nn.utils.clip_grad_norm_(model.parameters(), training.gradient_clip)
+    if not (torch.isfinite(loss) and torch.isfinite(norm)):
+        raise TrainingDiverged(run.step, float(loss))
+    run.optimiser.step()
+    keep = min(training.average_decay, (1.0 + run.step) / (10.0 + run.step))
+    with torch.no_grad():
+        torch._foreach_lerp_(list(run.average.parameters()), list(model.parameters()), 1.0 - keep)
+    return float(loss)
+
+
+def _with_noise(window: Tensor, n: int, scale: Tensor, generator: torch.Generator) -> Tensor:
+    """A random walk on the object vertices' history (h+1, V, B, 3) whose last velocity error has that scale."""
+    steps = window.shape[0] - 1
+    kicks = torch.randn((steps, n, *window.shape[2:]), generator=generator) * (scale / math.sqrt(steps))
+    walk = kicks.cumsum(dim=0).cumsum(dim=0)
+    noisy = window.clone()
+    noisy[1:, :n] += walk
+    return noisy
+
+
+def _validate(run: _Run, held_out: list[Track]) -> None:
+    error = open_loop_error(run.average, held_out)
+    run.validation.append((run.step, error))
+    if error < run.best_error_m or not run.best_weights:
+        run.best_error_m, run.best_step = error, run.step
+        run.best_weights = {name: value.clone() for name, value in run.average.state_dict().items()}
+
+
+def _mean_error(predicted: list[Tensor], tracks: list[Track], spec: GraphSpec) -> float:
+    """Mean over frames, vertices and episodes; infinite where a rollout left the numbers."""
+    n = spec.object_count
+    errors = [
+        torch.linalg.vector_norm(guess[:, :n].double() - track.positions[:, :n].double(), dim=-1).mean()
+        for guess, track in zip(predicted, tracks, strict=True)
+    ]
+    mean = float(torch.stack(errors).mean())
+    return mean if math.isfinite(mean) else math.inf
+
+
+def _inertial(track: Track, history: int) -> Tensor:
+    """Constant velocity from the last known frame."""
+    x = track.positions
+    ahead = torch.arange(1, x.shape[0] - history)[:, None, None]
+    return torch.cat([x[: history + 1], x[history] + ahead * (x[history] - x[history - 1])])
+
+
+def _static(track: Track, history: int) -> Tensor:
+    """The last known frame for ever."""
+    x = track.positions
+    return torch.cat([x[: history + 1], x[history].expand(x.shape[0] - history - 1, -1, -1)])
+
+
+def _identity(config: WorldModelConfig, training: TrainingConfig, scales: Normalisation) -> dict[str, Any]:
+    """What a checkpoint must agree with: settings, and the data's scales as their fingerprint."""
+    return {"config": asdict(config), "training": asdict(training), "scales": asdict(scales)}
+
+
+def _checkpoint(run: _Run, identity: dict[str, Any]) -> bytes:
+    held = {
+        "identity": repr(identity),
+        "model": run.model.state_dict(),
+        "average": run.average.state_dict(),
+        "optimiser": run.optimiser.state_dict(),
+        "generator": run.generator.get_state(),
+        "best_weights": run.best_weights,
+        "figures": [run.step, run.best_error_m, run.best_step, run.validation, run.losses],
+    }
+    buffer = io.BytesIO()
+    torch.save(held, buffer)
+    return buffer.getvalue()
+
+
+def _restore(run: _Run, checkpoint: bytes, identity: dict[str, Any]) -> None:
+    held = torch.load(io.BytesIO(checkpoint), weights_only=True)
+    if held["identity"] != repr(identity):
+        raise CheckpointMismatch(f"checkpoint of {held['identity']}, but this run is {identity!r}")
+    run.model.load_state_dict(held["model"])
+    run.average.load_state_dict(held["average"])
+    run.optimiser.load_state_dict(held["optimiser"])
+    run.generator.set_state(held["generator"])
+    run.best_weights = held["best_weights"]
+    run.step, run.best_error_m, run.best_step, run.validation, run.losses = held["figures"]
