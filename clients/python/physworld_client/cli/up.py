@@ -1,7 +1,8 @@
 """``physworld up``: the embedded service in the foreground.
 
 This process becomes the supervisor, so that Ctrl-C, a signal or a kill reaches exactly one process, and its
-exit code is the command's. The supervisor prints the addresses of API, docs and dashboard and the API key's place.
+exit code is the command's. The supervisor prints the addresses of API, docs and dashboard, and where the API
+key is.
 """
 
 from __future__ import annotations

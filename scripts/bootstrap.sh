@@ -1,0 +1,95 @@
+#!/usr/bin/env bash
+# Builds .venv with the pinned dependencies and both distributions, editable.
+#
+#   scripts/bootstrap.sh          what the service and the command line need
+#   scripts/bootstrap.sh --dev    also what the tests and the linters need, Chromium among it
+#
+# Needs Python 3.11 with pip; python3-venv is not assumed. Does nothing when .venv is up to date: a stamp in it
+# holds the hash of everything that decides its contents. PYTHON=/path/to/python3.11 chooses the interpreter.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+
+VENV=.venv
+TORCH=2.13.0
+SETUPTOOLS=84.2.1
+export PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_INPUT=1
+
+say() { printf 'bootstrap: %s\n' "$*"; }
+fail() { printf 'bootstrap: %s\n' "$*" >&2; exit 1; }
+
+is_python311() {
+    "$1" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' >/dev/null 2>&1
+}
+
+find_python() {
+    local candidate
+    for candidate in ${PYTHON:+"$PYTHON"} python3.11 python3 python /usr/bin/python3.11 /usr/local/bin/python3.11; do
+        if is_python311 "$candidate"; then
+            command -v "$candidate"
+            return
+        fi
+    done
+    fail "no Python 3.11 found (Debian 12: apt-get install python3 python3-pip); PYTHON=... names another place"
+}
+
+make_venv() {
+    local python
+    python=$(find_python)
+    say "making $VENV with $python"
+    rm -rf "$VENV"
+    if "$python" -c 'import ensurepip, venv' >/dev/null 2>&1; then
+        "$python" -m venv "$VENV"
+        return
+    fi
+    # Debian keeps ensurepip in a package of its own; virtualenv brings the wheels that it would install.
+    "$python" -m pip --version >/dev/null 2>&1 \
+        || fail "$python has neither ensurepip nor pip (Debian: apt-get install python3-venv or python3-pip)"
+    say "$python has no ensurepip: using virtualenv from .bootstrap"
+    "$python" -m pip install --quiet --upgrade --target .bootstrap virtualenv
+    PYTHONPATH=.bootstrap "$python" -m virtualenv --quiet --no-download "$VENV"
+}
+
+install() {
+    "$VENV/bin/python" -m pip install --quiet --constraint constraints.txt "$@"
+}
+
+install_torch() {
+    # The plain build may bring gigabytes of CUDA packages: the CPU build is taken where the index has it.
+    say "installing torch $TORCH"
+    install "torch==$TORCH+cpu" 2>/dev/null || install "torch==$TORCH"
+}
+
+install_chromium() {
+    local name
+    for name in chromium chromium-browser google-chrome; do
+        command -v "$name" >/dev/null && return
+    done
+    if [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null; then
+        say "installing Chromium"
+        apt-get update -qq
+        DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends chromium >/dev/null
+    else
+        say "no Chromium: the browser tests will be skipped (Debian: apt-get install chromium)"
+    fi
+}
+
+EXTRAS=api,sim,train
+[ "${1:-}" = --dev ] && EXTRAS=$EXTRAS,dev
+STAMP=$VENV/.bootstrap-stamp
+WANTED=$(cat pyproject.toml clients/python/pyproject.toml constraints.txt scripts/bootstrap.sh | sha256sum | cut -c1-64)
+
+[ "${1:-}" = --dev ] && install_chromium
+if [ -f "$STAMP" ] && is_python311 "$VENV/bin/python"; then
+    read -r stamped extras <"$STAMP"
+    if [ "$stamped" = "$WANTED" ] && { [ "$extras" = "$EXTRAS" ] || [ "$extras" = api,sim,train,dev ]; }; then
+        exit 0
+    fi
+fi
+is_python311 "$VENV/bin/python" && "$VENV/bin/python" -m pip --version >/dev/null 2>&1 || make_venv
+rm -f "$STAMP"
+install "setuptools==$SETUPTOOLS"
+install_torch
+say "installing PhysWorld [$EXTRAS] and its client"
+install --no-build-isolation --editable ".[$EXTRAS]" --editable clients/python
+printf '%s %s\n' "$WANTED" "$EXTRAS" >"$STAMP"
+say "done: $VENV"
