@@ -1,7 +1,7 @@
 """Which service a command talks to: a given one, the one on the data folder, or one started for it.
 
 The embedded service writes ``DATA/run/state.json`` (its addresses, its process id) and ``DATA/api-key``. It
-is started as ``python -m services.embedded``: the client imports nothing of it, so that the SDK installs alone.
+is started as ``python -m services.embedded``: the client imports nothing of it, and the SDK installs alone.
 """
 
 from __future__ import annotations
