@@ -15,6 +15,7 @@ LANES_FLOAT8 = r"""
     #define PW_LOG(v) logf(v)
     #define PW_ANY_BELOW(v, limit) ((v) < (limit))
     #define PW_FLOOR(v, limit) fmaxf((v), (limit))
+    #define PW_WHERE_POSITIVE(test, v, other) ((test) > 0.0f ? (v) : (other))
 #else
     typedef float V __attribute__((vector_size(32)));
     typedef float H __attribute__((vector_size(16)));
@@ -53,7 +54,12 @@ LANES_FLOAT8 = r"""
     #define PW_SUM(v) sum_lanes(v)
     #define PW_LOG(v) log_lanes(v)
     #define PW_ANY_BELOW(v, limit) any_below((v), (limit))
+    auto where_positive = [](V test, V v, float other) -> V {
+        I filled = test > 0.0f;
+        return (V)(((I)v & filled) | ((I)(V{} + other) & ~filled));
+    };
     #define PW_FLOOR(v, limit) floor_lanes((v), (limit))
+    #define PW_WHERE_POSITIVE(test, v, other) where_positive((test), (v), (other))
 #endif
 """
 

@@ -57,13 +57,14 @@ _SNIPPET = LANES_FLOAT8 + r"""
         cof[6] = F[1] * F[5] - F[2] * F[4];
         cof[7] = F[2] * F[3] - F[0] * F[5];
         cof[8] = F[0] * F[4] - F[1] * F[3];
+        const int p = cell * 8 + q;
+        const V muV = *(const V*)&mu_volume.data[p];
         V J = F[0] * cof[0] + F[1] * cof[1] + F[2] * cof[2];
+        J = PW_WHERE_POSITIVE(muV, J, 1.0f);   // a particle without material carries no stress, however it turns
         if (PW_ANY_BELOW(J, 0.02f)) {
             inverted.data[0] = 1;
             J = PW_FLOOR(J, 0.02f);
         }
-        const int p = cell * 8 + q;
-        const V muV = *(const V*)&mu_volume.data[p];
         const V lamV = *(const V*)&lambda_volume.data[p];
         const V invJ = 1.0f / J;
         const V pressure = (lamV * PW_LOG(J) - muV) * invJ;

@@ -1,0 +1,98 @@
+"""Where a rope or sheet is at the start: nodal positions and velocities from few noisy tracked points.
+
+Positions minimise  |W x - p|^2 / sigma^2 + bending + (stretch error)^2 : linear in the first two, a few Gauss-Newton
+steps for the third, so that the curve between markers has the material's length. Velocities are fitted to a local
+polynomial in time of the first frames, with the same smoothing.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import spsolve
+
+from physworld.mpm.lattice import Lattice
+from physworld.scene import Scene
+
+_VELOCITY_WINDOW_S = 0.06  # frames within this time of the first give the start's velocity
+_MIN_WINDOW_FRAMES = 4
+_BENDING_WEIGHT = 1e-3  # against data in units of the cell: fills gaps between markers, bends markers by little
+_STRETCH_WEIGHT = 0.3
+_GAUSS_NEWTON_STEPS = 12
+
+
+def fit_nodes(scene: Scene, lattice: Lattice, material: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Nodal positions [m] and velocities [m/s] at the first frame, both (n, 3).
+
+    Args:
+        scene: its first frames' visible points and controllers are used.
+        lattice: of dimension 1 or 2.
+        material: material coordinates of the tracked points [m], (N, d).
+    """
+    seen = scene.visible[0]
+    weights = lattice.interpolation(material[seen])
+    bending = _bending(lattice)
+    spacing = float(lattice.spacing.min())
+    data = weights / spacing
+    normal = data.T @ data + _BENDING_WEIGHT * bending
+    x = spsolve(normal.tocsc(), data.T @ (scene.points[0][seen] / spacing))
+    slopes = _slopes(lattice)
+    for _ in range(_GAUSS_NEWTON_STEPS):
+        x = _unstretch(x, data, scene.points[0][seen] / spacing, bending, slopes)
+    return x, _start_velocity(scene, lattice, material, bending)
+
+
+def _start_velocity(
+    scene: Scene, lattice: Lattice, material: np.ndarray, bending: sparse.csr_matrix
+) -> np.ndarray:
+    frames = max(_MIN_WINDOW_FRAMES, int(np.searchsorted(scene.times, _VELOCITY_WINDOW_S)) + 1)
+    frames = min(frames, scene.train[1])
+    if frames < 3:
+        return np.zeros((len(lattice.nodes), 3))
+    seen = scene.visible[:frames].all(axis=0)
+    if not seen.any():
+        return np.zeros((len(lattice.nodes), 3))
+    design = np.stack([np.ones(frames), scene.times[:frames], scene.times[:frames] ** 2], axis=1)
+    track = scene.points[:frames, seen].reshape(frames, -1)
+    coefficients, *_ = np.linalg.lstsq(design, track, rcond=None)
+    velocity = coefficients[1].reshape(-1, 3)
+    data = lattice.interpolation(material[seen]) / float(lattice.spacing.min())
+    normal = data.T @ data + _BENDING_WEIGHT * bending
+    return spsolve(normal.tocsc(), data.T @ (velocity / float(lattice.spacing.min())))
+
+
+def _bending(lattice: Lattice) -> sparse.csr_matrix:
+    """Sum over particles of the squared second derivatives, in units of the cell: (n, n), with a tiny mass term."""
+    coordinates = lattice.particle_coordinates
+    total = 1e-9 * sparse.eye(len(lattice.nodes), format="csr")
+    axes = range(lattice.dim)
+    for orders in {tuple(int(a == i) + int(a == j) for a in axes) for i in axes for j in axes}:
+        matrix = lattice.interpolation(coordinates, orders) * float(lattice.spacing.min())
+        total = total + matrix.T @ matrix
+    return total
+
+
+def _slopes(lattice: Lattice) -> list[sparse.csr_matrix]:
+    coordinates = lattice.particle_coordinates
+    return [lattice.interpolation(coordinates, tuple(int(a == j) for a in range(lattice.dim))) for j in range(lattice.dim)]
+
+
+def _unstretch(
+    x: np.ndarray, data: sparse.csr_matrix, target: np.ndarray, bending: sparse.csr_matrix, slopes: list
+) -> np.ndarray:
+    """One Gauss-Newton step on data, bending and (|x_,j| - 1)."""
+    n = len(x)
+    rows, residuals = [], []
+    for slope in slopes:
+        tangent = slope @ x
+        length = np.maximum(np.linalg.norm(tangent, axis=1), 1e-9)
+        direction = tangent / length[:, None]
+        rows.append(sparse.hstack([sparse.diags(direction[:, i]) @ slope for i in range(3)]))
+        residuals.append(length - 1.0)
+    stretch, error = sparse.vstack(rows).tocsr(), np.concatenate(residuals)
+    smooth = sparse.block_diag([data.T @ data + _BENDING_WEIGHT * bending] * 3)
+    gradient = np.concatenate([data.T @ (data @ x[:, i] - target[:, i]) + _BENDING_WEIGHT * (bending @ x[:, i])
+                               for i in range(3)])
+    normal = smooth + _STRETCH_WEIGHT * stretch.T @ stretch
+    step = spsolve(normal.tocsc(), -(gradient + _STRETCH_WEIGHT * stretch.T @ error))
+    return x + step.reshape(3, n).T

@@ -1,0 +1,281 @@
+"""The undeformed body of a scene: a solid, sheet or rod lattice and where its nodes are at the start.
+
+- *Rod* (rope, rod): reference coordinate is the arc length s; rest lengths between markers, the declared length, or
+  the measured polyline give s of every tracked point.
+- *Sheet*: two in-plane coordinates from the declared grid, or from the plane of an undeformed flat sheet.
+- *Solid* (everything else): reference coordinates are the world's at the start; a declared box, points that fill
+  the body, or points that bound it.
+
+Cell faces lie on the faces of boxes and on the inner faces of declared grips.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from physworld.errors import SceneUnsupported
+from physworld.geometry.curves import fit_nodes
+from physworld.geometry.filling import inside_surface_points, inside_volume_points
+from physworld.mpm.lattice import Lattice, lattice_from_cells
+from physworld.scene import AS_MEASURED, Scene
+
+ROD_KINDS = ("rope", "rod")
+SHEET_KINDS = ("sheet", "cloth")
+_ROD_CELLS = 48
+_SHEET_CELLS = 12
+_BOX_KINDS = ("beam", "block")
+_BOX_FILL = 0.93  # a cloud that fills this share of its bounding box is a box, whatever its kind
+
+
+@dataclass(frozen=True)
+class ReferenceBody:
+    """A lattice, its nodes in the world without stress and at the start, and the tracked points inside it.
+
+    Attributes:
+        lattice: cells, nodes, particles.
+        rest: nodal positions without stress [m], (n, 3).
+        start, start_velocity: nodal positions [m] and velocities [m/s] at the first frame, (n, 3).
+        points: material coordinates of the tracked points [m], (N, d).
+        offsets: distance of a tracked point from the sheet [m], (N, 1), or from the rod at the start [m], (N, 3);
+            zero columns for a solid.
+        thickness_m: thickness of a sheet or radius of a rod, declared or assumed.
+        notes: what was assumed, in words.
+    """
+
+    lattice: Lattice
+    rest: np.ndarray
+    start: np.ndarray
+    start_velocity: np.ndarray
+    points: np.ndarray
+    offsets: np.ndarray
+    thickness_m: float
+    notes: tuple[str, ...] = ()
+
+
+def reference_body(scene: Scene, particle_budget: int) -> ReferenceBody:
+    """Build the body that the scene declares or shows.
+
+    Raises:
+        SceneUnsupported: the scene declares too little, with the missing key.
+    """
+    if scene.kind in ROD_KINDS:
+        return _rod(scene)
+    if scene.kind in SHEET_KINDS:
+        sheet = _sheet(scene)
+        if sheet is not None:
+            return sheet
+    if scene.kind == "branched_rope":
+        raise SceneUnsupported("branched ropes are not covered yet: a rod has two ends, this scene's topology has more")
+    return _solid(scene, particle_budget)
+
+
+def _first_points(scene: Scene) -> np.ndarray:
+    """Tracked points at the first frame; a point not seen then takes its first sight."""
+    seen = np.argmax(scene.visible, axis=0)
+    return scene.points[seen, np.arange(scene.points.shape[1])]
+
+
+def _solid(scene: Scene, budget: int) -> ReferenceBody:
+    points = _first_points(scene)
+    body = scene.body
+    notes: list[str] = []
+    if body.box_min_m is not None and body.box_max_m is not None:
+        low, high, test = body.box_min_m, body.box_max_m, None
+    else:
+        cloud = scene.rest_volume_points
+        if cloud is not None and len(cloud) >= 20:
+            def test(q: np.ndarray) -> np.ndarray:
+                return inside_volume_points(cloud, q)
+        else:
+            cloud = points if scene.surface_points is None else np.concatenate([points, scene.surface_points])
+            if len(cloud) < 30:
+                raise SceneUnsupported(
+                    f"{len(cloud)} points do not bound a {scene.kind}: declare body.box_min_m and body.box_max_m, or "
+                    "give rest_volume_points"
+                )
+            notes.append("the volume was filled from points on the surface")
+            cell = float((np.prod(np.ptp(cloud, axis=0)) / budget) ** (1 / 3))
+            def test(q: np.ndarray) -> np.ndarray:
+                return inside_surface_points(cloud, q, cell)
+        low, high = cloud.min(axis=0), cloud.max(axis=0)
+        probe = np.random.default_rng(0).uniform(low, high, size=(4000, 3))
+        share = float(test(probe).mean())
+        if share >= _BOX_FILL or (scene.kind in _BOX_KINDS and share >= 0.7):
+            test = None
+            if body.size_m is not None and np.allclose(body.size_m, high - low, rtol=0.05):
+                centre = 0.5 * (low + high)
+                low, high = centre - 0.5 * body.size_m, centre + 0.5 * body.size_m
+        else:
+            notes.append(f"the body fills {share:.0%} of its bounding box")
+            budget = int(budget / max(share, 0.05))
+    lattice = _solid_lattice(scene, low, high, test, budget)
+    start = lattice.node_coordinates
+    return ReferenceBody(
+        lattice, start, start, np.zeros_like(start), points, np.zeros((len(points), 0)), 0.0, tuple(notes)
+    )
+
+
+def _solid_lattice(scene: Scene, low: np.ndarray, high: np.ndarray, test, budget: int) -> Lattice:
+    size = np.maximum(high - low, 1e-9)
+    cell = float((8 * np.prod(size) / budget) ** (1 / 3))
+    spacing = size / np.maximum(1, np.round(size / cell))
+    origin = low.copy()
+    for grip in scene.grips:
+        if grip.region_min_m is None or grip.region_max_m is None:
+            continue
+        cover = (np.minimum(grip.region_max_m, high) - np.maximum(grip.region_min_m, low)) / size
+        axis = int(np.argmin(cover))
+        if cover[axis] >= 0.9:
+            continue
+        at_low = grip.region_min_m[axis] - low[axis] < high[axis] - grip.region_max_m[axis]
+        face = grip.region_max_m[axis] if at_low else grip.region_min_m[axis]
+        free = high[axis] - face if at_low else face - low[axis]
+        spacing[axis] = free / max(1, round(free / cell))
+        behind = np.ceil((face - low[axis]) / spacing[axis] - 1e-6)
+        origin[axis] = face - behind * spacing[axis]
+        break
+    counts = np.ceil((high - origin) / spacing - 1e-6).astype(int)
+    cells = np.stack(np.meshgrid(*[np.arange(c) for c in counts], indexing="ij"), axis=-1).reshape(-1, 3)
+    fill = _box_fill(cells, origin, spacing, low, high)
+    if test is not None:
+        fill *= _sampled_fill(cells, origin, spacing, test)
+    present = fill.max(axis=1) > 0.25
+    if not present.any():
+        raise SceneUnsupported(f"no cell of {spacing} m holds material between {low} and {high}")
+    return lattice_from_cells(origin, spacing, cells[present], np.clip(fill[present], 0.0, 1.0))
+
+
+def _octants(cells: np.ndarray) -> np.ndarray:
+    """Lower corners of every cell's 8 octants in cell units, (C, 8, 3), in the order of the particles."""
+    corner = np.stack(np.meshgrid([0, 0.5], [0, 0.5], [0, 0.5], indexing="ij"), axis=-1).reshape(8, 3)
+    return cells[:, None, :] + corner[None]
+
+
+def _box_fill(
+    cells: np.ndarray, origin: np.ndarray, spacing: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    begin = origin + _octants(cells) * spacing
+    overlap = np.minimum(begin + 0.5 * spacing, high) - np.maximum(begin, low)
+    return np.prod(np.clip(overlap / (0.5 * spacing), 0.0, 1.0), axis=2)
+
+
+def _sampled_fill(cells: np.ndarray, origin: np.ndarray, spacing: np.ndarray, test) -> np.ndarray:
+    inner = np.stack(np.meshgrid(*[[0.125, 0.375]] * 3, indexing="ij"), axis=-1).reshape(8, 3)
+    samples = origin + (_octants(cells)[:, :, None, :] + inner[None, None]) * spacing
+    return test(samples.reshape(-1, 3)).reshape(len(cells), 8, 8).mean(axis=2)
+
+
+def _rod(scene: Scene) -> ReferenceBody:
+    points = _first_points(scene)
+    notes: list[str] = []
+    if scene.initial_state != AS_MEASURED and len(points) > 3:
+        cloud = points if scene.rest_volume_points is None else scene.rest_volume_points
+        centre = cloud.mean(axis=0)
+        direction = np.linalg.svd(cloud - centre, full_matrices=False)[2][0]
+        anchor = scene.controllers[0].mean(axis=0)
+        if np.dot(anchor - centre, direction) > 0:
+            direction = -direction
+        along = (cloud - centre) @ direction
+        arc = (points - centre) @ direction - along.min()
+        length = float(np.ptp(along))
+        base = centre + along.min() * direction
+        off_axis = float(np.sqrt(np.mean(np.sum((cloud - centre - along[:, None] * direction) ** 2, axis=1))))
+        radius = scene.body.radius_m or float(np.sqrt(2.0) * off_axis)
+        lattice = _rod_lattice(scene, length, (scene.controllers[0] - base) @ direction)
+        start = base + lattice.node_coordinates * direction
+        velocity = np.zeros_like(start)
+    else:
+        arc, length = _marker_arc_lengths(scene, points)
+        radius = scene.body.radius_m or 0.004
+        if scene.body.radius_m is None:
+            notes.append(f"radius not declared: {radius} m assumed (only bending over mass matters)")
+        nearest = np.argmin(np.linalg.norm(scene.controllers[0][:, None] - points[None], axis=2), axis=1)
+        lattice = _rod_lattice(scene, length, arc[nearest] if scene.body.segment_rest_lengths_m is not None else [0.0])
+        start, velocity = fit_nodes(scene, lattice, arc[:, None])
+        notes.append("the rest shape is taken as straight")
+    rest = np.zeros((len(lattice.nodes), 3))
+    rest[:, 0] = lattice.node_coordinates[:, 0]
+    offsets = points - lattice.interpolation(arc[:, None]) @ start
+    return ReferenceBody(lattice, rest, start, velocity, arc[:, None], offsets, radius, tuple(notes))
+
+
+def _marker_arc_lengths(scene: Scene, points: np.ndarray) -> tuple[np.ndarray, float]:
+    lengths = scene.body.segment_rest_lengths_m
+    if lengths is not None:
+        if len(lengths) != len(points) - 1:
+            raise SceneUnsupported(
+                f"{len(lengths)} segment rest lengths for {len(points)} tracked points; a chain needs one fewer"
+            )
+        arc = np.concatenate([[0.0], np.cumsum(lengths)])
+        return arc, float(arc[-1])
+    anchor = scene.controllers[0].mean(axis=0)
+    order = np.argsort(np.linalg.norm(points - anchor, axis=1))
+    steps = np.linalg.norm(np.diff(np.concatenate([anchor[None], points[order]]), axis=0), axis=1)
+    arc = np.empty(len(points))
+    arc[order] = np.cumsum(steps)
+    return arc, max(float(scene.body.length_m or 0.0), float(arc.max()))
+
+
+def _rod_lattice(scene: Scene, length: float, grip_arcs) -> Lattice:
+    grips = np.clip(np.atleast_1d(grip_arcs), 0.0, length)
+    left = grips[grips < 0.5 * length]
+    face = float(left.max()) if len(left) else 0.0
+    right = grips[grips >= 0.5 * length]
+    free = (float(right.min()) if len(right) else length) - face
+    count = max(4, round(_ROD_CELLS * free / length))
+    spacing = free / count
+    origin = face - np.ceil(face / spacing - 1e-6) * spacing
+    cells = np.arange(int(np.ceil((length - origin) / spacing - 1e-6)))[:, None]
+    begin = origin + (cells + np.array([0.0, 0.5])[None]) * spacing
+    fill = np.clip((np.minimum(begin + 0.5 * spacing, length) - np.maximum(begin, 0.0)) / (0.5 * spacing), 0.0, 1.0)
+    return lattice_from_cells(np.array([origin]), np.array([spacing]), cells, fill)
+
+
+def _sheet(scene: Scene) -> ReferenceBody | None:
+    points = _first_points(scene)
+    notes: list[str] = []
+    thickness = scene.body.thickness_m
+    if thickness is None and scene.body.size_m is not None:
+        thickness = float(np.min(scene.body.size_m))
+    if thickness is None:
+        thickness = 1e-3
+        notes.append("thickness not declared: 1 mm assumed (only stiffness over mass matters)")
+    grid = scene.body.grid_shape
+    if grid is not None and scene.body.side_m is not None and grid[0] * grid[1] == len(points):
+        side = scene.body.side_m
+        first, second = np.meshgrid(np.linspace(0, side, grid[0]), np.linspace(0, side, grid[1]), indexing="ij")
+        material = np.stack([first.ravel(), second.ravel()], axis=1)
+        size = np.array([side, side])
+        flat_map = None
+    else:
+        cloud = points if scene.rest_volume_points is None else scene.rest_volume_points
+        centre = cloud.mean(axis=0)
+        axes = np.linalg.svd(cloud - centre, full_matrices=False)[2]
+        if np.abs(axes[2]).max() > 0.999:  # a sheet in a coordinate plane: keep its edges along the axes
+            normal_axis = int(np.argmax(np.abs(axes[2])))
+            axes = np.stack([*(np.eye(3)[a] for a in range(3) if a != normal_axis), np.eye(3)[normal_axis]])
+            if np.linalg.det(axes) < 0:
+                axes[2] = -axes[2]
+        local = (cloud - centre) @ axes.T
+        size = np.ptp(local[:, :2], axis=0)
+        if np.sqrt(np.mean(local[:, 2] ** 2)) > 0.08 * size.min():
+            return None
+        low = local[:, :2].min(axis=0)
+        material = ((points - centre) @ axes.T)[:, :2] - low
+        flat_map = (centre + low @ axes[:2], axes)
+    cell = max(float(size.max()) / _SHEET_CELLS, 1e-4)
+    counts = np.maximum(3, np.round(size / cell)).astype(int)
+    cells = np.stack(np.meshgrid(*[np.arange(c) for c in counts], indexing="ij"), axis=-1).reshape(-1, 2)
+    lattice = lattice_from_cells(np.zeros(2), size / counts, cells, np.ones((len(cells), 4)))
+    rest = np.zeros((len(lattice.nodes), 3))
+    rest[:, :2] = lattice.node_coordinates
+    if flat_map is not None:
+        start = flat_map[0] + lattice.node_coordinates @ flat_map[1][:2]
+        velocity = np.zeros_like(start)
+        offsets = ((points - flat_map[0]) @ flat_map[1][2])[:, None]
+    else:
+        start, velocity = fit_nodes(scene, lattice, material)
+        offsets = np.zeros((len(points), 1))
+    return ReferenceBody(lattice, rest, start, velocity, material, offsets, thickness, tuple(notes))

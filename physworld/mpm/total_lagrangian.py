@@ -1,0 +1,215 @@
+"""Total Lagrangian material point method: particles carry the material, the nodal state stays on the grid.
+
+    m_a dv_a/dt = f_a(x) + m_a g - m_a c v_a        x_a += dt v_a        (symplectic Euler, lumped mass)
+
+Weights live in the reference configuration, so nothing is ever transferred between particles and grid and nothing is
+damped by transfers (de Vaucorbeil, Nguyen, Hutchinson 2020). It cannot tear or flow: plastic flow and self-contact
+belong to the updated Lagrangian form, which joins behind the same :class:`Formulation`.
+
+Substeps run in a captured graph; the host returns once a frame to record, to check and to report.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+import warp as wp
+
+from physworld.errors import CFLViolation, ParticlesLeftTheGrid, UnstableSimulation
+from physworld.materials.laws import Law, SolidLaw
+from physworld.mpm.contact import GroundContact, contact_frequency
+from physworld.mpm.forces import InternalForces, viscous_rate
+from physworld.mpm.lattice import Lattice
+from physworld.mpm.node_kernels import advance_counter, advance_nodes
+from physworld.mpm.stability import fastest_frequency, stable_time_step
+
+_CHUNK = 8  # substeps in one captured graph
+_REACH = 1e3  # a node farther than this many body sizes from its start has left every workspace
+
+
+@dataclass(frozen=True)
+class HeldNodes:
+    """Nodes that gripped material touches: their numbers (H,) and their paths at the frames, (T, H, 3) [m], [m/s]."""
+
+    nodes: np.ndarray
+    positions: np.ndarray
+    velocities: np.ndarray
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What a formulation integrates.
+
+    Attributes:
+        lattice, law: the reference body and its constitutive parameters.
+        rest: nodal positions without stress, in the world [m], (n, 3).
+        gravity_m_s2: (3,).
+        drag_per_s: linear drag rate c of every node [1/s].
+        stiffness_factor, density_factor: fields over the particles, (P,), or None for 1.
+        ground: contact with a horizontal plane, or None.
+    """
+
+    lattice: Lattice
+    law: Law
+    rest: np.ndarray
+    gravity_m_s2: np.ndarray
+    drag_per_s: float = 0.0
+    stiffness_factor: np.ndarray | None = None
+    density_factor: np.ndarray | None = None
+    ground: GroundContact | None = None
+    device: str = field(default="cpu")
+
+
+class Formulation(Protocol):
+    """One way to integrate a :class:`Problem`; the engine chooses by the scene."""
+
+    time_step_s: float
+
+    def run(
+        self,
+        x: np.ndarray,
+        v: np.ndarray,
+        held: HeldNodes,
+        times: np.ndarray,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> np.ndarray:
+        """Nodal positions at ``times``, (T, n, 3)."""
+        ...
+
+
+class TotalLagrangian:
+    """Integrates a problem; see the module's text.
+
+    Args:
+        problem: the body and what acts on it.
+        time_step_s: forced time step [s], or None for the stable one.
+
+    Raises:
+        CFLViolation: the forced time step exceeds the stable limit.
+    """
+
+    def __init__(self, problem: Problem, time_step_s: float | None = None) -> None:
+        lattice, law, device = problem.lattice, problem.law, problem.device
+        particles = lattice.fill.size
+        stiffness = np.ones(particles) if problem.stiffness_factor is None else problem.stiffness_factor
+        self.problem = problem
+        self.mass = nodal_mass(lattice, law, problem.density_factor)
+        self.forces = InternalForces(lattice, law, stiffness, problem.rest, device)
+        frequency = fastest_frequency(self.forces, problem.rest, self.mass, float(lattice.spacing.min()))
+        if problem.ground is not None and isinstance(law, SolidLaw):
+            frequency = float(np.hypot(frequency, contact_frequency(law, lattice)))
+        limit = stable_time_step(frequency, viscous_rate(law), safety=1.0)
+        if time_step_s is not None and time_step_s > limit:
+            raise CFLViolation(
+                f"time step {time_step_s:.3g} s exceeds the stable {limit:.3g} s of a body whose fastest mode has "
+                f"{frequency:.4g} rad/s (wave speed {law.wave_speed_m_s:.4g} m/s, cell {lattice.spacing.min():.3g} m)"
+            )
+        self.time_step_s = time_step_s or stable_time_step(frequency, viscous_rate(law))
+        self.substeps = 0
+
+    def run(
+        self,
+        x: np.ndarray,
+        v: np.ndarray,
+        held: HeldNodes,
+        times: np.ndarray,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> np.ndarray:
+        """Integrate from ``times[0]`` and record the nodes at every time.
+
+        Args:
+            x, v: nodal positions [m] and velocities [m/s] at the first time, (n, 3).
+            held: prescribed nodes; their paths are given at ``times``.
+            times: (T,) [s], strictly increasing.
+            progress: called with (frames done, frames in all) once a frame; may raise to stop.
+
+        Returns:
+            nodal positions [m], (T, n, 3) float64.
+
+        Raises:
+            UnstableSimulation: a cell inverted or a state is not finite.
+            ParticlesLeftTheGrid: a node is absurdly far from its start.
+        """
+        device = self.problem.device
+        nodes = len(self.mass)
+        slot = np.full(nodes, -1, dtype=np.int32)
+        slot[held.nodes] = np.arange(len(held.nodes), dtype=np.int32)
+        frames = len(times)
+
+        def upload(values: np.ndarray, dtype: type = wp.float64) -> wp.array:
+            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
+
+        x_d, v_d = upload(x.reshape(-1)), upload(v.reshape(-1))
+        force = wp.zeros(3 * nodes, dtype=wp.float64, device=device)
+        clock = wp.zeros(3, dtype=wp.float64, device=device)
+        counter = wp.zeros(3, dtype=wp.int32, device=device)
+        width = max(3 * len(held.nodes), 1)
+        paths = np.zeros((2, frames, width))
+        paths[0, :, : 3 * len(held.nodes)] = held.positions.reshape(frames, -1)
+        paths[1, :, : 3 * len(held.nodes)] = held.velocities.reshape(frames, -1)
+        node_inputs = [
+            upload(self.mass), upload(slot, wp.int32), upload(paths[0]), upload(paths[1]),
+            wp.vec3d(*self.problem.gravity_m_s2), wp.float64(self.problem.drag_per_s), clock, counter,
+        ]  # fmt: skip
+        contact = self.problem.ground.bind(device) if self.problem.ground is not None else None
+
+        self.forces.inverted.zero_()
+        self.forces.launch(x_d, clock, force)  # remembers the first strains; its forces are thrown away
+        force.zero_()
+
+        def substep() -> None:
+            self.forces.launch(x_d, clock, force)
+            if contact is not None:
+                contact.launch(x_d, v_d, force)
+            wp.launch(advance_nodes, dim=nodes, inputs=node_inputs, outputs=[force, x_d, v_d], device=device)
+            wp.launch(advance_counter, dim=1, inputs=[counter], device=device)
+
+        with wp.ScopedCapture(device=device) as capture:
+            for _ in range(_CHUNK):
+                substep()
+
+        recorded = np.empty((frames, nodes, 3))
+        recorded[0] = x
+        size = float(np.ptp(x, axis=0).max()) + float(self.problem.lattice.spacing.max())
+        for frame in range(frames - 1):
+            interval = times[frame + 1] - times[frame]
+            chunks = max(1, int(np.ceil(interval / (self.time_step_s * _CHUNK))))
+            dt = interval / (chunks * _CHUNK)
+            clock.assign(np.array([interval, 1.0 / dt, dt]))
+            counter.assign(np.array([frame, 0, chunks * _CHUNK], dtype=np.int32))
+            for _ in range(chunks):
+                wp.capture_launch(capture.graph)
+            self.substeps += chunks * _CHUNK
+            recorded[frame + 1] = x_d.numpy().reshape(nodes, 3)
+            self._check(recorded[frame + 1], x, size, times[frame + 1], dt)
+            if progress is not None:
+                progress(frame + 1, frames - 1)
+        return recorded
+
+    def _check(self, now: np.ndarray, start: np.ndarray, size: float, time: float, dt: float) -> None:
+        if self.forces.inverted.numpy()[0] or not np.isfinite(now).all():
+            raise UnstableSimulation(
+                f"the body inverted or blew up at t = {time:.4f} s with time step {dt:.3g} s "
+                f"({int((~np.isfinite(now)).any(axis=1).sum())} of {len(now)} nodes not finite)"
+            )
+        farthest = float(np.abs(now - start).max())
+        if farthest > _REACH * size:
+            raise ParticlesLeftTheGrid(
+                f"a node is {farthest:.3g} m from its start at t = {time:.4f} s; the body is {size:.3g} m long"
+            )
+
+
+def nodal_mass(lattice: Lattice, law: Law, density_factor: np.ndarray | None) -> np.ndarray:
+    """Lumped nodal masses [kg], (n,): rows of the mass matrix summed."""
+    density = {3: "density_kg_m3", 2: "density_kg_m2", 1: "density_kg_m"}[lattice.dim]
+    particle_mass = getattr(law, density) * lattice.particle_measures
+    if density_factor is not None:
+        particle_mass = particle_mass * density_factor
+    weights = lattice.table((0,) * lattice.dim)
+    per_cell = particle_mass.reshape(len(lattice.cells), -1) @ weights.T
+    mass = np.zeros(len(lattice.nodes))
+    np.add.at(mass, lattice.cell_nodes, per_cell)
+    return mass

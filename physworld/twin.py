@@ -1,0 +1,384 @@
+"""The digital twin: a reference body, its law, its grips, and the simulations that they allow.
+
+A twin is immutable; :meth:`Twin.with_parameters` gives a changed one. Positions go in and out in world coordinates
+[m]; a twin's *particles* are the quadrature points of its lattice, and its *tracked points* are the measured points of
+the scene followed as material points.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, fields, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+from scipy.sparse.linalg import splu
+
+from physworld.geometry.reference import ReferenceBody, reference_body
+from physworld.geometry.rigid import least_rotation, rigid_groups, rigid_motion
+from physworld.materials.laws import Law, RodLaw, SheetLaw, SolidLaw
+from physworld.mpm.contact import GroundContact
+from physworld.mpm.lattice import Lattice
+from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian
+from physworld.scene import AS_MEASURED, Scene
+
+Progress = Callable[[int, int], None]
+
+PRIOR_DENSITY_KG_M3 = 1000.0
+PRIOR_FRICTION = 0.5
+_LAWS: dict[int, type[Law]] = {1: RodLaw, 2: SheetLaw, 3: SolidLaw}
+_RELEASE_SIGMAS = 10.0
+_RELEASE_SHARE = 2e-3  # motion below this share of the body's size is not a release
+_MERGE_S = 1e-6  # control and frame times closer than this are one
+
+
+@dataclass(frozen=True)
+class Twin:
+    """See the module's text.
+
+    Attributes:
+        body: reference lattice, start, tracked points.
+        law: constitutive parameters.
+        gravity_m_s2: (3,).
+        air_drag_per_s: linear drag rate [1/s].
+        ground_height_m, ground_friction: ground plane, or None.
+        controller_groups: controllers that move as one rigid grip.
+        held_nodes: nodes that each grip holds, one array a group.
+        controllers_start: controllers at the first frame [m], (K, 3).
+        release_s: the body is held at its start until then (somebody let go of it).
+    """
+
+    body: ReferenceBody
+    law: Law
+    gravity_m_s2: np.ndarray
+    air_drag_per_s: float
+    ground_height_m: float | None
+    ground_friction: float
+    controller_groups: tuple[np.ndarray, ...]
+    held_nodes: tuple[np.ndarray, ...]
+    controllers_start: np.ndarray
+    release_s: float = 0.0
+
+    @property
+    def lattice(self) -> Lattice:
+        """The reference lattice."""
+        return self.body.lattice
+
+    @cached_property
+    def _particle_rows(self) -> Any:
+        return self.lattice.interpolation(self.lattice.particle_coordinates)
+
+    @property
+    def particles_rest(self) -> np.ndarray:
+        """Particles of the body without stress [m], (P, 3)."""
+        return self._particle_rows @ self.body.rest
+
+    @property
+    def particles_start(self) -> np.ndarray:
+        """Particles at the first frame [m], (P, 3)."""
+        return self._particle_rows @ self.body.start
+
+    @property
+    def particle_mass(self) -> np.ndarray:
+        """Mass of every particle [kg], (P,)."""
+        return self.density * self.lattice.particle_measures
+
+    @property
+    def density(self) -> float:
+        """Mass per volume, area or length [kg/m**d]."""
+        return float(getattr(self.law, {3: "density_kg_m3", 2: "density_kg_m2", 1: "density_kg_m"}[self.lattice.dim]))
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Every scalar that a calibration may change, by name (units in the names)."""
+        values = {**asdict(self.law), "air_drag_per_s": self.air_drag_per_s}
+        if self.ground_height_m is not None:
+            values["ground_friction"] = self.ground_friction
+        return values
+
+    def with_parameters(self, **values: float) -> Twin:
+        """A twin with other parameters; names are those of :attr:`parameters`. Raises KeyError for an unknown one."""
+        law_names = {f.name for f in fields(self.law)}
+        own = {"air_drag_per_s", "ground_friction"}
+        unknown = set(values) - law_names - own
+        if unknown:
+            raise KeyError(f"unknown parameters {sorted(unknown)}; this twin has {sorted(self.parameters)}")
+        law = replace(self.law, **{k: float(v) for k, v in values.items() if k in law_names})
+        return replace(self, law=law, **{k: float(v) for k, v in values.items() if k in own})
+
+    def simulate(
+        self,
+        control_times: np.ndarray,
+        control_points: np.ndarray,
+        frame_times: np.ndarray,
+        *,
+        properties: np.ndarray | None = None,
+        progress: Progress | None = None,
+        from_rest: bool = False,
+    ) -> np.ndarray:
+        """Particles (P, 3) [m] at every frame, (T, P, 3): see :meth:`simulate_nodes` for the arguments."""
+        nodes = self.simulate_nodes(
+            control_times, control_points, frame_times, properties=properties, progress=progress, from_rest=from_rest
+        )
+        return self.particles_at(nodes)
+
+    def simulate_nodes(
+        self,
+        control_times: np.ndarray,
+        control_points: np.ndarray,
+        frame_times: np.ndarray,
+        *,
+        properties: np.ndarray | None = None,
+        progress: Progress | None = None,
+        from_rest: bool = False,
+    ) -> np.ndarray:
+        """Integrate under a control track and return the nodes at the frames.
+
+        Args:
+            control_times, control_points: (Tc,) [s] and (Tc, K, 3) [m]; first time is the start.
+            frame_times: (T,) [s], the first one is the start.
+            properties: log factors of stiffness and density, (P, 2), or None.
+            progress: called with (knots done, knots in all); may raise to stop.
+            from_rest: start with zero velocity and release at once.
+
+        Returns:
+            (T, n, 3) [m].
+
+        Raises:
+            SimulationError: the run cannot be trusted; the message has the numbers.
+        """
+        knots, frame_index = _knots(control_times, frame_times, 0.0 if from_rest else self.release_s)
+        controls = PchipInterpolator(control_times, control_points, axis=0)(
+            np.clip(knots, control_times[0], control_times[-1])
+        )
+        problem = Problem(
+            lattice=self.lattice,
+            law=self.law,
+            rest=self.body.rest,
+            gravity_m_s2=self.gravity_m_s2,
+            drag_per_s=self.air_drag_per_s,
+            stiffness_factor=None if properties is None else np.exp(properties[:, 0]),
+            density_factor=None if properties is None else np.exp(properties[:, 1]),
+            ground=self._ground(),
+        )
+        velocity = np.zeros_like(self.body.start) if from_rest else self.body.start_velocity
+        held = self._held(knots, controls)
+        nodes = TotalLagrangian(problem).run(self.body.start, velocity, held, knots, progress)
+        held_back = np.repeat(self.body.start[None], int(np.sum(frame_index < 0)), axis=0)
+        return np.concatenate([held_back, nodes[frame_index[frame_index >= 0]]])
+
+    def particles_at(self, nodes: np.ndarray) -> np.ndarray:
+        """Particles (T, P, 3) of nodal trajectories (T, n, 3)."""
+        return _apply(self._particle_rows, nodes)
+
+    def track_nodes(self, nodes: np.ndarray) -> np.ndarray:
+        """Tracked points (T, N, 3) of nodal trajectories (T, n, 3)."""
+        body, lattice = self.body, self.lattice
+        tracks = _apply(lattice.interpolation(body.points), nodes)
+        if lattice.dim == 2 and np.any(body.offsets):
+            first = _apply(lattice.interpolation(body.points, (1, 0)), nodes)
+            second = _apply(lattice.interpolation(body.points, (0, 1)), nodes)
+            normal = np.cross(first, second)
+            tracks = tracks + body.offsets * normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+        elif lattice.dim == 1 and np.any(body.offsets):
+            slope = lattice.interpolation(body.points, (1,))
+            turn = least_rotation((slope @ body.start)[None], _apply(slope, nodes))
+            tracks = tracks + np.einsum("tnij,nj->tni", turn, body.offsets)
+        return tracks
+
+    def track(self, particles: np.ndarray) -> np.ndarray:
+        """Tracked points (T, N, 3) of particle trajectories (T, P, 3), through the nodes that carry them."""
+        rows = self._particle_rows
+        factor = splu((rows.T @ rows).tocsc())
+        flat = np.asarray(particles, dtype=float).transpose(1, 0, 2).reshape(rows.shape[0], -1)
+        nodes = factor.solve(rows.T @ flat).reshape(rows.shape[1], -1, 3).transpose(1, 0, 2)
+        return self.track_nodes(nodes)
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Everything as plain arrays, fit for an npz without pickle; :meth:`from_arrays` is the inverse."""
+        lattice, body = self.lattice, self.body
+        facts = {
+            "law": type(self.law).__name__,
+            "law_parameters": asdict(self.law),
+            "air_drag_per_s": self.air_drag_per_s,
+            "ground_height_m": self.ground_height_m,
+            "ground_friction": self.ground_friction,
+            "release_s": self.release_s,
+            "thickness_m": body.thickness_m,
+            "notes": list(body.notes),
+            "groups": [g.tolist() for g in self.controller_groups],
+            "held": [h.tolist() for h in self.held_nodes],
+        }
+        return {
+            "facts": np.array(json.dumps(facts)),
+            "gravity": np.asarray(self.gravity_m_s2, dtype=float),
+            "controllers_start": self.controllers_start,
+            **{f"lattice_{f.name}": getattr(lattice, f.name) for f in fields(lattice)},
+            **{f"body_{k}": getattr(body, k) for k in ("rest", "start", "start_velocity", "points", "offsets")},
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, np.ndarray]) -> Twin:
+        """The twin that :meth:`to_arrays` took apart."""
+        facts = json.loads(str(arrays["facts"]))
+        lattice = Lattice(**{f.name: arrays[f"lattice_{f.name}"] for f in fields(Lattice)})
+        body = ReferenceBody(
+            lattice=lattice,
+            thickness_m=facts["thickness_m"],
+            notes=tuple(facts["notes"]),
+            **{k: arrays[f"body_{k}"] for k in ("rest", "start", "start_velocity", "points", "offsets")},
+        )
+        return cls(
+            body=body,
+            law=_LAWS[lattice.dim](**facts["law_parameters"]),
+            gravity_m_s2=arrays["gravity"],
+            air_drag_per_s=facts["air_drag_per_s"],
+            ground_height_m=facts["ground_height_m"],
+            ground_friction=facts["ground_friction"],
+            controller_groups=tuple(np.array(g, dtype=int) for g in facts["groups"]),
+            held_nodes=tuple(np.array(h, dtype=int) for h in facts["held"]),
+            controllers_start=arrays["controllers_start"],
+            release_s=facts["release_s"],
+        )
+
+    def _ground(self) -> GroundContact | None:
+        if self.ground_height_m is None or not isinstance(self.law, SolidLaw):
+            return None
+        return GroundContact(self.lattice, self.law, self.ground_height_m, self.ground_friction)
+
+    def _held(self, times: np.ndarray, controls: np.ndarray) -> HeldNodes:
+        numbers, paths = [np.empty(0, dtype=int)], [np.empty((len(times), 0, 3))]
+        for group, nodes in zip(self.controller_groups, self.held_nodes, strict=True):
+            rotation, shift = rigid_motion(self.controllers_start[group], controls[:, group])
+            numbers.append(nodes)
+            paths.append(np.einsum("tij,nj->tni", rotation, self.body.start[nodes]) + shift[:, None])
+        positions = np.concatenate(paths, axis=1)
+        velocities = np.gradient(positions, times, axis=0, edge_order=2 if len(times) > 2 else 1)
+        return HeldNodes(np.concatenate(numbers), positions, velocities)
+
+
+def build_twin(scene: Scene, particle_budget: int = 2000) -> Twin:
+    """A twin of the scene with prior parameters, to be calibrated.
+
+    Args:
+        scene: the recording.
+        particle_budget: about how many particles a solid gets; rods and sheets take what their shape needs.
+
+    Raises:
+        SceneUnsupported: the scene declares too little for a body.
+    """
+    body = reference_body(scene, particle_budget)
+    times, controls = scene.control_track()
+    reach = 0.6 * float(np.ptp(body.start, axis=0).max())
+    if scene.grips:
+        groups = tuple(np.array(g.controllers, dtype=int) for g in scene.grips)
+    else:
+        groups = tuple(rigid_groups(controls, reach))
+    held, taken = [], np.empty(0, dtype=int)
+    for number, group in enumerate(groups):
+        region = scene.grips[number] if scene.grips else None
+        nodes = np.setdiff1d(_gripped_nodes(body, controls[0, group], region), taken)
+        held.append(nodes)
+        taken = np.concatenate([taken, nodes])
+    friction = scene.ground.friction if scene.ground is not None else None
+    return Twin(
+        body=body,
+        law=_prior_law(scene, body),
+        gravity_m_s2=np.asarray(scene.gravity_m_s2, dtype=float),
+        air_drag_per_s=0.0,
+        ground_height_m=scene.ground.height_m if scene.ground is not None else None,
+        ground_friction=PRIOR_FRICTION if friction is None else friction,
+        controller_groups=groups,
+        held_nodes=tuple(held),
+        controllers_start=controls[0],
+        release_s=_release_time(scene),
+    )
+
+
+def _prior_law(scene: Scene, body: ReferenceBody) -> Law:
+    facts, lattice = scene.body, body.lattice
+    measure = float(lattice.particle_measures.sum())
+    section = {3: 1.0, 2: body.thickness_m, 1: np.pi * body.thickness_m**2}[lattice.dim]
+    if facts.density_kg_m3 is not None:
+        density = facts.density_kg_m3 * section
+    elif facts.mass_kg is not None:
+        density = facts.mass_kg / measure
+    else:
+        density = PRIOR_DENSITY_KG_M3 * section
+    modulus = 1e5
+    if lattice.dim == 3:
+        return SolidLaw(youngs_modulus_pa=modulus, density_kg_m3=density)
+    if lattice.dim == 2:
+        membrane = modulus * section / (1 - 0.3**2)
+        return SheetLaw(membrane, membrane * section**2 / 12, density_kg_m2=density)
+    return RodLaw(stretching_n=density * 40.0**2, bending_n_m2=density * 1e-2, density_kg_m=density)
+
+
+def _gripped_nodes(body: ReferenceBody, controllers: np.ndarray, grip: Any) -> np.ndarray:
+    """Every node that gripped material touches: all nodes of cells half of whose particles are in the grip."""
+    lattice = body.lattice
+    particles = lattice.interpolation(lattice.particle_coordinates) @ body.start
+    slack = 1e-6
+    if grip is not None and grip.region_min_m is not None:
+        low, high = np.asarray(grip.region_min_m) - slack, np.asarray(grip.region_max_m) + slack
+        margin = 0.5 * body.thickness_m if lattice.dim < 3 else 0.0
+        inside = np.all((particles >= low - margin) & (particles <= high + margin), axis=1)
+    else:
+        nearest = lattice.particle_coordinates[_nearest(particles, controllers)]
+        reach = 0.5 * lattice.spacing
+        low, high = nearest.min(axis=0) - reach, nearest.max(axis=0) + reach
+        coordinates = lattice.particle_coordinates
+        inside = np.all((coordinates >= low) & (coordinates <= high), axis=1)
+    solid = lattice.fill > 0
+    share = (inside.reshape(solid.shape) & solid).sum(axis=1) / np.maximum(solid.sum(axis=1), 1)
+    cells = share >= 0.5 if np.any(share >= 0.5) else share > 0
+    if not np.any(cells):
+        cells = np.zeros(len(lattice.cells), dtype=bool)
+        cells[np.unique(_nearest(particles, controllers) // lattice.fill.shape[1])] = True
+    return np.unique(lattice.cell_nodes[cells])
+
+
+def _nearest(particles: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    return np.argmin(np.linalg.norm(targets[:, None] - particles[None], axis=2), axis=1)
+
+
+def _release_time(scene: Scene) -> float:
+    """When a body that is held by nobody known starts to move [s]; 0 where it moves from the start.
+
+    A body that neither moves nor is moved stays where it is in any case, so holding it changes nothing; one that
+    starts out of balance (kept level by a hand, say) falls only when it is let go.
+    """
+    if scene.initial_state != AS_MEASURED:
+        return 0.0
+    size = float(np.ptp(np.concatenate([scene.points[0], scene.controllers[0]]), axis=0).max())
+    limit = max(_RELEASE_SIGMAS * (scene.noise_sigma_m or 0.0), _RELEASE_SHARE * size)
+    moved = np.linalg.norm(scene.points - scene.points[0], axis=2)
+    moved = np.where(scene.visible & scene.visible[0], moved, 0.0).max(axis=1) > limit
+    driven = np.linalg.norm(scene.controllers - scene.controllers[0], axis=2).max(axis=1) > _RELEASE_SHARE * size
+    first = int(np.argmax(moved)) if moved.any() else 0
+    if first >= scene.train[1] or driven[: first + 1].any():
+        return 0.0
+    return float(scene.times[max(first - 1, 0)])
+
+
+def _knots(control_times: np.ndarray, frame_times: np.ndarray, release: float) -> tuple[np.ndarray, np.ndarray]:
+    """Times at which the solver stops, and each frame's place among them (-1 before the release)."""
+    start = max(float(frame_times[0]), release)
+    inner = control_times[(control_times > start) & (control_times < frame_times[-1])]
+    knots = np.unique(np.concatenate([[start], inner, frame_times[frame_times >= start]]))
+    keep = np.concatenate([[True], np.diff(knots) > _MERGE_S])
+    knots = knots[keep]
+    if len(knots) < 2:
+        knots = np.array([start, start + 1e-3])
+    index = np.clip(np.searchsorted(knots, frame_times + _MERGE_S, side="right") - 1, 0, len(knots) - 1)
+    return knots, np.where(frame_times < start - _MERGE_S, -1, index)
+
+
+def _apply(matrix: Any, nodes: np.ndarray) -> np.ndarray:
+    """Sparse (M, n) times trajectories (T, n, 3): (T, M, 3)."""
+    frames, n, _ = nodes.shape
+    flat = matrix @ nodes.transpose(1, 0, 2).reshape(n, -1)
+    return np.asarray(flat).reshape(matrix.shape[0], frames, 3).transpose(1, 0, 2)
