@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from physworld.demonstrate.limits import limits_of, training_track
+from physworld.demonstrate.limits import MotionLimits, limits_of, training_track
 from physworld.demonstrate.motion import random_motion
 from physworld.demonstrate.perturbation import perturb_properties
 from physworld.demonstrate.replay import (
@@ -134,12 +134,12 @@ def plan_episode(scene: Scene, twin: Twin, config: DemonstrationConfig, seed: in
     if choice.uniform() < config.replay_share:
         motion, rate = str(choice.choice(VARIANTS)), float(np.exp(choice.uniform(*np.log(WARP))))
         from_rest, scale = motion != "replay", 1.0
-        control_times, points = _replay(scene, twin, motion, rate, duration, config.control_substeps)
+        control_times, points = _replay(scene, twin, limits, motion, rate, duration, config.control_substeps)
     else:
         from_rest = True
         control_times = _control_times(duration, dt, config.control_substeps)
         first_pose = training_track(scene)[1][0]
-        drawn = random_motion(first_pose, twin.controller_groups, limits, control_times, motion_generator)
+        drawn = random_motion(first_pose, limits, control_times, motion_generator)
         motion, points, scale = drawn.pattern, drawn.points, drawn.scale
     ticks = slice(None, None, config.control_substeps)
     return EpisodePlan(
@@ -241,7 +241,13 @@ def _control_times(duration_s: float, dt: float, substeps: int) -> np.ndarray:
 
 
 def _replay(
-    scene: Scene, twin: Twin, motion: str, rate: float, duration_s: float, substeps: int
+    scene: Scene,
+    twin: Twin,
+    limits: MotionLimits,
+    motion: str,
+    rate: float,
+    duration_s: float,
+    substeps: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Control times (S,) and points (S, K, 3) of a variant of the training track, cut at ``duration_s``."""
     dt = model_dt(scene.fps)
@@ -251,7 +257,7 @@ def _replay(
         return control_times, replayed(track_times, track, control_times)
     if motion == "replay_mirrored":
         object_centre = twin.particles_start.mean(axis=0)
-        track, rate = mirrored(track, twin.controller_groups, object_centre, _up(scene)), 1.0
+        track, rate = mirrored(track, limits.grips, object_centre, _up(scene)), 1.0
     control_times = _control_times(min(duration_s, playback_duration(track_times[-1], rate)), dt, substeps)
     return control_times, replayed(track_times, track, playback_clock(control_times, rate))
 

@@ -18,6 +18,7 @@ from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from physworld.geometry.rigid import rigid_motion
 from physworld.scene import Scene
 from physworld.worldmodel.clock import model_dt, resample
 
@@ -34,7 +35,9 @@ GROUND_CLEARANCE = 0.02  # in object sizes
 CLOSENESS = 0.3  # grips do not come nearer than this share of their first distance
 SLACK = 1.01  # the recording's own noise must not forbid its first pose
 GRAPH_NEIGHBORS = 24
-IDENTITY_PRIOR = 1e-3  # keeps the rotation of a two-point grip minimal about its own axis
+JOINED_SHARE = 0.15  # grips with less material between them, in object sizes, are one body
+CLAMP_SHARE = 0.5  # the same for grips that kept their distance within STEADY_SHARE
+STEADY_SHARE = 0.1
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,7 @@ class MotionLimits:
     """Limits of the grips' motion; G grips.
 
     Attributes:
+        grips: control points that move as one rigid body, G index arrays.
         reach_min_m, reach_max_m: box of a grip centre's displacement from its first place, (3,).
         speed_m_s, acceleration_m_s2: of any control point.
         turn_rad: largest rotation of a grip from its first pose.
@@ -50,6 +54,7 @@ class MotionLimits:
         size_m: largest side of the rest shape's bounding box.
     """
 
+    grips: tuple[np.ndarray, ...]
     reach_min_m: np.ndarray
     reach_max_m: np.ndarray
     speed_m_s: float
@@ -63,28 +68,28 @@ class MotionLimits:
 
 def limits_of(scene: Scene, twin: Twin) -> MotionLimits:
     """The limits that the training frames of ``scene`` and the twin's rest shape give."""
-    size = float(np.ptp(twin.particles_rest, axis=0).max())
+    rest, start = twin.particles_rest, twin.particles_start
+    size = float(np.ptp(rest, axis=0).max())
     times, track = training_track(scene)
-    groups = twin.controller_groups
-    centres = np.stack([track[:, group].mean(axis=1) for group in groups], axis=1)
+    paths = material_paths(rest, start, track[0])
+    grips = _joined_grips(twin.controller_groups, track, paths, size)
+    centres = np.stack([track[:, grip].mean(axis=1) for grip in grips], axis=1)
     moves = centres - centres[0]
+    distances = np.linalg.norm(centres[:, :, None] - centres[:, None, :], axis=-1)
     floor = _floor(scene, track, size)
     reach_min = np.minimum(moves.min(axis=(0, 1)), -REACH_FLOOR * size)
     reach_min[2] = max(reach_min[2], floor - float(track[0, :, 2].min()))
-    distances = np.linalg.norm(centres[:, :, None] - centres[:, None, :], axis=-1)
-    material = material_distances(twin.particles_rest, twin.particles_start, track[0], groups)
     speed, acceleration = _speed_and_acceleration(scene, times, track)
     speed = max(speed, SPEED_FLOOR * size)
-    turns = [grip_turns(track[:, group]).magnitude() for group in groups if len(group) > 1]
-    turn = float(np.percentile(np.concatenate(turns), SPEED_PERCENTILE)) if turns else 0.0
     return MotionLimits(
+        grips=grips,
         reach_min_m=reach_min,
         reach_max_m=np.maximum(moves.max(axis=(0, 1)), REACH_FLOOR * size),
         speed_m_s=speed,
         acceleration_m_s2=max(acceleration, speed / RAMP_S),
-        turn_rad=float(np.clip(turn, TURN_FLOOR_RAD, TURN_CEILING_RAD)),
+        turn_rad=float(np.clip(_turn(grips, track), TURN_FLOOR_RAD, TURN_CEILING_RAD)),
         spread_min_m=np.minimum(CLOSENESS * distances[0], distances.min(axis=0) / SLACK),
-        spread_max_m=np.maximum(SLACK * distances.max(axis=0), material),
+        spread_max_m=np.maximum(SLACK * distances.max(axis=0), material_between(grips, paths)),
         floor_m=floor,
         size_m=size,
     )
@@ -99,44 +104,52 @@ def training_track(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     return all_times - start, resample(points, times, all_times)
 
 
-def grip_turns(points: np.ndarray) -> Rotation:
-    """Rotations of a rigid grip from its first pose, from its points (T, n, 3) by orthogonal Procrustes.
+def material_paths(rest: np.ndarray, start: np.ndarray, control_points: np.ndarray) -> np.ndarray:
+    """Shortest paths [m] through the rest shape between what the control points hold, (K, K); inf: none.
 
-    A small pull towards the identity settles what too few points leave open: a grip of two points turns by
-    the smallest rotation that carries one axis to the other.
-    """
-    first = points[0] - points[0].mean(axis=0)
-    now = points - points.mean(axis=1, keepdims=True)
-    prior = IDENTITY_PRIOR * max(float(np.sum(first**2)), np.finfo(np.float64).tiny)
-    covariance = np.einsum("tni,nj->tij", now, first) + prior * np.eye(3)
-    left, _, right = np.linalg.svd(covariance)
-    left[:, :, 2] *= np.sign(np.linalg.det(left @ right))[:, None]
-    return Rotation.from_matrix(left @ right)
-
-
-def material_distances(
-    rest: np.ndarray, start: np.ndarray, control_points: np.ndarray, groups: Sequence[np.ndarray]
-) -> np.ndarray:
-    """Shortest paths [m] through the rest shape between what the grips hold, (G, G); inf where none leads.
-
-    Particles ``rest`` and ``start`` (P, 3) are the same material; each grip holds the particles of the start
-    state that are nearest to its ``control_points`` (K, 3).
+    Particles ``rest`` and ``start`` (P, 3) are the same material; a control point of ``control_points`` (K, 3)
+    holds the particle of the start state that is nearest to it.
     """
     count = len(rest)
     distances, indices = cKDTree(rest).query(rest, k=min(GRAPH_NEIGHBORS, count - 1) + 1)
     rows = np.repeat(np.arange(count), indices.shape[1])
     entries = (distances.ravel(), (rows, indices.ravel()))
     graph = sparse.coo_matrix(entries, shape=(count, count)).tocsr()
-    graph = graph.maximum(graph.T)
     _, nearest = cKDTree(start).query(control_points)
-    held = [np.unique(nearest[group]) for group in groups]
-    result = np.zeros((len(groups), len(groups)))
-    for g, particles in enumerate(held):
-        paths = csgraph.dijkstra(graph, directed=False, indices=particles)
-        for h, others in enumerate(held):
-            # between the middles of what the two hold, as the centres are
-            result[g, h] = 0.0 if g == h else float(np.mean(paths[:, others]))
-    return 0.5 * (result + result.T)
+    return csgraph.dijkstra(graph.maximum(graph.T), directed=False, indices=nearest)[:, nearest]
+
+
+def material_between(grips: Sequence[np.ndarray], paths: np.ndarray) -> np.ndarray:
+    """Mean material path [m] between grips, (G, G), zero on the diagonal."""
+    means = [[float(paths[np.ix_(one, other)].mean()) for other in grips] for one in grips]
+    return np.array(means) * (1.0 - np.eye(len(grips)))
+
+
+def _joined_grips(
+    groups: Sequence[np.ndarray], track: np.ndarray, paths: np.ndarray, size: float
+) -> tuple[np.ndarray, ...]:
+    """Groups that move as one body: those on the same small piece of material.
+
+    Groups are joined when the material between them is short, or shorter than half the object while the
+    recording never moved them against each other (a clamp seen by several markers).
+    """
+    material = material_between(groups, paths)
+    centres = np.stack([track[:, group].mean(axis=1) for group in groups], axis=1)
+    distances = np.linalg.norm(centres[:, :, None] - centres[:, None, :], axis=-1)
+    steady = np.ptp(distances, axis=0) < STEADY_SHARE * distances[0]
+    joined = (material < JOINED_SHARE * size) | (steady & (material < CLAMP_SHARE * size))
+    count, labels = csgraph.connected_components(sparse.csr_matrix(joined), directed=False)
+    return tuple(np.concatenate([groups[g] for g in np.flatnonzero(labels == c)]) for c in range(count))
+
+
+def _turn(grips: Sequence[np.ndarray], track: np.ndarray) -> float:
+    """A high percentile of the grips' rotation from their first pose [rad]."""
+    angles = [
+        Rotation.from_matrix(rigid_motion(track[0, grip], track[:, grip])[0]).magnitude()
+        for grip in grips
+        if len(grip) > 1
+    ]
+    return float(np.percentile(np.concatenate(angles), SPEED_PERCENTILE)) if angles else 0.0
 
 
 def _speed_and_acceleration(scene: Scene, times: np.ndarray, track: np.ndarray) -> tuple[float, float]:

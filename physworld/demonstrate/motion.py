@@ -16,7 +16,7 @@ it. Everything starts at the recording's first pose, at rest.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -108,7 +108,6 @@ def patterns_for(grips: int) -> tuple[str, ...]:
 
 def random_motion(
     first_pose: np.ndarray,
-    groups: Sequence[np.ndarray],
     limits: MotionLimits,
     times: np.ndarray,
     generator: np.random.Generator,
@@ -116,9 +115,9 @@ def random_motion(
 ) -> Motion:
     """A random motion of the control points from ``first_pose`` (K, 3) at ``times`` (T,) within the limits.
 
-    Control points in no group stay where they are.
+    Control points in no grip stay where they are.
     """
-    grips = len(groups)
+    groups, grips = limits.grips, len(limits.grips)
     pattern = str(generator.choice(patterns_for(grips))) if pattern is None else pattern
     duration = float(times[-1])
     share = PATHS_ADDED if pattern == "bimanual" else 1.0
@@ -128,7 +127,7 @@ def random_motion(
     if pattern in ("together", "bimanual"):
         common = random_path(limits, duration, generator, share=share, turning=turning)
     if len(movers):
-        allowed = _spread_check(first_pose, groups, movers, limits)
+        allowed = _spread_check(first_pose, movers, limits)
         relative = random_path(limits, duration, generator, share=share, turning=turning, allowed=allowed)
     common_move, common_turn = common.pose(times)
     relative_move, relative_turn = relative.pose(times)
@@ -137,7 +136,7 @@ def random_motion(
         """Control points with every displacement and turn times ``scale``."""
         points = np.repeat(first_pose[None], len(times), axis=0)
         if pattern == "together":
-            body = np.concatenate(list(groups))
+            body = np.concatenate(groups)
             points[:, body] = rigid_points(first_pose[body], scale * common_move, scale * common_turn)
             return points
         for g, group in enumerate(groups):
@@ -147,7 +146,7 @@ def random_motion(
             points[:, group] = rigid_points(first_pose[group], scale * displacement, scale * turn)
         return points
 
-    scale = _largest(lambda share: broken_limit(place(share), groups, limits, times) is None)
+    scale = _largest(lambda share: broken_limit(place(share), limits, times) is None)
     return Motion(pattern, place(scale), scale)
 
 
@@ -187,11 +186,9 @@ def random_path(
     return GripPath(tuple(segments))
 
 
-def broken_limit(
-    points: np.ndarray, groups: Sequence[np.ndarray], limits: MotionLimits, times: np.ndarray
-) -> str | None:
+def broken_limit(points: np.ndarray, limits: MotionLimits, times: np.ndarray) -> str | None:
     """The first limit that control points (T, K, 3) pass, with its numbers; None when they keep all."""
-    centres = np.stack([points[:, group].mean(axis=1) for group in groups], axis=1)
+    centres = np.stack([points[:, grip].mean(axis=1) for grip in limits.grips], axis=1)
     moves = centres - centres[0]
     slack = 1e-9 * max(limits.size_m, 1e-3)
     if np.any(moves < limits.reach_min_m - slack) or np.any(moves > limits.reach_max_m + slack):
@@ -246,11 +243,9 @@ def _next_curve(
     return straight(place, np.zeros(3)) if np.linalg.norm(place) > 0.0 else None
 
 
-def _spread_check(
-    first_pose: np.ndarray, groups: Sequence[np.ndarray], movers: np.ndarray, limits: MotionLimits
-) -> Allowed:
+def _spread_check(first_pose: np.ndarray, movers: np.ndarray, limits: MotionLimits) -> Allowed:
     """Whether displacements of the ``movers`` against the other grips keep every pair's spread."""
-    first = np.stack([first_pose[group].mean(axis=0) for group in groups])
+    first = np.stack([first_pose[grip].mean(axis=0) for grip in limits.grips])
 
     def allowed(displacement: np.ndarray) -> bool:
         centres = np.repeat(first[None], len(displacement), axis=0)

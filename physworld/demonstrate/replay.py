@@ -15,8 +15,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from physworld.demonstrate.limits import grip_turns
 from physworld.demonstrate.motion import rigid_points
+from physworld.geometry.rigid import rigid_motion
 from physworld.worldmodel.clock import resample
 
 VARIANTS = ("replay", "replay_warped", "replay_mirrored")
@@ -57,7 +57,7 @@ def mirrored(
         displacement = (track[:, group].mean(axis=1) - first) @ mirror
         turns = np.zeros_like(displacement)
         if len(group) > 1:
-            rotations = grip_turns(track[:, group]).as_matrix()
+            rotations, _ = rigid_motion(track[0, group], track[:, group])
             turns = Rotation.from_matrix(mirror @ rotations @ mirror).as_rotvec()
         result[:, group] = rigid_points(track[0, group], displacement, turns)
     return result
