@@ -1,0 +1,108 @@
+"""Content-addressed files: ``artifacts/ab/<sha256>``, written once, never changed.
+
+A write is atomic (a reader sees the whole file or none); writing the same bytes again writes nothing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import obstore
+
+from schemas.base import Artifact
+from storage.errors import ArtifactCorrupt, NotFound
+from storage.settings import Settings
+from storage.store import open_store, reading, writing
+
+CHUNK_BYTES = 1 << 20
+DEFAULT_MEDIA_TYPE = "application/octet-stream"
+SHA256 = re.compile(r"[0-9a-f]{64}")
+
+
+class ArtifactStore:
+    """Files by the SHA-256 of their bytes, in a local folder or a bucket."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._store = open_store(settings)
+
+    def put_bytes(self, data: bytes, name: str, media_type: str = DEFAULT_MEDIA_TYPE) -> Artifact:
+        """Store ``data``. Raises StoreWriteFailed or StoreFull; nothing is then visible."""
+        sha256 = hashlib.sha256(data).hexdigest()
+        if not self._has(sha256, len(data)):
+            with writing(f"artifact {name}", len(data), self._settings):
+                obstore.put(self._store, _key(sha256), data)
+        return Artifact(name=name, sha256=sha256, size=len(data), media_type=media_type)
+
+    def put_file(
+        self, path: Path | str, name: str | None = None, media_type: str = DEFAULT_MEDIA_TYPE
+    ) -> Artifact:
+        """Store the file at ``path`` without holding it in memory. Its name is the file's unless given."""
+        path = Path(path)
+        with path.open("rb") as stream:
+            sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
+            size = stream.tell()
+        name = name or path.name
+        if not self._has(sha256, size):
+            with writing(f"artifact {name}", size, self._settings):
+                obstore.put(self._store, _key(sha256), path)
+        return Artifact(name=name, sha256=sha256, size=size, media_type=media_type)
+
+    def open(self, sha256: str, start: int = 0, end: int | None = None) -> Iterator[bytes]:
+        """Bytes ``[start, end)`` in pieces; NotFound is raised here, not by the first piece.
+
+        A whole file is checked against its digest: ArtifactCorrupt comes after the last piece.
+        """
+        size = self.size(sha256)
+        end = size if end is None else min(end, size)
+        if not 0 <= start <= end:
+            raise ValueError(f"range {start} to {end} does not lie in {size} bytes")
+        if start == end:
+            return iter(())
+        with reading("artifact", sha256, self._settings):
+            found = obstore.get(self._store, _key(sha256), options={"range": (start, end)})
+            stream = found.stream(min_chunk_size=CHUNK_BYTES)
+        return self._pieces(stream, sha256, whole=(start, end) == (0, size))
+
+    def read_bytes(self, sha256: str) -> bytes:
+        """The whole file, checked. Raises NotFound or ArtifactCorrupt."""
+        return b"".join(self.open(sha256))
+
+    def exists(self, sha256: str) -> bool:
+        """Whether the store holds it."""
+        try:
+            self.size(sha256)
+        except NotFound:
+            return False
+        return True
+
+    def size(self, sha256: str) -> int:
+        """Its size [bytes]. Raises NotFound."""
+        if not SHA256.fullmatch(sha256):
+            raise NotFound("artifact", sha256[:80])
+        with reading("artifact", sha256, self._settings):
+            return int(obstore.head(self._store, _key(sha256))["size"])
+
+    def _has(self, sha256: str, size: int) -> bool:
+        try:
+            return self.size(sha256) == size
+        except NotFound:
+            return False
+
+    def _pieces(self, stream: obstore.BytesStream, sha256: str, *, whole: bool) -> Iterator[bytes]:
+        digest = hashlib.sha256()
+        with reading("artifact", sha256, self._settings):
+            for piece in stream:
+                data = bytes(piece)
+                if whole:
+                    digest.update(data)
+                yield data
+        if whole and digest.hexdigest() != sha256:
+            raise ArtifactCorrupt(f"artifact {sha256} now has the digest {digest.hexdigest()}")
+
+
+def _key(sha256: str) -> str:
+    return f"artifacts/{sha256[:2]}/{sha256}"

@@ -1,0 +1,103 @@
+"""The object store behind artifacts and episodes: a local folder or a bucket, and its errors as ours.
+
+A missing object is NotFound; a write that failed is StoreWriteFailed or, for want of space, StoreFull; any
+other failure to read is StoreReadFailed. Open stores in the process that uses them, after a fork.
+"""
+
+from __future__ import annotations
+
+import errno
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import timedelta
+from typing import Any
+from urllib.parse import urlsplit
+
+from obstore.exceptions import BaseError, NotFoundError
+from obstore.store import LocalStore, S3Store
+
+from storage.errors import ConfigurationError, NotFound, StoreFull, StoreReadFailed, StoreWriteFailed
+from storage.settings import STORE_SCHEMES, Settings
+
+REQUEST_TIMEOUT = timedelta(seconds=60)
+RETRY_TIMEOUT = timedelta(seconds=30)
+MAX_RETRIES = 5
+
+FULL_ERRNO = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+FULL_WORDS = (
+    *(f"(os error {number})" for number in sorted(FULL_ERRNO)),
+    "InsufficientStorage",
+    "507 Insufficient Storage",
+    "QuotaExceeded",
+    "StorageFull",
+)
+
+Store = LocalStore | S3Store
+
+
+def open_store(settings: Settings, below: str = "") -> Store:
+    """The store that ``settings.store_url`` names, or what lies ``below`` a path in it.
+
+    Raises ConfigurationError, or StoreWriteFailed when the local folder cannot be made.
+    """
+    if settings.store_folder is not None:
+        folder = settings.store_folder / below
+        with writing(f"the folder {folder}", 0, settings):
+            folder.mkdir(parents=True, exist_ok=True)
+            return LocalStore(folder, automatic_cleanup=True)
+    url = urlsplit(settings.store_url)
+    if url.scheme != "s3":
+        raise ConfigurationError([f"store URL {settings.store_url!r}: known are {', '.join(STORE_SCHEMES)}"])
+    secret = settings.s3_secret_access_key
+    given: dict[str, Any] = {
+        "endpoint": settings.s3_endpoint,
+        "access_key_id": settings.s3_access_key_id,
+        "secret_access_key": None if secret is None else secret.get_secret_value(),
+    }
+    plain = (settings.s3_endpoint or "").startswith("http://")
+    return S3Store(
+        url.netloc,
+        prefix="/".join(part for part in (url.path.strip("/"), below) if part) or None,
+        region=settings.s3_region,
+        client_options={"timeout": REQUEST_TIMEOUT, "allow_http": plain},
+        retry_config={"max_retries": MAX_RETRIES, "retry_timeout": RETRY_TIMEOUT},
+        **{name: value for name, value in given.items() if value},
+    )
+
+
+@contextmanager
+def writing(what: str, size: int, settings: Settings) -> Iterator[None]:
+    """Errors of writing ``what`` (``size`` bytes) become StoreFull or StoreWriteFailed."""
+    try:
+        yield
+    except (OSError, BaseError) as error:
+        reason = f"{what}, {size} bytes, was not written to {settings.store_url}: {_first_line(error)}"
+        full = error.errno in FULL_ERRNO if isinstance(error, OSError) else False
+        if full or any(word in str(error) for word in FULL_WORDS):
+            raise StoreFull(f"{reason}{_free_bytes(settings)}") from error
+        raise StoreWriteFailed(reason) from error
+
+
+@contextmanager
+def reading(kind: str, identifier: str, settings: Settings) -> Iterator[None]:
+    """Errors of reading an object become NotFound or StoreReadFailed."""
+    try:
+        yield
+    except (FileNotFoundError, NotFoundError) as error:
+        raise NotFound(kind, identifier) from error
+    except (OSError, BaseError) as error:
+        reason = f"{kind} {identifier} cannot be read from {settings.store_url}: {_first_line(error)}"
+        raise StoreReadFailed(reason) from error
+
+
+def _free_bytes(settings: Settings) -> str:
+    folder = settings.store_folder
+    if folder is None or not folder.is_dir():
+        return ""
+    return f" ({shutil.disk_usage(folder).free} bytes are free)"
+
+
+def _first_line(error: BaseException) -> str:
+    lines = str(error).strip().splitlines()
+    return lines[0] if lines else type(error).__name__
