@@ -29,7 +29,7 @@ from services.embedded import logs
 from services.embedded.broker import Broker, choose_broker
 from services.embedded.child import Child, Program
 from services.embedded.folder import DataFolder, FolderLocks, write_private
-from storage import keys
+from storage import keys, leases
 from storage.database import open_database
 from storage.settings import Settings
 
@@ -39,6 +39,8 @@ START_WITHIN_S = 120.0
 END_WITHIN_S = 8.0
 EARLIER_RUN_WITHIN_S = 15.0
 READY_FILE = "PHYSWORLD_READY_FILE"
+_DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+"""Opens loopback addresses whatever proxy the environment names."""
 
 
 @dataclass(frozen=True)
@@ -157,6 +159,9 @@ class Supervisor:
         settings.check(broker=False)
         database = open_database(settings)
         database.upgrade()
+        if not os.environ.get("PHYSWORLD_DATABASE_URL"):
+            with database.session() as session:  # alone on it: nobody of an earlier run is left
+                leases.recover(session, datetime.now(UTC))
         if not self._folder.api_key.exists():
             with database.session() as session:
                 token = keys.create_key(session, name=f"embedded-{secrets.token_hex(3)}", role="admin")
@@ -208,7 +213,7 @@ class Supervisor:
 
     def _web_is_ready(self) -> bool:
         with suppress(urllib.error.URLError, TimeoutError, ConnectionError):
-            with urllib.request.urlopen(f"{self._url}/health/ready", timeout=2) as answer:
+            with _DIRECT.open(f"{self._url}/health/ready", timeout=2) as answer:
                 return bool(answer.status == 200)
         return False
 

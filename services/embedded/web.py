@@ -12,6 +12,7 @@ import sys
 
 import uvicorn
 
+from services.api.logs import configure_logs
 from services.web import create_app
 from storage.settings import get_settings
 
@@ -24,9 +25,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--fd", type=int, required=True, help="descriptor of the listening socket")
     options = parser.parse_args(arguments)
     settings = get_settings()
-    settings.check(broker=False)
+    configure_logs(settings.log_level)
     config = uvicorn.Config(
-        create_app(), log_level=settings.log_level, timeout_graceful_shutdown=GRACE_S, server_header=False
+        create_app(settings),
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        timeout_graceful_shutdown=GRACE_S,
     )
     server = uvicorn.Server(config)
     with socket.socket(fileno=options.fd) as listening:

@@ -1,0 +1,25 @@
+"""``python -m services.trainer [--name trainer]``: one trainer process."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from services.trainer.app import serve
+from storage.settings import get_settings
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Parse the command line and serve."""
+    parser = argparse.ArgumentParser(prog="python -m services.trainer", description=__doc__)
+    parser.add_argument(
+        "--name", default="trainer", help="name of this trainer on its host (default: trainer)"
+    )
+    options = parser.parse_args(arguments)
+    settings = get_settings()
+    settings.check()
+    return serve(settings, options.name)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

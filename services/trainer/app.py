@@ -1,0 +1,20 @@
+"""The trainer service: a worker on the ``train`` queue that knows how to do ``training`` shards.
+
+It consumes the episodes of a sealed dataset and publishes a version of a model. A dataset's last commit opens
+its training job, so the trainer starts as soon as there is something to learn from.
+"""
+
+from __future__ import annotations
+
+from schemas.queues import TRAINING
+from storage.settings import Settings
+from workers.app import run_worker
+from workers.registry import register
+
+HANDLER = "services.trainer.training:run"
+
+
+def serve(settings: Settings, name: str) -> int:
+    """Serve the training queue until told to stop; returns the exit code."""
+    register("training", HANDLER)
+    return run_worker(settings, TRAINING, name)

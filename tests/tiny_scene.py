@@ -1,0 +1,70 @@
+"""A scene small enough for tests of the service: a soft bar held at one end and moved up and down."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Scene
+from storage import resources
+from storage.artifacts import ArtifactStore
+from storage.database import Database
+from storage.scene_bundle import canonical_archive
+
+FRAMES, FPS = 12, 30.0
+LENGTH_M, SIDE_M = 0.12, 0.03
+STROKE_M = 0.01
+
+
+def tiny_scene(frames: int = FRAMES) -> Scene:
+    """The bar's four tracked points follow its grip: a first guess of a motion, good enough to fit to."""
+    times = np.arange(frames) / FPS
+    lift = STROKE_M * np.sin(2 * np.pi * 1.5 * times)[:, None, None] * np.array([0.0, 0.0, 1.0])
+    x = np.array([0.03, 0.06, 0.09, 0.12])
+    points = np.stack([x, np.zeros(4), np.full(4, SIDE_M / 2)], axis=1)
+    grip = np.array([[0.0, y, z] for y in (-0.01, 0.01) for z in (-0.01, 0.01)])
+    box_min = np.array([0.0, -SIDE_M / 2, -SIDE_M / 2])
+    box_max = np.array([LENGTH_M, SIDE_M / 2, SIDE_M / 2])
+    split = round(0.7 * frames)
+    return Scene(
+        name="tiny bar",
+        kind="beam",
+        points=points + lift,
+        visible=np.ones((frames, 4), dtype=bool),
+        controllers=grip + lift,
+        times=times,
+        gravity_m_s2=np.array([0.0, 0.0, -9.81]),
+        noise_sigma_m=1e-3,
+        train=(0, split),
+        test=(split, frames),
+        initial_state=UNDEFORMED_AT_REST,
+        fps=FPS,
+        body=Body(box_min_m=box_min, box_max_m=box_max, density_kg_m3=300.0),
+        grips=(
+            Grip(
+                controllers=(0, 1, 2, 3),
+                region_min_m=box_min,
+                region_max_m=np.array([0.02, SIDE_M / 2, SIDE_M / 2]),
+            ),
+        ),
+    )
+
+
+def register(scene: Scene, database: Database, artifacts: ArtifactStore) -> str:
+    """Store the scene as an upload would; its id."""
+    archive = artifacts.put_bytes(canonical_archive(scene), "scene.zip", "application/zip")
+    with database.session() as session:
+        return resources.create_scene(
+            session,
+            name=scene.name,
+            kind=scene.kind,
+            digest=archive.sha256,
+            frames=scene.frame_count,
+            points=scene.points.shape[1],
+            controllers=scene.controllers.shape[1],
+            fps=scene.fps,
+            duration_s=float(scene.times[-1]),
+            noise_sigma_m=scene.noise_sigma_m,
+            train=scene.train,
+            test=scene.test,
+            artifacts=[archive],
+        ).id

@@ -1,0 +1,107 @@
+"""What a handler holds while it works: the lease, kept alive by a thread, and the way to report and to stop.
+
+The thread renews the lease about every two seconds (sooner when there is new progress) and reads from the
+same transaction whether the job was cancelled or the lease lost. A handler calls ``progress`` and ``check``
+as often as it likes: both only touch memory. A database that does not answer costs the lease once
+``lease_seconds`` have passed since the last renewal, by this process's own monotonic clock, so a paused
+process stops by itself.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from datetime import UTC, datetime
+from types import TracebackType
+
+from schemas.job import Progress
+from storage import leases
+from storage.database import Database
+from storage.errors import DatabaseUnavailable
+from storage.settings import Settings
+from workers.errors import Cancelled, LeaseLost
+
+logger = logging.getLogger(__name__)
+
+RENEW_INTERVAL_S = 2.0
+PROGRESS_INTERVAL_S = 0.5
+
+
+class TaskContext:
+    """A lease under renewal; use as a context manager around the handler."""
+
+    def __init__(self, lease: leases.Lease, database: Database, settings: Settings) -> None:
+        self.lease = lease
+        self.database = database
+        self.settings = settings
+        self._interval_s = min(RENEW_INTERVAL_S, settings.lease_seconds / 4)
+        self._progress: Progress | None = None
+        self._lock = threading.Lock()
+        self._fresh = threading.Event()
+        self._stop = threading.Event()
+        self._cancelled = False
+        self._lost = False
+        self._renewed_at = time.monotonic()
+        self._thread = threading.Thread(target=self._beat, name=f"lease-{lease.shard_id}", daemon=True)
+
+    def __enter__(self) -> TaskContext:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stop.set()
+        self._fresh.set()
+        self._thread.join()
+
+    def progress(self, done: float, total: float, unit: str = "", message: str = "") -> None:
+        """Report how far the shard is; written to the database at most twice a second."""
+        with self._lock:
+            self._progress = Progress(done=done, total=total, unit=unit, message=message)
+        self._fresh.set()
+
+    def cancelled(self) -> bool:
+        """Whether the job was cancelled. Raises LeaseLost when the shard is no longer ours."""
+        late_s = time.monotonic() - self._renewed_at
+        if self._lost or late_s > self.settings.lease_seconds:
+            raise LeaseLost(
+                f"lease on shard {self.lease.shard_id} epoch {self.lease.epoch} lost, "
+                f"{late_s:.1f} s after its last renewal (lease {self.settings.lease_seconds} s)"
+            )
+        return self._cancelled
+
+    def check(self) -> None:
+        """Raise Cancelled or LeaseLost if the handler must stop; call it every frame."""
+        if self.cancelled():
+            raise Cancelled(f"job {self.lease.job_id} was cancelled")
+
+    def _beat(self) -> None:
+        while not self._stop.is_set():
+            self._fresh.wait(self._interval_s)
+            if self._stop.is_set():
+                return
+            self._fresh.clear()
+            with self._lock:
+                progress, self._progress = self._progress, None
+            try:
+                self._renew(progress)
+            except DatabaseUnavailable as error:
+                logger.warning("lease %s not renewed: %s", self.lease.shard_id, error)
+            if self._lost:
+                return
+            self._stop.wait(min(PROGRESS_INTERVAL_S, self._interval_s))
+
+    def _renew(self, progress: Progress | None) -> None:
+        started = time.monotonic()
+        with self.database.session() as session:
+            state = leases.renew(
+                session, self.lease, datetime.now(UTC), self.settings.lease_seconds, progress
+            )
+        if state == "lost":
+            self._lost = True
+            return
+        self._renewed_at = started
+        if state == "cancel":
+            self._cancelled = True

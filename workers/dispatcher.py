@@ -1,0 +1,147 @@
+"""Moves work from the database to the broker, and back when somebody dies: ``python -m workers.dispatcher``.
+
+Every 0.1 s: publish the shards that wait (an outbox: publish first, then mark; a crash in between publishes
+twice, which a claim by compare-and-set makes harmless). Every second: take back leases that ran out, at once
+those whose owner on this host is provably dead, and look how deep the broker's queues are.
+
+A queue that is empty in two looks while shards of it wait has lost their messages: they are published again
+after two seconds instead of ``republish_seconds``. A queue that is deep gets nothing more, so the broker
+never holds more than a screenful of repeated messages, whatever happens.
+
+Several dispatchers do the same work twice and no harm.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+import threading
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+from types import FrameType
+
+from celery import Celery
+from kombu.exceptions import OperationalError as BrokerError
+
+from schemas.queues import SIMULATION, TASK_NAME, TRAINING
+from storage import leases
+from storage.database import Database, open_database
+from storage.errors import DatabaseUnavailable
+from storage.settings import Settings, get_settings
+from workers.app import READY_FILE_VARIABLE, create_app
+from workers.owner import owner_is_gone
+
+logger = logging.getLogger(__name__)
+
+TICK_S = 0.1
+SWEEP_S = 1.0
+LOST_AFTER_S = 2.0
+PAUSE_AFTER_ERROR_S = 1.0
+MAX_DEPTH = 64
+"""Messages of one queue in the broker at a time."""
+
+
+class Dispatcher:
+    """One pass is ``tick``; ``run`` repeats it until ``stop`` is set."""
+
+    def __init__(self, settings: Settings, database: Database, app: Celery) -> None:
+        self._settings = settings
+        self._database = database
+        self._app = app
+        self._connection = app.connection_for_write()
+        self._depth = dict.fromkeys((SIMULATION, TRAINING), 0)
+        self._empty_looks = dict.fromkeys((SIMULATION, TRAINING), 0)
+        self._sweep_due = 0.0
+
+    def run(self, stop: threading.Event) -> None:
+        """Tick until told to stop; a broker or database that is away is waited for."""
+        while not stop.is_set():
+            try:
+                self.tick()
+            except (BrokerError, *self._connection.connection_errors) as error:
+                logger.warning("broker away: %s", error)
+                self._connection.close()
+                self._connection = self._app.connection_for_write()
+                stop.wait(PAUSE_AFTER_ERROR_S)
+            except DatabaseUnavailable as error:
+                logger.warning("database away: %s", error)
+                stop.wait(PAUSE_AFTER_ERROR_S)
+            stop.wait(TICK_S)
+
+    def tick(self) -> None:
+        """One pass."""
+        if time.monotonic() >= self._sweep_due:
+            self._sweep_due = time.monotonic() + SWEEP_S
+            self._take_back()
+            self._look_at_queues()
+            lost_in = {queue for queue, looks in self._empty_looks.items() if looks >= 2}
+            self._publish(LOST_AFTER_S, lost_in)
+        self._publish(self._settings.republish_seconds, set(self._depth))
+
+    def _publish(self, republish_seconds: float, queues: set[str]) -> None:
+        open_queues = {queue for queue in queues if self._depth[queue] < MAX_DEPTH}
+        if not open_queues:
+            return
+        with self._database.reading() as session:
+            found = leases.publishable(
+                session, datetime.now(UTC), republish_seconds=republish_seconds, window=MAX_DEPTH
+            )
+        waiting = [publication for publication in found if publication.queue in open_queues]
+        if not waiting:
+            return
+        with self._app.amqp.Producer(self._connection, auto_declare=False) as producer:
+            for publication in waiting:
+                self._app.send_task(
+                    TASK_NAME,
+                    args=[publication.shard_id],
+                    queue=publication.queue,
+                    producer=producer,
+                    retry=False,
+                )
+                self._depth[publication.queue] += 1
+        with self._database.session() as session:
+            leases.mark_published(session, waiting, datetime.now(UTC))
+        logger.info("published %d shards", len(waiting))
+
+    def _take_back(self) -> None:
+        with self._database.session() as session:
+            leases.end_leases_of(session, owner_is_gone, datetime.now(UTC))
+            taken = leases.reap(session, datetime.now(UTC))
+        if taken:
+            logger.warning("took back %d shards: %s", len(taken), ", ".join(taken))
+
+    def _look_at_queues(self) -> None:
+        channel = self._connection.default_channel
+        for queue in self._depth:
+            depth = channel.queue_declare(queue=queue, durable=True, auto_delete=False).message_count
+            self._depth[queue] = depth
+            self._empty_looks[queue] = 0 if depth else self._empty_looks[queue] + 1
+
+
+def main() -> int:
+    """Run until SIGTERM or SIGINT."""
+    settings = get_settings()
+    settings.check()
+    logging.basicConfig(
+        level=settings.log_level.upper(), format="%(asctime)s %(levelname)s %(name)s %(message)s"
+    )
+    stop = threading.Event()
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        stop.set()
+
+    signal.signal(signal.SIGTERM, on_signal)
+    signal.signal(signal.SIGINT, on_signal)
+    dispatcher = Dispatcher(settings, open_database(settings), create_app(settings))
+    ready_file = os.environ.get(READY_FILE_VARIABLE)
+    if ready_file:
+        Path(ready_file).write_text(f"{os.getpid()}\n")
+    dispatcher.run(stop)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,141 @@
+"""Does one shard: claim by compare-and-set, run the handler under a renewed lease, commit by compare-and-set.
+
+A handler's failure becomes a problem document with the exception's own numbers. Physics, faulty input and
+bugs fail the shard at once: they would fail again. Storage, network and memory are tried again with the
+attempts capped in the database.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import re
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Literal
+
+from celery.exceptions import SoftTimeLimitExceeded
+
+from physworld.errors import Cancelled as LibraryCancelled
+from physworld.errors import PhysworldError
+from schemas.base import Problem
+from storage import leases
+from storage.database import Database, open_database
+from storage.errors import DatabaseUnavailable, StorageError, StoreReadFailed, StoreWriteFailed
+from storage.settings import Settings, get_settings
+from workers.context import TaskContext
+from workers.errors import Cancelled, LeaseLost, UnknownShardKind, WorkerError, WorkerStopping
+from workers.owner import process_owner
+from workers.registry import Handler, HandlerResult, handler_of
+from workers.stores import Stores
+
+logger = logging.getLogger(__name__)
+
+Outcome = Literal["done", "failed", "retried", "cancelled", "not committed", "not claimed"]
+WORTH_A_RETRY = (
+    OSError,
+    MemoryError,
+    DatabaseUnavailable,
+    StoreReadFailed,
+    StoreWriteFailed,
+    UnknownShardKind,
+)
+SAID_BY_THE_WORK = (PhysworldError, StorageError, WorkerError, ValueError, SoftTimeLimitExceeded)
+
+
+@dataclass(frozen=True)
+class Runtime:
+    """What every shard of this process shares."""
+
+    settings: Settings
+    database: Database
+    stores: Stores
+    owner: str
+    handler_of: Callable[[str], Handler] = handler_of
+
+
+@functools.cache
+def process_runtime() -> Runtime:
+    """The runtime of this process, opened at its first shard (never before a fork)."""
+    settings = get_settings()
+    database = open_database(settings)
+    return Runtime(settings, database, Stores(settings, database), process_owner())
+
+
+def run_shard(runtime: Runtime, shard_id: str) -> Outcome:
+    """Do the shard if it can be had; a duplicate or late message ends here without effect."""
+    with runtime.database.session() as session:
+        lease = leases.claim(
+            session, shard_id, runtime.owner, datetime.now(UTC), runtime.settings.lease_seconds
+        )
+    if lease is None:
+        logger.info("shard %s: not to be had (done, cancelled or held by another)", shard_id)
+        return "not claimed"
+    logger.info("shard %s: %s %d, attempt %d", shard_id, lease.kind, lease.index, lease.attempt)
+    started = time.monotonic()
+    outcome = _run_claimed(runtime, lease)
+    logger.info("shard %s: %s after %.2f s", shard_id, outcome, time.monotonic() - started)
+    return outcome
+
+
+def _run_claimed(runtime: Runtime, lease: leases.Lease) -> Outcome:
+    try:
+        with TaskContext(lease, runtime.database, runtime.settings) as context:
+            made = runtime.handler_of(lease.kind)(context, runtime.stores)
+        return _commit(runtime, lease, made)
+    except LeaseLost as error:
+        logger.warning("shard %s: %s", lease.shard_id, error)
+        return "not committed"
+    except (Cancelled, LibraryCancelled):
+        with runtime.database.session() as session:
+            leases.mark_cancelled(session, lease)
+        return "cancelled"
+    except WorkerStopping:
+        with runtime.database.session() as session:
+            leases.release(session, lease)
+        raise
+    except WORTH_A_RETRY as error:
+        logger.exception("shard %s: attempt %d failed", lease.shard_id, lease.attempt)
+        return _record_failure(runtime, lease, error, retry=True)
+    except SAID_BY_THE_WORK as error:
+        logger.warning("shard %s: %s: %s", lease.shard_id, type(error).__name__, error)
+        return _record_failure(runtime, lease, error, retry=False)
+    except Exception as error:
+        _record_failure(runtime, lease, error, retry=False)
+        raise
+
+
+def _commit(runtime: Runtime, lease: leases.Lease, made: HandlerResult) -> Outcome:
+    with runtime.database.session() as session:
+        committed = leases.complete(session, lease, made.result, made.digest)
+    return "done" if committed else "not committed"
+
+
+def _record_failure(runtime: Runtime, lease: leases.Lease, error: BaseException, *, retry: bool) -> Outcome:
+    with runtime.database.session() as session:
+        leases.fail(session, lease, problem_of(error), retry)
+    return "retried" if retry else "failed"
+
+
+def problem_of(error: BaseException) -> Problem:
+    """The problem document of an exception: its own code if it has one, else its type in snake case."""
+    name = type(error).__name__
+    return Problem(
+        type=f"urn:physworld:problem:{_code(error)}",
+        title=_words(name),
+        status=500 if isinstance(error, WORTH_A_RETRY) or not isinstance(error, SAID_BY_THE_WORK) else 422,
+        code=_code(error),
+        detail=f"{name}: {error}" if str(error) else name,
+        errors=list(getattr(error, "faults", [])),
+        hint=getattr(error, "hint", None),
+    )
+
+
+def _code(error: BaseException) -> str:
+    return str(getattr(error, "code", None) or _words(type(error).__name__).replace(" ", "_"))
+
+
+def _words(name: str) -> str:
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", " ", name).lower()

@@ -1,0 +1,32 @@
+"""What made an object: inputs with their digests, code, configuration, seeds, device."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from collections.abc import Sequence
+from importlib import metadata
+from typing import Any
+
+from schemas.base import Lineage, Reference
+
+
+def lineage_of(
+    inputs: Sequence[Reference], config: dict[str, Any], seeds: dict[str, int], device: str | None = None
+) -> dict[str, Any]:
+    """A lineage as JSON; ``config_digest`` is the SHA-256 of the configuration with sorted keys."""
+    canonical = json.dumps(config, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    lineage = Lineage(
+        inputs=list(inputs),
+        code_version=code_version(),
+        config_digest=hashlib.sha256(canonical.encode()).hexdigest(),
+        seeds=seeds,
+        device=device or f"cpu {platform.machine()}",
+    )
+    return lineage.model_dump(mode="json")
+
+
+def code_version() -> str:
+    """The installed version of this distribution, e.g. ``physworld 0.1.0``."""
+    return f"physworld {metadata.version('physworld')}"

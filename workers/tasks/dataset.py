@@ -1,0 +1,145 @@
+"""Makes a dataset: one shard plans it, one shard makes each episode, one shard seals it.
+
+An episode is written under the epoch of its lease and exists once its shard is committed: whatever a killed
+or overtaken worker wrote belongs to nobody and is removed at sealing. Its seed follows from the dataset's
+and its index alone, so a second attempt makes the same episode. The seal reads every episode again and
+compares digests.
+"""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections import Counter
+from typing import Any
+
+import numpy as np
+
+from physworld.demonstrate import DemonstrationConfig, derived_seed, make_episode
+from physworld.demonstrate.episode import episode_frames
+from schemas.dataset import DatasetConfig, Episode
+from storage import resources
+from workers.context import TaskContext
+from workers.errors import DatasetIncomplete, NotEnoughDisk
+from workers.lineage import lineage_of
+from workers.registry import HandlerResult
+from workers.stores import Stores
+from workers.tasks.inputs import fit_reference, scene_of, scene_reference, twin_of
+
+ATTEMPTS = 5
+FLOAT_BYTES = 4
+STORE_OVERHEAD = 1.05
+RESERVED_BYTES = 256 * 2**20
+"""Left free for database, logs and the model that follows."""
+
+
+def plan(context: TaskContext, stores: Stores) -> HandlerResult:
+    """Settle the size of the dataset and refuse one that the disk cannot hold."""
+    payload = context.lease.payload
+    config = DatasetConfig.model_validate(payload["config"])
+    scene = scene_of(stores, payload["scene_id"])
+    twin = twin_of(stores, payload["fit_id"])
+    frames = episode_frames(scene, _demonstration(config))
+    particles, controllers = len(twin.particles_rest), scene.controllers.shape[1]
+    per_frame = 3 * FLOAT_BYTES * (particles + controllers) + 8
+    need = round(STORE_OVERHEAD * config.episodes * (frames * per_frame + 2 * FLOAT_BYTES * particles))
+    _check_disk(stores, need, f"{config.episodes} episodes of {frames} frames x {particles} particles")
+    return HandlerResult(
+        {"episodes": config.episodes, "frames": frames, "particles": particles, "estimated_bytes": need}
+    )
+
+
+def episode(context: TaskContext, stores: Stores) -> HandlerResult:
+    """Plan, simulate and write one episode."""
+    lease = context.lease
+    payload = lease.payload
+    config = DatasetConfig.model_validate(payload["config"])
+    index = int(payload["index"])
+    scene = scene_of(stores, payload["scene_id"])
+    twin = twin_of(stores, payload["fit_id"])
+
+    def progress(done: int, total: int) -> None:
+        context.check()
+
+    started = time.perf_counter()
+    arrays, attributes = make_episode(
+        scene, twin, _demonstration(config), derived_seed(config.seed % 2**63, index), progress
+    )
+    simulated = time.perf_counter()
+    context.check()
+    attributes |= {"index": index, "scene_id": payload["scene_id"], "fit_id": payload["fit_id"]}
+    path, digest = stores.episodes.write(payload["dataset_id"], index, lease.epoch, arrays, attributes)
+    written = time.perf_counter()
+    frames, particles, _ = arrays["particles"].shape
+    result = {
+        "index": index,
+        "path": path,
+        "digest": digest,
+        "seed": attributes["seed"],
+        "frames": frames,
+        "particles": particles,
+        "motion": attributes["motion"],
+        "seconds": simulated - started,
+        "store_seconds": written - simulated,
+        "rejected": attributes["rejected"],
+    }
+    return HandlerResult(result, digest)
+
+
+def seal(context: TaskContext, stores: Stores) -> HandlerResult:
+    """Read every episode again, compare digests, write the manifest, remove what belongs to nobody."""
+    payload = context.lease.payload
+    dataset_id = payload["dataset_id"]
+    config = DatasetConfig.model_validate(payload["config"])
+    with stores.database.reading() as session:
+        episodes = resources.all_episodes(session, dataset_id)
+    indices = [episode.index for episode in episodes]
+    if indices != list(range(config.episodes)):
+        missing = sorted(set(range(config.episodes)) - set(indices))
+        raise DatasetIncomplete(
+            f"dataset {dataset_id} holds {len(indices)} episodes of {config.episodes}; missing {missing[:20]}"
+        )
+    for done, committed in enumerate(episodes):
+        context.check()
+        context.progress(done, len(episodes), "episodes", "verifying")
+        stores.episodes.verify(committed.path, committed.digest)
+    manifest = stores.episodes.write_manifest(dataset_id, episodes)
+    context.check()
+    stores.episodes.remove_orphans(dataset_id, [committed.path for committed in episodes])
+    inputs = [scene_reference(stores, payload["scene_id"]), fit_reference(stores, payload["fit_id"])]
+    result = {
+        "digest": manifest.sha256,
+        "statistics": _statistics(episodes),
+        "artifacts": [manifest.model_dump(mode="json")],
+        "lineage": lineage_of(inputs, payload["config"], {"dataset": config.seed}),
+    }
+    return HandlerResult(result, manifest.sha256)
+
+
+def _demonstration(config: DatasetConfig) -> DemonstrationConfig:
+    return DemonstrationConfig(frames=config.frames, property_sigma=config.property_sigma, attempts=ATTEMPTS)
+
+
+def _check_disk(stores: Stores, need: int, what: str) -> None:
+    folder = stores.settings.store_folder
+    if folder is None:
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    free = shutil.disk_usage(folder).free
+    if need + RESERVED_BYTES > free:
+        raise NotEnoughDisk(
+            f"{what} take about {need / 2**20:.0f} MiB; {free / 2**20:.0f} MiB are free in {folder}, "
+            f"of which {RESERVED_BYTES / 2**20:.0f} MiB stay reserved"
+        )
+
+
+def _statistics(episodes: list[Episode]) -> dict[str, Any]:
+    frames = np.array([episode.frames for episode in episodes])
+    return {
+        "episodes": len(episodes),
+        "frames": int(frames.sum()),
+        "frames_per_episode": [int(frames.min()), int(frames.max())],
+        "particles": episodes[0].particles,
+        "motions": dict(sorted(Counter(episode.motion for episode in episodes).items())),
+        "repeated_attempts": sum(episode.attempt > 1 for episode in episodes),
+    }
