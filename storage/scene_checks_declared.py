@@ -14,7 +14,7 @@ from storage.scene_declaration import BodyForm, Declaration, GripForm, GroundFor
 
 STANDARD_GRAVITY = 9.80665
 GRAVITY_ALLOWED = (1.5, 15.0)
-"""Moon to a little more than Earth; beyond, the unit is wrong. Zero passes with a warning (orbit, parabola)."""
+"""Moon to a little more than Earth; beyond, the unit is wrong. Zero passes with a warning."""
 GRAVITY_USUAL = (9.76, 9.84)
 """On the Earth's surface, pole to equator."""
 TILT_WARNING_DEGREES = 1.0
@@ -34,8 +34,10 @@ EXTENT_WARNING = 1.6
 MANY_POINTS = 20
 """So many tracked points cover an undeformed body, so their box is the body's."""
 
+GROUND_FAULT_SIZES = 0.1
+GROUND_WARNING_SIZES = 0.02
 GROUND_TOLERANCE_SIGMAS = 6.0
-GROUND_TOLERANCE_SIZES = 0.02
+"""How deep a point may lie under the ground: noise, and a table plane that was fitted to depth images."""
 REGION_TOLERANCE_SIZES = 0.01
 
 
@@ -153,7 +155,8 @@ def check_grips(
 def check_ground(ground: GroundForm, noise_sigma_m: float, measured: Measured, findings: Findings) -> None:
     """A plane under the object."""
     where = ["scene.json", "ground", "height_m"]
-    tolerance = max(GROUND_TOLERANCE_SIGMAS * noise_sigma_m, GROUND_TOLERANCE_SIZES * measured.size_m)
+    noise = GROUND_TOLERANCE_SIGMAS * noise_sigma_m
+    tolerance = max(noise, GROUND_FAULT_SIZES * measured.size_m)
     height = np.where(measured.seen, measured.points[..., 2], np.inf)
     under = int((height[measured.first_frame] < ground.height_m - tolerance).sum())
     lowest = height.min(axis=1)
@@ -166,7 +169,7 @@ def check_ground(ground: GroundForm, noise_sigma_m: float, measured: Measured, f
             f"is {ground.height_m:.4g} m, and point {i} lies {depth[first]:.4g} m below it in frame {first}"
             f" ({under} points do; allowed {tolerance:.2g} m)",
         )
-    elif depth.max() > tolerance:
+    elif depth.max() > max(noise, GROUND_WARNING_SIZES * measured.size_m):
         t = int(np.argmax(depth))
         findings.warn(
             where,

@@ -106,7 +106,7 @@ class Declaration(Form):
 
 
 def parse_json(text: bytes) -> tuple[dict[str, Any], list[FieldError]]:
-    """The object in ``scene.json`` and the faults of its text: no JSON, or numbers that JSON does not have."""
+    """The object in ``scene.json`` and the faults of its text."""
     where: list[str | int] = ["scene.json"]
     if len(text) > MAX_JSON_BYTES:
         return {}, [FieldError(loc=where, msg=f"has {len(text)} bytes, at most {MAX_JSON_BYTES} are read")]

@@ -1,0 +1,185 @@
+"""Reads a pickle that holds numbers in numpy arrays and plain containers, and nothing else.
+
+A pickle is a program; here it can reach five names, and none of them is numpy's own code: stand-ins take the
+state that numpy would be given, check it and build the array from bytes. Any other name that the pickle asks
+for is refused by that name. The interpreter is the pure Python one: the C one allocates what a forged memo
+index says.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import pickle
+import re
+import struct
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+NUMBER_CODE = re.compile(r"^([<>|=]?)([biuf])(1|2|4|8)$")
+"""Type codes of numpy that are plain numbers."""
+
+MALFORMED = (
+    pickle.UnpicklingError,
+    struct.error,
+    EOFError,
+    ValueError,
+    TypeError,
+    KeyError,
+    IndexError,
+    AttributeError,
+    OverflowError,
+    AssertionError,
+    MemoryError,
+)
+"""What the interpreter raises on a truncated or forged stream."""
+
+
+class PickleRefused(ValueError):
+    """A pickle that is not just arrays; the message names what it wanted."""
+
+
+def load_arrays(data: bytes) -> Any:
+    """The object in the pickle: dicts, lists, tuples, strings, numbers and numpy arrays of numbers.
+
+    Raises:
+        PickleRefused: it calls something, holds something else, or is damaged.
+    """
+    try:
+        loaded = _ArrayUnpickler(io.BytesIO(data)).load()
+        return _unwrap(loaded, depth=0)
+    except PickleRefused:
+        raise
+    except MALFORMED as error:
+        text = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        raise PickleRefused(
+            f"the pickle of {len(data)} bytes is damaged or truncated ({text[:200]})"
+        ) from error
+
+
+class _Dtype:
+    """Stands for ``numpy.dtype``."""
+
+    def __init__(self, code: str, *_flags: object) -> None:
+        if not isinstance(code, str) or not NUMBER_CODE.match(code):
+            raise PickleRefused(f"holds an array of type {str(code)[:40]!r}; only numbers are read")
+        self.code = code.lstrip("<>|=")
+        self.order = "<"
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        order, subtype, names, fields = state[1:5]
+        if order not in ("<", ">", "|", "=") or any(part is not None for part in (subtype, names, fields)):
+            raise PickleRefused("holds an array of a structured type; only numbers are read")
+        self.order = order
+
+    def numpy(self) -> np.dtype[Any]:
+        """The type itself."""
+        return np.dtype(self.order + self.code)
+
+
+class _Array:
+    """Stands for ``numpy.ndarray``."""
+
+    def __init__(self, *_empty: object) -> None:
+        self.value: np.ndarray | None = None
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        _version, shape, dtype, fortran, content = state
+        self.value = _build(shape, dtype, "F" if fortran else "C", content)
+
+
+class _Callable:
+    """A name that the pickle may call; its state cannot be touched."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+
+    def __call__(self, *args: object) -> Any:
+        return self._function(*args)
+
+    def __setstate__(self, state: object) -> None:
+        raise PickleRefused("tries to change a function")
+
+
+def _build(shape: Any, dtype: Any, order: str, content: Any) -> np.ndarray:
+    if not isinstance(dtype, _Dtype) or not isinstance(content, bytes | bytearray):
+        raise PickleRefused("holds an array of Python objects; only numbers are read")
+    if not isinstance(shape, tuple) or not all(isinstance(n, int) and n >= 0 for n in shape):
+        raise PickleRefused(f"holds an array of shape {str(shape)[:80]}")
+    kind = dtype.numpy()
+    if math.prod(shape) * kind.itemsize != len(content):
+        raise PickleRefused(
+            f"holds an array that claims shape {shape} of {kind} and has {len(content)} bytes"
+        )
+    return np.frombuffer(content, dtype=kind).reshape(shape, order="F" if order == "F" else "C").copy()
+
+
+def _empty_array(kind: Any, *_placeholder: object) -> _Array:
+    if kind is not _Array:
+        raise PickleRefused("reconstructs something that is not an array")
+    return _Array()
+
+
+def _from_buffer(content: Any, dtype: Any, shape: Any, order: str, *_axes: object) -> _Array:
+    array = _Array()
+    array.value = _build(shape, dtype, order, content)
+    return array
+
+
+def _scalar(dtype: Any, content: Any) -> _Array:
+    array = _Array()
+    array.value = _build((), dtype, "C", content)
+    return array
+
+
+class _ArrayUnpickler(pickle._Unpickler):
+    """Finds the names that numpy writes for an array, and their stand-ins."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) == ("numpy", "ndarray"):
+            return _Array
+        if (module, name) == ("numpy", "dtype"):
+            return _Dtype
+        functions: dict[tuple[str, str], Callable[..., Any]] = {
+            ("multiarray", "_reconstruct"): _empty_array,
+            ("multiarray", "scalar"): _scalar,
+            ("numeric", "_frombuffer"): _from_buffer,
+        }
+        package, _, part = module.rpartition(".")
+        if package in ("numpy.core", "numpy._core") and (part, name) in functions:
+            return _Callable(functions[part, name])
+        raise PickleRefused(f"wants {module}.{name}; only numpy arrays and plain containers are read")
+
+    def persistent_load(self, pid: object) -> Any:
+        raise PickleRefused("refers to an object outside the file")
+
+
+MAX_DEPTH = 8
+MAX_ITEMS = 1_000_000
+
+
+def _unwrap(value: Any, depth: int) -> Any:
+    """Containers with the arrays themselves in the stand-ins' places."""
+    if depth > MAX_DEPTH:
+        raise PickleRefused(f"nests deeper than {MAX_DEPTH} levels")
+    if isinstance(value, _Array):
+        if value.value is None:
+            raise PickleRefused("holds an array without content")
+        return value.value
+    if isinstance(value, dict | list | tuple) and len(value) > MAX_ITEMS:
+        raise PickleRefused(f"holds a container of {len(value)} items, at most {MAX_ITEMS} are read")
+    if isinstance(value, dict):
+        return {_plain(key): _unwrap(item, depth + 1) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_unwrap(item, depth + 1) for item in value]
+    return _plain(value)
+
+
+def _plain(value: Any) -> Any:
+    if value is None or isinstance(value, str | bytes | bool | int | float):
+        return value
+    raise PickleRefused(
+        f"holds a {type(value).__name__.lstrip('_')}; only arrays and plain containers are read"
+    )
