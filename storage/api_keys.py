@@ -80,6 +80,12 @@ def verify(session: Session, token: str) -> ApiKey | None:
     return None if row is None else _key(row)
 
 
+def get_active_key(session: Session, key_id: str) -> ApiKey | None:
+    """The key with this id, or None when it is unknown or revoked (a browser's session keeps only the id)."""
+    row = session.get(ApiKeyRow, key_id)
+    return None if row is None or row.revoked_at is not None else _key(row)
+
+
 def revoke_key(session: Session, key_id: str) -> ApiKey:
     """End a key; it stays listed. Raises NotFound."""
     row = session.get(ApiKeyRow, key_id)
