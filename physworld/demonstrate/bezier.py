@@ -18,8 +18,8 @@ GAUSS_NODES, GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(12)
 GAUSS_NODES = 0.5 * (GAUSS_NODES + 1.0)  # moved from [-1, 1] to [0, 1]
 GAUSS_WEIGHTS = 0.5 * GAUSS_WEIGHTS
 MAX_PANELS = 1024
-CURVATURE_SAMPLES = 129
-SHRINK_STEPS = 24
+CURVATURE_SAMPLES = 65
+SHRINK_STEPS = 12
 
 
 class DegenerateCurve(ValueError):
@@ -111,12 +111,14 @@ class ArcLength:
         u = low + (high - low) * np.where(span > 0.0, (s - base) / np.where(span > 0.0, span, 1.0), 0.0)
         for _ in range(60):
             error = base + self._between(start, u) - s
-            if float(np.abs(error).max(initial=0.0)) <= self.tolerance * self.length:
+            open_ = np.abs(error) > self.tolerance * self.length
+            if not open_.any():
                 return u
             low, high = np.where(error < 0.0, u, low), np.where(error > 0.0, u, high)
             speed = np.linalg.norm(self.curve.derivative(u), axis=-1)
             step = u - error / np.maximum(speed, 1e-300)
-            u = np.where((step > low) & (step < high), step, 0.5 * (low + high))
+            step = np.where((step > low) & (step < high), step, 0.5 * (low + high))
+            u = np.where(open_, step, u)
         raise DegenerateCurve(
             f"inverting the arc length left {float(np.abs(error).max()):.2e} m of {self.length:g} m"
         )

@@ -107,7 +107,7 @@ def training_track(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 def material_paths(rest: np.ndarray, start: np.ndarray, control_points: np.ndarray) -> np.ndarray:
     """Shortest paths [m] through the rest shape between what the control points hold, (K, K); inf: none.
 
-    Particles ``rest`` and ``start`` (P, 3) are the same material; a control point of ``control_points`` (K, 3)
+    Particles ``rest`` and ``start`` (P, 3) are the same material; each of the ``control_points`` (K, 3)
     holds the particle of the start state that is nearest to it.
     """
     count = len(rest)
