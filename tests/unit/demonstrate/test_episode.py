@@ -115,7 +115,7 @@ def test_attributes_are_json(block, block_twin):
 
 
 def test_an_episode_that_cannot_be_simulated_is_replaced_and_the_reasons_are_kept(block, block_twin):
-    # the softer the block, the more of its motions invert a cell: somewhere on this ladder some do, some do not
+    # the softer the block, the more of its motions invert a cell: somewhere here some do, some do not
     config = DemonstrationConfig(frames=40, attempts=6)
     for modulus_pa in (3000.0, 2000.0, 1500.0, 1000.0, 700.0, 500.0):
         soft = block_twin.with_parameters(youngs_modulus_pa=modulus_pa)
