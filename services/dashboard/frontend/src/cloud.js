@@ -1,0 +1,341 @@
+// 3D view of a page: `<figure data-cloud="URL">` with a canvas and controls becomes a player of moving points.
+// The JSON at URL: { times: [s], split: frame | null, floor: m | null,
+//   layers: [{ name, label, role, count, size, shown, url, pairs? }] }
+// A layer's URL gives float32 little-endian (frames, count, 3) [m], z up; NaN marks a point that is not visible.
+// `pairs: "name"` draws a thin line from every point of the layer to its twin in the layer of that name.
+
+import {
+  BufferAttribute, BufferGeometry, Color, DynamicDrawUsage, LineBasicMaterial, LineSegments, PerspectiveCamera,
+  Points, Scene, ShaderMaterial, Vector3, WebGLRenderer,
+} from "three";
+import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
+import { colour, onSchemeChange } from "./palette.js";
+
+const VERTEX = `
+  uniform float size; uniform float scale;
+  void main() {
+    vec4 view = modelViewMatrix * vec4(position, 1.0);
+    gl_Position = projectionMatrix * view;
+    gl_PointSize = clamp(size * scale / -view.z, 2.0, 40.0);
+  }`;
+const FRAGMENT = `
+  uniform vec3 tint; uniform float opacity;
+  void main() {
+    vec2 p = gl_PointCoord * 2.0 - 1.0;
+    float r = dot(p, p);
+    if (r > 1.0) discard;
+    float light = 0.62 + 0.38 * sqrt(1.0 - r) - 0.18 * (p.x + p.y) * 0.5;
+    gl_FragColor = vec4(tint * light, opacity);
+    #include <colorspace_fragment>
+  }`;
+
+/** One set of moving points with its own colour, size and switch. */
+class Layer {
+  constructor(spec, frames) {
+    this.spec = spec;
+    this.frames = frames;
+    this.shown = spec.shown;
+    this.values = null;
+    this.geometry = new BufferGeometry();
+    this.attribute = new BufferAttribute(new Float32Array(spec.count * 3), 3).setUsage(DynamicDrawUsage);
+    this.geometry.setAttribute("position", this.attribute);
+    this.material = new ShaderMaterial({
+      vertexShader: VERTEX,
+      fragmentShader: FRAGMENT,
+      uniforms: {
+        size: { value: spec.size }, scale: { value: 1 }, tint: { value: new Color() },
+        opacity: { value: spec.opacity ?? 1 },
+      },
+      transparent: (spec.opacity ?? 1) < 1,
+      depthWrite: (spec.opacity ?? 1) === 1,
+    });
+    this.points = new Points(this.geometry, this.material);
+    this.points.frustumCulled = false;
+    this.paint();
+  }
+
+  paint() {
+    this.material.uniforms.tint.value.set(colour(this.spec.role));
+  }
+
+  async load() {
+    if (this.values) return;
+    const response = await fetch(this.spec.url);
+    if (!response.ok) throw new Error(`${this.spec.label}: ${response.status}`);
+    const values = new Float32Array(await response.arrayBuffer());
+    const expected = this.frames * this.spec.count * 3;
+    if (values.length !== expected) throw new Error(`${this.spec.label}: ${values.length} numbers, expected ${expected}`);
+    this.values = values;
+  }
+
+  /** Copies the visible points of a frame to the GPU buffer. */
+  show(frame) {
+    this.points.visible = this.shown && this.values !== null;
+    if (!this.points.visible) return;
+    const size = this.spec.count * 3;
+    const source = this.values.subarray(frame * size, (frame + 1) * size);
+    const target = this.attribute.array;
+    let used = 0;
+    for (let i = 0; i < size; i += 3) {
+      if (Number.isNaN(source[i])) continue;
+      target[used] = source[i];
+      target[used + 1] = source[i + 1];
+      target[used + 2] = source[i + 2];
+      used += 3;
+    }
+    this.geometry.setDrawRange(0, used / 3);
+    this.attribute.needsUpdate = true;
+  }
+}
+
+/** Lines between two layers of the same count: what the prediction is wrong by. */
+class Pairs {
+  constructor(from, to) {
+    this.from = from;
+    this.to = to;
+    this.attribute = new BufferAttribute(new Float32Array(from.spec.count * 6), 3).setUsage(DynamicDrawUsage);
+    const geometry = new BufferGeometry();
+    geometry.setAttribute("position", this.attribute);
+    this.lines = new LineSegments(geometry, new LineBasicMaterial({ transparent: true, opacity: 0.75 }));
+    this.lines.frustumCulled = false;
+    this.paint();
+  }
+
+  paint() {
+    this.lines.material.color.set(colour("error-line"));
+  }
+
+  show(frame) {
+    const { from, to } = this;
+    this.lines.visible = from.points.visible && to.points.visible;
+    if (!this.lines.visible) return;
+    const size = from.spec.count * 3;
+    let used = 0;
+    for (let i = frame * size; i < (frame + 1) * size; i += 3) {
+      if (Number.isNaN(from.values[i]) || Number.isNaN(to.values[i])) continue;
+      this.attribute.array.set(from.values.subarray(i, i + 3), used);
+      this.attribute.array.set(to.values.subarray(i, i + 3), used + 3);
+      used += 6;
+    }
+    this.lines.geometry.setDrawRange(0, used / 3);
+    this.attribute.needsUpdate = true;
+  }
+}
+
+/** Corners of everything that the layers show over all frames. */
+function bounds(layers) {
+  const low = new Vector3(Infinity, Infinity, Infinity);
+  const high = new Vector3(-Infinity, -Infinity, -Infinity);
+  const point = new Vector3();
+  for (const layer of layers) {
+    if (!layer.values) continue;
+    for (let i = 0; i < layer.values.length; i += 3) {
+      if (Number.isNaN(layer.values[i])) continue;
+      point.fromArray(layer.values, i);
+      low.min(point);
+      high.max(point);
+    }
+  }
+  return low.x <= high.x ? [low, high] : [new Vector3(-0.5, -0.5, 0), new Vector3(0.5, 0.5, 1)];
+}
+
+/** A round number of metres near a tenth of the extent: 1, 2 or 5 times a power of ten. */
+function gridStep(extent) {
+  const rough = extent / 8;
+  const power = 10 ** Math.floor(Math.log10(rough));
+  return [1, 2, 5, 10].map((factor) => factor * power).find((step) => step >= rough);
+}
+
+function grid(low, high, floor) {
+  const extent = Math.max(high.x - low.x, high.y - low.y, (high.z - low.z) * 0.6, 0.01) * 1.3;
+  const step = gridStep(extent);
+  const half = Math.ceil(extent / 2 / step) * step;
+  const centre = [low.x + high.x, low.y + high.y].map((sum) => Math.round(sum / 2 / step) * step);
+  const z = floor ?? low.z - 0.02 * extent;
+  const corners = [];
+  for (let offset = -half; offset <= half + step / 2; offset += step) {
+    corners.push(centre[0] + offset, centre[1] - half, z, centre[0] + offset, centre[1] + half, z);
+    corners.push(centre[0] - half, centre[1] + offset, z, centre[0] + half, centre[1] + offset, z);
+  }
+  const geometry = new BufferGeometry();
+  geometry.setAttribute("position", new BufferAttribute(new Float32Array(corners), 3));
+  return [new LineSegments(geometry, new LineBasicMaterial()), step];
+}
+
+class Player {
+  constructor(figure, data) {
+    this.figure = figure;
+    this.data = data;
+    this.frame = 0;
+    this.playing = false;
+    this.canvas = figure.querySelector("canvas");
+    this.renderer = new WebGLRenderer({ canvas: this.canvas, antialias: true, alpha: true });
+    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
+    this.scene = new Scene();
+    this.camera = new PerspectiveCamera(36, 1, 0.001, 1000);
+    this.camera.up.set(0, 0, 1);
+    this.orbit = new OrbitControls(this.camera, this.canvas);
+    this.orbit.addEventListener("change", () => this.render());
+    this.layers = data.layers.map((spec) => new Layer(spec, data.times.length));
+    this.pairs = [];
+    for (const layer of this.layers) this.scene.add(layer.points);
+    for (const from of this.layers) {
+      const to = this.layers.find((layer) => layer.spec.name === from.spec.pairs);
+      if (to && to.spec.count === from.spec.count) this.pairs.push(new Pairs(from, to));
+    }
+    for (const pair of this.pairs) this.scene.add(pair.lines);
+  }
+
+  async start() {
+    await Promise.all(this.layers.filter((layer) => layer.shown).map((layer) => layer.load()));
+    this.place();
+    this.buildControls();
+    new ResizeObserver(() => this.resize()).observe(this.canvas.parentElement);
+    onSchemeChange(() => this.paint());
+    this.resize();
+    this.seek(0);
+    this.figure.dataset.ready = "true";
+  }
+
+  place() {
+    const [low, high] = bounds(this.layers);
+    const centre = low.clone().add(high).multiplyScalar(0.5);
+    const radius = Math.max(high.clone().sub(low).length() / 2, 1e-3);
+    const distance = (radius * 1.12) / Math.sin((this.camera.fov / 2) * (Math.PI / 180));
+    const direction = new Vector3(0.62, -1, 0.42).normalize();
+    this.camera.position.copy(centre).addScaledVector(direction, distance);
+    this.camera.near = distance / 200;
+    this.camera.far = distance * 20;
+    this.orbit.target.copy(centre);
+    this.orbit.update();
+    const [lines, step] = grid(low, high, this.data.floor);
+    this.grid = lines;
+    this.scene.add(lines);
+    this.radius = radius;
+    const label = this.figure.querySelector("[data-scale]");
+    if (label) label.textContent = `grid ${step >= 1 ? `${step} m` : `${+(step * 100).toPrecision(2)} cm`}`;
+    this.paint();
+  }
+
+  paint() {
+    for (const item of [...this.layers, ...this.pairs]) item.paint();
+    this.grid.material.color.set(colour("grid"));
+    this.render();
+  }
+
+  buildControls() {
+    const find = (name) => this.figure.querySelector(`[data-${name}]`);
+    this.slider = find("slider");
+    this.slider.max = this.data.times.length - 1;
+    this.slider.value = 0;
+    this.slider.addEventListener("input", () => {
+      this.pause();
+      this.seek(Number(this.slider.value));
+    });
+    if (this.data.split != null) {
+      const share = this.data.split / Math.max(1, this.data.times.length - 1);
+      this.slider.style.setProperty("--split", `${Math.min(1, share) * 100}%`);
+    }
+    this.button = find("play");
+    this.button.addEventListener("click", () => (this.playing ? this.pause() : this.play()));
+    this.speed = find("speed");
+    this.clock = find("clock");
+    const legend = find("legend");
+    for (const layer of this.layers) legend.append(this.switch(layer));
+    document.addEventListener("seek", (event) => this.seek(this.frameAt(event.detail)));
+  }
+
+  switch(layer) {
+    const label = document.createElement("label");
+    const box = document.createElement("input");
+    const dot = document.createElement("span");
+    box.type = "checkbox";
+    box.checked = layer.shown;
+    dot.className = `dot role-${layer.spec.role}`;
+    label.append(box, dot, layer.spec.label);
+    box.addEventListener("change", async () => {
+      layer.shown = box.checked;
+      if (layer.shown) await layer.load();
+      this.seek(this.frame);
+    });
+    return label;
+  }
+
+  frameAt(time) {
+    const times = this.data.times;
+    let low = 0;
+    let high = times.length - 1;
+    while (low < high) {
+      const middle = (low + high + 1) >> 1;
+      if (times[middle] <= time) low = middle;
+      else high = middle - 1;
+    }
+    return low;
+  }
+
+  play() {
+    this.playing = true;
+    this.button.textContent = "Pause";
+    if (this.frame >= this.data.times.length - 1) this.seek(0);
+    let last = performance.now();
+    let time = this.data.times[this.frame];
+    const step = (now) => {
+      if (!this.playing) return;
+      time += ((now - last) / 1000) * Number(this.speed.value);
+      last = now;
+      const frame = this.frameAt(time);
+      if (frame !== this.frame) this.seek(frame);
+      if (frame >= this.data.times.length - 1) this.pause();
+      else requestAnimationFrame(step);
+    };
+    requestAnimationFrame(step);
+  }
+
+  pause() {
+    this.playing = false;
+    this.button.textContent = "Play";
+  }
+
+  seek(frame) {
+    const { times, split } = this.data;
+    this.frame = Math.max(0, Math.min(times.length - 1, frame));
+    for (const item of [...this.layers, ...this.pairs]) item.show(this.frame);
+    this.slider.value = this.frame;
+    this.figure.dataset.frame = this.frame;
+    const part = split == null ? "" : this.frame >= split ? " · held out" : " · training";
+    this.clock.textContent = `${times[this.frame].toFixed(3)} s · frame ${this.frame + 1} of ${times.length}${part}`;
+    document.dispatchEvent(new CustomEvent("frame", { detail: times[this.frame] }));
+    this.render();
+  }
+
+  resize() {
+    const { clientWidth, clientHeight } = this.canvas.parentElement;
+    if (!clientWidth || !clientHeight) return;
+    this.renderer.setSize(clientWidth, clientHeight, false);
+    this.camera.aspect = clientWidth / clientHeight;
+    this.camera.updateProjectionMatrix();
+    const pixels = clientHeight * this.renderer.getPixelRatio();
+    const scale = pixels / (2 * Math.tan((this.camera.fov / 2) * (Math.PI / 180)));
+    for (const layer of this.layers) layer.material.uniforms.scale.value = scale * this.radius;
+    this.render();
+  }
+
+  render() {
+    this.renderer.render(this.scene, this.camera);
+  }
+}
+
+async function mount(figure) {
+  const note = figure.querySelector("[data-note]");
+  try {
+    const response = await fetch(figure.dataset.cloud);
+    if (!response.ok) throw new Error(`the server answered ${response.status}`);
+    const player = new Player(figure, await response.json());
+    await player.start();
+    note.remove();
+  } catch (error) {
+    note.textContent = `The 3D view could not be shown: ${error.message}.`;
+  }
+}
+
+for (const figure of document.querySelectorAll("[data-cloud]")) mount(figure);

@@ -1,0 +1,92 @@
+"""Datasets: the list, a dataset's episodes with one of them in 3D, and how far the writing is, live."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from fastapi import APIRouter, Query, Request
+from fastapi.responses import HTMLResponse, JSONResponse, Response
+
+from services.dashboard import live
+from services.dashboard.clouds import Cloud, Layer, thinned
+from services.dashboard.pages_scenes import layer_response
+from services.dashboard.site import BASE, Site
+from storage import overview, resources
+
+PAGE_SIZE = 50
+DONE_STATES = frozenset({"sealed", "failed"})
+
+Cursor = Annotated[str | None, Query(max_length=512)]
+
+
+def router(site: Site) -> APIRouter:
+    """Pages below ``/datasets``."""
+    routes = APIRouter()
+
+    @routes.get("/datasets")
+    def index(request: Request, cursor: Cursor = None) -> HTMLResponse:
+        with site.database.reading() as session:
+            page = resources.list_datasets(session, limit=PAGE_SIZE, cursor=cursor)
+            names = overview.scene_names(session, (item.scene_id for item in page.data))
+        return site.page(
+            request,
+            "datasets.html",
+            datasets=page.data,
+            names=names,
+            cursor=cursor,
+            next_cursor=page.next_cursor,
+        )
+
+    @routes.get("/datasets/{dataset_id}")
+    def page(
+        request: Request, dataset_id: str, episode: int | None = None, cursor: Cursor = None
+    ) -> HTMLResponse:
+        with site.database.reading() as session:
+            dataset = resources.get_dataset(session, dataset_id)
+            scene = resources.get_scene(session, dataset.scene_id)
+            episodes = resources.list_episodes(session, dataset_id, limit=PAGE_SIZE, cursor=cursor)
+            chosen = episodes.data[0] if episodes.data else None
+            if episode is not None:
+                chosen = resources.get_episode(session, dataset_id, episode)
+        return site.page(
+            request,
+            "dataset.html",
+            dataset=dataset,
+            scene=scene,
+            chosen=chosen,
+            episodes=episodes.data,
+            cursor=cursor,
+            next_cursor=episodes.next_cursor,
+        )
+
+    @routes.get("/live/datasets/{dataset_id}")
+    async def live_page(request: Request, dataset_id: str) -> Response:
+        def render() -> tuple[str, bool]:
+            with site.database.reading() as session:
+                dataset = resources.get_dataset(session, dataset_id)
+            return site.fragment(request, "_dataset.html", dataset=dataset), dataset.state in DONE_STATES
+
+        return await live.stream(render)
+
+    @routes.get("/datasets/{dataset_id}/episodes/{index}/cloud")
+    def cloud(dataset_id: str, index: int) -> Response:
+        url = f"{BASE}/datasets/{dataset_id}/episodes/{index}/cloud"
+        return JSONResponse(_cloud(site, dataset_id, index).describe(url))
+
+    @routes.get("/datasets/{dataset_id}/episodes/{index}/cloud/{layer}")
+    def cloud_layer(dataset_id: str, index: int, layer: str) -> Response:
+        return layer_response(_cloud(site, dataset_id, index), layer)
+
+    return routes
+
+
+def _cloud(site: Site, dataset_id: str, index: int) -> Cloud:
+    with site.database.reading() as session:
+        episode = resources.get_episode(session, dataset_id, index)
+    arrays, _attributes = site.episodes.read(episode.path)
+    layers = [thinned(Layer("particles", "Particles", "predicted", np.asarray(arrays["particles"])))]
+    if arrays["controllers"].shape[1]:
+        controllers = np.asarray(arrays["controllers"])
+        layers.append(thinned(Layer("controllers", "Controllers", "controllers", controllers)))
+    return Cloud(np.asarray(arrays["times"]), layers)

@@ -1,0 +1,149 @@
+"""The overview of jobs, a job's page, their live streams, and the button that cancels a job."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated, Any
+from urllib.parse import urlencode
+
+from fastapi import APIRouter, Depends, Query, Request
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
+from sqlalchemy.orm import Session
+
+from schemas.base import Reference
+from schemas.job import TERMINAL_STATES, Event, Job
+from services.dashboard import live
+from services.dashboard.access import require_same_origin, require_writer
+from services.dashboard.site import BASE, Site
+from services.dashboard.text import figure
+from storage import jobs, overview
+
+PAGE_SIZE = 20
+EVENTS_SHOWN = 100
+FILTERS = ("all", "running", "queued", "succeeded", "failed", "cancelled")
+
+Cursor = Annotated[str | None, Query(max_length=512)]
+State = Annotated[str | None, Query(pattern=r"^[a-z]{1,20}$")]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A job of the list, what it is about, and a pipeline's children."""
+
+    job: Job
+    subject: str
+    children: list[Job] = field(default_factory=list)
+
+
+def router(site: Site) -> APIRouter:
+    """Pages below the dashboard's root and ``/jobs``."""
+    routes = APIRouter()
+
+    @routes.get("/")
+    def index(request: Request, cursor: Cursor = None, state: State = None) -> HTMLResponse:
+        query = {name: value for name, value in (("cursor", cursor), ("state", state)) if value}
+        live_url = f"{BASE}/live/jobs?{urlencode(query)}"
+        return site.page(request, "jobs.html", live_url=live_url, **_list(site, cursor, state))
+
+    @routes.get("/live/jobs")
+    async def live_list(request: Request, cursor: Cursor = None, state: State = None) -> Response:
+        def render() -> tuple[str, bool]:
+            return site.fragment(request, "_jobs.html", **_list(site, cursor, state)), False
+
+        return await live.stream(render)
+
+    @routes.get("/jobs/{job_id}")
+    def page(request: Request, job_id: str) -> HTMLResponse:
+        return site.page(request, "job.html", **_job(site, job_id))
+
+    @routes.get("/live/jobs/{job_id}")
+    async def live_page(request: Request, job_id: str) -> Response:
+        def render() -> tuple[str, bool]:
+            context = _job(site, job_id)
+            return site.fragment(request, "_job.html", **context), context["job"].state in TERMINAL_STATES
+
+        return await live.stream(render)
+
+    @routes.post(
+        "/jobs/{job_id}/cancel", dependencies=[Depends(require_same_origin), Depends(require_writer)]
+    )
+    def cancel(job_id: str) -> Response:
+        with site.database.session() as session:
+            jobs.cancel_job(session, job_id)
+        return RedirectResponse(f"{BASE}/jobs/{job_id}", 303)
+
+    return routes
+
+
+def _list(site: Site, cursor: str | None, state: str | None) -> dict[str, Any]:
+    with site.database.reading() as session:
+        counts = overview.count_objects(session)
+        page = overview.list_top_jobs(session, limit=PAGE_SIZE, cursor=cursor, state=state)
+        children = overview.children_of(session, page.data)
+        subjects = overview.subjects_of(session, page.data)
+    return {
+        "counts": [
+            ("active jobs", counts.active_jobs, ""),
+            ("scenes", counts.scenes, "/scenes"),
+            ("datasets", counts.datasets, "/datasets"),
+            ("models", counts.models, "/models"),
+        ],
+        "entries": [Entry(job, subjects.get(job.id, ""), children.get(job.id, [])) for job in page.data],
+        "filters": FILTERS,
+        "state": state,
+        "cursor": cursor,
+        "next_cursor": page.next_cursor,
+    }
+
+
+def _job(site: Site, job_id: str) -> dict[str, Any]:
+    with site.database.reading() as session:
+        job = jobs.get_job(session, job_id)
+        children = overview.children_of(session, [job]).get(job_id, [])
+        family = {item.id: item for item in (job, *children)}
+        events = overview.latest_events(session, list(family), EVENTS_SHOWN)
+        subject = overview.subjects_of(session, [job]).get(job_id, "")
+        inputs = [_link(session, reference) for reference in job.inputs]
+        links = {
+            item.id: [_link(session, reference) for reference in item.outputs] for item in family.values()
+        }
+
+    def event_words(event: Event) -> str:
+        about = "" if event.job_id == job_id else f"{family[event.job_id].kind}: "
+        return about + describe(event)
+
+    return {
+        "job": job,
+        "children": children,
+        "subject": subject,
+        "inputs": inputs,
+        "links": links,
+        "events": events,
+        "event_words": event_words,
+    }
+
+
+def describe(event: Event) -> str:
+    """One line for an entry of the log."""
+    data = event.data
+    if event.type == "progress":
+        counted = f"{figure(data.get('done'))} of {figure(data.get('total'))} {data.get('unit', '')}".strip()
+        return f"{counted} · {data['message']}" if data.get("message") else counted
+    if event.type == "state":
+        error = data.get("error") or {}
+        detail = error.get("detail") or error.get("title")
+        return f"{data.get('state', '')}: {detail}" if detail else str(data.get("state", ""))
+    return str(data.get("message", ""))
+
+
+def _link(session: Session, reference: Reference) -> tuple[str, str]:
+    """Path below the dashboard and label of what a job was made from or has made."""
+    if reference.kind == "model":
+        name, _, version = reference.id.rpartition(":")
+        return f"/models/{name}/{version}", f"{name}, version {version}"
+    if reference.kind == "fit":
+        return f"/fits/{reference.id}", f"fit …{reference.id[-6:]}"
+    if reference.kind == "scene":
+        name = overview.scene_names(session, [reference.id]).get(reference.id, reference.id)
+        return f"/scenes/{reference.id}", f"scene {name}"
+    return f"/{reference.kind}s/{reference.id}", f"{reference.kind} …{reference.id[-6:]}"

@@ -1,0 +1,121 @@
+"""World models: the list, versions of a name, a version's card with errors, 3D overlay and files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Request
+from fastapi.responses import HTMLResponse, JSONResponse, Response
+
+from schemas.model import Model, ModelVersion
+from services.dashboard.clouds import Cloud, Layer, measured_layers, resampled, scene_cloud, thinned
+from services.dashboard.curves import chart, given_curves
+from services.dashboard.pages_scenes import PREDICTION, layer_response, recording_of
+from services.dashboard.site import BASE, Site
+from services.dashboard.tables import held_out_of
+from storage import registry, resources
+from storage.errors import NotFound
+
+PAGE_SIZE = 50
+
+Cursor = Annotated[str | None, Query(max_length=512)]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A model of the list, its newest version, and that version's held-out track error [m]."""
+
+    model: Model
+    newest: ModelVersion | None
+    track_m: float | None
+
+
+def router(site: Site) -> APIRouter:
+    """Pages below ``/models``."""
+    routes = APIRouter()
+
+    @routes.get("/models")
+    def index(request: Request, cursor: Cursor = None) -> HTMLResponse:
+        with site.database.reading() as session:
+            page = registry.list_models(session, limit=PAGE_SIZE, cursor=cursor)
+            newest = {
+                model.name: registry.list_versions(session, model.name, limit=1).data for model in page.data
+            }
+        entries = [_entry(model, newest[model.name]) for model in page.data]
+        return site.page(request, "models.html", entries=entries, cursor=cursor, next_cursor=page.next_cursor)
+
+    @routes.get("/models/{name}")
+    def model_page(request: Request, name: str, cursor: Cursor = None) -> HTMLResponse:
+        with site.database.reading() as session:
+            model = registry.get_model(session, name)
+            page = registry.list_versions(session, name, limit=PAGE_SIZE, cursor=cursor)
+        return site.page(
+            request,
+            "model.html",
+            model=model,
+            versions=page.data,
+            cursor=cursor,
+            next_cursor=page.next_cursor,
+        )
+
+    @routes.get("/models/{name}/{number}")
+    def version_page(request: Request, name: str, number: int) -> HTMLResponse:
+        version = _version(site, name, number)
+        return site.page(
+            request,
+            "version.html",
+            version=version,
+            has_curve=given_curves(version.metrics) is not None,
+            has_cloud=version.scene_id is not None and site.arrays(version.artifacts, PREDICTION) is not None,
+        )
+
+    @routes.get("/models/{name}/{number}/curve")
+    def curve(name: str, number: int) -> Response:
+        given = given_curves(_version(site, name, number).metrics)
+        if given is None:
+            raise NotFound("curve of model version", f"{name}:{number}")
+        return JSONResponse(chart(*given, split=None))
+
+    @routes.get("/models/{name}/{number}/cloud")
+    def cloud(name: str, number: int) -> Response:
+        url = f"{BASE}/models/{name}/{number}/cloud"
+        return JSONResponse(_cloud(site, _version(site, name, number)).describe(url))
+
+    @routes.get("/models/{name}/{number}/cloud/{layer}")
+    def cloud_layer(name: str, number: int, layer: str) -> Response:
+        return layer_response(_cloud(site, _version(site, name, number)), layer)
+
+    return routes
+
+
+def _version(site: Site, name: str, number: int) -> ModelVersion:
+    with site.database.reading() as session:
+        return registry.get_version(session, name, number)
+
+
+def _cloud(site: Site, version: ModelVersion) -> Cloud:
+    """What the model predicted over what was measured, on the recording's time line."""
+    arrays = site.arrays(version.artifacts, PREDICTION)
+    if arrays is None or version.scene_id is None:
+        raise NotFound("prediction of model version", f"{version.name}:{version.version}")
+    with site.database.reading() as session:
+        record = resources.get_scene(session, version.scene_id)
+    recording = recording_of(site, record)
+    layers = measured_layers(recording)
+    for key, label, role, opacity in (
+        ("tracks", "World model", "predicted", 1.0),
+        ("vertices", "Vertices", "model", 0.75),
+    ):
+        if key in arrays:
+            points = resampled(arrays[key], arrays["times"], recording.times)
+            pairs = "measured" if key == "tracks" else None
+            layers.append(thinned(Layer(key, label, role, points, opacity=opacity, pairs=pairs)))
+    return scene_cloud(recording, layers)
+
+
+def _entry(model: Model, newest: list[ModelVersion]) -> Entry:
+    version = newest[0] if newest else None
+    table = held_out_of(version.metrics) if version else None
+    errors = table.get("track_m", {}) if table else {}
+    return Entry(model, version, errors.get("world_model_finetuned", errors.get("world_model")))

@@ -1,0 +1,175 @@
+"""Scenes: the list, a recording with its newest calibrated twin drawn over it, error curve, parameters."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+from fastapi import APIRouter, Query, Request
+from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
+
+from schemas.fit import Fit
+from schemas.scene import Scene as SceneRecord
+from services.dashboard.clouds import (
+    Cloud,
+    Layer,
+    measured_layers,
+    resampled,
+    scene_cloud,
+    thinned,
+)
+from services.dashboard.curves import chart, frame_errors, given_curves, onto
+from services.dashboard.site import BASE, Site
+from storage import resources
+from storage.errors import NotFound
+
+if TYPE_CHECKING:
+    from physworld.scene import Scene
+
+PAGE_SIZE = 50
+RELATED_SHOWN = 10
+PREDICTION = "prediction.npz"
+DECLARED_SHOWN = ("gravity_m_s2", "initial_state", "body", "ground", "grips", "notes")
+
+FitId = Annotated[str | None, Query(max_length=64)]
+
+
+def router(site: Site) -> APIRouter:
+    """Pages below ``/scenes``, and the address of a fit, which is a view of its scene's page."""
+    routes = APIRouter()
+
+    @routes.get("/scenes")
+    def index(request: Request, cursor: Annotated[str | None, Query(max_length=512)] = None) -> HTMLResponse:
+        with site.database.reading() as session:
+            page = resources.list_scenes(session, limit=PAGE_SIZE, cursor=cursor)
+        return site.page(
+            request, "scenes.html", scenes=page.data, cursor=cursor, next_cursor=page.next_cursor
+        )
+
+    @routes.get("/fits/{fit_id}")
+    def fit_page(fit_id: str) -> Response:
+        with site.database.reading() as session:
+            fit = resources.get_fit(session, fit_id)
+        return RedirectResponse(f"{BASE}/scenes/{fit.scene_id}?fit={fit.id}", 303)
+
+    @routes.get("/scenes/{scene_id}")
+    def page(request: Request, scene_id: str, fit: FitId = None) -> HTMLResponse:
+        record, shown = _load(site, scene_id, fit)
+        with site.database.reading() as session:
+            fits = resources.list_fits(session, scene_id=scene_id, limit=RELATED_SHOWN).data
+            datasets = resources.list_datasets(session, scene_id=scene_id, limit=RELATED_SHOWN).data
+        return site.page(
+            request,
+            "scene.html",
+            scene=record,
+            fit=shown,
+            has_curve=shown is not None and _has_curve(shown),
+            fits=fits,
+            datasets=datasets,
+            declared=_declared(record),
+        )
+
+    @routes.get("/scenes/{scene_id}/cloud")
+    def cloud(scene_id: str, fit: FitId = None) -> Response:
+        record, shown = _load(site, scene_id, fit)
+        query = f"?fit={shown.id}" if shown else ""
+        return JSONResponse(_cloud(site, record, shown).describe(f"{BASE}/scenes/{scene_id}/cloud", query))
+
+    @routes.get("/scenes/{scene_id}/cloud/{layer}")
+    def cloud_layer(scene_id: str, layer: str, fit: FitId = None) -> Response:
+        record, shown = _load(site, scene_id, fit)
+        return layer_response(_cloud(site, record, shown), layer)
+
+    @routes.get("/scenes/{scene_id}/curve")
+    def curve(scene_id: str, fit: FitId = None) -> Response:
+        record, shown = _load(site, scene_id, fit)
+        recording = recording_of(site, record)
+        errors: dict[str, np.ndarray] = {}
+        given = given_curves(shown.metrics) if shown else None
+        if given is not None:
+            errors.update(
+                {name: onto(given[0], values, recording.times) for name, values in given[1].items()}
+            )
+        arrays = site.arrays(shown.artifacts, PREDICTION) if shown else None
+        if arrays is not None:
+            tracks = resampled(arrays["tracks"], arrays["times"], recording.times)
+            errors["twin"] = frame_errors(recording, tracks)
+        return JSONResponse(chart(recording.times, errors, split=split_time(recording)))
+
+    return routes
+
+
+def recording_of(site: Site, record: SceneRecord) -> Scene:
+    """The arrays of a scene. Raises NotFound where its archive is not among its artifacts."""
+    recording = site.recording(record.artifacts)
+    if recording is None:
+        raise NotFound("archive of scene", record.id)
+    return recording
+
+
+def layer_response(cloud: Cloud, name: str) -> Response:
+    """A layer's buffer. What is under its address never changes, so the browser may keep it for a while."""
+    layer = cloud.layer(name)
+    if layer is None:
+        raise NotFound("layer", name)
+    headers = {"Cache-Control": "private, max-age=600"}
+    return Response(layer.buffer(), media_type="application/octet-stream", headers=headers)
+
+
+def split_time(recording: Scene) -> float | None:
+    """When the held-out frames begin [s], None where none are held out."""
+    first, last = recording.test
+    return float(recording.times[first]) if first < last else None
+
+
+def _load(site: Site, scene_id: str, fit_id: str | None) -> tuple[SceneRecord, Fit | None]:
+    """The scene and the fit to show: the one asked for where it is ready, else the newest that is."""
+    with site.database.reading() as session:
+        record = resources.get_scene(session, scene_id)
+        if fit_id is not None:
+            fit = resources.get_fit(session, fit_id)
+            if fit.state == "ready" and fit.scene_id == scene_id:
+                return record, fit
+        newest = resources.list_fits(session, scene_id=scene_id, state="ready", limit=1).data
+    return record, newest[0] if newest else None
+
+
+def _cloud(site: Site, record: SceneRecord, fit: Fit | None) -> Cloud:
+    recording = recording_of(site, record)
+    layers = measured_layers(recording)
+    arrays = site.arrays(fit.artifacts, PREDICTION) if fit else None
+    if arrays is not None:
+        tracks = resampled(arrays["tracks"], arrays["times"], recording.times)
+        layers.append(thinned(Layer("predicted", "Twin", "predicted", tracks, pairs="measured")))
+        if "particles" in arrays:
+            body = resampled(arrays["particles"], arrays["times"], recording.times)
+            layers.append(thinned(Layer("particles", "Particles", "particles", body, opacity=0.4)))
+    return scene_cloud(recording, layers)
+
+
+def _has_curve(fit: Fit) -> bool:
+    return any(item.name == PREDICTION for item in fit.artifacts) or given_curves(fit.metrics) is not None
+
+
+def _declared(record: SceneRecord) -> list[tuple[str, object]]:
+    """Declared facts worth a line: the body's one by one, the others as they are."""
+    facts: list[tuple[str, object]] = []
+    for key in DECLARED_SHOWN:
+        value = record.declared.get(key)
+        if key == "body" and isinstance(value, dict):
+            facts += [(_fact_label(name), item) for name, item in value.items() if _is_short(item)]
+        elif value not in (None, [], {}):
+            facts.append((_fact_label(key), value if _is_short(value) else f"{len(value)} declared"))
+    return facts
+
+
+def _is_short(value: object) -> bool:
+    return isinstance(value, str | int | float | dict) or (isinstance(value, list) and 0 < len(value) <= 4)
+
+
+def _fact_label(key: str) -> str:
+    """``density_kg_m3`` as ``Density [kg/m³]``."""
+    for suffix, unit in (("_kg_m3", "kg/m³"), ("_m_s2", "m/s²"), ("_kg", "kg"), ("_m", "m")):
+        if key.endswith(suffix):
+            return f"{key.removesuffix(suffix).replace('_', ' ').capitalize()} [{unit}]"
+    return key.replace("_", " ").capitalize()

@@ -1,0 +1,111 @@
+"""What every page shares: templates, static files by digest, stores, parsed recordings."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from collections.abc import Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from fastapi import Request
+from fastapi.responses import HTMLResponse
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from schemas.base import Artifact
+from schemas.job import Job
+from services.dashboard import text
+from services.dashboard.tables import held_out_columns, held_out_of, held_out_rows, noise_floor_of
+from services.stores import Stores
+from storage.api_keys import ApiKey
+from storage.database import Database
+from storage.scene_bundle import bundle_from_bytes
+from storage.settings import Settings
+
+if TYPE_CHECKING:
+    from physworld.scene import Scene
+
+BASE = "/dashboard"
+HERE = Path(__file__).parent
+STATIC = HERE / "static"
+CACHED_OBJECTS = 8
+
+
+class Site:
+    """The dashboard's stores and templates; one per process, safe between threads."""
+
+    def __init__(self, settings: Settings, database: Database, stores: Stores) -> None:
+        self.settings = settings
+        self.database = database
+        self.artifacts = stores.artifacts
+        self.episodes = stores.episodes
+        self._templates = _environment()
+        self._scene_of = lru_cache(maxsize=CACHED_OBJECTS)(self._read_scene)
+        self._arrays_of = lru_cache(maxsize=CACHED_OBJECTS)(self._read_arrays)
+
+    def page(self, request: Request, template: str, *, status: int = 200, **context: Any) -> HTMLResponse:
+        """A whole page. Who looks is taken from the request, where ``access.require_viewer`` left it."""
+        return HTMLResponse(self.fragment(request, template, **context), status)
+
+    def fragment(self, request: Request, template: str, **context: Any) -> str:
+        """A rendered template, e.g. the part of a page that a live stream sends again."""
+        viewer: ApiKey | None = getattr(request.state, "viewer", None)
+        may_write = viewer is not None and viewer.allows("write")
+        return self._templates.get_template(template).render(viewer=viewer, may_write=may_write, **context)
+
+    def recording(self, artifacts: list[Artifact]) -> Scene | None:
+        """The recording behind a scene's artifacts: its canonical archive, parsed; None without one."""
+        archive = next((item for item in artifacts if item.name.endswith(".zip")), None)
+        return None if archive is None else self._scene_of(archive.sha256)
+
+    def arrays(self, artifacts: list[Artifact], name: str) -> Mapping[str, np.ndarray] | None:
+        """The arrays of the artifact called ``name`` (an npz without pickles); None without one."""
+        found = next((item for item in artifacts if item.name == name), None)
+        return None if found is None else self._arrays_of(found.sha256)
+
+    def _read_scene(self, sha256: str) -> Scene:
+        scene, _warnings = bundle_from_bytes(self.artifacts.read_bytes(sha256))
+        return scene
+
+    def _read_arrays(self, sha256: str) -> Mapping[str, np.ndarray]:
+        with np.load(io.BytesIO(self.artifacts.read_bytes(sha256)), allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+
+
+def share(job: Job) -> float:
+    """How far a job is, 0 to 1."""
+    if job.state == "succeeded":
+        return 1.0
+    total = job.progress.total
+    return max(0.0, min(1.0, job.progress.done / total)) if total > 0 else 0.0
+
+
+def _environment() -> Environment:
+    environment = Environment(
+        loader=FileSystemLoader(HERE / "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(text.FILTERS)
+    environment.globals.update(
+        base=BASE,
+        static=_static_url,
+        share=share,
+        lasted=text.lasted,
+        held_out_of=held_out_of,
+        noise_floor_of=noise_floor_of,
+        held_out_columns=held_out_columns,
+        held_out_rows=held_out_rows,
+    )
+    return environment
+
+
+@lru_cache(maxsize=64)
+def _static_url(name: str) -> str:
+    """Address of a static file; its digest is in it, so that browsers may keep the file for ever."""
+    digest = hashlib.sha256((STATIC / name).read_bytes()).hexdigest()[:12]
+    return f"{BASE}/static/{name}?v={digest}"

@@ -1,0 +1,74 @@
+"""The held-out table of a fit or a model version: which predictor errs by how much, and the best."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from services.dashboard.curves import LABELS, PREDICTORS
+
+METRICS = ("track_m", "chamfer_phystwin_m", "chamfer_l2_m")
+HeldOut = Mapping[str, Mapping[str, float | None]]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """An error [m], and whether no other predictor has a smaller one."""
+
+    value: float | None
+    best: bool
+
+
+@dataclass(frozen=True)
+class Row:
+    """One predictor; baselines are set apart from what the service made."""
+
+    label: str
+    baseline: bool
+    cells: Sequence[Cell]
+
+
+def held_out_of(metrics: Mapping[str, Any]) -> HeldOut | None:
+    """The table in an object's metrics: under ``held_out``, or the metrics themselves; None without one."""
+    for table in (metrics.get("held_out"), metrics):
+        if isinstance(table, Mapping) and held_out_columns(table):
+            return table
+    return None
+
+
+def noise_floor_of(metrics: Mapping[str, Any]) -> float | None:
+    """What a perfect prediction would show [m], where it is known."""
+    table = metrics.get("held_out")
+    inner = table.get("noise_floor_m") if isinstance(table, Mapping) else None
+    found = metrics.get("noise_floor_m", inner)
+    return float(found) if isinstance(found, int | float) else None
+
+
+def held_out_columns(table: Mapping[str, Any]) -> list[str]:
+    """Metrics of the table that are shown, in their order."""
+    return [metric for metric in METRICS if isinstance(table.get(metric), Mapping)]
+
+
+def held_out_rows(table: HeldOut) -> list[Row]:
+    """One row for each predictor that any metric has, baselines first."""
+    columns = held_out_columns(table)
+    present = {name for metric in columns for name in table[metric]}
+    names = [name for name in LABELS if name in present] + sorted(present - set(LABELS))
+    best = {metric: _smallest(table[metric]) for metric in columns}
+    return [
+        Row(
+            LABELS.get(name, (name.replace("_", " "), ""))[0],
+            name not in PREDICTORS,
+            [
+                Cell(value, value is not None and value == best[metric])
+                for metric in columns
+                for value in [table[metric].get(name)]
+            ],
+        )
+        for name in names
+    ]
+
+
+def _smallest(values: Mapping[str, float | None]) -> float | None:
+    return min((value for value in values.values() if value is not None), default=None)

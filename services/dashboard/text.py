@@ -1,0 +1,138 @@
+"""Words for times, durations and quantities on the pages; the filters of every template."""
+
+from __future__ import annotations
+
+import math
+from datetime import UTC, datetime
+
+from markupsafe import Markup
+
+_AGES = ((60, 1, "s"), (3600, 60, "min"), (86_400, 3600, "h"), (30 * 86_400, 86_400, "d"))
+DASH = "–"
+
+
+def utc_now() -> datetime:
+    """The present, aware, in UTC."""
+    return datetime.now(UTC)
+
+
+def ago(when: datetime, now: datetime | None = None) -> str:
+    """``3 min ago``; the date for what is older than a month. ``frontend/src/app.js`` keeps counting."""
+    seconds = ((now or utc_now()) - when).total_seconds()
+    if seconds < 2:
+        return "just now"
+    for limit, unit, name in _AGES:
+        if seconds < limit:
+            return f"{int(seconds // unit)} {name} ago"
+    return when.strftime("%Y-%m-%d")
+
+
+def moment(when: datetime | None) -> Markup:
+    """A ``<time>`` element: relative words, the absolute time as its title."""
+    if when is None:
+        return Markup(DASH)
+    absolute = when.astimezone(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+    stamp = when.astimezone(UTC).isoformat()
+    return Markup('<time datetime="{}" title="{}" data-ago>{}</time>').format(stamp, absolute, ago(when))
+
+
+def duration(seconds: float | None) -> str:
+    """``0.4 s``, ``12 s``, ``3 min 20 s``, ``2 h 05 min``."""
+    if seconds is None or not math.isfinite(seconds):
+        return DASH
+    if seconds < 9.95:
+        return f"{seconds:.1f} s"
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+
+
+def lasted(start: datetime | None, end: datetime | None) -> Markup | str:
+    """Duration between two moments; counted on by the browser where the end is open."""
+    if start is None:
+        return DASH
+    if end is not None:
+        return duration((end - start).total_seconds())
+    stamp = start.astimezone(UTC).isoformat()
+    return Markup('<time datetime="{}" data-since>{}</time>').format(stamp, span(start))
+
+
+def span(start: datetime) -> str:
+    """Duration from a moment until now."""
+    return duration((utc_now() - start).total_seconds())
+
+
+def figure(value: object, digits: int = 4) -> str:
+    """A number with ``digits`` significant digits; thousands apart, powers of ten where they are shorter."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if value is None:
+        return DASH
+    if isinstance(value, int):
+        return f"{value:,}"
+    if not isinstance(value, float):
+        return str(value)
+    if not math.isfinite(value):
+        return DASH
+    if value != 0 and not 1e-3 <= abs(value) < 1e6:
+        mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+        return f"{mantissa.rstrip('0').rstrip('.')}e{int(exponent)}"
+    if value.is_integer():
+        return f"{value:,.0f}"
+    return f"{value:,.{max(0, digits - 1 - math.floor(math.log10(abs(value))))}f}"
+
+
+def millimetres(metres: float | None) -> str:
+    """A length in metres as millimetres with three significant digits, without the unit."""
+    return DASH if metres is None else figure(float(metres) * 1000, 3)
+
+
+def size(count: int) -> str:
+    """Bytes in the binary units that file managers use."""
+    value = float(count)
+    for unit in ("bytes", "KiB", "MiB"):
+        if value < 1024:
+            return f"{value:.0f} {unit}" if unit == "bytes" else f"{value:.1f} {unit}"
+        value /= 1024
+    return f"{value:.1f} GiB"
+
+
+def words(name: str) -> str:
+    """``world_model_finetuned`` as a person reads it."""
+    return name.replace("_", " ").strip()
+
+
+def identifier(value: str) -> Markup:
+    """A long id or digest, cut to its end, the whole of it in the title."""
+    short = (
+        value if len(value) <= 16 else f"{value[:4]}…{value[-6:]}" if "_" in value[:4] else f"{value[:12]}…"
+    )
+    return Markup('<span class="mono nowrap" title="{}">{}</span>').format(value, short)
+
+
+def plain(value: object) -> str:
+    """A declared fact of any shape, as one line."""
+    if isinstance(value, dict):
+        return ", ".join(
+            f"{words(str(key))} {plain(item)}" for key, item in value.items() if item is not None
+        )
+    if isinstance(value, list | tuple):
+        if len(value) > 6:
+            return f"{len(value)} entries"
+        return "(" + ", ".join(plain(item) for item in value) + ")"
+    return figure(value)
+
+
+FILTERS = {
+    "moment": moment,
+    "duration": duration,
+    "figure": figure,
+    "millimetres": millimetres,
+    "size": size,
+    "words": words,
+    "identifier": identifier,
+    "plain": plain,
+}

@@ -1,0 +1,294 @@
+"""An installation to look at: every row and file made through the storage, as workers make them.
+
+One scene went through the whole chain (fit, dataset of three episodes, model), a second one has a fit under
+way, a third one's fit has failed. Numbers are synthetic: a damped chain of points, and predictions beside it.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from physworld.scene import Body, Scene
+from schemas.base import Artifact, Problem
+from schemas.dataset import DatasetConfig
+from schemas.fit import FitConfig
+from schemas.job import Job, Progress
+from schemas.model import TrainingConfig
+from schemas.pipeline import PipelineCreate
+from services.stores import Stores
+from storage import api_keys, jobs, leases, resources
+from storage.database import Database, open_database
+from storage.scene_bundle import canonical_archive
+from storage.settings import Settings
+from storage.tables import utc_now
+
+FRAMES, POINTS, PARTICLES = 90, 24, 300
+FIRST_HELD_OUT = 63
+EPISODES = 3
+LEASE_SECONDS = 600.0
+PREDICTORS = ("static", "rigid_follow", "constant_velocity", "twin", "world_model", "world_model_finetuned")
+
+
+@dataclass
+class World:
+    """Stores, the keys of the people, and the ids of what was made."""
+
+    settings: Settings
+    database: Database
+    stores: Stores
+    writer_token: str = ""
+    reader_token: str = ""
+    scene_id: str = ""
+    pipeline_id: str = ""
+    dataset_id: str = ""
+    model_file: Artifact | None = None
+    model_bytes: bytes = b""
+    running: leases.Lease | None = None
+    running_id: str = ""
+    failed_id: str = ""
+    arrays: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+def build_world(folder: Path) -> World:
+    """The installation in ``folder``."""
+    settings = Settings(data_dir=folder)
+    database = open_database(settings)
+    database.upgrade()
+    world = World(settings, database, Stores(settings))
+    with database.session() as session:
+        _, world.writer_token = api_keys.create_key(session, "writer", "write")
+        _, world.reader_token = api_keys.create_key(session, "reader", "read")
+    recording = chain_recording()
+    world.scene_id = add_scene(world, recording)
+    world.pipeline_id = _finish_pipeline(world, recording)
+    world.failed_id = _fail_fit(world, add_scene(world, replace(recording, name="chain_failed")))
+    _start_fit(world, add_scene(world, replace(recording, name="chain_running")))
+    return world
+
+
+def chain_recording() -> Scene:
+    """A hanging chain that swings and settles; every seventh observation is hidden."""
+    times = np.arange(FRAMES) / 30.0
+    along = np.linspace(0.0, 1.0, POINTS)
+    swing = 0.7 * np.exp(-0.35 * times[:, None]) * np.cos(3.4 * times[:, None] - 0.9 * along)
+    points = np.stack(
+        [
+            0.45 * along * np.sin(swing),
+            0.06 * np.sin(5.0 * along + times[:, None]),
+            0.6 - 0.45 * along * np.cos(swing),
+        ],
+        axis=-1,
+    )
+    hidden = (np.arange(FRAMES)[:, None] + np.arange(POINTS)) % 7 == 3
+    hidden[0] = False
+    return Scene(
+        name="chain_swing",
+        kind="rope",
+        description="A chain of 24 markers, held at one end, swings and settles.",
+        points=points,
+        visible=~hidden,
+        controllers=np.repeat(points[:, :1], 1, axis=1),
+        times=times,
+        gravity_m_s2=np.array([0.0, 0.0, -9.81]),
+        noise_sigma_m=2e-4,
+        train=(0, FIRST_HELD_OUT),
+        test=(FIRST_HELD_OUT, FRAMES),
+        body=Body(length_m=0.45, radius_m=0.008, density_kg_m3=1100.0),
+    )
+
+
+def add_scene(world: World, recording: Scene) -> str:
+    """Store a recording as the API does; its id."""
+    archive = world.stores.artifacts.put_bytes(canonical_archive(recording), "scene.zip", "application/zip")
+    with world.database.session() as session:
+        scene = resources.create_scene(
+            session,
+            name=recording.name,
+            kind=recording.kind,
+            description=recording.description,
+            digest=archive.sha256,
+            frames=recording.frame_count,
+            points=recording.points.shape[1],
+            controllers=recording.controllers.shape[1],
+            fps=recording.fps,
+            duration_s=float(recording.times[-1]),
+            noise_sigma_m=recording.noise_sigma_m,
+            train=recording.train,
+            test=recording.test,
+            declared={"gravity_m_s2": [0.0, 0.0, -9.81], "body": {"length_m": 0.45, "density_kg_m3": 1100.0}},
+            artifacts=[archive],
+        )
+    return scene.id
+
+
+def claim(world: World, job_id: str) -> leases.Lease:
+    """Take the next queued shard of a job, as a worker does."""
+    with world.database.session() as session:
+        family = {job_id, *jobs.get_job(session, job_id).children}
+        for publication in leases.publishable(session, utc_now(), 1000):
+            lease = leases.claim(session, publication.shard_id, "test", utc_now(), LEASE_SECONDS)
+            if lease is not None and lease.job_id in family:
+                return lease
+            if lease is not None:
+                leases.release(session, lease)
+    raise AssertionError(f"job {job_id} has no queued shard")
+
+
+def report(world: World, lease: leases.Lease, done: float, total: float, unit: str, message: str) -> None:
+    """Renew a lease with progress."""
+    progress = Progress(done=done, total=total, unit=unit, message=message)
+    with world.database.session() as session:
+        leases.renew(session, lease, utc_now(), LEASE_SECONDS, progress)
+
+
+def complete(world: World, lease: leases.Lease, result: dict[str, Any], digest: str | None = None) -> None:
+    """Commit a shard's result."""
+    with world.database.session() as session:
+        assert leases.complete(session, lease, result, digest)
+
+
+def _finish_pipeline(world: World, recording: Scene) -> str:
+    request = PipelineCreate(
+        scene_id=world.scene_id,
+        fit=FitConfig(max_simulations=40),
+        dataset=DatasetConfig(episodes=EPISODES),
+        training=TrainingConfig(steps=500),
+    )
+    with world.database.session() as session:
+        pipeline = jobs.create_pipeline(session, request)
+    lease = claim(world, pipeline.id)
+    report(world, lease, 20, 40, "simulations", "Gauss-Newton, loss 2.1e-6")
+    complete(world, lease, _fit_result(world, recording))
+    complete(world, claim(world, pipeline.id), {"episodes": EPISODES, "frames": 40, "particles": PARTICLES})
+    for _ in range(EPISODES):
+        lease = claim(world, pipeline.id)
+        world.dataset_id = lease.payload["dataset_id"]
+        _write_episode(world, lease)
+    lease = claim(world, pipeline.id)
+    with world.database.reading() as session:
+        episodes = resources.all_episodes(session, world.dataset_id)
+    manifest = world.stores.episodes.write_manifest(world.dataset_id, episodes)
+    seal = {"digest": manifest.sha256, "statistics": {"seconds": 12.5}, "artifacts": [manifest.model_dump()]}
+    complete(world, lease, seal, manifest.sha256)
+    complete(world, claim(world, pipeline.id), _training_result(world, recording))
+    return pipeline.id
+
+
+def _fit_result(world: World, recording: Scene) -> dict[str, Any]:
+    generator = np.random.default_rng(0)
+    drift = np.linspace(0.0, 0.02, FRAMES)[:, None, None] * np.array([1.0, 0.4, -0.3])
+    along = generator.integers(0, POINTS, PARTICLES)
+    tracks = (recording.points + drift).astype(np.float32)
+    particles = tracks[:, along] + 0.012 * generator.standard_normal((PARTICLES, 3)).astype(np.float32)
+    world.arrays = {"tracks": tracks, "particles": particles.astype(np.float32), "times": recording.times}
+    prediction = world.stores.artifacts.put_bytes(packed(world.arrays), "prediction.npz")
+    parameter = {"value": 1.84e5, "unit": "Pa", "ci95": [1.71e5, 1.98e5], "identified": True}
+    density = {"value": 1100.0, "unit": "kg/m³", "identified": False, "note": "declared"}
+    return {
+        "parameters": {"youngs_modulus": parameter, "density": density},
+        "metrics": {"held_out": held_out(recording, PREDICTORS[:4])},
+        "artifacts": [prediction.model_dump()],
+        "lineage": {"code_version": "0.1.0", "seeds": {"fit": 0}, "device": "cpu"},
+    }
+
+
+def _write_episode(world: World, lease: leases.Lease) -> None:
+    times = np.arange(40) / 30.0
+    rest = np.random.default_rng(lease.index).uniform(-0.05, 0.05, (PARTICLES, 3))
+    path = 0.1 * np.stack([np.sin(times), np.cos(times), 0.2 * times], axis=-1)
+    arrays = {
+        "times": times,
+        "particles": (rest + path[:, None]).astype(np.float32),
+        "controllers": path[:, None].astype(np.float32),
+        "properties": np.zeros((PARTICLES, 2), np.float32),
+    }
+    place, digest = world.stores.episodes.write(world.dataset_id, lease.index, lease.epoch, arrays, {})
+    result = {
+        "index": lease.index,
+        "path": place,
+        "digest": digest,
+        "seed": 1000 + lease.index,
+        "frames": len(times),
+        "particles": PARTICLES,
+        "motion": "bezier",
+    }
+    complete(world, lease, result, digest)
+
+
+def _training_result(world: World, recording: Scene) -> dict[str, Any]:
+    world.model_bytes = bytes(range(256)) * 300
+    put = world.stores.artifacts.put_bytes
+    world.model_file = put(world.model_bytes, "model.safetensors")
+    tracks = (recording.points + 0.01).astype(np.float32)
+    arrays = {"tracks": tracks, "vertices": tracks[:, ::2], "times": recording.times}
+    manifest = put(json.dumps({"name": "chain_swing", "version": 1}).encode(), "manifest.json")
+    files = [world.model_file, manifest, put(packed(arrays), "prediction.npz")]
+    return {
+        "artifacts": [item.model_dump() for item in files],
+        "sha256": manifest.sha256,
+        "metrics": {
+            "held_out": held_out(recording, PREDICTORS),
+            "steps_per_second": {"twin": 41.0, "world_model": 640.0},
+            "noise_floor_m": 3.2e-4,
+            "seconds": {"training": 91.0},
+        },
+        "lineage": {"code_version": "0.1.0", "seeds": {"training": 7}, "device": "cpu"},
+    }
+
+
+def held_out(recording: Scene, predictors: tuple[str, ...]) -> dict[str, Any]:
+    """A table as the library's ``held_out_table`` gives it, each predictor better than the last."""
+    times = recording.times[FIRST_HELD_OUT:]
+    errors = {name: 0.03 / (index + 1) for index, name in enumerate(predictors)}
+    growth = np.linspace(0.6, 1.4, len(times))
+    return {
+        "track_m": errors,
+        "chamfer_phystwin_m": {name: error / 2 for name, error in errors.items()},
+        "chamfer_l2_m": {name: error / 3 for name, error in errors.items()},
+        "noise_floor_m": 3.2e-4,
+        "frames": [FIRST_HELD_OUT, FRAMES],
+        "per_frame": {
+            "frames": list(range(FIRST_HELD_OUT, FRAMES)),
+            "times_s": times.tolist(),
+            "track_m": {name: (error * growth).tolist() for name, error in errors.items()},
+        },
+    }
+
+
+def _fail_fit(world: World, scene_id: str) -> str:
+    job = _open_fit(world, scene_id)
+    lease = claim(world, job.id)
+    problem = Problem(
+        title="The time step is too long",
+        status=422,
+        code="cfl_violation",
+        detail="dt 1.0e-4 s exceeds the CFL limit 6.1e-5 s for E 2.0e6 Pa at dx 0.01 m",
+        hint="Lower the particle budget, or let the engine choose the step.",
+    )
+    with world.database.session() as session:
+        leases.fail(session, lease, problem, retry=False)
+    return job.id
+
+
+def _start_fit(world: World, scene_id: str) -> None:
+    world.running_id = _open_fit(world, scene_id).id
+    world.running = claim(world, world.running_id)
+    report(world, world.running, 10, 80, "simulations", "global stage")
+
+
+def _open_fit(world: World, scene_id: str) -> Job:
+    with world.database.session() as session:
+        return jobs.create_fit(session, scene_id, FitConfig())
+
+
+def packed(arrays: dict[str, np.ndarray]) -> bytes:
+    """Arrays as the bytes of an npz."""
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()
