@@ -74,6 +74,12 @@ def get_scene(session: Session, scene_id: str) -> Scene:
     return _scene(_required(session, SceneRow, "scene", scene_id))
 
 
+def find_scene(session: Session, digest: str) -> Scene | None:
+    """The scene whose canonical bundle has ``digest``, None when there is none."""
+    row = session.scalars(select(SceneRow).where(SceneRow.digest == digest)).one_or_none()
+    return None if row is None else _scene(row)
+
+
 def list_scenes(
     session: Session, *, limit: int = 50, cursor: str | None = None, kind: str | None = None
 ) -> Page[Scene]:

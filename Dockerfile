@@ -1,0 +1,57 @@
+# Images of the service, one target each:
+#   api      web process, migration: neither torch nor warp
+#   worker   dispatcher, simulation workers: warp
+#   trainer  training workers: warp and torch
+# Dependencies are installed before the source is copied, so that a change of code rebuilds one small layer.
+# Build arguments: PIP_INDEX_URL and PIP_EXTRA_INDEX_URL where packages come from another index (the pinned CPU
+# build of torch lies on its project's own index).
+ARG PYTHON_IMAGE=python:3.11.14-slim-bookworm
+
+FROM ${PYTHON_IMAGE} AS base
+ENV PYTHONUNBUFFERED=1 \
+    PYTHONDONTWRITEBYTECODE=1 \
+    PIP_NO_CACHE_DIR=1 \
+    PIP_DISABLE_PIP_VERSION_CHECK=1 \
+    HOME=/var/lib/physworld \
+    PHYSWORLD_DATA_DIR=/var/lib/physworld \
+    WARP_CACHE_PATH=/var/cache/physworld/warp
+RUN groupadd --gid 10001 physworld \
+    && useradd --uid 10001 --gid 10001 --home-dir /var/lib/physworld --shell /usr/sbin/nologin physworld \
+    && mkdir -p /var/lib/physworld /var/cache/physworld \
+    && chown 10001:10001 /var/lib/physworld /var/cache/physworld
+WORKDIR /app
+COPY pyproject.toml constraints.txt scripts/requirements.py ./
+ARG PIP_INDEX_URL=
+ARG PIP_EXTRA_INDEX_URL=
+
+FROM base AS api
+RUN python requirements.py api > requirements.txt && pip install -r requirements.txt -c constraints.txt
+COPY schemas/ schemas/
+COPY storage/ storage/
+COPY physworld/__init__.py physworld/scene.py physworld/
+COPY services/__init__.py services/stores.py services/web.py services/
+COPY services/api/ services/api/
+COPY services/dashboard/ services/dashboard/
+USER 10001:10001
+EXPOSE 8000
+CMD ["python", "-m", "services.web", "--host", "0.0.0.0", "--port", "8000"]
+
+FROM base AS worker
+RUN python requirements.py api sim > requirements.txt && pip install -r requirements.txt -c constraints.txt
+COPY schemas/ schemas/
+COPY storage/ storage/
+COPY physworld/ physworld/
+COPY workers/ workers/
+USER 10001:10001
+CMD ["python", "-m", "workers"]
+
+FROM base AS trainer
+RUN python requirements.py api sim train > requirements.txt && pip install -r requirements.txt -c constraints.txt
+COPY schemas/ schemas/
+COPY storage/ storage/
+COPY physworld/ physworld/
+COPY workers/ workers/
+COPY services/__init__.py services/
+COPY services/trainer/ services/trainer/
+USER 10001:10001
+CMD ["python", "-m", "services.trainer"]

@@ -1,0 +1,88 @@
+"""Request ids, the JSON access log and the request metrics: one middleware around everything.
+
+A client may send ``X-Request-Id`` (letters, digits, ``._-``, at most 64); otherwise the service makes one.
+The answer carries it, every problem carries it, every log line of the request carries it.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+
+import structlog
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from schemas.ids import new_id
+from services.api.metrics import Metrics
+
+_REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
+_METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
+_UNLOGGED = frozenset({"/health/live", "/health/ready", "/metrics"})
+
+log = structlog.get_logger("physworld.access")
+
+
+class Access:
+    """ASGI middleware; the outermost of ours, so that refusals are logged and counted too."""
+
+    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
+        self.app = app
+        self.metrics = metrics
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Give the request its id, run it, count it and log one line."""
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        request_id = _request_id(Headers(scope=scope))
+        scope.setdefault("state", {})["request_id"] = request_id
+        status = 500
+
+        async def send_with_id(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+                headers = MutableHeaders(scope=message)
+                headers["X-Request-Id"] = request_id
+                headers.setdefault("X-Content-Type-Options", "nosniff")
+            await send(message)
+
+        started = time.perf_counter()
+        with structlog.contextvars.bound_contextvars(request_id=request_id):
+            try:
+                await self.app(scope, receive, send_with_id)
+            except Exception:
+                log.exception("request_failed", method=scope["method"], path=scope["path"])
+                raise
+            finally:
+                self._account(scope, status, time.perf_counter() - started)
+
+    def _account(self, scope: Scope, status: int, seconds: float) -> None:
+        method = scope["method"] if scope["method"] in _METHODS else "other"
+        route = _route_of(scope)
+        self.metrics.requests.labels(method, route, str(status)).inc()
+        self.metrics.latency.labels(method, route).observe(seconds)
+        if scope["path"] in _UNLOGGED:
+            return
+        client = scope.get("client")
+        log.info(
+            "request",
+            method=scope["method"],
+            path=scope["path"],
+            status=status,
+            seconds=round(seconds, 6),
+            client=client[0] if client else None,
+            key=scope["state"].get("key_id"),
+        )
+
+
+def _request_id(headers: Headers) -> str:
+    sent = headers.get("X-Request-Id", "")
+    return sent if _REQUEST_ID.fullmatch(sent) else new_id("request")
+
+
+def _route_of(scope: Scope) -> str:
+    """The path's template, so that ids do not become labels; unknown paths share one label."""
+    route = scope.get("route")
+    return getattr(route, "path", "unmatched")

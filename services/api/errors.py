@@ -1,0 +1,219 @@
+"""RFC 9457 problem details: every answer that is not a success is one ``application/problem+json``.
+
+``code`` is stable and is what a client branches on; ``detail`` carries the numbers that broke; ``errors``
+names each field at fault; ``request_id`` finds the line in the access log. The framework's own answers (no
+such path, wrong method, body that does not validate) and the storage's exceptions are translated here, once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from http import HTTPStatus
+from typing import Any
+
+import structlog
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from sqlalchemy.exc import DataError
+from starlette.exceptions import HTTPException
+
+from schemas.base import FieldError, Problem
+from storage.errors import (
+    ArtifactCorrupt,
+    Conflict,
+    DatabaseUnavailable,
+    EpisodeCorrupt,
+    IdempotencyMismatch,
+    InvalidCursor,
+    NotFound,
+    SceneInvalid,
+    StorageError,
+    StoreError,
+    StoreFull,
+)
+
+PROBLEM_MEDIA_TYPE = "application/problem+json"
+TYPE_PREFIX = "urn:physworld:problem:"
+
+_CODES = {
+    400: "bad_request",
+    401: "unauthenticated",
+    403: "forbidden",
+    404: "not_found",
+    405: "method_not_allowed",
+    406: "not_acceptable",
+    409: "conflict",
+    413: "content_too_large",
+    415: "unsupported_media_type",
+    416: "range_not_satisfiable",
+    422: "invalid_request",
+    500: "internal_error",
+    503: "unavailable",
+}
+
+# Which status an error of the storage answers with; the first class that fits, so children before parents.
+_STORAGE_STATUS: tuple[tuple[type[StorageError], int], ...] = (
+    (NotFound, 404),
+    (IdempotencyMismatch, 422),
+    (Conflict, 409),
+    (InvalidCursor, 422),
+    (SceneInvalid, 422),
+    (DatabaseUnavailable, 503),
+    (ArtifactCorrupt, 500),
+    (EpisodeCorrupt, 500),
+    (StoreFull, 507),
+    (StoreError, 503),
+)
+
+log = structlog.get_logger("physworld.api")
+
+
+class ApiProblem(HTTPException):
+    """A problem that a route or a middleware answers with; raised, never returned."""
+
+    def __init__(
+        self,
+        status: int,
+        code: str,
+        detail: str,
+        *,
+        errors: Sequence[FieldError] = (),
+        hint: str | None = None,
+        headers: Mapping[str, str] | None = None,
+    ) -> None:
+        super().__init__(status_code=status, detail=detail, headers=headers)
+        self.code = code
+        self.errors = list(errors)
+        self.hint = hint
+
+
+def problem_response(
+    status: int,
+    code: str,
+    detail: str,
+    *,
+    request_id: str | None,
+    errors: Sequence[FieldError] = (),
+    hint: str | None = None,
+    headers: Mapping[str, str] | None = None,
+) -> JSONResponse:
+    """The answer for one problem."""
+    problem = Problem(
+        type=f"{TYPE_PREFIX}{code}",
+        title=HTTPStatus(status).phrase,
+        status=status,
+        code=code,
+        detail=detail,
+        request_id=request_id,
+        errors=list(errors),
+        hint=hint,
+    )
+    return JSONResponse(
+        problem.model_dump(mode="json"), status, headers=dict(headers or {}), media_type=PROBLEM_MEDIA_TYPE
+    )
+
+
+def answer(problem: ApiProblem, scope: Mapping[str, Any]) -> JSONResponse:
+    """The answer for a raised problem, in the request of this ASGI scope."""
+    return problem_response(
+        problem.status_code,
+        problem.code,
+        problem.detail,
+        request_id=request_id_of(scope),
+        errors=problem.errors,
+        hint=problem.hint,
+        headers=problem.headers,
+    )
+
+
+def request_id_of(scope: Mapping[str, Any]) -> str | None:
+    """The id that the access log gave this request (``services.api.access``)."""
+    return scope.get("state", {}).get("request_id")
+
+
+def documented(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """The ``responses=`` of a route: which problems it answers with, for the OpenAPI document."""
+    return {
+        status: {
+            "description": HTTPStatus(status).phrase,
+            "content": {PROBLEM_MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
+        }
+        for status in statuses
+    }
+
+
+def install(app: FastAPI) -> None:
+    """Register the translation of every exception that leaves a route."""
+    app.add_exception_handler(HTTPException, _http)
+    app.add_exception_handler(RequestValidationError, _invalid)
+    app.add_exception_handler(DataError, _unstorable)
+    app.add_exception_handler(StorageError, _storage)
+    app.add_exception_handler(Exception, _unexpected)
+
+
+async def _http(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, HTTPException)
+    if isinstance(error, ApiProblem):
+        return answer(error, request.scope)
+    status = error.status_code
+    detail = str(error.detail)
+    if detail == HTTPStatus(status).phrase:
+        detail = f"{detail}: {request.method} {request.url.path}"
+    return problem_response(
+        status,
+        _CODES.get(status, "error"),
+        detail,
+        request_id=request_id_of(request.scope),
+        headers=error.headers,
+    )
+
+
+async def _invalid(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, RequestValidationError)
+    faults = [FieldError(loc=list(fault["loc"]), msg=fault["msg"]) for fault in error.errors()]
+    detail = "; ".join(f"{'.'.join(map(str, fault.loc))}: {fault.msg}" for fault in faults[:3])
+    if len(faults) > 3:
+        detail += f"; and {len(faults) - 3} more"
+    return problem_response(
+        422, "invalid_request", detail, request_id=request_id_of(request.scope), errors=faults
+    )
+
+
+async def _unstorable(request: Request, error: Exception) -> JSONResponse:
+    """A value that the schema allows and the database refuses, e.g. a NUL character in Postgres text."""
+    assert isinstance(error, DataError)
+    return problem_response(
+        422,
+        "invalid_request",
+        f"the database refuses a value of this request: {error.orig}",
+        request_id=request_id_of(request.scope),
+    )
+
+
+async def _storage(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, StorageError)
+    status = next((status for kind, status in _STORAGE_STATUS if isinstance(error, kind)), 500)
+    if status >= 500:
+        log.error(error.code, path=request.url.path, error=str(error))
+    return problem_response(
+        status,
+        "idempotency_key_reused" if isinstance(error, IdempotencyMismatch) else error.code,
+        str(error),
+        request_id=request_id_of(request.scope),
+        errors=error.faults if isinstance(error, SceneInvalid) else (),
+        headers={"Retry-After": "2"} if status == 503 else None,
+    )
+
+
+async def _unexpected(request: Request, error: Exception) -> JSONResponse:
+    """A fault of ours. The text of the exception stays in the log: it may hold addresses or secrets."""
+    request_id = request_id_of(request.scope)
+    return problem_response(
+        500,
+        "internal_error",
+        f"{type(error).__name__} while answering {request.method} {request.url.path}",
+        request_id=request_id,
+        hint="The service's log holds the traceback under this request id.",
+        headers={"X-Request-Id": request_id} if request_id else None,
+    )

@@ -1,0 +1,53 @@
+"""Upper bounds on request bodies, counted as they stream: 413 with both numbers, and nothing stored."""
+
+from __future__ import annotations
+
+from starlette.datastructures import Headers
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from services.api.errors import ApiProblem, answer
+
+JSON_LIMIT_BYTES = 1024 * 1024
+MULTIPART_OVERHEAD_BYTES = 64 * 1024
+UPLOAD_PATHS = frozenset({"/v1/scenes"})
+
+
+class BodyLimit:
+    """ASGI middleware; uploads are bounded by the settings, every other body by 1 MiB."""
+
+    def __init__(self, app: ASGIApp, max_upload_bytes: int) -> None:
+        self.app = app
+        self.max_upload_bytes = max_upload_bytes
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Refuse by the declared length at once, and by the counted length while the body streams."""
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        if scope["path"] in UPLOAD_PATHS:
+            allowed, limit = self.max_upload_bytes + MULTIPART_OVERHEAD_BYTES, self.max_upload_bytes
+        else:
+            allowed = limit = JSON_LIMIT_BYTES
+        declared = Headers(scope=scope).get("Content-Length", "0")
+        if declared.isdigit() and int(declared) > allowed:
+            await answer(too_large(int(declared), limit), scope)(scope, receive, send)
+            return
+        counted = 0
+
+        async def receive_counted() -> Message:
+            nonlocal counted
+            message = await receive()
+            counted += len(message.get("body", b""))
+            if counted > allowed:
+                raise too_large(counted, limit, at_least=True)
+            return message
+
+        await self.app(scope, receive_counted, send)
+
+
+def too_large(size: int, limit: int, *, at_least: bool = False) -> ApiProblem:
+    """The 413 with both numbers."""
+    words = "at least " if at_least else ""
+    return ApiProblem(
+        413, "content_too_large", f"the body has {words}{size} bytes; the limit is {limit} bytes"
+    )

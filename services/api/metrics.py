@@ -1,0 +1,88 @@
+"""Prometheus figures: requests and their latency, jobs by state, shards by queue and state.
+
+The job and shard figures are counted in the database when a scrape asks for them, so that every web process
+tells the same truth and none of them keeps books.
+"""
+
+from __future__ import annotations
+
+from collections import Counter as Tally
+from collections.abc import Iterator
+
+from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
+from prometheus_client.core import GaugeMetricFamily
+from prometheus_client.registry import Collector
+
+from schemas.queues import QUEUE_OF_SHARD
+from storage.counts import count_jobs, count_shards
+from storage.database import Database
+
+WAITING = "QUEUED"
+_LATENCY_BUCKETS_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0)
+
+
+class Metrics:
+    """The figures of one web process, in a registry of its own.
+
+    Attributes:
+        requests: counter by method, route template and status.
+        latency: histogram of seconds from the first byte in to the last byte out.
+    """
+
+    def __init__(self, database: Database) -> None:
+        self._registry = CollectorRegistry()
+        self.requests = Counter(
+            "physworld_requests", "HTTP requests", ["method", "route", "status"], registry=self._registry
+        )
+        self.latency = Histogram(
+            "physworld_request_seconds",
+            "Seconds from the first byte in to the last byte out",
+            ["method", "route"],
+            buckets=_LATENCY_BUCKETS_S,
+            registry=self._registry,
+        )
+        self._registry.register(_DatabaseFigures(database))
+
+    def exposition(self) -> bytes:
+        """All figures in the Prometheus text format."""
+        return generate_latest(self._registry)
+
+
+class _DatabaseFigures(Collector):
+    """Jobs and shards as the database has them at the time of the scrape."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def describe(self) -> Iterator[GaugeMetricFamily]:
+        """Names without values: registering must not need a migrated database."""
+        yield from (_jobs(), _shards(), _depth())
+
+    def collect(self) -> Iterator[GaugeMetricFamily]:
+        """One reading transaction for all figures of a scrape."""
+        with self._database.reading() as session:
+            jobs, shards = count_jobs(session), count_shards(session)
+        by_job, by_shard, depth = _jobs(), _shards(), _depth()
+        for (kind, state), count in sorted(jobs.items()):
+            by_job.add_metric([kind, state], count)
+        waiting = Tally(dict.fromkeys(QUEUE_OF_SHARD.values(), 0))
+        for (kind, state), count in sorted(shards.items()):
+            by_shard.add_metric([QUEUE_OF_SHARD[kind], kind, state.lower()], count)
+            waiting[QUEUE_OF_SHARD[kind]] += count if state == WAITING else 0
+        for queue, count in sorted(waiting.items()):
+            depth.add_metric([queue], count)
+        yield from (by_job, by_shard, depth)
+
+
+def _jobs() -> GaugeMetricFamily:
+    return GaugeMetricFamily("physworld_jobs", "Jobs", labels=["kind", "state"])
+
+
+def _shards() -> GaugeMetricFamily:
+    return GaugeMetricFamily("physworld_shards", "Shards", labels=["queue", "kind", "state"])
+
+
+def _depth() -> GaugeMetricFamily:
+    return GaugeMetricFamily(
+        "physworld_queue_depth", "Shards that wait for a worker, published or not", labels=["queue"]
+    )

@@ -1,0 +1,87 @@
+"""Datasets: let a twin demonstrate, and read the episodes."""
+
+from __future__ import annotations
+
+import io
+import json
+from typing import Annotated, Literal
+
+import numpy as np
+from fastapi import APIRouter, Path, Query, Response
+
+from schemas.base import Page
+from schemas.dataset import Dataset, DatasetCreate, Episode
+from schemas.job import Job
+from services.api.dependencies import ID_PATTERN, DatabaseDep, ObjectId, PageDep, StoresDep
+from services.api.errors import documented
+from services.api.idempotency import IdempotencyDep, accepted
+from storage import jobs, resources
+
+router = APIRouter(prefix="/datasets", tags=["datasets"])
+
+NPZ = "application/vnd.numpy.npz"
+
+EpisodeIndex = Annotated[int, Path(ge=0, lt=2**31, description="number of the episode in its dataset")]
+
+
+@router.post("", status_code=202, response_model=Job, responses=documented(401, 403, 404, 409, 413, 422))
+def create_dataset(body: DatasetCreate, idempotency: IdempotencyDep) -> Response:
+    """Start the demonstrations of a ready fit; the dataset's id is in the job's `outputs`."""
+    return idempotency.run(
+        body, lambda session: accepted(jobs.create_dataset(session, body.fit_id, body.config))
+    )
+
+
+@router.get("", responses=documented(401, 403, 422))
+def list_datasets(
+    database: DatabaseDep,
+    page: PageDep,
+    state: Literal["pending", "writing", "sealed", "failed"] | None = None,
+    fit_id: Annotated[str | None, Query(pattern=ID_PATTERN)] = None,
+    scene_id: Annotated[str | None, Query(pattern=ID_PATTERN)] = None,
+) -> Page[Dataset]:
+    """Datasets, newest first."""
+    with database.reading() as session:
+        return resources.list_datasets(
+            session, limit=page.limit, cursor=page.cursor, state=state, fit_id=fit_id, scene_id=scene_id
+        )
+
+
+@router.get("/{dataset_id}", responses=documented(401, 403, 404, 422))
+def get_dataset(dataset_id: ObjectId, database: DatabaseDep) -> Dataset:
+    """A dataset: its state, statistics and manifest."""
+    with database.reading() as session:
+        return resources.get_dataset(session, dataset_id)
+
+
+@router.get("/{dataset_id}/episodes", responses=documented(401, 403, 404, 422))
+def list_episodes(dataset_id: ObjectId, database: DatabaseDep, page: PageDep) -> Page[Episode]:
+    """Committed episodes, by index."""
+    with database.reading() as session:
+        return resources.list_episodes(session, dataset_id, limit=page.limit, cursor=page.cursor)
+
+
+@router.get(
+    "/{dataset_id}/episodes/{index}",
+    response_class=Response,
+    responses={
+        200: {
+            "description": "times (T,) s, particles (T, P, 3) m, controllers (T, K, 3) m, properties (P, 2); "
+            "`attributes` holds the episode's attributes as JSON text",
+            "content": {NPZ: {"schema": {"type": "string", "format": "binary"}}},
+        },
+        **documented(401, 403, 404, 422, 503),
+    },
+)
+def get_episode(
+    dataset_id: ObjectId, index: EpisodeIndex, database: DatabaseDep, stores: StoresDep
+) -> Response:
+    """The arrays of one episode as npz (no pickles)."""
+    with database.reading() as session:
+        episode = resources.get_episode(session, dataset_id, index)
+    arrays, attributes = stores.episodes.read(episode.path)
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, attributes=np.array(json.dumps(attributes)), **arrays)
+    name = f"{dataset_id}-{index:05d}.npz"
+    headers = {"Content-Disposition": f'attachment; filename="{name}"', "ETag": f'"{episode.digest}"'}
+    return Response(buffer.getvalue(), headers=headers, media_type=NPZ)

@@ -1,0 +1,19 @@
+"""The whole chain in one call: fit, dataset, training."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, Response
+
+from schemas.job import Job
+from schemas.pipeline import PipelineCreate
+from services.api.errors import documented
+from services.api.idempotency import IdempotencyDep, accepted
+from storage import jobs
+
+router = APIRouter(prefix="/pipelines", tags=["pipelines"])
+
+
+@router.post("", status_code=202, response_model=Job, responses=documented(401, 403, 404, 409, 413, 422))
+def create_pipeline(body: PipelineCreate, idempotency: IdempotencyDep) -> Response:
+    """Calibrate a twin of a scene, let it demonstrate, train a world model on it and publish that."""
+    return idempotency.run(body, lambda session: accepted(jobs.create_pipeline(session, body)))

@@ -1,0 +1,98 @@
+"""Scenes: upload a recording, read what was declared and measured."""
+
+from __future__ import annotations
+
+from typing import Annotated, cast
+
+import anyio
+from fastapi import APIRouter, Query, Request, Response
+from sqlalchemy.orm import Session
+
+from physworld.scene import Scene as Recording
+from schemas.base import Artifact, Page
+from schemas.scene import Scene
+from services.api.dependencies import DatabaseDep, ObjectId, PageDep, SettingsDep, StoresDep
+from services.api.errors import documented
+from services.api.idempotency import Idempotency, IdempotencyDep, answer_of
+from services.api.uploads import MULTIPART_BODY, Upload, parse_scene, read_form, upload_of
+from services.stores import Stores
+from storage import resources
+from storage.idempotency import Answer
+
+router = APIRouter(prefix="/scenes", tags=["scenes"])
+
+ARCHIVE_NAME = "scene.zip"
+
+
+@router.post(
+    "",
+    status_code=201,
+    response_model=Scene,
+    responses={
+        200: {"model": Scene, "description": "A scene with this content was there already"},
+        **documented(400, 401, 403, 413, 415, 422, 503, 507),
+    },
+    openapi_extra=MULTIPART_BODY,
+)
+async def create_scene(
+    request: Request, settings: SettingsDep, stores: StoresDep, idempotency: IdempotencyDep
+) -> Response:
+    """Upload a recording. It is checked as a whole; every fault is named in `errors`, with its numbers."""
+    slots = cast(anyio.CapacityLimiter, request.app.state.upload_slots)
+    form = await read_form(request)
+    try:
+        upload = upload_of(form, settings.max_upload_bytes)
+        return await anyio.to_thread.run_sync(_register, upload, stores, idempotency, limiter=slots)
+    finally:
+        await form.close()
+
+
+@router.get("", responses=documented(401, 403, 422))
+def list_scenes(
+    database: DatabaseDep,
+    page: PageDep,
+    kind: Annotated[str | None, Query(max_length=32, pattern=r"^[a-z_]+$")] = None,
+) -> Page[Scene]:
+    """Scenes, newest first."""
+    with database.reading() as session:
+        return resources.list_scenes(session, limit=page.limit, cursor=page.cursor, kind=kind)
+
+
+@router.get("/{scene_id}", responses=documented(401, 403, 404, 422))
+def get_scene(scene_id: ObjectId, database: DatabaseDep) -> Scene:
+    """A scene: what is declared of it, and the archive with the arrays among its artifacts."""
+    with database.reading() as session:
+        return resources.get_scene(session, scene_id)
+
+
+def _register(upload: Upload, stores: Stores, idempotency: Idempotency) -> Response:
+    recording, warnings, archive = parse_scene(upload)
+    artifact = stores.artifacts.put_bytes(archive, ARCHIVE_NAME, "application/zip")
+
+    def work(session: Session) -> Answer:
+        known = resources.find_scene(session, artifact.sha256)
+        scene = known or _create(session, recording, warnings, artifact)
+        return answer_of(200 if known else 201, scene, {"Location": f"/v1/scenes/{scene.id}"})
+
+    return idempotency.run(upload.fingerprint(), work)
+
+
+def _create(session: Session, recording: Recording, warnings: list[str], artifact: Artifact) -> Scene:
+    return resources.create_scene(
+        session,
+        name=recording.name,
+        kind=recording.kind,
+        description=recording.description,
+        digest=artifact.sha256,
+        frames=recording.frame_count,
+        points=recording.points.shape[1],
+        controllers=recording.controllers.shape[1],
+        fps=recording.fps,
+        duration_s=float(recording.times[-1] - recording.times[0]),
+        noise_sigma_m=recording.noise_sigma_m,
+        train=recording.train,
+        test=recording.test,
+        declared=recording.declared,
+        warnings=warnings,
+        artifacts=[artifact],
+    )

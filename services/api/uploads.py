@@ -1,0 +1,132 @@
+"""A scene file on its way in: multipart parts to a temporary file, parsed, named, made canonical.
+
+The file is read while it streams into a temporary file (``limits`` bounds it), then parsed by the storage's
+importers, which treat it as hostile. The temporary file is gone when the request is.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from dataclasses import dataclass
+from typing import Any
+
+from fastapi import Request
+from pydantic import ValidationError
+from starlette.datastructures import FormData, UploadFile
+
+from physworld.scene import Scene
+from schemas.base import FieldError
+from schemas.scene import SceneImport
+from services.api.errors import ApiProblem
+from services.api.limits import too_large
+from storage.importers import import_any
+from storage.importers.options import ImportOptions
+from storage.scene_bundle import canonical_archive, checked
+from storage.scene_declaration import KINDS
+
+FIELDS = frozenset({"bundle", "name", "options"})
+FIELD_LIMIT_BYTES = 64 * 1024
+
+MULTIPART_BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            "multipart/form-data": {
+                "schema": {
+                    "type": "object",
+                    "required": ["bundle"],
+                    "additionalProperties": False,
+                    "properties": {
+                        "bundle": {
+                            "type": "string",
+                            "format": "binary",
+                            "description": "zip or tar of scene.json and scene.npz, PhysTwin's "
+                            "final_data.pkl, or C3D",
+                        },
+                        "name": {"type": "string", "minLength": 1, "maxLength": 128},
+                        "options": {"type": "string", "description": "a SceneImport as JSON"},
+                    },
+                },
+                "encoding": {"bundle": {"contentType": "application/octet-stream"}},
+            }
+        },
+    }
+}
+
+
+@dataclass(frozen=True)
+class Upload:
+    """What was sent: the open file, its name, and what completes it."""
+
+    file: UploadFile
+    options: SceneImport
+
+    def fingerprint(self) -> str:
+        """What makes two uploads the same one, whatever their multipart boundary."""
+        digest = hashlib.sha256()
+        self.file.file.seek(0)
+        while piece := self.file.file.read(1 << 20):
+            digest.update(piece)
+        return f"{self.file.filename}\n{self.options.model_dump_json()}\n{digest.hexdigest()}"
+
+
+async def read_form(request: Request) -> FormData:
+    """The multipart parts of a request. Raises the problems 400 (malformed) and 415 (another media type)."""
+    media_type = request.headers.get("Content-Type", "")
+    if not media_type.lower().startswith("multipart/form-data"):
+        raise ApiProblem(
+            415,
+            "unsupported_media_type",
+            f"Content-Type is {media_type or 'missing'!r}; send multipart/form-data with the file in bundle",
+        )
+    return await request.form(max_files=1, max_fields=len(FIELDS), max_part_size=FIELD_LIMIT_BYTES)
+
+
+def upload_of(form: FormData, limit_bytes: int) -> Upload:
+    """The upload in a form. Raises the problems 413 and 422."""
+    faults = [
+        FieldError(loc=["body", name], msg="is not a field of this form")
+        for name in form
+        if name not in FIELDS
+    ]
+    file, name, text = form.get("bundle"), form.get("name"), form.get("options")
+    if not isinstance(file, UploadFile):
+        faults.append(FieldError(loc=["body", "bundle"], msg="the file is missing"))
+    for key, value in (("name", name), ("options", text)):
+        if isinstance(value, UploadFile):
+            faults.append(FieldError(loc=["body", key], msg="is a file; send text"))
+    options = SceneImport()
+    if not faults:
+        try:
+            options = SceneImport.model_validate_json(text or "{}")
+            if name is not None:
+                options = SceneImport.model_validate({**options.model_dump(), "name": name})
+        except ValidationError as error:
+            faults += [
+                FieldError(loc=["body", "options", *fault["loc"]], msg=fault["msg"])
+                for fault in error.errors()
+            ]
+        if options.kind is not None and options.kind not in KINDS:
+            known = ", ".join(KINDS)
+            faults.append(
+                FieldError(loc=["body", "options", "kind"], msg=f"{options.kind!r}; known: {known}")
+            )
+    if faults:
+        detail = "; ".join(f"{'.'.join(map(str, fault.loc))}: {fault.msg}" for fault in faults)
+        raise ApiProblem(422, "invalid_request", detail, errors=faults)
+    assert isinstance(file, UploadFile)
+    if file.size is not None and file.size > limit_bytes:
+        raise too_large(file.size, limit_bytes)
+    return Upload(file, options)
+
+
+def parse_scene(upload: Upload) -> tuple[Scene, list[str], bytes]:
+    """The scene in an upload, its warnings, and the one archive that its content has. Raises SceneInvalid."""
+    options = upload.options
+    given = {name: value for name, value in options.model_dump().items() if value is not None}
+    upload.file.file.seek(0)
+    scene, warnings = import_any(upload.file.file.read(), upload.file.filename or "", ImportOptions(**given))
+    if options.name is not None and options.name != scene.name:
+        scene, warnings = checked(dataclasses.replace(scene, name=options.name))
+    return scene, warnings, canonical_archive(scene)

@@ -1,0 +1,26 @@
+"""What the web process reads from and writes to, opened once and handed to the API and to the dashboard."""
+
+from __future__ import annotations
+
+from storage.artifacts import ArtifactStore
+from storage.database import Database, open_database
+from storage.episodes import EpisodeStore
+from storage.settings import Settings
+
+
+class Stores:
+    """The artifact store and the episode store of one installation.
+
+    Attributes:
+        artifacts: content-addressed files (scene archives, twins, model files).
+        episodes: zarr groups of demonstration episodes.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self.artifacts = ArtifactStore(settings)
+        self.episodes = EpisodeStore(settings)
+
+
+def open_all(settings: Settings) -> tuple[Database, Stores]:
+    """Database and stores that the settings name."""
+    return open_database(settings), Stores(settings)

@@ -1,0 +1,66 @@
+"""The web process: REST API, dashboard and documentation in one application.
+
+``python -m services.web --host 127.0.0.1 --port 8000``, or any ASGI server on the factory
+``services.web:create_app``. It reads and writes the database and the store; it never talks to the broker.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+import uvicorn
+from fastapi import FastAPI
+from fastapi.responses import RedirectResponse
+
+from services.api.app import create_api
+from services.api.logs import configure_logs
+from services.dashboard.app import mount as mount_dashboard
+from services.stores import open_all
+from storage.settings import Settings, get_settings
+
+GRACEFUL_SHUTDOWN_S = 5
+
+
+def create_app(settings: Settings | None = None) -> FastAPI:
+    """The application on the stores that the settings name.
+
+    Without settings it is a server's factory: the environment's are taken, and logs become JSON lines.
+    """
+    if settings is None:
+        settings = get_settings()
+        configure_logs(settings.log_level)
+    settings.check(broker=False)
+    database, stores = open_all(settings)
+    app = create_api(settings, database, stores)
+    mount_dashboard(app, settings, database, stores)
+
+    @app.get("/", include_in_schema=False)
+    def home() -> RedirectResponse:
+        return RedirectResponse("/dashboard")
+
+    return app
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Serve until told to stop."""
+    parser = argparse.ArgumentParser(
+        prog="python -m services.web", description="Serve the API and the dashboard."
+    )
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1)")
+    parser.add_argument("--port", type=int, default=8000, help="port to listen on (default: 8000)")
+    options = parser.parse_args(arguments)
+    uvicorn.run(
+        create_app(),
+        host=options.host,
+        port=options.port,
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        timeout_graceful_shutdown=GRACEFUL_SHUTDOWN_S,
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
