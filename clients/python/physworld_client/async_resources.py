@@ -15,7 +15,7 @@ from physworld_client.bundle import open_bundle
 from physworld_client.errors import PhysWorldError, WaitTimedOut
 from physworld_client.manifest import artifacts_of, verify_folder
 from physworld_client.pages import AsyncListPage
-from physworld_client.partial import CHUNK_BYTES, PartialFile
+from physworld_client.partial import PartialFile
 from physworld_client.stream import HEARTBEAT_S, IDLE_LIMIT_S, EventDecoder, ends_job
 from physworld_client.waiting import Patience, job_id_of, require_success
 from schemas.base import Artifact
@@ -314,7 +314,7 @@ class AsyncArtifacts(AsyncResource):
         async with self._client.http.stream("GET", path, headers=partial.headers()) as response:
             if response.is_success:
                 partial.accept(response)
-                async for chunk in response.aiter_bytes(CHUNK_BYTES):
+                async for chunk in response.aiter_bytes():
                     partial.write(chunk)
             else:
                 await response.aread()

@@ -14,8 +14,6 @@ import httpx
 
 from physworld_client.errors import DigestMismatch, PhysWorldError
 
-CHUNK_BYTES = 1 << 20
-
 
 class PartialFile:
     """The unfinished download of one artifact; used by the synchronous and the asynchronous client."""

@@ -1,0 +1,139 @@
+"""The real web application on a free loopback port, and a hand that does the workers' part.
+
+``Service.work`` takes shards through the same leases as a worker and commits results of a believable form, so
+that the SDK sees every state of a job without simulations.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from physworld_client import Client
+
+from schemas.base import Artifact, Problem
+from services.stores import Stores
+from storage import leases
+from storage.database import Database
+from storage.tables import utc_now
+
+LEASE_S = 30.0
+METRICS = ("track_m", "chamfer_phystwin_m", "chamfer_l2_m")
+ROWS = ("static", "rigid_follow", "constant_velocity", "twin", "world_model", "world_model_finetuned")
+
+
+@dataclass
+class Service:
+    """A running service: its address, an admin key, and what lies behind it."""
+
+    url: str
+    token: str
+    database: Database
+    stores: Stores
+
+    def client(self, **options: Any) -> Client:
+        """A client with the admin key."""
+        return Client(self.url, self.token, **options)
+
+    def work(self, shards: int | None = None) -> int:
+        """Executes queued shards until none is left, or so many; returns how many."""
+        done = 0
+        while shards is None or done < shards:
+            lease = self.claim()
+            if lease is None:
+                break
+            result = self._result(lease)
+            with self.database.session() as session:
+                assert leases.complete(session, lease, result)
+            done += 1
+        return done
+
+    def claim(self) -> leases.Lease | None:
+        """Takes the next queued shard, or None."""
+        with self.database.session() as session:
+            now = utc_now()
+            ready = leases.publishable(session, now)
+            leases.mark_published(session, ready[:1], now)
+            return leases.claim(session, ready[0].shard_id, "test", now, LEASE_S) if ready else None
+
+    def fail(self, problem: Problem) -> None:
+        """The next queued shard fails for good."""
+        lease = self.claim()
+        assert lease is not None
+        with self.database.session() as session:
+            leases.fail(session, lease, problem, retry=False)
+
+    def _put(self, name: str, data: bytes) -> Artifact:
+        return self.stores.artifacts.put_bytes(data, name)
+
+    def _result(self, lease: leases.Lease) -> dict[str, Any]:
+        if lease.kind == "fit":
+            twin = self._put("twin.npz", np.random.default_rng(0).bytes(3_000_000))
+            parameter = {"value": 2.0e5, "unit": "Pa", "ci95": [1.8e5, 2.2e5]}
+            return {
+                "parameters": {"youngs_modulus_pa": parameter},
+                "metrics": {},
+                "artifacts": [twin.model_dump()],
+            }
+        if lease.kind == "dataset_plan":
+            return {"episodes": lease.payload["config"]["episodes"], "frames": 10, "particles": 20}
+        if lease.kind == "episode":
+            digest = hashlib.sha256(lease.shard_id.encode()).hexdigest()
+            place = {"index": lease.index, "path": f"{lease.shard_id}.zarr", "digest": digest}
+            return {**place, "seed": lease.index, "frames": 10, "particles": 20, "motion": "bezier"}
+        if lease.kind == "dataset_seal":
+            manifest = self._put("manifest.json", lease.shard_id.encode())
+            return {"digest": manifest.sha256, "artifacts": [manifest.model_dump()]}
+        return self._published(lease.payload["name"], lease.payload["version"])
+
+    def _published(self, name: str, version: int) -> dict[str, Any]:
+        files = [self._put("model.safetensors", f"{name} {version}".encode()), self._put("card.json", b"{}")]
+        listed = {file.name: {"sha256": file.sha256, "size": file.size} for file in files}
+        manifest = {"name": name, "version": version, "files": listed}
+        files.append(self._put("manifest.json", json.dumps(manifest).encode()))
+        held_out: dict[str, Any] = {metric: dict.fromkeys(ROWS, 0.001) for metric in METRICS}
+        metrics = {
+            "held_out": held_out,
+            "steps_per_second": {"twin": 12.0, "world_model": 345.6},
+            "noise_floor_m": 0.0005,
+        }
+        artifacts = [file.model_dump() for file in files]
+        return {"artifacts": artifacts, "sha256": files[-1].sha256, "metrics": metrics}
+
+
+def write_scene(folder: Path, name: str = "strip", *, seed: int = 0) -> Path:
+    """A small valid bundle: 9 points on a strip of 0.2 m that follows one controller for 20 frames."""
+    folder.mkdir(parents=True)
+    rng = np.random.default_rng(seed)
+    frames = 20
+    times = np.arange(frames) / 30.0
+    rest = np.stack([np.linspace(0.0, 0.2, 9), np.zeros(9), np.full(9, 0.5)], axis=1)
+    shift = np.stack([0.05 * np.sin(4.0 * times), np.zeros(frames), np.zeros(frames)], axis=1)
+    points = rest + shift[:, None] + rng.normal(0.0, 1e-4, (frames, 9, 3))
+    np.savez(
+        folder / "scene.npz",
+        points=points.astype(np.float32),
+        visible=np.ones((frames, 9), dtype=bool),
+        controllers=(rest[:1] + shift[:, None]).astype(np.float32),
+        times=times,
+    )
+    declared = {
+        "schema_version": 1,
+        "name": name,
+        "kind": "beam",
+        "description": "a strip",
+        "fps": 30.0,
+        "gravity_m_s2": [0.0, 0.0, -9.81],
+        "noise_sigma_m": 1e-4,
+        "split": {"train": [0, 14], "test": [14, 20]},
+        "initial_state": "as measured",
+        "body": {"size_m": [0.2, 0.02, 0.02], "density_kg_m3": 1000.0},
+        "ground": None,
+        "grips": None,
+    }
+    (folder / "scene.json").write_text(json.dumps(declared))
+    return folder
