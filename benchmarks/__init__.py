@@ -1,0 +1,1 @@
+"""Benchmarks: what prints every number in ``docs/benchmarks.md``, with peers measured in the same run."""
