@@ -20,7 +20,7 @@ from types import FrameType
 from typing import Any
 
 from celery import Celery, signals
-from kombu import Queue
+from kombu import Exchange, Queue
 
 from schemas.queues import SIMULATION, TASK_NAME, TRAINING
 from storage.settings import Settings
@@ -30,6 +30,7 @@ HARD_LIMIT_S = 12 * 3600
 SOFT_LIMIT_S = HARD_LIMIT_S - 60
 VISIBILITY_TIMEOUT_S = HARD_LIMIT_S + 3600
 TASKS_PER_CHILD = 1000  # a fresh process loads the physics kernels again, which takes seconds
+EXCHANGE = Exchange("physworld", type="direct")
 READY_FILE_VARIABLE = "PHYSWORLD_READY_FILE"
 HEAVY_MODULES = ("torch", "warp")
 
@@ -50,7 +51,7 @@ def create_app(settings: Settings) -> Celery:
         task_create_missing_queues=False,
         task_default_queue=SIMULATION,
         task_ignore_result=True,
-        task_queues=[Queue(SIMULATION), Queue(TRAINING)],
+        task_queues=[Queue(name, EXCHANGE, routing_key=name) for name in (SIMULATION, TRAINING)],
         task_reject_on_worker_lost=True,
         task_serializer="json",
         task_soft_time_limit=SOFT_LIMIT_S,

@@ -9,7 +9,6 @@ ends every child (Linux: PR_SET_PDEATHSIG) and the next start carries on from th
 from __future__ import annotations
 
 import os
-import secrets
 import signal
 import socket
 import sys
@@ -29,7 +28,7 @@ from services.embedded import logs
 from services.embedded.broker import Broker, choose_broker
 from services.embedded.child import Child, Program
 from services.embedded.folder import DataFolder, FolderLocks, write_private
-from storage import keys, leases
+from storage import api_keys, leases
 from storage.database import open_database
 from storage.settings import Settings
 
@@ -38,6 +37,7 @@ LOGS_S = 60.0
 START_WITHIN_S = 120.0
 END_WITHIN_S = 8.0
 EARLIER_RUN_WITHIN_S = 15.0
+KEY_NAME = "embedded"
 READY_FILE = "PHYSWORLD_READY_FILE"
 _DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 """Opens loopback addresses whatever proxy the environment names."""
@@ -162,9 +162,11 @@ class Supervisor:
         if not os.environ.get("PHYSWORLD_DATABASE_URL"):
             with database.session() as session:  # alone on it: nobody of an earlier run is left
                 leases.recover(session, datetime.now(UTC))
-        if not self._folder.api_key.exists():
-            with database.session() as session:
-                token = keys.create_key(session, name=f"embedded-{secrets.token_hex(3)}", role="admin")
+        with database.session() as session:
+            if self._folder.api_key.exists():
+                api_keys.ensure_key(session, self._folder.api_key.read_text().strip(), KEY_NAME, "admin")
+            else:
+                _, token = api_keys.create_key(session, KEY_NAME, "admin")
                 write_private(self._folder.api_key, token + "\n")
         database.dispose()
 
