@@ -1,4 +1,4 @@
-"""kill -9 of a worker, of the broker and of the whole service in the middle of a dataset loses and doubles nothing."""
+"""kill -9 of worker, broker and whole service in the middle of a dataset loses and doubles nothing."""
 
 from __future__ import annotations
 

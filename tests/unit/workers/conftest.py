@@ -1,0 +1,74 @@
+"""An installation on a folder of its own: database, stores, a registered scene, a broker when asked for."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from tiny_scene import register, tiny_scene
+
+from services.embedded.broker import choose_broker
+from services.embedded.child import Child, Program
+from services.embedded.folder import DataFolder
+from storage.database import open_database
+from storage.settings import Settings
+from workers.execute import Runtime
+from workers.owner import process_owner
+from workers.registry import Handler
+from workers.stores import Stores
+
+BROKER_WITHIN_S = 20.0
+RuntimeOf = Callable[..., Runtime]
+
+
+@pytest.fixture
+def settings(tmp_path: Path) -> Settings:
+    return Settings(data_dir=tmp_path / "data", lease_seconds=5.0)
+
+
+@pytest.fixture
+def stores(settings: Settings) -> Iterator[Stores]:
+    database = open_database(settings)
+    database.upgrade()
+    yield Stores(settings, database)
+    database.dispose()
+
+
+@pytest.fixture
+def scene_id(stores: Stores) -> str:
+    return register(tiny_scene(), stores.database, stores.artifacts)
+
+
+@pytest.fixture
+def runtime_with(settings: Settings, stores: Stores) -> RuntimeOf:
+    """A runtime whose handlers are the given functions; without any, those of the registry."""
+
+    def make(**handlers: Handler) -> Runtime:
+        runtime = Runtime(settings, stores.database, stores, process_owner())
+        if not handlers:
+            return runtime
+        return Runtime(settings, stores.database, stores, process_owner(), handlers.__getitem__)
+
+    return make
+
+
+@pytest.fixture
+def broker_url(tmp_path: Path) -> Iterator[str]:
+    """The address of a real broker of this test's own, on a free port."""
+    folder = DataFolder(tmp_path / "broker-data")
+    folder.prepare()
+    broker = choose_broker(folder, {})
+    family = os.open(folder.run / "family", os.O_CREAT | os.O_RDWR)
+    child = Child(Program("broker", broker.command, dict(os.environ)), folder.logs / "broker.log", family)
+    child.start()
+    deadline = time.monotonic() + BROKER_WITHIN_S
+    while not broker.answers():
+        assert time.monotonic() < deadline, child.log.read_text()
+        time.sleep(0.05)
+    yield broker.url
+    child.ask_to_stop()
+    child.wait_or_kill(time.monotonic() + 5)
+    os.close(family)

@@ -1,0 +1,107 @@
+"""A lease is kept alive while a handler works, and the handler learns when it must stop."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+
+import pytest
+
+from schemas.fit import FitConfig
+from schemas.job import Job
+from storage import jobs, leases
+from storage.settings import Settings
+from storage.tables import ShardRow
+from workers.context import TaskContext
+from workers.errors import Cancelled, LeaseLost
+from workers.stores import Stores
+
+WITHIN_S = 10.0
+LEASE_S = 2.0
+
+
+def _until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + WITHIN_S
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+@pytest.fixture
+def settings(tmp_path) -> Settings:
+    return Settings(data_dir=tmp_path / "data", lease_seconds=LEASE_S)
+
+
+@pytest.fixture
+def job(stores: Stores, scene_id: str) -> Job:
+    with stores.database.session() as session:
+        return jobs.create_fit(session, scene_id, FitConfig())
+
+
+@pytest.fixture
+def lease(stores: Stores, job: Job) -> leases.Lease:
+    with stores.database.session() as session:
+        shard_id = session.query(ShardRow.id).scalar()
+        claimed = leases.claim(session, shard_id, "test", datetime.now(UTC), LEASE_S)
+    assert claimed is not None
+    return claimed
+
+
+def test_the_lease_outlives_its_first_term(stores: Stores, lease: leases.Lease, settings: Settings) -> None:
+    with TaskContext(lease, stores.database, settings) as context:
+        time.sleep(1.5 * LEASE_S)
+        context.check()
+        with stores.database.session() as session:
+            assert leases.reap(session, datetime.now(UTC)) == []
+
+
+def test_progress_reaches_the_job(stores: Stores, lease: leases.Lease, settings: Settings, job: Job) -> None:
+    def progress() -> float:
+        with stores.database.reading() as session:
+            return jobs.get_job(session, job.id).progress.done
+
+    with TaskContext(lease, stores.database, settings) as context:
+        for done in range(1, 1000):
+            context.progress(done, 1000, "simulations", "1.2 mm")
+        _until(lambda: progress() == 999)
+    with stores.database.reading() as session:
+        events = [event for event in jobs.events_after(session, job.id, 0, 500) if event.type == "progress"]
+    assert len(events) < 20
+
+
+def test_a_cancel_is_seen_by_a_handler_that_only_polls(
+    stores: Stores, lease: leases.Lease, settings: Settings, job: Job
+) -> None:
+    with TaskContext(lease, stores.database, settings) as context:
+        assert not context.cancelled()
+        with stores.database.session() as session:
+            jobs.cancel_job(session, job.id)
+        _until(context.cancelled)
+        with pytest.raises(Cancelled, match=job.id):
+            context.check()
+
+
+def test_a_lease_that_another_took_is_lost(stores: Stores, lease: leases.Lease, settings: Settings) -> None:
+    with TaskContext(lease, stores.database, settings) as context:
+        with stores.database.session() as session:
+            leases.recover(session, datetime.now(UTC))
+            leases.reap(session, datetime.now(UTC))
+
+        def lost() -> bool:
+            try:
+                context.check()
+            except LeaseLost:
+                return True
+            return False
+
+        _until(lost)
+
+
+def test_a_process_that_could_not_renew_in_time_stops_by_its_own_clock(
+    stores: Stores, lease: leases.Lease, settings: Settings
+) -> None:
+    context = TaskContext(lease, stores.database, settings)  # never entered: nobody renews
+    time.sleep(1.1 * LEASE_S)
+    with pytest.raises(LeaseLost, match=r"2\.\d s after its last renewal \(lease 2\.0 s\)"):
+        context.check()

@@ -1,0 +1,160 @@
+"""What becomes of a shard when its handler ends, fails, is cancelled, is overtaken or is stopped."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+
+import pytest
+
+from physworld.errors import CFLViolation, UnstableSimulation
+from schemas.fit import FitConfig
+from schemas.job import Job
+from storage import jobs, leases
+from storage.tables import ShardRow
+from workers.context import TaskContext
+from workers.errors import Cancelled, WorkerStopping
+from workers.execute import Runtime, problem_of, run_shard
+from workers.registry import HandlerResult
+from workers.stores import Stores
+
+FIT_RESULT = {"parameters": {}, "metrics": {}, "artifacts": []}
+
+
+@pytest.fixture
+def job(stores: Stores, scene_id: str) -> Iterator[Job]:
+    with stores.database.session() as session:
+        return jobs.create_fit(session, scene_id, FitConfig())
+
+
+def _shard(stores: Stores) -> ShardRow:
+    with stores.database.reading() as session:
+        return session.query(ShardRow).one()
+
+
+def _job(stores: Stores, job: Job) -> Job:
+    with stores.database.reading() as session:
+        return jobs.get_job(session, job.id)
+
+
+def _succeed(context: TaskContext, stores: Stores) -> HandlerResult:
+    return HandlerResult(FIT_RESULT, "a" * 64)
+
+
+def test_a_finished_shard_is_committed_with_its_digest(runtime_with, stores: Stores, job: Job) -> None:
+    assert run_shard(runtime_with(fit=_succeed), _shard(stores).id) == "done"
+    assert (_shard(stores).state, _shard(stores).digest) == ("DONE", "a" * 64)
+    assert _job(stores, job).state == "succeeded"
+
+
+def test_a_second_message_for_the_same_shard_does_nothing(runtime_with, stores: Stores, job: Job) -> None:
+    runtime: Runtime = runtime_with(fit=_succeed)
+    shard_id = _shard(stores).id
+    assert [run_shard(runtime, shard_id), run_shard(runtime, shard_id)] == ["done", "not claimed"]
+    assert run_shard(runtime, "shd_unknown") == "not claimed"
+
+
+def test_physics_fails_at_once_and_keeps_its_numbers(runtime_with, stores: Stores, job: Job) -> None:
+    def explode(context: TaskContext, stores: Stores) -> HandlerResult:
+        raise UnstableSimulation("12 of 400 nodes are not finite after step 31")
+
+    assert run_shard(runtime_with(fit=explode), _shard(stores).id) == "failed"
+    failed = _job(stores, job)
+    assert failed.state == "failed" and failed.error is not None
+    assert (failed.error.code, failed.error.status) == ("unstable_simulation", 422)
+    assert failed.error.detail == "UnstableSimulation: 12 of 400 nodes are not finite after step 31"
+
+
+def test_infrastructure_is_tried_again_until_the_attempts_are_spent(
+    runtime_with, stores: Stores, job: Job
+) -> None:
+    def unreachable(context: TaskContext, stores: Stores) -> HandlerResult:
+        raise ConnectionResetError("connection to the store reset after 3 s")
+
+    runtime: Runtime = runtime_with(fit=unreachable)
+    shard_id = _shard(stores).id
+    for attempt in range(1, runtime.settings.max_attempts + 1):
+        assert _shard(stores).state == "QUEUED"
+        assert run_shard(runtime, shard_id) == "retried"
+        assert _shard(stores).attempt == attempt
+        with stores.database.session() as session:
+            session.get_one(ShardRow, shard_id).not_before = datetime.now(UTC) - timedelta(seconds=1)
+    failed = _job(stores, job)
+    assert failed.state == "failed" and failed.error is not None
+    assert "attempt 5 of 5" in failed.error.detail
+    assert "reset after 3 s" in failed.error.detail
+
+
+def test_a_bug_fails_the_shard_and_is_raised_for_the_log(runtime_with, stores: Stores, job: Job) -> None:
+    def divide(context: TaskContext, stores: Stores) -> HandlerResult:
+        return HandlerResult({"value": 1 // 0})
+
+    with pytest.raises(ZeroDivisionError):
+        run_shard(runtime_with(fit=divide), _shard(stores).id)
+    error = _job(stores, job).error
+    assert error is not None and error.code == "zero_division_error" and error.status == 500
+
+
+def test_a_result_of_the_wrong_form_is_not_committed(runtime_with, stores: Stores, job: Job) -> None:
+    def odd(context: TaskContext, stores: Stores) -> HandlerResult:
+        return HandlerResult({"metrics": {"track_m": float("nan")}})
+
+    assert run_shard(runtime_with(fit=odd), _shard(stores).id) == "failed"
+    error = _job(stores, job).error
+    assert error is not None and error.code == "result_invalid" and "track_m" in error.detail
+
+
+def test_a_cancelled_job_stops_its_handler(runtime_with, stores: Stores, job: Job) -> None:
+    def wait_for_cancel(context: TaskContext, stores: Stores) -> HandlerResult:
+        with stores.database.session() as session:
+            jobs.cancel_job(session, job.id)
+        while True:
+            context.progress(1, 10, "simulations")
+            context.check()
+
+    assert run_shard(runtime_with(fit=wait_for_cancel), _shard(stores).id) == "cancelled"
+    assert _job(stores, job).state == "cancelled"
+    assert _shard(stores).state == "CANCELLED"
+
+
+def test_a_job_cancelled_before_the_commit_is_cancelled_not_done(
+    runtime_with, stores: Stores, job: Job
+) -> None:
+    def cancel_then_finish(context: TaskContext, stores: Stores) -> HandlerResult:
+        with stores.database.session() as session:
+            jobs.cancel_job(session, job.id)
+        return HandlerResult(FIT_RESULT)
+
+    assert run_shard(runtime_with(fit=cancel_then_finish), _shard(stores).id) == "not committed"
+    assert _job(stores, job).state == "cancelled"
+
+
+def test_an_overtaken_worker_commits_nothing(runtime_with, stores: Stores, job: Job) -> None:
+    def be_overtaken(context: TaskContext, stores: Stores) -> HandlerResult:
+        with stores.database.session() as session:
+            leases.recover(session, datetime.now(UTC))
+            leases.reap(session, datetime.now(UTC))
+            leases.claim(session, context.lease.shard_id, "another", datetime.now(UTC), 60.0)
+        return HandlerResult(FIT_RESULT)
+
+    assert run_shard(runtime_with(fit=be_overtaken), _shard(stores).id) == "not committed"
+    assert (_shard(stores).state, _shard(stores).lease_owner) == ("RUNNING", "another")
+
+
+def test_a_worker_that_is_stopped_gives_its_shard_back_untried(
+    runtime_with, stores: Stores, job: Job
+) -> None:
+    def stop(context: TaskContext, stores: Stores) -> HandlerResult:
+        raise WorkerStopping(0)
+
+    with pytest.raises(SystemExit):
+        run_shard(runtime_with(fit=stop), _shard(stores).id)
+    shard = _shard(stores)
+    assert (shard.state, shard.attempt, shard.lease_owner) == ("QUEUED", 0, None)
+
+
+def test_problems_carry_code_and_numbers() -> None:
+    problem = problem_of(Cancelled("job job_1 was cancelled"))
+    assert (problem.code, problem.title) == ("cancelled", "cancelled")
+    assert problem_of(OSError(28, "No space left on device")).code == "os_error"
+    assert problem_of(CFLViolation("dt 1.0e-4 s exceeds 6.1e-5 s")).code == "cfl_violation"
