@@ -1,8 +1,8 @@
 """The graph network of a world model in NumPy: one step, for one body, without a gradient.
 
-The equations and the names of the tensors are those of ``physworld.worldmodel.model``; this file is written from
-them alone and needs neither torch nor the library. Geometry is computed in double precision, the layers in single
-precision, as they were trained.
+The equations and the names of the tensors are those of ``physworld.worldmodel.model``; this file is written
+from them alone and needs neither torch nor the library. Geometry is computed in double precision, the layers
+in single precision, as they were trained.
 
 Legend: n object vertices, C control vertices, V = n + C; D neighbour slots per vertex; H width; h history; L
 message passing steps; F edge features, 3h + 10.
@@ -40,7 +40,7 @@ class Network:
         inputs = self._tensor("encoder.in.weight").shape[1] - (3 * self.history + 5 + PROPERTY_COUNT)
         if self.control_count < 0 or features != 3 * self.history + 10 or inputs not in (0, 1):
             raise ModelUnreadable(
-                f"the tensors do not fit together: {vertex_count} vertices of which {object_count} of the object, "
+                f"the tensors do not fit together: {vertex_count} vertices, {object_count} of the object, "
                 f"{features} edge features, {inputs} inputs beyond those of history {self.history}"
             )
         self.has_ground = inputs == 1

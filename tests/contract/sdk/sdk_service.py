@@ -64,6 +64,10 @@ class Service:
         """The next queued shard fails for good."""
         lease = self.claim()
         assert lease is not None
+        self.fail_lease(lease, problem)
+
+    def fail_lease(self, lease: leases.Lease, problem: Problem) -> None:
+        """This shard fails for good."""
         with self.database.session() as session:
             leases.fail(session, lease, problem, retry=False)
 

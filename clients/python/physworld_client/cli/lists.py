@@ -28,6 +28,7 @@ from schemas.scene import Scene
 
 Item = TypeVar("Item", bound=BaseModel)
 DEFAULT_LIMIT = 20
+PAGE = 100
 
 scenes = typer.Typer(help="Measured scenes.", no_args_is_help=True)
 fits = typer.Typer(help="Calibrated twins.", no_args_is_help=True)
@@ -51,7 +52,7 @@ def scenes_list(
         return (scene.id, scene.name, scene.kind, *counts, ago(scene.created_at))
 
     with service.connect(url, token, data) as client:
-        _show_list(client.scenes.list(limit=limit).auto_paging_iter(), limit, json, headings, row)
+        _show_list(client.scenes.list(limit=min(limit, PAGE)).auto_paging_iter(), limit, json, headings, row)
 
 
 @scenes.command("add")
@@ -97,7 +98,7 @@ def fits_list(
         return (fit.id, fit.scene_id, fit.state, shown, ago(fit.created_at))
 
     with service.connect(url, token, data) as client:
-        _show_list(client.fits.list(limit=limit).auto_paging_iter(), limit, json, headings, row)
+        _show_list(client.fits.list(limit=min(limit, PAGE)).auto_paging_iter(), limit, json, headings, row)
 
 
 @fits.command("show")
@@ -130,7 +131,9 @@ def datasets_list(
         return (dataset.id, dataset.fit_id, dataset.state, episodes, ago(dataset.created_at))
 
     with service.connect(url, token, data) as client:
-        _show_list(client.datasets.list(limit=limit).auto_paging_iter(), limit, json, headings, row)
+        _show_list(
+            client.datasets.list(limit=min(limit, PAGE)).auto_paging_iter(), limit, json, headings, row
+        )
 
 
 @datasets.command("show")
@@ -155,7 +158,7 @@ def datasets_episodes(
     headings = ("index", "motion", "seed", "frames", "particles", "attempt", "digest")
     with service.connect(url, token, data) as client:
         _show_list(
-            client.datasets.episodes(dataset_id, limit=limit).auto_paging_iter(),
+            client.datasets.episodes(dataset_id, limit=min(limit, PAGE)).auto_paging_iter(),
             limit,
             json,
             headings,
@@ -187,7 +190,7 @@ def models_list(
         return (model.name, str(model.latest_version or "none"), aliases, ago(model.created_at))
 
     with service.connect(url, token, data) as client:
-        pages = client.models.list(limit=limit).auto_paging_iter()
+        pages = client.models.list(limit=min(limit, PAGE)).auto_paging_iter()
         _show_list(pages, limit, json, ("name", "latest", "aliases", "age"), row)
 
 
@@ -213,7 +216,7 @@ def models_versions(
         )
 
     with service.connect(url, token, data) as client:
-        pages = client.models.versions(name, limit=limit).auto_paging_iter()
+        pages = client.models.versions(name, limit=min(limit, PAGE)).auto_paging_iter()
         _show_list(pages, limit, json, ("version", "state", "aliases", "sha256", "age"), row)
 
 
@@ -276,7 +279,7 @@ def jobs_list(
         return (job.id, job.kind, job.state, progress_text(job), ago(job.created_at))
 
     with service.connect(url, token, data) as client:
-        pages = client.jobs.list(limit=limit, state=state, kind=kind).auto_paging_iter()
+        pages = client.jobs.list(limit=min(limit, PAGE), state=state, kind=kind).auto_paging_iter()
         _show_list(pages, limit, json, ("id", "kind", "state", "progress", "age"), row)
 
 

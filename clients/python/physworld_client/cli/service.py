@@ -25,6 +25,7 @@ from physworld_client.errors import PhysWorldError
 START_TIMEOUT_S = 180.0
 STOP_TIMEOUT_S = 30.0
 POLL_S = 0.1
+MAX_RETRIES = 2
 LOG_TAIL_LINES = 15
 PR_SET_PDEATHSIG = 1
 
@@ -71,7 +72,7 @@ def connect(url: str | None, token: str | None, data: Path | None) -> Client:
         raise PhysWorldError(
             f"no service runs on {data_folder(data)}: start it with `physworld up`, or give --url and --token"
         )
-    return Client(address.url, address.token)
+    return Client(address.url, address.token, max_retries=MAX_RETRIES)
 
 
 class Embedded:
