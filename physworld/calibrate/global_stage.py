@@ -2,7 +2,8 @@
 
 1. Scan the stiffness over its decades (multi-start: the cost has local minima where phases slip).
 2. Gauss-Newton on the stiffness parameters from the two best starts.
-3. Add air drag, then internal friction, each only if it lowers the training cost by more than 2 %.
+3. Add air drag and internal friction, the better one first, each only if it lowers the training cost by more
+   than 2 %.
 4. Shift the tracked points inside the body by their mean residual (frame 0 is noisy too), clipped at 3 sigma.
 5. Gauss-Newton again on all that were kept; intervals from blocks of frames.
 
@@ -109,14 +110,18 @@ def calibrate(
     stiffness = [p for p in parameters if p.stage == "stiffness"]
     solution = search.scan(stiffness)
     kept, rejected = list(stiffness), {}
-    if config.damping == "auto":
-        for candidate in (p for p in parameters if p.stage == "damping"):
-            trial = search.solve([*kept, candidate], np.append(solution.theta, np.log(candidate.start[0])), 4)
-            gain = 1.0 - trial.cost / solution.cost
-            if gain > _DAMPING_GAIN:
-                kept, solution = [*kept, candidate], trial
-            else:
-                rejected[candidate.name] = float(gain)
+    candidates = [p for p in parameters if p.stage == "damping"] if config.damping == "auto" else []
+    while candidates:
+        trials = [
+            search.solve([*kept, c], np.append(solution.theta, np.log(c.start[0])), 4 if len(candidates) > 1 else 3)
+            for c in candidates
+        ]
+        best = int(np.argmin([t.cost for t in trials]))
+        gain = 1.0 - trials[best].cost / solution.cost
+        if gain <= _DAMPING_GAIN:
+            rejected.update({c.name: 1.0 - t.cost / solution.cost for c, t in zip(candidates, trials, strict=True)})
+            break
+        kept, solution = [*kept, candidates.pop(best)], trials[best]
     if search.shift_points(kept, solution.theta):
         solution = search.solve(kept, solution.theta, 3)
     twin = search.twin_at(kept, solution.theta)
