@@ -1,7 +1,7 @@
 """Databases and stores for the storage's tests: SQLite in a fresh folder, Postgres and S3 where they are.
 
-With ``PHYSWORLD_TEST_POSTGRES_URL`` set every test that takes ``database`` also runs on that server, each in a
-schema of its own that is dropped afterwards. S3 is moto's server over real HTTP.
+With ``PHYSWORLD_TEST_POSTGRES_URL`` set every test that takes ``database`` also runs on that server, each
+in a schema of its own that is dropped afterwards. S3 is moto's server over real HTTP.
 """
 
 from __future__ import annotations
