@@ -1,0 +1,167 @@
+"""The embedded service as a person uses it: start, look, start again, Ctrl-C, kill, start again."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import stat
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+
+import psutil
+import pytest
+from service_process import END_WITHIN_S, ServiceProcess, environment, until
+from tiny_scene import register, tiny_scene
+
+from schemas.fit import FitConfig
+from storage import jobs
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
+
+RESTART_WITHIN_S = 60.0
+DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+
+
+def _status(url: str, token: str | None = None) -> int:
+    headers = {} if token is None else {"Authorization": f"Bearer {token}"}
+    with DIRECT.open(urllib.request.Request(url, headers=headers), timeout=10) as answer:
+        return int(answer.status)
+
+
+def test_start_look_start_again_and_ctrl_c(tmp_path: Path) -> None:
+    with ServiceProcess(tmp_path / "data", "--workers", "2") as service:
+        service.start()
+        state = service.state()
+        assert set(state["children"]) == {
+            "broker",
+            "web",
+            "dispatcher",
+            "worker-1",
+            "worker-2",
+            "trainer",
+        }
+        key_file = Path(state["api_key_file"])
+        assert stat.S_IMODE(key_file.stat().st_mode) == 0o600
+        assert _status(f"{state['api_url']}/health/ready") == 200
+        assert _status(f"{state['api_url']}/v1/jobs", key_file.read_text().strip()) == 200
+
+        second = subprocess.run(
+            [sys.executable, "-m", "services.embedded", "--data", str(service.data)],
+            env=environment(),
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert second.returncode == 3
+        assert "already running" in second.stdout and state["api_url"] in second.stdout
+        assert service.state() == state
+
+        family = service.family()
+        assert len(family) >= 10  # the supervisor, six children, three pool processes
+        assert service.interrupt() == 0
+        _, alive = psutil.wait_procs(family, END_WITHIN_S)
+        assert alive == []
+        assert service.state() == {}
+
+
+def test_a_killed_child_is_started_again_and_the_url_stays(tmp_path: Path) -> None:
+    with ServiceProcess(tmp_path / "data", "--workers", "1", "--no-trainer") as service:
+        service.start()
+        url = service.state()["api_url"]
+        for name in ("web", "broker", "worker-1", "dispatcher"):
+            before = service.kill_child(name)
+            until(
+                lambda name=name, before=before: service.state()["children"].get(name, before) != before,
+                f"{name} is not started again",
+                RESTART_WITHIN_S,
+            )
+        assert _status(f"{url}/health/live") == 200
+        service.kill()
+        service.start()
+        assert service.state()["api_url"] == url
+        assert service.interrupt() == 0
+
+
+def test_work_that_ctrl_c_stopped_is_given_back_untried_and_done_after_the_next_start(tmp_path: Path) -> None:
+    with ServiceProcess(tmp_path / "data", "--workers", "1", "--no-trainer") as service:
+        service.start()
+        database, stores = service.stores()
+        scene_id = register(tiny_scene(frames=90), database, stores.artifacts)
+        with database.session() as session:
+            job = jobs.create_fit(session, scene_id, FitConfig(particle_budget=2000, max_simulations=60))
+
+        def job_now() -> tuple[str, int, float]:
+            with database.reading() as session:
+                found = jobs.get_job(session, job.id)
+            assert found.error is None, found.error
+            return found.state, found.attempt, found.progress.done
+
+        until(lambda: job_now()[2] >= 2, "the fit does not start", RESTART_WITHIN_S)
+        assert service.interrupt() == 0
+        assert job_now()[0] == "running"
+        service.start()
+        until(lambda: job_now()[0] == "succeeded", "the fit is not done", 200.0)
+        assert job_now()[1] == 1  # the attempt that was stopped does not count
+        assert service.interrupt() == 0
+        database.dispose()
+
+
+def test_a_port_that_somebody_has_is_named(tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        done = subprocess.run(
+            [
+                sys.executable,
+                "-m",
+                "services.embedded",
+                "--data",
+                str(tmp_path / "data"),
+                "--port",
+                str(port),
+            ],
+            env=environment(),
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+    assert done.returncode == 1
+    assert f"port {port} on 127.0.0.1 cannot be had" in done.stderr
+
+
+def test_settings_that_cannot_work_end_the_start_with_their_names(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "services.embedded", "--data", str(tmp_path / "data"), "--no-trainer"],
+        env={**environment(), "PHYSWORLD_BROKER_URL": "http://not-a-broker"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert "PHYSWORLD_BROKER_URL has scheme 'http'" in done.stderr
+    assert not (tmp_path / "data" / "run" / "state.json").exists()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="PR_SET_PDEATHSIG is Linux's")
+def test_nobody_survives_a_supervisor_killed_while_it_starts(tmp_path: Path) -> None:
+    service = ServiceProcess(tmp_path / "data", "--workers", "1", "--no-trainer")
+    with service.output.open("wb") as output:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "services.embedded", "--data", str(service.data), *service.options],
+            env=environment(),
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+    with process:
+        supervisor = psutil.Process(process.pid)
+        until(lambda: len(supervisor.children()) >= 2, "no children yet", RESTART_WITHIN_S)
+        family = supervisor.children(recursive=True)
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+        _, alive = psutil.wait_procs(family, END_WITHIN_S)
+        assert alive == []

@@ -1,0 +1,127 @@
+"""Work reaches the broker, and comes back when the broker or a worker loses it. With a real broker."""
+
+from __future__ import annotations
+
+import base64
+import json
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+
+import pytest
+import redis
+from pydantic import SecretStr
+
+from schemas.fit import FitConfig
+from schemas.queues import SIMULATION
+from storage import jobs, leases
+from storage.settings import Settings
+from storage.tables import ShardRow
+from workers.app import create_app
+from workers.dispatcher import MAX_DEPTH, Dispatcher
+from workers.stores import Stores
+
+WITHIN_S = 20.0
+
+
+@pytest.fixture
+def settings(tmp_path, broker_url: str) -> Settings:
+    return Settings(data_dir=tmp_path / "data", broker_url=SecretStr(broker_url))
+
+
+@pytest.fixture
+def broker(broker_url: str) -> Iterator[redis.Redis]:
+    with redis.Redis.from_url(broker_url) as client:
+        yield client
+
+
+@pytest.fixture
+def dispatching(settings: Settings, stores: Stores) -> Iterator[None]:
+    app = create_app(settings)
+    stop = threading.Event()
+    thread = threading.Thread(target=Dispatcher(settings, stores.database, app).run, args=(stop,))
+    thread.start()
+    yield
+    stop.set()
+    thread.join()
+    app.close()
+
+
+def _create_fits(stores: Stores, scene_id: str, count: int) -> None:
+    with stores.database.session() as session:
+        for _ in range(count):
+            jobs.create_fit(session, scene_id, FitConfig())
+
+
+def _shards(stores: Stores) -> list[ShardRow]:
+    with stores.database.reading() as session:
+        return session.query(ShardRow).all()
+
+
+def _until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + WITHIN_S
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+@pytest.mark.usefixtures("dispatching")
+def test_a_new_shard_is_published_with_its_id_only(
+    stores: Stores, scene_id: str, broker: redis.Redis
+) -> None:
+    _create_fits(stores, scene_id, 1)
+    _until(lambda: broker.llen(SIMULATION) == 1)
+    message = broker.lindex(SIMULATION, 0)
+    _until(lambda: _shards(stores)[0].published_at is not None)
+    assert _shards(stores)[0].id.encode() in _body(message)
+
+
+@pytest.mark.usefixtures("dispatching")
+def test_messages_that_the_broker_lost_are_published_again(
+    stores: Stores, scene_id: str, broker: redis.Redis
+) -> None:
+    _create_fits(stores, scene_id, 3)
+    _until(lambda: broker.llen(SIMULATION) == 3)
+    broker.flushall()
+    _until(lambda: broker.llen(SIMULATION) == 3)
+
+
+@pytest.mark.usefixtures("dispatching")
+def test_the_broker_is_not_filled_with_a_large_dataset(
+    stores: Stores, scene_id: str, broker: redis.Redis
+) -> None:
+    _create_fits(stores, scene_id, MAX_DEPTH + 20)
+    _until(lambda: broker.llen(SIMULATION) == MAX_DEPTH)
+    time.sleep(1.5)
+    assert broker.llen(SIMULATION) == MAX_DEPTH
+
+
+@pytest.mark.usefixtures("dispatching")
+@pytest.mark.skipif(sys.platform != "linux", reason="owners are told apart through /proc")
+def test_the_shard_of_a_killed_worker_comes_back_before_its_lease_ends(
+    stores: Stores, scene_id: str, broker: redis.Redis
+) -> None:
+    code = "from workers.owner import process_owner; print(process_owner(), flush=True); input()"
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as worker:
+        assert worker.stdout is not None
+        owner = worker.stdout.readline().strip()
+        _create_fits(stores, scene_id, 1)
+        with stores.database.session() as session:
+            lease = leases.claim(session, _shards(stores)[0].id, owner, datetime.now(UTC), 3600.0)
+        assert lease is not None
+        time.sleep(1.5)
+        assert _shards(stores)[0].state == "RUNNING"
+        worker.kill()
+        worker.wait()
+        _until(lambda: _shards(stores)[0].state == "QUEUED")
+        _until(lambda: broker.llen(SIMULATION) >= 1)
+
+
+def _body(message: bytes) -> bytes:
+    """The body of a kombu message, decoded."""
+    return base64.b64decode(json.loads(message)["body"])

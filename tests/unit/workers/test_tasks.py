@@ -1,0 +1,166 @@
+"""The real handlers in one process: a scene becomes a fit, the fit a sealed dataset."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_scene import FRAMES, tiny_scene
+
+from physworld.twin import Twin
+from schemas.dataset import Dataset, DatasetConfig
+from schemas.fit import Fit, FitConfig
+from schemas.job import Job
+from storage import jobs, leases, resources
+from storage.tables import EpisodeRow
+from workers.execute import Runtime, run_shard
+from workers.stores import Stores
+from workers.tasks import dataset as dataset_task
+from workers.tasks.inputs import named, npz_arrays, npz_bytes
+
+EPISODES = 3
+
+
+def _drain(runtime: Runtime) -> list[str]:
+    """Do every shard that waits, as workers would; the outcomes."""
+    outcomes = []
+    while True:
+        with runtime.database.reading() as session:
+            waiting = leases.publishable(session, datetime.now(UTC))
+        if not waiting:
+            return outcomes
+        outcomes += [run_shard(runtime, publication.shard_id) for publication in waiting]
+
+
+def _job(stores: Stores, job: Job) -> Job:
+    with stores.database.reading() as session:
+        return jobs.get_job(session, job.id)
+
+
+@pytest.fixture
+def fit(runtime_with, stores: Stores, scene_id: str) -> Fit:
+    with stores.database.session() as session:
+        job = jobs.create_fit(session, scene_id, FitConfig(particle_budget=60, max_simulations=6))
+    assert _drain(runtime_with()) == ["done"]
+    with stores.database.reading() as session:
+        return resources.get_fit(session, job.outputs[0].id)
+
+
+def _make_dataset(runtime: Runtime, fit: Fit, **config: int) -> tuple[Job, Dataset]:
+    with runtime.database.session() as session:
+        job = jobs.create_dataset(session, fit.id, DatasetConfig(**config))
+    _drain(runtime)
+    with runtime.database.reading() as session:
+        return _job(runtime.stores, job), resources.get_dataset(session, job.outputs[0].id)
+
+
+def test_a_fit_leaves_a_twin_a_prediction_and_its_errors(fit: Fit, stores: Stores) -> None:
+    assert fit.state == "ready"
+    assert fit.parameters["youngs_modulus_pa"].value > 0
+    assert {"static", "rigid_follow", "constant_velocity", "twin"} <= set(fit.metrics["held_out"]["track_m"])
+    twin = Twin.from_arrays(
+        npz_arrays(stores.artifacts.read_bytes(named(fit.artifacts, "twin.npz", fit.id).sha256))
+    )
+    prediction = npz_arrays(
+        stores.artifacts.read_bytes(named(fit.artifacts, "prediction.npz", fit.id).sha256)
+    )
+    scene = tiny_scene()
+    assert prediction["tracks"].shape == scene.points.shape
+    assert prediction["particles"].shape == (FRAMES, len(prediction["particle_indices"]), 3)
+    again = twin.simulate(*scene.control_track(), scene.times)
+    shown = again[:, prediction["particle_indices"]]
+    np.testing.assert_allclose(shown, prediction["particles"], atol=1e-6)  # stored in single precision
+    assert fit.lineage.inputs[0].kind == "scene" and fit.lineage.config_digest
+
+
+def test_a_dataset_is_sealed_under_the_digest_of_its_manifest(runtime_with, fit: Fit, stores: Stores) -> None:
+    job, dataset = _make_dataset(runtime_with(), fit, episodes=EPISODES, frames=8, seed=7)
+    assert (job.state, dataset.state) == ("succeeded", "sealed")
+    assert dataset.statistics["episodes"] == EPISODES and dataset.statistics["frames"] == 8 * EPISODES
+    assert dataset.digest is not None
+    lines = []
+    for line, arrays, attributes in stores.episodes.iterate(dataset.digest):
+        assert arrays["particles"].shape == (8, line.particles, 3)
+        assert arrays["particles"].dtype == np.float32 and arrays["times"].dtype == np.float64
+        assert attributes["fit_id"] == fit.id
+        lines.append(line)
+    assert [line.index for line in lines] == list(range(EPISODES))
+    assert len({line.seed for line in lines}) == EPISODES
+
+
+def test_the_same_seed_makes_the_same_episodes(runtime_with, fit: Fit, stores: Stores) -> None:
+    digests = []
+    for _ in range(2):
+        _, dataset = _make_dataset(runtime_with(), fit, episodes=2, frames=8, seed=11)
+        with stores.database.reading() as session:
+            digests.append([episode.digest for episode in resources.all_episodes(session, dataset.id)])
+    assert digests[0] == digests[1]
+
+
+def test_what_a_dead_attempt_wrote_is_removed_at_sealing(
+    runtime_with, fit: Fit, stores: Stores, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = stores.episodes.write
+
+    def write_twice(dataset_id, index, epoch, arrays, attributes):
+        write(dataset_id, index, epoch + 90, arrays, attributes)  # as an overtaken worker would have
+        return write(dataset_id, index, epoch, arrays, attributes)
+
+    monkeypatch.setattr(stores.episodes, "write", write_twice)
+    job, dataset = _make_dataset(runtime_with(), fit, episodes=2, frames=8)
+    assert job.state == "succeeded"
+    assert stores.settings.store_folder is not None
+    folder = stores.settings.store_folder / "datasets" / dataset.id / "episodes"
+    with stores.database.reading() as session:
+        kept = {Path(episode.path).name for episode in resources.all_episodes(session, dataset.id)}
+    assert {path.name for path in folder.iterdir()} == kept
+
+
+def test_a_damaged_episode_is_found_before_sealing(
+    runtime_with, fit: Fit, stores: Stores, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = stores.episodes.write
+
+    def write_and_lie(*arguments):
+        path, _ = write(*arguments)
+        return path, "0" * 64
+
+    monkeypatch.setattr(stores.episodes, "write", write_and_lie)
+    job, dataset = _make_dataset(runtime_with(), fit, episodes=2, frames=8)
+    assert (job.state, dataset.state) == ("failed", "failed")
+    assert job.error is not None and job.error.code == "episode_corrupt"
+
+
+def test_a_dataset_with_a_missing_episode_is_not_sealed(runtime_with, fit: Fit, stores: Stores) -> None:
+    runtime = runtime_with()
+    with stores.database.session() as session:
+        job = jobs.create_dataset(session, fit.id, DatasetConfig(episodes=2, frames=8))
+    for _ in range(2):  # plan, then episodes
+        with stores.database.reading() as session:
+            waiting = leases.publishable(session, datetime.now(UTC))
+        for publication in waiting:
+            run_shard(runtime, publication.shard_id)
+    with stores.database.session() as session:
+        session.delete(session.get_one(EpisodeRow, (job.outputs[0].id, 1)))
+    _drain(runtime)
+    error = _job(stores, job).error
+    assert error is not None and error.code == "dataset_incomplete"
+    assert "holds 1 episodes of 2; missing [1]" in error.detail
+
+
+def test_a_dataset_that_the_disk_cannot_hold_is_refused_before_its_first_episode(
+    runtime_with, fit: Fit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dataset_task, "RESERVED_BYTES", 2**62)
+    job, _ = _make_dataset(runtime_with(), fit, episodes=2, frames=8)
+    assert job.state == "failed" and job.error is not None
+    assert job.error.code == "budget_exceeded" and "MiB are free" in job.error.detail
+
+
+def test_arrays_survive_the_npz_and_the_same_arrays_give_the_same_bytes() -> None:
+    arrays = {"a": np.arange(6.0).reshape(2, 3), "b": np.array("text")}
+    data = npz_bytes(arrays)
+    assert data == npz_bytes(arrays)
+    assert str(npz_arrays(data)["b"]) == "text"
