@@ -11,7 +11,7 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Protocol
 
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from physworld_client.cli.lists import progress_text
 from physworld_client.cli.output import stdout
@@ -80,12 +80,12 @@ class Bars:
             TextColumn("{task.description:<9}"),
             BarColumn(bar_width=30),
             TextColumn("{task.fields[state]:<9}"),
-            TimeElapsedColumn(),
+            TextColumn("{task.fields[seconds]:>6}"),
             TextColumn("{task.fields[text]}"),
             console=stdout,
         )
         self._tasks: dict[str, TaskID] = {
-            stage: self._progress.add_task(stage, start=False, total=1.0, state="waiting", text="")
+            stage: self._progress.add_task(stage, total=1.0, state="waiting", seconds="", text="")
             for stage in STAGES
         }
 
@@ -101,14 +101,16 @@ class Bars:
     def show(self, stages: dict[str, Job]) -> None:
         """Moves the bars."""
         for kind, job in stages.items():
-            task = self._tasks[kind]
-            if job.started_at is not None:
-                self._progress.start_task(task)
             total = job.progress.total or 1.0
             done = total if job.state == "succeeded" else min(job.progress.done, total)
-            self._progress.update(task, total=total, completed=done, state=job.state, text=progress_text(job))
-            if job.state in TERMINAL_STATES:
-                self._progress.stop_task(task)
+            self._progress.update(
+                self._tasks[kind],
+                total=total,
+                completed=done,
+                state=job.state,
+                seconds=f"{duration_s(job):.0f} s" if job.started_at else "",
+                text=progress_text(job),
+            )
 
 
 class Lines:

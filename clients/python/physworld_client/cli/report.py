@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from rich.table import Table
+from rich.text import Text
 
 from physworld_client.cli.output import stdout
 from physworld_client.errors import PhysWorldError
@@ -73,7 +75,7 @@ def build_report(
 
 def print_report(report: RunReport) -> None:
     """The results table, the speeds and the model."""
-    table = Table(title=f"Held-out error of {report.scene} [mm]", title_justify="left")
+    table = Table(title=Text(f"Held-out error of {report.scene}, in mm"), title_justify="left")
     table.add_column("prediction")
     for heading in METRICS.values():
         table.add_column(heading, justify="right")
@@ -111,9 +113,9 @@ def write_report(report: RunReport, path: Path) -> None:
 
 
 def duration_s(job: Job) -> float:
-    """Seconds from a job's start to its end (to its last sign of life while it runs)."""
+    """Seconds from a job's start to its end, or until now."""
     start = job.started_at or job.created_at
-    end = job.finished_at or job.heartbeat_at or start
+    end = job.finished_at or datetime.now(UTC)
     return max(0.0, (end - start).total_seconds())
 
 
@@ -141,7 +143,8 @@ def _millimetres(metres: float | None) -> str:
 
 
 def _parameter_line(name: str, parameter: Mapping[str, Any]) -> str:
-    text = f"{name}: {parameter['value']:.4g} {parameter['unit']}".rstrip()
+    unit = parameter["unit"] if parameter["unit"] != "1" else ""
+    text = f"{name}: {parameter['value']:.4g} {unit}".rstrip()
     if parameter.get("ci95"):
         low, high = parameter["ci95"]
         text += f" (95 %: {low:.4g} to {high:.4g})"
