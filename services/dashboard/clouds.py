@@ -8,7 +8,7 @@ every k-th point, and the layer's label says so. ``frontend/src/cloud.js`` is th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
 LAYER_BYTES = 8 * 2**20
 BYTES_PER_POINT = 12
-SMALLEST_POINT, LARGEST_POINT = 0.009, 0.05
+SMALLEST_POINT, LARGEST_POINT = 0.010, 0.05
+MEASURED_SCALE = 1.4  # a measured point stays visible around the prediction that hits it
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,7 @@ class Layer:
         points: (T, n, 3) float32 [m], NaN where not visible.
         shown: drawn from the start.
         opacity: 1 is solid.
+        scale: size of the points against those of another layer of the same count.
         pairs: name of the layer whose points are the twins of these, joined by lines; None for none.
     """
 
@@ -42,6 +44,7 @@ class Layer:
     shown: bool = True
     opacity: float = 1.0
     pairs: str | None = None
+    scale: float = 1.0
 
     @property
     def count(self) -> int:
@@ -78,7 +81,7 @@ class Cloud:
                     "label": layer.label,
                     "role": layer.role,
                     "count": layer.count,
-                    "size": _point_size(layer.count),
+                    "size": _point_size(layer.count) * layer.scale,
                     "shown": layer.shown,
                     "opacity": layer.opacity,
                     "pairs": layer.pairs,
@@ -92,7 +95,9 @@ class Cloud:
 def measured_layers(scene: Scene) -> list[Layer]:
     """The recording itself: tracked points where they were visible, and the driven points."""
     points = np.where(scene.visible[..., None], scene.points, np.nan)
-    layers = [thinned(Layer("measured", "Measured", "measured", points.astype(np.float32)))]
+    layers = [
+        thinned(Layer("measured", "Measured", "measured", points.astype(np.float32), scale=MEASURED_SCALE))
+    ]
     if scene.controllers.shape[1]:
         controllers = scene.controllers.astype(np.float32)
         layers.append(thinned(Layer("controllers", "Controllers", "controllers", controllers)))
@@ -126,7 +131,7 @@ def thinned(layer: Layer) -> Layer:
         return layer
     points = layer.points[:, ::stride]
     label = f"{layer.label} ({points.shape[1]} of {count})"
-    return Layer(layer.name, label, layer.role, points, layer.shown, layer.opacity, layer.pairs)
+    return replace(layer, label=label, points=points)
 
 
 def _point_size(count: int) -> float:

@@ -80,14 +80,21 @@ def figure(value: object, digits: int = 4) -> str:
     if value != 0 and not 1e-3 <= abs(value) < 1e6:
         mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
         return f"{mantissa.rstrip('0').rstrip('.')}e{int(exponent)}"
-    if value.is_integer():
-        return f"{value:,.0f}"
-    return f"{value:,.{max(0, digits - 1 - math.floor(math.log10(abs(value))))}f}"
+    text = _fixed(value, digits)
+    return text.rstrip("0").rstrip(".") if "." in text else text
 
 
 def millimetres(metres: float | None) -> str:
     """A length in metres as millimetres with three significant digits, without the unit."""
-    return DASH if metres is None else figure(float(metres) * 1000, 3)
+    if metres is None or not math.isfinite(metres):
+        return DASH
+    return _fixed(float(metres) * 1000, 3)
+
+
+def _fixed(value: float, digits: int) -> str:
+    """Decimal notation with ``digits`` significant digits, zeros at the end kept."""
+    places = digits - 1 - math.floor(math.log10(abs(value))) if value else digits - 1
+    return f"{value:,.{max(0, places)}f}"
 
 
 def size(count: int) -> str:

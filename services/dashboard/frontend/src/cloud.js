@@ -147,7 +147,7 @@ function gridStep(extent) {
 }
 
 function grid(low, high, floor) {
-  const extent = Math.max(high.x - low.x, high.y - low.y, (high.z - low.z) * 0.6, 0.01) * 1.3;
+  const extent = Math.max(high.x - low.x, high.y - low.y, (high.z - low.z) * 0.6, 0.01) * 1.1;
   const step = gridStep(extent);
   const half = Math.ceil(extent / 2 / step) * step;
   const centre = [low.x + high.x, low.y + high.y].map((sum) => Math.round(sum / 2 / step) * step);
@@ -201,8 +201,8 @@ class Player {
     const [low, high] = bounds(this.layers);
     const centre = low.clone().add(high).multiplyScalar(0.5);
     const radius = Math.max(high.clone().sub(low).length() / 2, 1e-3);
-    const distance = (radius * 1.12) / Math.sin((this.camera.fov / 2) * (Math.PI / 180));
-    const direction = new Vector3(0.62, -1, 0.42).normalize();
+    const distance = (radius * 1.16) / Math.sin((this.camera.fov / 2) * (Math.PI / 180));
+    const direction = new Vector3(0.62, -1, 0.36).normalize();
     this.camera.position.copy(centre).addScaledVector(direction, distance);
     this.camera.near = distance / 200;
     this.camera.far = distance * 20;

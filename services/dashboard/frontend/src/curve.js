@@ -10,7 +10,8 @@ const HEIGHT_PX = 260;
 function axis(label, size) {
   return {
     label,
-    labelSize: 22,
+    labelSize: 18,
+    labelGap: 0,
     labelFont: "12px system-ui, sans-serif",
     font: "11px system-ui, sans-serif",
     size,
@@ -31,6 +32,7 @@ function shadeHeldOut(chart, split) {
   context.fillRect(from, top, left + width - from, height);
   context.fillStyle = colour("quiet");
   context.font = `${11 * devicePixelRatio}px system-ui, sans-serif`;
+  context.textAlign = "left";
   context.textBaseline = "top";
   context.fillText("held out", from + 6 * devicePixelRatio, top + 5 * devicePixelRatio);
   context.restore();
@@ -56,7 +58,7 @@ function options(data, state, element) {
     padding: [10, 12, 0, 0],
     scales: { x: { time: false }, y: { range: (_, low, high) => [Math.min(0, low), high > 0 ? high * 1.06 : 1] } },
     cursor: { points: { size: 7 }, drag: { x: true, y: false } },
-    axes: [axis(data.x.label, 44), axis(data.y.label, 58)],
+    axes: [axis(data.x.label, 30), axis(data.y.label, 46)],
     series: [
       { label: data.x.label, value: (_, value) => number(value) },
       ...data.series.map((series) => ({

@@ -1,0 +1,331 @@
+"""The dashboard as a person sees it: a real server, rows made through the storage, headless Chromium.
+
+Every test's browser records console errors, violations of the content security policy and the address of
+every request: at the end of each test there are none of the former two, and no request left this machine.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+from dashboard_world import EPISODES, FRAMES, World, build_world, claim, complete, report
+from fastapi import FastAPI
+from playwright.sync_api import Browser, Page, expect, sync_playwright
+from serving import serve
+
+from schemas.fit import FitConfig
+from services.dashboard import mount
+from storage import jobs, resources
+
+pytestmark = pytest.mark.browser
+
+CHROMIUM = next(
+    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
+)
+FLAGS = (
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--no-sandbox",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+)
+READY_MS = 60_000  # software WebGL on a busy machine
+expect.set_options(timeout=READY_MS)
+WATCH_POLICY = """
+window.violations = [];
+document.addEventListener("securitypolicyviolation", (event) =>
+  window.violations.push(`${event.violatedDirective} ${event.blockedURI}`));
+"""
+
+
+@dataclass
+class Visit:
+    """A browser tab, and what went wrong in it."""
+
+    page: Page
+    base: str
+    errors: list[str] = field(default_factory=list)
+    requests: list[str] = field(default_factory=list)
+
+    def open(self, path: str) -> None:
+        """Go to a page of the dashboard."""
+        self.page.goto(self.base + path)
+
+    def login(self, token: str) -> None:
+        """Log in through the form that the present page shows."""
+        self.page.fill("#key", token)
+        self.page.click("button[type=submit]")
+        self.page.wait_for_selector(".top nav")
+
+    def points_shown(self) -> None:
+        """Wait until the 3D view has its points."""
+        self.page.wait_for_selector("[data-cloud][data-ready]", timeout=READY_MS)
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> World:
+    """The installation that all tests look at."""
+    return build_world(tmp_path_factory.mktemp("dashboard"))
+
+
+@pytest.fixture(scope="module")
+def base(world: World) -> Iterator[str]:
+    """Address of a real server with the dashboard and nothing else."""
+    app = FastAPI()
+    mount(app, world.settings, world.database, world.stores)
+    with serve(app) as origin:
+        yield f"{origin}/dashboard"
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    """Headless Chromium with software WebGL."""
+    if CHROMIUM is None:
+        pytest.skip("no Chromium on this machine")
+    with sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture
+def stranger(browser: Browser, base: str) -> Iterator[Visit]:
+    """A tab without a session; clean at the end."""
+    context = browser.new_context(viewport={"width": 1280, "height": 900}, accept_downloads=True)
+    context.add_init_script(WATCH_POLICY)
+    page = context.new_page()
+    visit = Visit(page, base)
+    page.on("console", lambda message: visit.errors.append(message.text) if message.type == "error" else None)
+    page.on("pageerror", lambda error: visit.errors.append(str(error)))
+    page.on("request", lambda request: visit.requests.append(request.url))
+    yield visit
+    assert page.evaluate("window.violations") == []
+    context.close()
+    assert visit.errors == []
+    origin = base.removesuffix("/dashboard")
+    assert [url for url in visit.requests if not url.startswith((origin + "/", "blob:", "data:"))] == []
+
+
+@pytest.fixture
+def visit(stranger: Visit, world: World) -> Visit:
+    """A tab of somebody who may write, on the overview."""
+    stranger.open("/")
+    stranger.login(world.writer_token)
+    return stranger
+
+
+def test_a_stranger_is_led_to_the_login_and_back(stranger: Visit, world: World) -> None:
+    stranger.open(f"/scenes/{world.scene_id}")
+    assert "/dashboard/login?next=" in stranger.page.url
+    stranger.login(world.reader_token)
+    expect(stranger.page).to_have_url(f"{stranger.base}/scenes/{world.scene_id}")
+    cookie = next(item for item in stranger.page.context.cookies() if item["name"] == "physworld_session")
+    assert cookie["httpOnly"]
+    assert cookie["sameSite"] == "Strict"
+    stranger.points_shown()
+    stranger.page.get_by_role("button", name="Log out").click()
+    stranger.page.wait_for_selector("#key")
+    stranger.open("/")
+    expect(stranger.page.locator("#key")).to_be_visible()
+
+
+def test_a_wrong_key_is_refused(stranger: Visit) -> None:
+    stranger.open("/login")
+    stranger.page.fill("#key", "pw_wrong")
+    stranger.page.click("button[type=submit]")
+    expect(stranger.page.get_by_role("alert")).to_contain_text("not known")
+    assert stranger.page.context.cookies() == []
+    stranger.errors.clear()  # Chromium notes the 401 of the form itself
+
+
+def test_the_job_list_moves_with_the_work(visit: Visit, world: World) -> None:
+    assert world.running is not None
+    row = visit.page.locator(f"#{world.running_id}")
+    expect(row).to_contain_text("10 / 80 simulations")
+    report(world, world.running, 40, 80, "simulations", "local stage")
+    expect(row).to_contain_text("40 / 80 simulations")
+    assert row.locator("progress").evaluate("bar => bar.value") == 0.5
+    with world.database.session() as session:
+        added = jobs.create_fit(session, world.scene_id, FitConfig())
+    expect(visit.page.locator(f"#{added.id}")).to_contain_text("queued")
+
+
+def test_a_pipeline_shows_its_three_stages(visit: Visit, world: World) -> None:
+    row = visit.page.locator(f"#{world.pipeline_id}")
+    expect(row.locator(".stage")).to_have_count(3)
+    row.locator(".title a").click()
+    expect(visit.page.locator(".stage-cards .stage")).to_have_count(3)
+    expect(visit.page.locator("h1")).to_contain_text("Pipeline of chain_swing")
+    expect(visit.page.locator(".log li")).not_to_have_count(0)
+    visit.page.get_by_role("link", name="chain_swing, version 1").first.click()
+    expect(visit.page).to_have_url(f"{visit.base}/models/chain_swing/1")
+    visit.points_shown()
+
+
+def test_a_failed_job_says_why_with_its_numbers_and_a_hint(visit: Visit, world: World) -> None:
+    visit.open(f"/jobs/{world.failed_id}")
+    problem = visit.page.locator(".problem")
+    expect(problem).to_contain_text("dt 1.0e-4 s exceeds the CFL limit 6.1e-5 s")
+    expect(problem.locator(".hint")).to_contain_text("Lower the particle budget")
+
+
+def test_a_job_is_cancelled_by_its_button_and_only_by_who_may_write(visit: Visit, world: World) -> None:
+    with world.database.session() as session:
+        job = jobs.create_fit(session, world.scene_id, FitConfig())
+    visit.open(f"/jobs/{job.id}")
+    visit.page.on("dialog", lambda dialog: dialog.accept())
+    visit.page.get_by_role("button", name="Cancel").click()
+    expect(visit.page.locator("h1 .badge")).to_have_text("cancelled")
+    visit.page.get_by_role("button", name="Log out").click()
+    visit.login(world.reader_token)
+    visit.open(f"/jobs/{world.running_id}")
+    expect(visit.page.locator("h1 .badge")).to_have_text("running")
+    expect(visit.page.get_by_role("button", name="Cancel")).to_have_count(0)
+
+
+def test_the_scene_is_drawn_and_the_slider_moves_it(visit: Visit, world: World, tmp_path: Path) -> None:
+    visit.open(f"/scenes/{world.scene_id}")
+    visit.points_shown()
+    canvas = visit.page.locator("figure canvas")
+    first = canvas.screenshot(path=tmp_path / "first.png")
+    assert coloured_pixels(visit.page, first) > 200
+    slider = visit.page.locator("[data-slider]")
+    assert slider.get_attribute("max") == str(FRAMES - 1)
+    slider.fill("70")
+    expect(visit.page.locator("[data-clock]")).to_contain_text(f"frame 71 of {FRAMES} · held out")
+    second = canvas.screenshot(path=tmp_path / "second.png")
+    assert second != first
+    assert coloured_pixels(visit.page, second) > 200
+    for box in visit.page.locator("[data-legend] input").all():
+        box.uncheck()
+    assert coloured_pixels(visit.page, canvas.screenshot()) < 20
+
+
+def test_the_scene_plays(visit: Visit, world: World) -> None:
+    visit.open(f"/scenes/{world.scene_id}")
+    visit.points_shown()
+    visit.page.select_option("[data-speed]", "2")
+    visit.page.get_by_role("button", name="Play").click()
+    expect(visit.page.locator("figure")).to_have_attribute("data-frame", str(FRAMES - 1), timeout=READY_MS)
+    expect(visit.page.get_by_role("button", name="Play")).to_be_visible()
+
+
+def test_the_error_curve_and_the_parameters_of_the_twin_are_there(visit: Visit, world: World) -> None:
+    visit.open(f"/scenes/{world.scene_id}")
+    visit.page.wait_for_selector("[data-curve][data-ready]")
+    legend = visit.page.locator(".u-legend")
+    for name in ("Twin", "Static", "Rigid follow", "Constant velocity"):
+        expect(legend).to_contain_text(name)
+    table = visit.page.locator("section", has_text="Calibrated parameters").last
+    expect(table).to_contain_text("171,000 to 198,000")
+    expect(table).to_contain_text("no, held at its prior")
+    curve = visit.page.evaluate(
+        "url => fetch(url).then(answer => answer.json())", f"{visit.base}/scenes/{world.scene_id}/curve"
+    )
+    with world.database.reading() as session:
+        fit = resources.list_fits(session, scene_id=world.scene_id, state="ready").data[0]
+    assert fit.parameters["youngs_modulus"].value == 1.84e5
+    twin = next(item["values"] for item in curve["series"] if item["label"] == "Twin")
+    assert len(twin) == FRAMES
+    assert twin[-1] == pytest.approx(20 * (1 + 0.4**2 + 0.3**2) ** 0.5, rel=1e-4)  # the drift of 20 mm put in
+    visit.points_shown()
+
+
+def test_a_dataset_shows_its_episodes_and_one_of_them_in_3d(visit: Visit, world: World) -> None:
+    visit.open(f"/datasets/{world.dataset_id}")
+    visit.points_shown()
+    expect(visit.page.locator("tbody tr")).to_have_count(EPISODES)
+    visit.page.locator("tbody a").last.click()
+    visit.points_shown()
+    expect(visit.page.locator("figure canvas")).to_have_attribute(
+        "aria-label", "Particles of episode 2 in 3D"
+    )
+
+
+def test_a_model_shows_its_card_and_gives_its_files(visit: Visit, world: World, tmp_path: Path) -> None:
+    assert world.model_file is not None
+    visit.open("/models/chain_swing/1")
+    visit.points_shown()
+    visit.page.wait_for_selector("[data-curve][data-ready]")
+    best = visit.page.locator("table.held-out td.best").first
+    expect(best).to_have_text("5.00")
+    expect(visit.page.locator("main")).to_contain_text("640 steps/s")
+    with visit.page.expect_download() as download:
+        visit.page.get_by_role("link", name="model.safetensors").click()
+    assert download.value.suggested_filename == "model.safetensors"
+    download.value.save_as(tmp_path / "model")
+    data = (tmp_path / "model").read_bytes()
+    assert data == world.model_bytes
+    assert hashlib.sha256(data).hexdigest() == world.model_file.sha256
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_no_page_is_wider_than_a_phone(visit: Visit, world: World, scheme: str) -> None:
+    visit.page.emulate_media(color_scheme=scheme)
+    visit.page.set_viewport_size({"width": 400, "height": 860})
+    for path in (
+        "/",
+        f"/jobs/{world.pipeline_id}",
+        "/scenes",
+        f"/scenes/{world.scene_id}",
+        "/datasets",
+        f"/datasets/{world.dataset_id}",
+        "/models",
+        "/models/chain_swing",
+        "/models/chain_swing/1",
+    ):
+        visit.open(path)
+        assert visit.page.evaluate("document.documentElement.scrollWidth") <= 400, path
+
+
+def test_what_does_not_exist_has_a_friendly_page(visit: Visit) -> None:
+    for path in (
+        "/nothing",
+        "/scenes/scn_unknown",
+        "/jobs/job_unknown",
+        "/models/unknown/1",
+        "/models/chain_swing/x",
+    ):
+        visit.open(path)
+        expect(visit.page.locator("main")).to_contain_text("This page does not exist")
+    visit.errors.clear()  # Chromium notes each 404 itself
+
+
+def test_a_finished_job_ends_its_stream(visit: Visit, world: World) -> None:
+    with world.database.session() as session:
+        job = jobs.create_fit(session, world.scene_id, FitConfig())
+    visit.open(f"/jobs/{job.id}")
+    expect(visit.page.locator("h1 .badge")).to_have_text("queued")
+    lease = claim(world, job.id)
+    expect(visit.page.locator("h1 .badge")).to_have_text("running")
+    complete(world, lease, {"parameters": {}, "metrics": {}, "artifacts": []})
+    expect(visit.page.locator("h1 .badge")).to_have_text("succeeded")
+
+
+def coloured_pixels(page: Page, screenshot: bytes) -> int:
+    """Pixels of a PNG with a clear hue: points, not background, grid or text. The browser decodes it."""
+    return page.evaluate(
+        """async (bytes) => {
+          const image = await createImageBitmap(new Blob([new Uint8Array(bytes)], { type: "image/png" }));
+          const canvas = new OffscreenCanvas(image.width, image.height);
+          const context = canvas.getContext("2d");
+          context.drawImage(image, 0, 0);
+          const data = context.getImageData(0, 40, image.width, image.height - 40).data;
+          let count = 0;
+          for (let i = 0; i < data.length; i += 4) {
+            const channels = [data[i], data[i + 1], data[i + 2]];
+            if (Math.max(...channels) - Math.min(...channels) > 60) count += 1;
+          }
+          return count;
+        }""",
+        list(screenshot),
+    )
