@@ -3,9 +3,10 @@
 # make bench               the figures of docs/benchmarks.md
 # make up                  the embedded service in the foreground
 SHELL := /bin/bash
-SCENE ?= sample
+SCENE ?= sample/soft_beam
 DATA ?= .demo
 BIN := .venv/bin
+BENCHMARKS := $(filter-out __init__ harness,$(basename $(notdir $(wildcard benchmarks/*.py))))
 export OMP_NUM_THREADS ?= 1
 
 .PHONY: demo test bench lint up clean install dev
@@ -32,7 +33,7 @@ test: lint
 	$(BIN)/python -m pytest
 
 bench: dev
-	$(BIN)/python -m benchmarks
+	@set -e; for name in $(BENCHMARKS); do $(BIN)/python -m benchmarks.$$name; done
 
 clean:
 	rm -rf .venv .bootstrap .demo .pytest_cache .ruff_cache .mypy_cache .hypothesis .import_linter_cache build
