@@ -119,10 +119,14 @@ def summarise(rounds: Sequence[float]) -> Timing:
 
 
 def write_json(report: Report, path: Path) -> None:
-    """The report with its machine as JSON."""
-    facts = {key: value for key, value in asdict(report).items() if key not in ("header", "rows")}
+    """The report with its machine as JSON; its figures also lie at the top, under their own keys."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(facts, indent=2) + "\n")
+    path.write_text(json.dumps({**report.figures, "report": asdict(report)}, indent=2) + "\n")
+
+
+def read_json(path: Path) -> Report:
+    """What ``write_json`` wrote."""
+    return Report(**json.loads(path.read_text())["report"])
 
 
 def write_section(report: Report, path: Path) -> None:

@@ -1,0 +1,201 @@
+"""The data factory through the real embedded service: episodes a minute with one and two workers.
+
+Broker, database, dispatcher and worker processes are those of ``physworld up`` on an empty data folder; the
+sample scene is fitted once. Rounds alternate between one and two workers, the service restarted in between
+and each worker warmed up by episodes that do not count. The clock runs from the request for the dataset to the
+end of its last episode.
+
+A worker's shard reports its seconds of planning and simulating and its seconds of writing to the store; what
+is left of the wall time is the queue's: publishing, claiming, committing, waiting for the next shard.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import sqlite3
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from physworld_client import Client
+
+from benchmarks.harness import Report, interleave, run_alone, summarise
+from schemas.dataset import DatasetConfig
+from schemas.fit import FitConfig
+
+SCENE = Path(__file__).resolve().parents[1] / "sample" / "soft_beam"
+EPISODES = 24
+WARM_UP = 2  # episodes a worker
+FIT_SIMULATIONS = 12
+MOST_ROUNDS = 3  # a round takes a minute
+START_S, STOP_S, JOB_S = 120.0, 60.0, 1800.0
+
+
+class ServiceDidNotStart(RuntimeError):
+    """The embedded service ended, or was not ready in time."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One dataset, all times in seconds.
+
+    Attributes:
+        workers, episodes: how many.
+        wall_s: from the request to the end of the last episode.
+        simulate_s, store_s: summed over the episodes, as their workers measured it.
+    """
+
+    workers: int
+    episodes: int
+    wall_s: float
+    simulate_s: float
+    store_s: float
+
+    @property
+    def per_minute(self) -> float:
+        """Episodes a minute."""
+        return 60.0 * self.episodes / self.wall_s
+
+    @property
+    def store_percent(self) -> float:
+        """Writing, in percent of the simulation time."""
+        return 100.0 * self.store_s / self.simulate_s
+
+    @property
+    def queue_percent(self) -> float:
+        """What workers did besides simulating and writing, idling included, in percent of the simulation."""
+        return 100.0 * (self.workers * self.wall_s - self.simulate_s - self.store_s) / self.simulate_s
+
+
+def measure(repeats: int, seed: int) -> Report:
+    """Alternate one and two workers, at most ``MOST_ROUNDS`` rounds."""
+    runs: dict[int, list[Run]] = {1: [], 2: []}
+    with tempfile.TemporaryDirectory(prefix="physworld-bench-") as folder:
+        data = Path(folder)
+        with service(data, 2) as client:
+            scene = client.scenes.create(SCENE)
+            config = FitConfig(max_simulations=FIT_SIMULATIONS, seed=seed)
+            job = client.jobs.wait(client.fits.create(scene.id, config), timeout=JOB_S)
+            fit_id = job.outputs[0].id
+
+        def case(workers: int) -> float:
+            with service(data, workers) as client:
+                _dataset(client, fit_id, WARM_UP * workers, seed)
+                runs[workers].append(_timed(client, data, fit_id, workers, seed))
+            return runs[workers][-1].per_minute
+
+        rounds = min(repeats, MOST_ROUNDS)
+        timings = interleave({"1": lambda: case(1), "2": lambda: case(2)}, rounds)
+    speedup = timings["2"].median / timings["1"].median
+    figures = {
+        "episodes": EPISODES,
+        "episodes_per_minute": {name: timing.median for name, timing in timings.items()},
+        "spread": {name: timing.spread for name, timing in timings.items()},
+        "speedup_two_workers": speedup,
+        "simulate_s_per_episode": {str(n): _median(runs[n], "simulate_s") / EPISODES for n in runs},
+        "store_percent": {str(n): _median(runs[n], "store_percent") for n in runs},
+        "queue_percent": {str(n): _median(runs[n], "queue_percent") for n in runs},
+    }
+    rows = [
+        [
+            name,
+            f"{timing.median:.1f} ± {timing.spread:.1f}",
+            f"{_median(runs[int(name)], 'simulate_s') / EPISODES:.2f}",
+            f"{_median(runs[int(name)], 'store_percent'):.1f} %",
+            f"{_median(runs[int(name)], 'queue_percent'):.1f} %",
+        ]
+        for name, timing in timings.items()
+    ]
+    return Report(
+        name="factory",
+        title="Data factory, episodes a minute through the embedded service",
+        figures=figures,
+        header=["workers", "episodes/min", "simulation, s an episode", "store adds", "queue adds"],
+        rows=rows,
+        notes=[
+            f"Two workers against one: {speedup:.2f} times the episodes a minute.",
+            f"{EPISODES} episodes of the sample scene `{SCENE.name}`, {rounds} rounds.",
+            "What store and queue add is in percent of the simulation time; with two workers the queue's "
+            "share holds the idle end of whoever finishes first.",
+        ],
+        seed=seed,
+    )
+
+
+@contextmanager
+def service(data: Path, workers: int) -> Iterator[Client]:
+    """The embedded service on ``data`` with so many workers and no trainer; stopped at the end."""
+    command = [sys.executable, "-m", "services.embedded", "--data", str(data), "--workers", str(workers)]
+    with (data / "service.log").open("a") as log:
+        process = subprocess.Popen([*command, "--no-trainer"], stdout=log, stderr=subprocess.STDOUT)
+        try:
+            state = _ready_state(data, process)
+            key = Path(state["api_key_file"]).read_text().strip()
+            with Client(state["api_url"], key) as client:
+                yield client
+        finally:
+            process.send_signal(signal.SIGTERM)
+            try:
+                process.wait(STOP_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+def _ready_state(data: Path, process: subprocess.Popen[bytes]) -> dict[str, str]:
+    """What the service wrote of itself once it is ready."""
+    deadline = time.monotonic() + START_S
+    path = data / "run" / "state.json"
+    while time.monotonic() < deadline:
+        if process.poll() is not None:
+            raise ServiceDidNotStart(f"exit code {process.returncode}: {_tail(data)}")
+        if path.exists():
+            state: dict[str, str] = json.loads(path.read_text())
+            if state.get("pid") == process.pid and state.get("ready"):
+                return state
+        time.sleep(0.05)
+    raise ServiceDidNotStart(f"not ready after {START_S:.0f} s: {_tail(data)}")
+
+
+def _tail(data: Path) -> str:
+    return (data / "service.log").read_text()[-2000:]
+
+
+def _dataset(client: Client, fit_id: str, episodes: int, seed: int) -> str:
+    """Make a dataset and wait for its seal; its job's id."""
+    job = client.datasets.create(fit_id, DatasetConfig(episodes=episodes, seed=seed))
+    return client.jobs.wait(job, timeout=JOB_S).id
+
+
+def _timed(client: Client, data: Path, fit_id: str, workers: int, seed: int) -> Run:
+    """A dataset of ``EPISODES`` and what its shards reported."""
+    asked = datetime.now(UTC)
+    job_id = _dataset(client, fit_id, EPISODES, seed)
+    with sqlite3.connect(f"file:{data / 'physworld.db'}?mode=ro", uri=True) as database:
+        rows = database.execute(
+            "SELECT result, finished_at FROM shards WHERE job_id = ? AND kind = 'episode'", (job_id,)
+        ).fetchall()
+    results = [json.loads(result) for result, _ in rows]
+    last = max(datetime.fromisoformat(finished) for _, finished in rows)
+    return Run(
+        workers=workers,
+        episodes=len(rows),
+        wall_s=(last.replace(tzinfo=UTC) - asked).total_seconds(),
+        simulate_s=sum(result["seconds"] for result in results),
+        store_s=sum(result["store_seconds"] for result in results),
+    )
+
+
+def _median(runs: list[Run], field: str) -> float:
+    return summarise([getattr(run, field) for run in runs]).median
+
+
+if __name__ == "__main__":
+    run_alone(measure)
