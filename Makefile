@@ -6,7 +6,6 @@ SHELL := /bin/bash
 SCENE ?= sample/soft_beam
 DATA ?= .demo
 BIN := .venv/bin
-BENCHMARKS := $(filter-out __init__ harness,$(basename $(notdir $(wildcard benchmarks/*.py))))
 export OMP_NUM_THREADS ?= 1
 
 .PHONY: demo test bench lint up clean install dev
@@ -33,7 +32,7 @@ test: lint
 	$(BIN)/python -m pytest
 
 bench: dev
-	@set -e; for name in $(BENCHMARKS); do $(BIN)/python -m benchmarks.$$name; done
+	$(BIN)/python -m benchmarks
 
 clean:
 	rm -rf .venv .bootstrap .demo .pytest_cache .ruff_cache .mypy_cache .hypothesis .import_linter_cache build

@@ -4,8 +4,8 @@ The equations and the names of the tensors are those of ``physworld.worldmodel.m
 from them alone and needs neither torch nor the library. Geometry is computed in double precision, the layers
 in single precision, as they were trained.
 
-Legend: n object vertices, C control vertices, V = n + C; D neighbour slots per vertex; H width; h history; L
-message passing steps; F edge features, 3h + 10.
+Legend: n object vertices, C control vertices, V = n + C; E directed edges, sorted by receiver; H width; h
+history; L message passing steps; F edge features, 3h + 10.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import numpy as np
 
 from physworld_client.errors import ModelUnreadable
 
-EMPTY_SLOT = np.float32(-1.0e9)  # added before the ReLU of a message that nobody sends
 PROPERTY_COUNT = 2
 
 
@@ -32,7 +31,7 @@ class Network:
         self._tensors = tensors
         self.layers = sum(name.startswith("receive.") and name.endswith(".weight") for name in tensors)
         neighbours = self._tensor("graph.neighbours").astype(np.int64)
-        vertex_count, slots = neighbours.shape
+        vertex_count = neighbours.shape[0]
         self.object_count = object_count
         self.control_count = vertex_count - object_count
         features = self._tensor("edge.0.weight").shape[1]
@@ -44,7 +43,7 @@ class Network:
                 f"{features} edge features, {inputs} inputs beyond those of history {self.history}"
             )
         self.has_ground = inputs == 1
-        self._prepare(neighbours, slots)
+        self._prepare(neighbours)
 
     def step(self, window: np.ndarray, control_next: np.ndarray, phi: np.ndarray) -> np.ndarray:
         """Positions of all vertices one clock tick later [m], (V, 3).
@@ -55,36 +54,37 @@ class Network:
             phi: log property ratios of the object vertices, (n, 2).
         """
         n = self.object_count
-        state = self._mlp("encoder", self._vertex_features(window, control_next - window[-1, n:], phi))
+        features = self._vertex_features(window, control_next - window[-1, n:], phi)
+        state = self._mlp("encoder", features)
         edges = self._edge_features(window) @ self._edge_weights
-        edges = edges.reshape(len(state), -1, self.layers, state.shape[1])
+        edges = edges.reshape(len(edges), self.layers, -1)
         for layer in range(self.layers):
             heard = self._linear(f"receive.{layer}", state)
-            sent = np.concatenate([state @ self._tensor(f"send.{layer}.weight").T, self._silent])
-            messages = heard[:, None] + sent[self._neighbours] + edges[:, :, layer]
-            total = np.maximum(messages, 0.0).sum(axis=1) / self._degree
-            received = total @ self._tensor(f"message.{layer}.weight").T
+            sent = state @ self._tensor(f"send.{layer}.weight").T
+            messages = np.maximum(heard[self._receivers] + sent[self._senders] + edges[:, layer], 0.0)
+            mean = np.add.reduceat(messages, self._first, axis=0) * self._share
+            received = mean @ self._tensor(f"message.{layer}.weight").T
             inner = self._linear(f"update_in.{layer}", np.concatenate([state, received], axis=1))
             state = state + self._linear(f"update_out.{layer}", np.maximum(inner, 0.0))
-        correction = self._mlp("decoder", state[:n]).astype(np.float64)
+        correction = self._mlp("decoder", state[:n]) + features[:n] @ self._tensor("skip.weight").T
         inertial = 2.0 * window[-1, :n] - window[-2, :n]
-        return np.concatenate([inertial + self._scale("acceleration") * correction, control_next])
+        moved = inertial + self._scale("acceleration") * correction.astype(np.float64)
+        return np.concatenate([moved, control_next])
 
-    def _prepare(self, neighbours: np.ndarray, slots: int) -> None:
+    def _prepare(self, neighbours: np.ndarray) -> None:
         """What depends on weights and graph only."""
         vertex_count, n = neighbours.shape[0], self.object_count
-        receiver = np.broadcast_to(np.arange(vertex_count)[:, None], neighbours.shape)
-        filled = neighbours < vertex_count
-        controlled = (receiver >= n) | (neighbours >= n)
-        rest = self._tensor("graph.rest_relative").astype(np.float64)
-        self._neighbours = neighbours
-        self._senders = np.where(filled, neighbours, receiver)
-        self._rest = rest
-        self._rest_length = np.linalg.norm(rest, axis=2, keepdims=True)
-        self._kind = np.stack([~controlled, controlled], axis=2).astype(np.float64)
-        width = self._tensor("decoder.in.weight").shape[1]
-        self._silent = np.full((1, width), EMPTY_SLOT)
-        self._degree = np.float32(self._scale("degree"))
+        receivers, slots = np.nonzero(neighbours < vertex_count)
+        degree = np.bincount(receivers, minlength=vertex_count)
+        if not degree.all():
+            raise ModelUnreadable(f"vertex {int(np.argmin(degree))} of the graph hears nobody")
+        self._receivers, self._senders = receivers, neighbours[receivers, slots]
+        self._first = np.concatenate([[0], np.cumsum(degree)[:-1]])
+        self._share = (1.0 / degree[:, None]).astype(np.float32)
+        self._rest = self._tensor("graph.rest_relative").astype(np.float64)[receivers, slots]
+        self._rest_length = np.linalg.norm(self._rest, axis=1, keepdims=True)
+        controlled = (receivers >= n) | (self._senders >= n)
+        self._kind = np.stack([~controlled, controlled], axis=1).astype(np.float64)
         layers = [self._tensor(f"edge.{layer}.weight") for layer in range(self.layers)]
         self._edge_weights = np.concatenate(layers).T.copy()
 
@@ -103,9 +103,9 @@ class Network:
         return np.concatenate(parts, axis=1).astype(np.float32)
 
     def _edge_features(self, window: np.ndarray) -> np.ndarray:
-        """e_ij of every slot, (V, D, F); those of empty slots are never heard."""
-        relative = window[:, self._senders] - window[:, :, None]
-        length = np.linalg.norm(relative[-1], axis=2, keepdims=True)
+        """e_ij, (E, F)."""
+        relative = window[:, self._senders] - window[:, self._receivers]
+        length = np.linalg.norm(relative[-1], axis=1, keepdims=True)
         moves = (relative[1:] - relative[:-1])[::-1] / self._scale("relative")
         parts = [
             relative[-1] / self._scale("length"),
@@ -115,7 +115,7 @@ class Network:
             (length - self._rest_length) / self._scale("stretch"),
             self._kind,
         ]
-        return np.concatenate(parts, axis=2).astype(np.float32)
+        return np.concatenate(parts, axis=1).astype(np.float32)
 
     def _mlp(self, name: str, values: np.ndarray) -> np.ndarray:
         return self._linear(f"{name}.out", np.maximum(self._linear(f"{name}.in", values), 0.0))
