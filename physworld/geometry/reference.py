@@ -23,7 +23,7 @@ from physworld.scene import AS_MEASURED, Scene
 
 ROD_KINDS = ("rope", "rod")
 SHEET_KINDS = ("sheet", "cloth")
-_ROD_CELLS = 48
+_ROD_CELLS = 32
 _SHEET_CELLS = 12
 _BOX_KINDS = ("beam", "block")
 _BOX_FILL = 0.93  # a cloud that fills this share of its bounding box is a box, whatever its kind

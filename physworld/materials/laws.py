@@ -6,7 +6,7 @@ prior then, and the stiffness is reported for that density.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -70,7 +70,7 @@ class RodLaw:
     Attributes:
         stretching_n: EA, force per strain [N].
         bending_n_m2: B = EI, bending stiffness [N m^2].
-        relaxation_s: Kelvin-Voigt time tau of stretch and bending.
+        relaxation_s: Kelvin-Voigt time tau of bending.
         density_kg_m: mass per length.
     """
 
@@ -86,3 +86,17 @@ class RodLaw:
 
 
 Law = SolidLaw | SheetLaw | RodLaw
+
+
+def friction_law(law: Law) -> Law | None:
+    """The elastic law whose linear stiffness is the law's friction (force per velocity); None without friction."""
+    if isinstance(law, SolidLaw):
+        if law.viscosity_pa_s == 0:
+            return None
+        return replace(law, youngs_modulus_pa=2 * law.viscosity_pa_s, poissons_ratio=0.0, viscosity_pa_s=0.0)
+    tau = law.relaxation_s
+    if tau == 0:
+        return None
+    if isinstance(law, SheetLaw):
+        return replace(law, membrane_n_m=tau * law.membrane_n_m, bending_n_m=tau * law.bending_n_m, relaxation_s=0.0)
+    return replace(law, stretching_n=0.0, bending_n_m2=tau * law.bending_n_m2, relaxation_s=0.0)

@@ -44,7 +44,6 @@ class InternalForces:
             self._kernel, self._model, self._state = sheet_forces, *self._sheet(lattice, law, measure)
         else:
             self._kernel, self._model, self._state = rod_forces, *self._rod(lattice, law, measure)
-        self.viscous = viscous_rate(law) > 0
         self.inverted = wp.zeros(1, dtype=wp.int32, device=device)
 
     def launch(self, x: wp.array, clock: wp.array, force: wp.array) -> None:
@@ -100,13 +99,3 @@ class InternalForces:
             int(law.relaxation_s > 0),
         ]
         return model, wp.zeros(self.cells * 12, dtype=wp.float64, device=self.device)
-
-
-def viscous_rate(law: Law) -> float:
-    """Upper bound of (internal friction) / (stiffness) over all modes [s]; 0 without friction.
-
-    A solid's friction has the operator of a linear solid with mu = eta, lambda = 0, at most eta / mu of its stiffness.
-    """
-    if isinstance(law, SolidLaw):
-        return law.viscosity_pa_s / law.lame[0]
-    return law.relaxation_s

@@ -3,8 +3,8 @@
     W = EA / 2 (|x'| - 1)^2 + B / 2 |k|^2     k = x' x x'' / |x'|^3     B = EI
 
 The rod is isotropic and its ends do not twist it, so twist decouples and is not carried (Bergou et al. 2008, the
-twist-free case). Internal friction is of Kelvin-Voigt kind with the time tau, on the stretch and on the corotational
-rate of bending, so that a rigid turn dissipates nothing. One cell a thread, its 2 particles are the lanes.
+twist-free case). Internal friction is of Kelvin-Voigt kind with the time tau, on the corotational rate of bending, so
+that a rigid turn dissipates nothing. One cell a thread, its 2 particles are the lanes.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _SNIPPET = (
         PW_CROSS(wt, w, t);
         PW_CROSS(cw, c, w);
         const V turn = 3.0 * PW_DOT(w, w) * inv_a2;
-        V strain = length - 1.0;
+        const V strain = length - 1.0;
         V St[3], Sc[3];
         for (int i = 0; i < 3; ++i) {
             Sc[i] = B * inv_a6 * wt[i];
@@ -56,7 +56,6 @@ _SNIPPET = (
             }
             const V* td = rate;
             const V* cd = rate + 3;
-            strain += tau * PW_DOT(t, td) / length;
             PW_CROSS(spin, t, td);
             for (int i = 0; i < 3; ++i) spin[i] = spin[i] * inv_a2;
             PW_CROSS(carried, spin, c);

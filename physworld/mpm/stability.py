@@ -1,11 +1,12 @@
 """The largest stable time step, from the body's own fastest mode instead of a rule of thumb.
 
 The fastest frequency omega of M^-1 K is found by power iteration on the engine's own forces about the undeformed
-state. The symplectic Euler step with friction that lags half a step is stable while
+state, and the fastest rate r of M^-1 C in the same way. The symplectic Euler step with friction that lags half a step
+is stable while
 
-    omega^2 dt^2 + 2 (tau omega^2) dt <= 4,        tau: friction per stiffness [s]
+    omega^2 dt^2 + 2 r dt <= 4
 
-(Belytschko, Liu, Moran, ch. 6.2, for tau = 0). For a full lattice of quadratic B-splines this is about 0.9 to
+(Belytschko, Liu, Moran, ch. 6.2, for r = 0). For a full lattice of quadratic B-splines this is about 0.9 to
 1.3 dx / c, the CFL limit of the pressure wave; thin cells, partial fill and bending are covered too.
 """
 
@@ -45,10 +46,10 @@ def fastest_frequency(forces: InternalForces, rest: np.ndarray, mass: np.ndarray
     return _MARGIN * float(np.sqrt(max(frequency_squared, 1e-12)))
 
 
-def stable_time_step(frequency_rad_s: float, friction_s: float, safety: float = SAFETY) -> float:
-    """Largest time step [s] times ``safety``, for the fastest frequency [rad/s] and friction per stiffness [s]."""
-    damping = friction_s * frequency_rad_s**2
-    return safety * (np.sqrt(damping**2 + 4 * frequency_rad_s**2) - damping) / frequency_rad_s**2
+def stable_time_step(frequency_rad_s: float, friction_per_s: float, safety: float = SAFETY) -> float:
+    """Largest time step [s] times ``safety``, for the fastest frequency [rad/s] and friction rate [1/s]."""
+    root = np.sqrt(friction_per_s**2 + 4 * frequency_rad_s**2)
+    return float(safety * (root - friction_per_s) / frequency_rad_s**2)
 
 
 def _forces_at(forces: InternalForces, x: np.ndarray, clock: wp.array) -> np.ndarray:

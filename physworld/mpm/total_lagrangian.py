@@ -19,9 +19,9 @@ import numpy as np
 import warp as wp
 
 from physworld.errors import CFLViolation, ParticlesLeftTheGrid, UnstableSimulation
-from physworld.materials.laws import Law, SolidLaw
+from physworld.materials.laws import Law, SolidLaw, friction_law
 from physworld.mpm.contact import GroundContact, contact_frequency
-from physworld.mpm.forces import InternalForces, viscous_rate
+from physworld.mpm.forces import InternalForces
 from physworld.mpm.lattice import Lattice
 from physworld.mpm.node_kernels import advance_counter, advance_nodes
 from physworld.mpm.stability import fastest_frequency, stable_time_step
@@ -98,16 +98,21 @@ class TotalLagrangian:
         self.problem = problem
         self.mass = nodal_mass(lattice, law, problem.density_factor)
         self.forces = InternalForces(lattice, law, stiffness, problem.rest, device)
-        frequency = fastest_frequency(self.forces, problem.rest, self.mass, float(lattice.spacing.min()))
+        cell = float(lattice.spacing.min())
+        frequency = fastest_frequency(self.forces, problem.rest, self.mass, cell)
+        friction, rate = friction_law(law), 0.0
+        if friction is not None:
+            damper = InternalForces(lattice, friction, stiffness, problem.rest, device)
+            rate = fastest_frequency(damper, problem.rest, self.mass, cell) ** 2
         if problem.ground is not None and isinstance(law, SolidLaw):
             frequency = float(np.hypot(frequency, contact_frequency(law, lattice)))
-        limit = stable_time_step(frequency, viscous_rate(law), safety=1.0)
+        limit = stable_time_step(frequency, rate, safety=1.0)
         if time_step_s is not None and time_step_s > limit:
             raise CFLViolation(
                 f"time step {time_step_s:.3g} s exceeds the stable {limit:.3g} s of a body whose fastest mode has "
                 f"{frequency:.4g} rad/s (wave speed {law.wave_speed_m_s:.4g} m/s, cell {lattice.spacing.min():.3g} m)"
             )
-        self.time_step_s = time_step_s or stable_time_step(frequency, viscous_rate(law))
+        self.time_step_s = time_step_s or stable_time_step(frequency, rate)
         self.substeps = 0
 
     def run(
