@@ -89,7 +89,9 @@ class Twin:
     @property
     def density(self) -> float:
         """Mass per volume, area or length [kg/m**d]."""
-        return float(getattr(self.law, {3: "density_kg_m3", 2: "density_kg_m2", 1: "density_kg_m"}[self.lattice.dim]))
+        return float(
+            getattr(self.law, {3: "density_kg_m3", 2: "density_kg_m2", 1: "density_kg_m"}[self.lattice.dim])
+        )
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -121,7 +123,12 @@ class Twin:
     ) -> np.ndarray:
         """Particles (P, 3) [m] at every frame, (T, P, 3): see :meth:`simulate_nodes` for the arguments."""
         nodes = self.simulate_nodes(
-            control_times, control_points, frame_times, properties=properties, progress=progress, from_rest=from_rest
+            control_times,
+            control_points,
+            frame_times,
+            properties=properties,
+            progress=progress,
+            from_rest=from_rest,
         )
         return self.particles_at(nodes)
 
@@ -217,7 +224,10 @@ class Twin:
             "gravity": np.asarray(self.gravity_m_s2, dtype=float),
             "controllers_start": self.controllers_start,
             **{f"lattice_{f.name}": getattr(lattice, f.name) for f in fields(lattice)},
-            **{f"body_{k}": getattr(body, k) for k in ("rest", "start", "start_velocity", "points", "offsets")},
+            **{
+                f"body_{k}": getattr(body, k)
+                for k in ("rest", "start", "start_velocity", "points", "offsets")
+            },
         }
 
     @classmethod
@@ -357,14 +367,18 @@ def _release_time(scene: Scene) -> float:
     limit = max(_RELEASE_SIGMAS * (scene.noise_sigma_m or 0.0), _RELEASE_SHARE * size)
     moved = np.linalg.norm(scene.points - scene.points[0], axis=2)
     moved = np.where(scene.visible & scene.visible[0], moved, 0.0).max(axis=1) > limit
-    driven = np.linalg.norm(scene.controllers - scene.controllers[0], axis=2).max(axis=1) > _RELEASE_SHARE * size
+    driven = (
+        np.linalg.norm(scene.controllers - scene.controllers[0], axis=2).max(axis=1) > _RELEASE_SHARE * size
+    )
     first = int(np.argmax(moved)) if moved.any() else 0
     if first >= scene.train[1] or driven[: first + 1].any():
         return 0.0
     return float(scene.times[max(first - 1, 0)])
 
 
-def _knots(control_times: np.ndarray, frame_times: np.ndarray, release: float) -> tuple[np.ndarray, np.ndarray]:
+def _knots(
+    control_times: np.ndarray, frame_times: np.ndarray, release: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Times at which the solver stops, and each frame's place among them (-1 before the release)."""
     start = max(float(frame_times[0]), release)
     inner = control_times[(control_times > start) & (control_times < frame_times[-1])]

@@ -28,7 +28,9 @@ from physworld.twin import Twin, build_twin
 Progress = Callable[[int, int, str], None]
 
 _DAMPING_GAIN = 0.02  # share of the training cost that a damping parameter must remove
-_UNIDENTIFIED_LOG_WIDTH = 1.5  # half width of a 95 % interval in the logarithm beyond which a value is not known
+_UNIDENTIFIED_LOG_WIDTH = (
+    1.5  # half width of a 95 % interval in the logarithm beyond which a value is not known
+)
 _OFFSET_CLIP_SIGMAS = 3.0
 
 
@@ -113,13 +115,17 @@ def calibrate(
     candidates = [p for p in parameters if p.stage == "damping"] if config.damping == "auto" else []
     while candidates:
         trials = [
-            search.solve([*kept, c], np.append(solution.theta, np.log(c.start[0])), 4 if len(candidates) > 1 else 3)
+            search.solve(
+                [*kept, c], np.append(solution.theta, np.log(c.start[0])), 4 if len(candidates) > 1 else 3
+            )
             for c in candidates
         ]
         best = int(np.argmin([t.cost for t in trials]))
         gain = 1.0 - trials[best].cost / solution.cost
         if gain <= _DAMPING_GAIN:
-            rejected.update({c.name: 1.0 - t.cost / solution.cost for c, t in zip(candidates, trials, strict=True)})
+            rejected.update(
+                {c.name: 1.0 - t.cost / solution.cost for c, t in zip(candidates, trials, strict=True)}
+            )
             break
         kept, solution = [*kept, candidates.pop(best)], trials[best]
     if search.shift_points(kept, solution.theta):
@@ -204,7 +210,9 @@ class _Search:
                 f"none of {len(costs)} starts of {parameters[0].name} from {parameters[0].start[0]:.3g} to "
                 f"{parameters[0].start[-1]:.3g} {parameters[0].unit} gave a usable simulation"
             )
-        return min((self.solve(parameters, np.array(theta), 5) for _, theta in usable[:2]), key=lambda s: s.cost)
+        return min(
+            (self.solve(parameters, np.array(theta), 5) for _, theta in usable[:2]), key=lambda s: s.cost
+        )
 
     def solve(self, parameters: list[Parameter], theta: np.ndarray, iterations: int) -> Solution:
         return gauss_newton(
@@ -225,11 +233,15 @@ class _Search:
         twin = self.twin_at(parameters, theta)
         times, controls = self.scene.control_track()
         try:
-            nodes = twin.simulate_nodes(times, controls, self.scene.times[: self.scene.train[1]], progress=self._poll)
+            nodes = twin.simulate_nodes(
+                times, controls, self.scene.times[: self.scene.train[1]], progress=self._poll
+            )
         except SimulationError:
             return False
         self.simulations += 1
-        error = np.where(self.mask[..., None], self.scene.points[self.frames] - twin.track_nodes(nodes)[self.frames], 0)
+        error = np.where(
+            self.mask[..., None], self.scene.points[self.frames] - twin.track_nodes(nodes)[self.frames], 0
+        )
         gradient = _deformation(lattice, twin.body.points, nodes[self.frames])
         local = np.linalg.solve(gradient, error[..., None])[..., 0]
         seen = np.maximum(self.mask.sum(axis=0), 1)[:, None]
@@ -264,7 +276,11 @@ def _estimates(parameters: list[Parameter], solution: Solution, frames: np.ndarr
         at_bound = not (parameter.low * 1.01 < value < parameter.high * 0.99)
         identified = half < _UNIDENTIFIED_LOG_WIDTH and not at_bound and not insensitive
         note = "" if identified else "at the bound of its search" if at_bound else "the data do not fix it"
-        interval = (value * float(np.exp(-min(half, 50))), value * float(np.exp(min(half, 50)))) if half > 0 else None
+        interval = (
+            (value * float(np.exp(-min(half, 50))), value * float(np.exp(min(half, 50))))
+            if half > 0
+            else None
+        )
         found[parameter.name] = Estimate(value, parameter.unit, interval, identified, note)
     return found
 
@@ -275,13 +291,19 @@ def _priors(scene: Scene, twin: Twin, rejected: dict[str, float]) -> dict[str, E
     declared = scene.body.density_kg_m3 is not None or scene.body.mass_kg is not None
     note = "as declared" if declared else "prior"
     held = {
-        "density": Estimate(twin.density, unit, None, False, f"{note}; only stiffness over density shows in the motion")
+        "density": Estimate(
+            twin.density, unit, None, False, f"{note}; only stiffness over density shows in the motion"
+        )
     }
     for name, value in twin.parameters.items():
         if name == "poissons_ratio":
             held[name] = Estimate(value, "1", None, False, "held at its prior")
         elif name == "stretching_n":
-            held[name] = Estimate(value, "N", None, False, "held: stiff enough to stretch by less than a percent")
+            held[name] = Estimate(
+                value, "N", None, False, "held: stiff enough to stretch by less than a percent"
+            )
     for name, gain in rejected.items():
-        held[name] = Estimate(0.0, "", None, False, f"not needed: removes {max(gain, 0.0):.1%} of the training cost")
+        held[name] = Estimate(
+            0.0, "", None, False, f"not needed: removes {max(gain, 0.0):.1%} of the training cost"
+        )
     return held

@@ -37,7 +37,12 @@ class Solution:
 
 
 def gauss_newton(
-    residual: Residual, theta: np.ndarray, low: np.ndarray, high: np.ndarray, steps: np.ndarray, max_iterations: int = 6
+    residual: Residual,
+    theta: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    steps: np.ndarray,
+    max_iterations: int = 6,
 ) -> Solution:
     """Minimise |residual(theta)|^2 within bounds; a residual that is not finite counts as no descent.
 

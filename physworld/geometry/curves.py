@@ -16,7 +16,9 @@ from physworld.scene import Scene
 
 _VELOCITY_WINDOW_S = 0.06  # frames within this time of the first give the start's velocity
 _MIN_WINDOW_FRAMES = 4
-_BENDING_WEIGHT = 1e-3  # against data in units of the cell: fills gaps between markers, bends markers by little
+_BENDING_WEIGHT = (
+    1e-3  # against data in units of the cell: fills gaps between markers, bends markers by little
+)
 _STRETCH_WEIGHT = 0.3
 _GAUSS_NEWTON_STEPS = 12
 
@@ -74,7 +76,10 @@ def _bending(lattice: Lattice) -> sparse.csr_matrix:
 
 def _slopes(lattice: Lattice) -> list[sparse.csr_matrix]:
     coordinates = lattice.particle_coordinates
-    return [lattice.interpolation(coordinates, tuple(int(a == j) for a in range(lattice.dim))) for j in range(lattice.dim)]
+    return [
+        lattice.interpolation(coordinates, tuple(int(a == j) for a in range(lattice.dim)))
+        for j in range(lattice.dim)
+    ]
 
 
 def _unstretch(
@@ -91,8 +96,9 @@ def _unstretch(
         residuals.append(length - 1.0)
     stretch, error = sparse.vstack(rows).tocsr(), np.concatenate(residuals)
     smooth = sparse.block_diag([data.T @ data + _BENDING_WEIGHT * bending] * 3)
-    gradient = np.concatenate([data.T @ (data @ x[:, i] - target[:, i]) + _BENDING_WEIGHT * (bending @ x[:, i])
-                               for i in range(3)])
+    gradient = np.concatenate(
+        [data.T @ (data @ x[:, i] - target[:, i]) + _BENDING_WEIGHT * (bending @ x[:, i]) for i in range(3)]
+    )
     normal = smooth + _STRETCH_WEIGHT * stretch.T @ stretch
     step = spsolve(normal.tocsc(), -(gradient + _STRETCH_WEIGHT * stretch.T @ error))
     return x + step.reshape(3, n).T

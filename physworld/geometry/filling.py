@@ -29,7 +29,9 @@ def inside_volume_points(points: np.ndarray, query: np.ndarray) -> np.ndarray:
     determinant = np.linalg.det(edges)
     flat = np.abs(determinant) < 1e-12 * np.maximum(squares.max(axis=1), 1e-30) ** 1.5
     safe = np.where(flat[:, None, None], np.eye(3), edges)
-    radius = np.where(flat, np.inf, 0.5 * np.linalg.norm(np.linalg.solve(safe, squares[..., None])[..., 0], axis=1))
+    radius = np.where(
+        flat, np.inf, 0.5 * np.linalg.norm(np.linalg.solve(safe, squares[..., None])[..., 0], axis=1)
+    )
     kept = radius <= _ALPHA * median_spacing(points) * 1.5
     found = mesh.find_simplex(query)
     gap, _ = cKDTree(points).query(query)

@@ -67,7 +67,9 @@ def reference_body(scene: Scene, particle_budget: int) -> ReferenceBody:
         if sheet is not None:
             return sheet
     if scene.kind == "branched_rope":
-        raise SceneUnsupported("branched ropes are not covered yet: a rod has two ends, this scene's topology has more")
+        raise SceneUnsupported(
+            "branched ropes are not covered yet: a rod has two ends, this scene's topology has more"
+        )
     return _solid(scene, particle_budget)
 
 
@@ -86,6 +88,7 @@ def _solid(scene: Scene, budget: int) -> ReferenceBody:
     else:
         cloud = scene.rest_volume_points
         if cloud is not None and len(cloud) >= 20:
+
             def test(q: np.ndarray) -> np.ndarray:
                 return inside_volume_points(cloud, q)
         else:
@@ -97,8 +100,10 @@ def _solid(scene: Scene, budget: int) -> ReferenceBody:
                 )
             notes.append("the volume was filled from points on the surface")
             cell = float((np.prod(np.ptp(cloud, axis=0)) / budget) ** (1 / 3))
+
             def test(q: np.ndarray) -> np.ndarray:
                 return inside_surface_points(cloud, q, cell)
+
         low, high = cloud.min(axis=0), cloud.max(axis=0)
         probe = np.random.default_rng(0).uniform(low, high, size=(4000, 3))
         share = float(test(probe).mean())
@@ -192,7 +197,9 @@ def _rod(scene: Scene) -> ReferenceBody:
         if scene.body.radius_m is None:
             notes.append(f"radius not declared: {radius} m assumed (only bending over mass matters)")
         nearest = np.argmin(np.linalg.norm(scene.controllers[0][:, None] - points[None], axis=2), axis=1)
-        lattice = _rod_lattice(scene, length, arc[nearest] if scene.body.segment_rest_lengths_m is not None else [0.0])
+        lattice = _rod_lattice(
+            scene, length, arc[nearest] if scene.body.segment_rest_lengths_m is not None else [0.0]
+        )
         start, velocity = fit_nodes(scene, lattice, arc[:, None])
         notes.append("the rest shape is taken as straight")
     rest = np.zeros((len(lattice.nodes), 3))
@@ -229,7 +236,9 @@ def _rod_lattice(scene: Scene, length: float, grip_arcs) -> Lattice:
     origin = face - np.ceil(face / spacing - 1e-6) * spacing
     cells = np.arange(int(np.ceil((length - origin) / spacing - 1e-6)))[:, None]
     begin = origin + (cells + np.array([0.0, 0.5])[None]) * spacing
-    fill = np.clip((np.minimum(begin + 0.5 * spacing, length) - np.maximum(begin, 0.0)) / (0.5 * spacing), 0.0, 1.0)
+    fill = np.clip(
+        (np.minimum(begin + 0.5 * spacing, length) - np.maximum(begin, 0.0)) / (0.5 * spacing), 0.0, 1.0
+    )
     return lattice_from_cells(np.array([origin]), np.array([spacing]), cells, fill)
 
 
@@ -245,7 +254,9 @@ def _sheet(scene: Scene) -> ReferenceBody | None:
     grid = scene.body.grid_shape
     if grid is not None and scene.body.side_m is not None and grid[0] * grid[1] == len(points):
         side = scene.body.side_m
-        first, second = np.meshgrid(np.linspace(0, side, grid[0]), np.linspace(0, side, grid[1]), indexing="ij")
+        first, second = np.meshgrid(
+            np.linspace(0, side, grid[0]), np.linspace(0, side, grid[1]), indexing="ij"
+        )
         material = np.stack([first.ravel(), second.ravel()], axis=1)
         size = np.array([side, side])
         flat_map = None

@@ -98,5 +98,7 @@ def friction_law(law: Law) -> Law | None:
     if tau == 0:
         return None
     if isinstance(law, SheetLaw):
-        return replace(law, membrane_n_m=tau * law.membrane_n_m, bending_n_m=tau * law.bending_n_m, relaxation_s=0.0)
+        return replace(
+            law, membrane_n_m=tau * law.membrane_n_m, bending_n_m=tau * law.bending_n_m, relaxation_s=0.0
+        )
     return replace(law, stretching_n=0.0, bending_n_m2=tau * law.bending_n_m2, relaxation_s=0.0)

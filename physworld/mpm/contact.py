@@ -60,7 +60,9 @@ class BoundContact:
 
     def launch(self, x: wp.array, v: wp.array, force: wp.array) -> None:
         """Add contact forces [N] at nodal positions and velocities (3n,) to ``force``."""
-        wp.launch(ground_contact, dim=self.points, inputs=[*self.inputs, x, v], outputs=[force], device=self.device)
+        wp.launch(
+            ground_contact, dim=self.points, inputs=[*self.inputs, x, v], outputs=[force], device=self.device
+        )
 
 
 def contact_frequency(law: SolidLaw, lattice: Lattice) -> float:

@@ -60,7 +60,9 @@ class InternalForces:
     def _array(self, values: np.ndarray, dtype: Any) -> wp.array:
         return wp.array(np.ascontiguousarray(values).reshape(-1), dtype=dtype, device=self.device)
 
-    def _solid(self, lattice: Lattice, law: SolidLaw, measure: np.ndarray, rest: np.ndarray) -> tuple[list, wp.array]:
+    def _solid(
+        self, lattice: Lattice, law: SolidLaw, measure: np.ndarray, rest: np.ndarray
+    ) -> tuple[list, wp.array]:
         mu, lam = law.lame
         slopes = np.stack([lattice.table(tuple(int(a == j) for a in range(3))) for j in range(3)], axis=1)
         model = [

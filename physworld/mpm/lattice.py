@@ -61,7 +61,9 @@ class Lattice:
         """Weights of a cell's nodes at its particles, differentiated in units of the cell, (3**d, 2**d)."""
         return np.ascontiguousarray(tensor_weights(gauss_points(self.dim), orders).T)
 
-    def interpolation(self, coordinates: np.ndarray, orders: tuple[int, ...] | None = None) -> sparse.csr_matrix:
+    def interpolation(
+        self, coordinates: np.ndarray, orders: tuple[int, ...] | None = None
+    ) -> sparse.csr_matrix:
         """Matrix (M, n) that takes nodal values to the values at material ``coordinates`` (M, d).
 
         Outside the material the field of the nearest cell is continued linearly: a marker on a stalk moves as if it
@@ -99,7 +101,9 @@ class Lattice:
         return near[pick, best], local[pick, best]
 
 
-def lattice_from_cells(origin: np.ndarray, spacing: np.ndarray, cells: np.ndarray, fill: np.ndarray) -> Lattice:
+def lattice_from_cells(
+    origin: np.ndarray, spacing: np.ndarray, cells: np.ndarray, fill: np.ndarray
+) -> Lattice:
     """Number the nodes of the given cells.
 
     Raises:
@@ -110,7 +114,9 @@ def lattice_from_cells(origin: np.ndarray, spacing: np.ndarray, cells: np.ndarra
     if len(cells) == 0:
         raise ValueError("a lattice needs at least one cell with material, got 0")
     if fill.shape != (len(cells), 2**dim) or fill.min() < 0 or fill.max() > 1:
-        raise ValueError(f"fill must be ({len(cells)}, {2**dim}) in [0, 1], got {fill.shape}, up to {fill.max()}")
+        raise ValueError(
+            f"fill must be ({len(cells)}, {2**dim}) in [0, 1], got {fill.shape}, up to {fill.max()}"
+        )
     touched = (cells[:, None, :] + local_offsets(dim)[None]).reshape(-1, dim)
     nodes, inverse = np.unique(touched, axis=0, return_inverse=True)
     return Lattice(
@@ -126,6 +132,8 @@ def lattice_from_cells(origin: np.ndarray, spacing: np.ndarray, cells: np.ndarra
 def box_lattice(origin: np.ndarray, size: np.ndarray, counts: tuple[int, ...]) -> Lattice:
     """A full box of ``counts`` cells: every face of the body lies on a cell face."""
     counts_array = np.asarray(counts)
-    cells = np.stack(np.meshgrid(*[np.arange(c) for c in counts], indexing="ij"), axis=-1).reshape(-1, len(counts))
+    cells = np.stack(np.meshgrid(*[np.arange(c) for c in counts], indexing="ij"), axis=-1).reshape(
+        -1, len(counts)
+    )
     fill = np.ones((len(cells), 2 ** len(counts)))
     return lattice_from_cells(origin, np.asarray(size, dtype=float) / counts_array, cells, fill)

@@ -98,8 +98,7 @@ def rod_cell(
     previous: wp.array(dtype=wp.float64),
     # out
     force: wp.array(dtype=wp.float64),
-):
-    ...
+): ...
 
 
 @wp.kernel
@@ -120,4 +119,6 @@ def rod_forces(
     force: wp.array(dtype=wp.float64),
 ):
     """Add the internal forces [N] of one cell to its 3 nodes; ``clock[1]`` is 1/dt [1/s]."""
-    rod_cell(wp.tid(), cell_nodes, derivatives, stretching, bending, tau, viscous, clock[1], x, previous, force)
+    rod_cell(
+        wp.tid(), cell_nodes, derivatives, stretching, bending, tau, viscous, clock[1], x, previous, force
+    )

@@ -96,8 +96,7 @@ def sheet_cell(
     previous: wp.array(dtype=wp.float64),
     # out
     force: wp.array(dtype=wp.float64),
-):
-    ...
+): ...
 
 
 @wp.kernel
@@ -119,4 +118,6 @@ def sheet_forces(
     force: wp.array(dtype=wp.float64),
 ):
     """Add the internal forces [N] of one cell to its 9 nodes; ``clock[1]`` is 1/dt [1/s]."""
-    sheet_cell(wp.tid(), cell_nodes, derivatives, membrane, bending, nu, tau, viscous, clock[1], x, previous, force)
+    sheet_cell(
+        wp.tid(), cell_nodes, derivatives, membrane, bending, nu, tau, viscous, clock[1], x, previous, force
+    )

@@ -17,7 +17,9 @@ import warp as wp
 
 from physworld.mpm.lanes import LANES_FLOAT8
 
-_SNIPPET = LANES_FLOAT8 + r"""
+_SNIPPET = (
+    LANES_FLOAT8
+    + r"""
     const int* node = &cell_nodes.data[cell * 27];
     const double* anchor = &x.data[3 * node[13]];
     const double* anchor_rest = &x_rest.data[3 * node[13]];
@@ -101,6 +103,7 @@ _SNIPPET = LANES_FLOAT8 + r"""
         }
     }
 """
+)
 
 
 @wp.func_native(_SNIPPET)
@@ -125,8 +128,7 @@ def solid_cell(
     # out
     force: wp.array(dtype=wp.float64),
     inverted: wp.array(dtype=wp.int32),
-):
-    ...
+): ...
 
 
 @wp.kernel
@@ -151,6 +153,20 @@ def solid_forces(
 ):
     """Add the internal forces [N] of one cell to its 27 nodes; ``clock[1]`` is 1/dt [1/s]."""
     solid_cell(
-        wp.tid(), cell_nodes, gradients, x_rest, mu_volume, lambda_volume, eta_volume,
-        inv_dx[0], inv_dx[1], inv_dx[2], viscous, wp.float32(clock[1]), x, previous, force, inverted,
+        wp.tid(),
+        cell_nodes,
+        gradients,
+        x_rest,
+        mu_volume,
+        lambda_volume,
+        eta_volume,
+        inv_dx[0],
+        inv_dx[1],
+        inv_dx[2],
+        viscous,
+        wp.float32(clock[1]),
+        x,
+        previous,
+        force,
+        inverted,
     )

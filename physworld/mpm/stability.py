@@ -38,7 +38,9 @@ def fastest_frequency(forces: InternalForces, rest: np.ndarray, mass: np.ndarray
     frequency_squared = 0.0
     for _ in range(_ITERATIONS):
         mode /= np.abs(mode).max()
-        pushed = _forces_at(forces, rest + scale * mode, clock) - _forces_at(forces, rest - scale * mode, clock)
+        pushed = _forces_at(forces, rest + scale * mode, clock) - _forces_at(
+            forces, rest - scale * mode, clock
+        )
         response = -pushed / (2 * scale) / mass[:, None]
         weighted = mass[:, None] * mode
         frequency_squared = float(np.sum(weighted * response) / np.sum(weighted * mode))

@@ -4,12 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.optimize import brentq, curve_fit
-
-from physworld.errors import CFLViolation, UnstableSimulation
-from physworld.mpm.contact import GroundContact
-from physworld.mpm.lattice import box_lattice
-from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian, nodal_mass
 from bodies import (
     GRAVITY,
     RodLaw,
@@ -21,6 +15,12 @@ from bodies import (
     run,
     still_clamp,
 )
+from scipy.optimize import brentq, curve_fit
+
+from physworld.errors import CFLViolation, UnstableSimulation
+from physworld.mpm.contact import GroundContact
+from physworld.mpm.lattice import box_lattice
+from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian, nodal_mass
 
 LENGTH, DEPTH = 0.3, 0.03
 FIRST_ROOT = 1.8751  # of cos x cosh x = -1, the clamped-free beam
@@ -166,7 +166,10 @@ def test_a_time_step_above_the_stable_limit_is_refused_and_just_below_it_runs() 
     times = np.linspace(0.0, 0.3, 7)
     solver = TotalLagrangian(problem, time_step_s=0.9 * limit)
     nodes = solver.run(
-        rest_nodes(lattice), np.zeros((len(solver.mass), 3)), still_clamp(lattice, rest_nodes(lattice), 7), times
+        rest_nodes(lattice),
+        np.zeros((len(solver.mass), 3)),
+        still_clamp(lattice, rest_nodes(lattice), 7),
+        times,
     )
     assert np.isfinite(nodes).all()
 
@@ -180,5 +183,8 @@ def test_the_limit_is_sharp_enough_to_matter() -> None:
     times = np.linspace(0.0, 1.0, 7)
     with pytest.raises(UnstableSimulation, match="blew up"):
         solver.run(
-            rest_nodes(lattice), np.zeros((len(solver.mass), 3)), still_clamp(lattice, rest_nodes(lattice), 7), times
+            rest_nodes(lattice),
+            np.zeros((len(solver.mass), 3)),
+            still_clamp(lattice, rest_nodes(lattice), 7),
+            times,
         )

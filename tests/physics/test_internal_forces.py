@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import warp as wp
+from bodies import rest_nodes
 from scipy.spatial.transform import Rotation
 
 from physworld.materials.laws import Law, RodLaw, SheetLaw, SolidLaw
 from physworld.mpm.forces import InternalForces
 from physworld.mpm.lattice import Lattice, box_lattice
-from bodies import rest_nodes
 
 SINGLE_PRECISION = 3e-5  # solids carry strains in float32; relative to the largest nodal force
 DOUBLE_DIFFERENCE = 2e-6  # central differences of the energy in float64
@@ -25,7 +25,9 @@ BODIES = {
 }
 
 
-def forces_of(lattice: Lattice, law: Law, x: np.ndarray, viscous_from: np.ndarray | None = None) -> np.ndarray:
+def forces_of(
+    lattice: Lattice, law: Law, x: np.ndarray, viscous_from: np.ndarray | None = None
+) -> np.ndarray:
     forces = InternalForces(lattice, law, np.ones(lattice.fill.size), rest_nodes(lattice), "cpu")
     clock = wp.zeros(3, dtype=wp.float64)
     out = wp.zeros(x.size, dtype=wp.float64)
@@ -39,6 +41,7 @@ def forces_of(lattice: Lattice, law: Law, x: np.ndarray, viscous_from: np.ndarra
 
 def energy(lattice: Lattice, law: Law, x: np.ndarray) -> float:
     """Stored energy [J] written from the docstrings of the kernels."""
+
     def at(*orders: int) -> np.ndarray:
         return lattice.interpolation(lattice.particle_coordinates, orders) @ x
 
