@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
+import re
 from datetime import datetime
-from typing import Any, Generic, Literal, TypeVar
+from typing import Annotated, Any, Generic, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 ObjectKind = Literal["scene", "fit", "trace", "dataset", "model", "artifact"]
+_UNSTORABLE = re.compile("[\0\ud800-\udfff]")
+Seed = Annotated[int, Field(ge=0, lt=2**63)]
 
 
 class Request(BaseModel):
     """A body that a client sends: an unknown field is an error, not a silent typo."""
 
     model_config = ConfigDict(extra="forbid")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _storable(cls, value: Any) -> Any:
+        """Refuse text that Postgres keeps neither as text nor in JSON: NUL, and halves of surrogate pairs."""
+        if _holds_unstorable(value):
+            raise ValueError("holds a NUL character or half of a surrogate pair")
+        return value
 
 
 class Resource(BaseModel):
@@ -79,6 +90,14 @@ class Problem(Resource):
     request_id: str | None = None
     errors: list[FieldError] = Field(default_factory=list)
     hint: str | None = None
+
+
+def _holds_unstorable(value: Any) -> bool:
+    if isinstance(value, str):
+        return _UNSTORABLE.search(value) is not None
+    if isinstance(value, dict):
+        return any(_holds_unstorable(part) for pair in value.items() for part in pair)
+    return isinstance(value, list) and any(map(_holds_unstorable, value))
 
 
 class Figures(Resource):

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from schemas.base import Artifact, Lineage, Request, Resource
+from schemas.base import Artifact, Lineage, Request, Resource, Seed
 
 
 class DatasetConfig(Request):
@@ -16,7 +16,7 @@ class DatasetConfig(Request):
     episodes: int = Field(default=40, ge=1, le=20_000)
     frames: int | None = Field(default=None, ge=2, le=5000)
     property_sigma: float = Field(default=0.2, ge=0.0, le=2.0)
-    seed: int = 0
+    seed: Seed = 0
 
 
 class DatasetCreate(Request):

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from schemas.base import Artifact, Lineage, Request, Resource
+from schemas.base import Artifact, Lineage, Request, Resource, Seed
 
 
 class FitConfig(Request):
@@ -16,7 +16,7 @@ class FitConfig(Request):
     material: Literal["auto", "neo_hookean"] = "auto"
     particle_budget: int = Field(default=2000, ge=50, le=200_000)
     max_simulations: int = Field(default=80, ge=1, le=5000)
-    seed: int = 0
+    seed: Seed = 0
 
 
 class FitCreate(Request):
@@ -37,7 +37,7 @@ class Parameter(Resource):
 
 
 class Fit(Resource):
-    """A calibrated twin: parameters, metrics on held-out frames, artifacts ``twin.npz`` and ``report.json``."""
+    """A calibrated twin: parameters, metrics on held-out frames, ``twin.npz`` and ``report.json``."""
 
     id: str
     scene_id: str

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from schemas.base import Artifact, Lineage, Request, Resource
+from schemas.base import Artifact, Lineage, Request, Resource, Seed
 
 
 class TrainingConfig(Request):
@@ -22,7 +22,7 @@ class TrainingConfig(Request):
     batch_size: int = Field(default=8, ge=1, le=256)
     learning_rate: float = Field(default=1e-3, gt=0, le=1)
     fine_tune_steps: int = Field(default=60, ge=0, le=10_000)
-    seed: int = 0
+    seed: Seed = 0
 
 
 class TrainingCreate(Request):
@@ -69,4 +69,4 @@ class Model(Resource):
 class AliasSet(Request):
     """Body of PUT /v1/models/{name}/aliases/{alias}."""
 
-    version: int = Field(ge=1)
+    version: int = Field(ge=1, lt=2**31)

@@ -83,6 +83,14 @@ def _request_id(headers: Headers) -> str:
 
 
 def _route_of(scope: Scope) -> str:
-    """The path's template, so that ids do not become labels; unknown paths share one label."""
-    route = scope.get("route")
-    return getattr(route, "path", "unmatched")
+    """The path's template, so that ids do not become labels; unknown paths share one label.
+
+    A route knows its path below the routers that include it; what stands before it is in the request.
+    """
+    template = getattr(scope.get("route"), "path", None)
+    if template is None:
+        return "unmatched"
+    if ":path}" in template:
+        return str(template)
+    above = scope["path"].split("/")[: -template.count("/") or None]
+    return "/".join(above) + str(template)

@@ -41,7 +41,6 @@ def event_response(
         _stream(database, job_id, batch, seq, ended),
         ping=HEARTBEAT_S,
         ping_message_factory=lambda: ServerSentEvent(comment="heartbeat"),
-        sep="\n",
     )
 
 

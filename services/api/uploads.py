@@ -85,37 +85,13 @@ async def read_form(request: Request) -> FormData:
 
 def upload_of(form: FormData, limit_bytes: int) -> Upload:
     """The upload in a form. Raises the problems 413 and 422."""
-    faults = [
-        FieldError(loc=["body", name], msg="is not a field of this form")
-        for name in form
-        if name not in FIELDS
-    ]
-    file, name, text = form.get("bundle"), form.get("name"), form.get("options")
+    faults = [_fault("is not a field of this form", name) for name in form if name not in FIELDS]
+    file = form.get("bundle")
     if not isinstance(file, UploadFile):
-        faults.append(FieldError(loc=["body", "bundle"], msg="the file is missing"))
-    for key, value in (("name", name), ("options", text)):
-        if isinstance(value, UploadFile):
-            faults.append(FieldError(loc=["body", key], msg="is a file; send text"))
-    options = SceneImport()
-    if not faults:
-        try:
-            options = SceneImport.model_validate_json(text or "{}")
-            if name is not None:
-                options = SceneImport.model_validate({**options.model_dump(), "name": name})
-        except ValidationError as error:
-            faults += [
-                FieldError(loc=["body", "options", *fault["loc"]], msg=fault["msg"])
-                for fault in error.errors()
-            ]
-        if options.kind is not None and options.kind not in KINDS:
-            known = ", ".join(KINDS)
-            faults.append(
-                FieldError(loc=["body", "options", "kind"], msg=f"{options.kind!r}; known: {known}")
-            )
+        raise _invalid([*faults, _fault("the file is missing", "bundle")])
+    options = _options(form.get("name"), form.get("options"), faults)
     if faults:
-        detail = "; ".join(f"{'.'.join(map(str, fault.loc))}: {fault.msg}" for fault in faults)
-        raise ApiProblem(422, "invalid_request", detail, errors=faults)
-    assert isinstance(file, UploadFile)
+        raise _invalid(faults)
     if file.size is not None and file.size > limit_bytes:
         raise too_large(file.size, limit_bytes)
     return Upload(file, options)
@@ -130,3 +106,30 @@ def parse_scene(upload: Upload) -> tuple[Scene, list[str], bytes]:
     if options.name is not None and options.name != scene.name:
         scene, warnings = checked(dataclasses.replace(scene, name=options.name))
     return scene, warnings, canonical_archive(scene)
+
+
+def _options(
+    name: UploadFile | str | None, text: UploadFile | str | None, faults: list[FieldError]
+) -> SceneImport:
+    if isinstance(name, UploadFile) or isinstance(text, UploadFile):
+        faults.append(_fault("name and options are text, not files"))
+        return SceneImport()
+    try:
+        options = SceneImport.model_validate_json(text or "{}")
+        if name is not None:
+            options = SceneImport.model_validate({**options.model_dump(), "name": name})
+    except ValidationError as error:
+        faults += [_fault(fault["msg"], "options", *fault["loc"]) for fault in error.errors()]
+        return SceneImport()
+    if options.kind is not None and options.kind not in KINDS:
+        faults.append(_fault(f"{options.kind!r}; known: {', '.join(KINDS)}", "options", "kind"))
+    return options
+
+
+def _fault(message: str, *where: str | int) -> FieldError:
+    return FieldError(loc=["body", *where], msg=message)
+
+
+def _invalid(faults: list[FieldError]) -> ApiProblem:
+    detail = "; ".join(f"{'.'.join(map(str, fault.loc))}: {fault.msg}" for fault in faults)
+    return ApiProblem(422, "invalid_request", detail, errors=faults)

@@ -55,10 +55,9 @@ def test_compose_accepts_the_file_and_refuses_it_without_secrets(repository: Pat
     if command is None:
         pytest.skip("no compose binary on this machine")
     (tmp_path / "docker-compose.yml").write_text((repository / "docker-compose.yml").read_text())
-    for missing in SECRETS:
-        result = _config(command, tmp_path, {name: "x" for name in SECRETS if name != missing})
-        assert result.returncode != 0
-        assert missing in result.stderr
+    result = _config(command, tmp_path, {})
+    assert result.returncode != 0
+    assert any(f"set {name}" in result.stderr for name in SECRETS), result.stderr
     result = _config(command, tmp_path, dict.fromkeys(SECRETS, "given"))
     assert result.returncode == 0, result.stderr
     assert set(yaml.safe_load(result.stdout)["services"]) >= OURS

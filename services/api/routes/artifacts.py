@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Path, Request, Response
 from fastapi.responses import StreamingResponse
@@ -16,7 +16,7 @@ router = APIRouter(prefix="/artifacts", tags=["artifacts"])
 
 MEDIA_TYPE = "application/octet-stream"
 _FILE = {MEDIA_TYPE: {"schema": {"type": "string", "format": "binary"}}}
-_ANSWERS = {
+_ANSWERS: dict[int | str, dict[str, Any]] = {
     200: {"description": "The file", "content": _FILE},
     206: {"description": "A byte range of the file", "content": _FILE},
     304: {"description": "The client has this file"},
