@@ -250,5 +250,5 @@ def _decoding(path: str) -> Iterator[None]:
     """What zarr and its codecs raise for bytes that are not what they should be becomes EpisodeCorrupt."""
     try:
         yield
-    except (ValueError, RuntimeError, KeyError, TypeError, EOFError) as error:
+    except (ValueError, RuntimeError, LookupError, TypeError, AttributeError, ArithmeticError) as error:
         raise EpisodeCorrupt(f"{path} cannot be decoded: {type(error).__name__}: {error}") from error

@@ -1,0 +1,262 @@
+"""The episode store: what was committed is what is read, and damage is never read as data."""
+
+from __future__ import annotations
+
+import resource
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays_of
+
+from schemas.dataset import Episode
+from storage.episodes import Arrays, EpisodeStore, arrays_digest, episode_path
+from storage.errors import EpisodeCorrupt, NotFound
+from storage.settings import Settings
+
+DATASET = "dst_01TEST"
+
+
+def episode(frames: int = 12, particles: int = 20, controllers: int = 2, seed: int = 0) -> Arrays:
+    chance = np.random.default_rng(seed)
+    return {
+        "times": np.arange(frames) / 30.0,
+        "particles": chance.normal(size=(frames, particles, 3)).astype(np.float32),
+        "controllers": chance.normal(size=(frames, controllers, 3)).astype(np.float32),
+        "properties": np.zeros((particles, 2), dtype=np.float32),
+    }
+
+
+@pytest.fixture
+def episodes(store_settings: Settings) -> EpisodeStore:
+    return EpisodeStore(store_settings)
+
+
+@pytest.fixture
+def local(tmp_path: Path) -> EpisodeStore:
+    return EpisodeStore(Settings(data_dir=tmp_path))
+
+
+def test_what_was_written_is_read_again(episodes: EpisodeStore) -> None:
+    wanted = episode()
+    path, digest = episodes.write(DATASET, 3, 2, wanted, {"seed": 7, "motion": "lift"})
+    assert path == f"datasets/{DATASET}/episodes/00003-e2.zarr"
+    assert digest == arrays_digest(wanted)
+    found, attributes = episodes.read(path, digest)
+    assert attributes == {"seed": 7, "motion": "lift"}
+    assert set(found) == set(wanted)
+    for name, array in wanted.items():
+        assert found[name].dtype == array.dtype
+        np.testing.assert_array_equal(found[name], array)
+
+
+def test_an_episode_without_controllers_is_kept(episodes: EpisodeStore) -> None:
+    path, digest = episodes.write(DATASET, 0, 1, episode(controllers=0), {})
+    episodes.verify(path, digest)
+    assert episodes.read(path)[0]["controllers"].shape == (12, 0, 3)
+
+
+def test_an_array_is_one_shard_however_many_chunks_it_has(local: EpisodeStore, tmp_path: Path) -> None:
+    path, digest = local.write(DATASET, 0, 1, episode(frames=101, particles=3000), {})
+    local.verify(path, digest)
+    folder = tmp_path / "store" / path
+    shards = [file for file in folder.rglob("*") if file.is_file() and file.name != "zarr.json"]
+    assert len(shards) == 4
+    assert not list((tmp_path / "store").glob("zarr.json"))
+
+
+def test_writing_an_attempt_again_replaces_it(episodes: EpisodeStore) -> None:
+    episodes.write(DATASET, 0, 1, episode(frames=40, seed=1), {"old": True})
+    path, digest = episodes.write(DATASET, 0, 1, episode(seed=2), {})
+    assert episodes.read(path, digest)[1] == {}
+
+
+def test_another_digest_is_refused(episodes: EpisodeStore) -> None:
+    path, _ = episodes.write(DATASET, 0, 1, episode(seed=1), {})
+    with pytest.raises(EpisodeCorrupt, match="committed was"):
+        episodes.verify(path, arrays_digest(episode(seed=2)))
+
+
+def test_what_is_not_there_is_not_found(episodes: EpisodeStore) -> None:
+    with pytest.raises(NotFound):
+        episodes.read(episode_path(DATASET, 0, 1))
+    with pytest.raises(EpisodeCorrupt, match="is gone"):
+        episodes.verify(episode_path(DATASET, 0, 1), "0" * 64)
+    with pytest.raises(NotFound):
+        episodes.read("../../etc")
+    with pytest.raises(ValueError, match="not the id of a dataset"):
+        episodes.write("../x", 0, 1, episode(), {})
+
+
+def test_what_is_no_number_is_refused_before_anything_is_written(local: EpisodeStore, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="array names is"):
+        local.write(DATASET, 0, 1, {"names": np.array(["a"])}, {})
+    assert not (tmp_path / "store" / "datasets").exists()
+
+
+@given(kept=st.floats(0.0, 0.999), which=st.sampled_from(["particles", "controllers", "times"]))
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_truncated_shard_is_noticed(local: EpisodeStore, tmp_path: Path, kept: float, which: str) -> None:
+    path, digest = local.write(DATASET, 0, 1, episode(), {})
+    shard = _shard(tmp_path, path, which)
+    data = shard.read_bytes()
+    shard.write_bytes(data[: int(kept * len(data))])
+    with pytest.raises(EpisodeCorrupt):
+        local.verify(path, digest)
+
+
+@given(
+    name=st.sampled_from(["particles/c/0/0/0", "particles/zarr.json", "zarr.json"]),
+    place=st.floats(0.0, 0.999),
+    bit=st.integers(0, 7),
+)
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_flipped_bit_never_changes_what_is_read(
+    local: EpisodeStore, tmp_path: Path, name: str, place: float, bit: int
+) -> None:
+    wanted = episode(frames=3, particles=5)
+    path, digest = local.write(DATASET, 0, 1, wanted, {})
+    victim = tmp_path / "store" / path / name
+    data = bytearray(victim.read_bytes())
+    data[int(place * len(data))] ^= 1 << bit
+    victim.write_bytes(bytes(data))
+    try:
+        found, _ = local.read(path, digest)
+    except (EpisodeCorrupt, NotFound):
+        return
+    np.testing.assert_array_equal(found["particles"], wanted["particles"])
+
+
+@pytest.mark.parametrize("name", ["particles/c/0/0/0", "particles/zarr.json", "zarr.json", "particles"])
+def test_a_lost_file_is_noticed(local: EpisodeStore, tmp_path: Path, name: str) -> None:
+    wanted = episode()
+    wanted["particles"][:] = 0
+    path, digest = local.write(DATASET, 0, 1, wanted, {})
+    victim = tmp_path / "store" / path / name
+    for file in [victim] if victim.is_file() else [file for file in victim.rglob("*") if file.is_file()]:
+        file.unlink()
+    with pytest.raises(EpisodeCorrupt):
+        local.verify(path, digest)
+
+
+@pytest.mark.parametrize("text", ["", "{}", "null", '{"zarr_format": 3, "node_type": "group"}', "\xff"])
+def test_damaged_metadata_is_noticed(local: EpisodeStore, tmp_path: Path, text: str) -> None:
+    path, digest = local.write(DATASET, 0, 1, episode(), {})
+    (tmp_path / "store" / path / "zarr.json").write_text(text, encoding="latin-1")
+    with pytest.raises(EpisodeCorrupt):
+        local.verify(path, digest)
+
+
+@given(
+    array=arrays_of.arrays(
+        dtype=st.sampled_from([np.float32, np.float64, np.int32, np.uint8, np.bool_]),
+        shape=arrays_of.array_shapes(min_dims=1, max_dims=3, min_side=0, max_side=5),
+    )
+)
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_every_array_of_numbers_survives(local: EpisodeStore, array: np.ndarray) -> None:
+    path, digest = local.write(DATASET, 0, 1, {"x": array}, {})
+    found = local.read(path, digest)[0]["x"]
+    assert found.dtype == array.dtype
+    np.testing.assert_array_equal(found, array)
+
+
+def test_the_digest_knows_names_types_shapes_and_bytes() -> None:
+    base = np.arange(6, dtype=np.float32)
+    others = [
+        {"y": base},
+        {"x": base.astype(np.float64)},
+        {"x": base.reshape(2, 3)},
+        {"x": -base},
+        {"x": base, "y": base},
+    ]
+    digests = {arrays_digest(arrays) for arrays in [{"x": base}, *others]}
+    assert len(digests) == 6
+    assert arrays_digest({"x": base.astype(">f4")}) == arrays_digest({"x": base})
+    assert arrays_digest({"x": np.stack([base, base])[:, ::2]}) == arrays_digest(
+        {"x": np.stack([base[::2], base[::2]])}
+    )
+
+
+def test_a_sealed_dataset_is_read_through_its_manifest(episodes: EpisodeStore) -> None:
+    committed = [_commit(episodes, index) for index in (2, 0, 1)]
+    manifest = episodes.write_manifest(DATASET, committed)
+    assert (manifest.name, manifest.media_type) == ("manifest.json", "application/json")
+    read = [
+        (line.index, line.seed, arrays["particles"]) for line, arrays, _ in episodes.iterate(manifest.sha256)
+    ]
+    assert [(index, seed) for index, seed, _ in read] == [(0, 0), (1, 1), (2, 2)]
+    np.testing.assert_array_equal(read[1][2], episode(seed=1)["particles"])
+    assert episodes.write_manifest(DATASET, reversed(committed)).sha256 == manifest.sha256
+
+
+def test_a_damaged_episode_stops_the_reading_of_its_dataset(local: EpisodeStore, tmp_path: Path) -> None:
+    committed = [_commit(local, index) for index in range(2)]
+    manifest = local.write_manifest(DATASET, committed)
+    _shard(tmp_path, committed[1].path, "particles").unlink()
+    found = local.iterate(manifest.sha256)
+    assert next(found)[0].index == 0
+    with pytest.raises(EpisodeCorrupt, match="00001-e1"):
+        next(found)
+
+
+def test_orphans_go_and_the_committed_stay(episodes: EpisodeStore) -> None:
+    kept, digest = episodes.write(DATASET, 0, 2, episode(), {})
+    orphans = [episodes.write(DATASET, 0, epoch, episode(), {})[0] for epoch in (1, 20)]
+    other, other_digest = episodes.write("dst_01OTHER", 0, 1, episode(), {})
+    assert episodes.remove_orphans(DATASET, [kept]) == sorted(orphans)
+    assert episodes.remove_orphans(DATASET, [kept]) == []
+    episodes.verify(kept, digest)
+    episodes.verify(other, other_digest)
+    for orphan in orphans:
+        with pytest.raises(NotFound):
+            episodes.read(orphan)
+
+
+FILL = """
+import sys, numpy as np
+from storage.episodes import EpisodeStore
+from storage.errors import StoreFull
+from storage.settings import Settings
+store = EpisodeStore(Settings(data_dir=sys.argv[1]))
+noise = np.random.default_rng(0).random((64, 4096, 3)).astype(np.float32)
+try:
+    store.write("dst_01FULL", 0, 1, {"particles": noise}, {})
+except StoreFull as error:
+    print(error)
+"""
+
+
+def test_a_full_disk_is_said_plainly_and_leaves_nothing(tmp_path: Path, repository: Path) -> None:
+    """A limit on the size of a file makes the kernel refuse the write, as a full disk does."""
+
+    def limit() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, 1 << 20))
+
+    done = subprocess.run(
+        [sys.executable, "-c", FILL, str(tmp_path)],
+        cwd=repository,
+        preexec_fn=limit,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "episode datasets/dst_01FULL/episodes/00000-e1.zarr, 3145728 bytes, was not written" in done.stdout
+    assert "bytes are free" in done.stdout
+    assert [path for path in (tmp_path / "store").rglob("*") if path.is_file()] == []
+
+
+def _commit(store: EpisodeStore, index: int) -> Episode:
+    path, digest = store.write(DATASET, index, 1, episode(seed=index), {})
+    return Episode(index=index, path=path, digest=digest, seed=index, frames=12, particles=20)
+
+
+def _shard(tmp_path: Path, path: str, name: str) -> Path:
+    files = (tmp_path / "store" / path / name / "c").rglob("*")
+    return next(file for file in files if file.is_file())
