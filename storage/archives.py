@@ -16,6 +16,7 @@ import math
 import stat
 import struct
 import tarfile
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -73,6 +74,17 @@ DAMAGED = (
     OverflowError,
 )
 """What the standard library raises on truncated or malformed archives."""
+
+MALFORMED_HEADER = (
+    ValueError,
+    SyntaxError,
+    TypeError,
+    EOFError,
+    RecursionError,
+    MemoryError,
+    tokenize.TokenError,
+)
+"""What numpy raises on the header of an npy file that is none."""
 
 
 def is_zip(data: bytes) -> bool:
@@ -287,7 +299,7 @@ def _parse_array(name: str, content: bytes) -> np.ndarray:
         if read_header is None:
             raise ArchiveRefused(f"{name} has npy version {version[0]}.{version[1]}, 1.0 and 2.0 are read")
         shape, fortran_order, dtype = read_header(stream, max_header_size=NPY_HEADER_LIMIT)
-    except (ValueError, SyntaxError, TypeError, EOFError, RecursionError, MemoryError) as error:
+    except MALFORMED_HEADER as error:
         raise ArchiveRefused(f"{name} is not an npy file: {error}") from error
     if dtype.kind not in NUMERIC_KINDS or dtype.hasobject or dtype.subdtype is not None:
         raise ArchiveRefused(f"{name} holds {dtype}; only plain numbers are read, never Python objects")
