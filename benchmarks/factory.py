@@ -1,9 +1,9 @@
 """The data factory through the real embedded service: episodes a minute with one and two workers.
 
 Broker, database, dispatcher and worker processes are those of ``physworld up`` on an empty data folder; the
-sample scene is fitted once. Rounds alternate between one and two workers. The service is restarted in between,
-and each worker is warmed up by episodes that do not count. The clock runs from the request for the dataset to
-the end of its last episode.
+sample scene is fitted once. Rounds alternate between one and two workers. The service is restarted in
+between, and each worker is warmed up by episodes that do not count. The clock runs from the request for the
+dataset to the end of its last episode.
 
 A worker's shard reports its seconds of planning and simulating and its seconds of writing to the store; what
 is left of the wall time is the queue's: publishing, claiming, committing, waiting for the next shard.
