@@ -31,7 +31,8 @@ lint: dev
 test: lint
 	$(BIN)/python -m pytest
 
-bench: dev
+bench:
+	@scripts/bootstrap.sh --bench
 	$(BIN)/python -m benchmarks
 
 clean:

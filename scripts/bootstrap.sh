@@ -3,6 +3,7 @@
 #
 #   scripts/bootstrap.sh          what the service and the command line need
 #   scripts/bootstrap.sh --dev    also what the tests and the linters need, Chromium among it
+#   scripts/bootstrap.sh --bench  also the peers that the benchmarks measure beside us
 #
 # Needs Python 3.11 with pip; python3-venv is not assumed. Does nothing when .venv is up to date: a stamp in it
 # holds the hash of everything that decides its contents. PYTHON=/path/to/python3.11 chooses the interpreter.
@@ -74,17 +75,25 @@ install_chromium() {
 }
 
 EXTRAS=api,sim,train
-[ "${1:-}" = --dev ] && EXTRAS=$EXTRAS,dev
+case "${1:-}" in
+    "") ;;
+    --dev) EXTRAS=$EXTRAS,dev ;;
+    --bench) EXTRAS=$EXTRAS,dev,bench ;;
+    *) fail "unknown option $1" ;;
+esac
 STAMP=$VENV/.bootstrap-stamp
 WANTED=$(cat pyproject.toml clients/python/pyproject.toml constraints.txt scripts/bootstrap.sh | sha256sum | cut -c1-64)
 
 [ "${1:-}" = --dev ] && install_chromium
+present=
 if [ -f "$STAMP" ] && is_python311 "$VENV/bin/python"; then
-    read -r stamped extras <"$STAMP"
-    if [ "$stamped" = "$WANTED" ] && { [ "$extras" = "$EXTRAS" ] || [ "$extras" = api,sim,train,dev ]; }; then
-        exit 0
-    fi
+    read -r stamped present <"$STAMP"
+    case "$present" in
+        "$EXTRAS" | "$EXTRAS",*) [ "$stamped" = "$WANTED" ] && exit 0 ;;
+        *) present= ;;
+    esac
 fi
+EXTRAS=${present:-$EXTRAS}
 is_python311 "$VENV/bin/python" && "$VENV/bin/python" -m pip --version >/dev/null 2>&1 || make_venv
 rm -f "$STAMP"
 install "setuptools==$SETUPTOOLS"
