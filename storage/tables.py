@@ -91,7 +91,9 @@ def insert_if_absent(session: Session, table: type[Base], values: Json) -> bool:
     dialect = session.get_bind().dialect.name
     insert = postgresql.insert if dialect == "postgresql" else sqlite.insert
     statement = insert(table).values(values).on_conflict_do_nothing()
-    return session.connection().execute(statement).rowcount == 1
+    # Without the option SQLAlchemy does not ask psycopg how many rows an INSERT made.
+    kept = statement.execution_options(preserve_rowcount=True)
+    return session.connection().execute(kept).rowcount == 1
 
 
 class SceneRow(Base):

@@ -9,13 +9,12 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from fastapi import Request
 from pydantic import ValidationError
 from starlette.datastructures import FormData, UploadFile
 
-from physworld.scene import Scene
 from schemas.base import FieldError
 from schemas.scene import SceneImport
 from services.api.errors import ApiProblem
@@ -24,6 +23,9 @@ from storage.importers import import_any
 from storage.importers.options import ImportOptions
 from storage.scene_bundle import canonical_archive, checked
 from storage.scene_declaration import KINDS
+
+if TYPE_CHECKING:
+    from physworld.scene import Scene
 
 FIELDS = frozenset({"bundle", "name", "options"})
 FIELD_LIMIT_BYTES = 64 * 1024

@@ -12,6 +12,7 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -135,19 +136,16 @@ def test_workers_scale(services: dict[str, Any]) -> None:
 
 
 def test_commands_exist_in_their_image(services: dict[str, Any], repository: Path) -> None:
-    dockerfile = (repository / "Dockerfile").read_text()
     for name in OURS:
         command, target = services[name]["command"], services[name]["build"]["target"]
         assert command[:2] == ["python", "-m"]
         source = _module_file(repository, command[2])
         assert source.is_file(), f"{name}: {source} is missing"
         assert _has_main(source), f"{source} does nothing when run"
-        stage = re.split(r"(?m)^FROM ", dockerfile.split(f" AS {target}\n")[1])[0]
         relative = source.relative_to(repository).as_posix()
-        sources = [word for line in re.findall(r"(?m)^COPY (.+)$", stage) for word in line.split()[:-1]]
-        assert any(relative == word or relative.startswith(word) for word in sources), f"{name}: {relative}"
-        for word in sources:
-            assert (repository / word).exists(), word
+        sources = _copied(repository, target)
+        assert any(relative == word or relative.startswith(f"{word}/") for word in sources), name
+        assert all((repository / word).exists() for word in sources)
 
 
 def test_named_volumes_are_declared(text: str) -> None:
@@ -158,6 +156,47 @@ def test_named_volumes_are_declared(text: str) -> None:
         for volume in service.get("volumes", [])
     }
     assert used == set(document["volumes"])
+
+
+@pytest.mark.parametrize(
+    ("target", "modules", "absent"),
+    [
+        ("api", "services.web services.api.migrate", "torch warp celery kombu workers benchmarks"),
+        ("worker", "workers.__main__ workers.dispatcher workers.app", "torch warp services benchmarks"),
+        ("trainer", "services.trainer.__main__ workers.app", "torch warp fastapi benchmarks"),
+    ],
+)
+def test_an_image_holds_what_its_process_imports(
+    repository: Path, tmp_path: Path, target: str, modules: str, absent: str
+) -> None:
+    for word in _copied(repository, target):
+        destination = tmp_path / word
+        destination.parent.mkdir(parents=True, exist_ok=True)
+        if (repository / word).is_dir():
+            shutil.copytree(repository / word, destination, ignore=shutil.ignore_patterns("node_modules"))
+        else:
+            shutil.copy(repository / word, destination)
+    program = f"""
+import importlib, sys
+sys.modules.update(dict.fromkeys({absent.split()!r}))  # importing one of these fails
+for name in {modules.split()!r}:
+    importlib.import_module(name)
+"""
+    environment = os.environ | {"PYTHONPATH": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"}
+    result = subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+
+
+def _copied(repository: Path, target: str) -> list[str]:
+    stage = (repository / "Dockerfile").read_text().split(f" AS {target}\n")[1].split("\nFROM ")[0]
+    return [word.rstrip("/") for line in re.findall(r"(?m)^COPY (.+)$", stage) for word in line.split()[:-1]]
 
 
 def _interpolated(text: str) -> str:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, cast
+from typing import TYPE_CHECKING, Annotated, cast
 
 import anyio
 from fastapi import APIRouter, Query, Request, Response
 from sqlalchemy.orm import Session
 
-from physworld.scene import Scene as Recording
 from schemas.base import Artifact, Page
 from schemas.scene import Scene
 from services.api.dependencies import DatabaseDep, ObjectId, PageDep, SettingsDep, StoresDep
@@ -18,6 +17,9 @@ from services.api.uploads import MULTIPART_BODY, Upload, parse_scene, read_form,
 from services.stores import Stores
 from storage import resources
 from storage.idempotency import Answer
+
+if TYPE_CHECKING:
+    from physworld.scene import Scene as Recording
 
 router = APIRouter(prefix="/scenes", tags=["scenes"])
 
