@@ -12,11 +12,11 @@ What each setting is for:
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import sys
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from celery import Celery, signals
@@ -24,7 +24,6 @@ from kombu import Exchange, Queue
 
 from schemas.queues import SIMULATION, TASK_NAME, TRAINING
 from storage.settings import Settings
-from workers.errors import WorkerStopping
 
 HARD_LIMIT_S = 12 * 3600
 SOFT_LIMIT_S = HARD_LIMIT_S - 60
@@ -84,9 +83,10 @@ def transport_options() -> dict[str, Any]:
 
 def run_worker(settings: Settings, queue: str, name: str) -> int:
     """Serve one queue with one warm child process until told to stop; returns the exit code."""
+    logging.getLogger("alembic").setLevel(logging.WARNING)
     app = create_app(settings)
     signals.worker_init.connect(_refuse_heavy_modules, weak=False)
-    signals.worker_process_init.connect(_prepare_child, weak=False)
+    signals.worker_process_init.connect(_die_with_parent, weak=False)
     signals.worker_ready.connect(_announce, weak=False)
     app.worker_main(
         [
@@ -115,18 +115,13 @@ def _refuse_heavy_modules(**_: Any) -> None:
         raise RuntimeError(f"{', '.join(loaded)} loaded before the fork: a child that uses it would hang")
 
 
-def _prepare_child(**_: Any) -> None:
-    """A pool process gives its shard back when asked to end, and ends with a worker that was killed."""
-    signal.signal(signal.SIGTERM, _stop_child)
+def _die_with_parent(**_: Any) -> None:
+    """A pool process must not go on computing for a worker that was killed."""
     if sys.platform == "linux":
         import ctypes
 
         parent_death_signal = 1  # PR_SET_PDEATHSIG
         ctypes.CDLL(None, use_errno=True).prctl(parent_death_signal, signal.SIGKILL)
-
-
-def _stop_child(number: int, frame: FrameType | None) -> None:
-    raise WorkerStopping(0)
 
 
 def _announce(**_: Any) -> None:

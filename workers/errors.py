@@ -9,8 +9,6 @@
     ├── NotEnoughDisk        the estimate of what a dataset writes exceeds what is free
     ├── EpisodeRejected      every sub-seed of an episode gave an unstable simulation
     └── DatasetIncomplete    at sealing, an episode is missing, twice there, or its digest differs
-
-    WorkerStopping (a SystemExit) this process was asked to end: the shard goes back untried
 """
 
 from __future__ import annotations
@@ -56,7 +54,3 @@ class DatasetIncomplete(WorkerError):
     """The dataset cannot be sealed."""
 
     code = "dataset_incomplete"
-
-
-class WorkerStopping(SystemExit):
-    """Raised in a handler by SIGTERM; the lease is released on the way out."""

@@ -26,7 +26,7 @@ from storage.database import Database, open_database
 from storage.errors import DatabaseUnavailable, StorageError, StoreReadFailed, StoreWriteFailed
 from storage.settings import Settings, get_settings
 from workers.context import TaskContext
-from workers.errors import Cancelled, LeaseLost, UnknownShardKind, WorkerError, WorkerStopping
+from workers.errors import Cancelled, LeaseLost, UnknownShardKind, WorkerError
 from workers.owner import process_owner
 from workers.registry import Handler, HandlerResult, handler_of
 from workers.stores import Stores
@@ -92,7 +92,8 @@ def _run_claimed(runtime: Runtime, lease: leases.Lease) -> Outcome:
         with runtime.database.session() as session:
             leases.mark_cancelled(session, lease)
         return "cancelled"
-    except WorkerStopping:
+    except SystemExit:  # SIGTERM in a pool process: the worker is being stopped
+        logger.info("shard %s: given back, the worker is stopping", lease.shard_id)
         with runtime.database.session() as session:
             leases.release(session, lease)
         raise

@@ -23,6 +23,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
 
+from pydantic import SecretStr
+
 from schemas.queues import SIMULATION
 from services.embedded import logs
 from services.embedded.broker import Broker, choose_broker
@@ -102,7 +104,9 @@ class Supervisor:
         environment = {**os.environ, "PHYSWORLD_DATA_DIR": str(self._folder.root), "PYTHONUNBUFFERED": "1"}
         broker = choose_broker(self._folder, environment)
         environment["PHYSWORLD_BROKER_URL"] = broker.url
-        self._prepare_database()
+        settings = Settings(data_dir=self._folder.root, broker_url=SecretStr(broker.url))
+        settings.check()
+        self._prepare_database(settings)
         self._url = f"http://127.0.0.1:{listening.getsockname()[1]}"
         if broker.command:
             self._add(Program("broker", broker.command, environment), family)
@@ -154,9 +158,7 @@ class Supervisor:
         child.start()
         self._children.append(child)
 
-    def _prepare_database(self) -> None:
-        settings = Settings(data_dir=self._folder.root)
-        settings.check(broker=False)
+    def _prepare_database(self, settings: Settings) -> None:
         database = open_database(settings)
         database.upgrade()
         if not os.environ.get("PHYSWORLD_DATABASE_URL"):

@@ -17,7 +17,9 @@ from service_process import END_WITHIN_S, ServiceProcess, environment, until
 from tiny_scene import register, tiny_scene
 
 from schemas.fit import FitConfig
+from schemas.job import Job
 from storage import jobs
+from storage.tables import ShardRow
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
 
@@ -85,26 +87,32 @@ def test_a_killed_child_is_started_again_and_the_url_stays(tmp_path: Path) -> No
         assert service.interrupt() == 0
 
 
-def test_work_that_ctrl_c_stopped_is_given_back_untried_and_done_after_the_next_start(tmp_path: Path) -> None:
+def test_work_that_ctrl_c_stopped_carries_on_untried_and_can_be_cancelled(tmp_path: Path) -> None:
     with ServiceProcess(tmp_path / "data", "--workers", "1", "--no-trainer") as service:
         service.start()
         database, stores = service.stores()
         scene_id = register(tiny_scene(frames=90), database, stores.artifacts)
         with database.session() as session:
-            job = jobs.create_fit(session, scene_id, FitConfig(particle_budget=2000, max_simulations=60))
+            job = jobs.create_fit(session, scene_id, FitConfig(particle_budget=2000, max_simulations=500))
 
-        def job_now() -> tuple[str, int, float]:
+        def shard() -> tuple[str, int]:
             with database.reading() as session:
-                found = jobs.get_job(session, job.id)
-            assert found.error is None, found.error
-            return found.state, found.attempt, found.progress.done
+                row = session.query(ShardRow).one()
+            return row.state, row.attempt
 
-        until(lambda: job_now()[2] >= 2, "the fit does not start", RESTART_WITHIN_S)
+        def job_now() -> Job:
+            with database.reading() as session:
+                return jobs.get_job(session, job.id)
+
+        until(lambda: job_now().progress.done >= 1, "the fit does not start", RESTART_WITHIN_S)
         assert service.interrupt() == 0
-        assert job_now()[0] == "running"
+        assert shard() == ("QUEUED", 0)
+        assert job_now().state == "running"
         service.start()
-        until(lambda: job_now()[0] == "succeeded", "the fit is not done", 200.0)
-        assert job_now()[1] == 1  # the attempt that was stopped does not count
+        until(lambda: shard() == ("RUNNING", 1), "the fit does not go on", RESTART_WITHIN_S)
+        with database.session() as session:
+            assert jobs.cancel_job(session, job.id).state == "cancelling"
+        until(lambda: job_now().state == "cancelled", "the fit does not stop", RESTART_WITHIN_S)
         assert service.interrupt() == 0
         database.dispose()
 

@@ -13,7 +13,7 @@ from schemas.job import Job
 from storage import jobs, leases
 from storage.tables import ShardRow
 from workers.context import TaskContext
-from workers.errors import Cancelled, WorkerStopping
+from workers.errors import Cancelled
 from workers.execute import Runtime, problem_of, run_shard
 from workers.registry import HandlerResult
 from workers.stores import Stores
@@ -145,7 +145,7 @@ def test_a_worker_that_is_stopped_gives_its_shard_back_untried(
     runtime_with, stores: Stores, job: Job
 ) -> None:
     def stop(context: TaskContext, stores: Stores) -> HandlerResult:
-        raise WorkerStopping(0)
+        raise SystemExit(-241)
 
     with pytest.raises(SystemExit):
         run_shard(runtime_with(fit=stop), _shard(stores).id)
