@@ -22,7 +22,7 @@ from storage.errors import ConfigurationError
 
 DATABASE_SCHEMES = ("sqlite", "postgresql", "postgres", "postgresql+psycopg")
 STORE_SCHEMES = ("file", "s3")
-BROKER_SCHEMES = ("redis", "rediss", "valkey", "valkeys")
+BROKER_SCHEMES = ("redis", "rediss")
 
 
 class Settings(BaseSettings):
