@@ -24,12 +24,13 @@ from storage.tables import ShardRow
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
 
 RESTART_WITHIN_S = 60.0
+ANSWER_WITHIN_S = 60.0
 DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 
 
 def _status(url: str, token: str | None = None) -> int:
     headers = {} if token is None else {"Authorization": f"Bearer {token}"}
-    with DIRECT.open(urllib.request.Request(url, headers=headers), timeout=10) as answer:
+    with DIRECT.open(urllib.request.Request(url, headers=headers), timeout=ANSWER_WITHIN_S) as answer:
         return int(answer.status)
 
 
