@@ -67,6 +67,7 @@ def require_viewer(request: Request) -> None:
     if viewer is None:
         raise LoginRequired
     request.state.viewer = viewer
+    request.state.key_id = viewer.id  # for the access log
 
 
 def require_same_origin(request: Request) -> None:

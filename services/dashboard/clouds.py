@@ -58,12 +58,21 @@ class Layer:
 
 @dataclass(frozen=True)
 class Cloud:
-    """What one view shows: times (T,) [s], the first held-out frame, the ground's height [m], the layers."""
+    """What one view shows.
+
+    Attributes:
+        times: (T,) [s].
+        layers: sets of points on this time line.
+        split: the first held-out frame.
+        floor: height of the ground [m].
+        box: corners of the undeformed body [m], where it is declared to be a box.
+    """
 
     times: np.ndarray
     layers: Sequence[Layer]
     split: int | None = None
     floor: float | None = None
+    box: tuple[list[float], list[float]] | None = None
 
     def layer(self, name: str) -> Layer | None:
         """The layer of this name."""
@@ -75,6 +84,7 @@ class Cloud:
             "times": [round(float(time), 6) for time in self.times],
             "split": self.split,
             "floor": self.floor,
+            "box": self.box,
             "layers": [
                 {
                     "name": layer.name,
@@ -108,7 +118,11 @@ def scene_cloud(scene: Scene, layers: Sequence[Layer]) -> Cloud:
     """The view of a recording with further layers, which must already be on its time line."""
     split = scene.test[0] if scene.test[1] > scene.test[0] else None
     floor = None if scene.ground is None else float(scene.ground.height_m)
-    return Cloud(scene.times, layers, split, floor)
+    body = scene.body
+    box = None
+    if body.box_min_m is not None and body.box_max_m is not None:
+        box = (body.box_min_m.tolist(), body.box_max_m.tolist())
+    return Cloud(scene.times, layers, split, floor, box)
 
 
 def resampled(points: np.ndarray, times: np.ndarray, onto: np.ndarray) -> np.ndarray:

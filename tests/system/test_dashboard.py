@@ -19,6 +19,7 @@ from playwright.sync_api import Browser, Page, expect, sync_playwright
 from serving import serve
 
 from schemas.fit import FitConfig
+from schemas.pipeline import PipelineCreate
 from services.dashboard import mount
 from storage import jobs, resources
 
@@ -155,8 +156,9 @@ def test_the_job_list_moves_with_the_work(visit: Visit, world: World) -> None:
     expect(row).to_contain_text("40 / 80 simulations")
     assert row.locator("progress").evaluate("bar => bar.value") == 0.5
     with world.database.session() as session:
-        added = jobs.create_fit(session, world.scene_id, FitConfig())
-    expect(visit.page.locator(f"#{added.id}")).to_contain_text("queued")
+        added = jobs.create_pipeline(session, PipelineCreate(scene_id=world.scene_id))
+    stages = visit.page.locator(f"#{added.id} .stage")
+    expect(stages).to_contain_text(["queued", "waiting", "waiting"])
 
 
 def test_a_pipeline_shows_its_three_stages(visit: Visit, world: World) -> None:
@@ -208,6 +210,34 @@ def test_the_scene_is_drawn_and_the_slider_moves_it(visit: Visit, world: World, 
     for box in visit.page.locator("[data-legend] input").all():
         box.uncheck()
     assert coloured_pixels(visit.page, canvas.screenshot()) < 20
+
+
+def test_a_scene_without_a_twin_says_what_to_do_or_where_one_is_being_made(
+    visit: Visit, world: World
+) -> None:
+    with world.database.reading() as session:
+        scenes = {scene.name: scene.id for scene in resources.list_scenes(session).data}
+    visit.open(f"/scenes/{scenes['chain_failed']}")
+    expect(visit.page.locator("main")).to_contain_text("physworld run chain_failed")
+    visit.points_shown()
+    visit.open(f"/scenes/{scenes['chain_running']}")
+    visit.points_shown()
+    visit.page.get_by_role("link", name="follow its job").click()
+    expect(visit.page).to_have_url(f"{visit.base}/jobs/{world.running_id}")
+
+
+def test_long_lists_come_in_pages(visit: Visit, world: World) -> None:
+    with world.database.session() as session:
+        made = [jobs.create_fit(session, world.scene_id, FitConfig()).id for _ in range(30)]
+        for job_id in made:
+            jobs.cancel_job(session, job_id)
+    visit.open("/?state=cancelled")
+    seen = visit.page.locator(".job").evaluate_all("rows => rows.map(row => row.id)")
+    visit.page.get_by_role("link", name="Older").click()
+    visit.page.wait_for_selector("text=Newest")
+    seen += visit.page.locator(".job").evaluate_all("rows => rows.map(row => row.id)")
+    assert set(made) <= set(seen)
+    assert len(seen) == len(set(seen))
 
 
 def test_the_scene_plays(visit: Visit, world: World) -> None:

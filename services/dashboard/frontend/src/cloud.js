@@ -1,5 +1,5 @@
 // 3D view of a page: `<figure data-cloud="URL">` with a canvas and controls becomes a player of moving points.
-// The JSON at URL: { times: [s], split: frame | null, floor: m | null,
+// The JSON at URL: { times: [s], split: frame | null, floor: m | null, box: [corner, corner] | null (declared body),
 //   layers: [{ name, label, role, count, size, shown, url, pairs? }] }
 // A layer's URL gives float32 little-endian (frames, count, 3) [m], z up; NaN marks a point that is not visible.
 // `pairs: "name"` draws a thin line from every point of the layer to its twin in the layer of that name.
@@ -23,9 +23,10 @@ const FRAGMENT = `
   void main() {
     vec2 p = gl_PointCoord * 2.0 - 1.0;
     float r = dot(p, p);
-    if (r > 1.0) discard;
+    float edge = 1.0 - smoothstep(1.0 - min(0.5, 2.0 * fwidth(r)), 1.0, r);
+    if (edge <= 0.0) discard;
     float light = 0.62 + 0.38 * sqrt(1.0 - r) - 0.18 * (p.x + p.y) * 0.5;
-    gl_FragColor = vec4(tint * light, opacity);
+    gl_FragColor = vec4(tint * light, opacity * edge);
     #include <colorspace_fragment>
   }`;
 
@@ -48,6 +49,7 @@ class Layer {
       },
       transparent: (spec.opacity ?? 1) < 1,
       depthWrite: (spec.opacity ?? 1) === 1,
+      alphaToCoverage: (spec.opacity ?? 1) === 1,
     });
     this.points = new Points(this.geometry, this.material);
     this.points.frustumCulled = false;
@@ -122,11 +124,15 @@ class Pairs {
   }
 }
 
-/** Corners of everything that the layers show over all frames. */
-function bounds(layers) {
+/** Corners of everything that the layers show over all frames, and of the declared body. */
+function bounds(layers, box) {
   const low = new Vector3(Infinity, Infinity, Infinity);
   const high = new Vector3(-Infinity, -Infinity, -Infinity);
   const point = new Vector3();
+  for (const corner of box ?? []) {
+    low.min(point.fromArray(corner));
+    high.max(point);
+  }
   for (const layer of layers) {
     if (!layer.values) continue;
     for (let i = 0; i < layer.values.length; i += 3) {
@@ -157,9 +163,23 @@ function grid(low, high, floor) {
     corners.push(centre[0] + offset, centre[1] - half, z, centre[0] + offset, centre[1] + half, z);
     corners.push(centre[0] - half, centre[1] + offset, z, centre[0] + half, centre[1] + offset, z);
   }
+  return [segments(corners), step];
+}
+
+/** The edges of the box between two corners. */
+function wireframe([low, high]) {
+  const corner = (index) => [0, 1, 2].map((axis) => (index & (1 << axis) ? high : low)[axis]);
+  const ends = [];
+  for (let index = 0; index < 8; index += 1) {
+    for (const bit of [1, 2, 4]) if (!(index & bit)) ends.push(...corner(index), ...corner(index | bit));
+  }
+  return segments(ends);
+}
+
+function segments(ends) {
   const geometry = new BufferGeometry();
-  geometry.setAttribute("position", new BufferAttribute(new Float32Array(corners), 3));
-  return [new LineSegments(geometry, new LineBasicMaterial()), step];
+  geometry.setAttribute("position", new BufferAttribute(new Float32Array(ends), 3));
+  return new LineSegments(geometry, new LineBasicMaterial());
 }
 
 class Player {
@@ -198,7 +218,7 @@ class Player {
   }
 
   place() {
-    const [low, high] = bounds(this.layers);
+    const [low, high] = bounds(this.layers, this.data.box);
     const centre = low.clone().add(high).multiplyScalar(0.5);
     const radius = Math.max(high.clone().sub(low).length() / 2, 1e-3);
     const distance = (radius * 1.16) / Math.sin((this.camera.fov / 2) * (Math.PI / 180));
@@ -211,6 +231,10 @@ class Player {
     const [lines, step] = grid(low, high, this.data.floor);
     this.grid = lines;
     this.scene.add(lines);
+    if (this.data.box) {
+      this.body = wireframe(this.data.box);
+      this.scene.add(this.body);
+    }
     this.radius = radius;
     const label = this.figure.querySelector("[data-scale]");
     if (label) label.textContent = `grid ${step >= 1 ? `${step} m` : `${+(step * 100).toPrecision(2)} cm`}`;
@@ -220,6 +244,7 @@ class Player {
   paint() {
     for (const item of [...this.layers, ...this.pairs]) item.paint();
     this.grid.material.color.set(colour("grid"));
+    this.body?.material.color.set(colour("particles"));
     this.render();
   }
 
