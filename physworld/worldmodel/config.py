@@ -17,7 +17,9 @@ class WorldModelConfig:
         neighbours: each vertex hears at least its so many nearest; the edge set is made symmetric, so the mean
             degree comes out about a fifth higher.
         edge_radius_spacings: no edge between object vertices is longer than this many vertex spacings d_v.
-        control_vertices_per_grip: with more than ``control_vertices_all`` controllers, so many of each rigid
+        coarse_vertices: so many vertices, spread over the body, are linked with each other.
+        coarse_links: and every vertex with so many of them; 0 leaves the paper's local graph.
+        control_vertices_all, control_vertices_per_grip: with more than ``control_vertices_all`` controllers, so many of each rigid
             group become vertices.
     """
 
@@ -27,6 +29,8 @@ class WorldModelConfig:
     vertices: int = 120
     neighbours: int = 10
     edge_radius_spacings: float = 6.0
+    coarse_vertices: int = 12
+    coarse_links: int = 2
     control_vertices_all: int = 16
     control_vertices_per_grip: int = 6
 

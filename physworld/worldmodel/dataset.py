@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from physworld.worldmodel.errors import DatasetUnusable
-from physworld.worldmodel.graph import GraphSpec
+from physworld.worldmodel.graph import EDGE_KINDS, GraphSpec
 from physworld.worldmodel.messages import EdgeList
 from physworld.worldmodel.model import Normalisation
 
@@ -79,24 +79,32 @@ def split_tracks(tracks: list[Track], fraction: float, seed: int) -> tuple[list[
 def measure_scales(tracks: list[Track], spec: GraphSpec) -> Normalisation:
     """Root-mean-square scales over all frames of all object vertices and edges."""
     n = spec.object_count
-    edges = EdgeList.from_neighbours(spec.neighbours)
-    rest = torch.as_tensor(spec.rest_relative[spec.neighbours < spec.vertex_count], dtype=torch.float32)
-    rest_length = torch.linalg.vector_norm(rest, dim=-1)
-    senders = edges.senders.long()
-    squares = dict.fromkeys(("velocity", "relative", "strain", "stretch", "acceleration"), 0.0)
+    squares: dict[str, float] = {}
     for track in tracks:
         x = track.positions
-        relative = x[:, senders] - x[:, edges.receivers]
-        stretch = torch.linalg.vector_norm(relative, dim=-1) - rest_length
-        squares["velocity"] += _mean_square(x[1:, :n] - x[:-1, :n])
-        squares["acceleration"] += _mean_square(x[2:, :n] - 2.0 * x[1:-1, :n] + x[:-2, :n])
-        squares["relative"] += _mean_square(relative[1:] - relative[:-1])
-        squares["strain"] += _mean_square(relative - rest)
-        squares["stretch"] += _mean_square(stretch)
+        _add(squares, "velocity", x[1:, :n] - x[:-1, :n])
+        _add(squares, "acceleration", x[2:, :n] - 2.0 * x[1:-1, :n] + x[:-2, :n])
+        for kind in range(EDGE_KINDS):
+            taken = (spec.neighbours < spec.vertex_count) & (spec.edge_kind == kind)
+            edges = EdgeList.from_neighbours(spec.neighbours, taken)
+            rest = torch.as_tensor(spec.rest_relative[taken], dtype=torch.float32)
+            relative = x[:, edges.senders] - x[:, edges.receivers]
+            stretch = torch.linalg.vector_norm(relative, dim=-1) - torch.linalg.vector_norm(rest, dim=-1)
+            _add(squares, f"relative{kind}", relative[1:] - relative[:-1])
+            _add(squares, f"strain{kind}", relative - rest)
+            _add(squares, f"stretch{kind}", stretch)
     scales = {name: max((total / len(tracks)) ** 0.5, SCALE_FLOOR_M) for name, total in squares.items()}
     spread = torch.stack([track.phi for track in tracks]).square().mean(dim=(0, 1)).sqrt()
-    properties = tuple(max(float(value), PROPERTY_FLOOR) for value in spread)
-    return Normalisation(**scales, properties=(properties[0], properties[1]))
+    by_kind = {
+        name: tuple(scales[f"{name}{kind}"] for kind in range(EDGE_KINDS))
+        for name in ("relative", "strain", "stretch")
+    }
+    return Normalisation(
+        velocity=scales["velocity"],
+        acceleration=scales["acceleration"],
+        properties=tuple(max(float(value), PROPERTY_FLOOR) for value in spread),
+        **by_kind,
+    )
 
 
 class WindowSampler:
@@ -132,5 +140,7 @@ class WindowSampler:
         return self._starts[frames]
 
 
-def _mean_square(values: Tensor) -> float:
-    return float(values.double().square().mean())
+def _add(squares: dict[str, float], name: str, values: Tensor) -> None:
+    """Add the mean square of ``values`` to that name's total; nothing where there are no values."""
+    mean = float(values.double().square().mean()) if values.numel() else 0.0
+    squares[name] = squares.get(name, 0.0) + mean

@@ -1,9 +1,13 @@
 """The graph: which particles are vertices, which controllers, and who hears whom. NumPy only.
 
 Vertices are the object's particles picked by farthest-point sampling (n of them, smallest separation d_v),
-followed by the control vertices (C). Edges are bidirectional: between object vertices the nearest neighbours
-within d_e = ``edge_radius_spacings`` · d_v, and between each control vertex and its nearest object vertices
-(a marker of the gripper may sit outside the body, so that no radius is asked of these).
+followed by the control vertices (C). Edges are bidirectional, of three kinds:
+
+* NEAR: object vertices, the nearest neighbours within d_e = ``edge_radius_spacings`` · d_v;
+* COARSE: object vertices, the first few of the sampling (they are spread over the body) with each other and
+  every vertex with the nearest of them. In one step of 1/30 s a bending wave crosses the whole body; seven hops
+  of a local graph do not;
+* GRIP: with control vertices. A marker of the gripper may sit outside the body, so no radius is asked of these.
 
 Neighbours are *material*: found once on the undeformed body and kept. An elastic solid keeps its neighbours, so
 the force on a vertex comes from the same vertices at all times; parts that merely pass close by (a folded rope)
@@ -23,6 +27,10 @@ from physworld.worldmodel.config import WorldModelConfig
 from physworld.worldmodel.errors import GraphInvalid
 
 
+NEAR, COARSE, GRIP = 0, 1, 2
+EDGE_KINDS = 3
+
+
 @dataclass(frozen=True)
 class GraphSpec:
     """A scene's graph at a fixed clock.
@@ -33,8 +41,9 @@ class GraphSpec:
         particle_index: the particle that each object vertex is, (n,).
         control_index: the controller that each control vertex is, (C,).
         neighbours: senders that each vertex hears, (V, D); V marks an empty slot.
+        edge_kind: NEAR, COARSE or GRIP of each slot, (V, D); NEAR in empty slots.
         rest_relative: undeformed x_sender − x_receiver of each slot [m], (V, D, 3); 0 in empty slots. For
-            edges with a control vertex: as at the start of the recording.
+            GRIP edges: as at the start of the recording.
         vertex_spacing_m: d_v, the smallest separation of object vertices.
         edge_radius_m: d_e, the longest edge allowed between object vertices, the network's unit of length.
         ground_height_m: the plane's height, or None.
@@ -45,6 +54,7 @@ class GraphSpec:
     particle_index: np.ndarray
     control_index: np.ndarray
     neighbours: np.ndarray
+    edge_kind: np.ndarray
     rest_relative: np.ndarray
     vertex_spacing_m: float
     edge_radius_m: float
@@ -130,19 +140,24 @@ def build_graph(
     np.fill_diagonal(distances, np.inf)
     spacing = float(distances.min())
     radius = config.edge_radius_spacings * spacing
-    pairs = _object_pairs(distances, min(config.neighbours, n - 1), radius)
 
     controllers = np.asarray(controllers_start, dtype=np.float64)
     control = choose_control_vertices(controllers, control_groups, config)
     start = np.asarray(particles_start, dtype=np.float64)[index]
-    reach = np.linalg.norm(controllers[control][:, None] - start[None], axis=2)
-    held = np.argsort(reach, axis=1, kind="stable")[:, : min(config.neighbours, n)]
-    for slot, objects in enumerate(held):
-        for vertex in objects:
-            pairs += [(int(vertex), n + slot), (n + slot, int(vertex))]
-
     vertex_count = n + len(control)
-    neighbours = _slot_table(pairs, vertex_count)
+    kind = np.full((vertex_count, vertex_count), -1)
+    object_kind = kind[:n, :n]
+    object_kind[_coarse_links(distances, min(config.coarse_vertices, n), config.coarse_links)] = COARSE
+    object_kind[_near_links(distances, min(config.neighbours, n - 1), radius)] = NEAR
+    reach = np.linalg.norm(start[:, None] - controllers[control][None], axis=2)
+    for block, links in zip(
+        (kind[:n, n:], kind[n:, :n], kind[n:, n:]),
+        _control_links(reach, control, control_groups, config.neighbours),
+        strict=True,
+    ):
+        block[links] = GRIP
+    np.fill_diagonal(kind, -1)
+    neighbours, edge_kind = _slot_table(kind)
     reference = np.concatenate([start, controllers[control]])
     undeformed = np.concatenate([rest, np.zeros((len(control), 3))])
     return GraphSpec(
@@ -151,6 +166,7 @@ def build_graph(
         particle_index=index,
         control_index=control,
         neighbours=neighbours,
+        edge_kind=edge_kind,
         rest_relative=_relative(neighbours, undeformed, reference, n),
         vertex_spacing_m=spacing,
         edge_radius_m=radius,
@@ -158,26 +174,55 @@ def build_graph(
     )
 
 
-def _object_pairs(distances: np.ndarray, neighbours: int, radius: float) -> list[tuple[int, int]]:
-    """Directed pairs (receiver, sender): each other's nearest within the radius, made symmetric."""
+def _near_links(distances: np.ndarray, neighbours: int, radius: float) -> np.ndarray:
+    """Each vertex with its nearest within the radius, (n, n) bool."""
     nearest = np.argsort(distances, axis=1, kind="stable")[:, :neighbours]
     linked = np.zeros(distances.shape, dtype=bool)
     np.put_along_axis(linked, nearest, True, axis=1)
-    linked &= distances <= radius
-    receivers, senders = np.nonzero(linked | linked.T)
-    return list(zip(receivers.tolist(), senders.tolist(), strict=True))
+    return (linked | linked.T) & (distances <= radius)
 
 
-def _slot_table(pairs: list[tuple[int, int]], vertex_count: int) -> np.ndarray:
-    """Senders by receiver, (V, D) int64, empty slots filled with V."""
-    senders: list[list[int]] = [[] for _ in range(vertex_count)]
-    for receiver, sender in pairs:
-        senders[receiver].append(sender)
-    width = max(1, max(len(row) for row in senders))
-    table = np.full((vertex_count, width), vertex_count, dtype=np.int64)
-    for receiver, row in enumerate(senders):
-        table[receiver, : len(row)] = sorted(row)
-    return table
+def _coarse_links(distances: np.ndarray, coarse: int, links: int) -> np.ndarray:
+    """The first ``coarse`` sampled vertices with each other, and every vertex with its nearest ones of them."""
+    linked = np.zeros(distances.shape, dtype=bool)
+    if coarse and links:
+        linked[:coarse, :coarse] = True
+        nearest = np.argsort(distances[:, :coarse], axis=1, kind="stable")[:, :links]
+        np.put_along_axis(linked, nearest, True, axis=1)
+    return linked | linked.T
+
+
+def _control_links(
+    reach: np.ndarray, control: np.ndarray, groups: tuple[np.ndarray, ...], neighbours: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Object with control vertices (n, C), the same turned round (C, n), control with control vertices (C, C).
+
+    Every control vertex with its nearest object vertices; every object vertex with the nearest control vertex of
+    every grip, from which it reads its displacement against the grip; the control vertices of a grip with each
+    other, from which the grip's turn is read.
+    """
+    n, count = reach.shape
+    to_object = np.zeros((n, count), dtype=bool)
+    np.put_along_axis(to_object, np.argsort(reach, axis=0, kind="stable")[:neighbours], True, axis=0)
+    together = np.zeros((count, count), dtype=bool)
+    for group in groups:
+        members = np.nonzero(np.isin(control, group))[0]
+        if len(members):
+            together[np.ix_(members, members)] = True
+            to_object[np.arange(n), members[np.argmin(reach[:, members], axis=1)]] = True
+    return to_object, to_object.T, together
+
+
+def _slot_table(kind: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Senders by receiver (V, D), empty slots filled with V, and their kinds, from kinds (V, V) with -1 for none."""
+    vertex_count = kind.shape[0]
+    linked = kind >= 0
+    width = max(1, int(linked.sum(axis=1).max()))
+    order = np.argsort(~linked, axis=1, kind="stable")[:, :width]
+    filled = np.take_along_axis(linked, order, axis=1)
+    return np.where(filled, order, vertex_count), np.where(
+        filled, np.take_along_axis(kind, order, axis=1), NEAR
+    )
 
 
 def _relative(neighbours: np.ndarray, undeformed: np.ndarray, reference: np.ndarray, n: int) -> np.ndarray:

@@ -20,23 +20,22 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class EdgeList:
-    """Edges grouped by receiver: ``offsets`` (V + 1,) and ``senders`` (E,) int32, ``receivers`` (E,) int64."""
+    """Edges grouped by receiver: ``offsets`` (V + 1,), ``senders`` (E,) and ``receivers`` (E,), int32."""
 
     offsets: Tensor
     senders: Tensor
     receivers: Tensor
 
     @classmethod
-    def from_neighbours(cls, neighbours: np.ndarray) -> EdgeList:
-        """From a slot table (V, D) in which V marks an empty slot."""
-        vertex_count = neighbours.shape[0]
-        filled = neighbours < vertex_count
+    def from_neighbours(cls, neighbours: np.ndarray, taken: np.ndarray | bool = True) -> EdgeList:
+        """From a slot table (V, D) in which V marks an empty slot; only the slots in ``taken`` (V, D)."""
+        filled = (neighbours < neighbours.shape[0]) & taken
         receivers = np.nonzero(filled)[0]
         offsets = np.concatenate([[0], np.cumsum(filled.sum(axis=1))])
         return cls(
             torch.as_tensor(offsets, dtype=torch.int32),
             torch.as_tensor(neighbours[filled], dtype=torch.int32),
-            torch.as_tensor(receivers, dtype=torch.int64),
+            torch.as_tensor(receivers, dtype=torch.int32),
         )
 
 
@@ -53,7 +52,7 @@ def sum_messages_torch(
     edges: EdgeList, heard: Tensor, sent: Tensor, bias: Tensor, length: Tensor, weight: Tensor
 ) -> Tensor:
     """The same in plain torch, on any device and in any precision."""
-    along = sent.index_select(0, edges.senders.long()) + heard.index_select(0, edges.receivers)
+    along = sent.index_select(0, edges.senders) + heard.index_select(0, edges.receivers)
     messages = torch.relu(along + bias[:, None] + length[..., None] * weight)
     return torch.zeros_like(heard).index_add(0, edges.receivers, messages)
 

@@ -17,39 +17,41 @@ Vertex features f_i, in this order (no positions: the network is equivariant to 
     1 if object vertex, 1 if control vertex                        2
     clip(z_i^t / σ_length, 0, 1), only with a ground               1
 
-Edge features e_ij of receiver i and sender j, with r^t = x_j^t - x_i^t and r_rest = ``graph.rest_relative``:
+Edge features e_ij of receiver i and sender j, with r^t = x_j^t - x_i^t and r_rest = ``graph.rest_relative``; κ =
+``graph.edge_kind`` is 0 near, 1 coarse (both between object vertices), 2 grip (with a control vertex):
     r^t / σ_length                                                 3
-    (r^t - r_rest) / σ_strain                                      3
-    ((r^{t-k}) - (r^{t-k-1})) / σ_relative   for k = 0 … h-1      3h
+    (r^t - r_rest) / σ_strain[κ]                                   3
+    ((r^{t-k}) - (r^{t-k-1})) / σ_relative[κ]   for k = 0 … h-1   3h
     |r_rest| / σ_length                                            1
-    (|r^t| - |r_rest|) / σ_stretch                                 1
-    1 if both are object vertices, 1 if one is a control vertex    2
+    (|r^t| - |r_rest|) / σ_stretch[κ]                              1
+The type of an edge is not a feature: each kind has weights of its own.
 
-**Equations.** The sums run over the filled slots of ``graph.neighbours[i]``.
+**Equations.** Means run over the filled slots of kind κ of ``graph.neighbours[i]``, and are 0 where there is none.
     h_i  = encoder.out(relu(encoder.in(f_i)))
     for l = 0 … L-1:
-        m_ij = relu(receive.l.weight h_i + send.l.weight h_j + edge.l.weight e_ij + receive.l.bias)
-        s_i  = message.l.weight · Σ_j m_ij / norm.degree
-        h_i  = h_i + update_out.l(relu(update_in.l.weight [h_i, s_i] + update_in.l.bias))
-    y_i  = decoder.out(relu(decoder.in(h_i)))                      (n, 3), object vertices only
+        m_ij = relu(receive.l.weight h_i + send.l.weight h_j + edge.l.weight[κ_ij] e_ij + receive.l.bias)
+        s_iκ = mean_{j of kind κ} m_ij                             κ = 0, 1, 2
+        h_i  = h_i + update_out.l(relu(update_in.l.weight [h_i, s_i0, s_i1, s_i2] + update_in.l.bias))
+    y_i  = decoder.out(relu(decoder.in(h_i))) + skip.weight f_i     (n, 3), object vertices only
     x_i^{t+1} = 2 x_i^t - x_i^{t-1} + σ_acceleration · y_i         a correction of the inertial motion
     x_i^{t+1} = c_i^{t+1}                                          for control vertices
 
 **Tensors** of ``model.safetensors`` (float32 unless said; ``.weight`` is (out, in)):
     encoder.in.weight (H, 3h+7 or 3h+8), encoder.in.bias (H), encoder.out.weight (H, H), encoder.out.bias (H),
-    receive.{l}.weight (H, H), receive.{l}.bias (H), send.{l}.weight (H, H), edge.{l}.weight (H, 3h+10),
-    message.{l}.weight (H, H), update_in.{l}.weight (H, 2H), update_in.{l}.bias (H), update_out.{l}.weight (H, H),
-    update_out.{l}.bias (H), decoder.in.weight (H, H), decoder.in.bias (H), decoder.out.weight (3, H),
-    decoder.out.bias (3);
-    norm.velocity, norm.relative, norm.strain, norm.stretch, norm.acceleration, norm.length, norm.degree (1,),
+    receive.{l}.weight (H, H), receive.{l}.bias (H), send.{l}.weight (H, H), edge.{l}.weight (3, H, 3h+8),
+    update_in.{l}.weight (H, 4H), update_in.{l}.bias (H), update_out.{l}.weight (H, H), update_out.{l}.bias (H),
+    decoder.in.weight (H, H), decoder.in.bias (H), decoder.out.weight (3, H), decoder.out.bias (3),
+    skip.weight (3, 3h+7 or 3h+8);
+    norm.velocity, norm.acceleration, norm.length (1,), norm.relative, norm.strain, norm.stretch (3,),
     norm.properties (2,);
-    graph.neighbours (V, D) int64, V where the slot is empty; graph.rest_relative (V, D, 3).
-What ``physworld.worldmodel.files`` adds beside them for a scene is told there.
+    graph.neighbours (V, D) int64, V where the slot is empty; graph.edge_kind (V, D) int64; graph.rest_relative
+    (V, D, 3).
+What a published version adds for its scene is told in ``physworld.worldmodel.published``.
 
 **Split.** The first edge product of [h_i, h_j, e_ij] is taken apart: h_i and h_j are multiplied once per vertex
 and gathered on edges, and so is what of e_ij is linear in positions (r^t = x_j - x_i is a difference of vertex
 quantities). Per edge and step there remain a constant of the graph, computed once per sequence, and |r^t|. The
-second edge product follows the sum. The function is that of ``naive.NaiveWorldModel`` up to rounding.
+product of the messages with update_in follows the sum. The function is that of ``naive.NaiveWorldModel`` up to rounding.
 """
 
 from __future__ import annotations
@@ -61,7 +63,7 @@ import torch
 from torch import Tensor, nn
 
 from physworld.worldmodel.config import WorldModelConfig
-from physworld.worldmodel.graph import GraphSpec
+from physworld.worldmodel.graph import EDGE_KINDS, GraphSpec
 from physworld.worldmodel.messages import EdgeList, sum_messages
 
 PROPERTY_COUNT = 2
@@ -73,29 +75,29 @@ class Normalisation:
 
     Attributes:
         velocity: of vertex displacements per step.
-        relative: of relative displacements per step along edges.
-        strain: of r - r_rest along edges.
-        stretch: of |r| - |r_rest| along edges.
         acceleration: of x^{t+1} - 2 x^t + x^{t-1}.
+        relative: of relative displacements per step along edges, by edge kind.
+        strain: of r - r_rest along edges, by edge kind.
+        stretch: of |r| - |r_rest| along edges, by edge kind.
         properties: of Φ, (2,).
     """
 
     velocity: float = 1.0
-    relative: float = 1.0
-    strain: float = 1.0
-    stretch: float = 1.0
     acceleration: float = 1.0
+    relative: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    strain: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    stretch: tuple[float, float, float] = (1.0, 1.0, 1.0)
     properties: tuple[float, float] = (1.0, 1.0)
 
 
 @dataclass(frozen=True)
 class EdgeConstants:
-    """Per-layer edge terms that depend on weights and graph only: ``bias`` (E, H), ``position`` (3(h+1), H) for the
-    linear part of the positions, ``length`` (H,) for |r^t|."""
+    """Edge terms by layer and kind that depend on weights and graph only: ``bias`` (E, H), ``position`` (3(h+1), H)
+    for the linear part of the positions, ``length`` (H,) for |r^t|."""
 
-    bias: tuple[Tensor, ...]
-    position: tuple[Tensor, ...]
-    length: tuple[Tensor, ...]
+    bias: tuple[tuple[Tensor, ...], ...]
+    position: tuple[tuple[Tensor, ...], ...]
+    length: tuple[tuple[Tensor, ...], ...]
 
 
 class WorldModel(nn.Module):
@@ -112,33 +114,29 @@ class WorldModel(nn.Module):
         self.encoder = _two_layers(vertex_features, hidden, hidden)
         self.receive = nn.ModuleList(nn.Linear(hidden, hidden) for _ in range(layers))
         self.send = nn.ModuleList(nn.Linear(hidden, hidden, bias=False) for _ in range(layers))
-        self.edge = nn.ModuleList(nn.Linear(3 * h + 10, hidden, bias=False) for _ in range(layers))
-        self.message = nn.ModuleList(nn.Linear(hidden, hidden, bias=False) for _ in range(layers))
-        self.update_in = nn.ModuleList(nn.Linear(2 * hidden, hidden) for _ in range(layers))
+        self.edge = nn.ModuleList(_EdgeWeights(hidden, 3 * h + 8) for _ in range(layers))
+        self.update_in = nn.ModuleList(nn.Linear((1 + EDGE_KINDS) * hidden, hidden) for _ in range(layers))
         self.update_out = nn.ModuleList(nn.Linear(hidden, hidden) for _ in range(layers))
         self.decoder = _two_layers(hidden, hidden, 3)
+        self.skip = nn.Linear(vertex_features, 3, bias=False)
+        nn.init.zeros_(self.skip.weight)
         self._set_graph(spec)
-        self.norm = _Scales(normalisation or Normalisation(), spec, config)
+        self.norm = _Scales(normalisation or Normalisation(), spec)
 
     def _set_graph(self, spec: GraphSpec) -> None:
-        """Constants of the edges, in the order of the edge list."""
-        n = spec.object_count
-        self.edges = EdgeList.from_neighbours(spec.neighbours)
-        filled = spec.neighbours < spec.vertex_count
-        receivers, senders = np.nonzero(filled)[0], spec.neighbours[filled]
-        reference, rest = _reference_positions(spec), spec.rest_relative[filled]
-        controlled = (senders >= n) | (receivers >= n)
-        offset = reference[senders] - reference[receivers]
-        buffers = {
-            "_reference": reference,
-            "_offset": offset,
-            "_constants": np.column_stack(
-                [offset, offset - rest, np.linalg.norm(rest, axis=1), ~controlled, controlled]
-            ),
-        }
-        for name, value in buffers.items():
-            self.register_buffer(name, torch.as_tensor(value, dtype=torch.float32), persistent=False)
-        self.register_buffer("_senders", torch.as_tensor(senders, dtype=torch.int64), persistent=False)
+        """The edges of each kind and their constants, in the order of the edge lists."""
+        reference = _reference_positions(spec)
+        self.register_buffer("_reference", _single(reference), persistent=False)
+        self.edges = [EdgeList.from_neighbours(spec.neighbours, spec.edge_kind == k) for k in range(EDGE_KINDS)]
+        for kind, edges in enumerate(self.edges):
+            taken = (spec.neighbours < spec.vertex_count) & (spec.edge_kind == kind)
+            rest = spec.rest_relative[taken]
+            offset = reference[edges.senders] - reference[edges.receivers]
+            constants = np.column_stack([offset, offset - rest, np.linalg.norm(rest, axis=1)])
+            share = 1.0 / np.maximum(taken.sum(axis=1), 1)
+            self.register_buffer(f"_offset_{kind}", _single(offset), persistent=False)
+            self.register_buffer(f"_constants_{kind}", _single(constants), persistent=False)
+            self.register_buffer(f"_share_{kind}", _single(share), persistent=False)
 
     def forward(
         self, window: Tensor, action: Tensor, phi: Tensor, constants: EdgeConstants | None = None
@@ -152,25 +150,30 @@ class WorldModel(nn.Module):
             constants: ``edge_constants()``, when many steps share the weights.
         """
         constants = constants or self.edge_constants()
-        n, hidden = self.spec.object_count, self.config.hidden
+        n = self.spec.object_count
         moves = (window[1:] - window[:-1]).flip(0)
-        state = self.encoder(self._vertex_features(window, moves, action, phi))
+        features = self._vertex_features(window, moves, action, phi)
         shifted = window[-1] - self._reference[:, None]
         places = torch.cat([shifted, *moves.unbind(0)], dim=-1)
-        relative = shifted.index_select(0, self._senders) - shifted.index_select(0, self.edges.receivers)
-        length = torch.linalg.vector_norm(relative + self._offset[:, None], dim=-1)
+        lengths = [self._edge_lengths(shifted, kind) for kind in range(EDGE_KINDS)]
+        state = self.encoder(features)
         for layer in range(self.config.message_passing_steps):
-            placed = places @ constants.position[layer]
-            heard = self.receive[layer](state) - placed
-            sent = self.send[layer](state) + placed
-            received = sum_messages(
-                self.edges, heard, sent, constants.bias[layer], length, constants.length[layer]
-            )
-            own, other = self.update_in[layer].weight.split(hidden, dim=1)
-            other = other @ self.message[layer].weight / self.norm.degree
-            inner = state @ own.T + received @ other.T + self.update_in[layer].bias
+            heard, sent = self.receive[layer](state), self.send[layer](state)
+            gathered = [state]
+            for kind, edges in enumerate(self.edges):
+                placed = places @ constants.position[layer][kind]
+                total = sum_messages(
+                    edges,
+                    heard - placed,
+                    sent + placed,
+                    constants.bias[layer][kind],
+                    lengths[kind],
+                    constants.length[layer][kind],
+                )
+                gathered.append(total * getattr(self, f"_share_{kind}")[:, None, None])
+            inner = self.update_in[layer](torch.cat(gathered, dim=-1))
             state = state + self.update_out[layer](torch.relu(inner))
-        return self.decoder(state[:n])
+        return self.decoder(state[:n]) + self.skip(features[:n])
 
     def step(
         self, window: Tensor, control_next: Tensor, phi: Tensor, constants: EdgeConstants | None = None
@@ -183,17 +186,26 @@ class WorldModel(nn.Module):
 
     def edge_constants(self) -> EdgeConstants:
         """What of the edge products depends on weights and graph only; valid until the weights change."""
-        h, norm = self.config.history, self.norm
-        bias, position, length = [], [], []
-        for layer in self.edge:
-            weight = layer.weight.T
-            near, strain = weight[0:3] / norm.length, weight[3:6] / norm.strain
-            moves, rest = weight[6 : 6 + 3 * h] / norm.relative, weight[6 + 3 * h] / norm.length
-            stretch, kind = weight[7 + 3 * h] / norm.stretch, weight[8 + 3 * h :]
-            bias.append(self._constants @ torch.cat([near, strain, (rest - stretch)[None], kind]))
-            position.append(torch.cat([near + strain, moves]))
-            length.append(stretch)
-        return EdgeConstants(tuple(bias), tuple(position), tuple(length))
+        parts = [[self._edge_terms(layer.weight, k) for k in range(EDGE_KINDS)] for layer in self.edge]
+        bias, position, length = (
+            tuple(tuple(kind[term] for kind in layer) for layer in parts) for term in range(3)
+        )
+        return EdgeConstants(bias, position, length)
+
+    def _edge_terms(self, weights: Tensor, kind: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Bias, position and length terms of one layer and kind from its weights (3, H, 3h+8)."""
+        h, norm, weight = self.config.history, self.norm, weights[kind].T
+        near, strain = weight[0:3] / norm.length, weight[3:6] / norm.strain[kind]
+        moves, rest = weight[6 : 6 + 3 * h] / norm.relative[kind], weight[6 + 3 * h] / norm.length
+        stretch = weight[7 + 3 * h] / norm.stretch[kind]
+        bias = getattr(self, f"_constants_{kind}") @ torch.cat([near, strain, (rest - stretch)[None]])
+        return bias, torch.cat([near + strain, moves]), stretch
+
+    def _edge_lengths(self, shifted: Tensor, kind: int) -> Tensor:
+        """|r^t| of every edge of a kind [m], (E, B)."""
+        edges = self.edges[kind]
+        relative = shifted.index_select(0, edges.senders) - shifted.index_select(0, edges.receivers)
+        return torch.linalg.vector_norm(relative + getattr(self, f"_offset_{kind}")[:, None], dim=-1)
 
     def _vertex_features(self, window: Tensor, moves: Tensor, action: Tensor, phi: Tensor) -> Tensor:
         """f_i, (V, B, F)."""
@@ -211,17 +223,29 @@ class WorldModel(nn.Module):
         return torch.cat(parts, dim=-1)
 
 
-class _Scales(nn.Module):
-    """The scalars ``norm.*`` as float32 buffers of shape (1,), ``properties`` (2,)."""
+class _EdgeWeights(nn.Module):
+    """``weight`` (3, H, F): one linear map of the edge features for each kind of edge."""
 
-    def __init__(self, normalisation: Normalisation, spec: GraphSpec, config: WorldModelConfig) -> None:
+    def __init__(self, hidden: int, features: int) -> None:
         super().__init__()
-        values = {name: getattr(normalisation, name) for name in ("velocity", "relative", "strain", "stretch")}
-        values |= {"acceleration": normalisation.acceleration, "length": spec.edge_radius_m}
-        values["degree"] = float(config.neighbours)
+        bound = features**-0.5
+        self.weight = nn.Parameter(torch.empty(EDGE_KINDS, hidden, features).uniform_(-bound, bound))
+
+
+class _Scales(nn.Module):
+    """The scales ``norm.*`` as float32 buffers: (1,), by edge kind (3,), by property (2,)."""
+
+    def __init__(self, normalisation: Normalisation, spec: GraphSpec) -> None:
+        super().__init__()
+        values = {name: (getattr(normalisation, name),) for name in ("velocity", "acceleration")}
+        values |= {name: getattr(normalisation, name) for name in ("relative", "strain", "stretch", "properties")}
+        values["length"] = (spec.edge_radius_m,)
         for name, value in values.items():
-            self.register_buffer(name, torch.tensor([value], dtype=torch.float32))
-        self.register_buffer("properties", torch.tensor(normalisation.properties, dtype=torch.float32))
+            self.register_buffer(name, torch.tensor(value, dtype=torch.float32))
+
+
+def _single(values: np.ndarray) -> Tensor:
+    return torch.as_tensor(values, dtype=torch.float32)
 
 
 def _two_layers(inputs: int, hidden: int, outputs: int) -> nn.Sequential:

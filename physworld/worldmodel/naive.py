@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from physworld.worldmodel.graph import EDGE_KINDS
 from physworld.worldmodel.model import WorldModel
 
 
@@ -21,30 +22,31 @@ class NaiveWorldModel(nn.Module):
         spec = model.spec
         neighbours = torch.as_tensor(spec.neighbours)
         receiver, slot = torch.nonzero(neighbours < spec.vertex_count, as_tuple=True)
+        rest = torch.as_tensor(spec.rest_relative, dtype=torch.float32)[receiver, slot]
         self.register_buffer("receiver", receiver, persistent=False)
         self.register_buffer("sender", neighbours[receiver, slot], persistent=False)
-        rest = torch.as_tensor(spec.rest_relative, dtype=torch.float32)[receiver, slot]
+        self.register_buffer("kind", torch.as_tensor(spec.edge_kind)[receiver, slot], persistent=False)
         self.register_buffer("rest", rest, persistent=False)
-        controlled = (self.receiver >= spec.object_count) | (self.sender >= spec.object_count)
-        self.register_buffer("kind", torch.stack([~controlled, controlled], 1).float(), persistent=False)
 
     def edge_features(self, window: Tensor) -> Tensor:
-        """e_ij of every edge, (E, B, 3h + 10)."""
+        """e_ij of every edge, (E, B, 3h + 8)."""
         norm = self.model.norm
         batch = window.shape[2]
         relative = window[:, self.sender] - window[:, self.receiver]
         rest = self.rest[:, None].expand(-1, batch, -1)
         rest_length = torch.linalg.vector_norm(rest, dim=-1, keepdim=True)
         length = torch.linalg.vector_norm(relative[-1], dim=-1, keepdim=True)
-        moves = (relative[1:] - relative[:-1]).flip(0) / norm.relative
+        strain, drift, stretch = (
+            scale[self.kind][:, None, None] for scale in (norm.strain, norm.relative, norm.stretch)
+        )
+        moves = (relative[1:] - relative[:-1]).flip(0) / drift
         return torch.cat(
             [
                 relative[-1] / norm.length,
-                (relative[-1] - rest) / norm.strain,
+                (relative[-1] - rest) / strain,
                 *moves.unbind(0),
                 rest_length / norm.length,
-                (length - rest_length) / norm.stretch,
-                self.kind[:, None].expand(-1, batch, -1),
+                (length - rest_length) / stretch,
             ],
             dim=-1,
         )
@@ -53,16 +55,21 @@ class NaiveWorldModel(nn.Module):
         """Normalised accelerations (n, B, 3); arguments as ``WorldModel.forward``."""
         model = self.model
         moves = (window[1:] - window[:-1]).flip(0)
-        state = model.encoder(model._vertex_features(window, moves, action, phi))
+        features = model._vertex_features(window, moves, action, phi)
+        state = model.encoder(features)
         edges = self.edge_features(window)
+        kinds = [torch.nonzero(self.kind == k)[:, 0] for k in range(EDGE_KINDS)]
         for layer in range(model.config.message_passing_steps):
-            weight = torch.cat(
-                [model.receive[layer].weight, model.send[layer].weight, model.edge[layer].weight], dim=1
-            )
-            joined = torch.cat([state[self.receiver], state[self.sender], edges], dim=-1)
-            messages = torch.relu(joined @ weight.T + model.receive[layer].bias)
-            messages = messages @ model.message[layer].weight.T
-            total = torch.zeros_like(state).index_add(0, self.receiver, messages) / model.norm.degree
-            inner = model.update_in[layer](torch.cat([state, total], dim=-1))
+            ends = torch.cat([model.receive[layer].weight, model.send[layer].weight], dim=1)
+            own, *others = model.update_in[layer].weight.chunk(1 + EDGE_KINDS, dim=1)
+            inner = state @ own.T + model.update_in[layer].bias
+            for kind, taken in enumerate(kinds):
+                receiver = self.receiver[taken]
+                joined = torch.cat([state[receiver], state[self.sender[taken]], edges[taken]], dim=-1)
+                weight = torch.cat([ends, model.edge[layer].weight[kind]], dim=1)
+                messages = torch.relu(joined @ weight.T + model.receive[layer].bias) @ others[kind].T
+                degree = torch.bincount(receiver, minlength=state.shape[0]).clamp(min=1)
+                inner = inner + torch.zeros_like(state).index_add(0, receiver, messages) / degree[:, None, None]
             state = state + model.update_out[layer](torch.relu(inner))
-        return model.decoder(state[: model.spec.object_count])
+        n = model.spec.object_count
+        return model.decoder(state[:n]) + model.skip(features[:n])

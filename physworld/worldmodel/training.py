@@ -160,12 +160,12 @@ def _train_step(run: _Run, sampler: WindowSampler, training: TrainingConfig, loo
     loss.backward()
     norm = torch.nn.utils.clip_grad_norm_(model.parameters(), training.gradient_clip)
     if not (torch.isfinite(loss) and torch.isfinite(norm)):
-        raise TrainingDiverged(run.step, float(loss))
+        raise TrainingDiverged(run.step, loss.item())
     run.optimiser.step()
     keep = min(training.average_decay, (1.0 + run.step) / (10.0 + run.step))
     with torch.no_grad():
         torch._foreach_lerp_(list(run.average.parameters()), list(model.parameters()), 1.0 - keep)
-    return float(loss)
+    return loss.item()
 
 
 def _with_noise(window: Tensor, n: int, scale: Tensor, generator: torch.Generator) -> Tensor:
