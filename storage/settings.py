@@ -5,6 +5,7 @@ Embedded and distributed differ here and nowhere else::
     PHYSWORLD_DATA_DIR       folder of the embedded service            ~/.local/share/physworld
     PHYSWORLD_DATABASE_URL   sqlite:///… or postgresql://…             sqlite:///{data_dir}/physworld.db
     PHYSWORLD_BROKER_URL     redis://:password@host:port/0             none (the embedded service sets it)
+    PHYSWORLD_BROKER_PREFIX  of every key in a broker that is shared    none
     PHYSWORLD_STORE_URL      file:///folder or s3://bucket/prefix      file://{data_dir}/store
 """
 
@@ -33,6 +34,7 @@ class Settings(BaseSettings):
     data_dir: Path = Field(default_factory=lambda: Path.home() / ".local" / "share" / "physworld")
     database_url: str = Field(default="", repr=False)
     broker_url: SecretStr | None = None
+    broker_prefix: str = ""
     store_url: str = ""
     s3_endpoint: str | None = None
     s3_access_key_id: str | None = None

@@ -28,9 +28,10 @@ POLL_S = 0.05
 class ServiceProcess:
     """``python -m services.embedded`` on a data folder, in a session of its own; ended with the block."""
 
-    def __init__(self, data: Path, *options: str) -> None:
+    def __init__(self, data: Path, *options: str, variables: dict[str, str] | None = None) -> None:
         self.data = data
         self.options = options
+        self.variables = variables or {}
         self.output = data.parent / f"{data.name}.out"
         self.process: subprocess.Popen[bytes] | None = None
 
@@ -50,7 +51,7 @@ class ServiceProcess:
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "services.embedded", "--data", str(self.data), *self.options],
                 cwd=Path(__file__).resolve().parents[1],
-                env=environment(),
+                env={**environment(), **self.variables},
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=subprocess.STDOUT,

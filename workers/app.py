@@ -43,7 +43,7 @@ def create_app(settings: Settings) -> Celery:
         accept_content=["json"],
         broker_connection_max_retries=None,
         broker_connection_retry_on_startup=True,
-        broker_transport_options=transport_options(),
+        broker_transport_options=transport_options(settings.broker_prefix),
         enable_utc=True,
         result_accept_content=["json"],
         task_acks_late=True,
@@ -67,9 +67,10 @@ def create_app(settings: Settings) -> Celery:
     return app
 
 
-def transport_options() -> dict[str, Any]:
-    """Options of kombu's Redis transport, the same for consumers and the publisher."""
+def transport_options(prefix: str = "") -> dict[str, Any]:
+    """Options of kombu's Redis transport; ``prefix`` keeps installations apart that share a broker."""
     return {
+        "global_keyprefix": prefix,
         "health_check_interval": 10,
         "queue_order_strategy": "priority",
         "socket_connect_timeout": 5,

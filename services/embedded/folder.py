@@ -9,6 +9,7 @@ dies.
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import json
 import os
 import time
@@ -58,6 +59,11 @@ class DataFolder:
     def broker(self) -> Path:
         """The broker's append-only files."""
         return self.root / "broker"
+
+    @property
+    def digest(self) -> str:
+        """Eight characters that tell this folder from others."""
+        return hashlib.sha256(str(self.root.resolve()).encode()).hexdigest()[:8]
 
     @property
     def api_key(self) -> Path:

@@ -104,6 +104,8 @@ class Supervisor:
         environment = {**os.environ, "PHYSWORLD_DATA_DIR": str(self._folder.root), "PYTHONUNBUFFERED": "1"}
         broker = choose_broker(self._folder, environment)
         environment["PHYSWORLD_BROKER_URL"] = broker.url
+        if not broker.command:  # somebody else's: others may use it for the same
+            environment.setdefault("PHYSWORLD_BROKER_PREFIX", f"physworld-{self._folder.digest}:")
         settings = Settings(data_dir=self._folder.root, broker_url=SecretStr(broker.url))
         settings.check()
         self._prepare_database(settings)
@@ -135,11 +137,11 @@ class Supervisor:
         ]
         for number in range(1, self._options.workers + 1):
             name = f"worker-{number}"
-            command = (*python, "workers", "--queue", SIMULATION, "--name", name)
-            programs.append(self._python_program(name, command, environment, signal.SIGQUIT))
+            serve = (*python, "workers", "--queue", SIMULATION, "--name", name)
+            programs.append(self._python_program(name, serve, environment, signal.SIGQUIT))
         if self._options.trainer:
-            command = (*python, "services.trainer", "--name", "trainer")
-            programs.append(self._python_program("trainer", command, environment, signal.SIGQUIT))
+            train = (*python, "services.trainer", "--name", "trainer")
+            programs.append(self._python_program("trainer", train, environment, signal.SIGQUIT))
         return programs
 
     def _python_program(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import socket
@@ -13,11 +14,14 @@ from pathlib import Path
 
 import psutil
 import pytest
-from service_process import END_WITHIN_S, ServiceProcess, environment, until
+import redis
+from service_process import END_WITHIN_S, ServiceProcess, environment, until, wait_for_job
 from tiny_scene import register, tiny_scene
 
 from schemas.fit import FitConfig
 from schemas.job import Job
+from services.embedded.broker import choose_broker
+from services.embedded.folder import DataFolder
 from storage import jobs
 from storage.tables import ShardRow
 
@@ -25,6 +29,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
 
 RESTART_WITHIN_S = 60.0
 ANSWER_WITHIN_S = 60.0
+JOB_WITHIN_S = 120.0
 DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 
 
@@ -116,6 +121,38 @@ def test_work_that_ctrl_c_stopped_carries_on_untried_and_can_be_cancelled(tmp_pa
         until(lambda: job_now().state == "cancelled", "the fit does not stop", RESTART_WITHIN_S)
         assert service.interrupt() == 0
         database.dispose()
+
+
+def test_two_services_share_a_broker_without_taking_each_others_work(tmp_path: Path) -> None:
+    folder = DataFolder(tmp_path / "broker")
+    folder.prepare()
+    broker = choose_broker(folder, {})
+    with contextlib.ExitStack() as stack:
+        server = subprocess.Popen(broker.command, stdout=subprocess.DEVNULL)
+        stack.callback(server.wait)
+        stack.callback(server.terminate)
+        until(broker.answers, "no broker", RESTART_WITHIN_S)
+        started = []
+        for name in ("first", "second"):
+            variables = {"PHYSWORLD_BROKER_URL": broker.url}
+            service = ServiceProcess(tmp_path / name, "--workers", "1", "--no-trainer", variables=variables)
+            stack.enter_context(service)
+            service.start()
+            assert "broker" not in service.state()["children"]
+            database, stores = service.stores()
+            stack.callback(database.dispose)
+            scene_id = register(tiny_scene(), database, stores.artifacts)
+            with database.session() as session:
+                jobs_made = [
+                    jobs.create_fit(session, scene_id, FitConfig(particle_budget=60, max_simulations=1))
+                    for _ in range(4)
+                ]
+            started.append((database, jobs_made))
+        for database, jobs_made in started:
+            for job in jobs_made:
+                wait_for_job(database, job.id, JOB_WITHIN_S)
+        with redis.Redis.from_url(broker.url) as client:
+            assert all(key.startswith(b"physworld-") for key in client.scan_iter())
 
 
 def test_a_port_that_somebody_has_is_named(tmp_path: Path) -> None:
