@@ -8,6 +8,7 @@ from fastapi_offline import FastAPIOffline
 
 from services.api import errors
 from services.api.access import Access
+from services.api.closing import Closing
 from services.api.limits import BodyLimit
 from services.api.metrics import Metrics
 from services.api.openapi import describe
@@ -35,13 +36,16 @@ PARALLEL_UPLOADS = 2  # each holds its file in memory while it is parsed
 
 def create_api(settings: Settings, database: Database, stores: Stores) -> FastAPI:
     """The application on opened stores; its documentation is served from the installed package, at /docs."""
+    closing = Closing()
     app = FastAPIOffline(
         title="PhysWorld",
         version=VERSION,
         summary="From a recording of a deformable object to a published world model",
         redoc_url=None,
         docs_url="/docs",
+        lifespan=closing.lifespan,
     )
+    app.state.closing = closing
     app.state.settings = settings
     app.state.database = database
     app.state.stores = stores

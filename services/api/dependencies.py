@@ -7,6 +7,7 @@ from typing import Annotated, cast
 
 from fastapi import Depends, Path, Query, Request
 
+from services.api.closing import Closing
 from services.api.security import Principal
 from services.stores import Stores
 from storage.database import Database
@@ -30,6 +31,11 @@ def get_stores(request: Request) -> Stores:
 def get_app_settings(request: Request) -> Settings:
     """The settings that this process was started with."""
     return cast(Settings, request.app.state.settings)
+
+
+def get_closing(request: Request) -> Closing:
+    """Whether the server was told to stop."""
+    return cast(Closing, request.app.state.closing)
 
 
 def get_principal(request: Request) -> Principal:
@@ -58,6 +64,7 @@ def get_page_query(
 DatabaseDep = Annotated[Database, Depends(get_database)]
 StoresDep = Annotated[Stores, Depends(get_stores)]
 SettingsDep = Annotated[Settings, Depends(get_app_settings)]
+ClosingDep = Annotated[Closing, Depends(get_closing)]
 PrincipalDep = Annotated[Principal, Depends(get_principal)]
 PageDep = Annotated[PageQuery, Depends(get_page_query)]
 

@@ -12,7 +12,7 @@ from starlette.concurrency import run_in_threadpool
 
 from schemas.base import Page
 from schemas.job import TERMINAL_STATES, Job, JobKind, JobState
-from services.api.dependencies import DatabaseDep, ObjectId, PageDep
+from services.api.dependencies import ClosingDep, DatabaseDep, ObjectId, PageDep
 from services.api.errors import documented
 from services.api.idempotency import IdempotencyDep, accepted, job_links
 from services.api.sse import event_response, pending_events
@@ -41,6 +41,7 @@ def list_jobs(
 async def get_job(
     job_id: ObjectId,
     database: DatabaseDep,
+    closing: ClosingDep,
     wait: Annotated[
         float, Query(ge=0, le=MAX_WAIT_S, description="seconds to wait for the job's end before answering")
     ] = 0,
@@ -50,7 +51,7 @@ async def get_job(
     while True:
         job = await run_in_threadpool(_read, database, job_id)
         left = until - time.monotonic()
-        if job.state in TERMINAL_STATES or left <= 0:
+        if job.state in TERMINAL_STATES or left <= 0 or closing:
             return job_links(job)
         await anyio.sleep(min(POLL_S, left))
 
@@ -81,13 +82,14 @@ def cancel_job(job_id: ObjectId, idempotency: IdempotencyDep) -> Response:
 def follow_job(
     job_id: ObjectId,
     database: DatabaseDep,
+    closing: ClosingDep,
     last_event_id: Annotated[int, Header(ge=0, le=MAX_SEQ, description="resume after this event")] = 0,
 ) -> Response:
     """Follow a job until it has ended."""
     batch, ended = pending_events(database, job_id, last_event_id)
     if ended and not batch:
         return Response(status_code=204)
-    return event_response(database, job_id, batch, last_event_id, ended)
+    return event_response(database, job_id, batch, last_event_id, ended, closing)
 
 
 def _read(database: Database, job_id: str) -> Job:
