@@ -107,12 +107,11 @@ def scene_from_files(
         arrays = read_arrays(npz, limits)
     except ArchiveRefused as error:
         faults.append(FieldError(loc=[ARRAYS_NAME], msg=str(error)))
-    warnings: list[str] = []
-    if declared and arrays:
-        found, warnings = check_scene(declared, arrays)
-        faults += found
-    if faults or not declared:
-        raise SceneInvalid(faults or [FieldError(loc=[JSON_NAME], msg="is an empty object")])
+    if faults:
+        raise SceneInvalid(faults)
+    faults, warnings = check_scene(declared, arrays)
+    if faults:
+        raise SceneInvalid(faults)
     return scene_from_parts(declared, arrays), warnings
 
 

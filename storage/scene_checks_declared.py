@@ -64,8 +64,7 @@ def check_split(declaration: Declaration, measured: Measured, findings: Findings
 def check_gravity(declaration: Declaration, findings: Findings) -> None:
     """Metres per second squared, downwards along -z."""
     where = ["scene.json", "gravity_m_s2"]
-    gravity = np.asarray(declaration.gravity_m_s2)
-    strength = float(np.linalg.norm(gravity))
+    strength = math.hypot(*declaration.gravity_m_s2)
     if strength == 0.0:
         findings.warn(where, "is zero: nothing falls")
         return
@@ -80,7 +79,7 @@ def check_gravity(declaration: Declaration, findings: Findings) -> None:
         findings.fault(where, f"has strength {strength:.5g} m/s2, outside {GRAVITY_ALLOWED}{hint}")
     elif not GRAVITY_USUAL[0] <= strength <= GRAVITY_USUAL[1]:
         findings.warn(where, f"has strength {strength:.5g} m/s2; on Earth it is {STANDARD_GRAVITY:.4g}")
-    tilt = math.degrees(math.acos(max(-1.0, min(1.0, -gravity[2] / strength))))
+    tilt = math.degrees(math.acos(max(-1.0, min(1.0, -declaration.gravity_m_s2[2] / strength))))
     if tilt > 90.0 + TILT_WARNING_DEGREES:
         findings.fault(where, f"points up, {tilt:.1f} degrees from -z: the world frame is z up")
     elif tilt > TILT_WARNING_DEGREES:
@@ -265,7 +264,7 @@ def _check_extent(declaration: Declaration, measured: Measured, findings: Findin
         )
         return
     covered = declaration.initial_state.startswith("undeformed") and measured.seen[first].sum() >= MANY_POINTS
-    if larger > EXTENT_WARNING or (covered and declared / measured.size_m > EXTENT_WARNING):
+    if larger > EXTENT_WARNING or (covered and declared > EXTENT_WARNING * measured.size_m):
         findings.warn(
             where, f"declares {declared:.4g} m, the points of frame {first} measure {measured.size_m:.4g} m"
         )
@@ -291,7 +290,7 @@ def _check_region(
     margin = REGION_TOLERANCE_SIZES * max(measured.size_m, declared_size_m(body) or 0.0)
     low, high = np.subtract(grip.region_min_m, margin), np.add(grip.region_max_m, margin)
     volume = arrays.get("rest_volume_points")
-    if volume is not None and volume.ndim == 2 and volume.shape[1:] == (3,) and len(volume):
+    if volume is not None and volume.dtype.kind in "fiu" and volume.shape[1:] == (3,) and len(volume):
         material, what = np.asarray(volume, dtype=np.float64), f"{len(volume)} volume points"
     elif body.box_min_m is not None and body.box_max_m is not None:
         nearest = np.clip((low + high) / 2.0, body.box_min_m, body.box_max_m)

@@ -103,11 +103,13 @@ def check_arrays(arrays: dict[str, np.ndarray], findings: Findings) -> Measured 
     if ("ctrl_times" in arrays) != ("ctrl_points" in arrays):
         findings.fault(["scene.npz", "ctrl_times"], "ctrl_times and ctrl_points come together or not at all")
     lengths: dict[str, tuple[int, str]] = {}
-    sound = all(name in arrays for name in REQUIRED)
-    for name, wanted in ARRAY_SHAPES.items():
-        if name in arrays and not _check_shape(name, arrays[name], wanted, lengths, findings):
-            sound = sound and name not in REQUIRED
-    if not sound:
+    sound = {
+        name
+        for name, wanted in ARRAY_SHAPES.items()
+        if name in arrays and _check_shape(name, arrays[name], wanted, lengths, findings)
+    }
+    _check_others(arrays, findings)
+    if not sound.issuperset(REQUIRED):
         return None
     frames, count = arrays["points"].shape[:2]
     if frames < 2:
@@ -118,8 +120,8 @@ def check_arrays(arrays: dict[str, np.ndarray], findings: Findings) -> Measured 
         findings.warn(["scene.npz", "controllers"], "there is none: nothing drives the object")
     if frames < 2 or count < 1:
         return None
-    for name in ("controllers", "times", *(n for n in ARRAY_SHAPES if n not in REQUIRED)):
-        if name in arrays:
+    for name in ARRAY_SHAPES:
+        if name in sound and name not in ("points", "visible"):
             _check_finite(name, arrays[name], findings)
     return _measure(arrays, findings)
 
@@ -320,6 +322,25 @@ def _check_shape(
     if name == "rest_volume_points" and not len(array):
         findings.fault(where, "is empty")
     return agrees
+
+
+def _check_others(arrays: dict[str, np.ndarray], findings: Findings) -> None:
+    """Arrays of more than one allowed shape, and those that no code here reads: plain numbers at least."""
+    points = arrays.get("points")
+    for name, array in arrays.items():
+        where = ["scene.npz", name]
+        if name not in ARRAY_SHAPES and array.dtype.kind not in "biuf":
+            findings.fault(where, f"holds {array.dtype}, not numbers")
+        elif name == "colors" and points is not None and array.shape not in (points.shape, points.shape[1:]):
+            findings.fault(where, f"has shape {array.shape}, neither {points.shape} nor {points.shape[1:]}")
+        elif name == "part_features":
+            volume = arrays.get("rest_volume_points", np.zeros((0, 3)))
+            owners = {len(volume), 0 if points is None or points.ndim < 2 else points.shape[1]} - {0}
+            if array.ndim != 2 or len(array) not in owners:
+                counts = " or ".join(str(n) for n in sorted(owners))
+                findings.fault(where, f"has shape {array.shape}, not (points, features) for {counts} points")
+            else:
+                _check_finite(name, array, findings)
 
 
 def _check_finite(name: str, array: np.ndarray, findings: Findings) -> None:

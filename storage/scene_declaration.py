@@ -123,19 +123,22 @@ def parse_json(text: bytes) -> tuple[dict[str, Any], list[FieldError]]:
         return {}, [FieldError(loc=where, msg=f"holds a {type(declared).__name__}, not an object")]
     if _depth(declared) > MAX_DEPTH:
         return {}, [FieldError(loc=where, msg=f"nests deeper than {MAX_DEPTH} levels")]
-    faults = [
-        FieldError(loc=[*where, *path], msg=f"is {value}, which JSON has no word for")
-        for path, value in _non_finite(declared, [])
-    ]
-    return declared, faults
+    return declared, []
 
 
 def check_form(declared: dict[str, Any]) -> tuple[Declaration | None, list[FieldError]]:
-    """``declared`` as the form, or every fault of it."""
+    """``declared`` as the form, or every fault of it; NaN and infinities are faults wherever they are."""
+    faults = [
+        FieldError(loc=["scene.json", *path], msg=f"is {value}, which JSON has no word for")
+        for path, value in _non_finite(declared, [])
+    ]
     try:
-        return Declaration.model_validate_json(json.dumps(declared)), []
+        declaration = Declaration.model_validate_json(json.dumps(declared))
     except ValidationError as error:
-        return None, [_field_error(fault) for fault in error.errors(include_url=False, include_context=False)]
+        named = [fault.loc for fault in faults]
+        found = [_field_error(fault) for fault in error.errors(include_url=False, include_context=False)]
+        return None, faults + [fault for fault in found if fault.loc not in named]
+    return (None if faults else declaration), faults
 
 
 def _field_error(fault: Any) -> FieldError:

@@ -47,9 +47,10 @@ def check_scene(
     findings = Findings(faults=form_faults)
     if declaration is not None:
         check_gravity(declaration, findings)
-    measured = check_arrays(arrays, findings)
-    if measured is not None:
-        _check_measured(declaration, arrays, measured, findings)
+    with np.errstate(over="ignore", invalid="ignore"):  # absurd values overflow, and are then named
+        measured = check_arrays(arrays, findings)
+        if measured is not None:
+            _check_measured(declaration, arrays, measured, findings)
     return findings.faults, findings.warnings
 
 
