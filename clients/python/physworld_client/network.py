@@ -4,8 +4,8 @@ The equations and the names of the tensors are those of ``physworld.worldmodel.m
 from them alone and needs neither torch nor the library. Geometry is computed in double precision, the layers
 in single precision, as they were trained.
 
-Legend: n object vertices, C control vertices, V = n + C; E directed edges, sorted by receiver; H width; h
-history; L message passing steps; F edge features, 3h + 10.
+Legend: n object vertices, C control vertices, V = n + C; E directed edges, sorted by receiver and kind; H
+width; h history; L message passing steps; F edge features, 3h + 8.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 
 from physworld_client.errors import ModelUnreadable
 
+EDGE_KINDS = 3  # near, coarse, grip
 PROPERTY_COUNT = 2
 
 
@@ -23,27 +24,32 @@ class Network:
     """Encode, process, decode.
 
     Attributes:
-        object_count: n. control_count: C. history: h.
+        object_count: n.
+        control_count: C.
+        history: h; a step sees h + 1 frames.
         has_ground: whether the vertices see their height above the ground.
     """
 
     def __init__(self, tensors: Mapping[str, np.ndarray], object_count: int) -> None:
         self._tensors = tensors
         self.layers = sum(name.startswith("receive.") and name.endswith(".weight") for name in tensors)
-        neighbours = self._tensor("graph.neighbours").astype(np.int64)
-        vertex_count = neighbours.shape[0]
+        vertex_count = self._tensor("graph.neighbours").shape[0]
         self.object_count = object_count
         self.control_count = vertex_count - object_count
-        features = self._tensor("edge.0.weight").shape[1]
-        self.history = (features - 10) // 3
+        kinds, _, features = self._tensor("edge.0.weight").shape
+        self.history = (features - 8) // 3
         inputs = self._tensor("encoder.in.weight").shape[1] - (3 * self.history + 5 + PROPERTY_COUNT)
-        if self.control_count < 0 or features != 3 * self.history + 10 or inputs not in (0, 1):
+        fits = features == 3 * self.history + 8 and kinds == EDGE_KINDS and inputs in (0, 1)
+        if self.control_count < 0 or not fits:
             raise ModelUnreadable(
                 f"the tensors do not fit together: {vertex_count} vertices, {object_count} of the object, "
-                f"{features} edge features, {inputs} inputs beyond those of history {self.history}"
+                f"{kinds} kinds of edges, {features} edge features, {inputs} inputs beyond those of history "
+                f"{self.history}"
             )
         self.has_ground = inputs == 1
-        self._prepare(neighbours)
+        self._sort_edges(vertex_count)
+        layers = [self._tensor(f"edge.{layer}.weight") for layer in range(self.layers)]
+        self._edge_weights = np.concatenate(layers, axis=1).transpose(0, 2, 1).copy()
 
     def step(self, window: np.ndarray, control_next: np.ndarray, phi: np.ndarray) -> np.ndarray:
         """Positions of all vertices one clock tick later [m], (V, 3).
@@ -56,37 +62,41 @@ class Network:
         n = self.object_count
         features = self._vertex_features(window, control_next - window[-1, n:], phi)
         state = self._mlp("encoder", features)
-        edges = self._edge_features(window) @ self._edge_weights
-        edges = edges.reshape(len(edges), self.layers, -1)
+        edges = self._edge_terms(window)
         for layer in range(self.layers):
             heard = self._linear(f"receive.{layer}", state)
             sent = state @ self._tensor(f"send.{layer}.weight").T
             messages = np.maximum(heard[self._receivers] + sent[self._senders] + edges[:, layer], 0.0)
-            mean = np.add.reduceat(messages, self._first, axis=0) * self._share
-            received = mean @ self._tensor(f"message.{layer}.weight").T
-            inner = self._linear(f"update_in.{layer}", np.concatenate([state, received], axis=1))
+            inner = self._linear(f"update_in.{layer}", np.hstack([state, self._means(messages)]))
             state = state + self._linear(f"update_out.{layer}", np.maximum(inner, 0.0))
         correction = self._mlp("decoder", state[:n]) + features[:n] @ self._tensor("skip.weight").T
         inertial = 2.0 * window[-1, :n] - window[-2, :n]
         moved = inertial + self._scale("acceleration") * correction.astype(np.float64)
         return np.concatenate([moved, control_next])
 
-    def _prepare(self, neighbours: np.ndarray) -> None:
-        """What depends on weights and graph only."""
-        vertex_count, n = neighbours.shape[0], self.object_count
+    def _sort_edges(self, vertex_count: int) -> None:
+        """The edge list, and where the edges of one receiver and kind begin in it."""
+        neighbours = self._tensor("graph.neighbours")
         receivers, slots = np.nonzero(neighbours < vertex_count)
-        degree = np.bincount(receivers, minlength=vertex_count)
-        if not degree.all():
-            raise ModelUnreadable(f"vertex {int(np.argmin(degree))} of the graph hears nobody")
+        kinds = self._tensor("graph.edge_kind")[receivers, slots]
+        segments = receivers * EDGE_KINDS + kinds
+        order = np.argsort(segments, kind="stable")
+        receivers, slots, self._kinds = receivers[order], slots[order], kinds[order]
         self._receivers, self._senders = receivers, neighbours[receivers, slots]
-        self._first = np.concatenate([[0], np.cumsum(degree)[:-1]])
-        self._share = (1.0 / degree[:, None]).astype(np.float32)
         self._rest = self._tensor("graph.rest_relative").astype(np.float64)[receivers, slots]
         self._rest_length = np.linalg.norm(self._rest, axis=1, keepdims=True)
-        controlled = (receivers >= n) | (self._senders >= n)
-        self._kind = np.stack([~controlled, controlled], axis=1).astype(np.float64)
-        layers = [self._tensor(f"edge.{layer}.weight") for layer in range(self.layers)]
-        self._edge_weights = np.concatenate(layers).T.copy()
+        self._segments, self._first, counts = np.unique(
+            segments[order], return_index=True, return_counts=True
+        )
+        self._share = (1.0 / counts[:, None]).astype(np.float32)
+        self._of_kind = [np.nonzero(self._kinds == kind)[0] for kind in range(EDGE_KINDS)]
+
+    def _means(self, messages: np.ndarray) -> np.ndarray:
+        """Means of the messages (E, H) by receiver and kind, (V, 3H); 0 where there is no such edge."""
+        vertex_count, width = self.object_count + self.control_count, messages.shape[1]
+        means = np.zeros((vertex_count * EDGE_KINDS, width), dtype=messages.dtype)
+        means[self._segments] = np.add.reduceat(messages, self._first, axis=0) * self._share
+        return means.reshape(vertex_count, EDGE_KINDS * width)
 
     def _vertex_features(self, window: np.ndarray, action: np.ndarray, phi: np.ndarray) -> np.ndarray:
         """f_i, (V, 3h+7 or 3h+8): own velocities newest first, action, properties, kind, height."""
@@ -102,20 +112,23 @@ class Network:
             parts.append(np.clip(window[-1, :, 2:] / self._scale("length"), 0.0, 1.0))
         return np.concatenate(parts, axis=1).astype(np.float32)
 
-    def _edge_features(self, window: np.ndarray) -> np.ndarray:
-        """e_ij, (E, F)."""
+    def _edge_terms(self, window: np.ndarray) -> np.ndarray:
+        """edge.l.weight[κ] e_ij of every edge and layer, (E, L, H)."""
         relative = window[:, self._senders] - window[:, self._receivers]
         length = np.linalg.norm(relative[-1], axis=1, keepdims=True)
-        moves = (relative[1:] - relative[:-1])[::-1] / self._scale("relative")
+        moves = (relative[1:] - relative[:-1])[::-1] / self._scale_by_kind("relative")
         parts = [
             relative[-1] / self._scale("length"),
-            (relative[-1] - self._rest) / self._scale("strain"),
+            (relative[-1] - self._rest) / self._scale_by_kind("strain"),
             *moves,
             self._rest_length / self._scale("length"),
-            (length - self._rest_length) / self._scale("stretch"),
-            self._kind,
+            (length - self._rest_length) / self._scale_by_kind("stretch"),
         ]
-        return np.concatenate(parts, axis=1).astype(np.float32)
+        features = np.concatenate(parts, axis=1).astype(np.float32)
+        terms = np.empty((len(features), self._edge_weights.shape[2]), dtype=np.float32)
+        for kind, edges in enumerate(self._of_kind):
+            terms[edges] = features[edges] @ self._edge_weights[kind]
+        return terms.reshape(len(features), self.layers, -1)
 
     def _mlp(self, name: str, values: np.ndarray) -> np.ndarray:
         return self._linear(f"{name}.out", np.maximum(self._linear(f"{name}.in", values), 0.0))
@@ -125,6 +138,10 @@ class Network:
 
     def _scale(self, name: str) -> float:
         return float(self._tensor(f"norm.{name}")[0])
+
+    def _scale_by_kind(self, name: str) -> np.ndarray:
+        """σ_name[κ] of every edge, (E, 1)."""
+        return self._tensor(f"norm.{name}").astype(np.float64)[self._kinds][:, None]
 
     def _tensor(self, name: str) -> np.ndarray:
         try:

@@ -1,7 +1,7 @@
 """The commands and their common end: an error is one clear line on standard error and an exit code.
 
 Exit codes: 0 done, 1 the work failed or the service said no, 2 the command line is wrong, 3 ``up`` on a data
-folder where the service already runs, 130 interrupted.
+folder where the service already runs, 130 interrupted (Typer's).
 """
 
 from __future__ import annotations
@@ -18,8 +18,6 @@ import typer
 from physworld_client.cli import lists, run, up
 from physworld_client.cli.output import stderr
 from physworld_client.errors import PhysWorldError
-
-INTERRUPTED = 130
 
 app = typer.Typer(
     name="physworld",
@@ -52,9 +50,6 @@ def main() -> None:
     except PhysWorldError as error:
         stderr.print(f"error: {error}", markup=False, highlight=False, soft_wrap=True)
         sys.exit(1)
-    except KeyboardInterrupt:
-        stderr.print("interrupted")
-        sys.exit(INTERRUPTED)
     except BrokenPipeError:
         # The reader of our output has left (``physworld jobs list | head``): not an error of ours.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

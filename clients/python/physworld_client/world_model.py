@@ -1,0 +1,179 @@
+"""A published world model without the service: load a downloaded version, roll it out on NumPy arrays.
+
+    model = WorldModel.load("models/beam-1")
+    vertices = model.rollout(controllers)      # (T, n, 3) from (T, K, 3), model.dt_s apart
+    points = model.track(vertices)             # (T, N, 3), the scene's measured points
+
+The files are checked against the manifest before anything of them is read. Needs numpy and safetensors. The
+tensors and their meaning: ``physworld.worldmodel.model`` and ``physworld.worldmodel.published``.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load_file
+
+from physworld_client.errors import ModelUnreadable
+from physworld_client.manifest import CARD_NAME, WEIGHTS_NAME, verify_folder
+from physworld_client.network import PROPERTY_COUNT, Network
+
+
+@dataclass(frozen=True)
+class WorldModel:
+    """A loaded version. Positions in metres, world frame z up; the clock ticks every ``dt_s`` seconds.
+
+    Attributes:
+        name, version: of the registry.
+        card: the model card: lineage, metrics, versions, seeds.
+        dt_s: the model's time step [s].
+        start_history: object vertices at the first h+1 ticks of the recording, (h+1, n, 3).
+        start_controllers: all controllers at these ticks, (h+1, K, 3).
+        start_time_s: time of the first of them in the recording [s].
+        rest_vertices: undeformed places of the object vertices, (n, 3).
+        control_index: the controller that each control vertex is, (C,).
+        phi: log property ratios (E, density) after fine-tuning, (n, 2).
+        phi_calibrated: before it, (n, 2).
+        ground_height_m: height of the ground plane, None without one.
+    """
+
+    name: str
+    version: int
+    card: dict[str, Any]
+    dt_s: float
+    start_history: np.ndarray
+    start_controllers: np.ndarray
+    start_time_s: float
+    rest_vertices: np.ndarray
+    control_index: np.ndarray
+    phi: np.ndarray
+    phi_calibrated: np.ndarray
+    ground_height_m: float | None
+    _network: Network
+    _skin: tuple[np.ndarray, np.ndarray] | None
+
+    @classmethod
+    def load(cls, folder: str | Path, *, sha256: str | None = None) -> WorldModel:
+        """Loads a folder written by ``client.models.download``.
+
+        Args:
+            sha256: the version's digest, when known from elsewhere; the folder must be exactly that version.
+
+        Raises:
+            DigestMismatch: a file is not the published one.
+            ModelUnreadable: a file is missing, or the artifact has a layout that this client does not know.
+        """
+        place = Path(folder)
+        manifest = verify_folder(place, sha256)
+        missing = [name for name in (WEIGHTS_NAME, CARD_NAME) if name not in manifest.files]
+        if missing:
+            raise ModelUnreadable(f"the manifest in {place} lists no {' and no '.join(missing)}")
+        try:
+            tensors = load_file(place / WEIGHTS_NAME)
+            card = json.loads((place / CARD_NAME).read_bytes())
+            facts = card["architecture"]
+            dt_s, ground = float(facts["dt_s"]), facts["ground_height_m"]
+        except (SafetensorError, ValueError, KeyError, TypeError) as error:
+            raise ModelUnreadable(f"{place} is not a world model of a known layout: {error!r}") from error
+        return cls._assemble(manifest.name, manifest.version, card, dt_s, ground, tensors)
+
+    @classmethod
+    def _assemble(
+        cls,
+        name: str,
+        version: int,
+        card: dict[str, Any],
+        dt_s: float,
+        ground_height_m: float | None,
+        tensors: Mapping[str, np.ndarray],
+    ) -> WorldModel:
+        """The model of verified tensors."""
+
+        def tensor(key: str) -> np.ndarray:
+            if key not in tensors:
+                raise ModelUnreadable(f"{name} version {version} lacks the tensor {key!r}")
+            return tensors[key]
+
+        rest = tensor("rest.vertices").astype(np.float64)
+        network = Network(tensors, len(rest))
+        if network.has_ground != (ground_height_m is not None):
+            raise ModelUnreadable(
+                f"{name} version {version}: ground height {ground_height_m} against its weights"
+            )
+        skin = None
+        if "skin.index" in tensors:
+            skin = (tensors["skin.index"], tensor("skin.weight").astype(np.float64))
+        return cls(
+            name=name,
+            version=version,
+            card=card,
+            dt_s=dt_s,
+            start_history=tensor("start.history").astype(np.float64),
+            start_controllers=tensor("start.controllers").astype(np.float64),
+            start_time_s=float(tensor("start.time")[0]),
+            rest_vertices=rest,
+            control_index=tensor("control.index"),
+            phi=tensor("phi").astype(np.float64),
+            phi_calibrated=tensor("phi.calibrated").astype(np.float64),
+            ground_height_m=ground_height_m,
+            _network=network,
+            _skin=skin,
+        )
+
+    @property
+    def history(self) -> int:
+        """h: a step looks back so many ticks."""
+        return self._network.history
+
+    @property
+    def controller_count(self) -> int:
+        """K, the controllers of the scene."""
+        return int(self.start_controllers.shape[1])
+
+    def rollout(
+        self, controllers: np.ndarray, phi: np.ndarray | None = None, *, history: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Object vertices over time [m], (T, n, 3); the first h+1 frames are the history itself.
+
+        Args:
+            controllers: all controllers at T ticks [m], (T, K, 3); the first h+1 belong to the history.
+            phi: log property ratios, (n, 2); by default those of the fine-tuning. Adding log 2 to the first
+                column doubles the stiffness.
+            history: object vertices at the first h+1 ticks [m], (h+1, n, 3); by default the recording's.
+                From rest: one frame h+1 times, with controllers that stand still as long.
+        """
+        frames, n = self.history + 1, self._network.object_count
+        start = self.start_history if history is None else np.asarray(history, dtype=np.float64)
+        driven = np.asarray(controllers, dtype=np.float64)
+        properties = self.phi if phi is None else np.asarray(phi, dtype=np.float64)
+        if driven.ndim != 3 or driven.shape[1:] != (self.controller_count, 3) or len(driven) < frames:
+            raise ValueError(f"controllers {driven.shape}, not (T >= {frames}, {self.controller_count}, 3)")
+        if start.shape != (frames, n, 3) or properties.shape != (n, PROPERTY_COUNT):
+            raise ValueError(
+                f"history {start.shape} and phi {properties.shape}, not {(frames, n, 3)} and "
+                f"{(n, PROPERTY_COUNT)}"
+            )
+        origin = start[-1].mean(axis=0)
+        if self.ground_height_m is not None:
+            origin[2] = self.ground_height_m
+        controls = driven[:, self.control_index] - origin
+        path = np.empty((len(driven), n + len(self.control_index), 3))
+        path[:frames, :n] = start - origin
+        path[:, n:] = controls
+        for tick in range(frames, len(driven)):
+            path[tick] = self._network.step(path[tick - frames : tick], controls[tick], properties)
+        return path[:, :n] + origin
+
+    def track(self, vertices: np.ndarray) -> np.ndarray:
+        """The scene's measured points that vertices (T, n, 3) carry [m], (T, N, 3)."""
+        if self._skin is None:
+            raise ModelUnreadable(f"{self.name} version {self.version} carries no measured points")
+        index, weight = self._skin
+        points: np.ndarray = np.einsum("mk,...mkx->...mx", weight, np.asarray(vertices)[..., index, :])
+        return points
