@@ -68,8 +68,9 @@ def test_a_failure_leaves_the_key_free(client: httpx.Client) -> None:
 
 def test_upload_is_the_same_whatever_its_boundary(client: httpx.Client) -> None:
     client.headers["Idempotency-Key"] = "upload"
-    first = upload(client, bundle("keyed"))
-    again = upload(client, bundle("keyed"))
+    data = bundle("keyed")
+    first = upload(client, data)
+    again = upload(client, data)
     assert first.status_code == again.status_code == 201
     assert again.headers["Idempotent-Replayed"] == "true"
     assert again.content == first.content
