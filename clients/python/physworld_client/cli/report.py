@@ -149,5 +149,5 @@ def _parameter_line(name: str, parameter: Mapping[str, Any]) -> str:
         low, high = parameter["ci95"]
         text += f" (95 %: {low:.4g} to {high:.4g})"
     if not parameter.get("identified", True):
-        text += ", not identified: held at its prior"
+        text += f", not identified: {parameter.get('note') or 'held at its prior'}"
     return text
