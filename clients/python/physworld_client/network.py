@@ -70,8 +70,8 @@ class Network:
             inner = self._linear(f"update_in.{layer}", np.hstack([state, self._means(messages)]))
             state = state + self._linear(f"update_out.{layer}", np.maximum(inner, 0.0))
         correction = self._mlp("decoder", state[:n]) + features[:n] @ self._tensor("skip.weight").T
-        inertial = 2.0 * window[-1, :n] - window[-2, :n]
-        moved = inertial + self._scale("acceleration") * correction.astype(np.float64)
+        inertial = window[-1, :n] + self._scale("inertia") * (window[-1, :n] - window[-2, :n])
+        moved = inertial + self._scale("change") * correction.astype(np.float64)
         return np.concatenate([moved, control_next])
 
     def _sort_edges(self, vertex_count: int) -> None:

@@ -24,6 +24,8 @@ from physworld_client.errors import ModelUnreadable
 from physworld_client.manifest import CARD_NAME, WEIGHTS_NAME, verify_folder
 from physworld_client.network import PROPERTY_COUNT, Network
 
+CARD_SCHEMA = 1
+
 
 @dataclass(frozen=True)
 class WorldModel:
@@ -77,10 +79,15 @@ class WorldModel:
         try:
             tensors = load_file(place / WEIGHTS_NAME)
             card = json.loads((place / CARD_NAME).read_bytes())
-            facts = card["architecture"]
+            known, facts = card["schema_version"] == CARD_SCHEMA, card["architecture"]
             dt_s, ground = float(facts["dt_s"]), facts["ground_height_m"]
         except (SafetensorError, ValueError, KeyError, TypeError) as error:
             raise ModelUnreadable(f"{place} is not a world model of a known layout: {error!r}") from error
+        if not known:
+            raise ModelUnreadable(
+                f"{place} is not a world model of a known layout: its card has schema_version "
+                f"{card['schema_version']}, this client reads {CARD_SCHEMA}"
+            )
         return cls._assemble(manifest.name, manifest.version, card, dt_s, ground, tensors)
 
     @classmethod

@@ -40,7 +40,7 @@ def published(ground_height_m: float | None = None) -> PublishedModel:
         control_groups=(np.arange(3), np.arange(3, 6)),
         ground_height_m=ground_height_m,
     )
-    scales = {"velocity": 5e-3, "acceleration": 1e-3}
+    scales = {"velocity": 5e-3, "inertia": 0.9, "change": 1e-3}
     names = {field.name for field in dataclasses.fields(Normalisation)} - {*scales, "properties"}
     torch.manual_seed(3)
     model = Network(config, spec, Normalisation(**scales, properties=(0.2, 0.1)))
@@ -65,7 +65,7 @@ def published(ground_height_m: float | None = None) -> PublishedModel:
 def write(folder: Path, model: PublishedModel) -> str:
     """The files of a version; the digest of its manifest."""
     save_file(model.to_tensors(), folder / "model.safetensors")
-    (folder / "card.json").write_text(json.dumps({"architecture": model.facts()}))
+    (folder / "card.json").write_text(json.dumps({"schema_version": 1, "architecture": model.facts()}))
     return seal(folder)
 
 
@@ -157,13 +157,20 @@ def test_a_missing_tensor_is_named(tmp_path: Path, tensor: str) -> None:
     tensors = model.to_tensors()
     del tensors[tensor]
     save_file(tensors, tmp_path / "model.safetensors")
-    (tmp_path / "card.json").write_text(json.dumps({"architecture": model.facts()}))
+    (tmp_path / "card.json").write_text(json.dumps({"schema_version": 1, "architecture": model.facts()}))
     seal(tmp_path)
     with pytest.raises(ModelUnreadable, match=tensor):
         WorldModel.load(tmp_path).rollout(driven(model))
 
 
-@pytest.mark.parametrize(("name", "data"), [("card.json", b"{}"), ("model.safetensors", b"not tensors")])
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [
+        ("card.json", b"{}"),
+        ("card.json", b'{"schema_version": 2, "architecture": {"dt_s": 1, "ground_height_m": null}}'),
+        ("model.safetensors", b"not tensors"),
+    ],
+)
 def test_an_unknown_layout_is_refused(tmp_path: Path, name: str, data: bytes) -> None:
     write(tmp_path, published())
     (tmp_path / name).write_bytes(data)
