@@ -271,6 +271,18 @@ def test_recovery_ends_every_lease_and_forgets_every_message(work: Work) -> None
         assert len(leases.publishable(session, now)) == 3
 
 
+def test_leases_of_the_provably_dead_end_at_once(work: Work) -> None:
+    work.dataset(episodes=2)
+    work.complete(work.claim())
+    dead, alive = work.claim(owner="dead"), work.claim(owner="alive")
+    now = utc_now()
+    with work.database.session() as session:
+        assert leases.end_leases_of(session, lambda owner: owner == "dead", now) == 1
+        assert leases.reap(session, now) == [dead.shard_id]
+    assert not work.complete(dead)
+    assert work.complete(alive)
+
+
 def test_reapers_at_the_same_time_requeue_a_shard_once(work: Work) -> None:
     work.dataset(episodes=6)
     work.complete(work.claim())
