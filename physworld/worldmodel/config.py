@@ -19,6 +19,7 @@ class WorldModelConfig:
         edge_radius_spacings: no edge between object vertices is longer than this many vertex spacings d_v.
         coarse_vertices: so many vertices, spread over the body, are linked with each other.
         coarse_links: and every vertex with so many of them; 0 leaves the paper's local graph.
+        modes: most modes of the modal prior.
         control_vertices_all, control_vertices_per_grip: with more than ``control_vertices_all`` controllers, so many of each rigid
             group become vertices.
     """
@@ -31,6 +32,7 @@ class WorldModelConfig:
     edge_radius_spacings: float = 6.0
     coarse_vertices: int = 12
     coarse_links: int = 2
+    modes: int = 48
     control_vertices_all: int = 16
     control_vertices_per_grip: int = 6
 
@@ -51,7 +53,7 @@ class TrainingConfig:
         learning_rate: Adam's, decayed by a cosine to ``learning_rate_floor`` of itself.
         gradient_clip: largest norm of the gradient.
         noise_history: standard deviation of the random walk's end on the history, in units of the data's
-            root-mean-square acceleration per step (m); it teaches the network to pull errors back.
+            root-mean-square change of displacement per step; it teaches the network to pull errors back.
         noise_properties: standard deviation of the noise on Φ, in units of the data's spread of Φ.
         average_decay: decay of the running average of the weights that is validated and published.
         validation_fraction: share of the episodes held out whole.

@@ -6,6 +6,7 @@ An episode's arrays: ``times`` (T,) [s], ``particles`` (T, P, 3) [m], ``controll
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,14 +77,17 @@ def split_tracks(tracks: list[Track], fraction: float, seed: int) -> tuple[list[
     return [tracks[i] for i in order[held_out:]], [tracks[i] for i in order[:held_out]]
 
 
-def measure_scales(tracks: list[Track], spec: GraphSpec) -> Normalisation:
-    """Root-mean-square scales over all frames of all object vertices and edges."""
+def measure_scales(tracks: list[Track], spec: GraphSpec, residual: Callable[[Track], Tensor]) -> Normalisation:
+    """Root-mean-square scales over all frames of all object vertices and edges.
+
+    ``residual`` gives what the modal prior leaves of a track's steps [m], (…, n, 3).
+    """
     n = spec.object_count
     squares: dict[str, float] = {}
     for track in tracks:
         x = track.positions
         _add(squares, "velocity", x[1:, :n] - x[:-1, :n])
-        _add(squares, "acceleration", x[2:, :n] - 2.0 * x[1:-1, :n] + x[:-2, :n])
+        _add(squares, "change", residual(track))
         for kind in range(EDGE_KINDS):
             taken = (spec.neighbours < spec.vertex_count) & (spec.edge_kind == kind)
             edges = EdgeList.from_neighbours(spec.neighbours, taken)
@@ -101,7 +105,7 @@ def measure_scales(tracks: list[Track], spec: GraphSpec) -> Normalisation:
     }
     return Normalisation(
         velocity=scales["velocity"],
-        acceleration=scales["acceleration"],
+        change=scales["change"],
         properties=tuple(max(float(value), PROPERTY_FLOOR) for value in spread),
         **by_kind,
     )

@@ -12,7 +12,8 @@ Vertex features f_i, in this order (no positions: the network is equivariant to 
     (x_i^{t-k} - x_i^{t-k-1}) / σ_velocity   for k = 0 … h-1      3h   (each vertex's own velocities, as in GNS;
                                                                        the paper has relative positions only,
                                                                        which hides the fall of a whole body)
-    (c_i^{t+1} - c_i^t) / σ_velocity; 0 for object vertices        3   (the action a_t)
+    (x̂_i^{t+1} - x_i^t) / σ_velocity, for control vertices
+        (c_i^{t+1} - c_i^t) / σ_velocity                           3   (the modal prior; the action a_t)
     φ_i / σ_properties; 0 for control vertices                     2
     1 if object vertex, 1 if control vertex                        2
     clip(z_i^t / σ_length, 0, 1), only with a ground               1
@@ -33,8 +34,16 @@ The type of an edge is not a feature: each kind has weights of its own.
         s_iκ = mean_{j of kind κ} m_ij                             κ = 0, 1, 2
         h_i  = h_i + update_out.l(relu(update_in.l.weight [h_i, s_i0, s_i1, s_i2] + update_in.l.bias))
     y_i  = decoder.out(relu(decoder.in(h_i))) + skip.weight f_i     (n, 3), object vertices only
-    x_i^{t+1} = 2 x_i^t - x_i^{t-1} + σ_acceleration · y_i         a correction of the inertial motion
+    x_i^{t+1} = x̂_i^{t+1} + σ_change · y_i                         x̂: the modal prior
     x_i^{t+1} = c_i^{t+1}                                          for control vertices
+
+**Modal prior** (``physworld.worldmodel.modal`` says why). c̄^s: mean of the control vertices at frame s, where
+s = t+1 takes c^{t+1}.
+    a^s = Σ_i prior.basis[:, i] · (x_i^s - c̄^s - prior.mean_i)     (R,), s = t … t-h
+    d^s = c^s - c̄^s - prior.shape                                  (C, 3), s = t+1, t … t-h
+    e^s = c̄^s - c̄^t                                                (3,), s = t+1, t-1 … t-h
+    a^{t+1} = prior.weight [a^t … a^{t-h}, d^{t+1}, d^t … d^{t-h}, e^{t+1}, e^{t-1} … e^{t-h}, 1]
+    x̂_i^{t+1} = c̄^{t+1} + prior.mean_i + Σ_r a_r^{t+1} prior.basis[r, i]
 
 **Tensors** of ``model.safetensors`` (float32 unless said; ``.weight`` is (out, in)):
     encoder.in.weight (H, 3h+7 or 3h+8), encoder.in.bias (H), encoder.out.weight (H, H), encoder.out.bias (H),
@@ -42,8 +51,9 @@ The type of an edge is not a feature: each kind has weights of its own.
     update_in.{l}.weight (H, 4H), update_in.{l}.bias (H), update_out.{l}.weight (H, H), update_out.{l}.bias (H),
     decoder.in.weight (H, H), decoder.in.bias (H), decoder.out.weight (3, H), decoder.out.bias (3),
     skip.weight (3, 3h+7 or 3h+8);
-    norm.velocity, norm.acceleration, norm.length (1,), norm.relative, norm.strain, norm.stretch (3,),
+    norm.velocity, norm.change, norm.length (1,), norm.relative, norm.strain, norm.stretch (3,),
     norm.properties (2,);
+    prior.mean (n, 3), prior.basis (R, n, 3), prior.shape (C, 3), prior.weight (R, F);
     graph.neighbours (V, D) int64, V where the slot is empty; graph.edge_kind (V, D) int64; graph.rest_relative
     (V, D, 3).
 What a published version adds for its scene is told in ``physworld.worldmodel.published``.
@@ -65,6 +75,7 @@ from torch import Tensor, nn
 from physworld.worldmodel.config import WorldModelConfig
 from physworld.worldmodel.graph import EDGE_KINDS, GraphSpec
 from physworld.worldmodel.messages import EdgeList, sum_messages
+from physworld.worldmodel.modal import ModalPrior, rigid_prior
 
 PROPERTY_COUNT = 2
 
@@ -75,7 +86,7 @@ class Normalisation:
 
     Attributes:
         velocity: of vertex displacements per step.
-        acceleration: of x^{t+1} - 2 x^t + x^{t-1}.
+        change: of what the modal prior leaves, x^{t+1} - x̂^{t+1}.
         relative: of relative displacements per step along edges, by edge kind.
         strain: of r - r_rest along edges, by edge kind.
         stretch: of |r| - |r_rest| along edges, by edge kind.
@@ -83,7 +94,7 @@ class Normalisation:
     """
 
     velocity: float = 1.0
-    acceleration: float = 1.0
+    change: float = 1.0
     relative: tuple[float, float, float] = (1.0, 1.0, 1.0)
     strain: tuple[float, float, float] = (1.0, 1.0, 1.0)
     stretch: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -101,10 +112,14 @@ class EdgeConstants:
 
 
 class WorldModel(nn.Module):
-    """Encode, process, decode: the correction of every object vertex's inertial motion over one step."""
+    """Encode, process, decode: what every object vertex does in one step beyond the modal prior."""
 
     def __init__(
-        self, config: WorldModelConfig, spec: GraphSpec, normalisation: Normalisation | None = None
+        self,
+        config: WorldModelConfig,
+        spec: GraphSpec,
+        normalisation: Normalisation | None = None,
+        prior: ModalPrior | None = None,
     ) -> None:
         super().__init__()
         self.config = config
@@ -119,9 +134,13 @@ class WorldModel(nn.Module):
         self.update_out = nn.ModuleList(nn.Linear(hidden, hidden) for _ in range(layers))
         self.decoder = _two_layers(hidden, hidden, 3)
         self.skip = nn.Linear(vertex_features, 3, bias=False)
-        nn.init.zeros_(self.skip.weight)
+        for start in (self.skip.weight, self.decoder.out.weight, self.decoder.out.bias):
+            nn.init.zeros_(start)  # an untrained network leaves the prior as it is
         self._set_graph(spec)
         self.norm = _Scales(normalisation or Normalisation(), spec)
+        reference = _reference_positions(spec)
+        n = spec.object_count
+        self.prior = PriorStep(prior or rigid_prior(reference[:n], reference[n:], h), h)
 
     def _set_graph(self, spec: GraphSpec) -> None:
         """The edges of each kind and their constants, in the order of the edge lists."""
@@ -139,20 +158,20 @@ class WorldModel(nn.Module):
             self.register_buffer(f"_share_{kind}", _single(share), persistent=False)
 
     def forward(
-        self, window: Tensor, action: Tensor, phi: Tensor, constants: EdgeConstants | None = None
+        self, window: Tensor, ahead: Tensor, phi: Tensor, constants: EdgeConstants | None = None
     ) -> Tensor:
-        """Normalised accelerations (n, B, 3).
+        """What the prior lacks, in units of σ_change: y (n, B, 3).
 
         Args:
             window: x^{t-h} … x^t [m], (h+1, V, B, 3).
-            action: c^{t+1} - c^t [m], (C, B, 3).
+            ahead: x̂^{t+1} of the object vertices and c^{t+1} [m], (V, B, 3).
             phi: log property ratios of the object vertices, (n, B, 2).
             constants: ``edge_constants()``, when many steps share the weights.
         """
         constants = constants or self.edge_constants()
         n = self.spec.object_count
         moves = (window[1:] - window[:-1]).flip(0)
-        features = self._vertex_features(window, moves, action, phi)
+        features = self._vertex_features(window, moves, ahead, phi)
         shifted = window[-1] - self._reference[:, None]
         places = torch.cat([shifted, *moves.unbind(0)], dim=-1)
         lengths = [self._edge_lengths(shifted, kind) for kind in range(EDGE_KINDS)]
@@ -180,9 +199,9 @@ class WorldModel(nn.Module):
     ) -> Tensor:
         """Positions of all vertices at t + 1 [m], (V, B, 3); control vertices go to ``control_next`` (C, B, 3)."""
         n = self.spec.object_count
-        correction = self.forward(window, control_next - window[-1, n:], phi, constants)
-        inertial = 2.0 * window[-1, :n] - window[-2, :n]
-        return torch.cat([inertial + self.norm.acceleration * correction, control_next])
+        ahead = torch.cat([self.prior(window, control_next), control_next])
+        correction = self.forward(window, ahead, phi, constants)
+        return torch.cat([ahead[:n] + self.norm.change * correction, control_next])
 
     def edge_constants(self) -> EdgeConstants:
         """What of the edge products depends on weights and graph only; valid until the weights change."""
@@ -207,12 +226,12 @@ class WorldModel(nn.Module):
         relative = shifted.index_select(0, edges.senders) - shifted.index_select(0, edges.receivers)
         return torch.linalg.vector_norm(relative + getattr(self, f"_offset_{kind}")[:, None], dim=-1)
 
-    def _vertex_features(self, window: Tensor, moves: Tensor, action: Tensor, phi: Tensor) -> Tensor:
+    def _vertex_features(self, window: Tensor, moves: Tensor, ahead: Tensor, phi: Tensor) -> Tensor:
         """f_i, (V, B, F)."""
         n, control, batch = self.spec.object_count, self.spec.control_count, window.shape[2]
         new = window.new_zeros
         own = moves.permute(1, 2, 0, 3).flatten(2) / self.norm.velocity
-        act = torch.cat([new(n, batch, 3), action / self.norm.velocity])
+        act = (ahead - window[-1]) / self.norm.velocity
         properties = torch.cat([phi / self.norm.properties, new(control, batch, PROPERTY_COUNT)])
         kind = new(n + control, batch, 2)
         kind[:n, :, 0] = 1.0
@@ -221,6 +240,45 @@ class WorldModel(nn.Module):
         if self.spec.ground_height_m is not None:
             parts.append(torch.clamp(window[-1, :, :, 2:] / self.norm.length, 0.0, 1.0))
         return torch.cat(parts, dim=-1)
+
+
+class PriorStep(nn.Module):
+    """The modal prior's step, in single precision; tensors ``prior.*``."""
+
+    def __init__(self, prior: ModalPrior, history: int) -> None:
+        super().__init__()
+        self.history = history
+        for name in ("mean", "basis", "shape", "weight"):
+            self.register_buffer(name, _single(getattr(prior, name)))
+
+    def forward(self, window: Tensor, control_next: Tensor) -> Tensor:
+        """x̂^{t+1} (n, B, 3) from x^{t-h} … x^t (h+1, V, B, 3) and c^{t+1} (C, B, 3)."""
+        n, batch = self.mean.shape[0], window.shape[2]
+        controls = torch.cat([control_next[None], window[:, n:].flip(0)])
+        centre = controls.mean(dim=1)
+        relative = window[:, :n].flip(0) - centre[1:, None] - self.mean[:, None]
+        amplitudes = torch.tensordot(relative, self.basis, dims=([1, 3], [1, 2]))
+        shapes = controls - centre[:, None] - self.shape[:, None]
+        path = torch.cat([centre[:1], centre[2:]]) - centre[1]
+        regressors = torch.cat(
+            [
+                amplitudes.transpose(0, 1).reshape(batch, -1),
+                shapes.permute(2, 0, 1, 3).reshape(batch, -1),
+                path.transpose(0, 1).reshape(batch, -1),
+                path.new_ones(batch, 1),
+            ],
+            dim=1,
+        )
+        ahead = torch.tensordot(regressors @ self.weight.T, self.basis, dims=1)
+        return ahead.transpose(0, 1) + self.mean[:, None] + centre[0]
+
+    def residual(self, positions: Tensor) -> Tensor:
+        """What the prior leaves of each step of a track (T, V, 3): x^{t+1} - x̂^{t+1}, (n, T-1-h, 3)."""
+        n, h = self.mean.shape[0], self.history
+        count = positions.shape[0] - 1 - h
+        window = torch.stack([positions[k : k + count].transpose(0, 1) for k in range(h + 1)])
+        following = positions[h + 1 :].transpose(0, 1)
+        return following[:n] - self(window, following[n:])
 
 
 class _EdgeWeights(nn.Module):
@@ -237,7 +295,7 @@ class _Scales(nn.Module):
 
     def __init__(self, normalisation: Normalisation, spec: GraphSpec) -> None:
         super().__init__()
-        values = {name: (getattr(normalisation, name),) for name in ("velocity", "acceleration")}
+        values = {name: (getattr(normalisation, name),) for name in ("velocity", "change")}
         values |= {name: getattr(normalisation, name) for name in ("relative", "strain", "stretch", "properties")}
         values["length"] = (spec.edge_radius_m,)
         for name, value in values.items():

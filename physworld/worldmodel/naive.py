@@ -51,11 +51,11 @@ class NaiveWorldModel(nn.Module):
             dim=-1,
         )
 
-    def forward(self, window: Tensor, action: Tensor, phi: Tensor) -> Tensor:
-        """Normalised accelerations (n, B, 3); arguments as ``WorldModel.forward``."""
+    def forward(self, window: Tensor, ahead: Tensor, phi: Tensor) -> Tensor:
+        """y (n, B, 3); arguments as ``WorldModel.forward``."""
         model = self.model
         moves = (window[1:] - window[:-1]).flip(0)
-        features = model._vertex_features(window, moves, action, phi)
+        features = model._vertex_features(window, moves, ahead, phi)
         state = model.encoder(features)
         edges = self.edge_features(window)
         kinds = [torch.nonzero(self.kind == k)[:, 0] for k in range(EDGE_KINDS)]

@@ -3,9 +3,10 @@
 Two ways:
 
 * **Affine weights**, for tracked points: every point is a fixed combination of its K nearest vertices, p = Σ w_k x_k,
-  with Σ w_k = 1 and, as well as the neighbourhood allows, Σ w_k x_k = p where the weights are made. Among all such
-  weights the ones closest to 1/distance are taken. It is exact for every affine motion of the neighbourhood,
-  needs no rotation, and is linear: differentiable for free, in numpy or torch.
+  Σ w_k = 1, that minimises over the states s at hand
+      Σ_s |Σ_k w_k x_k^s - p^s|² + λ Σ_k (w_k - v_k)² / v_k,        v ∝ 1/distance.
+  With one state it is exact for every affine motion of a neighbourhood that spans space; with several it also
+  learns what a line or a sheet of vertices hides. It needs no rotation and is linear: differentiable for free.
 * **Linear blend skinning** as in the paper's appendix, for what also needs an orientation (3D Gaussians): weights
   1/distance, each vertex moved by its translation and by the rotation that fits its neighbourhood best
   (Kabsch), quaternions blended after their signs are made to agree, which published code forgets.
@@ -21,7 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-RIDGE = 1e-3  # of the fit's own scale: how far weights may leave 1/distance to meet an offset the plane lacks
+RIDGE = 1e-4  # λ in units of the neighbourhood's mean square size: keeps weights near 1/distance where free
 DISTANCE_FLOOR = 1e-3  # of the neighbourhood's size: a point that is a vertex
 
 
@@ -58,19 +59,20 @@ def inverse_distance_weights(distance: np.ndarray) -> np.ndarray:
 
 
 def affine_skin(points: np.ndarray, vertices: np.ndarray, neighbours: int = 8) -> Skin:
-    """Weights that reproduce affine motions; both arguments in the same, preferably undeformed, state."""
-    index, distance = nearest_vertices(points, vertices, neighbours)
+    """Weights from one state, points (M, 3) and vertices (n, 3), or from several, (S, M, 3) and (S, n, 3).
+
+    Neighbours are the nearest in the first state.
+    """
+    points, vertices = points.reshape(-1, *points.shape[-2:]), vertices.reshape(-1, *vertices.shape[-2:])
+    index, distance = nearest_vertices(points[0], vertices[0], neighbours)
     prior = inverse_distance_weights(distance)
-    offset = vertices[index] - points[:, None]
-    scale = np.maximum(distance[:, -1], np.finfo(np.float64).tiny)
-    offset = offset / scale[:, None, None]
-    # Least change of the prior, weighted by the prior itself, that removes Σ w_k offset_k while Σ w_k stays 1.
-    centred = offset - np.einsum("mk,mkx->mx", prior, offset)[:, None]
-    spread = np.einsum("mk,mkx,mky->mxy", prior, centred, centred)
-    missing = np.einsum("mk,mkx->mx", prior, offset)
-    ridge = RIDGE * np.trace(spread, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-12 * np.eye(3)
-    slope = np.linalg.solve(spread + ridge, missing[..., None])[..., 0]
-    weight = prior * (1.0 - np.einsum("mkx,mx->mk", centred, slope))
+    offset = vertices[:, index] - points[:, :, None]
+    gram = np.einsum("smkx,smlx->mkl", offset, offset)
+    scale = np.trace(gram, axis1=1, axis2=2) / index.shape[1] + np.finfo(np.float64).tiny
+    penalty = np.eye(index.shape[1]) / prior[:, None]
+    # The minimum under Σ w = 1: (G + λ diag(1/v)) w is the same in every component.
+    system = gram / scale[:, None, None] + RIDGE * penalty
+    weight = np.linalg.solve(system, np.ones((*index.shape, 1)))[..., 0]
     return Skin(index, weight / weight.sum(axis=1, keepdims=True))
 
 

@@ -1,6 +1,6 @@
 """Training the graph network on demonstration episodes (paper, section Model Training).
 
-    loss = Σ_{i=1..τ} mean ‖x_pred^{t+i} - x^{t+i}‖² / σ_acceleration²
+    loss = Σ_{i=1..τ} mean ‖x_pred^{t+i} - x^{t+i}‖² / σ_change²
 
 unrolled from a random frame t whose history carries random-walk noise, so that training sees the kind of errors
 that a rollout makes; Φ carries noise too, so that it can be fine-tuned later. τ grows from 1 to ``look_ahead``
@@ -25,7 +25,8 @@ from physworld.worldmodel.config import TrainingConfig, WorldModelConfig
 from physworld.worldmodel.dataset import Track, WindowSampler, measure_scales, split_tracks
 from physworld.worldmodel.errors import CheckpointMismatch, DatasetUnusable, TrainingCancelled, TrainingDiverged
 from physworld.worldmodel.graph import GraphSpec
-from physworld.worldmodel.model import Normalisation, WorldModel
+from physworld.worldmodel.modal import ModalPrior, fit_prior
+from physworld.worldmodel.model import Normalisation, PriorStep, WorldModel
 from physworld.worldmodel.rollout import rollout_tracks
 
 GROWTH_SHARE = 2.0 / 3.0
@@ -40,7 +41,7 @@ class TrainingResult:
     losses: list[tuple[int, float]]
     best_step: int
     best_error_m: float
-    inertial_error_m: float
+    prior_error_m: float
     static_error_m: float
 
 
@@ -83,12 +84,16 @@ def train(
         raise DatasetUnusable("no episode to train on")
     torch.set_num_threads(training.threads)
     fitting, held_out = split_tracks(tracks, training.validation_fraction, training.seed)
-    scales = measure_scales(fitting, spec)
-    run = _start(config, spec, scales, training)
+    n, h = spec.object_count, config.history
+    prior = fit_prior([track.positions.numpy() for track in fitting], n, h, config.modes)
+    scales = measure_scales(fitting, spec, lambda track: PriorStep(prior, h).residual(track.positions))
+    run = _start(config, spec, scales, prior, training)
     identity = _identity(config, training, scales)
     if checkpoint is not None:
         _restore(run, checkpoint, identity)
     sampler = WindowSampler(fitting)
+    if run.step == 0:
+        _validate(run, held_out)
     longest = max(sampler.lengths) - config.history - 1
     while run.step < training.steps:
         if cancelled is not None and cancelled():
@@ -109,7 +114,7 @@ def train(
         losses=run.losses,
         best_step=run.best_step,
         best_error_m=run.best_error_m,
-        inertial_error_m=_mean_error([_inertial(track, config.history) for track in held_out], held_out, spec),
+        prior_error_m=run.validation[0][1],
         static_error_m=_mean_error([_static(track, config.history) for track in held_out], held_out, spec),
     )
 
@@ -120,11 +125,15 @@ def open_loop_error(model: WorldModel, tracks: list[Track]) -> float:
 
 
 def _start(
-    config: WorldModelConfig, spec: GraphSpec, scales: Normalisation, training: TrainingConfig
+    config: WorldModelConfig,
+    spec: GraphSpec,
+    scales: Normalisation,
+    prior: ModalPrior,
+    training: TrainingConfig,
 ) -> _Run:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(training.seed)
-        model = WorldModel(config, spec, scales)
+        model = WorldModel(config, spec, scales, prior)
     generator = torch.Generator().manual_seed(training.seed)
     optimiser = torch.optim.Adam(model.parameters(), lr=training.learning_rate)
     return _Run(model, copy.deepcopy(model), optimiser, generator)
@@ -140,8 +149,8 @@ def _train_step(run: _Run, sampler: WindowSampler, training: TrainingConfig, loo
     """One optimiser step; the loss. Raises TrainingDiverged."""
     model, h = run.model, run.model.config.history
     batch = sampler.draw(h + 1 + look_ahead, training.batch_size, run.generator)
-    n, acceleration = model.spec.object_count, model.norm.acceleration
-    window = _with_noise(batch.positions[: h + 1], n, training.noise_history * acceleration, run.generator)
+    n, change = model.spec.object_count, model.norm.change
+    window = _with_noise(batch.positions[: h + 1], n, training.noise_history * change, run.generator)
     noise = torch.randn(batch.phi.shape, generator=run.generator) * model.norm.properties
     phi = batch.phi + training.noise_properties * noise
     constants = model.edge_constants()
@@ -149,7 +158,7 @@ def _train_step(run: _Run, sampler: WindowSampler, training: TrainingConfig, loo
     for i in range(look_ahead):
         truth = batch.positions[h + 1 + i]
         predicted = model.step(window, truth[n:], phi, constants)
-        loss = loss + ((predicted[:n] - truth[:n]) / acceleration).square().sum(dim=-1).mean()
+        loss = loss + ((predicted[:n] - truth[:n]) / change).square().sum(dim=-1).mean()
         window = torch.cat([window[1:], predicted[None]])
     share = run.step / training.steps
     floor = training.learning_rate_floor
@@ -195,13 +204,6 @@ def _mean_error(predicted: list[Tensor], tracks: list[Track], spec: GraphSpec) -
     ]
     mean = float(torch.stack(errors).mean())
     return mean if math.isfinite(mean) else math.inf
-
-
-def _inertial(track: Track, history: int) -> Tensor:
-    """Constant velocity from the last known frame."""
-    x = track.positions
-    ahead = torch.arange(1, x.shape[0] - history)[:, None, None]
-    return torch.cat([x[: history + 1], x[history] + ahead * (x[history] - x[history - 1])])
 
 
 def _static(track: Track, history: int) -> Tensor:

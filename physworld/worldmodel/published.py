@@ -1,0 +1,137 @@
+"""A world model with everything that its scene needs, as named tensors and plain facts.
+
+Beside the network's tensors (``physworld.worldmodel.model``) a version holds, float32 unless said:
+    rest.vertices (n, 3)          undeformed places of the object vertices [m]
+    particle.index (n,) int64     the twin's particle that each object vertex is
+    control.index (C,) int64      the controller that each control vertex is
+    phi (n, 2)                    properties after fine-tuning; phi.calibrated (n, 2) before it
+    start.history (h+1, n, 3)     object vertices at the first h+1 ticks of the recording [m]
+    start.controllers (h+1, K, 3) all controllers at those ticks [m]
+    start.time (1,) float64       time of the first of these ticks [s]
+    skin.index (N, 8) int64, skin.weight (N, 8)   tracked point = Σ_k weight · vertex[index]
+
+and the facts (``architecture`` of the card): the ``WorldModelConfig``, ``dt_s``, ``ground_height_m`` (null: none),
+``vertex_spacing_m``, ``edge_radius_m``, ``object_vertices`` n, ``control_vertices`` C, ``edges``.
+
+A rollout starts with ``start.history`` and ``start.controllers``, or from rest: one frame h+1 times with still
+controllers. Its single-precision origin is the mean of the history's last frame; its z is the ground's height
+where there is a ground.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from physworld.worldmodel.config import WorldModelConfig
+from physworld.worldmodel.graph import GraphSpec
+from physworld.worldmodel.modal import ModalPrior
+from physworld.worldmodel.model import WorldModel
+from physworld.worldmodel.rollout import rollout
+from physworld.worldmodel.skinning import Skin
+
+_OWN = ("rest.", "particle.", "control.", "phi", "start.", "skin.", "graph.")
+
+
+@dataclass(frozen=True)
+class PublishedModel:
+    """See the module's text for the arrays."""
+
+    model: WorldModel
+    phi: np.ndarray
+    phi_calibrated: np.ndarray
+    start_history: np.ndarray
+    start_controllers: np.ndarray
+    start_time_s: float
+    skin: Skin
+
+    @property
+    def spec(self) -> GraphSpec:
+        """The graph."""
+        return self.model.spec
+
+    def rollout(
+        self, controllers: np.ndarray, *, history: np.ndarray | None = None, phi: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Object vertices (T, n, 3) [m] for controllers (T, K, 3) at ticks from the start's first one."""
+        return rollout(
+            self.model,
+            self.spec,
+            self.start_history if history is None else history,
+            controllers,
+            self.phi if phi is None else phi,
+        )
+
+    def to_tensors(self) -> dict[str, np.ndarray]:
+        """Every array by its published name."""
+        spec = self.spec
+        single = {
+            "graph.rest_relative": spec.rest_relative,
+            "rest.vertices": spec.rest_vertices,
+            "phi": self.phi,
+            "phi.calibrated": self.phi_calibrated,
+            "start.history": self.start_history,
+            "start.controllers": self.start_controllers,
+            "skin.weight": self.skin.weight,
+        }
+        whole = {
+            "graph.neighbours": spec.neighbours,
+            "graph.edge_kind": spec.edge_kind,
+            "particle.index": spec.particle_index,
+            "control.index": spec.control_index,
+            "skin.index": self.skin.index,
+        }
+        network = {name: value.numpy(force=True) for name, value in self.model.state_dict().items()}
+        return (
+            {name: np.ascontiguousarray(value) for name, value in network.items()}
+            | {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in single.items()}
+            | {name: np.ascontiguousarray(value, dtype=np.int64) for name, value in whole.items()}
+            | {"start.time": np.array([self.start_time_s], dtype=np.float64)}
+        )
+
+    def facts(self) -> dict[str, Any]:
+        """The ``architecture`` of the card."""
+        spec = self.spec
+        return asdict(self.model.config) | {
+            "dt_s": spec.dt_s,
+            "ground_height_m": spec.ground_height_m,
+            "vertex_spacing_m": spec.vertex_spacing_m,
+            "edge_radius_m": spec.edge_radius_m,
+            "object_vertices": spec.object_count,
+            "control_vertices": spec.control_count,
+            "edges": spec.edge_count,
+        }
+
+    @classmethod
+    def from_tensors(cls, tensors: dict[str, np.ndarray], facts: dict[str, Any]) -> PublishedModel:
+        """The inverse of :meth:`to_tensors` and :meth:`facts`."""
+        names = WorldModelConfig.__dataclass_fields__
+        config = WorldModelConfig(**{name: facts[name] for name in names})
+        spec = GraphSpec(
+            dt_s=facts["dt_s"],
+            rest_vertices=tensors["rest.vertices"].astype(np.float64),
+            particle_index=tensors["particle.index"],
+            control_index=tensors["control.index"],
+            neighbours=tensors["graph.neighbours"],
+            edge_kind=tensors["graph.edge_kind"],
+            rest_relative=tensors["graph.rest_relative"].astype(np.float64),
+            vertex_spacing_m=facts["vertex_spacing_m"],
+            edge_radius_m=facts["edge_radius_m"],
+            ground_height_m=facts["ground_height_m"],
+        )
+        prior = ModalPrior(*(tensors[f"prior.{part}"] for part in ("mean", "basis", "shape", "weight")))
+        model = WorldModel(config, spec, prior=prior)
+        network = {name: value for name, value in tensors.items() if not name.startswith(_OWN)}
+        model.load_state_dict({name: torch.as_tensor(value) for name, value in network.items()})
+        return cls(
+            model=model,
+            phi=tensors["phi"].astype(np.float64),
+            phi_calibrated=tensors["phi.calibrated"].astype(np.float64),
+            start_history=tensors["start.history"].astype(np.float64),
+            start_controllers=tensors["start.controllers"].astype(np.float64),
+            start_time_s=float(tensors["start.time"][0]),
+            skin=Skin(tensors["skin.index"], tensors["skin.weight"].astype(np.float64)),
+        )

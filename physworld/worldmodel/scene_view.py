@@ -1,0 +1,136 @@
+"""A recording and its calibrated twin as the world model sees them: on the model's clock, at the graph's vertices.
+
+The network needs h + 1 frames to start from. They are the twin's, from the moment at which the body is let go
+(tick ``first``; before it the prediction is the start itself), so that a recording that starts in motion, or is
+held back for a while, starts the network as it starts the twin. Everything after these frames is the network's own.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from physworld.scene import Scene
+from physworld.twin import Twin
+from physworld.worldmodel.clock import clock_times, model_dt, resample, resample_smooth
+from physworld.worldmodel.config import WorldModelConfig
+from physworld.worldmodel.errors import GraphInvalid
+from physworld.worldmodel.finetune import Recording
+from physworld.worldmodel.graph import GraphSpec, build_graph
+from physworld.worldmodel.model import WorldModel
+from physworld.worldmodel.published import PublishedModel
+from physworld.worldmodel.skinning import Skin, affine_skin
+
+SKIN_STATES = 24
+
+
+@dataclass(frozen=True)
+class SceneView:
+    """See the module's text.
+
+    Attributes:
+        scene: the recording.
+        spec: the graph.
+        times: ticks from the scene's first frame [s], (T,).
+        controllers: all controllers at the ticks [m], (T, K, 3).
+        vertices: the twin's object vertices at the ticks [m], (T, n, 3).
+        twin_tracks: the twin's tracked points at the ticks [m], (T, N, 3).
+        skin: how vertices carry tracked points.
+        first: tick at which the network's history starts.
+        history: h.
+        twin_steps_per_second: ticks that the twin simulates in a second of computing.
+        skin_error_m: mean distance between skinned and twin's own tracked points.
+    """
+
+    scene: Scene
+    spec: GraphSpec
+    times: np.ndarray
+    controllers: np.ndarray
+    vertices: np.ndarray
+    twin_tracks: np.ndarray
+    skin: Skin
+    first: int
+    history: int
+    twin_steps_per_second: float
+    skin_error_m: float
+
+    @property
+    def start_history(self) -> np.ndarray:
+        """(h+1, n, 3) [m]."""
+        return self.vertices[self.first : self.first + self.history + 1]
+
+    def tracks_of(self, rolled: np.ndarray) -> np.ndarray:
+        """Tracked points at the measured times (F, N, 3) of a rollout (T - first, n, 3) from tick ``first``."""
+        held = np.repeat(self.vertices[:1], self.first, axis=0)
+        ticks = self.skin.apply(np.concatenate([held, rolled]))
+        return resample_smooth(ticks, self.times, self.scene.times - self.scene.times[0])
+
+    def recording(self) -> Recording:
+        """The training frames for fine-tuning: those after the network's history."""
+        ticks = (self.scene.times - self.scene.times[0]) / self.spec.dt_s - self.first
+        begin, end = self.scene.train
+        taken = np.arange(begin, end)
+        taken = taken[ticks[taken] > self.history]
+        return Recording(
+            history=self.start_history,
+            controllers=self.controllers[self.first :],
+            ticks=ticks[taken],
+            points=self.scene.points[taken],
+            visible=self.scene.visible[taken],
+        )
+
+    def published(self, model: WorldModel, phi: np.ndarray, phi_calibrated: np.ndarray) -> PublishedModel:
+        """The model with this scene's start and skin."""
+        window = slice(self.first, self.first + self.history + 1)
+        return PublishedModel(
+            model=model,
+            phi=phi,
+            phi_calibrated=phi_calibrated,
+            start_history=self.start_history,
+            start_controllers=self.controllers[window],
+            start_time_s=float(self.times[self.first]),
+            skin=self.skin,
+        )
+
+
+def view_scene(scene: Scene, twin: Twin, config: WorldModelConfig) -> SceneView:
+    """Simulate the twin on the recording's controllers and read it with the graph. Raises GraphInvalid."""
+    dt = model_dt(scene.fps)
+    control_times, control_points = scene.control_track()
+    times = clock_times(float(scene.times[-1] - scene.times[0]), dt)
+    first = int(np.ceil(twin.release_s / dt - 1e-6))
+    if first + config.history + 1 >= len(times):
+        raise GraphInvalid(
+            f"the recording has {len(times)} ticks of {dt:.4g} s, let go at tick {first}: too few for history "
+            f"{config.history}"
+        )
+    started = time.perf_counter()
+    particles = twin.simulate(control_times, control_points, times + control_times[0])
+    seconds = time.perf_counter() - started
+    spec = build_graph(
+        twin.particles_rest,
+        twin.particles_start,
+        twin.controllers_start,
+        dt_s=dt,
+        config=config,
+        control_groups=twin.controller_groups,
+        ground_height_m=twin.ground_height_m,
+    )
+    vertices, tracks = particles[:, spec.particle_index], twin.track(particles)
+    states = np.unique(np.linspace(0, len(times) - 1, SKIN_STATES).round().astype(np.int64))
+    skin = affine_skin(tracks[states], vertices[states])
+    return SceneView(
+        scene=scene,
+        spec=spec,
+        times=times,
+        controllers=resample(control_points, control_times - control_times[0], times),
+        vertices=vertices,
+        twin_tracks=tracks,
+        skin=skin,
+        first=first,
+        history=config.history,
+        twin_steps_per_second=(len(times) - 1) / seconds,
+        skin_error_m=float(np.linalg.norm(skin.apply(vertices) - tracks, axis=2).mean()),
+    )

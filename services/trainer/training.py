@@ -1,0 +1,340 @@
+"""The ``training`` shard: from a sealed dataset to a published world model.
+
+Reads the episodes through the manifest, trains with a checkpoint every few hundred steps (a killed trainer
+carries on from the last one), fine-tunes the properties on the recording's training frames, measures everything
+open loop on the frames that were held out, and stores the version's files:
+
+* ``model.safetensors``: see ``physworld.worldmodel.model`` and ``.published``;
+* ``card.json``: lineage, architecture, metrics, seeds, versions, intended use, limits;
+* ``prediction.npz``: ``times`` (T,) f8 [s], ``tracks`` and ``tracks_calibrated`` (T, N, 3) f4 [m] after and before
+  fine-tuning, ``twin_tracks``; ``tick_times`` (S,) f8 and ``vertices`` (S, n, 3) f4 on the model's clock;
+* ``manifest.json``: sha256 and size of each of them; its digest is the version's.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import os
+import shutil
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors.numpy import save as save_tensors
+
+from physworld.evaluate.table import held_out_table
+from physworld.worldmodel import config as settings_of
+from physworld.worldmodel.clock import resample_smooth
+from physworld.worldmodel.dataset import Track, read_track
+from physworld.worldmodel.errors import CheckpointMismatch, TrainingCancelled
+from physworld.worldmodel.finetune import FineTuneResult, fine_tune
+from physworld.worldmodel.published import PublishedModel
+from physworld.worldmodel.scene_view import SceneView, view_scene
+from physworld.worldmodel.training import TrainingResult, train
+from schemas.base import Artifact, Reference
+from schemas.model import TrainingConfig
+from storage import resources
+from workers.context import TaskContext
+from workers.lineage import lineage_of
+from workers.registry import HandlerResult
+from workers.stores import Stores
+from workers.tasks.inputs import fit_reference, npz_bytes, scene_of, scene_reference, twin_of
+
+logger = logging.getLogger(__name__)
+
+CHECKPOINT = "training.pt"
+SPEED_REPEATS = 3
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Predictions of tracked points at the measured times (T, N, 3) [m], their table, steps per second."""
+
+    tracks: np.ndarray
+    tracks_calibrated: np.ndarray
+    twin_tracks: np.ndarray
+    vertices: np.ndarray
+    table: dict[str, Any]
+    steps_per_second: dict[str, float]
+
+
+def run(context: TaskContext, stores: Stores) -> HandlerResult:
+    """Train, fine-tune, measure, store."""
+    payload = context.lease.payload
+    config = TrainingConfig.model_validate(payload["config"])
+    architecture, training, tuning = translate(config)
+    scene, twin = scene_of(stores, payload["scene_id"]), twin_of(stores, payload["fit_id"])
+    context.progress(0, config.steps, "steps", "reading the dataset")
+    view = view_scene(scene, twin, architecture)
+    dataset = _dataset_reference(stores, payload["dataset_id"])
+    tracks = _read_tracks(context, stores, dataset, view, architecture.history)
+    started = time.perf_counter()
+    trained = _train(context, stores.settings.data_dir, tracks, view, architecture, training)
+    training_s = time.perf_counter() - started
+    context.progress(config.steps, config.steps, "steps", "fine-tuning on the recording")
+    phi = np.zeros((view.spec.object_count, 2))
+    started = time.perf_counter()
+    tuned = _stopping(
+        context,
+        lambda: fine_tune(trained.model, phi, view.recording(), view.skin, tuning, cancelled=context.cancelled),
+    )
+    tuning_s = time.perf_counter() - started
+    context.progress(config.steps, config.steps, "steps", "measuring on the held-out frames")
+    published = view.published(trained.model, tuned.phi, phi)
+    measured = measure(view, published)
+    seconds = {"training": training_s, "fine_tuning": tuning_s}
+    metrics = json_safe(_metrics(view, trained, tuned, measured, seconds, len(tracks)))
+    inputs = [dataset, fit_reference(stores, payload["fit_id"]), scene_reference(stores, payload["scene_id"])]
+    lineage = lineage_of(inputs, payload["config"], {"training": config.seed})
+    card = _card(payload, config, published, metrics, lineage)
+    artifacts = _store(stores, payload, published, view, measured, card)
+    context.check()
+    shutil.rmtree(_checkpoint_folder(stores.settings.data_dir, context.lease.job_id), ignore_errors=True)
+    result = {
+        "artifacts": [artifact.model_dump(mode="json") for artifact in artifacts],
+        "sha256": artifacts[-1].sha256,
+        "metrics": metrics,
+        "lineage": lineage,
+    }
+    return HandlerResult(result, artifacts[-1].sha256)
+
+
+def translate(
+    config: TrainingConfig,
+) -> tuple[settings_of.WorldModelConfig, settings_of.TrainingConfig, settings_of.FineTuneConfig]:
+    """The wire's settings as the library's; threads from ``PHYSWORLD_TRAINER_THREADS``, 1 without it."""
+    interval = max(1, min(250, config.steps // 8))
+    return (
+        settings_of.WorldModelConfig(
+            hidden=config.hidden,
+            message_passing_steps=config.message_passing_steps,
+            history=config.history,
+            vertices=config.vertices,
+        ),
+        settings_of.TrainingConfig(
+            steps=config.steps,
+            batch_size=config.batch_size,
+            look_ahead=config.look_ahead,
+            learning_rate=config.learning_rate,
+            validation_every=interval,
+            checkpoint_every=interval,
+            threads=int(os.environ.get("PHYSWORLD_TRAINER_THREADS", "1")),
+            seed=config.seed,
+        ),
+        settings_of.FineTuneConfig(steps=config.fine_tune_steps),
+    )
+
+
+def measure(view: SceneView, published: PublishedModel) -> Measured:
+    """Open-loop predictions over the whole recording, and what they cost."""
+    controllers = view.controllers[view.first :]
+    seconds = []
+    for _ in range(SPEED_REPEATS):
+        started = time.perf_counter()
+        rolled = published.rollout(controllers)
+        seconds.append(time.perf_counter() - started)
+    calibrated = published.rollout(controllers, phi=published.phi_calibrated)
+    frame_times = view.scene.times - view.scene.times[0]
+    tracks, tracks_calibrated = view.tracks_of(rolled), view.tracks_of(calibrated)
+    twin_tracks = resample_smooth(view.twin_tracks, view.times, frame_times)
+    predictions = {"twin": twin_tracks, "world_model": tracks_calibrated, "world_model_finetuned": tracks}
+    return Measured(
+        tracks=tracks,
+        tracks_calibrated=tracks_calibrated,
+        twin_tracks=twin_tracks,
+        vertices=np.concatenate([np.repeat(view.vertices[:1], view.first, axis=0), rolled]),
+        table=held_out_table(view.scene, predictions),
+        steps_per_second={
+            "twin": view.twin_steps_per_second,
+            "world_model": (len(rolled) - view.history - 1) / min(seconds),
+        },
+    )
+
+
+def json_safe(value: Any) -> Any:
+    """Plain JSON types; a number that is not finite (a rollout that blew up) becomes None."""
+    if isinstance(value, dict):
+        return {str(key): json_safe(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [json_safe(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _dataset_reference(stores: Stores, dataset_id: str) -> Reference:
+    with stores.database.reading() as session:
+        return Reference(kind="dataset", id=dataset_id, digest=resources.get_dataset(session, dataset_id).digest)
+
+
+def _read_tracks(
+    context: TaskContext, stores: Stores, dataset: Reference, view: SceneView, history: int
+) -> list[Track]:
+    """Every episode of the sealed dataset, checked against its manifest, at the graph's vertices."""
+    if dataset.digest is None:
+        raise ValueError(f"dataset {dataset.id} has no digest: it is not sealed")
+    tracks = []
+    for _, arrays, _ in stores.episodes.iterate(dataset.digest):
+        context.check()
+        tracks.append(read_track(view.spec, arrays, history))
+    return tracks
+
+
+def _train(
+    context: TaskContext,
+    data_dir: Path,
+    tracks: list[Track],
+    view: SceneView,
+    architecture: settings_of.WorldModelConfig,
+    training: settings_of.TrainingConfig,
+) -> TrainingResult:
+    """Train, from the checkpoint of an earlier attempt where there is one."""
+    path = _checkpoint_folder(data_dir, context.lease.job_id) / CHECKPOINT
+
+    def save(data: bytes) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_suffix(f".{os.getpid()}")
+        partial.write_bytes(data)
+        partial.replace(path)
+
+    def progress(step: int, steps: int, loss: float) -> None:
+        context.progress(step, steps, "steps", f"loss {loss:.4g}")
+
+    def attempt(checkpoint: bytes | None) -> TrainingResult:
+        return train(
+            tracks,
+            view.spec,
+            architecture,
+            training,
+            checkpoint=checkpoint,
+            save_checkpoint=save,
+            progress=progress,
+            cancelled=context.cancelled,
+        )
+
+    try:
+        return _stopping(context, lambda: attempt(path.read_bytes() if path.exists() else None))
+    except CheckpointMismatch as mismatch:
+        logger.warning("job %s starts anew: %s", context.lease.job_id, mismatch)
+        return _stopping(context, lambda: attempt(None))
+
+
+def _stopping(context: TaskContext, work: Any) -> Any:
+    """``work()``; a cancellation that it noticed ends the shard as the worker's own does."""
+    try:
+        return work()
+    except TrainingCancelled:
+        context.check()
+        raise
+
+
+def _metrics(
+    view: SceneView,
+    trained: TrainingResult,
+    tuned: FineTuneResult,
+    measured: Measured,
+    seconds: dict[str, float],
+    episodes: int,
+) -> dict[str, Any]:
+    return {
+        "held_out": measured.table,
+        "steps_per_second": measured.steps_per_second,
+        "noise_floor_m": measured.table["noise_floor_m"],
+        "seconds": seconds,
+        "episodes": episodes,
+        "validation": {
+            "open_loop_m": trained.best_error_m,
+            "static_m": trained.static_error_m,
+            "prior_m": trained.prior_error_m,
+            "best_step": trained.best_step,
+            "curve": trained.validation,
+            "training_loss": trained.losses,
+        },
+        "fine_tuning": {
+            "kept": tuned.kept,
+            "inner_validation_before_m": tuned.error_before_m,
+            "inner_validation_after_m": tuned.error_after_m,
+            "steps": tuned.steps,
+            "phi_rms": float(np.sqrt((tuned.phi**2).mean())),
+        },
+        "skin_error_m": view.skin_error_m,
+        "world_model_against_twin_m": float(
+            np.linalg.norm(measured.tracks_calibrated - measured.twin_tracks, axis=2).mean()
+        ),
+    }
+
+
+def _card(
+    payload: dict[str, Any],
+    config: TrainingConfig,
+    published: PublishedModel,
+    metrics: dict[str, Any],
+    lineage: dict[str, Any],
+) -> dict[str, Any]:
+    return {
+        "schema_version": 1,
+        "name": payload["name"],
+        "version": payload["version"],
+        "scene_id": payload["scene_id"],
+        "fit_id": payload["fit_id"],
+        "dataset_id": payload["dataset_id"],
+        "dt_s": published.spec.dt_s,
+        "architecture": published.facts(),
+        "training": config.model_dump(mode="json"),
+        "library_settings": [asdict(part) for part in translate(config)],
+        "metrics": metrics,
+        "lineage": lineage,
+        "seeds": {"training": config.seed},
+        "versions": {"torch": torch.__version__, "numpy": np.__version__, "physworld": lineage["code_version"]},
+        "intended_use": (
+            "Predict the motion of this object under motions of its grips like those of the demonstrations, "
+            "open loop, at the clock dt_s."
+        ),
+        "limits": (
+            "One object and its grips, as recorded: edges are material, so contact of the object with itself, "
+            "fracture, flow and other grips are not represented; motions much faster or wider than the "
+            "demonstrations are extrapolated; the start needs history + 1 frames."
+        ),
+    }
+
+
+def _store(
+    stores: Stores,
+    payload: dict[str, Any],
+    published: PublishedModel,
+    view: SceneView,
+    measured: Measured,
+    card: dict[str, Any],
+) -> list[Artifact]:
+    """The version's files, the manifest last."""
+    put = stores.artifacts.put_bytes
+    prediction = {
+        "times": view.scene.times,
+        "tracks": measured.tracks.astype(np.float32),
+        "tracks_calibrated": measured.tracks_calibrated.astype(np.float32),
+        "twin_tracks": measured.twin_tracks.astype(np.float32),
+        "tick_times": view.times,
+        "vertices": measured.vertices.astype(np.float32),
+    }
+    facts = {"format": "physworld-world-model", "name": payload["name"], "version": str(payload["version"])}
+    artifacts = [
+        put(save_tensors(published.to_tensors(), facts), "model.safetensors", "application/octet-stream"),
+        put(json.dumps(card, indent=1, allow_nan=False).encode(), "card.json", "application/json"),
+        put(npz_bytes(prediction), "prediction.npz", "application/x-npz"),
+    ]
+    manifest = {
+        "name": payload["name"],
+        "version": payload["version"],
+        "files": {item.name: {"sha256": item.sha256, "size": item.size} for item in artifacts},
+    }
+    text = json.dumps(manifest, indent=1, sort_keys=True).encode()
+    return [*artifacts, put(text, "manifest.json", "application/json")]
+
+
+def _checkpoint_folder(data_dir: Path, job_id: str) -> Path:
+    return Path(data_dir) / "checkpoints" / job_id
