@@ -15,7 +15,7 @@ class FitConfig(Request):
 
     material: Literal["auto", "neo_hookean"] = "auto"
     particle_budget: int = Field(default=2000, ge=50, le=200_000)
-    max_simulations: int = Field(default=80, ge=1, le=5000)
+    max_simulations: int = Field(default=120, ge=1, le=5000)
     seed: Seed = 0
 
 

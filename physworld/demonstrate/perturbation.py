@@ -20,9 +20,7 @@ EIGENVALUE_FLOOR = 1e-9  # relative; directions below it carry no variance and w
 
 def similarity(first: np.ndarray, second: np.ndarray, length_scale: float) -> np.ndarray:
     """S between features (A, F) and (B, F): (A, B) in (0, 1]."""
-    squared = (
-        np.sum(first**2, axis=1)[:, None] + np.sum(second**2, axis=1)[None, :] - 2.0 * first @ second.T
-    )
+    squared = np.sum(first**2, axis=1)[:, None] + np.sum(second**2, axis=1)[None, :] - 2.0 * first @ second.T
     return np.exp(-np.maximum(squared, 0.0) / (2.0 * length_scale**2))
 
 
