@@ -1,6 +1,7 @@
 """The world model: a graph network that learns a twin's dynamics from demonstrations.
 
-``clock`` and ``graph`` need numpy only; importing anything named below imports torch, so it happens on first use.
+``clock`` and ``graph`` need numpy only; importing anything named below imports torch, so it happens on
+first use.
 """
 
 from __future__ import annotations

@@ -14,14 +14,14 @@ class WorldModelConfig:
         message_passing_steps: steps with unshared weights; 7 in the paper.
         history: h; the network sees h + 1 frames, h velocities.
         vertices: object vertices by farthest-point sampling, 100 to 150 in the paper.
-        neighbours: each vertex hears at least its so many nearest; the edge set is made symmetric, so the mean
-            degree comes out about a fifth higher.
+        neighbours: each vertex hears at least its so many nearest; the edge set is made symmetric, so the
+            mean degree comes out about a fifth higher.
         edge_radius_spacings: no edge between object vertices is longer than this many vertex spacings d_v.
         coarse_vertices: so many vertices, spread over the body, are linked with each other.
         coarse_links: and every vertex with so many of them; 0 leaves the paper's local graph.
         modes: most modes of the modal prior.
-        control_vertices_all, control_vertices_per_grip: with more than ``control_vertices_all`` controllers, so many of each rigid
-            group become vertices.
+        control_vertices_all, control_vertices_per_grip: with more than ``control_vertices_all``
+            controllers, so many of each rigid group become vertices.
     """
 
     hidden: int = 64

@@ -1,7 +1,8 @@
 """Episodes as training data: the vertices' tracks, their scales, and batches of sub-sequences.
 
-An episode's arrays: ``times`` (T,) [s], ``particles`` (T, P, 3) [m], ``controllers`` (T, K, 3) [m], ``properties``
-(P, 2) = log(E/E_fit), log(ρ/ρ_fit). Everything random comes from the ``torch.Generator`` that is passed in.
+An episode's arrays: ``times`` (T,) [s], ``particles`` (T, P, 3) [m], ``controllers`` (T, K, 3) [m],
+``properties`` (P, 2) = log(E/E_fit), log(ρ/ρ_fit). Everything random comes from the ``torch.Generator``
+that is passed in.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ CLOCK_TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class Track:
-    """One episode seen by the graph: ``positions`` (T, V, 3) float32 from ``graph_origin``, ``phi`` (n, 2)."""
+    """One episode seen by the graph: ``positions`` (T, V, 3) float32 from ``graph_origin``, ``phi`` (n, 2).
+    """
 
     positions: Tensor
     phi: Tensor
@@ -40,7 +42,9 @@ class Batch:
 
 
 def graph_origin(spec: GraphSpec, vertices: np.ndarray) -> np.ndarray:
-    """Where single precision counts from, (3,): the vertices' mean (…, n, 3), with z at the ground if there is one."""
+    """Where single precision counts from, (3,): the vertices' mean (…, n, 3), with z at the ground if there
+    is one.
+    """
     origin = np.asarray(vertices, dtype=np.float64).reshape(-1, 3).mean(axis=0)
     if spec.ground_height_m is not None:
         origin[2] = spec.ground_height_m
@@ -55,7 +59,9 @@ def read_track(spec: GraphSpec, arrays: dict[str, np.ndarray], history: int) -> 
         raise DatasetUnusable(f"an episode of {frames} frames is shorter than history {history} + 2")
     step = float(times[-1] - times[0]) / (frames - 1)
     if abs(step - spec.dt_s) > CLOCK_TOLERANCE * spec.dt_s:
-        raise DatasetUnusable(f"an episode's frames are {step:.6g} s apart, the model's clock is {spec.dt_s:.6g} s")
+        raise DatasetUnusable(
+            f"an episode's frames are {step:.6g} s apart, the model's clock is {spec.dt_s:.6g} s"
+        )
     if particles.shape[1] <= int(spec.particle_index.max()):
         raise DatasetUnusable(f"an episode of {particles.shape[1]} particles is of another body")
     vertices = np.concatenate(
@@ -77,7 +83,9 @@ def split_tracks(tracks: list[Track], fraction: float, seed: int) -> tuple[list[
     return [tracks[i] for i in order[held_out:]], [tracks[i] for i in order[:held_out]]
 
 
-def measure_scales(tracks: list[Track], spec: GraphSpec, residual: Callable[[Track], Tensor]) -> Normalisation:
+def measure_scales(
+    tracks: list[Track], spec: GraphSpec, residual: Callable[[Track], Tensor]
+) -> Normalisation:
     """Root-mean-square scales over all frames of all object vertices and edges.
 
     ``residual`` gives what the modal prior leaves of a track's steps [m], (…, n, 3).

@@ -1,15 +1,15 @@
 """Fine-tuning of Φ on a recording, weights frozen (paper, section Physical Property Fine-Tuning).
 
-The open-loop rollout over the recording's fitting frames is cut into segments of ``window`` steps. Each step of the
-optimisation unrolls all segments at once (a batch) from the rollout's own states and compares the skinned
-tracked points with the visible measured ones:
+The open-loop rollout over the recording's fitting frames is cut into segments of ``window`` steps. Each
+step of the optimisation unrolls all segments at once (a batch) from the rollout's own states and compares
+the skinned tracked points with the visible measured ones:
 
     loss = MSE / s² + chamfer_weight · Chamfer / s + smoothness_weight · ‖(Φ - Φ_start) / σ_properties‖²
 
-where s is the root-mean-square excursion of the measured points and Chamfer goes from the measured points to the nearest predicted
-ones. The states are refreshed by a new rollout each time the inner validation is made. That one, the open-loop
-error on the last share of the *training* frames, decides when to stop and whether the result is kept at all:
-a Φ that does not beat the calibrated one there is thrown away.
+where s is the root-mean-square excursion of the measured points and Chamfer goes from the measured points
+to the nearest predicted ones. The states are refreshed by a new rollout each time the inner validation is
+made. That one, the open-loop error on the last share of the *training* frames, decides when to stop and
+whether the result is kept at all: a Φ that does not beat the calibrated one there is thrown away.
 """
 
 from __future__ import annotations
@@ -140,7 +140,9 @@ class _Task:
         return unroll(self.model, self.start, self.driven, phi[:, None])[:, :, 0].clone()
 
     def validation_error(self, path: Tensor) -> float:
-        """Mean distance [m] of visible points in the frames that the fit does not see; infinite if not a number."""
+        """Mean distance [m] of visible points in the frames that the fit does not see; infinite if not a
+        number.
+        """
         held_out = slice(self.fitting, None) if self.fitting < len(self.left) else slice(None)
         n = self.model.spec.object_count
         predicted = self._at_frames(path[:, :n], np.arange(len(self.left))[held_out], 0)

@@ -5,14 +5,16 @@ followed by the control vertices (C). Edges are bidirectional, of three kinds:
 
 * NEAR: object vertices, the nearest neighbours within d_e = ``edge_radius_spacings`` · d_v;
 * COARSE: object vertices, the first few of the sampling (they are spread over the body) with each other and
-  every vertex with the nearest of them. In one step of 1/30 s a bending wave crosses the whole body; seven hops
-  of a local graph do not;
-* GRIP: with control vertices. A marker of the gripper may sit outside the body, so no radius is asked of these.
+  every vertex with the nearest of them. In one step of 1/30 s a bending wave crosses the whole body; seven
+  hops of a local graph do not;
+* GRIP: with control vertices. A marker of the gripper may sit outside the body, so no radius is asked of
+  these.
 
-Neighbours are *material*: found once on the undeformed body and kept. An elastic solid keeps its neighbours, so
-the force on a vertex comes from the same vertices at all times; parts that merely pass close by (a folded rope)
-exert no elastic force, while a spatial radius would connect them; and a fixed graph trains as one dense batch
-and rolls out without a search. What it cannot express is contact of the object with itself, fracture and flow.
+Neighbours are *material*: found once on the undeformed body and kept. An elastic solid keeps its
+neighbours, so the force on a vertex comes from the same vertices at all times; parts that merely pass close
+by (a folded rope) exert no elastic force, while a spatial radius would connect them; and a fixed graph
+trains as one dense batch and rolls out without a search. What it cannot express is contact of the object
+with itself, fracture and flow.
 
 Legend: n object vertices, C control vertices, V = n + C, D slots per vertex (largest degree), K controllers.
 """
@@ -25,7 +27,6 @@ import numpy as np
 
 from physworld.worldmodel.config import WorldModelConfig
 from physworld.worldmodel.errors import GraphInvalid
-
 
 NEAR, COARSE, GRIP = 0, 1, 2
 EDGE_KINDS = 3
@@ -82,7 +83,9 @@ class GraphSpec:
 
 
 def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
-    """Indices (≤ count,) of a farthest-point sampling of ``points`` (P, 3), from the point nearest the middle."""
+    """Indices (≤ count,) of a farthest-point sampling of ``points`` (P, 3), from the point nearest the
+    middle.
+    """
     points = np.asarray(points, dtype=np.float64)
     chosen = [int(np.argmin(((points - points.mean(axis=0)) ** 2).sum(axis=1)))]
     distance = ((points - points[chosen[0]]) ** 2).sum(axis=1)
@@ -183,7 +186,8 @@ def _near_links(distances: np.ndarray, neighbours: int, radius: float) -> np.nda
 
 
 def _coarse_links(distances: np.ndarray, coarse: int, links: int) -> np.ndarray:
-    """The first ``coarse`` sampled vertices with each other, and every vertex with its nearest ones of them."""
+    """The first ``coarse`` sampled vertices with each other, and every vertex with its nearest ones of them.
+    """
     linked = np.zeros(distances.shape, dtype=bool)
     if coarse and links:
         linked[:coarse, :coarse] = True
@@ -195,11 +199,12 @@ def _coarse_links(distances: np.ndarray, coarse: int, links: int) -> np.ndarray:
 def _control_links(
     reach: np.ndarray, control: np.ndarray, groups: tuple[np.ndarray, ...], neighbours: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Object with control vertices (n, C), the same turned round (C, n), control with control vertices (C, C).
+    """Object with control vertices (n, C), the same turned round (C, n), control with control vertices (C,
+    C).
 
-    Every control vertex with its nearest object vertices; every object vertex with the nearest control vertex of
-    every grip, from which it reads its displacement against the grip; the control vertices of a grip with each
-    other, from which the grip's turn is read.
+    Every control vertex with its nearest object vertices; every object vertex with the nearest control
+    vertex of every grip, from which it reads its displacement against the grip; the control vertices of a
+    grip with each other, from which the grip's turn is read.
     """
     n, count = reach.shape
     to_object = np.zeros((n, count), dtype=bool)
@@ -214,7 +219,9 @@ def _control_links(
 
 
 def _slot_table(kind: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Senders by receiver (V, D), empty slots filled with V, and their kinds, from kinds (V, V) with -1 for none."""
+    """Senders by receiver (V, D), empty slots filled with V, and their kinds, from kinds (V, V) with -1 for
+    none.
+    """
     vertex_count = kind.shape[0]
     linked = kind >= 0
     width = max(1, int(linked.sum(axis=1).max()))
@@ -226,13 +233,17 @@ def _slot_table(kind: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _relative(neighbours: np.ndarray, undeformed: np.ndarray, reference: np.ndarray, n: int) -> np.ndarray:
-    """Undeformed x_sender − x_receiver of each slot, (V, D, 3): at rest, or at the start beside a controller."""
+    """Undeformed x_sender − x_receiver of each slot, (V, D, 3): at rest, or at the start beside a
+    controller.
+    """
     vertex_count = neighbours.shape[0]
     filled = neighbours < vertex_count
     sender = np.where(filled, neighbours, 0)
     receiver = np.broadcast_to(np.arange(vertex_count)[:, None], neighbours.shape)
     with_control = (sender >= n) | (receiver >= n)
     relative = np.where(
-        with_control[..., None], reference[sender] - reference[receiver], undeformed[sender] - undeformed[receiver]
+        with_control[..., None],
+        reference[sender] - reference[receiver],
+        undeformed[sender] - undeformed[receiver],
     )
     return np.where(filled[..., None], relative, 0.0)

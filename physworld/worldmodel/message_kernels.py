@@ -3,8 +3,8 @@
     out[i, b, :] = Σ_e relu(heard[i, b, :] + sent[s_e, b, :] + bias[e, :] + length[e, b] · weight[:])
 
 over the edges e of receiver i, which lie together. Nothing of the size (edges, batch, hidden) is ever stored:
-the adjoint computes the sums again. One thread walks all receivers, so the adjoint's scatter needs no atomics;
-arguments are addresses, since building an array wrapper costs more than the sum itself. CPU only;
+the adjoint computes the sums again. One thread walks all receivers, so the adjoint's scatter needs no
+atomics; arguments are addresses, since building an array wrapper costs more than the sum itself. CPU only;
 ``messages.py`` holds the plain torch form for other devices.
 """
 
@@ -79,8 +79,8 @@ _ADJOINT = (
                 float slope = 0.0f;
                 for (int c = 0; c < whole; c += 16) {
                     const V w = *(const V*)(W + c);
-                    const V m = *(const V*)(P + row + c) + *(const V*)(Q + q + c) + *(const V*)(S + s + c) + r * w;
-                    const V g = (V)((I)(*(const V*)(G + row + c)) & (m > 0.0f));
+                    const V m = *(const V*)(P + row + c) + *(const V*)(Q + q + c) + *(const V*)(S + s + c) +
+                    r * w; const V g = (V)((I)(*(const V*)(G + row + c)) & (m > 0.0f));
                     *(V*)(dP + row + c) += g;
                     *(V*)(dQ + q + c) += g;
                     *(V*)(dS + s + c) += g;

@@ -1,17 +1,19 @@
 """The modal prior: the best linear model of the data, in closed form, on which the network's correction sits.
 
-The object's places relative to its grips, g = x - c̄ - mean (c̄: mean of the control vertices), are written in their
-R principal modes, a = basis · g; the next amplitudes are a linear function of the last h + 1 and of what the
-grips do (dynamic mode decomposition with control, Proctor et al. 2016), found by ridge regression:
+The object's places relative to its grips, g = x - c̄ - mean (c̄: mean of the control vertices), are written
+in their R principal modes, a = basis · g; the next amplitudes are a linear function of the last h + 1 and
+of what the grips do (dynamic mode decomposition with control, Proctor et al. 2016), found by ridge
+regression:
 
     a^{t+1} = weight · [a^t … a^{t-h}, d^{t+1} … d^{t-h}, e^{t+1}, e^{t-1} … e^{t-h}, 1]
     d^s = x_c^s - c̄^s - shape   (C, 3), the grips' own shape;   e^s = c̄^s - c̄^t   (3,), their path
     x̂^{t+1} = c̄^{t+1} + mean + a^{t+1} · basis
 
-Why: at 30 steps a second an elastic body's motion is global (a bending wave crosses it within a step), and most of
-it is linear. Least squares finds that part in a second; a message-passing network needs thousands of steps. What is
-left to the network is what a linear map lacks: Φ, large rotations, stretching, contact. The prior is equivariant
-to translations. Number of modes and ridge are those with the least open-loop error on episodes kept aside.
+Why: at 30 steps a second an elastic body's motion is global (a bending wave crosses it within a step), and
+most of it is linear. Least squares finds that part in a second; a message-passing network needs thousands
+of steps. What is left to the network is what a linear map lacks: Φ, large rotations, stretching, contact.
+The prior is equivariant to translations. Number of modes and ridge are those with the least open-loop error
+on episodes kept aside.
 
 Legend: T frames, n object vertices, C control vertices, R modes, F regressors, h history. NumPy only.
 """
@@ -125,7 +127,9 @@ def _choose(
             kept = [a[:, :count] for a in amplitudes[fitting]]
             weight = _regress(kept, drives[fitting], size[:count], history, ridge)
             judged = zip(amplitudes[judging], drives[judging], strict=True)
-            error = float(np.mean([_open_loop_error(weight, a, drive, count, history) for a, drive in judged]))
+            error = float(
+                np.mean([_open_loop_error(weight, a, drive, count, history) for a, drive in judged])
+            )
             if error < best[0]:
                 best = (error, count, ridge)
     return best[1], best[2]

@@ -1,25 +1,25 @@
 """The graph network: one step of the world model (paper, section GNN-Based World Models).
 
 Legend: n object vertices, C control vertices, V = n + C; D neighbour slots per vertex; H = ``hidden``; h =
-``history``; L = ``message_passing_steps``; B batch. Frames are ``dt_s`` apart; positions in metres; the z of a
-window counts from the ground where the scene has one. ``relu(x) = max(x, 0)``; a layer ``name`` applies
-``x @ name.weight.T + name.bias``. σ_* are the scalars ``norm.*`` below.
+``history``; L = ``message_passing_steps``; B batch. Frames are ``dt_s`` apart; positions in metres; the z
+of a window counts from the ground where the scene has one. ``relu(x) = max(x, 0)``; a layer ``name``
+applies ``x @ name.weight.T + name.bias``. σ_* are the scalars ``norm.*`` below.
 
 **Inputs** at frame t: positions x_i^{t-h} … x_i^t of all vertices, next positions c^{t+1} of the control
 vertices, properties φ_i (n, 2) = log(E/E_fit), log(ρ/ρ_fit) of the object vertices.
 
 Vertex features f_i, in this order (no positions: the network is equivariant to translations):
-    (x_i^{t-k} - x_i^{t-k-1}) / σ_velocity   for k = 0 … h-1      3h   (each vertex's own velocities, as in GNS;
-                                                                       the paper has relative positions only,
-                                                                       which hides the fall of a whole body)
+    (x_i^{t-k} - x_i^{t-k-1}) / σ_velocity   for k = 0 … h-1      3h   (own velocities, as in GNS: relative
+                                                                        positions hide a whole body's fall)
     (x̂_i^{t+1} - x_i^t) / σ_velocity, for control vertices
         (c_i^{t+1} - c_i^t) / σ_velocity                           3   (the modal prior; the action a_t)
     φ_i / σ_properties; 0 for control vertices                     2
     1 if object vertex, 1 if control vertex                        2
     clip(z_i^t / σ_length, 0, 1), only with a ground               1
 
-Edge features e_ij of receiver i and sender j, with r^t = x_j^t - x_i^t and r_rest = ``graph.rest_relative``; κ =
-``graph.edge_kind`` is 0 near, 1 coarse (both between object vertices), 2 grip (with a control vertex):
+Edge features e_ij of receiver i and sender j, with r^t = x_j^t - x_i^t and r_rest =
+``graph.rest_relative``; κ = ``graph.edge_kind`` is 0 near, 1 coarse (both between object vertices), 2 grip
+(with a control vertex):
     r^t / σ_length                                                 3
     (r^t - r_rest) / σ_strain[κ]                                   3
     ((r^{t-k}) - (r^{t-k-1})) / σ_relative[κ]   for k = 0 … h-1   3h
@@ -27,7 +27,7 @@ Edge features e_ij of receiver i and sender j, with r^t = x_j^t - x_i^t and r_re
     (|r^t| - |r_rest|) / σ_stretch[κ]                              1
 The type of an edge is not a feature: each kind has weights of its own.
 
-**Equations.** Means run over the filled slots of kind κ of ``graph.neighbours[i]``, and are 0 where there is none.
+**Equations.** Means run over the filled slots of kind κ of ``graph.neighbours[i]``; 0 where there is none.
     h_i  = encoder.out(relu(encoder.in(f_i)))
     for l = 0 … L-1:
         m_ij = relu(receive.l.weight h_i + send.l.weight h_j + edge.l.weight[κ_ij] e_ij + receive.l.bias)
@@ -37,8 +37,8 @@ The type of an edge is not a feature: each kind has weights of its own.
     x_i^{t+1} = x̂_i^{t+1} + σ_change · y_i                         x̂: the modal prior
     x_i^{t+1} = c_i^{t+1}                                          for control vertices
 
-**Modal prior** (``physworld.worldmodel.modal`` says why). c̄^s: mean of the control vertices at frame s, where
-s = t+1 takes c^{t+1}.
+**Modal prior** (``physworld.worldmodel.modal`` says why). c̄^s: mean of the control vertices at frame s,
+where s = t+1 takes c^{t+1}.
     a^s = Σ_i prior.basis[:, i] · (x_i^s - c̄^s - prior.mean_i)     (R,), s = t … t-h
     d^s = c^s - c̄^s - prior.shape                                  (C, 3), s = t+1, t … t-h
     e^s = c̄^s - c̄^t                                                (3,), s = t+1, t-1 … t-h
@@ -48,20 +48,22 @@ s = t+1 takes c^{t+1}.
 **Tensors** of ``model.safetensors`` (float32 unless said; ``.weight`` is (out, in)):
     encoder.in.weight (H, 3h+7 or 3h+8), encoder.in.bias (H), encoder.out.weight (H, H), encoder.out.bias (H),
     receive.{l}.weight (H, H), receive.{l}.bias (H), send.{l}.weight (H, H), edge.{l}.weight (3, H, 3h+8),
-    update_in.{l}.weight (H, 4H), update_in.{l}.bias (H), update_out.{l}.weight (H, H), update_out.{l}.bias (H),
-    decoder.in.weight (H, H), decoder.in.bias (H), decoder.out.weight (3, H), decoder.out.bias (3),
-    skip.weight (3, 3h+7 or 3h+8);
+    update_in.{l}.weight (H, 4H), update_in.{l}.bias (H), update_out.{l}.weight (H, H),
+    update_out.{l}.bias (H), decoder.in.weight (H, H), decoder.in.bias (H), decoder.out.weight (3, H),
+    decoder.out.bias (3), skip.weight (3, 3h+7 or 3h+8);
     norm.velocity, norm.change, norm.length (1,), norm.relative, norm.strain, norm.stretch (3,),
     norm.properties (2,);
-    prior.mean (n, 3), prior.basis (R, n, 3), prior.shape (C, 3), prior.weight (R, F);
-    graph.neighbours (V, D) int64, V where the slot is empty; graph.edge_kind (V, D) int64; graph.rest_relative
-    (V, D, 3).
+    prior.mean (n, 3), prior.basis (R, n, 3), prior.shape (C, 3), prior.weight (R, F) with
+    F = (h+1) R + (h+2) 3C + (h+1) 3 + 1;
+    graph.neighbours (V, D) int64, V where the slot is empty; graph.edge_kind (V, D) int64;
+    graph.rest_relative (V, D, 3).
 What a published version adds for its scene is told in ``physworld.worldmodel.published``.
 
-**Split.** The first edge product of [h_i, h_j, e_ij] is taken apart: h_i and h_j are multiplied once per vertex
-and gathered on edges, and so is what of e_ij is linear in positions (r^t = x_j - x_i is a difference of vertex
-quantities). Per edge and step there remain a constant of the graph, computed once per sequence, and |r^t|. The
-product of the messages with update_in follows the sum. The function is that of ``naive.NaiveWorldModel`` up to rounding.
+**Split.** The first edge product of [h_i, h_j, e_ij] is taken apart: h_i and h_j are multiplied once per
+vertex and gathered on edges, and so is what of e_ij is linear in positions (r^t = x_j - x_i is a difference
+of vertex quantities). Per edge and step there remain a constant of the graph, computed once per sequence,
+and |r^t|. The product of the messages with update_in follows the sum. The function is that of
+``naive.NaiveWorldModel`` up to rounding.
 """
 
 from __future__ import annotations
@@ -103,7 +105,8 @@ class Normalisation:
 
 @dataclass(frozen=True)
 class EdgeConstants:
-    """Edge terms by layer and kind that depend on weights and graph only: ``bias`` (E, H), ``position`` (3(h+1), H)
+    """Edge terms by layer and kind that depend on weights and graph only: ``bias`` (E, H), ``position``
+    (3(h+1), H)
     for the linear part of the positions, ``length`` (H,) for |r^t|."""
 
     bias: tuple[tuple[Tensor, ...], ...]
@@ -146,7 +149,9 @@ class WorldModel(nn.Module):
         """The edges of each kind and their constants, in the order of the edge lists."""
         reference = _reference_positions(spec)
         self.register_buffer("_reference", _single(reference), persistent=False)
-        self.edges = [EdgeList.from_neighbours(spec.neighbours, spec.edge_kind == k) for k in range(EDGE_KINDS)]
+        self.edges = [
+            EdgeList.from_neighbours(spec.neighbours, spec.edge_kind == k) for k in range(EDGE_KINDS)
+        ]
         for kind, edges in enumerate(self.edges):
             taken = (spec.neighbours < spec.vertex_count) & (spec.edge_kind == kind)
             rest = spec.rest_relative[taken]
@@ -197,7 +202,9 @@ class WorldModel(nn.Module):
     def step(
         self, window: Tensor, control_next: Tensor, phi: Tensor, constants: EdgeConstants | None = None
     ) -> Tensor:
-        """Positions of all vertices at t + 1 [m], (V, B, 3); control vertices go to ``control_next`` (C, B, 3)."""
+        """Positions of all vertices at t + 1 [m], (V, B, 3); control vertices go to ``control_next`` (C, B,
+        3).
+        """
         n = self.spec.object_count
         ahead = torch.cat([self.prior(window, control_next), control_next])
         correction = self.forward(window, ahead, phi, constants)
@@ -296,7 +303,9 @@ class _Scales(nn.Module):
     def __init__(self, normalisation: Normalisation, spec: GraphSpec) -> None:
         super().__init__()
         values = {name: (getattr(normalisation, name),) for name in ("velocity", "change")}
-        values |= {name: getattr(normalisation, name) for name in ("relative", "strain", "stretch", "properties")}
+        values |= {
+            name: getattr(normalisation, name) for name in ("relative", "strain", "stretch", "properties")
+        }
         values["length"] = (spec.edge_radius_m,)
         for name, value in values.items():
             self.register_buffer(name, torch.tensor(value, dtype=torch.float32))
@@ -316,7 +325,9 @@ def _two_layers(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
 
 
 def _reference_positions(spec: GraphSpec) -> np.ndarray:
-    """A place of every vertex from which displacements are counted, (V, 3): rest, and near it for controllers."""
+    """A place of every vertex from which displacements are counted, (V, 3): rest, and near it for
+    controllers.
+    """
     n = spec.object_count
     reference = np.concatenate([spec.rest_vertices, np.zeros((spec.control_count, 3))])
     for vertex in range(n, spec.vertex_count):

@@ -1,7 +1,7 @@
 """The same network written the usual way: edge features concatenated with both ends' states, edge by edge.
 
-It shares a ``WorldModel``'s weights. It is the oracle of the tests and the yardstick of the benchmark, not meant
-to be used: it is several times slower. Equations and names: ``physworld.worldmodel.model``.
+It shares a ``WorldModel``'s weights. It is the oracle of the tests and the yardstick of the benchmark, not
+meant to be used: it is several times slower. Equations and names: ``physworld.worldmodel.model``.
 """
 
 from __future__ import annotations
@@ -69,7 +69,9 @@ class NaiveWorldModel(nn.Module):
                 weight = torch.cat([ends, model.edge[layer].weight[kind]], dim=1)
                 messages = torch.relu(joined @ weight.T + model.receive[layer].bias) @ others[kind].T
                 degree = torch.bincount(receiver, minlength=state.shape[0]).clamp(min=1)
-                inner = inner + torch.zeros_like(state).index_add(0, receiver, messages) / degree[:, None, None]
+                inner = (
+                    inner + torch.zeros_like(state).index_add(0, receiver, messages) / degree[:, None, None]
+                )
             state = state + model.update_out[layer](torch.relu(inner))
         n = model.spec.object_count
         return model.decoder(state[:n]) + model.skip(features[:n])

@@ -10,12 +10,12 @@ Beside the network's tensors (``physworld.worldmodel.model``) a version holds, f
     start.time (1,) float64       time of the first of these ticks [s]
     skin.index (N, 8) int64, skin.weight (N, 8)   tracked point = Σ_k weight · vertex[index]
 
-and the facts (``architecture`` of the card): the ``WorldModelConfig``, ``dt_s``, ``ground_height_m`` (null: none),
-``vertex_spacing_m``, ``edge_radius_m``, ``object_vertices`` n, ``control_vertices`` C, ``edges``.
+and the facts (``architecture`` of the card): the ``WorldModelConfig``, ``dt_s``, ``ground_height_m`` (null:
+none), ``vertex_spacing_m``, ``edge_radius_m``, ``object_vertices`` n, ``control_vertices`` C, ``edges``.
 
-A rollout starts with ``start.history`` and ``start.controllers``, or from rest: one frame h+1 times with still
-controllers. Its single-precision origin is the mean of the history's last frame; its z is the ground's height
-where there is a ground.
+A rollout starts with ``start.history`` and ``start.controllers``, or from rest: one frame h+1 times with
+still controllers. Its single-precision origin is the mean of the history's last frame; its z is the
+ground's height where there is a ground.
 """
 
 from __future__ import annotations

@@ -37,7 +37,9 @@ def rollout(
     if (initial_history.shape, phi.shape) != expected:
         raise GraphInvalid(f"history and phi of shapes {initial_history.shape}, {phi.shape}, not {expected}")
     if controllers.shape[0] < frames or controllers.shape[1] <= int(spec.control_index.max(initial=0)):
-        raise GraphInvalid(f"controllers of shape {controllers.shape} do not drive a history of {frames} frames")
+        raise GraphInvalid(
+            f"controllers of shape {controllers.shape} do not drive a history of {frames} frames"
+        )
     origin = graph_origin(spec, initial_history[-1])
     driven = torch.as_tensor(controllers[:, spec.control_index] - origin, dtype=torch.float32)
     start = torch.as_tensor(initial_history - origin, dtype=torch.float32)

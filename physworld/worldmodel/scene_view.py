@@ -1,8 +1,10 @@
-"""A recording and its calibrated twin as the world model sees them: on the model's clock, at the graph's vertices.
+"""A recording and its calibrated twin as the world model sees them: on the model's clock, at the graph's
+vertices.
 
 The network needs h + 1 frames to start from. They are the twin's, from the moment at which the body is let go
-(tick ``first``; before it the prediction is the start itself), so that a recording that starts in motion, or is
-held back for a while, starts the network as it starts the twin. Everything after these frames is the network's own.
+(tick ``first``; before it the prediction is the start itself), so that a recording that starts in motion,
+or is held back for a while, starts the network as it starts the twin. Everything after these frames is the
+network's own.
 """
 
 from __future__ import annotations
@@ -62,7 +64,8 @@ class SceneView:
         return self.vertices[self.first : self.first + self.history + 1]
 
     def tracks_of(self, rolled: np.ndarray) -> np.ndarray:
-        """Tracked points at the measured times (F, N, 3) of a rollout (T - first, n, 3) from tick ``first``."""
+        """Tracked points at the measured times (F, N, 3) of a rollout (T - first, n, 3) from tick ``first``.
+        """
         held = np.repeat(self.vertices[:1], self.first, axis=0)
         ticks = self.skin.apply(np.concatenate([held, rolled]))
         return resample_smooth(ticks, self.times, self.scene.times - self.scene.times[0])

@@ -2,14 +2,14 @@
 
 Two ways:
 
-* **Affine weights**, for tracked points: every point is a fixed combination of its K nearest vertices, p = Σ w_k x_k,
-  Σ w_k = 1, that minimises over the states s at hand
+* **Affine weights**, for tracked points: every point is a fixed combination of its K nearest vertices,
+  p = Σ w_k x_k with Σ w_k = 1, that minimises over the states s at hand
       Σ_s |Σ_k w_k x_k^s - p^s|² + λ Σ_k (w_k - v_k)² / v_k,        v ∝ 1/distance.
-  With one state it is exact for every affine motion of a neighbourhood that spans space; with several it also
-  learns what a line or a sheet of vertices hides. It needs no rotation and is linear: differentiable for free.
-* **Linear blend skinning** as in the paper's appendix, for what also needs an orientation (3D Gaussians): weights
-  1/distance, each vertex moved by its translation and by the rotation that fits its neighbourhood best
-  (Kabsch), quaternions blended after their signs are made to agree, which published code forgets.
+  With one state it is exact for every affine motion of a neighbourhood that spans space; with several it
+  also learns what a line or a sheet of vertices hides. It needs no rotation and is linear.
+* **Linear blend skinning** as in the paper's appendix, for what also needs an orientation (3D Gaussians):
+  weights 1/distance, each vertex moved by its translation and by the rotation that fits its neighbourhood
+  best (Kabsch), quaternions blended after their signs are made to agree, which published code forgets.
 
 Shapes: M points, n vertices, K neighbours; positions in metres. Quaternions (w, x, y, z).
 """
@@ -77,7 +77,8 @@ def affine_skin(points: np.ndarray, vertices: np.ndarray, neighbours: int = 8) -
 
 
 def local_rotations(rest: np.ndarray, moved: np.ndarray, neighbours: int = 8) -> np.ndarray:
-    """Rotation of every vertex's neighbourhood, (…, n, 3, 3): argmin_R Σ_j ‖R (rest_j − rest_i) − (moved_j − moved_i)‖².
+    """Rotation of every vertex's neighbourhood, (…, n, 3, 3): argmin_R Σ_j ‖R (rest_j − rest_i) − (moved_j
+    − moved_i)‖².
 
     ``rest`` (n, 3), ``moved`` (…, n, 3). Neighbourhoods on a line leave the turn about it free: it is then
     whatever the singular vectors give, and harmless for points near the line.
@@ -101,7 +102,8 @@ def linear_blend(
     neighbours: int = 8,
     quaternions: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Move points, and their orientations, with the vertices (paper, appendix 3D Gaussian Update Through LBS).
+    """Move points, and their orientations, with the vertices (paper, appendix 3D Gaussian Update Through
+    LBS).
 
     Args:
         points: (M, 3) in the rest state.

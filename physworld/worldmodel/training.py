@@ -2,11 +2,11 @@
 
     loss = Σ_{i=1..τ} mean ‖x_pred^{t+i} - x^{t+i}‖² / σ_change²
 
-unrolled from a random frame t whose history carries random-walk noise, so that training sees the kind of errors
-that a rollout makes; Φ carries noise too, so that it can be fine-tuned later. τ grows from 1 to ``look_ahead``
-over the first two thirds. A running average of the weights is what is validated (open-loop rollouts of whole held-out
-episodes) and returned; the best one wins. The same seed, data and settings give the same weights, and so does a
-run that was interrupted and resumed from a checkpoint.
+unrolled from a random frame t whose history carries random-walk noise, so that training sees the kind of
+errors that a rollout makes; Φ carries noise too, so that it can be fine-tuned later. τ grows from 1 to
+``look_ahead`` over the first two thirds. A running average of the weights is what is validated (open-loop
+rollouts of whole held-out episodes) and returned; the best one wins. The same seed, data and settings give
+the same weights, and so does a run that was interrupted and resumed from a checkpoint.
 """
 
 from __future__ import annotations
@@ -23,7 +23,12 @@ from torch import Tensor
 
 from physworld.worldmodel.config import TrainingConfig, WorldModelConfig
 from physworld.worldmodel.dataset import Track, WindowSampler, measure_scales, split_tracks
-from physworld.worldmodel.errors import CheckpointMismatch, DatasetUnusable, TrainingCancelled, TrainingDiverged
+from physworld.worldmodel.errors import (
+    CheckpointMismatch,
+    DatasetUnusable,
+    TrainingCancelled,
+    TrainingDiverged,
+)
 from physworld.worldmodel.graph import GraphSpec
 from physworld.worldmodel.modal import ModalPrior, fit_prior
 from physworld.worldmodel.model import Normalisation, PriorStep, WorldModel
@@ -120,7 +125,9 @@ def train(
 
 
 def open_loop_error(model: WorldModel, tracks: list[Track]) -> float:
-    """Mean distance [m] of predicted object vertices over whole episodes, after the given first h + 1 frames."""
+    """Mean distance [m] of predicted object vertices over whole episodes, after the given first h + 1
+    frames.
+    """
     return _mean_error(rollout_tracks(model, tracks), tracks, model.spec)
 
 
@@ -178,7 +185,8 @@ def _train_step(run: _Run, sampler: WindowSampler, training: TrainingConfig, loo
 
 
 def _with_noise(window: Tensor, n: int, scale: Tensor, generator: torch.Generator) -> Tensor:
-    """A random walk on the object vertices' history (h+1, V, B, 3) whose last velocity error has that scale."""
+    """A random walk on the object vertices' history (h+1, V, B, 3) whose last velocity error has that scale.
+    """
     steps = window.shape[0] - 1
     kicks = torch.randn((steps, n, *window.shape[2:]), generator=generator) * (scale / math.sqrt(steps))
     walk = kicks.cumsum(dim=0).cumsum(dim=0)

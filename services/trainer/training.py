@@ -1,13 +1,14 @@
 """The ``training`` shard: from a sealed dataset to a published world model.
 
 Reads the episodes through the manifest, trains with a checkpoint every few hundred steps (a killed trainer
-carries on from the last one), fine-tunes the properties on the recording's training frames, measures everything
-open loop on the frames that were held out, and stores the version's files:
+carries on from the last one), fine-tunes the properties on the recording's training frames, measures
+everything open loop on the frames that were held out, and stores the version's files:
 
 * ``model.safetensors``: see ``physworld.worldmodel.model`` and ``.published``;
 * ``card.json``: lineage, architecture, metrics, seeds, versions, intended use, limits;
-* ``prediction.npz``: ``times`` (T,) f8 [s], ``tracks`` and ``tracks_calibrated`` (T, N, 3) f4 [m] after and before
-  fine-tuning, ``twin_tracks``; ``tick_times`` (S,) f8 and ``vertices`` (S, n, 3) f4 on the model's clock;
+* ``prediction.npz``: ``times`` (T,) f8 [s], ``tracks`` and ``tracks_calibrated`` (T, N, 3) f4 [m] after and
+  before fine-tuning, ``twin_tracks``; ``tick_times`` (S,) f8 and ``vertices`` (S, n, 3) f4 on the model's
+  clock;
 * ``manifest.json``: sha256 and size of each of them; its digest is the version's.
 """
 
@@ -81,7 +82,9 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     started = time.perf_counter()
     tuned = _stopping(
         context,
-        lambda: fine_tune(trained.model, phi, view.recording(), view.skin, tuning, cancelled=context.cancelled),
+        lambda: fine_tune(
+            trained.model, phi, view.recording(), view.skin, tuning, cancelled=context.cancelled
+        ),
     )
     tuning_s = time.perf_counter() - started
     context.progress(config.steps, config.steps, "steps", "measuring on the held-out frames")
@@ -169,7 +172,9 @@ def json_safe(value: Any) -> Any:
 
 def _dataset_reference(stores: Stores, dataset_id: str) -> Reference:
     with stores.database.reading() as session:
-        return Reference(kind="dataset", id=dataset_id, digest=resources.get_dataset(session, dataset_id).digest)
+        return Reference(
+            kind="dataset", id=dataset_id, digest=resources.get_dataset(session, dataset_id).digest
+        )
 
 
 def _read_tracks(
@@ -290,7 +295,11 @@ def _card(
         "metrics": metrics,
         "lineage": lineage,
         "seeds": {"training": config.seed},
-        "versions": {"torch": torch.__version__, "numpy": np.__version__, "physworld": lineage["code_version"]},
+        "versions": {
+            "torch": torch.__version__,
+            "numpy": np.__version__,
+            "physworld": lineage["code_version"],
+        },
         "intended_use": (
             "Predict the motion of this object under motions of its grips like those of the demonstrations, "
             "open loop, at the clock dt_s."
