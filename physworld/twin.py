@@ -49,6 +49,7 @@ class Twin:
         held_nodes: nodes that each grip holds, one array a group.
         controllers_start: controllers at the first frame [m], (K, 3).
         release_s: the body is held at its start until then (somebody let go of it).
+        device: Warp device of the simulations; not part of the twin's identity.
     """
 
     body: ReferenceBody
@@ -61,6 +62,7 @@ class Twin:
     held_nodes: tuple[np.ndarray, ...]
     controllers_start: np.ndarray
     release_s: float = 0.0
+    device: str = "cpu"
 
     @property
     def lattice(self) -> Lattice:
@@ -170,6 +172,7 @@ class Twin:
             stiffness_factor=None if properties is None else np.exp(properties[:, 0]),
             density_factor=None if properties is None else np.exp(properties[:, 1]),
             ground=self._ground(),
+            device=self.device,
         )
         velocity = np.zeros_like(self.body.start) if from_rest else self.body.start_velocity
         held = self._held(knots, controls)
@@ -231,8 +234,8 @@ class Twin:
         }
 
     @classmethod
-    def from_arrays(cls, arrays: dict[str, np.ndarray]) -> Twin:
-        """The twin that :meth:`to_arrays` took apart."""
+    def from_arrays(cls, arrays: dict[str, np.ndarray], device: str = "cpu") -> Twin:
+        """The twin that :meth:`to_arrays` took apart, to be simulated on ``device``."""
         facts = json.loads(str(arrays["facts"]))
         lattice = Lattice(**{f.name: arrays[f"lattice_{f.name}"] for f in fields(Lattice)})
         body = ReferenceBody(
@@ -252,6 +255,7 @@ class Twin:
             held_nodes=tuple(np.array(h, dtype=int) for h in facts["held"]),
             controllers_start=arrays["controllers_start"],
             release_s=facts["release_s"],
+            device=device,
         )
 
     def _ground(self) -> GroundContact | None:
@@ -270,18 +274,19 @@ class Twin:
         return HeldNodes(np.concatenate(numbers), positions, velocities)
 
 
-def build_twin(scene: Scene, particle_budget: int = 2000) -> Twin:
+def build_twin(scene: Scene, particle_budget: int = 2000, device: str = "cpu") -> Twin:
     """A twin of the scene with prior parameters, to be calibrated.
 
     Args:
         scene: the recording.
         particle_budget: about how many particles a solid gets; rods and sheets take what their shape needs.
+        device: Warp device of the simulations.
 
     Raises:
         SceneUnsupported: the scene declares too little for a body.
     """
     body = reference_body(scene, particle_budget)
-    times, controls = scene.control_track()
+    _, controls = scene.control_track()
     reach = 0.6 * float(np.ptp(body.start, axis=0).max())
     if scene.grips:
         groups = tuple(np.array(g.controllers, dtype=int) for g in scene.grips)
@@ -305,6 +310,7 @@ def build_twin(scene: Scene, particle_budget: int = 2000) -> Twin:
         held_nodes=tuple(held),
         controllers_start=controls[0],
         release_s=_release_time(scene),
+        device=device,
     )
 
 

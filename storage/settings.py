@@ -7,6 +7,7 @@ Embedded and distributed differ here and nowhere else::
     PHYSWORLD_BROKER_URL     redis://:password@host:port/0             none (the embedded service sets it)
     PHYSWORLD_BROKER_PREFIX  of every key in a broker that is shared    none
     PHYSWORLD_STORE_URL      file:///folder or s3://bucket/prefix      file://{data_dir}/store
+    PHYSWORLD_DEVICE         of the simulations, cpu or cuda:0          cpu
 """
 
 from __future__ import annotations
@@ -44,6 +45,7 @@ class Settings(BaseSettings):
     max_attempts: int = Field(default=5, ge=1)
     republish_seconds: float = Field(default=60.0, gt=0)
     max_upload_bytes: int = Field(default=512 * 2**20, ge=1)
+    device: str = Field(default="cpu", pattern=r"^(cpu|cuda:\d+)$")
     log_level: Literal["debug", "info", "warning", "error"] = "info"
 
     @model_validator(mode="before")

@@ -38,11 +38,13 @@ class CalibrationConfig:
     Attributes:
         particle_budget: about how many particles a solid gets.
         max_simulations: at most this many runs over the training frames.
+        device: Warp device of the simulations.
         damping: "auto" adds drag and internal friction where the data ask; "none" keeps the declared physics only.
     """
 
     particle_budget: int = 2000
     max_simulations: int = 120
+    device: str = "cpu"
     damping: str = "auto"
 
 
@@ -104,7 +106,11 @@ def calibrate(
     config = config or CalibrationConfig()
     started = time.perf_counter()
     search = Search(
-        scene, build_twin(scene, config.particle_budget), config.max_simulations, progress, cancelled
+        scene,
+        build_twin(scene, config.particle_budget, config.device),
+        config.max_simulations,
+        progress,
+        cancelled,
     )
     separate = scene.body.thickness_m is None and scene.body.size_m is None
     parameters = parameters_of(search.twin, separate)

@@ -1,8 +1,8 @@
 """From points to volume: is a place inside the body that a point cloud fills or bounds?
 
 Points that fill a body: an alpha shape, the Delaunay tetrahedra whose circumsphere is no larger than a few point
-distances (Edelsbrunner, Muecke 1994), and half a point distance around the points, for the skin that they leave. Points that only bound it: a voxel shell whose holes are filled, opened again by
-the shell's own thickness; an open surface stays a shell one cell thick.
+distances (Edelsbrunner, Muecke 1994), and half a point distance around the points, for the skin that they leave.
+Points that only bound it: a voxel shell, closed and filled; an open surface stays a shell one voxel thick.
 """
 
 from __future__ import annotations

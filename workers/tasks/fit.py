@@ -38,7 +38,9 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
         context.progress(done, total, "simulations", message)
 
     calibration = CalibrationConfig(
-        particle_budget=config.particle_budget, max_simulations=config.max_simulations
+        particle_budget=config.particle_budget,
+        max_simulations=config.max_simulations,
+        device=stores.settings.device,
     )
     fitted = calibrate(scene, calibration, progress=progress, cancelled=context.cancelled)
     context.check()

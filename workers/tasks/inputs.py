@@ -81,4 +81,4 @@ def _read_twin(stores: Stores, fit_id: str) -> Twin:
     if fit.state != "ready":
         raise Conflict(f"fit {fit_id} is {fit.state}; its twin exists once it is ready")
     data = stores.artifacts.read_bytes(named(fit.artifacts, TWIN, fit_id).sha256)
-    return Twin.from_arrays(npz_arrays(data))
+    return Twin.from_arrays(npz_arrays(data), stores.settings.device)
