@@ -32,6 +32,7 @@ PRIOR_FRICTION = 0.5
 _LAWS: dict[int, type[Law]] = {1: RodLaw, 2: SheetLaw, 3: SolidLaw}
 _RELEASE_SIGMAS = 10.0
 _RELEASE_SHARE = 2e-3  # motion below this share of the body's size is not a release
+_DRIVEN_SHARE = 5e-4  # controllers that moved this share of the body's size drive it
 _MERGE_S = 1e-6  # control and frame times closer than this are one
 
 
@@ -372,9 +373,12 @@ def _release_time(scene: Scene) -> float:
     size = float(np.ptp(np.concatenate([scene.points[0], scene.controllers[0]]), axis=0).max())
     limit = max(_RELEASE_SIGMAS * (scene.noise_sigma_m or 0.0), _RELEASE_SHARE * size)
     moved = np.linalg.norm(scene.points - scene.points[0], axis=2)
-    moved = np.where(scene.visible & scene.visible[0], moved, 0.0).max(axis=1) > limit
+    seen = np.where(scene.visible & scene.visible[0], moved, np.nan)
+    usable = ~np.isnan(seen).all(axis=1)
+    moved = np.zeros(len(seen), dtype=bool)
+    moved[usable] = np.nanmedian(seen[usable], axis=1) > limit  # one point's jump is a tracker's, not a release
     driven = (
-        np.linalg.norm(scene.controllers - scene.controllers[0], axis=2).max(axis=1) > _RELEASE_SHARE * size
+        np.linalg.norm(scene.controllers - scene.controllers[0], axis=2).max(axis=1) > _DRIVEN_SHARE * size
     )
     first = int(np.argmax(moved)) if moved.any() else 0
     if first >= scene.train[1] or driven[: first + 1].any():
