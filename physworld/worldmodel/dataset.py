@@ -26,8 +26,7 @@ CLOCK_TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class Track:
-    """One episode seen by the graph: ``positions`` (T, V, 3) float32 from ``graph_origin``, ``phi`` (n, 2).
-    """
+    """One episode seen by the graph: ``positions`` (T, V, 3) float32 from ``graph_origin``, ``phi`` (n, 2)."""
 
     positions: Tensor
     phi: Tensor

@@ -73,7 +73,24 @@ def fine_tune(
     cancelled: Callable[[], bool] | None = None,
 ) -> FineTuneResult:
     """Optimise ``phi`` (n, 2) on the recording's training frames; see the module's docstring."""
-    task = _Task(model, recording, skin, config)
+    trainable = [parameter for parameter in model.parameters() if parameter.requires_grad]
+    for parameter in trainable:
+        parameter.requires_grad_(False)
+    try:
+        return _optimise(_Task(model, recording, skin, config), phi, progress, cancelled)
+    finally:
+        for parameter in trainable:
+            parameter.requires_grad_(True)
+
+
+def _optimise(
+    task: _Task,
+    phi: np.ndarray,
+    progress: Callable[[int, int, float], None] | None,
+    cancelled: Callable[[], bool] | None,
+) -> FineTuneResult:
+    """Adam on Φ until the inner validation stops improving."""
+    model, config = task.model, task.config
     start = torch.as_tensor(phi, dtype=torch.float32)
     path = task.rollout(start)
     before = best = task.validation_error(path)
@@ -110,8 +127,6 @@ class _Task:
         spec = model.spec
         origin = graph_origin(spec, recording.history[-1])
         self.model, self.skin, self.config = model, skin, config
-        for parameter in model.parameters():
-            parameter.requires_grad_(False)
         last = int(np.ceil(recording.ticks[-1] - 1e-6)) + 1
         self.start = torch.as_tensor(recording.history - origin, dtype=torch.float32)[:, :, None]
         controllers = recording.controllers[:last, spec.control_index] - origin

@@ -186,8 +186,7 @@ def _near_links(distances: np.ndarray, neighbours: int, radius: float) -> np.nda
 
 
 def _coarse_links(distances: np.ndarray, coarse: int, links: int) -> np.ndarray:
-    """The first ``coarse`` sampled vertices with each other, and every vertex with its nearest ones of them.
-    """
+    """The first ``coarse`` sampled vertices with each other, and every vertex with its nearest ones of them."""
     linked = np.zeros(distances.shape, dtype=bool)
     if coarse and links:
         linked[:coarse, :coarse] = True

@@ -64,8 +64,7 @@ class SceneView:
         return self.vertices[self.first : self.first + self.history + 1]
 
     def tracks_of(self, rolled: np.ndarray) -> np.ndarray:
-        """Tracked points at the measured times (F, N, 3) of a rollout (T - first, n, 3) from tick ``first``.
-        """
+        """Tracked points at the measured times (F, N, 3) of a rollout (T - first, n, 3) from tick ``first``."""
         held = np.repeat(self.vertices[:1], self.first, axis=0)
         ticks = self.skin.apply(np.concatenate([held, rolled]))
         return resample_smooth(ticks, self.times, self.scene.times - self.scene.times[0])

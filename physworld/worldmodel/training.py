@@ -185,8 +185,7 @@ def _train_step(run: _Run, sampler: WindowSampler, training: TrainingConfig, loo
 
 
 def _with_noise(window: Tensor, n: int, scale: Tensor, generator: torch.Generator) -> Tensor:
-    """A random walk on the object vertices' history (h+1, V, B, 3) whose last velocity error has that scale.
-    """
+    """A random walk on the object vertices' history (h+1, V, B, 3) whose last velocity error has that scale."""
     steps = window.shape[0] - 1
     kicks = torch.randn((steps, n, *window.shape[2:]), generator=generator) * (scale / math.sqrt(steps))
     walk = kicks.cumsum(dim=0).cumsum(dim=0)

@@ -1,0 +1,78 @@
+"""A bar of masses and springs held at one end: a tiny world to learn, independent of the engine."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from physworld.worldmodel.config import WorldModelConfig
+from physworld.worldmodel.graph import GraphSpec, build_graph
+
+DT_S = 1.0 / 30.0
+SPACING_M = 0.02
+COLUMNS, ROWS = 9, 2
+SUBSTEPS = 60
+SMALL = WorldModelConfig(hidden=16, message_passing_steps=3, history=2, vertices=30, neighbours=5, modes=6)
+
+
+def lattice() -> np.ndarray:
+    """Particles at rest [m], (36, 3): a bar of 9 by 2 by 2."""
+    axes = (np.arange(COLUMNS), np.arange(ROWS), np.arange(ROWS))
+    return SPACING_M * np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float64)
+
+
+def grip(rest: np.ndarray) -> np.ndarray:
+    """Particles that the grip holds: the first column."""
+    return np.nonzero(rest[:, 0] < 0.5 * SPACING_M)[0]
+
+
+def graph(config: WorldModelConfig = SMALL, ground_height_m: float | None = None) -> GraphSpec:
+    """The bar's graph; its controllers are the held particles, one rigid group."""
+    rest = lattice()
+    controllers = rest[grip(rest)]
+    return build_graph(
+        rest,
+        rest,
+        controllers,
+        dt_s=DT_S,
+        config=config,
+        control_groups=(np.arange(len(controllers)),),
+        ground_height_m=ground_height_m,
+    )
+
+
+def episode(seed: int, frames: int = 40) -> dict[str, np.ndarray]:
+    """One episode: the grip swings smoothly, the stiffness is scaled by a random factor."""
+    rng = np.random.default_rng(seed)
+    rest = lattice()
+    held = grip(rest)
+    i, j = np.nonzero(np.triu(np.linalg.norm(rest[:, None] - rest[None], axis=2) < 1.8 * SPACING_M, 1))
+    length = np.linalg.norm(rest[j] - rest[i], axis=1)
+    log_stiffness = rng.normal(0.0, 0.4)
+    stiffness, damping = 40_000.0 * np.exp(log_stiffness), 10.0
+    rate, phase = rng.uniform(4.0, 8.0, 3), rng.uniform(0.0, 2.0 * np.pi, 3)
+    swing = 0.02 * rng.normal(size=3)
+    step = DT_S / SUBSTEPS
+    x, v, path = rest.copy(), np.zeros_like(rest), [rest.copy()]
+    for tick in range(1, (frames - 1) * SUBSTEPS + 1):
+        along = x[j] - x[i]
+        now = np.linalg.norm(along, axis=1)
+        unit = along / now[:, None]
+        pull = stiffness * (now - length)[:, None] * unit + damping * (v[j] - v[i])
+        force = np.zeros_like(x)
+        np.add.at(force, i, pull)
+        np.add.at(force, j, -pull)
+        v = v + step * (force + np.array([0.0, 0.0, -1.0]))
+        x = x + step * v
+        x[held] = rest[held] + swing * (np.sin(rate * tick * step + phase) - np.sin(phase))
+        v[held] = swing * rate * np.cos(rate * tick * step + phase)
+        if tick % SUBSTEPS == 0:
+            path.append(x.copy())
+    particles = np.array(path)
+    properties = np.zeros((len(rest), 2))
+    properties[:, 0] = log_stiffness
+    return {
+        "times": np.arange(frames) * DT_S,
+        "particles": particles.astype(np.float32),
+        "controllers": particles[:, held].astype(np.float32),
+        "properties": properties.astype(np.float32),
+    }

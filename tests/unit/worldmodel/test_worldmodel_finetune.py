@@ -1,0 +1,109 @@
+"""Fine-tuning Φ on a recording whose true Φ is known, and the model as published tensors."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from held_bar import SMALL, graph
+
+from physworld.worldmodel.config import FineTuneConfig, TrainingConfig
+from physworld.worldmodel.dataset import Track
+from physworld.worldmodel.finetune import Recording, fine_tune
+from physworld.worldmodel.published import PublishedModel
+from physworld.worldmodel.rollout import rollout
+from physworld.worldmodel.skinning import affine_skin
+from physworld.worldmodel.training import train
+
+TRAINING = TrainingConfig(steps=60, batch_size=4, look_ahead=4, learning_rate=3e-3, validation_every=30)
+TUNING = FineTuneConfig(steps=20, window=10, windows=3)
+WRONG_PHI = 0.5
+
+
+@pytest.fixture(scope="module")
+def published(tracks: list[Track], episodes: list[dict[str, np.ndarray]]) -> PublishedModel:
+    spec = graph()
+    model = train(tracks, spec, SMALL, TRAINING).model
+    start = episodes[0]["particles"][: SMALL.history + 1].astype(np.float64)
+    zero = np.zeros((spec.object_count, 2))
+    return PublishedModel(
+        model=model,
+        phi=zero + 0.1,
+        phi_calibrated=zero,
+        start_history=start[:, spec.particle_index],
+        start_controllers=episodes[0]["controllers"][: SMALL.history + 1].astype(np.float64),
+        start_time_s=0.0,
+        skin=affine_skin(start[0][::4] + 1e-3, start[0][spec.particle_index]),
+    )
+
+
+def _recording(published: PublishedModel, controllers: np.ndarray, phi: np.ndarray) -> Recording:
+    """What the model itself predicts at ``phi``, as if it had been measured at uneven times."""
+    path = published.rollout(controllers, phi=phi)
+    ticks = np.sort(np.random.default_rng(0).uniform(SMALL.history + 0.5, len(path) - 1.5, 30))
+    left, part = np.floor(ticks).astype(int), (ticks % 1.0)[:, None, None]
+    points = published.skin.apply((1.0 - part) * path[left] + part * path[left + 1])
+    visible = np.ones(points.shape[:2], dtype=bool)
+    visible[::7] = False
+    points[::7] = 0.0
+    return Recording(published.start_history, controllers, ticks, points, visible)
+
+
+def test_a_wrong_property_is_mended_by_the_recording(
+    published: PublishedModel, episodes: list[dict[str, np.ndarray]]
+) -> None:
+    controllers = episodes[1]["controllers"].astype(np.float64)
+    truth = np.zeros((published.spec.object_count, 2))
+    truth[:, 0] = WRONG_PHI
+    recording = _recording(published, controllers, truth)
+    result = fine_tune(published.model, np.zeros_like(truth), recording, published.skin, TUNING)
+    assert result.kept
+    assert result.error_after_m < 0.8 * result.error_before_m
+
+
+def test_a_property_that_is_right_stays_as_it_is(
+    published: PublishedModel, episodes: list[dict[str, np.ndarray]]
+) -> None:
+    controllers = episodes[1]["controllers"].astype(np.float64)
+    truth = np.zeros((published.spec.object_count, 2))
+    result = fine_tune(
+        published.model, truth, _recording(published, controllers, truth), published.skin, TUNING
+    )
+    assert result.error_after_m <= result.error_before_m
+    assert result.kept or np.array_equal(result.phi, truth)
+
+
+def test_weights_are_frozen_and_given_back_trainable(
+    published: PublishedModel, episodes: list[dict[str, np.ndarray]]
+) -> None:
+    before = {name: value.clone() for name, value in published.model.state_dict().items()}
+    controllers = episodes[1]["controllers"].astype(np.float64)
+    phi = np.full((published.spec.object_count, 2), 0.1)
+    fine_tune(published.model, 0.0 * phi, _recording(published, controllers, phi), published.skin, TUNING)
+    assert all(torch.equal(before[name], value) for name, value in published.model.state_dict().items())
+    assert all(parameter.requires_grad for parameter in published.model.parameters())
+
+
+def test_no_steps_leave_the_calibrated_properties(
+    published: PublishedModel, episodes: list[dict[str, np.ndarray]]
+) -> None:
+    controllers = episodes[1]["controllers"].astype(np.float64)
+    phi = np.full((published.spec.object_count, 2), 0.3)
+    recording = _recording(published, controllers, 0.0 * phi)
+    result = fine_tune(published.model, phi, recording, published.skin, dataclasses.replace(TUNING, steps=0))
+    assert not result.kept
+    assert result.phi == pytest.approx(phi)
+
+
+def test_published_tensors_hold_everything(
+    published: PublishedModel, episodes: list[dict[str, np.ndarray]]
+) -> None:
+    again = PublishedModel.from_tensors(published.to_tensors(), published.facts())
+    controllers = episodes[2]["controllers"].astype(np.float64)
+    assert again.rollout(controllers) == pytest.approx(published.rollout(controllers), abs=1e-6)
+    assert again.skin.index.tolist() == published.skin.index.tolist()
+    history = episodes[2]["particles"][: SMALL.history + 1, published.spec.particle_index].astype(np.float64)
+    direct = rollout(published.model, published.spec, history, controllers, published.phi)
+    assert again.rollout(controllers, history=history) == pytest.approx(direct, abs=1e-6)

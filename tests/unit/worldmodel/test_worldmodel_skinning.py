@@ -1,0 +1,102 @@
+"""Carrying points with vertices."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from physworld.worldmodel.skinning import (
+    affine_skin,
+    linear_blend,
+    local_rotations,
+    quaternion_of,
+    quaternion_product,
+)
+
+RIDGE_ERROR = 5e-3  # of the neighbourhood: what the pull towards 1/distance costs
+
+
+def _cloud(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return rng.uniform(size=(60, 3)), rng.uniform(0.2, 0.8, size=(15, 3))
+
+
+def test_affine_motions_are_carried() -> None:
+    vertices, points = _cloud()
+    skin = affine_skin(points, vertices)
+    assert skin.weight.sum(axis=1) == pytest.approx(np.ones(15))
+    turn = Rotation.from_rotvec([0.5, -1.0, 2.0]).as_matrix() * 1.2
+    shift = np.array([1.0, 2.0, 3.0])
+    assert skin.apply(vertices @ turn.T + shift) == pytest.approx(points @ turn.T + shift, abs=RIDGE_ERROR)
+
+
+def test_a_point_that_is_a_vertex_goes_with_it() -> None:
+    vertices, _ = _cloud()
+    skin = affine_skin(vertices[:5], vertices)
+    moved = vertices + np.random.default_rng(1).normal(0.0, 0.05, vertices.shape)
+    assert skin.apply(moved) == pytest.approx(moved[:5], abs=RIDGE_ERROR)
+
+
+def test_several_states_teach_what_a_plane_of_vertices_hides() -> None:
+    rng = np.random.default_rng(2)
+    plane = np.concatenate([rng.uniform(size=(40, 2)), np.zeros((40, 1))], axis=1)
+    points = plane[:6] + np.array([0.01, 0.01, 0.0])
+    bend = np.array([[x, y, 0.3 * x * x] for x, y, _ in plane])
+    bent_points = np.array([[x, y, 0.3 * x * x] for x, y, _ in points])
+    one = affine_skin(points, plane)
+    both = affine_skin(np.stack([points, bent_points]), np.stack([plane, bend]))
+    error = [np.abs(skin.apply(bend) - bent_points).max() for skin in (one, both)]
+    assert error[1] < error[0]
+
+
+def test_torch_and_numpy_agree_and_torch_has_gradients() -> None:
+    vertices, points = _cloud()
+    skin = affine_skin(points, vertices)
+    moving = torch.tensor(np.stack([vertices, vertices * 1.1]), requires_grad=True)
+    carried = skin.apply_torch(moving)
+    assert carried.detach().numpy() == pytest.approx(skin.apply(moving.detach().numpy()))
+    carried.sum().backward()
+    assert float(moving.grad.sum()) == pytest.approx(2 * 15 * 3)
+
+
+def test_linear_blend_skinning_carries_rigid_motions_and_orientations() -> None:
+    vertices, points = _cloud()
+    turn = Rotation.from_rotvec([0.0, 0.0, 3.0])  # beyond where blended signs go wrong
+    moved = turn.apply(vertices) + 1.0
+    assert local_rotations(vertices, moved) == pytest.approx(np.repeat(turn.as_matrix()[None], 60, axis=0))
+    start = np.repeat(np.array([[1.0, 0.0, 0.0, 0.0]]), len(points), axis=0)
+    positions, quaternions = linear_blend(points, vertices, moved, quaternions=start)
+    assert positions == pytest.approx(turn.apply(points) + 1.0)
+    expected = turn.as_quat(scalar_first=True)
+    assert np.abs(quaternions @ expected) == pytest.approx(np.ones(len(points)))
+    assert linear_blend(points, vertices, moved)[1] is None
+
+
+def test_rotations_are_never_reflections() -> None:
+    vertices, _ = _cloud()
+    mirrored = vertices * np.array([1.0, 1.0, -1.0])
+    assert np.linalg.det(local_rotations(vertices, mirrored)) == pytest.approx(np.ones(60))
+
+
+def test_quaternions_near_half_turns_blend_without_cancelling() -> None:
+    vertices, points = _cloud()
+    lean = np.where(vertices[:, :1] > 0.5, 0.02, -0.02) * np.array([[0.0, 0.0, 1.0]])
+    turns = Rotation.from_rotvec(lean + np.array([0.0, 0.0, np.pi]))  # either side of a half turn: opposite signs
+    centre = vertices.mean(axis=0)
+    moved = turns.apply(vertices - centre)
+    start = np.repeat(np.array([[1.0, 0.0, 0.0, 0.0]]), len(points), axis=0)
+    _, quaternions = linear_blend(points, vertices, moved, quaternions=start)
+    half_turn = np.array([0.0, 0.0, 0.0, 1.0])
+    assert np.abs(quaternions @ half_turn).min() > 0.99
+
+
+def test_quaternion_algebra_is_that_of_scipy() -> None:
+    turns = Rotation.random(200, random_state=3)
+    mine = quaternion_of(turns.as_matrix())
+    theirs = turns.as_quat(scalar_first=True)
+    assert np.abs((mine * theirs).sum(axis=1)) == pytest.approx(np.ones(200))
+    product = quaternion_product(mine[:100], mine[100:])
+    expected = (turns[:100] * turns[100:]).as_quat(scalar_first=True)
+    assert np.abs((product * expected).sum(axis=1)) == pytest.approx(np.ones(100))
