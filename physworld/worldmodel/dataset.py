@@ -16,7 +16,6 @@ from torch import Tensor
 
 from physworld.worldmodel.errors import DatasetUnusable
 from physworld.worldmodel.graph import EDGE_KINDS, GraphSpec
-from physworld.worldmodel.messages import EdgeList
 from physworld.worldmodel.model import Normalisation
 
 SCALE_FLOOR_M = 1e-7
@@ -97,9 +96,8 @@ def measure_scales(
         _add(squares, "change", residual(track))
         for kind in range(EDGE_KINDS):
             taken = (spec.neighbours < spec.vertex_count) & (spec.edge_kind == kind)
-            edges = EdgeList.from_neighbours(spec.neighbours, taken)
             rest = torch.as_tensor(spec.rest_relative[taken], dtype=torch.float32)
-            relative = x[:, edges.senders] - x[:, edges.receivers]
+            relative = x[:, spec.neighbours[taken]] - x[:, np.nonzero(taken)[0]]
             stretch = torch.linalg.vector_norm(relative, dim=-1) - torch.linalg.vector_norm(rest, dim=-1)
             _add(squares, f"relative{kind}", relative[1:] - relative[:-1])
             _add(squares, f"strain{kind}", relative - rest)

@@ -1,8 +1,9 @@
 """Warp kernels of the message sum and its adjoint, in native rows of sixteen hidden channels.
 
-    out[i, b, :] = Σ_e relu(heard[i, b, :] + sent[s_e, b, :] + bias[e, :] + length[e, b] · weight[:])
+    out[i, b, :] = Σ_e relu(heard[i, b, :] + sent[s_e, b, :] + bias[e, :] + length[e, b] · weight[k, :])
 
-over the edges e of receiver i, which lie together. Nothing of the size (edges, batch, hidden) is ever stored:
+over the edges e of receiver i, which lie together; receivers come in groups of equal size, and k is the
+group of i. Nothing of the size (edges, batch, hidden) is ever stored:
 the adjoint computes the sums again. One thread walks all receivers, so the adjoint's scatter needs no
 atomics; arguments are addresses, since building an array wrapper costs more than the sum itself. CPU only;
 ``messages.py`` holds the plain torch form for other devices.
@@ -23,7 +24,7 @@ _PREAMBLE = r"""
     const float* Q = (const float*)sent;
     const float* S = (const float*)bias;
     const float* R = (const float*)length;
-    const float* W = (const float*)weight;
+    const int group = vertices / kinds;
     const int whole = hidden / 16 * 16;
 """
 
@@ -34,6 +35,7 @@ _FORWARD = (
     for (int i = 0; i < vertices; ++i)
         for (int b = 0; b < batch; ++b) {
             const long long row = (long long)(i * batch + b) * hidden;
+            const float* W = (const float*)weight + i / group * hidden;
             for (int c = 0; c < whole; c += 16) {
                 const V p = *(const V*)(P + row + c);
                 const V w = *(const V*)(W + c);
@@ -67,10 +69,11 @@ _ADJOINT = (
     float* dQ = (float*)grad_sent;
     float* dS = (float*)grad_bias;
     float* dR = (float*)grad_length;
-    float* dW = (float*)grad_weight;
     for (int i = 0; i < vertices; ++i)
         for (int b = 0; b < batch; ++b) {
             const long long row = (long long)(i * batch + b) * hidden;
+            const float* W = (const float*)weight + i / group * hidden;
+            float* dW = (float*)grad_weight + i / group * hidden;
             for (int e = first[i]; e < first[i + 1]; ++e) {
                 const long long q = (long long)(sender[e] * batch + b) * hidden;
                 const long long s = (long long)e * hidden;
@@ -110,6 +113,7 @@ def message_sum_rows(
     vertices: wp.int32,
     batch: wp.int32,
     hidden: wp.int32,
+    kinds: wp.int32,
     # graph
     offsets: wp.uint64,
     senders: wp.uint64,
@@ -130,6 +134,7 @@ def message_sum_adjoint_rows(
     vertices: wp.int32,
     batch: wp.int32,
     hidden: wp.int32,
+    kinds: wp.int32,
     # graph
     offsets: wp.uint64,
     senders: wp.uint64,
@@ -155,6 +160,7 @@ def message_sum(
     vertices: wp.int32,
     batch: wp.int32,
     hidden: wp.int32,
+    kinds: wp.int32,
     # graph
     offsets: wp.uint64,
     senders: wp.uint64,
@@ -168,7 +174,7 @@ def message_sum(
     out: wp.uint64,
 ):
     """Launch with dim 1; addresses of contiguous float32 (graph: int32) memory."""
-    message_sum_rows(vertices, batch, hidden, offsets, senders, heard, sent, bias, length, weight, out)
+    message_sum_rows(vertices, batch, hidden, kinds, offsets, senders, heard, sent, bias, length, weight, out)
 
 
 @wp.kernel
@@ -177,6 +183,7 @@ def message_sum_adjoint(
     vertices: wp.int32,
     batch: wp.int32,
     hidden: wp.int32,
+    kinds: wp.int32,
     # graph
     offsets: wp.uint64,
     senders: wp.uint64,
@@ -199,6 +206,7 @@ def message_sum_adjoint(
         vertices,
         batch,
         hidden,
+        kinds,
         offsets,
         senders,
         heard,

@@ -1,8 +1,8 @@
 """The message sum of one layer: what every vertex hears along its edges, differentiable.
 
-    out_i = Σ_{e into i} relu(heard_i + sent_{s(e)} + bias_e + length_e · weight)
+    out_{k,i} = Σ_{e of kind k into i} relu(heard_{k,i} + sent_{k,s(e)} + bias_e + length_e · weight_k)
 
-Shapes: heard, sent (V, B, H); bias (E, H); length (E, B); weight (H,); out (V, B, H). On a CPU in single
+Shapes: heard, sent, out (K, V, B, H); bias (E, H); length (E, B); weight (K, H), for K kinds of edges. On a CPU in single
 precision the native rows of ``message_kernels`` do it, elsewhere and in double precision plain torch does.
 """
 
@@ -20,29 +20,40 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class EdgeList:
-    """Edges grouped by receiver: ``offsets`` (V + 1,), ``senders`` (E,) and ``receivers`` (E,), int32."""
+    """Edges of K kinds, by kind and then by receiver; ends count from 0 to K·V, kind by kind; int32.
+
+    Attributes:
+        offsets: first edge of each receiver, (K·V + 1,).
+        senders, receivers: (E,).
+        order: rows of ``neighbours`` (V, D), flattened, that the edges were, (E,).
+    """
 
     offsets: Tensor
     senders: Tensor
     receivers: Tensor
+    order: np.ndarray
 
     @classmethod
-    def from_neighbours(cls, neighbours: np.ndarray, taken: np.ndarray | bool = True) -> EdgeList:
-        """From a slot table (V, D) in which V marks an empty slot; only the slots in ``taken`` (V, D)."""
-        filled = (neighbours < neighbours.shape[0]) & taken
-        receivers = np.nonzero(filled)[0]
-        offsets = np.concatenate([[0], np.cumsum(filled.sum(axis=1))])
+    def from_neighbours(cls, neighbours: np.ndarray, kind: np.ndarray, kinds: int) -> EdgeList:
+        """From a slot table (V, D) in which V marks an empty slot, and the slots' kinds (V, D)."""
+        vertex_count = neighbours.shape[0]
+        receiver, slot = np.nonzero(neighbours < vertex_count)
+        shift = vertex_count * kind[receiver, slot]
+        order = np.argsort(shift + receiver, kind="stable")
+        receiver, slot, shift = receiver[order], slot[order], shift[order]
+        degree = np.bincount(shift + receiver, minlength=kinds * vertex_count)
         return cls(
-            torch.as_tensor(offsets, dtype=torch.int32),
-            torch.as_tensor(neighbours[filled], dtype=torch.int32),
-            torch.as_tensor(receivers, dtype=torch.int32),
+            torch.as_tensor(np.concatenate([[0], np.cumsum(degree)]), dtype=torch.int32),
+            torch.as_tensor(shift + neighbours[receiver, slot], dtype=torch.int32),
+            torch.as_tensor(shift + receiver, dtype=torch.int32),
+            receiver * neighbours.shape[1] + slot,
         )
 
 
 def sum_messages(
     edges: EdgeList, heard: Tensor, sent: Tensor, bias: Tensor, length: Tensor, weight: Tensor
 ) -> Tensor:
-    """Summed messages of every vertex, (V, B, H)."""
+    """Summed messages of every vertex, by kind, (K, V, B, H)."""
     if heard.device.type == "cpu" and heard.dtype == torch.float32:
         return _NativeSum.apply(edges, heard, sent, bias, length, weight)
     return sum_messages_torch(edges, heard, sent, bias, length, weight)
@@ -52,9 +63,11 @@ def sum_messages_torch(
     edges: EdgeList, heard: Tensor, sent: Tensor, bias: Tensor, length: Tensor, weight: Tensor
 ) -> Tensor:
     """The same in plain torch, on any device and in any precision."""
-    along = sent.index_select(0, edges.senders) + heard.index_select(0, edges.receivers)
-    messages = torch.relu(along + bias[:, None] + length[..., None] * weight)
-    return torch.zeros_like(heard).index_add(0, edges.receivers, messages)
+    along = sent.flatten(0, 1)[edges.senders] + heard.flatten(0, 1)[edges.receivers]
+    weights = weight[edges.receivers // heard.shape[1]]
+    messages = torch.relu(along + bias[:, None] + length[..., None] * weights[:, None])
+    total = torch.zeros_like(heard).flatten(0, 1).index_add(0, edges.receivers, messages)
+    return total.view_as(heard)
 
 
 class _NativeSum(torch.autograd.Function):
@@ -82,7 +95,9 @@ class _NativeSum(torch.autograd.Function):
 def _launch(name: str, edges: EdgeList, tensors: tuple[Tensor, ...], shape: torch.Size) -> None:
     """One launch on the addresses of contiguous tensors."""
     warp, kernels = _warp(), _kernels()
-    arguments = [*shape, edges.offsets.data_ptr(), edges.senders.data_ptr(), *(x.data_ptr() for x in tensors)]
+    kinds, vertices, batch, hidden = shape
+    sizes = [kinds * vertices, batch, hidden, kinds]
+    arguments = [*sizes, edges.offsets.data_ptr(), edges.senders.data_ptr(), *(x.data_ptr() for x in tensors)]
     warp.launch(getattr(kernels, name), dim=1, inputs=arguments, device="cpu", record_tape=False)
 
 

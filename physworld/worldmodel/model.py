@@ -105,13 +105,12 @@ class Normalisation:
 
 @dataclass(frozen=True)
 class EdgeConstants:
-    """Edge terms by layer and kind that depend on weights and graph only: ``bias`` (E, H), ``position``
-    (3(h+1), H)
-    for the linear part of the positions, ``length`` (H,) for |r^t|."""
+    """Edge terms by layer that depend on weights and graph only: ``bias`` (E, H), ``position`` (3, 3(h+1), H) for
+    the linear part of the positions, ``length`` (3, H) for |r^t|."""
 
-    bias: tuple[tuple[Tensor, ...], ...]
-    position: tuple[tuple[Tensor, ...], ...]
-    length: tuple[tuple[Tensor, ...], ...]
+    bias: tuple[Tensor, ...]
+    position: tuple[Tensor, ...]
+    length: tuple[Tensor, ...]
 
 
 class WorldModel(nn.Module):
@@ -146,21 +145,25 @@ class WorldModel(nn.Module):
         self.prior = PriorStep(prior or rigid_prior(reference[:n], reference[n:], h), h)
 
     def _set_graph(self, spec: GraphSpec) -> None:
-        """The edges of each kind and their constants, in the order of the edge lists."""
+        """The edges, kind by kind, and their constants, in the order of the edge list."""
         reference = _reference_positions(spec)
-        self.register_buffer("_reference", _single(reference), persistent=False)
-        self.edges = [
-            EdgeList.from_neighbours(spec.neighbours, spec.edge_kind == k) for k in range(EDGE_KINDS)
-        ]
-        for kind, edges in enumerate(self.edges):
-            taken = (spec.neighbours < spec.vertex_count) & (spec.edge_kind == kind)
-            rest = spec.rest_relative[taken]
-            offset = reference[edges.senders] - reference[edges.receivers]
-            constants = np.column_stack([offset, offset - rest, np.linalg.norm(rest, axis=1)])
-            share = 1.0 / np.maximum(taken.sum(axis=1), 1)
-            self.register_buffer(f"_offset_{kind}", _single(offset), persistent=False)
-            self.register_buffer(f"_constants_{kind}", _single(constants), persistent=False)
-            self.register_buffer(f"_share_{kind}", _single(share), persistent=False)
+        self.edges = EdgeList.from_neighbours(spec.neighbours, spec.edge_kind, EDGE_KINDS)
+        senders, receivers = self.edges.senders % spec.vertex_count, self.edges.receivers % spec.vertex_count
+        rest = spec.rest_relative.reshape(-1, 3)[self.edges.order]
+        offset = reference[senders] - reference[receivers]
+        share = 1.0 / np.maximum(np.diff(self.edges.offsets), 1).reshape(EDGE_KINDS, -1, 1, 1)
+        constants = np.column_stack([offset, offset - rest, np.linalg.norm(rest, axis=1)])
+        for name, value in {
+            "_reference": reference,
+            "_offset": offset,
+            "_constants": constants,
+            "_share": share,
+        }.items():
+            self.register_buffer(name, torch.as_tensor(value, dtype=torch.float32), persistent=False)
+        self.register_buffer("_senders", senders, persistent=False)
+        self.register_buffer("_receivers", receivers, persistent=False)
+        kind_of_edge = self.edges.receivers // spec.vertex_count
+        self._edges_by_kind = torch.bincount(kind_of_edge, minlength=EDGE_KINDS).tolist()
 
     def forward(
         self, window: Tensor, ahead: Tensor, phi: Tensor, constants: EdgeConstants | None = None
@@ -178,24 +181,17 @@ class WorldModel(nn.Module):
         moves = (window[1:] - window[:-1]).flip(0)
         features = self._vertex_features(window, moves, ahead, phi)
         shifted = window[-1] - self._reference[:, None]
-        places = torch.cat([shifted, *moves.unbind(0)], dim=-1)
-        lengths = [self._edge_lengths(shifted, kind) for kind in range(EDGE_KINDS)]
+        places = torch.cat([shifted, *moves.unbind(0)], dim=-1).flatten(0, 1).expand(EDGE_KINDS, -1, -1)
+        relative = shifted.index_select(0, self._senders) - shifted.index_select(0, self._receivers)
+        length = torch.linalg.vector_norm(relative + self._offset[:, None], dim=-1)
         state = self.encoder(features)
         for layer in range(self.config.message_passing_steps):
-            heard, sent = self.receive[layer](state), self.send[layer](state)
-            gathered = [state]
-            for kind, edges in enumerate(self.edges):
-                placed = places @ constants.position[layer][kind]
-                total = sum_messages(
-                    edges,
-                    heard - placed,
-                    sent + placed,
-                    constants.bias[layer][kind],
-                    lengths[kind],
-                    constants.length[layer][kind],
-                )
-                gathered.append(total * getattr(self, f"_share_{kind}")[:, None, None])
-            inner = self.update_in[layer](torch.cat(gathered, dim=-1))
+            placed = torch.bmm(places, constants.position[layer]).unflatten(1, window.shape[1:3])
+            heard, sent = self.receive[layer](state) - placed, self.send[layer](state) + placed
+            total = sum_messages(
+                self.edges, heard, sent, constants.bias[layer], length, constants.length[layer]
+            )
+            inner = self.update_in[layer](torch.cat([state, *(total * self._share).unbind(0)], dim=-1))
             state = state + self.update_out[layer](torch.relu(inner))
         return self.decoder(state[:n]) + self.skip(features[:n])
 
@@ -212,26 +208,21 @@ class WorldModel(nn.Module):
 
     def edge_constants(self) -> EdgeConstants:
         """What of the edge products depends on weights and graph only; valid until the weights change."""
-        parts = [[self._edge_terms(layer.weight, k) for k in range(EDGE_KINDS)] for layer in self.edge]
-        bias, position, length = (
-            tuple(tuple(kind[term] for kind in layer) for layer in parts) for term in range(3)
-        )
+        terms = [self._edge_terms(layer.weight) for layer in self.edge]
+        bias, position, length = (tuple(layer[term] for layer in terms) for term in range(3))
         return EdgeConstants(bias, position, length)
 
-    def _edge_terms(self, weights: Tensor, kind: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Bias, position and length terms of one layer and kind from its weights (3, H, 3h+8)."""
-        h, norm, weight = self.config.history, self.norm, weights[kind].T
-        near, strain = weight[0:3] / norm.length, weight[3:6] / norm.strain[kind]
-        moves, rest = weight[6 : 6 + 3 * h] / norm.relative[kind], weight[6 + 3 * h] / norm.length
-        stretch = weight[7 + 3 * h] / norm.stretch[kind]
-        bias = getattr(self, f"_constants_{kind}") @ torch.cat([near, strain, (rest - stretch)[None]])
-        return bias, torch.cat([near + strain, moves]), stretch
-
-    def _edge_lengths(self, shifted: Tensor, kind: int) -> Tensor:
-        """|r^t| of every edge of a kind [m], (E, B)."""
-        edges = self.edges[kind]
-        relative = shifted.index_select(0, edges.senders) - shifted.index_select(0, edges.receivers)
-        return torch.linalg.vector_norm(relative + getattr(self, f"_offset_{kind}")[:, None], dim=-1)
+    def _edge_terms(self, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Bias, position and length terms of one layer from its weights (3, H, 3h+8)."""
+        h, norm, weight = self.config.history, self.norm, weights.transpose(1, 2)
+        strain_scale, drift_scale = norm.strain[:, None, None], norm.relative[:, None, None]
+        near, strain = weight[:, 0:3] / norm.length, weight[:, 3:6] / strain_scale
+        moves, rest = weight[:, 6 : 6 + 3 * h] / drift_scale, weight[:, 6 + 3 * h] / norm.length
+        stretch = weight[:, 7 + 3 * h] / norm.stretch[:, None]
+        table = torch.cat([near, strain, (rest - stretch)[:, None]], dim=1)
+        parts = self._constants.split(self._edges_by_kind)
+        bias = torch.cat([part @ table[kind] for kind, part in enumerate(parts)])
+        return bias, torch.cat([near + strain, moves], dim=1), stretch
 
     def _vertex_features(self, window: Tensor, moves: Tensor, ahead: Tensor, phi: Tensor) -> Tensor:
         """f_i, (V, B, F)."""

@@ -35,6 +35,7 @@ from physworld.worldmodel.model import Normalisation, PriorStep, WorldModel
 from physworld.worldmodel.rollout import rollout_tracks
 
 GROWTH_SHARE = 2.0 / 3.0
+WARM_UP_SHARE = 0.1
 
 
 @dataclass(frozen=True)
@@ -169,7 +170,8 @@ def _train_step(run: _Run, sampler: WindowSampler, training: TrainingConfig, loo
         window = torch.cat([window[1:], predicted[None]])
     share = run.step / training.steps
     floor = training.learning_rate_floor
-    rate = training.learning_rate * (floor + (1.0 - floor) * 0.5 * (1.0 + math.cos(math.pi * share)))
+    warm = min(1.0, (run.step + 1) / (WARM_UP_SHARE * training.steps))
+    rate = warm * training.learning_rate * (floor + (1.0 - floor) * 0.5 * (1.0 + math.cos(math.pi * share)))
     for group in run.optimiser.param_groups:
         group["lr"] = rate
     run.optimiser.zero_grad(set_to_none=True)

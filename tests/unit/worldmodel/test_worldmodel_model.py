@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
 from held_bar import SMALL, graph
 
-from physworld.worldmodel.graph import GraphSpec
+from physworld.worldmodel.graph import EDGE_KINDS, GraphSpec
 from physworld.worldmodel.messages import EdgeList, sum_messages, sum_messages_torch
 from physworld.worldmodel.modal import rigid_prior
 from physworld.worldmodel.model import Normalisation, WorldModel
@@ -123,33 +121,34 @@ def test_an_untrained_network_leaves_the_prior_as_it_is() -> None:
 
 def test_the_rigid_prior_follows_the_grip() -> None:
     spec = graph()
-    prior = rigid_prior(spec.rest_vertices, spec.rest_vertices[:3], SMALL.history)
-    model = WorldModel(SMALL, spec, SCALES, dataclasses.replace(prior))
+    prior = rigid_prior(spec.rest_vertices, spec.rest_vertices[: spec.control_count], SMALL.history)
+    model = WorldModel(SMALL, spec, SCALES, prior)
     window, control_next, _ = _state(spec)
     with torch.inference_mode():
         moved = model.prior(window, control_next)
     gap = moved - control_next.mean(dim=0)
-    rest = spec.rest_vertices - spec.rest_vertices[:3].mean(axis=0)
+    rest = spec.rest_vertices - spec.rest_vertices[: spec.control_count].mean(axis=0)
     assert gap[:, 0].numpy() == pytest.approx(rest, abs=1e-6)
 
 
 @pytest.mark.parametrize("hidden", [16, 40, 7])
 def test_native_message_sums_are_those_of_torch(hidden: int) -> None:
     generator = torch.Generator().manual_seed(2)
-    edges = EdgeList.from_neighbours(graph().neighbours)
-    vertices, count, batch = len(edges.offsets) - 1, len(edges.senders), 3
+    spec = graph()
+    edges = EdgeList.from_neighbours(spec.neighbours, spec.edge_kind, EDGE_KINDS)
+    count, batch = len(edges.senders), 3
 
     def normal(*shape: int) -> torch.Tensor:
         return torch.randn(shape, generator=generator).requires_grad_()
 
     inputs = (
-        normal(vertices, batch, hidden),
-        normal(vertices, batch, hidden),
+        normal(EDGE_KINDS, spec.vertex_count, batch, hidden),
+        normal(EDGE_KINDS, spec.vertex_count, batch, hidden),
         normal(count, hidden),
         normal(count, batch),
-        normal(hidden),
+        normal(EDGE_KINDS, hidden),
     )
-    slope = torch.randn((vertices, batch, hidden), generator=generator)
+    slope = torch.randn(inputs[0].shape, generator=generator)
     native, plain = sum_messages(edges, *inputs), sum_messages_torch(edges, *inputs)
     assert torch.allclose(native, plain, atol=1e-5)
     for a, b in zip(
@@ -159,8 +158,9 @@ def test_native_message_sums_are_those_of_torch(hidden: int) -> None:
 
 
 def test_a_vertex_that_nobody_speaks_to_hears_nothing() -> None:
-    edges = EdgeList.from_neighbours(np.array([[2, 2], [0, 2]]))
-    one = torch.ones((2, 1, 16))
-    heard = sum_messages(edges, one, one, torch.zeros(1, 16), torch.zeros(1, 1), torch.zeros(16))
-    assert heard[0].abs().max() == 0.0
-    assert torch.equal(heard[1], 2.0 * one[1])
+    neighbours = np.array([[2, 2], [0, 2]])
+    edges = EdgeList.from_neighbours(neighbours, np.zeros_like(neighbours), 1)
+    one = torch.ones((1, 2, 1, 16))
+    heard = sum_messages(edges, one, one, torch.zeros(1, 16), torch.zeros(1, 1), torch.zeros(1, 16))
+    assert heard[0, 0].abs().max() == 0.0
+    assert torch.equal(heard[0, 1], 2.0 * one[0, 1])
