@@ -1,0 +1,99 @@
+"""The documentation says what is there: links, command lines, settings, addresses, keys of a scene.
+
+Command lines are parsed with ``--help`` behind them: an unknown command or option fails, nothing runs.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from physworld_client.cli.app import app
+from typer.testing import CliRunner
+
+from services.web import create_app
+from storage.scene_bundle import FIELD_OF_ARRAY
+from storage.scene_declaration import BodyForm, Declaration, GripForm, GroundForm
+from storage.settings import Settings
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
+NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
+
+CODE_BLOCK = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
+HEADING = re.compile(r"^#+ +(.+)$", re.MULTILINE)
+COMMAND = re.compile(r"^ *(physworld [^\n]*)$", re.MULTILINE)
+INLINE_COMMAND = re.compile(r"`(physworld [^`]*)`")
+ADDRESS = re.compile(r"`(GET|POST|PUT|DELETE) (/[^`]*)`")
+
+
+def anchors(text: str) -> set[str]:
+    """Targets of ``#anchor`` links, as GitHub makes them from headings."""
+    titles = HEADING.findall(CODE_BLOCK.sub("", text))
+    return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in titles}
+
+
+def command_lines() -> list[tuple[str, str]]:
+    """(page, command line) of every command quoted in a code block or inline."""
+    found = []
+    for page, name in zip(PAGES, NAMES, strict=True):
+        text = page.read_text()
+        blocks = "\n".join(CODE_BLOCK.findall(text))
+        commands = COMMAND.findall(blocks) + INLINE_COMMAND.findall(CODE_BLOCK.sub("", text))
+        found += [(name, command) for command in commands]
+    return found
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_relative_links_resolve(page: Path) -> None:
+    broken = []
+    for target in LINK.findall(CODE_BLOCK.sub("", page.read_text())):
+        path, _, anchor = target.partition("#")
+        if re.match(r"[a-z]+:", target):
+            continue
+        goal = page if not path else (page.parent / path)
+        if not goal.exists() or (anchor and anchor not in anchors(goal.read_text())):
+            broken.append(target)
+    assert not broken
+
+
+def test_there_are_command_lines_to_check() -> None:
+    assert len(command_lines()) > 20
+
+
+@pytest.mark.parametrize(("page", "line"), command_lines())
+def test_quoted_command_lines_parse(page: str, line: str) -> None:
+    words = shlex.split(line, comments=True)[1:]
+    result = CliRunner().invoke(app, [*words, "--help"])
+    assert result.exit_code == 0, f"{page}: {line}\n{result.output}"
+
+
+def test_the_table_of_settings_is_the_settings() -> None:
+    page = (ROOT / "docs" / "operations.md").read_text()
+    table = page.partition("<!-- settings:begin -->")[2].partition("<!-- settings:end -->")[0]
+    documented = dict(re.findall(r"^\| `PHYSWORLD_(\w+)` \| ([^|]*) \|", table, re.MULTILINE))
+    fields = {name.upper(): field.get_default() for name, field in Settings.model_fields.items()}
+    assert set(documented) == set(fields)
+    plain = {
+        name: value for name, value in fields.items() if isinstance(value, str | int | float) and value != ""
+    }
+    wrong = {name: value for name, value in plain.items() if documented[name] != f"`{value}`"}
+    assert set(wrong) == set()
+
+
+def test_the_table_of_addresses_is_the_api(tmp_path: Path) -> None:
+    paths = create_app(Settings(data_dir=tmp_path)).openapi()["paths"]
+    served = {(method.upper(), path) for path, methods in paths.items() for method in methods}
+    page = (ROOT / "docs" / "api.md").read_text()
+    documented = {pair for pair in ADDRESS.findall(page) if pair[1] != "/metrics"}
+    assert documented == served
+
+
+def test_every_key_of_a_scene_is_documented() -> None:
+    page = (ROOT / "docs" / "scenes.md").read_text()
+    forms = (Declaration, BodyForm, GroundForm, GripForm)
+    keys = {key for form in forms for key in form.model_fields} | set(FIELD_OF_ARRAY)
+    assert {key for key in keys if f"`{key}`" not in page} == set()
