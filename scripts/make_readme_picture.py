@@ -152,7 +152,7 @@ def _draw_errors(axes: Axes, scene: Scene, twin: np.ndarray, model: np.ndarray) 
         axes.axhline(floor, color=INK, linewidth=1.0, linestyle=":", label="noise floor")
     split = 0.5 * (scene.times[scene.test[0] - 1] + scene.times[scene.test[0]])
     axes.axvspan(split, scene.times[-1], color="#f3f4f6", zorder=0)
-    axes.axvline(split, color=MUTED, linewidth=1.0)
+    axes.axvline(split, ymax=0.78, color=MUTED, linewidth=1.0)  # below the legend
     top = axes.get_xaxis_transform()
     axes.text(split, 1.02, "training ", transform=top, ha="right", color=MUTED)
     axes.text(split, 1.02, " held out", transform=top, ha="left", color=COLOURS["twin"])
@@ -162,7 +162,7 @@ def _draw_errors(axes: Axes, scene: Scene, twin: np.ndarray, model: np.ndarray) 
     axes.grid(axis="y", color="#e5e7eb", linewidth=0.8)
     axes.spines[["top", "right"]].set_visible(False)
     axes.set_ylim(top=ROOM_FOR_LEGEND * axes.get_ylim()[1])
-    axes.legend(loc="upper center", ncols=2, framealpha=0.95, edgecolor="none")
+    axes.legend(loc="upper center", ncols=2, frameon=False)
 
 
 def _draw_stages(axes: Axes) -> None:
