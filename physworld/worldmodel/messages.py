@@ -94,7 +94,7 @@ class _NativeSum(torch.autograd.Function):
 
 def _launch(name: str, edges: EdgeList, tensors: tuple[Tensor, ...], shape: torch.Size) -> None:
     """One launch on the addresses of contiguous tensors."""
-    warp, kernels = _warp(), _kernels()
+    warp, kernels = warp_module(), _kernels()
     kinds, vertices, batch, hidden = shape
     sizes = [kinds * vertices, batch, hidden, kinds]
     arguments = [*sizes, edges.offsets.data_ptr(), edges.senders.data_ptr(), *(x.data_ptr() for x in tensors)]
@@ -102,7 +102,7 @@ def _launch(name: str, edges: EdgeList, tensors: tuple[Tensor, ...], shape: torc
 
 
 @cache
-def _warp() -> ModuleType:
+def warp_module() -> ModuleType:
     """Warp, initialised without its banner; imported late, since importing it takes a second."""
     import warp
 

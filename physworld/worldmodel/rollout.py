@@ -2,7 +2,7 @@
 
 A rollout starts from h + 1 known frames of the object (from rest: the same frame h + 1 times, with the
 controllers still) and is driven by controllers on the model's clock. Positions are counted from the start's
-middle, in single precision.
+middle, in single precision. One sequence goes through the native engine, a batch through torch.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from physworld.worldmodel.dataset import Track, graph_origin
+from physworld.worldmodel.engine import RolloutEngine
 from physworld.worldmodel.errors import GraphInvalid
 from physworld.worldmodel.graph import GraphSpec
 from physworld.worldmodel.model import WorldModel
@@ -41,10 +42,10 @@ def rollout(
             f"controllers of shape {controllers.shape} do not drive a history of {frames} frames"
         )
     origin = graph_origin(spec, initial_history[-1])
-    driven = torch.as_tensor(controllers[:, spec.control_index] - origin, dtype=torch.float32)
-    start = torch.as_tensor(initial_history - origin, dtype=torch.float32)
-    predicted = unroll(model, start[:, :, None], driven[:, :, None], torch.as_tensor(phi).float()[:, None])
-    return predicted[:, :n, 0].double().numpy() + origin
+    predicted = RolloutEngine(model).run(
+        initial_history - origin, controllers[:, spec.control_index] - origin, phi
+    )
+    return predicted[:, :n].astype(np.float64) + origin
 
 
 def rollout_tracks(model: WorldModel, tracks: list[Track]) -> list[Tensor]:

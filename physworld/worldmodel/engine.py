@@ -1,0 +1,137 @@
+"""The fast rollout of one sequence on a CPU: prepares a model's weights once for the native kernel.
+
+It is the function of ``rollout.unroll`` for a batch of one, in single precision, several times faster: nothing is
+allocated and nothing returns to Python between steps.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from physworld.worldmodel.messages import warp_module
+from physworld.worldmodel.model import WorldModel
+
+REGISTER = 16
+
+
+class RolloutEngine:
+    """A model's weights, transposed and padded; call :meth:`run` as often as you like."""
+
+    def __init__(self, model: WorldModel) -> None:
+        spec, config, norm = model.spec, model.config, model.norm
+        self.history, self.objects, self.vertices = config.history, spec.object_count, spec.vertex_count
+        self.hidden = -(-config.hidden // REGISTER) * REGISTER
+        prior = model.prior
+        self._fixed = _pack_weights(model, self.hidden) | {
+            "offsets": _integers(model.edges.offsets),
+            "edge_sender": _integers(model._senders),
+            "edge_receiver": _integers(model._receivers),
+            "edge_offset": _floats(model._offset),
+            "share": _floats(model._share),
+            "reference": _floats(model._reference),
+            "mean": _floats(prior.mean),
+            "basis": _floats(prior.basis),
+            "shape": _floats(prior.shape),
+            "prior_weight": _floats(prior.weight),
+        }
+        self._property_scale = norm.properties.numpy()
+        change, velocity, length = (float(x) for x in (norm.change, norm.velocity, norm.length))
+        self._scalars = np.array([1.0 / velocity, change, 1.0 / length], dtype=np.float32)
+        self._sizes = {
+            "first": config.history,
+            "history": config.history,
+            "objects": spec.object_count,
+            "vertices": spec.vertex_count,
+            "edges": spec.edge_count,
+            "layers": config.message_passing_steps,
+            "hidden": self.hidden,
+            "modes": prior.basis.shape[0],
+            "controls": spec.control_count,
+            "inputs": model.skip.in_features,
+            "places_width": 3 * (config.history + 1),
+            "grounded": int(spec.ground_height_m is not None),
+        }
+
+    def run(self, start: np.ndarray, driven: np.ndarray, phi: np.ndarray) -> np.ndarray:
+        """All vertices (T, V, 3) float32 from object frames (h+1, n, 3), control vertices (T, C, 3), Φ (n, 2)."""
+        from physworld.worldmodel import engine_kernels as kernels
+
+        frames, sizes = driven.shape[0], self._sizes | {"frames": driven.shape[0]}
+        path = np.zeros((frames, self.vertices, 3), dtype=np.float32)
+        path[: self.history + 1, : self.objects] = start
+        path[:, self.objects :] = driven
+        rows, edges = self.vertices * self.hidden, sizes["edges"]
+        scratch = dict.fromkeys(("state", "hear", "say", "placed", "heard", "sent", "sums", "inner"), rows)
+        scratch |= {
+            "amplitudes": frames * sizes["modes"],
+            "features": self.vertices * sizes["inputs"],
+            "places": self.vertices * sizes["places_width"],
+            "correction": self.objects * REGISTER,
+            "length": edges,
+            "regressors": self._fixed["prior_weight"].shape[1],
+            "ahead": 3 * self.vertices,
+        }
+        arrays = self._fixed | {name: np.zeros(count, dtype=np.float32) for name, count in scratch.items()}
+        arrays |= {"path": path, "phi": np.ascontiguousarray(phi / self._property_scale, dtype=np.float32)}
+        table = np.array([arrays[name].ctypes.data for name in kernels.ARRAYS], dtype=np.int64)
+        numbers = np.array([sizes[name] for name in kernels.SIZES], dtype=np.int32)
+        addresses = [numbers.ctypes.data, self._scalars.ctypes.data, table.ctypes.data]
+        warp_module().launch(kernels.rollout, dim=1, inputs=addresses, device="cpu", record_tape=False)
+        return path
+
+
+def _pack_weights(model: WorldModel, hidden: int) -> dict[str, np.ndarray]:
+    """Every weight as (…, in, out), widths padded to ``hidden``; layers stacked."""
+    with torch.inference_mode():
+        constants = model.edge_constants()
+    own, wide = model.config.hidden, hidden
+
+    def stack(layers: torch.nn.ModuleList, blocks: int = 1) -> np.ndarray:
+        parts = [_padded(part.T, wide, wide) for layer in layers for part in layer.weight.split(own, dim=1)]
+        return np.stack(parts).reshape(len(layers), blocks, wide, wide)
+
+    def biases(layers: torch.nn.ModuleList) -> np.ndarray:
+        return np.stack([_padded(layer.bias[None], 1, wide)[0] for layer in layers])
+
+    encoder_in, encoder_out = getattr(model.encoder, "in"), model.encoder.out
+    decoder_in, decoder_out = getattr(model.decoder, "in"), model.decoder.out
+    inputs, edges = encoder_in.in_features, model.spec.edge_count
+    positions = [_padded(part, part.shape[0], wide) for layer in constants.position for part in layer]
+    lengths = [_padded(part[None], 1, wide) for layer in constants.length for part in layer]
+    return {
+        "encode_in": _padded(encoder_in.weight.T, inputs, wide),
+        "encode_in_bias": _padded(encoder_in.bias[None], 1, wide),
+        "encode_out": _padded(encoder_out.weight.T, wide, wide),
+        "encode_out_bias": _padded(encoder_out.bias[None], 1, wide),
+        "receive": stack(model.receive),
+        "receive_bias": biases(model.receive),
+        "send": stack(model.send),
+        "position": np.stack(positions),
+        "edge_bias": np.stack([_padded(layer, edges, wide) for layer in constants.bias]),
+        "edge_length": np.stack(lengths),
+        "update_in": stack(model.update_in, 4),
+        "update_in_bias": biases(model.update_in),
+        "update_out": stack(model.update_out),
+        "update_out_bias": biases(model.update_out),
+        "decode_in": _padded(decoder_in.weight.T, wide, wide),
+        "decode_in_bias": _padded(decoder_in.bias[None], 1, wide),
+        "decode_out": _padded(decoder_out.weight.T, wide, REGISTER),
+        "decode_out_bias": _padded(decoder_out.bias[None], 1, REGISTER),
+        "skip": _padded(model.skip.weight.T, inputs, REGISTER),
+    }
+
+
+def _padded(values: torch.Tensor, rows: int, columns: int) -> np.ndarray:
+    """As float32 (rows, columns), filled up with zeros."""
+    out = np.zeros((rows, columns), dtype=np.float32)
+    out[: values.shape[0], : values.shape[1]] = values.detach().numpy()
+    return out
+
+
+def _floats(values: torch.Tensor) -> np.ndarray:
+    return np.ascontiguousarray(values.detach().numpy(), dtype=np.float32)
+
+
+def _integers(values: torch.Tensor) -> np.ndarray:
+    return np.ascontiguousarray(values.numpy(), dtype=np.int32)
