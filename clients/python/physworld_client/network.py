@@ -60,7 +60,8 @@ class Network:
             phi: log property ratios of the object vertices, (n, 2).
         """
         n = self.object_count
-        features = self._vertex_features(window, control_next - window[-1, n:], phi)
+        ahead = np.concatenate([self._modal_prior(window, control_next), control_next])
+        features = self._vertex_features(window, ahead, phi)
         state = self._mlp("encoder", features)
         edges = self._edge_terms(window)
         for layer in range(self.layers):
@@ -70,9 +71,26 @@ class Network:
             inner = self._linear(f"update_in.{layer}", np.hstack([state, self._means(messages)]))
             state = state + self._linear(f"update_out.{layer}", np.maximum(inner, 0.0))
         correction = self._mlp("decoder", state[:n]) + features[:n] @ self._tensor("skip.weight").T
-        inertial = window[-1, :n] + self._scale("inertia") * (window[-1, :n] - window[-2, :n])
-        moved = inertial + self._scale("change") * correction.astype(np.float64)
-        return np.concatenate([moved, control_next])
+        ahead[:n] += self._scale("change") * correction.astype(np.float64)
+        return ahead
+
+    def _modal_prior(self, window: np.ndarray, control_next: np.ndarray) -> np.ndarray:
+        """x̂^{t+1} of the object vertices [m], (n, 3)."""
+        n = self.object_count
+        basis = self._tensor("prior.basis").astype(np.float64)
+        mean, shape = self._tensor("prior.mean"), self._tensor("prior.shape")
+        controls = np.concatenate([control_next[None], window[::-1, n:]])
+        centre = controls.mean(axis=1)
+        relative = window[::-1, :n] - centre[1:, None] - mean
+        amplitudes = np.einsum("rnx,snx->sr", basis, relative)
+        path = np.delete(centre, 1, axis=0) - centre[1]
+        shapes = controls - centre[:, None] - shape
+        regressors = np.concatenate([amplitudes.ravel(), shapes.ravel(), path.ravel(), [1.0]])
+        weight = self._tensor("prior.weight").astype(np.float64)
+        if weight.shape != (len(basis), len(regressors)):
+            raise ModelUnreadable(f"prior.weight is {weight.shape}, not {(len(basis), len(regressors))}")
+        next_amplitudes = weight @ regressors
+        return np.asarray(centre[0] + mean + np.tensordot(next_amplitudes, basis, axes=1))
 
     def _sort_edges(self, vertex_count: int) -> None:
         """The edge list, and where the edges of one receiver and kind begin in it."""
@@ -98,13 +116,13 @@ class Network:
         means[self._segments] = np.add.reduceat(messages, self._first, axis=0) * self._share
         return means.reshape(vertex_count, EDGE_KINDS * width)
 
-    def _vertex_features(self, window: np.ndarray, action: np.ndarray, phi: np.ndarray) -> np.ndarray:
-        """f_i, (V, 3h+7 or 3h+8): own velocities newest first, action, properties, kind, height."""
+    def _vertex_features(self, window: np.ndarray, ahead: np.ndarray, phi: np.ndarray) -> np.ndarray:
+        """f_i, (V, 3h+7 or 3h+8): own velocities newest first, what lies ahead, properties, kind, height."""
         n, control = self.object_count, self.control_count
         moves = (window[1:] - window[:-1])[::-1] / self._scale("velocity")
         parts = [
             np.moveaxis(moves, 0, 1).reshape(n + control, -1),
-            np.concatenate([np.zeros((n, 3)), action / self._scale("velocity")]),
+            (ahead - window[-1]) / self._scale("velocity"),
             np.concatenate([phi / self._tensor("norm.properties"), np.zeros((control, PROPERTY_COUNT))]),
             np.repeat(np.eye(2), (n, control), axis=0),
         ]

@@ -17,6 +17,8 @@ from physworld_client.world_model import WorldModel
 from safetensors.numpy import load_file, save_file
 
 from physworld.worldmodel import PublishedModel, WorldModelConfig, affine_skin, build_graph
+from physworld.worldmodel.graph import GraphSpec
+from physworld.worldmodel.modal import ModalPrior, regressor_count, rigid_prior
 from physworld.worldmodel.model import Normalisation
 from physworld.worldmodel.model import WorldModel as Network
 
@@ -40,10 +42,12 @@ def published(ground_height_m: float | None = None) -> PublishedModel:
         control_groups=(np.arange(3), np.arange(3, 6)),
         ground_height_m=ground_height_m,
     )
-    scales = {"velocity": 5e-3, "inertia": 0.9, "change": 1e-3}
+    scales = {"velocity": 5e-3, "change": 1e-3}
     names = {field.name for field in dataclasses.fields(Normalisation)} - {*scales, "properties"}
     torch.manual_seed(3)
-    model = Network(config, spec, Normalisation(**scales, properties=(0.2, 0.1)))
+    model = Network(
+        config, spec, Normalisation(**scales, properties=(0.2, 0.1)), some_prior(spec, config.history, rng)
+    )
     with torch.no_grad():
         model.skip.weight.normal_(0.0, 0.02)
         for name in names:
@@ -60,6 +64,18 @@ def published(ground_height_m: float | None = None) -> PublishedModel:
         start_time_s=0.5,
         skin=affine_skin(particles[:13], spec.rest_vertices),
     )
+
+
+def some_prior(spec: GraphSpec, history: int, rng: np.random.Generator) -> ModalPrior:
+    """Five modes that swing, and answer the grips a little: none of its terms is zero."""
+    n, modes = spec.object_count, 5
+    control_places = spec.rest_vertices[spec.neighbours[n:, 0]]
+    prior = rigid_prior(spec.rest_vertices, control_places, history)
+    basis = np.linalg.qr(rng.normal(size=(3 * n, modes)))[0].T.reshape(modes, n, 3)
+    weight = rng.normal(0.0, 0.02, (modes, regressor_count(modes, spec.control_count, history)))
+    weight[:, :modes] += 1.8 * np.eye(modes)
+    weight[:, modes : 2 * modes] -= 0.85 * np.eye(modes)
+    return dataclasses.replace(prior, basis=basis, weight=weight)
 
 
 def write(folder: Path, model: PublishedModel) -> str:
