@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 NARROWEST = 110
+LONGEST_LIST = 8
 
 stdout = Console(highlight=False, width=None if sys.stdout.isatty() else NARROWEST)
 stderr = Console(stderr=True, highlight=False, width=None if sys.stderr.isatty() else NARROWEST)
@@ -41,14 +42,26 @@ def print_table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
 
 
 def print_fields(value: BaseModel) -> None:
-    """The fields of one object, one a line; nested values as JSON."""
+    """The fields of one object, one a line; nested values as JSON, long lists of numbers by their length."""
     fields = value.model_dump(mode="json")
     width = max(len(name) for name in fields)
     for name, content in fields.items():
         if content in (None, "", [], {}):
             continue
-        text = content if isinstance(content, str) else json.dumps(content, ensure_ascii=False)
+        text = content if isinstance(content, str) else json.dumps(_shortened(content), ensure_ascii=False)
         stdout.print(f"{name:<{width}}  {text}", markup=False, soft_wrap=True)
+
+
+def _shortened(content: Any) -> Any:
+    """The same without lists of more than ``LONGEST_LIST`` numbers; ``--json`` prints them."""
+    if isinstance(content, dict):
+        return {name: _shortened(value) for name, value in content.items()}
+    if isinstance(content, list):
+        numbers = all(item is None or isinstance(item, int | float) for item in content)
+        if numbers and len(content) > LONGEST_LIST:
+            return f"{len(content)} numbers"
+        return [_shortened(item) for item in content]
+    return content
 
 
 def ago(moment: datetime) -> str:
