@@ -11,7 +11,7 @@ from physworld.worldmodel.dataset import Track, read_track
 
 @pytest.fixture(scope="session")
 def episodes() -> list[dict[str, np.ndarray]]:
-    return [episode(seed) for seed in range(10)]
+    return [episode(seed) for seed in range(16)]
 
 
 @pytest.fixture(scope="session")

@@ -47,8 +47,8 @@ def episode(seed: int, frames: int = 40) -> dict[str, np.ndarray]:
     held = grip(rest)
     i, j = np.nonzero(np.triu(np.linalg.norm(rest[:, None] - rest[None], axis=2) < 1.8 * SPACING_M, 1))
     length = np.linalg.norm(rest[j] - rest[i], axis=1)
-    log_stiffness = rng.normal(0.0, 0.4)
-    stiffness, damping = 40_000.0 * np.exp(log_stiffness), 10.0
+    log_stiffness = rng.normal(0.0, 0.5)
+    stiffness, damping = 10_000.0 * np.exp(log_stiffness), 40.0
     rate, phase = rng.uniform(4.0, 8.0, 3), rng.uniform(0.0, 2.0 * np.pi, 3)
     swing = 0.02 * rng.normal(size=3)
     step = DT_S / SUBSTEPS

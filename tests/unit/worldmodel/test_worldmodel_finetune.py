@@ -17,7 +17,9 @@ from physworld.worldmodel.rollout import rollout
 from physworld.worldmodel.skinning import affine_skin
 from physworld.worldmodel.training import train
 
-TRAINING = TrainingConfig(steps=60, batch_size=4, look_ahead=4, learning_rate=3e-3, validation_every=30)
+TRAINING = TrainingConfig(
+    steps=150, batch_size=8, look_ahead=6, learning_rate=3e-3, validation_every=50, validation_fraction=0.2
+)
 TUNING = FineTuneConfig(steps=20, window=10, windows=3)
 WRONG_PHI = 0.5
 

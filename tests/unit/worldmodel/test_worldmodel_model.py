@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 from held_bar import SMALL, graph
 
+from physworld.worldmodel.engine import RolloutEngine
 from physworld.worldmodel.graph import EDGE_KINDS, GraphSpec
 from physworld.worldmodel.messages import EdgeList, sum_messages, sum_messages_torch
 from physworld.worldmodel.modal import rigid_prior
 from physworld.worldmodel.model import Normalisation, WorldModel
 from physworld.worldmodel.naive import NaiveWorldModel
+from physworld.worldmodel.rollout import unroll
 
 SAME_FUNCTION = 1e-5  # of outputs of order one, in single precision
 SCALES = Normalisation(
@@ -24,10 +28,10 @@ SCALES = Normalisation(
 )
 
 
-def _model(spec: GraphSpec) -> WorldModel:
+def _model(spec: GraphSpec, hidden: int = SMALL.hidden) -> WorldModel:
     """Random weights everywhere, the ones that start at zero too."""
     torch.manual_seed(0)
-    model = WorldModel(SMALL, spec, SCALES)
+    model = WorldModel(dataclasses.replace(SMALL, hidden=hidden), spec, SCALES)
     with torch.no_grad():
         for parameter in (model.skip.weight, model.decoder.out.weight, model.decoder.out.bias):
             parameter.normal_(0.0, 0.2)
@@ -129,6 +133,22 @@ def test_the_rigid_prior_follows_the_grip() -> None:
     gap = moved - control_next.mean(dim=0)
     rest = spec.rest_vertices - spec.rest_vertices[: spec.control_count].mean(axis=0)
     assert gap[:, 0].numpy() == pytest.approx(rest, abs=1e-6)
+
+
+@pytest.mark.parametrize("ground", [None, -0.01])
+@pytest.mark.parametrize("hidden", [16, 24])
+def test_the_native_rollout_is_that_of_torch(hidden: int, ground: float | None) -> None:
+    spec = graph(ground_height_m=ground)
+    model = _model(spec, hidden)
+    window, control_next, phi = _state(spec, batch=1)
+    drift = torch.linspace(0.0, 0.05, 20)[:, None, None, None]
+    driven = torch.cat([window[:, spec.object_count :], control_next + drift])
+    expected = unroll(model, window[:, : spec.object_count], driven, phi)[:, :, 0].numpy()
+    native = RolloutEngine(model).run(
+        window[:, : spec.object_count, 0].numpy(), driven[:, :, 0].numpy(), phi[:, 0].numpy()
+    )
+    assert np.abs(expected[-1] - expected[SMALL.history]).max() > 1e-2
+    assert native == pytest.approx(expected, abs=1e-5)
 
 
 @pytest.mark.parametrize("hidden", [16, 40, 7])

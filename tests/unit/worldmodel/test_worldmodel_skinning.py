@@ -83,7 +83,9 @@ def test_rotations_are_never_reflections() -> None:
 def test_quaternions_near_half_turns_blend_without_cancelling() -> None:
     vertices, points = _cloud()
     lean = np.where(vertices[:, :1] > 0.5, 0.02, -0.02) * np.array([[0.0, 0.0, 1.0]])
-    turns = Rotation.from_rotvec(lean + np.array([0.0, 0.0, np.pi]))  # either side of a half turn: opposite signs
+    turns = Rotation.from_rotvec(
+        lean + np.array([0.0, 0.0, np.pi])
+    )  # either side of a half turn: opposite signs
     centre = vertices.mean(axis=0)
     moved = turns.apply(vertices - centre)
     start = np.repeat(np.array([[1.0, 0.0, 0.0, 0.0]]), len(points), axis=0)
