@@ -146,12 +146,13 @@ def measure(view: SceneView, published: PublishedModel) -> Measured:
     tracks, tracks_calibrated = view.tracks_of(rolled), view.tracks_of(calibrated)
     twin_tracks = resample_smooth(view.twin_tracks, view.times, frame_times)
     predictions = {"twin": twin_tracks, "world_model": tracks_calibrated, "world_model_finetuned": tracks}
+    finite = {name: path for name, path in predictions.items() if np.isfinite(path).all()}
     return Measured(
         tracks=tracks,
         tracks_calibrated=tracks_calibrated,
         twin_tracks=twin_tracks,
         vertices=np.concatenate([np.repeat(view.vertices[:1], view.first, axis=0), rolled]),
-        table=held_out_table(view.scene, predictions),
+        table=_with_absent(held_out_table(view.scene, finite), sorted(set(predictions) - set(finite))),
         steps_per_second={
             "twin": view.twin_steps_per_second,
             "world_model": (len(rolled) - view.history - 1) / min(seconds),
@@ -168,6 +169,14 @@ def json_safe(value: Any) -> Any:
     if isinstance(value, np.generic):
         value = value.item()
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _with_absent(table: dict[str, Any], absent: list[str]) -> dict[str, Any]:
+    """The table with None for predictions that left the numbers: they have no error, and the rest is published."""
+    for name in absent:
+        for metric in ("track_m", "track_phystwin_m", "chamfer_phystwin_m", "chamfer_l2_m"):
+            table[metric][name] = None
+    return table
 
 
 def _dataset_reference(stores: Stores, dataset_id: str) -> Reference:

@@ -1,0 +1,191 @@
+"""The training shard on a real dataset of a tiny scene: published files, resuming, cancelling."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import load
+from tiny_scene import register, tiny_scene
+
+from physworld.twin import build_twin
+from physworld.worldmodel import PublishedModel
+from schemas.dataset import DatasetConfig
+from schemas.fit import FitConfig
+from schemas.job import Job
+from schemas.model import ModelVersion, TrainingConfig, TrainingCreate
+from services.trainer import training
+from services.trainer.training import json_safe, translate
+from storage import jobs, leases, registry, resources
+from storage.database import open_database
+from storage.settings import Settings
+from storage.tables import ShardRow
+from workers.execute import Runtime, run_shard
+from workers.owner import process_owner
+from workers.registry import register as register_handler
+from workers.stores import Stores
+
+FRAMES = 24
+SMALL = TrainingConfig(
+    hidden=16,
+    message_passing_steps=2,
+    history=2,
+    look_ahead=2,
+    vertices=20,
+    steps=16,
+    batch_size=2,
+    fine_tune_steps=5,
+)
+
+
+@pytest.fixture
+def runtime(tmp_path: Path) -> Iterator[Runtime]:
+    """One process that knows every kind of shard, on a folder of its own."""
+    settings = Settings(data_dir=tmp_path / "data", lease_seconds=20.0)
+    database = open_database(settings)
+    database.upgrade()
+    register_handler("training", "services.trainer.training:run")
+    yield Runtime(settings, database, Stores(settings, database), process_owner())
+    database.dispose()
+
+
+@pytest.fixture
+def dataset_id(runtime: Runtime) -> str:
+    """A sealed dataset of four episodes of the tiny scene's twin."""
+    scene_id = register(tiny_scene(FRAMES), runtime.database, runtime.stores.artifacts)
+    with runtime.database.session() as session:
+        fit = jobs.create_fit(session, scene_id, FitConfig(particle_budget=60, max_simulations=4))
+    assert _drain(runtime) == {"done"}
+    with runtime.database.session() as session:
+        job = jobs.create_dataset(session, fit.outputs[0].id, DatasetConfig(episodes=4))
+    assert _drain(runtime) == {"done"}
+    return job.outputs[0].id
+
+
+def _drain(runtime: Runtime) -> set[str]:
+    outcomes: set[str] = set()
+    while True:
+        with runtime.database.reading() as session:
+            waiting = leases.publishable(session, datetime.now(UTC))
+        if not waiting:
+            return outcomes
+        outcomes |= {run_shard(runtime, publication.shard_id) for publication in waiting}
+
+
+def _train(runtime: Runtime, dataset_id: str) -> tuple[Job, ModelVersion]:
+    with runtime.database.session() as session:
+        job = jobs.create_training(session, TrainingCreate(name="bar", dataset_id=dataset_id, config=SMALL))
+    _drain(runtime)
+    with runtime.database.reading() as session:
+        version = registry.list_versions(session, "bar").data[0]
+        return jobs.get_job(session, job.id), version
+
+
+def _files(runtime: Runtime, version: ModelVersion) -> dict[str, bytes]:
+    return {item.name: runtime.stores.artifacts.read_bytes(item.sha256) for item in version.artifacts}
+
+
+def test_a_training_publishes_a_version_that_rolls_out(runtime: Runtime, dataset_id: str) -> None:
+    job, version = _train(runtime, dataset_id)
+    assert (job.state, version.state) == ("succeeded", "ready"), job.error
+    files = _files(runtime, version)
+    assert set(files) == {"model.safetensors", "card.json", "prediction.npz", "manifest.json"}
+    assert hashlib.sha256(files["manifest.json"]).hexdigest() == version.sha256
+    manifest = json.loads(files["manifest.json"])
+    assert (manifest["name"], manifest["version"]) == ("bar", 1)
+    for name, entry in manifest["files"].items():
+        assert entry == {"sha256": hashlib.sha256(files[name]).hexdigest(), "size": len(files[name])}
+    card = json.loads(files["card.json"])
+    published = PublishedModel.from_tensors(load(files["model.safetensors"]), card["architecture"])
+    controllers = np.repeat(published.start_controllers[-1:], 10, axis=0)
+    assert np.isfinite(published.rollout(controllers)).all()
+    with runtime.database.reading() as session:
+        digest = resources.get_dataset(session, dataset_id).digest
+    assert {item["kind"]: item["digest"] for item in card["lineage"]["inputs"]}["dataset"] == digest
+    assert not (runtime.settings.data_dir / "checkpoints" / job.id).exists()
+
+
+def test_the_metrics_have_every_row_of_the_table(runtime: Runtime, dataset_id: str) -> None:
+    _, version = _train(runtime, dataset_id)
+    rows = {"static", "rigid_follow", "constant_velocity", "twin", "world_model", "world_model_finetuned"}
+    for metric in ("track_m", "chamfer_phystwin_m", "chamfer_l2_m"):
+        row = version.metrics["held_out"][metric]
+        assert rows <= set(row)
+        assert all(row[name] > 0.0 for name in rows)
+    assert set(version.metrics["steps_per_second"]) == {"twin", "world_model"}
+    assert version.metrics["episodes"] == 4
+    assert version.metrics["validation"]["curve"][-1][0] == SMALL.steps
+
+
+def test_the_same_inputs_give_the_same_weights(runtime: Runtime, dataset_id: str) -> None:
+    digests = []
+    for _ in range(2):
+        _, version = _train(runtime, dataset_id)
+        tensors = load(_files(runtime, version)["model.safetensors"])
+        digests.append({name: value.tobytes() for name, value in tensors.items()})
+    assert digests[0] == digests[1]
+
+
+def test_a_killed_training_carries_on_from_its_checkpoint(
+    runtime: Runtime, dataset_id: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = load(_files(runtime, _train(runtime, dataset_id)[1])["model.safetensors"])
+    real_train, resumed = training.train, []
+
+    def killed_once(*arguments, checkpoint, save_checkpoint, **options):
+        resumed.append(checkpoint is not None)
+
+        def save(data: bytes) -> None:
+            save_checkpoint(data)
+            if len(resumed) == 1:
+                raise OSError("killed after its checkpoint")
+
+        return real_train(*arguments, checkpoint=checkpoint, save_checkpoint=save, **options)
+
+    monkeypatch.setattr(training, "train", killed_once)
+    with runtime.database.session() as session:
+        jobs.create_training(session, TrainingCreate(name="bar", dataset_id=dataset_id, config=SMALL))
+    with runtime.database.reading() as session:
+        (first,) = leases.publishable(session, datetime.now(UTC))
+    run_shard(runtime, first.shard_id)
+    with runtime.database.session() as session:
+        session.get_one(ShardRow, first.shard_id).not_before = None  # the pause before a retry
+    run_shard(runtime, first.shard_id)
+    with runtime.database.reading() as session:
+        version = registry.list_versions(session, "bar").data[0]
+    assert resumed == [False, True]
+    again = load(_files(runtime, version)["model.safetensors"])
+    assert all(np.array_equal(whole[name], again[name]) for name in whole)
+
+
+def test_settings_of_the_wire_reach_the_library(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PHYSWORLD_TRAINER_THREADS", "2")
+    architecture, settings, tuning = translate(SMALL)
+    assert (architecture.hidden, architecture.vertices, architecture.history) == (16, 20, 2)
+    assert (settings.steps, settings.look_ahead, settings.threads) == (16, 2, 2)
+    assert tuning.steps == 5
+
+
+def test_numbers_that_json_lacks_become_null() -> None:
+    value = {"a": [np.float64("inf"), np.int64(3)], "b": (float("nan"), True, None, "x")}
+    assert json_safe(value) == {"a": [None, 3], "b": [None, True, None, "x"]}
+
+
+def test_a_rollout_that_left_the_numbers_is_published_as_absent(monkeypatch: pytest.MonkeyPatch) -> None:
+    from physworld.worldmodel.model import WorldModel
+    from physworld.worldmodel.scene_view import view_scene
+
+    scene = tiny_scene(FRAMES)
+    architecture, _, _ = translate(SMALL)
+    view = view_scene(scene, build_twin(scene, 60), architecture)
+    model = WorldModel(architecture, view.spec)
+    phi = np.zeros((view.spec.object_count, 2))
+    model.prior.mean.fill_(float("inf"))
+    measured = training.measure(view, view.published(model, phi, phi))
+    assert measured.table["track_m"]["world_model"] is None
+    assert measured.table["track_m"]["twin"] is not None
