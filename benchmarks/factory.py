@@ -81,7 +81,7 @@ def measure(repeats: int, seed: int) -> Report:
         data = Path(folder)
         with service(data, 2) as client:
             scene = client.scenes.create(SCENE)
-            config = FitConfig(max_simulations=FIT_SIMULATIONS, seed=seed)
+            config = FitConfig(max_simulations=FIT_SIMULATIONS)
             job = client.jobs.wait(client.fits.create(scene.id, config), timeout=JOB_S)
             fit_id = job.outputs[0].id
 

@@ -7,16 +7,18 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from schemas.base import Artifact, Lineage, Request, Resource, Seed
+from schemas.base import Artifact, Lineage, Request, Resource
 
 
 class FitConfig(Request):
-    """Settings of the calibration; a null takes the engine's own choice and is recorded."""
+    """Settings of the calibration, which is deterministic: the same scene and settings give the same fit.
 
-    material: Literal["auto", "neo_hookean"] = "auto"
+    ``damping``: "auto" adds air drag and internal friction where the data ask; "none" keeps the declared physics.
+    """
+
     particle_budget: int = Field(default=2000, ge=50, le=200_000)
     max_simulations: int = Field(default=120, ge=1, le=5000)
-    seed: Seed = 0
+    damping: Literal["auto", "none"] = "auto"
 
 
 class FitCreate(Request):

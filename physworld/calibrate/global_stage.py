@@ -16,6 +16,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
@@ -45,7 +46,7 @@ class CalibrationConfig:
     particle_budget: int = 2000
     max_simulations: int = 120
     device: str = "cpu"
-    damping: str = "auto"
+    damping: Literal["auto", "none"] = "auto"
 
 
 @dataclass(frozen=True)

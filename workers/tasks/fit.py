@@ -41,6 +41,7 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
         particle_budget=config.particle_budget,
         max_simulations=config.max_simulations,
         device=stores.settings.device,
+        damping=config.damping,
     )
     fitted = calibrate(scene, calibration, progress=progress, cancelled=context.cancelled)
     context.check()
@@ -64,9 +65,7 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
         "metrics": metrics,
         "artifacts": [artifact.model_dump(mode="json") for artifact in artifacts],
         "seconds": fitted.seconds,
-        "lineage": lineage_of(
-            [scene_reference(stores, payload["scene_id"])], payload["config"], {"fit": config.seed}
-        ),
+        "lineage": lineage_of([scene_reference(stores, payload["scene_id"])], payload["config"], {}),
     }
     return HandlerResult(result, artifacts[0].sha256)
 

@@ -21,13 +21,36 @@ _MATERIALS = [
             "viscosity_pa_s": "Pa s",
             "density_kg_m3": "kg/m^3",
         },
-    )
+    ),
+    Material(
+        name="elastic_sheet",
+        title="Thin isotropic sheet, flat at rest",
+        energy="W(e, k) = C/2 (nu (tr e)^2 + (1 - nu) e:e) + D/2 (nu (tr k)^2 + (1 - nu) k:k)",
+        parameters={
+            "membrane_n_m": "N/m",
+            "bending_n_m": "N m",
+            "poissons_ratio": "1",
+            "relaxation_s": "s",
+            "density_kg_m2": "kg/m^2",
+        },
+    ),
+    Material(
+        name="elastic_rod",
+        title="Rope or rod, straight at rest",
+        energy="W(x', k) = EA/2 (|x'| - 1)^2 + B/2 |k|^2",
+        parameters={
+            "stretching_n": "N",
+            "bending_n_m2": "N m^2",
+            "relaxation_s": "s",
+            "density_kg_m": "kg/m",
+        },
+    ),
 ]
 
 
 @router.get("/materials")
 def list_materials() -> Page[Material]:
-    """Constitutive laws by the name that `FitConfig.material` takes."""
+    """Constitutive laws that a fit chooses from by the body's shape: solid, sheet, rod."""
     return Page(data=_MATERIALS)
 
 

@@ -106,7 +106,7 @@ def test_text_that_postgres_cannot_keep_is_refused(service: Service) -> None:
         assert_problem(client.post("/v1/fits", json={"scene_id": "a\0"}), 422, "invalid_request")
         scene = scene_id(client)
         assert_problem(
-            client.post("/v1/fits", json={"scene_id": scene, "config": {"seed": 2**63}}),
+            client.post("/v1/pipelines", json={"scene_id": scene, "dataset": {"seed": 2**63}}),
             422,
             "invalid_request",
         )

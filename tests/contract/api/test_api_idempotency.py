@@ -29,7 +29,7 @@ def test_another_body_or_address_is_refused(client: httpx.Client) -> None:
     body = {"scene_id": scene_id(client)}
     headers = {"Idempotency-Key": "other"}
     assert client.post("/v1/fits", json=body, headers=headers).status_code == 202
-    changed = client.post("/v1/fits", json={**body, "config": {"seed": 7}}, headers=headers)
+    changed = client.post("/v1/fits", json={**body, "config": {"max_simulations": 7}}, headers=headers)
     assert_problem(changed, 422, "idempotency_key_reused")
     assert_problem(client.post("/v1/pipelines", json=body, headers=headers), 422, "idempotency_key_reused")
 

@@ -52,8 +52,8 @@ def test_a_large_body_is_refused_with_both_numbers(client: httpx.Client) -> None
 def test_values_that_no_database_keeps_are_refused(client: httpx.Client) -> None:
     scene = scene_id(client)
     for seed in (-1, 2**63, 0.5):
-        body = {"scene_id": scene, "config": {"seed": seed}}
-        assert_problem(client.post("/v1/fits", json=body), 422, "invalid_request")
+        body = {"scene_id": scene, "dataset": {"seed": seed}}
+        assert_problem(client.post("/v1/pipelines", json=body), 422, "invalid_request")
     for text in ("\0", "a\0b", "\ud800"):
         data = json.dumps({"name": "m", "dataset_id": "dst_none", "description": text})
         headers = {"Content-Type": "application/json"}

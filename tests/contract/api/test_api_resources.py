@@ -89,9 +89,9 @@ def test_aliases_need_a_ready_version_and_a_sound_name(client: httpx.Client, cha
     client.post(f"/v1/jobs/{job['id']}/cancel")
 
 
-def test_libraries_name_what_a_fit_may_ask_for(client: httpx.Client) -> None:
+def test_libraries_name_the_laws_that_a_fit_chooses_from(client: httpx.Client) -> None:
     names = [material["name"] for material in client.get("/v1/materials").json()["data"]]
-    assert names == ["neo_hookean"]
+    assert names == ["neo_hookean", "elastic_sheet", "elastic_rod"]
     assert client.get("/v1/effects").json()["data"] == []
 
 

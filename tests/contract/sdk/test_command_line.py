@@ -104,7 +104,7 @@ def test_run_prints_the_table_and_writes_the_report(service: Service, tmp_path: 
     with service.client() as client:
         config = client.jobs.list(kind="pipeline", limit=1).data[0].config
     assert (config["training"]["hidden"], config["dataset"]["episodes"]) == (16, 3)
-    assert [config[stage]["seed"] for stage in ("fit", "dataset", "training")] == [5, 5, 5]
+    assert [config[stage]["seed"] for stage in ("dataset", "training")] == [5, 5]
 
 
 def test_a_failed_run_prints_the_problem_with_its_numbers(service: Service, tmp_path: Path) -> None:

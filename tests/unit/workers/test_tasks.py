@@ -75,6 +75,19 @@ def test_a_fit_leaves_a_twin_a_prediction_and_its_errors(fit: Fit, stores: Store
     assert fit.lineage.inputs[0].kind == "scene" and fit.lineage.config_digest
 
 
+def test_a_fit_without_damping_keeps_the_declared_physics(
+    runtime_with, stores: Stores, scene_id: str
+) -> None:
+    config = FitConfig(particle_budget=60, max_simulations=14, damping="none")
+    with stores.database.session() as session:
+        job = jobs.create_fit(session, scene_id, config)
+    assert _drain(runtime_with()) == ["done"]
+    with stores.database.reading() as session:
+        fit = resources.get_fit(session, job.outputs[0].id)
+    assert fit.config == config and fit.metrics["not_needed"] == {}
+    assert not {"air_drag_per_s", "viscosity_pa_s"} & set(fit.parameters)
+
+
 def test_a_dataset_is_sealed_under_the_digest_of_its_manifest(runtime_with, fit: Fit, stores: Stores) -> None:
     job, dataset = _make_dataset(runtime_with(), fit, episodes=EPISODES, frames=8, seed=7)
     assert (job.state, dataset.state) == ("succeeded", "sealed")

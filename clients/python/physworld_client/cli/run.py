@@ -36,7 +36,7 @@ def run(
     vertices: Annotated[int | None, typer.Option(min=4, help="Vertices of the graph.")] = None,
     particles: Annotated[int | None, typer.Option(min=50, help="Particles of the twin, about.")] = None,
     simulations: Annotated[int | None, typer.Option(min=1, help="Most simulations of the fit.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of every stage.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of demonstration and training.")] = None,
     name: Annotated[str | None, typer.Option(help="Name of the model [the scene's name].")] = None,
     json: Annotated[Path | None, typer.Option(help="Write the figures to this file.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the model [DATA/models/NAME-VERSION].")] = None,
