@@ -2,7 +2,8 @@
 
 Every 0.1 s: publish the shards that wait (an outbox: publish first, then mark; a crash in between publishes
 twice, which a claim by compare-and-set makes harmless). Every second: take back leases that ran out, at once
-those whose owner on this host is provably dead, and look how deep the broker's queues are.
+those whose owner on this host is provably dead, and look how deep the broker's queues are. Every hour: forget
+the idempotency keys of more than a day ago.
 
 A queue that is empty in two looks while shards of it wait has lost their messages: they are published again
 after two seconds instead of ``republish_seconds``. A queue that is deep gets nothing more, so the broker
@@ -19,7 +20,7 @@ import signal
 import sys
 import threading
 import time
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import FrameType
 
@@ -27,7 +28,7 @@ from celery import Celery
 from kombu.exceptions import OperationalError as BrokerError
 
 from schemas.queues import SIMULATION, TASK_NAME, TRAINING
-from storage import leases
+from storage import idempotency, leases
 from storage.database import Database, open_database
 from storage.errors import DatabaseUnavailable
 from storage.settings import Settings, get_settings
@@ -38,6 +39,8 @@ logger = logging.getLogger(__name__)
 
 TICK_S = 0.1
 SWEEP_S = 1.0
+FORGET_EVERY_S = 3600.0
+IDEMPOTENCY_KEPT = timedelta(hours=24)
 LOST_AFTER_S = 2.0
 PAUSE_AFTER_ERROR_S = 1.0
 MAX_DEPTH = 64
@@ -55,6 +58,7 @@ class Dispatcher:
         self._depth = dict.fromkeys((SIMULATION, TRAINING), 0)
         self._empty_looks = dict.fromkeys((SIMULATION, TRAINING), 0)
         self._sweep_due = 0.0
+        self._forget_due = 0.0
 
     def run(self, stop: threading.Event) -> None:
         """Tick until told to stop; a broker or database that is away is waited for."""
@@ -80,6 +84,9 @@ class Dispatcher:
             lost_in = {queue for queue, looks in self._empty_looks.items() if looks >= 2}
             self._publish(LOST_AFTER_S, lost_in)
         self._publish(self._settings.republish_seconds, set(self._depth))
+        if time.monotonic() >= self._forget_due:
+            self._forget_old_keys()
+            self._forget_due = time.monotonic() + FORGET_EVERY_S
 
     def _publish(self, republish_seconds: float, queues: set[str]) -> None:
         open_queues = {queue for queue in queues if self._depth[queue] < MAX_DEPTH}
@@ -112,6 +119,12 @@ class Dispatcher:
             taken = leases.reap(session, datetime.now(UTC))
         if taken:
             logger.warning("took back %d shards: %s", len(taken), ", ".join(taken))
+
+    def _forget_old_keys(self) -> None:
+        with self._database.session() as session:
+            forgotten = idempotency.forget(session, datetime.now(UTC) - IDEMPOTENCY_KEPT)
+        if forgotten:
+            logger.info("forgot %d idempotency keys older than %s", forgotten, IDEMPOTENCY_KEPT)
 
     def _look_at_queues(self) -> None:
         channel = self._connection.default_channel

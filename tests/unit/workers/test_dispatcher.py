@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 
 import pytest
 import redis
@@ -17,11 +17,11 @@ from pydantic import SecretStr
 
 from schemas.fit import FitConfig
 from schemas.queues import SIMULATION
-from storage import jobs, leases
+from storage import idempotency, jobs, leases
 from storage.settings import Settings
-from storage.tables import ShardRow
+from storage.tables import IdempotencyRow, ShardRow
 from workers.app import create_app
-from workers.dispatcher import MAX_DEPTH, Dispatcher
+from workers.dispatcher import FORGET_EVERY_S, MAX_DEPTH, Dispatcher
 from workers.stores import Stores
 
 WITHIN_S = 20.0
@@ -87,6 +87,34 @@ def test_messages_that_the_broker_lost_are_published_again(
     _until(lambda: broker.llen(SIMULATION) == 3)
     broker.flushall()
     _until(lambda: broker.llen(SIMULATION) == 3)
+
+
+def test_idempotency_keys_of_more_than_a_day_ago_are_forgotten_once_an_hour(
+    settings: Settings, stores: Stores, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def keep(name: str, age: timedelta) -> None:
+        with stores.database.session() as session:
+            assert idempotency.reserve(session, "key_1", name, "fingerprint") is None
+            session.get_one(IdempotencyRow, ("key_1", name)).created_at = datetime.now(UTC) - age
+
+    def kept() -> set[str]:
+        with stores.database.reading() as session:
+            return {row.key for row in session.query(IdempotencyRow)}
+
+    keep("old", timedelta(hours=25))
+    keep("fresh", timedelta(hours=23))
+    app = create_app(settings)
+    dispatcher = Dispatcher(settings, stores.database, app)
+    dispatcher.tick()
+    assert kept() == {"fresh"}
+    keep("old again", timedelta(hours=25))
+    dispatcher.tick()
+    assert kept() == {"fresh", "old again"}
+    later = time.monotonic() + FORGET_EVERY_S
+    monkeypatch.setattr(time, "monotonic", lambda: later)
+    dispatcher.tick()
+    assert kept() == {"fresh"}
+    app.close()
 
 
 @pytest.mark.usefixtures("dispatching")
