@@ -11,14 +11,17 @@ from schemas.base import Artifact, Lineage, Request, Resource, Seed
 
 
 class TrainingConfig(Request):
-    """Settings of the graph network (paper, section GNN-Based World Models) and of its training."""
+    """Settings of the graph network (paper, section GNN-Based World Models) and of its training.
+
+    The defaults train in about three minutes on one core; look-ahead grows to its value during training.
+    """
 
     hidden: int = Field(default=64, ge=8, le=1024)
     message_passing_steps: int = Field(default=7, ge=1, le=20)
     history: int = Field(default=3, ge=1, le=10)
-    look_ahead: int = Field(default=3, ge=1, le=20)
-    vertices: int = Field(default=120, ge=4, le=1000)
-    steps: int = Field(default=3000, ge=1, le=1_000_000)
+    look_ahead: int = Field(default=8, ge=1, le=20)
+    vertices: int = Field(default=100, ge=4, le=1000)
+    steps: int = Field(default=800, ge=1, le=1_000_000)
     batch_size: int = Field(default=8, ge=1, le=256)
     learning_rate: float = Field(default=1e-3, gt=0, le=1)
     fine_tune_steps: int = Field(default=60, ge=0, le=10_000)

@@ -2,8 +2,9 @@
 
     out_{k,i} = Σ_{e of kind k into i} relu(heard_{k,i} + sent_{k,s(e)} + bias_e + length_e · weight_k)
 
-Shapes: heard, sent, out (K, V, B, H); bias (E, H); length (E, B); weight (K, H), for K kinds of edges.
-On a CPU in single precision the native rows of ``message_kernels`` do it, elsewhere and in double precision plain torch does.
+Shapes: heard, sent, out (K, V, B, H); bias (E, H); length (E, B); weight (K, H), for K kinds.
+On a CPU in single precision the native rows of ``message_kernels`` do it, elsewhere and in double precision
+plain torch does.
 """
 
 from __future__ import annotations
