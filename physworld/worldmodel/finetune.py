@@ -23,9 +23,9 @@ from torch import Tensor
 
 from physworld.worldmodel.config import FineTuneConfig
 from physworld.worldmodel.dataset import graph_origin
+from physworld.worldmodel.engine import RolloutEngine
 from physworld.worldmodel.errors import TrainingCancelled
 from physworld.worldmodel.model import WorldModel
-from physworld.worldmodel.rollout import unroll
 from physworld.worldmodel.skinning import Skin
 
 CHECK_EVERY = 5
@@ -128,7 +128,7 @@ class _Task:
         origin = graph_origin(spec, recording.history[-1])
         self.model, self.skin, self.config = model, skin, config
         last = int(np.ceil(recording.ticks[-1] - 1e-6)) + 1
-        self.start = torch.as_tensor(recording.history - origin, dtype=torch.float32)[:, :, None]
+        self.start = recording.history - origin
         controllers = recording.controllers[:last, spec.control_index] - origin
         self.driven = torch.as_tensor(controllers, dtype=torch.float32)[:, :, None]
         self.points = torch.as_tensor(recording.points - origin, dtype=torch.float32)
@@ -140,6 +140,7 @@ class _Task:
         self.fitting = max(1, round((1.0 - config.validation_fraction) * len(self.left)))
         self.segments = self._segments(int(self.left[self.fitting - 1]))
         self.constants = model.edge_constants()
+        self.engine = RolloutEngine(model)
 
     def _segments(self, last: int) -> list[int]:
         """First ticks of the segments: evenly over the fitting part, all of one length."""
@@ -152,7 +153,7 @@ class _Task:
 
     def rollout(self, phi: Tensor) -> Tensor:
         """Open loop over the training frames, (T, V, 3)."""
-        return unroll(self.model, self.start, self.driven, phi[:, None])[:, :, 0].clone()
+        return torch.from_numpy(self.engine.run(self.start, self.driven.numpy()[:, :, 0], phi.numpy()))
 
     def validation_error(self, path: Tensor) -> float:
         """Mean distance [m] of visible points in the frames that the fit does not see; infinite if not a
