@@ -370,20 +370,24 @@ def _release_time(scene: Scene) -> float:
     """
     if scene.initial_state != AS_MEASURED:
         return 0.0
-    size = float(np.ptp(np.concatenate([scene.points[0], scene.controllers[0]]), axis=0).max())
+    first = np.concatenate([scene.points[0][scene.visible[0]], scene.controllers[0]])
+    size = float(np.ptp(first, axis=0).max())
     limit = max(_RELEASE_SIGMAS * (scene.noise_sigma_m or 0.0), _RELEASE_SHARE * size)
     moved = np.linalg.norm(scene.points - scene.points[0], axis=2)
     seen = np.where(scene.visible & scene.visible[0], moved, np.nan)
     usable = ~np.isnan(seen).all(axis=1)
     moved = np.zeros(len(seen), dtype=bool)
-    moved[usable] = np.nanmedian(seen[usable], axis=1) > limit  # one point's jump is a tracker's, not a release
+    moved[usable] = (
+        np.nanmedian(seen[usable], axis=1) > limit
+    )  # one point's jump is a tracker's, not a release
     driven = (
-        np.linalg.norm(scene.controllers - scene.controllers[0], axis=2).max(axis=1) > _DRIVEN_SHARE * size
+        np.linalg.norm(scene.controllers - scene.controllers[0], axis=2).max(axis=1, initial=0.0)
+        > _DRIVEN_SHARE * size
     )
-    first = int(np.argmax(moved)) if moved.any() else 0
-    if first >= scene.train[1] or driven[: first + 1].any():
+    released = int(np.argmax(moved)) if moved.any() else 0
+    if released >= scene.train[1] or driven[: released + 1].any():
         return 0.0
-    return float(scene.times[max(first - 1, 0)])
+    return float(scene.times[max(released - 1, 0)])
 
 
 def _knots(

@@ -11,6 +11,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
+from physworld.errors import SceneUnsupported
 from physworld.mpm.lattice import Lattice
 from physworld.scene import Scene
 
@@ -30,8 +31,15 @@ def fit_nodes(scene: Scene, lattice: Lattice, material: np.ndarray) -> tuple[np.
         scene: its first frames' visible points and controllers are used.
         lattice: of dimension 1 or 2.
         material: material coordinates of the tracked points [m], (N, d).
+
+    Raises:
+        SceneUnsupported: fewer points are visible than span a line (rod) or a plane (sheet).
     """
     seen = scene.visible[0]
+    if seen.sum() < lattice.dim + 1:
+        raise SceneUnsupported(
+            f"{int(seen.sum())} of {len(seen)} points are visible in the first frame: too few to place a {scene.kind}"
+        )
     weights = lattice.interpolation(material[seen])
     bending = _bending(lattice)
     spacing = float(lattice.spacing.min())

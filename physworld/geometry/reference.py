@@ -26,6 +26,8 @@ SHEET_KINDS = ("sheet", "cloth")
 _ROD_CELLS = 32
 _SHEET_CELLS = 12
 _BOX_KINDS = ("beam", "block")
+_FLAT = 0.08  # a sheet's points lie within this share of its width of their plane (root mean square)
+_THIN = 1e-4  # points whose extent falls below this share of their largest one span a dimension less
 _BOX_FILL = 0.93  # a cloud that fills this share of its bounding box is a box, whatever its kind
 
 
@@ -58,8 +60,13 @@ def reference_body(scene: Scene, particle_budget: int) -> ReferenceBody:
     """Build the body that the scene declares or shows.
 
     Raises:
-        SceneUnsupported: the scene declares too little, with the missing key.
+        SceneUnsupported: the scene shows or declares too little, with the missing key.
     """
+    frames, count = scene.visible.shape
+    if frames < 2 or not scene.visible.any():
+        raise SceneUnsupported(
+            f"{frames} frames with {count} points, {int(scene.visible.sum())} sightings in all: no motion to follow"
+        )
     if scene.kind in ROD_KINDS:
         return _rod(scene)
     if scene.kind in SHEET_KINDS:
@@ -74,20 +81,32 @@ def reference_body(scene: Scene, particle_budget: int) -> ReferenceBody:
 
 
 def _first_points(scene: Scene) -> np.ndarray:
-    """Tracked points at the first frame; a point not seen then takes its first sight."""
+    """Tracked points at the first frame; a point not seen then takes its first sight, one never seen another's."""
     seen = np.argmax(scene.visible, axis=0)
-    return scene.points[seen, np.arange(scene.points.shape[1])]
+    points = scene.points[seen, np.arange(scene.points.shape[1])]
+    sighted = scene.visible.any(axis=0)
+    points[~sighted] = points[np.argmax(sighted)]
+    return points
 
 
 def _solid(scene: Scene, budget: int) -> ReferenceBody:
     points = _first_points(scene)
     body = scene.body
     notes: list[str] = []
+    if scene.kind in SHEET_KINDS:
+        _, _, size, off_plane = _plane(scene, points)
+        notes.append(
+            f"the sheet is not flat at the start ({off_plane:.3g} m rms off its plane, {size.min():.3g} m wide) and is "
+            "taken as a solid"
+        )
     if body.box_min_m is not None and body.box_max_m is not None:
         low, high, test = body.box_min_m, body.box_max_m, None
+        if np.any(high <= low):
+            raise SceneUnsupported(f"the box from {low} to {high} m has no volume")
     else:
         cloud = scene.rest_volume_points
         if cloud is not None and len(cloud) >= 20:
+            _require_volume(cloud, scene.kind)
 
             def test(q: np.ndarray) -> np.ndarray:
                 return inside_volume_points(cloud, q)
@@ -95,9 +114,10 @@ def _solid(scene: Scene, budget: int) -> ReferenceBody:
             cloud = points if scene.surface_points is None else np.concatenate([points, scene.surface_points])
             if len(cloud) < 30:
                 raise SceneUnsupported(
-                    f"{len(cloud)} points do not bound a {scene.kind}: declare body.box_min_m and body.box_max_m, or "
-                    "give rest_volume_points"
+                    "; ".join([*notes, f"{len(cloud)} points do not bound a body of kind {scene.kind}"])
+                    + ": declare body.box_min_m and body.box_max_m, or give rest_volume_points"
                 )
+            _require_volume(cloud, scene.kind)
             notes.append("the volume was filled from points on the surface")
             cell = float((np.prod(np.ptp(cloud, axis=0)) / budget) ** (1 / 3))
 
@@ -120,6 +140,15 @@ def _solid(scene: Scene, budget: int) -> ReferenceBody:
     return ReferenceBody(
         lattice, start, start, np.zeros_like(start), points, np.zeros((len(points), 0)), 0.0, tuple(notes)
     )
+
+
+def _require_volume(cloud: np.ndarray, kind: str) -> None:
+    extent = np.linalg.svd(cloud - cloud.mean(axis=0), compute_uv=False)
+    if extent[2] <= _THIN * extent[0]:
+        raise SceneUnsupported(
+            f"{len(cloud)} points lie in a plane or on a line (principal extents {extent / np.sqrt(len(cloud))} m): "
+            f"they span no volume for a {kind}"
+        )
 
 
 def _solid_lattice(scene: Scene, low: np.ndarray, high: np.ndarray, test, budget: int) -> Lattice:
@@ -179,8 +208,7 @@ def _rod(scene: Scene) -> ReferenceBody:
         cloud = points if scene.rest_volume_points is None else scene.rest_volume_points
         centre = cloud.mean(axis=0)
         direction = np.linalg.svd(cloud - centre, full_matrices=False)[2][0]
-        anchor = scene.controllers[0].mean(axis=0)
-        if np.dot(anchor - centre, direction) > 0:
+        if len(scene.controllers[0]) and np.dot(scene.controllers[0].mean(axis=0) - centre, direction) > 0:
             direction = -direction
         along = (cloud - centre) @ direction
         arc = (points - centre) @ direction - along.min()
@@ -217,6 +245,11 @@ def _marker_arc_lengths(scene: Scene, points: np.ndarray) -> tuple[np.ndarray, f
             )
         arc = np.concatenate([[0.0], np.cumsum(lengths)])
         return arc, float(arc[-1])
+    if not len(scene.controllers[0]):
+        raise SceneUnsupported(
+            f"nothing orders the {len(points)} points of a {scene.kind} without controllers: declare "
+            "body.segment_rest_lengths_m"
+        )
     anchor = scene.controllers[0].mean(axis=0)
     order = np.argsort(np.linalg.norm(points - anchor, axis=1))
     steps = np.linalg.norm(np.diff(np.concatenate([anchor[None], points[order]]), axis=0), axis=1)
@@ -226,6 +259,8 @@ def _marker_arc_lengths(scene: Scene, points: np.ndarray) -> tuple[np.ndarray, f
 
 
 def _rod_lattice(scene: Scene, length: float, grip_arcs) -> Lattice:
+    if not length > 0:
+        raise SceneUnsupported(f"the tracked points of the {scene.kind} span {length} m: no length")
     grips = np.clip(np.atleast_1d(grip_arcs), 0.0, length)
     left = grips[grips < 0.5 * length]
     face = float(left.max()) if len(left) else 0.0
@@ -240,6 +275,23 @@ def _rod_lattice(scene: Scene, length: float, grip_arcs) -> Lattice:
         (np.minimum(begin + 0.5 * spacing, length) - np.maximum(begin, 0.0)) / (0.5 * spacing), 0.0, 1.0
     )
     return lattice_from_cells(np.array([origin]), np.array([spacing]), cells, fill)
+
+
+def _plane(scene: Scene, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Corner (3,), axes (3, 3), the last one normal, and sides (2,) of a sheet's plane; rms distance from it [m]."""
+    cloud = points if scene.rest_volume_points is None else scene.rest_volume_points
+    centre = cloud.mean(axis=0)
+    axes = np.linalg.svd(cloud - centre, full_matrices=len(cloud) < 3)[2]
+    if np.abs(axes[2]).max() > 0.999:  # a sheet in a coordinate plane: keep its edges along the axes
+        normal_axis = int(np.argmax(np.abs(axes[2])))
+        axes = np.stack([*(np.eye(3)[a] for a in range(3) if a != normal_axis), np.eye(3)[normal_axis]])
+        if np.linalg.det(axes) < 0:
+            axes[2] = -axes[2]
+    local = (cloud - centre) @ axes.T
+    size = np.ptp(local[:, :2], axis=0)
+    if size.min() <= _THIN * size.max():
+        raise SceneUnsupported(f"{len(cloud)} points of a {scene.kind} span {size} m: no area")
+    return centre + local[:, :2].min(axis=0) @ axes[:2], axes, size, float(np.sqrt(np.mean(local[:, 2] ** 2)))
 
 
 def _sheet(scene: Scene) -> ReferenceBody | None:
@@ -261,21 +313,11 @@ def _sheet(scene: Scene) -> ReferenceBody | None:
         size = np.array([side, side])
         flat_map = None
     else:
-        cloud = points if scene.rest_volume_points is None else scene.rest_volume_points
-        centre = cloud.mean(axis=0)
-        axes = np.linalg.svd(cloud - centre, full_matrices=False)[2]
-        if np.abs(axes[2]).max() > 0.999:  # a sheet in a coordinate plane: keep its edges along the axes
-            normal_axis = int(np.argmax(np.abs(axes[2])))
-            axes = np.stack([*(np.eye(3)[a] for a in range(3) if a != normal_axis), np.eye(3)[normal_axis]])
-            if np.linalg.det(axes) < 0:
-                axes[2] = -axes[2]
-        local = (cloud - centre) @ axes.T
-        size = np.ptp(local[:, :2], axis=0)
-        if np.sqrt(np.mean(local[:, 2] ** 2)) > 0.08 * size.min():
+        origin, axes, size, off_plane = _plane(scene, points)
+        if off_plane > _FLAT * size.min():
             return None
-        low = local[:, :2].min(axis=0)
-        material = ((points - centre) @ axes.T)[:, :2] - low
-        flat_map = (centre + low @ axes[:2], axes)
+        material = ((points - origin) @ axes.T)[:, :2]
+        flat_map = (origin, axes)
     cell = max(float(size.max()) / _SHEET_CELLS, 1e-4)
     counts = np.maximum(3, np.round(size / cell)).astype(int)
     cells = np.stack(np.meshgrid(*[np.arange(c) for c in counts], indexing="ij"), axis=-1).reshape(-1, 2)

@@ -67,14 +67,15 @@ def rigid_groups(tracks: np.ndarray, reach_m: float) -> list[np.ndarray]:
     Returns:
         index arrays, in the order of their first controller.
     """
-    count = tracks.shape[1]
+    if tracks.shape[1] == 0:
+        return []
     distance = np.linalg.norm(tracks[:, :, None] - tracks[:, None, :], axis=-1)
     mean = distance.mean(axis=0)
     spread = distance.std(axis=0)
     linked = (mean <= reach_m) & (spread <= _RIGID_STRAIN * np.maximum(mean, 1e-6))
     groups, labels = connected_components(csr_matrix(linked), directed=False)
     members = [np.flatnonzero(labels == g) for g in range(groups)]
-    return sorted(members, key=lambda m: int(m[0])) if count else []
+    return sorted(members, key=lambda m: int(m[0]))
 
 
 def _skew(v: np.ndarray) -> np.ndarray:
