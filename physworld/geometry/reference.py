@@ -14,6 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from physworld.errors import SceneUnsupported
 from physworld.geometry.curves import fit_nodes
@@ -27,6 +28,7 @@ _ROD_CELLS = 32
 _SHEET_CELLS = 12
 _BOX_KINDS = ("beam", "block")
 _FLAT = 0.08  # a sheet's points lie within this share of its width of their plane (root mean square)
+_TIGHTER = 0.97  # a sheet is turned in its plane if that shrinks its bounding rectangle below this share
 _THIN = 1e-4  # points whose extent falls below this share of their largest one span a dimension less
 _BOX_FILL = 0.93  # a cloud that fills this share of its bounding box is a box, whatever its kind
 
@@ -291,7 +293,24 @@ def _plane(scene: Scene, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     size = np.ptp(local[:, :2], axis=0)
     if size.min() <= _THIN * size.max():
         raise SceneUnsupported(f"{len(cloud)} points of a {scene.kind} span {size} m: no area")
+    turn = _tightest_turn(local[:, :2])
+    axes = np.concatenate([turn @ axes[:2], axes[2:]])
+    local = (cloud - centre) @ axes.T
+    size = np.ptp(local[:, :2], axis=0)
     return centre + local[:, :2].min(axis=0) @ axes[:2], axes, size, float(np.sqrt(np.mean(local[:, 2] ** 2)))
+
+
+def _tightest_turn(plane: np.ndarray) -> np.ndarray:
+    """Rotation (2, 2) after which points (M, 2) fill their bounding rectangle best: the principal axes of a square
+    sheet are arbitrary. None is needed where it would gain less than a few percent.
+    """
+    corners = plane[ConvexHull(plane).vertices]
+    sides = np.roll(corners, -1, axis=0) - corners
+    angle = np.concatenate([[0.0], np.arctan2(sides[:, 1], sides[:, 0])])
+    angle = (angle + np.pi / 4) % (np.pi / 2) - np.pi / 4
+    turns = np.stack([np.cos(angle), np.sin(angle), -np.sin(angle), np.cos(angle)], axis=1).reshape(-1, 2, 2)
+    areas = np.prod(np.ptp(np.einsum("kij,mj->kmi", turns, corners), axis=1), axis=1)
+    return turns[np.argmin(areas)] if areas.min() < _TIGHTER * areas[0] else np.eye(2)
 
 
 def _sheet(scene: Scene) -> ReferenceBody | None:
