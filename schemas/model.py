@@ -23,7 +23,7 @@ class TrainingConfig(Request):
     vertices: int = Field(default=100, ge=4, le=1000)
     steps: int = Field(default=800, ge=1, le=1_000_000)
     batch_size: int = Field(default=8, ge=1, le=256)
-    learning_rate: float = Field(default=1e-3, gt=0, le=1)
+    learning_rate: float = Field(default=2e-3, gt=0, le=1)
     fine_tune_steps: int = Field(default=60, ge=0, le=10_000)
     seed: Seed = 0
 

@@ -27,7 +27,7 @@ class WorldModelConfig:
     hidden: int = 64
     message_passing_steps: int = 7
     history: int = 3
-    vertices: int = 120
+    vertices: int = 100
     neighbours: int = 10
     edge_radius_spacings: float = 6.0
     coarse_vertices: int = 12
@@ -63,10 +63,10 @@ class TrainingConfig:
         seed: of initial weights, batches and noise.
     """
 
-    steps: int = 3000
+    steps: int = 800
     batch_size: int = 8
-    look_ahead: int = 3
-    learning_rate: float = 1e-3
+    look_ahead: int = 8
+    learning_rate: float = 2e-3
     learning_rate_floor: float = 0.01
     gradient_clip: float = 1.0
     noise_history: float = 0.1
