@@ -13,7 +13,7 @@ from schemas.base import Artifact, Lineage, Request, Resource, Seed
 class TrainingConfig(Request):
     """Settings of the graph network (paper, section GNN-Based World Models) and of its training.
 
-    The defaults train in about three minutes on one core; look-ahead grows to its value during training.
+    The defaults are meant for some minutes on one core; look-ahead grows to its value during training.
     """
 
     hidden: int = Field(default=64, ge=8, le=1024)
