@@ -123,8 +123,9 @@ def calibrate(
         trials = [
             search.solve([*kept, c], np.append(solution.theta, np.log(c.start[0])), 4) for c in candidates
         ]
-        best = int(np.argmin([t.cost for t in trials]))
-        if trials[best].cost >= (1.0 - _DAMPING_GAIN) * solution.cost:
+        costs = [t.cost if np.isfinite(t.cost) else np.inf for t in trials]  # not a number: the budget ended
+        best = int(np.argmin(costs))
+        if not costs[best] < (1.0 - _DAMPING_GAIN) * solution.cost:
             rejected.update(
                 {c.name: 1.0 - t.cost / solution.cost for c, t in zip(candidates, trials, strict=True)}
             )
@@ -158,17 +159,18 @@ def calibrate(
 
 def _estimates(parameters: list[Parameter], solution: Solution, frames: np.ndarray) -> dict[str, Estimate]:
     covariance = block_covariance(solution, frames)
+    factor = interval_factor(len(np.unique(frames)), len(parameters))
     found = {}
     for k, parameter in enumerate(parameters):
         value = float(np.exp(solution.theta[k]))
-        half = interval_factor() * float(np.sqrt(max(covariance[k, k], 0.0)))
+        half = factor * float(np.sqrt(covariance[k, k])) if covariance[k, k] > 0 else float("inf")
         insensitive = not np.any(solution.jacobian[:, k])
         at_bound = not (parameter.low * 1.01 < value < parameter.high * 0.99)
         identified = half < _UNIDENTIFIED_LOG_WIDTH and not at_bound and not insensitive
         note = "" if identified else _why_not_identified(at_bound, insensitive)
         interval = (
             (value * float(np.exp(-min(half, 50))), value * float(np.exp(min(half, 50))))
-            if half > 0
+            if np.isfinite(half)
             else None
         )
         found[parameter.name] = Estimate(value, parameter.unit, interval, identified, note)

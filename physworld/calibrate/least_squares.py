@@ -102,6 +102,7 @@ def block_covariance(solution: Solution, frame_of_residual: np.ndarray) -> np.nd
     return correction * inverse @ meat @ inverse
 
 
-def interval_factor(blocks: int = _BLOCKS) -> float:
-    """Student factor of a two-sided 95 % interval from that many blocks."""
-    return float(student.ppf(0.975, max(blocks - 1, 1)))
+def interval_factor(frames: int, parameters: int) -> float:
+    """Student factor of a two-sided 95 % interval from blocks of ``frames``; infinite for too few of them."""
+    blocks = min(_BLOCKS, frames)
+    return float(student.ppf(0.975, blocks - 1)) if blocks > parameters else float("inf")

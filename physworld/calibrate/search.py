@@ -132,6 +132,8 @@ class Search:
         lattice = self.twin.lattice
         if self.scene.initial_state != UNDEFORMED_AT_REST or lattice.dim != 3 or not sigma:
             return False
+        if self.simulations + 2 + len(parameters) > self.max_simulations:
+            return False  # the search on the moved points needs a residual and a Jacobian of its own
         twin = self.twin_at(parameters, theta)
         times, controls = self.scene.control_track()
         try:

@@ -1,0 +1,158 @@
+"""Calibration of recordings that a twin made of itself: what was planted is found, what was not is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_scene import box_body, made_scene, recorded_by
+
+from physworld.calibrate import CalibrationConfig, calibrate
+from physworld.errors import CalibrationError, Cancelled, SceneUnsupported
+from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
+from physworld.twin import Twin, build_twin
+
+FRAMES, FPS = 40, 30.0
+SIGMA_M = 2e-4
+YOUNGS_MODULUS_PA = 3.1e4
+DRAG_PER_S = 1.3
+LOW, HIGH = np.array([0.0, -0.015, -0.015]), np.array([0.12, 0.015, 0.015])
+CONFIG = CalibrationConfig(particle_budget=100)
+
+
+def shaken_bar() -> Scene:
+    """A bar clamped over its first 2 cm, whose clamp is shaken up and down for half of the recording."""
+    times = np.arange(FRAMES) / FPS
+    shake = 0.01 * np.sin(2 * np.pi * 2.0 * times) * (times < 0.5)
+    grip = np.array([[0.0, y, z] for y in (-0.01, 0.01) for z in (-0.01, 0.01)])
+    scene = made_scene(
+        [[x, 0.0, 0.015] for x in np.linspace(0.03, 0.12, 7)],
+        "beam",
+        grip,
+        FRAMES,
+        body=box_body(LOW, HIGH, density_kg_m3=300.0),
+        grips=(Grip((0, 1, 2, 3), LOW, np.array([0.02, 0.015, 0.015])),),
+        initial_state=UNDEFORMED_AT_REST,
+    )
+    return replace(scene, controllers=scene.controllers + shake[:, None, None] * np.array([0.0, 0.0, 1.0]))
+
+
+def truth(scene: Scene, **parameters: float) -> Twin:
+    planted = {"youngs_modulus_pa": YOUNGS_MODULUS_PA, **parameters}
+    return build_twin(scene, CONFIG.particle_budget).with_parameters(**planted)
+
+
+@pytest.fixture(scope="module")
+def undamped() -> Scene:
+    return recorded_by(truth(shaken_bar()), shaken_bar(), SIGMA_M)
+
+
+@pytest.fixture(scope="module")
+def damped() -> Scene:
+    return recorded_by(truth(shaken_bar(), air_drag_per_s=DRAG_PER_S), shaken_bar(), SIGMA_M, seed=1)
+
+
+def test_planted_stiffness_is_found_within_a_percent_and_its_interval(undamped: Scene) -> None:
+    told: list[tuple[int, int, str]] = []
+    found = calibrate(undamped, CONFIG, progress=lambda done, most, text: told.append((done, most, text)))
+    estimate = found.parameters["youngs_modulus_pa"]
+    assert estimate.value == pytest.approx(YOUNGS_MODULUS_PA, rel=0.01)
+    assert estimate.identified and estimate.unit == "Pa" and estimate.ci95 is not None
+    low, high = estimate.ci95
+    assert low < YOUNGS_MODULUS_PA < high < 1.05 * low
+    # damping that the bar does not have is told apart from damping that it has
+    assert {"air_drag_per_s", "viscosity_pa_s"} == set(found.rejected)
+    assert found.twin.air_drag_per_s == 0.0 and found.parameters["air_drag_per_s"].value == 0.0
+    assert "not needed" in found.parameters["air_drag_per_s"].note
+    # held-out frames, open loop
+    first = undamped.test[0]
+    error = found.tracks[first:] - undamped.points[first:]
+    assert np.sqrt(np.mean(error**2)) < 1.5 * SIGMA_M
+    assert found.tracks.shape == undamped.points.shape
+    assert found.particles.shape == (FRAMES, len(found.twin.particles_rest), 3)
+    assert len(told) <= found.simulations <= CONFIG.max_simulations
+    assert all(most == CONFIG.max_simulations and "youngs_modulus_pa" in text for _, most, text in told)
+    assert np.all(np.diff(found.loss_history) <= 0)
+
+
+def test_planted_drag_is_found_beside_the_stiffness(damped: Scene) -> None:
+    found = calibrate(damped, CONFIG)
+    drag, stiffness = found.parameters["air_drag_per_s"], found.parameters["youngs_modulus_pa"]
+    assert stiffness.value == pytest.approx(YOUNGS_MODULUS_PA, rel=0.01)
+    assert drag.identified and drag.ci95 is not None
+    assert drag.value == pytest.approx(DRAG_PER_S, rel=0.1)
+    assert found.twin.air_drag_per_s == drag.value
+    assert "viscosity_pa_s" in found.rejected
+
+
+def test_without_damping_only_the_declared_physics_is_fitted(damped: Scene) -> None:
+    found = calibrate(damped, replace(CONFIG, damping="none"))
+    assert found.rejected == {} and "air_drag_per_s" not in found.parameters
+    assert found.twin.air_drag_per_s == 0.0
+
+
+def test_density_is_a_declared_scale_not_a_finding(undamped: Scene) -> None:
+    found = calibrate(undamped, replace(CONFIG, damping="none"))
+    density = found.parameters["density"]
+    assert density.value == 300.0 and not density.identified and "as declared" in density.note
+    heavy = replace(undamped, body=box_body(LOW, HIGH, density_kg_m3=600.0))
+    twice = calibrate(heavy, replace(CONFIG, damping="none")).parameters["youngs_modulus_pa"].value
+    assert twice == pytest.approx(2 * found.parameters["youngs_modulus_pa"].value, rel=2e-3)
+
+
+def test_only_training_frames_are_looked_at(undamped: Scene) -> None:
+    spoiled = undamped.points.copy()
+    spoiled[undamped.test[0] :] += 1.0
+    config = replace(CONFIG, max_simulations=25, damping="none")
+    first, second = (calibrate(s, config) for s in (undamped, replace(undamped, points=spoiled)))
+    assert first.parameters == second.parameters
+    np.testing.assert_array_equal(first.tracks, second.tracks)
+
+
+@pytest.mark.parametrize("budget", [3, 12, 24, 31])
+def test_a_budget_that_ends_early_is_kept_and_never_adds_damping(undamped: Scene, budget: int) -> None:
+    found = calibrate(undamped, replace(CONFIG, max_simulations=budget))
+    assert found.simulations <= budget
+    assert found.twin.air_drag_per_s == 0.0 and found.twin.parameters["viscosity_pa_s"] == 0.0
+    assert np.isfinite(found.tracks).all()
+
+
+def test_a_budget_that_ended_before_any_sensitivity_is_reported(undamped: Scene) -> None:
+    estimate = calibrate(undamped, replace(CONFIG, max_simulations=3)).parameters["youngs_modulus_pa"]
+    assert not estimate.identified and estimate.ci95 is None
+    assert "budget of simulations ended first" in estimate.note
+
+
+def test_one_scored_frame_gives_no_interval(undamped: Scene) -> None:
+    short = replace(undamped, train=(0, 2), test=(2, FRAMES))
+    estimate = calibrate(short, replace(CONFIG, max_simulations=20, damping="none")).parameters[
+        "youngs_modulus_pa"
+    ]
+    assert estimate.ci95 is None and not estimate.identified
+
+
+def test_a_cancelled_calibration_stops_in_the_middle_of_a_run(undamped: Scene) -> None:
+    asked = iter([False] * 5 + [True])
+    with pytest.raises(Cancelled, match="in run 1 at frame 6 of"):
+        calibrate(undamped, CONFIG, cancelled=lambda: next(asked))
+
+
+def test_training_frames_without_a_sighting_are_refused(undamped: Scene) -> None:
+    visible = undamped.visible.copy()
+    visible[1 : undamped.train[1]] = False
+    with pytest.raises(CalibrationError, match=r"no visible point in the training frames \(0, 28\)"):
+        calibrate(replace(undamped, visible=visible), CONFIG)
+
+
+def test_hidden_points_do_not_count(undamped: Scene) -> None:
+    visible, points = undamped.visible.copy(), undamped.points.copy()
+    visible[5:15, 2] = False
+    points[5:15, 2] = 7.0
+    found = calibrate(replace(undamped, visible=visible, points=points), CONFIG)
+    assert found.parameters["youngs_modulus_pa"].value == pytest.approx(YOUNGS_MODULUS_PA, rel=0.01)
+
+
+def test_a_scene_without_a_body_is_refused_before_any_run() -> None:
+    with pytest.raises(SceneUnsupported, match="3 points"):
+        calibrate(made_scene(np.eye(3), "blob"), CONFIG)
