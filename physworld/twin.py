@@ -33,6 +33,7 @@ _LAWS: dict[int, type[Law]] = {1: RodLaw, 2: SheetLaw, 3: SolidLaw}
 _RELEASE_SIGMAS = 10.0
 _RELEASE_SHARE = 2e-3  # motion below this share of the body's size is not a release
 _DRIVEN_SHARE = 5e-4  # controllers that moved this share of the body's size drive it
+_SMOOTHING = 1e-9  # against particle positions: felt only by what particles do not see
 _MERGE_S = 1e-6  # control and frame times closer than this are one
 
 
@@ -107,7 +108,7 @@ class Twin:
     def with_parameters(self, **values: float) -> Twin:
         """A twin with other parameters; names are those of :attr:`parameters`. Raises KeyError for an unknown one."""
         law_names = {f.name for f in fields(self.law)}
-        own = {"air_drag_per_s", "ground_friction"}
+        own = {"air_drag_per_s"} if self.ground_height_m is None else {"air_drag_per_s", "ground_friction"}
         unknown = set(values) - law_names - own
         if unknown:
             raise KeyError(f"unknown parameters {sorted(unknown)}; this twin has {sorted(self.parameters)}")
@@ -201,9 +202,12 @@ class Twin:
         return tracks
 
     def track(self, particles: np.ndarray) -> np.ndarray:
-        """Tracked points (T, N, 3) of particle trajectories (T, P, 3), through the nodes that carry them."""
-        rows = self._particle_rows
-        factor = splu((rows.T @ rows).tocsc())
+        """Tracked points (T, N, 3) of particle trajectories (T, P, 3), through the nodes that carry them.
+
+        Where a body is one cell thick its particles do not fix the nodes: the smoothest of them are taken.
+        """
+        rows, bends = self._particle_rows, self.lattice.second_differences()
+        factor = splu((rows.T @ rows + _SMOOTHING * bends.T @ bends).tocsc())
         flat = np.asarray(particles, dtype=float).transpose(1, 0, 2).reshape(rows.shape[0], -1)
         nodes = factor.solve(rows.T @ flat).reshape(rows.shape[1], -1, 3).transpose(1, 0, 2)
         return self.track_nodes(nodes)

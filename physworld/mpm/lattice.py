@@ -83,6 +83,24 @@ class Lattice:
         shape = (len(coordinates), len(self.nodes))
         return sparse.csr_matrix((weights.ravel(), (rows, self.cell_nodes[cell].ravel())), shape=shape)
 
+    def second_differences(self) -> sparse.csr_matrix:
+        """Matrix (D, n) of x_(i-1) - 2 x_i + x_(i+1) over every three nodes in a row: zero for affine fields only."""
+        number = {tuple(node): k for k, node in enumerate(self.nodes.tolist())}
+        triples = []
+        for axis in range(self.dim):
+            step = np.eye(self.dim, dtype=int)[axis]
+            for k, node in enumerate(self.nodes):
+                before, after = (
+                    number.get(tuple((node - step).tolist())),
+                    number.get(tuple((node + step).tolist())),
+                )
+                if before is not None and after is not None:
+                    triples.append((before, k, after))
+        columns = np.array(triples).ravel()
+        rows = np.repeat(np.arange(len(triples)), 3)
+        values = np.tile([1.0, -2.0, 1.0], len(triples))
+        return sparse.csr_matrix((values, (rows, columns)), shape=(len(triples), len(self.nodes)))
+
     def outside(self, coordinates: np.ndarray) -> np.ndarray:
         """Distance of material ``coordinates`` (M, d) from the nearest cell that holds material [m], (M,)."""
         _, local = self._locate(np.asarray(coordinates, dtype=float).reshape(-1, self.dim))

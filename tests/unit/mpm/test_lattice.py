@@ -167,3 +167,15 @@ def test_a_lattice_without_material_or_with_too_much_is_refused() -> None:
         lattice_from_cells(np.zeros(1), np.ones(1), np.array([[0]]), np.array([[0.5, 1.5]]))
     with pytest.raises(ValueError, match=r"must be \(1, 2\)"):
         lattice_from_cells(np.zeros(1), np.ones(1), np.array([[0]]), np.array([[0.5, 0.5, 0.5]]))
+
+
+@pytest.mark.parametrize("dim", SHAPES)
+def test_second_differences_vanish_for_affine_fields_and_no_others_that_particles_miss(dim: int) -> None:
+    thin = box_lattice(ORIGIN[:dim], SIZE[:dim], (3, 1, 1)[:dim])
+    bends = thin.second_differences()
+    np.testing.assert_allclose(bends @ thin.node_coordinates, 0.0, atol=ROUND_OFF)
+    rows = thin.interpolation(thin.particle_coordinates)
+    both = np.concatenate([rows.toarray(), bends.toarray()])
+    assert np.linalg.matrix_rank(both) == len(thin.nodes)
+    if dim > 1:
+        assert np.linalg.matrix_rank(rows.toarray()) < len(thin.nodes)
