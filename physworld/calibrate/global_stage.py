@@ -44,7 +44,7 @@ class CalibrationConfig:
     """
 
     particle_budget: int = 2000
-    max_simulations: int = 120
+    max_simulations: int = 160
     device: str = "cpu"
     damping: Literal["auto", "none"] = "auto"
 
