@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import httpx
+import numpy as np
 
 from physworld_client import calls, transport
+from physworld_client.arrays import arrays_of
 from physworld_client.bundle import open_bundle
 from physworld_client.errors import PhysWorldError, WaitTimedOut
 from physworld_client.manifest import artifacts_of, verify_folder
@@ -103,6 +105,17 @@ class AsyncDatasets(AsyncResource):
     ) -> AsyncListPage[Episode]:
         """The committed episodes of a dataset."""
         return await self._page(lambda at: calls.dataset_episodes(dataset_id, limit=limit, cursor=at), cursor)
+
+    async def episode(self, dataset_id: str, index: int) -> dict[str, np.ndarray]:
+        """The arrays of one committed episode.
+
+        ``times`` (T,) [s], ``particles`` (T, P, 3) [m], ``controllers`` (T, K, 3) [m], ``properties`` (P, 2): log
+        factors of stiffness and density; ``attributes``: JSON text.
+
+        Raises:
+            NotFound: no such episode is committed.
+        """
+        return arrays_of(await self._client.send(calls.dataset_episode(dataset_id, index)))
 
 
 class AsyncModels(AsyncResource):

@@ -58,6 +58,8 @@ _EPISODES = TypeAdapter(Page[Episode])
 _MODELS = TypeAdapter(Page[Model])
 _VERSIONS = TypeAdapter(Page[ModelVersion])
 _JOBS = TypeAdapter(Page[Job])
+BYTES = TypeAdapter(bytes)
+"""An answer that is no JSON: its bytes as they are."""
 
 
 def _given(**values: str | int | float | None) -> dict[str, str | int | float]:
@@ -120,6 +122,11 @@ def dataset_episodes(dataset_id: str, *, limit: int | None, cursor: str | None) 
     """GET /v1/datasets/{id}/episodes."""
     path = f"/v1/datasets/{_part(dataset_id)}/episodes"
     return Call("GET", path, _EPISODES, query=_given(limit=limit, cursor=cursor))
+
+
+def dataset_episode(dataset_id: str, index: int) -> Call[bytes]:
+    """GET /v1/datasets/{id}/episodes/{index}: an npz."""
+    return Call("GET", f"/v1/datasets/{_part(dataset_id)}/episodes/{_part(index)}", BYTES)
 
 
 def training_create(

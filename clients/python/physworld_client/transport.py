@@ -19,7 +19,7 @@ from typing import Any
 import httpx
 from pydantic import ValidationError
 
-from physworld_client.calls import Call
+from physworld_client.calls import BYTES, Call
 from physworld_client.errors import (
     ConnectionFailed,
     PhysWorldError,
@@ -140,6 +140,8 @@ def new_key() -> str:
 def read_answer(call: Call[Any], response: httpx.Response) -> Any:
     """The typed answer of a call, or the typed error."""
     raise_for_problem(response)
+    if call.answer is BYTES:
+        return response.content
     try:
         return call.answer.validate_json(response.content)
     except ValidationError as error:

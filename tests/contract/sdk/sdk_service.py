@@ -6,7 +6,6 @@ that the SDK sees every state of a job without simulations.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -86,8 +85,15 @@ class Service:
         if lease.kind == "dataset_plan":
             return {"episodes": lease.payload["config"]["episodes"], "frames": 10, "particles": 20}
         if lease.kind == "episode":
-            digest = hashlib.sha256(lease.shard_id.encode()).hexdigest()
-            place = {"index": lease.index, "path": f"{lease.shard_id}.zarr", "digest": digest}
+            arrays = {
+                "times": np.arange(10) / 30.0,
+                "particles": np.full((10, 20, 3), lease.index, np.float32),
+            }
+            dataset = lease.payload["dataset_id"]
+            path, digest = self.stores.episodes.write(
+                dataset, lease.index, lease.epoch, arrays, {"motion": "made"}
+            )
+            place = {"index": lease.index, "path": path, "digest": digest}
             return {**place, "seed": lease.index, "frames": 10, "particles": 20, "motion": "bezier"}
         if lease.kind == "dataset_seal":
             manifest = self._put("manifest.json", lease.shard_id.encode())

@@ -173,6 +173,7 @@ def test_lists_show_and_download(service: Service, tmp_path: Path) -> None:
     for arguments, place in (
         (("models", "download", "listed"), "listed-1/model.safetensors"),
         (("fits", "download", fit["id"], "-o", "files"), "files/twin.npz"),
+        (("datasets", "download", dataset["id"], "--episodes", "-o", "all"), "all/episode-00000.npz"),
         (("models", "alias", "listed", "champion", "1"), ""),
         (("models", "download", "listed", "--version", "champion", "-o", "again"), "again/card.json"),
     ):

@@ -42,6 +42,10 @@ def test_the_whole_chain_step_by_step(service: Service, client: Client, tmp_path
     assert (dataset.state, dataset.episodes_done) == ("sealed", 7)
     episodes = list(client.datasets.episodes(dataset.id, limit=3).auto_paging_iter())
     assert [episode.index for episode in episodes] == list(range(7))
+    arrays = client.datasets.episode(dataset.id, 4)
+    assert arrays["particles"].shape == (10, 20, 3) and (arrays["particles"] == 4).all()
+    with pytest.raises(NotFound):
+        client.datasets.episode(dataset.id, 7)
 
     training = client.models.create("strip", dataset.id, TrainingConfig(steps=1), description="first")
     with pytest.raises(ModelUnreadable, match="strip version 1 is pending"):

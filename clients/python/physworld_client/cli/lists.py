@@ -10,6 +10,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Annotated, TypeVar
 
+import numpy as np
 import typer
 from pydantic import BaseModel
 
@@ -172,11 +173,26 @@ def datasets_episodes(
 
 @datasets.command("download")
 def datasets_download(
-    dataset_id: str, out: Out = None, url: Url = None, token: Token = None, data: Data = None
+    dataset_id: str,
+    out: Out = None,
+    episodes: Annotated[bool, typer.Option("--episodes", help="Every episode too, as npz.")] = False,
+    url: Url = None,
+    token: Token = None,
+    data: Data = None,
 ) -> None:
-    """Download the files of a dataset: its manifest."""
+    """Download the manifest of a dataset, and its episodes when asked."""
+    folder = out or Path(dataset_id)
     with service.connect(url, token, data) as client:
-        _download(client, client.datasets.get(dataset_id).artifacts, out or Path(dataset_id))
+        _download(client, client.datasets.get(dataset_id).artifacts, folder)
+        if not episodes:
+            return
+        folder.mkdir(parents=True, exist_ok=True)
+        count = 0
+        for episode in client.datasets.episodes(dataset_id, limit=PAGE).auto_paging_iter():
+            arrays = client.datasets.episode(dataset_id, episode.index)
+            np.savez(folder / f"episode-{episode.index:05d}.npz", allow_pickle=False, **arrays)
+            count += 1
+    stdout.print(f"{folder.absolute()}  {count} episodes", soft_wrap=True)
 
 
 @models.command("list")
