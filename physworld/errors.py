@@ -6,6 +6,8 @@ PhysworldError
 │   ├── UnstableSimulation  a state is not finite, or an element inverted
 │   ├── CFLViolation        a forced time step exceeds the stable one
 │   └── ParticlesLeftTheGrid  material left the stated workspace
+├── UnknownEffect           no effect or strength of that name
+├── EffectRefused           the effect makes no sense for this twin
 ├── CalibrationError        no parameter gave a usable simulation
 ├── Cancelled               the caller asked to stop
 └── TrainingDiverged        a loss or a weight is not finite
@@ -36,6 +38,14 @@ class CFLViolation(SimulationError):
 
 class ParticlesLeftTheGrid(SimulationError):
     """Material left the stated workspace."""
+
+
+class UnknownEffect(PhysworldError):
+    """No effect or strength of that name."""
+
+
+class EffectRefused(PhysworldError):
+    """The effect makes no sense for this twin."""
 
 
 class CalibrationError(PhysworldError):

@@ -17,11 +17,15 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.sparse.linalg import splu
 
+from physworld.effects.base import Effect
+from physworld.effects.registry import effect
+from physworld.errors import EffectRefused
 from physworld.geometry.reference import ReferenceBody, reference_body
 from physworld.geometry.rigid import least_rotation, rigid_groups, rigid_motion
 from physworld.materials.laws import Law, RodLaw, SheetLaw, SolidLaw
 from physworld.mpm.contact import GroundContact
 from physworld.mpm.lattice import Lattice
+from physworld.mpm.terms import Term
 from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian
 from physworld.scene import AS_MEASURED, Scene
 
@@ -51,6 +55,7 @@ class Twin:
         held_nodes: nodes that each grip holds, one array a group.
         controllers_start: controllers at the first frame [m], (K, 3).
         release_s: the body is held at its start until then (somebody let go of it).
+        effects: what acts beside the declared physics, in the order in which it is applied.
         device: Warp device of the simulations; not part of the twin's identity.
     """
 
@@ -64,6 +69,7 @@ class Twin:
     held_nodes: tuple[np.ndarray, ...]
     controllers_start: np.ndarray
     release_s: float = 0.0
+    effects: tuple[Effect, ...] = ()
     device: str = "cpu"
 
     @property
@@ -115,6 +121,21 @@ class Twin:
         law = replace(self.law, **{k: float(v) for k, v in values.items() if k in law_names})
         return replace(self, law=law, **{k: float(v) for k, v in values.items() if k in own})
 
+    def with_effect(self, added: Effect) -> Twin:
+        """A twin with this effect, in the place of one of the same name if there is one.
+
+        Raises:
+            EffectRefused: the effect makes no sense for this twin; the message says why.
+        """
+        reason = added.refuses(self)
+        if reason is not None:
+            raise EffectRefused(f"{added.name}: {reason}")
+        names = [known.name for known in self.effects]
+        if added.name in names:
+            place = names.index(added.name)
+            return replace(self, effects=(*self.effects[:place], added, *self.effects[place + 1 :]))
+        return replace(self, effects=(*self.effects, added))
+
     def simulate(
         self,
         control_times: np.ndarray,
@@ -162,6 +183,9 @@ class Twin:
             SimulationError: the run cannot be trusted; the message has the numbers.
         """
         knots, frame_index = _knots(control_times, frame_times, 0.0 if from_rest else self.release_s)
+        active = [known for known in self.effects if known.active]
+        for known in active:
+            control_times, control_points = known.controls(control_times, control_points)
         controls = PchipInterpolator(control_times, control_points, axis=0)(
             np.clip(knots, control_times[0], control_times[-1])
         )
@@ -173,11 +197,17 @@ class Twin:
             drag_per_s=self.air_drag_per_s,
             stiffness_factor=None if properties is None else np.exp(properties[:, 0]),
             density_factor=None if properties is None else np.exp(properties[:, 1]),
-            ground=self._ground(),
+            terms=self._contacts(),
             device=self.device,
         )
+        for known in active:
+            problem = known.problem(problem, self)
         velocity = np.zeros_like(self.body.start) if from_rest else self.body.start_velocity
         held = self._held(knots, controls)
+        for known in active:
+            held = known.held(held, self)
+        for known in active:
+            problem, held = known.attach(problem, held, self)
         nodes = TotalLagrangian(problem).run(self.body.start, velocity, held, knots, progress)
         held_back = np.repeat(self.body.start[None], int(np.sum(frame_index < 0)), axis=0)
         return np.concatenate([held_back, nodes[frame_index[frame_index >= 0]]])
@@ -199,6 +229,19 @@ class Twin:
             slope = lattice.interpolation(body.points, (1,))
             turn = least_rotation((slope @ body.start)[None], _apply(slope, nodes))
             tracks = tracks + np.einsum("tnij,nj->tni", turn, body.offsets)
+        return tracks
+
+    def observe(self, nodes: np.ndarray, times: np.ndarray) -> np.ndarray:
+        """Tracked points (T, N, 3) as the camera reports them: :meth:`track_nodes` and the measurement's effects.
+
+        Args:
+            nodes: nodal trajectories, (T, n, 3) [m].
+            times: their frames, (T,) [s].
+        """
+        tracks = self.track_nodes(nodes)
+        for known in self.effects:
+            if known.active:
+                tracks = known.measured(times, tracks, self)
         return tracks
 
     def track(self, particles: np.ndarray) -> np.ndarray:
@@ -226,6 +269,7 @@ class Twin:
             "notes": list(body.notes),
             "groups": [g.tolist() for g in self.controller_groups],
             "held": [h.tolist() for h in self.held_nodes],
+            "effects": [{"name": known.name, "strengths": known.values} for known in self.effects],
         }
         return {
             "facts": np.array(json.dumps(facts)),
@@ -260,13 +304,14 @@ class Twin:
             held_nodes=tuple(np.array(h, dtype=int) for h in facts["held"]),
             controllers_start=arrays["controllers_start"],
             release_s=facts["release_s"],
+            effects=tuple(effect(e["name"], **e["strengths"]) for e in facts.get("effects", ())),
             device=device,
         )
 
-    def _ground(self) -> GroundContact | None:
+    def _contacts(self) -> tuple[Term, ...]:
         if self.ground_height_m is None or not isinstance(self.law, SolidLaw):
-            return None
-        return GroundContact(self.lattice, self.law, self.ground_height_m, self.ground_friction)
+            return ()
+        return (GroundContact(self.lattice, self.law, self.ground_height_m, self.ground_friction),)
 
     def _held(self, times: np.ndarray, controls: np.ndarray) -> HeldNodes:
         numbers, paths = [np.empty(0, dtype=int)], [np.empty((len(times), 0, 3))]
@@ -339,11 +384,12 @@ def _prior_law(scene: Scene, body: ReferenceBody) -> Law:
 
 
 def _gripped_nodes(body: ReferenceBody, controllers: np.ndarray, grip: Any) -> np.ndarray:
-    """Every node that gripped material touches: all nodes of cells half of whose particles are in the grip."""
+    """Every node that gripped material touches: all nodes of cells most of whose particles are in the grip."""
     lattice = body.lattice
     particles = lattice.interpolation(lattice.particle_coordinates) @ body.start
     slack = 1e-6
-    if grip is not None and grip.region_min_m is not None:
+    declared = grip is not None and grip.region_min_m is not None
+    if declared:
         low, high = np.asarray(grip.region_min_m) - slack, np.asarray(grip.region_max_m) + slack
         margin = 0.5 * body.thickness_m if lattice.dim < 3 else 0.0
         inside = np.all((particles >= low - margin) & (particles <= high + margin), axis=1)
@@ -355,7 +401,8 @@ def _gripped_nodes(body: ReferenceBody, controllers: np.ndarray, grip: Any) -> n
         inside = np.all((coordinates >= low) & (coordinates <= high), axis=1)
     solid = lattice.fill > 0
     share = (inside.reshape(solid.shape) & solid).sum(axis=1) / np.maximum(solid.sum(axis=1), 1)
-    cells = share >= 0.5 if np.any(share >= 0.5) else share > 0
+    most = share > 0.5 if declared else share >= 0.5
+    cells = most if np.any(most) else share > 0
     if not np.any(cells):
         cells = np.zeros(len(lattice.cells), dtype=bool)
         cells[np.unique(_nearest(particles, controllers) // lattice.fill.shape[1])] = True

@@ -8,6 +8,7 @@ friction is min(mu p, 0.3 rho c |v|) against the sliding velocity: below the Cou
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -16,6 +17,10 @@ from physworld.materials.laws import SolidLaw
 from physworld.mpm.bspline import GAUSS_POINTS
 from physworld.mpm.lattice import Lattice
 from physworld.mpm.node_kernels import ground_contact
+from physworld.mpm.terms import BoundTerm
+
+if TYPE_CHECKING:
+    from physworld.mpm.total_lagrangian import Problem
 
 _STICK_IMPEDANCE = 0.3  # share of rho c
 _BOUNDARY_MASS = 6.0  # the outermost nodal layer of a quadratic spline carries 1/6 of a cell
@@ -30,8 +35,9 @@ class GroundContact:
     height_m: float
     friction: float
 
-    def bind(self, device: str) -> BoundContact:
-        """Device arrays for one run."""
+    def bind(self, problem: Problem) -> BoundContact:
+        """Device arrays for one problem."""
+        device = problem.device
         points, areas = surface_points(self.lattice)
         matrix = self.lattice.interpolation(points)
         mu, lam = self.law.lame
@@ -47,18 +53,20 @@ class GroundContact:
                 wp.float64(self.height_m), wp.float64(self.friction), wp.float64(stiffness), wp.float64(impedance),
             ],
             device=device,
+            frequency_rad_s=contact_frequency(self.law, self.lattice),
         )  # fmt: skip
 
 
 @dataclass(frozen=True)
-class BoundContact:
+class BoundContact(BoundTerm):
     """A ground contact whose arrays live on a device."""
 
     points: int
     inputs: list
     device: str
+    frequency_rad_s: float
 
-    def launch(self, x: wp.array, v: wp.array, force: wp.array) -> None:
+    def launch(self, x: wp.array, v: wp.array, clock: wp.array, counter: wp.array, force: wp.array) -> None:
         """Add contact forces [N] at nodal positions and velocities (3n,) to ``force``."""
         wp.launch(
             ground_contact, dim=self.points, inputs=[*self.inputs, x, v], outputs=[force], device=self.device

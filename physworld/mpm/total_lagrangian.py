@@ -19,12 +19,12 @@ import numpy as np
 import warp as wp
 
 from physworld.errors import CFLViolation, ParticlesLeftTheGrid, UnstableSimulation
-from physworld.materials.laws import Law, SolidLaw, friction_law
-from physworld.mpm.contact import GroundContact, contact_frequency
+from physworld.materials.laws import Law, friction_law
 from physworld.mpm.forces import InternalForces
 from physworld.mpm.lattice import Lattice
 from physworld.mpm.node_kernels import advance_counter, advance_nodes
 from physworld.mpm.stability import fastest_frequency, stable_time_step
+from physworld.mpm.terms import Term
 
 _CHUNK = 8  # substeps in one captured graph
 _REACH = 1e3  # a node farther than this many body sizes from its start has left every workspace
@@ -49,7 +49,7 @@ class Problem:
         gravity_m_s2: (3,).
         drag_per_s: linear drag rate c of every node [1/s].
         stiffness_factor, density_factor: fields over the particles, (P,), or None for 1.
-        ground: contact with a horizontal plane, or None.
+        terms: what else acts on the nodes, contacts and effects, in the order of their launches.
     """
 
     lattice: Lattice
@@ -59,7 +59,7 @@ class Problem:
     drag_per_s: float = 0.0
     stiffness_factor: np.ndarray | None = None
     density_factor: np.ndarray | None = None
-    ground: GroundContact | None = None
+    terms: tuple[Term, ...] = ()
     device: str = field(default="cpu")
 
 
@@ -100,12 +100,14 @@ class TotalLagrangian:
         self.forces = InternalForces(lattice, law, stiffness, problem.rest, device)
         cell = float(lattice.spacing.min())
         frequency = fastest_frequency(self.forces, problem.rest, self.mass, cell)
-        friction, rate = friction_law(law), 0.0
+        friction, rate = friction_law(law), problem.drag_per_s
         if friction is not None:
             damper = InternalForces(lattice, friction, stiffness, problem.rest, device)
-            rate = fastest_frequency(damper, problem.rest, self.mass, cell) ** 2
-        if problem.ground is not None and isinstance(law, SolidLaw):
-            frequency = float(np.hypot(frequency, contact_frequency(law, lattice)))
+            rate += fastest_frequency(damper, problem.rest, self.mass, cell) ** 2
+        self.terms = tuple(term.bind(problem) for term in problem.terms)
+        for term in self.terms:
+            frequency = float(np.hypot(frequency, term.frequency_rad_s))
+            rate += term.friction_per_s
         limit = stable_time_step(frequency, rate, safety=1.0)
         if time_step_s is not None and time_step_s > limit:
             raise CFLViolation(
@@ -159,16 +161,17 @@ class TotalLagrangian:
             upload(self.mass), upload(slot, wp.int32), upload(paths[0]), upload(paths[1]),
             wp.vec3d(*self.problem.gravity_m_s2), wp.float64(self.problem.drag_per_s), clock, counter,
         ]  # fmt: skip
-        contact = self.problem.ground.bind(device) if self.problem.ground is not None else None
 
+        for term in self.terms:
+            term.begin(times)
         self.forces.inverted.zero_()
         self.forces.launch(x_d, clock, force)  # remembers the first strains; its forces are thrown away
         force.zero_()
 
         def substep() -> None:
             self.forces.launch(x_d, clock, force)
-            if contact is not None:
-                contact.launch(x_d, v_d, force)
+            for term in self.terms:
+                term.launch(x_d, v_d, clock, counter, force)
             wp.launch(advance_nodes, dim=nodes, inputs=node_inputs, outputs=[force, x_d, v_d], device=device)
             wp.launch(advance_counter, dim=1, inputs=[counter], device=device)
 

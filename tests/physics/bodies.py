@@ -6,6 +6,7 @@ import numpy as np
 
 from physworld.materials.laws import Law, RodLaw, SheetLaw, SolidLaw
 from physworld.mpm.lattice import Lattice, box_lattice
+from physworld.mpm.terms import Term
 from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
@@ -44,11 +45,11 @@ def run(
     velocity: np.ndarray | None = None,
     clamped: bool = True,
     drag_per_s: float = 0.0,
-    ground: object = None,
+    terms: tuple[Term, ...] = (),
 ) -> np.ndarray:
     """Nodes over time, (T, n, 3), from rest (or ``velocity``, (n, 3)) in the undeformed shape."""
     rest = rest_nodes(lattice)
-    problem = Problem(lattice, law, rest, gravity, drag_per_s=drag_per_s, ground=ground)  # type: ignore[arg-type]
+    problem = Problem(lattice, law, rest, gravity, drag_per_s=drag_per_s, terms=terms)
     start_velocity = np.zeros_like(rest) if velocity is None else velocity
     return TotalLagrangian(problem).run(
         rest, start_velocity, still_clamp(lattice, rest, len(times), clamped), times

@@ -150,7 +150,7 @@ def test_a_block_on_the_ground_carries_its_weight_and_slides_to_the_coulomb_dist
     ground = GroundContact(lattice, law, 0.0, friction)
     velocity = np.tile([speed, 0.0, 0.0], (len(lattice.nodes), 1))
     times = np.linspace(0.0, 0.6, 61)
-    nodes = run(lattice, law, times, velocity=velocity, clamped=False, ground=ground)
+    nodes = run(lattice, law, times, velocity=velocity, clamped=False, terms=(ground,))
     path = material_point(lattice, nodes, (0.06, 0.06, 0.03))
     assert path[-1, 0] - path[0, 0] == pytest.approx(speed**2 / (2 * friction * 9.81), rel=0.08)
     assert abs(path[-1, 2] - 0.03) < 0.002

@@ -1,0 +1,108 @@
+"""What an effect is: a named departure from the declared physics, with strengths that a trace may estimate.
+
+An effect is a frozen dataclass. Its *gates* are the strengths whose zero means that nothing is there; with every gate
+at zero :attr:`Effect.active` is false, no hook is called, and the simulation is the same to the last bit. Other
+strengths (a relaxation time, a place) only shape what an open gate lets in; ``None`` lets the effect choose a place
+from the twin.
+
+The hooks run in this order: :meth:`~Effect.controls`, :meth:`~Effect.problem`, :meth:`~Effect.held`,
+:meth:`~Effect.attach`, then the integration, then :meth:`~Effect.measured`. Each leaves what it does not change.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+import numpy as np
+
+from physworld.mpm.total_lagrangian import HeldNodes, Problem
+
+if TYPE_CHECKING:
+    from physworld.twin import Twin
+
+Kind = Literal["force", "stress", "boundary", "field", "measurement"]
+
+
+@dataclass(frozen=True)
+class Strength:
+    """One number of an effect.
+
+    Attributes:
+        name: the effect's field.
+        unit: SI unit; "1" for none.
+        low, high: bounds of a search.
+        probe: a step for sensitivities, large enough to show in a simulation and small enough to stay linear.
+        gate: zero switches the effect off; False for a number that only shapes it.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    probe: float
+    gate: bool = True
+
+
+@dataclass(frozen=True)
+class Effect:
+    """Base of the effects; see the module's text.
+
+    Attributes:
+        name: name in the registry.
+        title: a few words for people.
+        equation: the law in plain text.
+        kind: where it enters.
+        gates: fields whose zero switches the effect off.
+    """
+
+    name: ClassVar[str]
+    title: ClassVar[str]
+    equation: ClassVar[str]
+    kind: ClassVar[Kind]
+    gates: ClassVar[tuple[str, ...]]
+
+    @property
+    def active(self) -> bool:
+        """Whether any gate is open."""
+        return any(getattr(self, gate) != 0.0 for gate in self.gates)
+
+    @property
+    def values(self) -> dict[str, float | None]:
+        """Every field by name: what :func:`physworld.effects.registry.effect` takes to make it again."""
+        return asdict(self)
+
+    @property
+    def derived(self) -> dict[str, tuple[float, str]]:
+        """Numbers that people ask for and the strengths imply: name to (value, unit)."""
+        return {}
+
+    @classmethod
+    def strengths(cls, twin: Twin) -> tuple[Strength, ...]:
+        """What a trace may estimate on this twin; bounds and probes follow its scales."""
+        raise NotImplementedError(f"{cls.__name__} names no strengths")
+
+    @classmethod
+    def refuses(cls, twin: Twin) -> str | None:
+        """Why the effect makes no sense for this twin; None where it does."""
+        return None
+
+    def controls(self, times: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The control track (Tc,) [s], (Tc, K, 3) [m] that the body really followed."""
+        return times, points
+
+    def problem(self, problem: Problem, twin: Twin) -> Problem:
+        """The problem with its fields, its gravity or its terms changed."""
+        return problem
+
+    def held(self, held: HeldNodes, twin: Twin) -> HeldNodes:
+        """The prescribed nodes, changed."""
+        return held
+
+    def attach(self, problem: Problem, held: HeldNodes, twin: Twin) -> tuple[Problem, HeldNodes]:
+        """For a grip that pulls instead of prescribing: takes nodes out of ``held`` and adds a term."""
+        return problem, held
+
+    def measured(self, times: np.ndarray, tracks: np.ndarray, twin: Twin) -> np.ndarray:
+        """What the camera reports at ``times`` (T,) [s] of true ``tracks`` (T, N, 3) [m]."""
+        return tracks

@@ -1,0 +1,60 @@
+"""Three small twins, one of each dimension, held at one end and moved: what every effect is tried on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from made_scene import FPS, box_body, made_scene
+
+from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Ground, Scene
+from physworld.twin import Twin, build_twin
+
+FRAMES = 8
+SIZE = np.array([0.16, 0.04, 0.04])
+PLATE = np.array([[0.0, 0.0, 0.0], [0.0, 0.03, 0.0], [0.0, 0.0, 0.03]])
+
+
+def _moved(scene: Scene) -> Scene:
+    lift = np.sin(6.0 * scene.times)[:, None, None] ** 2 * np.array([0.01, 0.02, 0.02])
+    return replace(scene, controllers=scene.controllers + lift)
+
+
+def solid() -> Scene:
+    """A bar on the ground, its first fifth gripped."""
+    points = np.linspace([0.04, 0.02, 0.04], [0.16, 0.02, 0.04], 4)
+    grips = (Grip((0, 1, 2), np.zeros(3), np.array([0.032, 0.04, 0.04])),)
+    body = box_body([0, 0, 0], SIZE, density_kg_m3=500.0)
+    return _moved(
+        made_scene(points, "beam", PLATE, FRAMES, body=body, grips=grips, ground=Ground(-0.003, 0.4),
+                   initial_state=UNDEFORMED_AT_REST)
+    )  # fmt: skip
+
+
+def sheet() -> Scene:
+    """A square sheet, one corner held."""
+    plane = np.stack(np.meshgrid(*[np.linspace(0, 0.2, 3)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
+    points = np.concatenate([plane, np.zeros((9, 1))], axis=1)
+    scene = made_scene(
+        points, "sheet", PLATE, FRAMES, body=Body(thickness_m=2e-3), initial_state=UNDEFORMED_AT_REST
+    )
+    return _moved(scene)
+
+
+def rope() -> Scene:
+    """A rope held at its first end."""
+    points = np.linspace([0.0, 0.0, 0.0], [0.3, 0.0, 0.0], 5)
+    body = Body(radius_m=0.004)
+    return _moved(made_scene(points, "rope", PLATE[:1], FRAMES, body=body, initial_state=UNDEFORMED_AT_REST))
+
+
+SCENES = {"solid": solid, "sheet": sheet, "rope": rope}
+TWINS = {name: build_twin(make(), 300) for name, make in SCENES.items()}
+
+
+def simulated(twin: Twin, scene: Scene) -> np.ndarray:
+    """Nodes over the scene's frames, (T, n, 3)."""
+    return twin.simulate_nodes(*scene.control_track(), scene.times)
+
+
+__all__ = ["FPS", "FRAMES", "SCENES", "TWINS", "simulated"]
