@@ -32,7 +32,7 @@ class InternalForces:
     def __init__(
         self, lattice: Lattice, law: Law, stiffness_factor: np.ndarray, rest: np.ndarray, device: str
     ) -> None:
-        if lattice.dim != {RodLaw: 1, SheetLaw: 2, SolidLaw: 3}[type(law)]:
+        if not isinstance(law, {1: RodLaw, 2: SheetLaw, 3: SolidLaw}[lattice.dim]):
             raise ValueError(f"a {type(law).__name__} does not fit a lattice of dimension {lattice.dim}")
         self.device = device
         self.cells = len(lattice.cells)

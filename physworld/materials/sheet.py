@@ -1,0 +1,120 @@
+"""Laws of thin sheets, flat at rest: quadratic in the membrane strain and in the change of curvature (Koiter 1966).
+
+    W = K/2 [e11^2 + r e22^2 + 2 nu sqrt(r) e11 e22 + 2 (1 - nu) s e12^2]       membrane
+      + D/2 [k11^2 + b k22^2 + 2 nu sqrt(b) k11 k22 + 2 (1 - nu) t k12^2]       bending
+    e_ab = (a_a . a_b - delta_ab) / 2       k_ab = n . x,ab
+
+K = h E / (1 - nu^2) and D are stiffnesses along the first axis (warp); r and b are the ratios of the second (weft) to
+them, s and t the ratios of shear and twist to an isotropic sheet's. An isotropic sheet has all four at 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class SheetLaw:
+    """Thin isotropic sheet.
+
+    Attributes:
+        membrane_n_m: K = h E / (1 - nu^2), in-plane stiffness [N/m].
+        bending_n_m: D, bending stiffness [N m].
+        poissons_ratio: of the sheet.
+        relaxation_s: Kelvin-Voigt time tau of stretch and bending.
+        density_kg_m2: mass per area.
+    """
+
+    name: ClassVar[str] = "isotropic_sheet"
+
+    membrane_n_m: float
+    bending_n_m: float
+    poissons_ratio: float = 0.3
+    relaxation_s: float = 0.0
+    density_kg_m2: float = 0.3
+
+    @property
+    def membrane_shape(self) -> tuple[float, float, float, float]:
+        """C11, C22, C12 and C33 over K: N11 = C11 e11 + C12 e22, N22 = C12 e11 + C22 e22, N12 = C33 e12."""
+        return 1.0, 1.0, self.poissons_ratio, 1.0 - self.poissons_ratio
+
+    @property
+    def bending_shape(self) -> tuple[float, float, float, float]:
+        """The same of the moments, over D."""
+        return 1.0, 1.0, self.poissons_ratio, 1.0 - self.poissons_ratio
+
+    @property
+    def wave_speed_m_s(self) -> float:
+        """Speed of the fastest in-plane waves [m/s]."""
+        stiffest = max(self.membrane_shape[:2])
+        return float(np.sqrt(self.membrane_n_m * stiffest / self.density_kg_m2))
+
+    def energy_density(self, strain: np.ndarray, curvature: np.ndarray) -> np.ndarray:
+        """Stored energy [J/m^2] of strains (e11, e22, e12) and curvatures (k11, k22, k12) [1/m], both (..., 3)."""
+        return 0.5 * self.membrane_n_m * _quadratic(self.membrane_shape, strain) + (
+            0.5 * self.bending_n_m * _quadratic(self.bending_shape, curvature)
+        )
+
+
+@dataclass(frozen=True)
+class OrthotropicSheetLaw(SheetLaw):
+    """Woven cloth: warp along the sheet's first axis, weft along its second; see the module's text.
+
+    Attributes:
+        weft_ratio: r, in-plane stiffness along the weft over the warp's.
+        shear_ratio: s, shear stiffness over an isotropic sheet's; about 0.01 to 0.1 for woven cloth.
+        bending_weft_ratio: b, bending stiffness along the weft over the warp's.
+        bending_twist_ratio: t, twisting stiffness over an isotropic sheet's.
+    """
+
+    name: ClassVar[str] = "orthotropic_sheet"
+
+    weft_ratio: float = 1.0
+    shear_ratio: float = 1.0
+    bending_weft_ratio: float = 1.0
+    bending_twist_ratio: float = 1.0
+
+    @property
+    def membrane_shape(self) -> tuple[float, float, float, float]:
+        """C11, C22, C12 and C33 over K."""
+        nu, ratio = self.poissons_ratio, self.weft_ratio
+        return 1.0, ratio, nu * float(np.sqrt(ratio)), (1.0 - nu) * self.shear_ratio
+
+    @property
+    def bending_shape(self) -> tuple[float, float, float, float]:
+        """The same of the moments, over D."""
+        nu, ratio = self.poissons_ratio, self.bending_weft_ratio
+        return 1.0, ratio, nu * float(np.sqrt(ratio)), (1.0 - nu) * self.bending_twist_ratio
+
+
+def sheet_strains(derivatives: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Strains (e11, e22, e12) and curvatures (k11, k22, k12) [1/m], both (..., 3).
+
+    Args:
+        derivatives: x,1 and x,2 (no unit), x,11, x,22 and x,12 [1/m] of the surface, (..., 5, 3).
+    """
+    first, second = derivatives[..., 0, :], derivatives[..., 1, :]
+    normal = np.cross(first, second)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    strain = np.stack(
+        [
+            0.5 * (np.sum(first * first, axis=-1) - 1),
+            0.5 * (np.sum(second * second, axis=-1) - 1),
+            0.5 * np.sum(first * second, axis=-1),
+        ],
+        axis=-1,
+    )
+    return strain, np.einsum("...i,...ki->...k", normal, derivatives[..., 2:, :])
+
+
+def _quadratic(shape: tuple[float, float, float, float], s: np.ndarray) -> np.ndarray:
+    c11, c22, c12, c33 = shape
+    return (
+        c11 * s[..., 0] ** 2
+        + c22 * s[..., 1] ** 2
+        + 2 * c12 * s[..., 0] * s[..., 1]
+        + 2 * c33 * s[..., 2] ** 2
+    )
