@@ -6,7 +6,9 @@
 - *Solid* (everything else): reference coordinates are the world's at the start; a declared box, points that fill
   the body, or points that bound it.
 
-Cell faces lie on the faces of boxes and on the inner faces of declared grips.
+Cell faces lie on the faces of boxes. At a declared grip they lie 1/(2 sqrt 3) of a cell inside it: prescribing every
+node of the gripped cells also fixes the slope at their face, which a solid's clamp does not, and so acts that much
+beyond it. With this the clamp is second order in the cell size (``docs/verification.md``).
 """
 
 from __future__ import annotations
@@ -29,6 +31,8 @@ _SHEET_CELLS = 12
 _BOX_KINDS = ("beam", "block")
 _FLAT = 0.08  # a sheet's points lie within this share of its width of their plane (root mean square)
 _TIGHTER = 0.97  # a sheet is turned in its plane if that shrinks its bounding rectangle below this share
+_CLAMP_REACH = 0.5 / np.sqrt(3.0)  # cells by which a held layer of splines acts beyond its face
+_THINNEST_GRIP = 0.25  # cells of gripped material that must stay behind a face that was moved into the grip
 _THIN = 1e-4  # points whose extent falls below this share of their largest one span a dimension less
 _BOX_FILL = 0.93  # a cloud that fills this share of its bounding box is a box, whatever its kind
 
@@ -168,7 +172,10 @@ def _solid_lattice(scene: Scene, low: np.ndarray, high: np.ndarray, test, budget
         at_low = grip.region_min_m[axis] - low[axis] < high[axis] - grip.region_max_m[axis]
         face = grip.region_max_m[axis] if at_low else grip.region_min_m[axis]
         free = high[axis] - face if at_low else face - low[axis]
-        spacing[axis] = free / max(1, round(free / cell))
+        depth = face - low[axis] if at_low else high[axis] - face
+        reach = _CLAMP_REACH if depth > (_CLAMP_REACH + _THINNEST_GRIP) * cell else 0.0
+        spacing[axis] = free / (max(1, round(free / cell + reach)) - reach)
+        face -= (1 if at_low else -1) * reach * spacing[axis]
         behind = np.ceil((face - low[axis]) / spacing[axis] - 1e-6)
         origin[axis] = face - behind * spacing[axis]
         break
