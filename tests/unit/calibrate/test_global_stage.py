@@ -45,7 +45,9 @@ def truth(scene: Scene, **parameters: float) -> Twin:
 
 @pytest.fixture(scope="module")
 def undamped() -> Scene:
-    return recorded_by(truth(shaken_bar()), shaken_bar(), SIGMA_M, seed=2)  # a 95 % interval misses one draw in 20
+    return recorded_by(
+        truth(shaken_bar()), shaken_bar(), SIGMA_M, seed=2
+    )  # a 95 % interval misses one draw in 20
 
 
 @pytest.fixture(scope="module")
