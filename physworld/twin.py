@@ -42,6 +42,30 @@ _MERGE_S = 1e-6  # control and frame times closer than this are one
 
 
 @dataclass(frozen=True)
+class Integration:
+    """A run of a twin before it is run.
+
+    Attributes:
+        problem: what is integrated.
+        velocity: of the nodes at the first knot [m/s], (n, 3).
+        held: prescribed nodes at the knots.
+        knots: times at which the solver stops [s].
+        frame_index: each frame's place among the knots, (T,); -1 before the release.
+    """
+
+    problem: Problem
+    velocity: np.ndarray
+    held: HeldNodes
+    knots: np.ndarray
+    frame_index: np.ndarray
+
+    def at_frames(self, start: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+        """Nodes (T, n, 3) at the frames from those at the knots; before the release they are at ``start`` (n, 3)."""
+        held_back = np.repeat(start[None], int(np.sum(self.frame_index < 0)), axis=0)
+        return np.concatenate([held_back, nodes[self.frame_index[self.frame_index >= 0]]])
+
+
+@dataclass(frozen=True)
 class Twin:
     """See the module's text.
 
@@ -182,6 +206,22 @@ class Twin:
         Raises:
             SimulationError: the run cannot be trusted; the message has the numbers.
         """
+        run = self.integration(
+            control_times, control_points, frame_times, properties=properties, from_rest=from_rest
+        )
+        nodes = TotalLagrangian(run.problem).run(self.body.start, run.velocity, run.held, run.knots, progress)
+        return run.at_frames(self.body.start, nodes)
+
+    def integration(
+        self,
+        control_times: np.ndarray,
+        control_points: np.ndarray,
+        frame_times: np.ndarray,
+        *,
+        properties: np.ndarray | None = None,
+        from_rest: bool = False,
+    ) -> Integration:
+        """What :meth:`simulate_nodes` integrates, for whoever wants to integrate it otherwise: same arguments."""
         knots, frame_index = _knots(control_times, frame_times, 0.0 if from_rest else self.release_s)
         active = [known for known in self.effects if known.active]
         for known in active:
@@ -208,9 +248,7 @@ class Twin:
             held = known.held(held, self)
         for known in active:
             problem, held = known.attach(problem, held, self)
-        nodes = TotalLagrangian(problem).run(self.body.start, velocity, held, knots, progress)
-        held_back = np.repeat(self.body.start[None], int(np.sum(frame_index < 0)), axis=0)
-        return np.concatenate([held_back, nodes[frame_index[frame_index >= 0]]])
+        return Integration(problem, velocity, held, knots, frame_index)
 
     def particles_at(self, nodes: np.ndarray) -> np.ndarray:
         """Particles (T, P, 3) of nodal trajectories (T, n, 3)."""
