@@ -15,7 +15,7 @@ from typing import NoReturn
 
 import typer
 
-from physworld_client.cli import lists, run, up
+from physworld_client.cli import fit, lists, run, up
 from physworld_client.cli.output import stderr
 from physworld_client.errors import PhysWorldError
 
@@ -29,6 +29,7 @@ app = typer.Typer(
 )
 app.command("up")(up.up)
 app.command("run")(run.run)
+app.command("fit")(fit.fit)
 app.add_typer(lists.scenes, name="scenes")
 app.add_typer(lists.fits, name="fits")
 app.add_typer(lists.datasets, name="datasets")

@@ -1,0 +1,43 @@
+"""``physworld fit SCENE``: calibrate a twin without the service.
+
+This process becomes the command (``python -m workers.commands.fit``), so that Ctrl-C reaches exactly one process,
+its exit code is this one's, and the client imports no engine.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from physworld_client.errors import PhysWorldError
+
+MODULE = "workers.commands.fit"
+
+
+def fit(
+    scene: Annotated[Path, typer.Argument(help="Folder, archive, final_data.pkl or C3D file.")],
+    json: Annotated[Path | None, typer.Option(help="Write the figures to this file.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the twin and its prediction.")] = None,
+    particles: Annotated[int | None, typer.Option(min=50, help="Particles of the twin, about.")] = None,
+    simulations: Annotated[int | None, typer.Option(min=1, help="Most simulations of the search.")] = None,
+) -> None:
+    """Calibrate a twin in this process and measure it on the held-out frames; needs no service."""
+    given = {"--json": json, "--out": out, "--particles": particles, "--simulations": simulations}
+    options = [text for name, value in given.items() if value is not None for text in (name, str(value))]
+    become(MODULE, [*options, "--", str(scene)])
+
+
+def become(module: str, arguments: list[str]) -> None:
+    """Replace this process by ``python -m module``. Raises PhysWorldError where only the client is installed."""
+    if importlib.util.find_spec("workers") is None or importlib.util.find_spec("warp") is None:
+        raise PhysWorldError(
+            "the engine is not installed here, only the client: install the distribution physworld with the "
+            "extras api and sim"
+        )
+    sys.stdout.flush()
+    os.execv(sys.executable, [sys.executable, "-m", module, *arguments])

@@ -1,0 +1,108 @@
+"""``physworld fit``: one process, files in, files out, and every known error one line with exit code 2."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_scene import box_body, made_scene, recorded_by
+
+from physworld.scene import UNDEFORMED_AT_REST, Grip
+from physworld.twin import Twin, build_twin
+from storage.scene_bundle import write_bundle
+from workers.commands import fit
+
+FRAMES, BUDGET, SIMULATIONS = 16, 60, 60
+YOUNGS_MODULUS_PA = 4e4
+LOW, HIGH = np.array([0.0, -0.015, -0.015]), np.array([0.12, 0.015, 0.015])
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bar that sags from its clamp, as a folder."""
+    grip = np.array([[0.0, y, z] for y in (-0.01, 0.01) for z in (-0.01, 0.01)])
+    scene = made_scene(
+        [[x, 0.0, 0.015] for x in np.linspace(0.03, 0.12, 7)],
+        "beam",
+        grip,
+        FRAMES,
+        body=box_body(LOW, HIGH, density_kg_m3=300.0),
+        grips=(Grip((0, 1, 2, 3), LOW, np.array([0.02, 0.015, 0.015])),),
+        initial_state=UNDEFORMED_AT_REST,
+    )
+    scene = replace(scene, name="bar")
+    twin = build_twin(scene, BUDGET).with_parameters(youngs_modulus_pa=YOUNGS_MODULUS_PA)
+    folder = tmp_path_factory.mktemp("scenes") / "bar"
+    write_bundle(recorded_by(twin, scene, 2e-4), folder)
+    return folder
+
+
+def arguments(bundle: Path, *more: str) -> list[str]:
+    return [str(bundle), "--particles", str(BUDGET), "--simulations", str(SIMULATIONS), *more]
+
+
+def test_the_figures_and_the_files_of_a_fit(
+    bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    figures, out = tmp_path / "deep" / "fit.json", tmp_path / "twin"
+    assert fit.main(arguments(bundle, "--json", str(figures), "--out", str(out))) == 0
+    found = json.loads(figures.read_text())
+    assert found["schema_version"] == 1 and found["scene"] == "bar"
+    modulus = found["parameters"]["youngs_modulus_pa"]
+    assert modulus["value"] == pytest.approx(YOUNGS_MODULUS_PA, rel=0.03) and modulus["unit"] == "Pa"
+    held_out = found["held_out"]
+    for metric in ("track_m", "chamfer_phystwin_m", "chamfer_l2_m"):
+        assert {"static", "rigid_follow", "constant_velocity", "twin"} <= set(held_out[metric])
+        assert len(held_out["per_frame"][metric]["twin"]) == held_out["frames"][1] - held_out["frames"][0]
+    assert held_out["track_m"]["twin"] < 1.5 * held_out["noise_floor_m"]  # frame 0 is as noisy
+    assert 0 < found["simulations"] <= SIMULATIONS
+    with np.load(out / "twin.npz", allow_pickle=False) as arrays:
+        twin = Twin.from_arrays(dict(arrays))
+    assert twin.parameters["youngs_modulus_pa"] == modulus["value"]
+    assert {path.name for path in out.iterdir()} == {"twin.npz", "prediction.npz", "report.json"}
+    assert "youngs_modulus_pa" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("content", "word"), [(None, "FileNotFoundError"), (b"nothing that we read", "SceneInvalid")]
+)
+def test_what_cannot_be_read_is_one_line_and_exit_code_2(
+    tmp_path: Path, content: bytes | None, word: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "scene.zip"
+    if content is not None:
+        path.write_bytes(content)
+    assert fit.main([str(path), "--json", str(tmp_path / "fit.json")]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 and lines[0].startswith(f"error: {word}")
+    assert not (tmp_path / "fit.json").exists()
+
+
+def test_a_scene_that_no_law_covers_is_one_line_and_exit_code_2(
+    bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "few"
+    write_bundle(replace(made_scene(np.eye(3), "blob"), name="few"), folder)
+    assert fit.main([str(folder)]) == 2
+    assert capsys.readouterr().err.startswith("error: SceneUnsupported: ")
+
+
+def test_an_interrupt_cancels_and_says_so(bundle: Path, tmp_path: Path) -> None:
+    figures = tmp_path / "fit.json"
+    command = [sys.executable, "-m", "workers.commands.fit", *arguments(bundle, "--json", str(figures))]
+    command[-1:] = [str(figures), "--particles", "4000"]  # slow enough to be met while it works
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=dict(os.environ)) as process:
+        assert process.stderr is not None
+        first = next(line for line in process.stderr if line.startswith("fit bar"))
+        process.send_signal(signal.SIGINT)
+        rest = process.stderr.read()
+    assert first.startswith("fit bar 1/")
+    assert process.returncode == 130 and "cancelled; nothing was written" in rest and "Traceback" not in rest
+    assert not figures.exists()

@@ -1,0 +1,95 @@
+"""``python -m workers.commands.fit SCENE --json FILE``: calibrate a twin in this process and measure it.
+
+The figures are those of :func:`fit_document`; ``--out DIR`` also keeps the twin and its prediction, the files of
+the service's fit. Ctrl-C cancels; nothing is written before the end.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+SCHEMA_VERSION = 1
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Parse the command line, fit, write."""
+    given = _parser().parse_args(arguments)
+    from workers.commands.terminal import guarded
+
+    return guarded(lambda: _fit(given))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="physworld fit", description="Calibrate a twin of a recording.")
+    parser.add_argument("scene", type=Path, help="folder, archive, final_data.pkl or C3D file")
+    parser.add_argument("--json", type=Path, default=None, help="write the figures to this file")
+    parser.add_argument("--out", type=Path, default=None, help="folder for the twin and its prediction")
+    parser.add_argument("--particles", type=_count, default=None, help="particles of the twin, about")
+    parser.add_argument("--simulations", type=_count, default=None, help="most simulations of the search")
+    return parser
+
+
+def _count(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{value} is below 1")
+    return value
+
+
+def _fit(given: argparse.Namespace) -> None:
+    import warp as wp
+
+    wp.config.quiet = True  # before the first import that starts it
+    from physworld.calibrate import CalibrationConfig, calibrate
+    from workers.commands.terminal import progress_bar, read_scene
+    from workers.tasks.fit_report import fit_files, fit_report
+
+    scene = read_scene(given.scene)
+    numbers = {"particle_budget": given.particles, "max_simulations": given.simulations}
+    config = CalibrationConfig(**{name: value for name, value in numbers.items() if value is not None})
+    with progress_bar(f"fit {scene.name}") as shown:
+        fitted = calibrate(scene, config, progress=shown)
+    report = fit_report(scene, fitted)
+    document = fit_document(scene.name, report)
+    _print(document)
+    if given.out is not None:
+        given.out.mkdir(parents=True, exist_ok=True)
+        for name, content in fit_files(scene, fitted, report).items():
+            (given.out / name).write_bytes(content)
+    if given.json is not None:
+        given.json.parent.mkdir(parents=True, exist_ok=True)
+        given.json.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n")
+
+
+def fit_document(scene_name: str, report: dict[str, Any]) -> dict[str, Any]:
+    """The machine-readable answer: the report's figures under stable keys at the top."""
+    metrics = dict(report["metrics"])
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "scene": scene_name,
+        "parameters": report["parameters"],
+        **metrics,
+        "notes": report["notes"],
+    }
+
+
+def _print(document: dict[str, Any]) -> None:
+    for name, parameter in document["parameters"].items():
+        interval = parameter["ci95"]
+        shown = "" if interval is None else f"  [{interval[0]:.5g}, {interval[1]:.5g}]"
+        note = "" if parameter["identified"] and not parameter["note"] else f"  ({parameter['note']})"
+        print(f"{name:<26} {parameter['value']:.5g} {parameter['unit']}{shown}{note}")
+    held_out = document["held_out"]
+    floor = held_out["noise_floor_m"]
+    print(f"held-out track error [mm]{'' if floor is None else f', noise floor {1e3 * floor:.4g}'}:")
+    for name, error in sorted(held_out["track_m"].items(), key=lambda item: item[1] or 0.0):
+        print(f"  {name:<20} {'-' if error is None else format(1e3 * error, '.4g')}")
+    print(f"{document['simulations']} simulations, {document['seconds']:.0f} s")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,86 @@
+"""What a fit leaves behind, the same for the service's task and for ``physworld fit``: figures and files.
+
+Files: ``twin.npz`` (the twin, see ``Twin.to_arrays``), ``prediction.npz`` (``times`` (T,) f8 [s], ``tracks``
+(T, N, 3) f4 [m], ``particles`` (T, P', 3) f4 [m] with P' at most 1500, ``particle_indices`` (P',)),
+``report.json`` (parameters, metrics, notes).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+
+from physworld.calibrate import Estimate, FitResult
+from physworld.evaluate.table import held_out_table
+from physworld.scene import Scene
+from schemas.fit import Parameter
+from workers.tasks.inputs import TWIN, npz_bytes
+
+PREDICTION = "prediction.npz"
+REPORT = "report.json"
+SHOWN_PARTICLES = 1500
+MEDIA_TYPES = {TWIN: "application/x-npz", PREDICTION: "application/x-npz", REPORT: "application/json"}
+
+
+def fit_report(scene: Scene, fitted: FitResult) -> dict[str, Any]:
+    """``parameters``, ``metrics`` and ``notes`` as plain JSON; a number that is not finite is None."""
+    metrics = {
+        "held_out": held_out_table(scene, {"twin": fitted.tracks}),
+        "simulations": fitted.simulations,
+        "seconds": fitted.seconds,
+        "training_loss_m": fitted.loss_history,
+        "not_needed": fitted.rejected,
+        "particles": fitted.particles.shape[1],
+    }
+    return {
+        "parameters": {name: _parameter(estimate) for name, estimate in fitted.parameters.items()},
+        "metrics": json_safe(metrics),
+        "notes": list(fitted.twin.body.notes),
+    }
+
+
+def fit_files(scene: Scene, fitted: FitResult, report: dict[str, Any]) -> dict[str, bytes]:
+    """The files by name, the twin first."""
+    count = fitted.particles.shape[1]
+    shown = np.unique(np.linspace(0, count - 1, min(count, SHOWN_PARTICLES)).round().astype(np.int64))
+    prediction = {
+        "times": scene.times,
+        "tracks": fitted.tracks.astype(np.float32),
+        "particles": fitted.particles[:, shown].astype(np.float32),
+        "particle_indices": shown,
+    }
+    return {
+        TWIN: npz_bytes(fitted.twin.to_arrays()),
+        PREDICTION: npz_bytes(prediction),
+        REPORT: json.dumps(report, indent=1, allow_nan=False).encode(),
+    }
+
+
+def json_safe(value: Any) -> Any:
+    """Plain JSON types; a number that is not finite becomes None (a run that blew up has no loss)."""
+    if isinstance(value, dict):
+        return {str(key): json_safe(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [json_safe(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _parameter(estimate: Estimate) -> dict[str, Any]:
+    interval = estimate.ci95
+    if interval is not None and not all(math.isfinite(end) for end in interval):
+        interval = None
+    parameter = Parameter(
+        value=estimate.value,
+        unit=estimate.unit,
+        ci95=interval,
+        identified=estimate.identified,
+        note=estimate.note,
+    )
+    return parameter.model_dump(mode="json")
