@@ -22,6 +22,7 @@ from physworld.materials.solid import SolidLaw
 from physworld.materials.stress import Stress
 
 STRESS = Stress(
+    "fixed_corotated",
     r"""
     S square = F[0] * F[0], cofactors = cof[0] * cof[0];
     for (int k = 1; k < 9; ++k) {
@@ -51,7 +52,7 @@ STRESS = Stress(
         for (int j = 0; j < 3; ++j)
             P[3 * i + j] = straight * F[3 * i + j] + rest * cof[3 * i + j]
                 + twice * (F[3 * i] * C[j] + F[3 * i + 1] * C[3 + j] + F[3 * i + 2] * C[6 + j]);
-    """
+    """,
 )
 
 

@@ -19,55 +19,63 @@ from physworld.materials.solid import SolidLaw
 from physworld.materials.stress import Stress
 
 _HELPERS = r"""
-    static CUDA_CALLABLE void eigen(V* A, V* Q) {   // A (3 x 3, symmetric) becomes diagonal; Q holds the vectors
-        for (int k = 0; k < 9; ++k) Q[k] = V{} + (k % 4 == 0 ? 1.0f : 0.0f);
-        for (int turn = 0; turn < 12; ++turn) {
-            const int p = turn % 3 == 2 ? 1 : 0, r = turn % 3 == 0 ? 1 : 2;
-            const V off = A[3 * p + r], gap = A[4 * r] - A[4 * p];
-            // t = tan of the turn: sign(gap) 2 off / (|gap| + sqrt(gap^2 + 4 off^2))
-            const V far = absolute(gap) + sqrt(gap * gap + off * off * 4.0f) + 1e-30f;
-            const V t = where_positive(gap, off * 2.0f, off * -2.0f) / far;
-            const V cosine = 1.0f / sqrt(t * t + 1.0f), sine = t * cosine;
-            for (int k = 0; k < 3; ++k) {
-                const V a = A[3 * k + p], b = A[3 * k + r];
-                A[3 * k + p] = cosine * a - sine * b;
-                A[3 * k + r] = sine * a + cosine * b;
-            }
-            for (int k = 0; k < 3; ++k) {
-                const V a = A[3 * p + k], b = A[3 * r + k];
-                A[3 * p + k] = cosine * a - sine * b;
-                A[3 * r + k] = sine * a + cosine * b;
-                const V u = Q[3 * k + p], w = Q[3 * k + r];
-                Q[3 * k + p] = cosine * u - sine * w;
-                Q[3 * k + r] = sine * u + cosine * w;
-            }
+    static PW_INLINE void rotate(V* A, V* Q, int p, int r) {   // makes A[p][r] zero
+        const V off = A[3 * p + r], gap = A[4 * r] - A[4 * p];
+        // tangent of the turn: sign(gap) 2 off / (|gap| + sqrt(gap^2 + 4 off^2))
+        const V far = absolute(gap) + sqrt(gap * gap + off * off * 4.0f) + 1e-30f;
+        const V t = where_positive(gap, off * 2.0f, off * -2.0f) / far;
+        const V cosine = 1.0f / sqrt(t * t + 1.0f), sine = t * cosine;
+        for (int k = 0; k < 3; ++k) {
+            const V a = A[3 * k + p], b = A[3 * k + r];
+            A[3 * k + p] = cosine * a - sine * b;
+            A[3 * k + r] = sine * a + cosine * b;
+        }
+        for (int k = 0; k < 3; ++k) {
+            const V a = A[3 * p + k], b = A[3 * r + k];
+            A[3 * p + k] = cosine * a - sine * b;
+            A[3 * r + k] = sine * a + cosine * b;
+            const V u = Q[3 * k + p], w = Q[3 * k + r];
+            Q[3 * k + p] = cosine * u - sine * w;
+            Q[3 * k + r] = sine * u + cosine * w;
         }
     }
-    static CUDA_CALLABLE void log_symmetric(const V* C, V* L) {
+    static PW_INLINE void eigen(V* A, V* Q) {   // A (3 x 3, symmetric) becomes diagonal; Q holds its vectors
+        for (int k = 0; k < 9; ++k) Q[k] = V{} + (k % 4 == 0 ? 1.0f : 0.0f);
+        for (int sweep = 0; sweep < 4; ++sweep) {
+            rotate(A, Q, 0, 1);
+            rotate(A, Q, 0, 2);
+            rotate(A, Q, 1, 2);
+        }
+    }
+    static PW_INLINE V log_one_plus(V x) {
+        const V u = x + 1.0f;
+        return log(u) - ((u - 1.0f) - x) / u;
+    }
+    static PW_INLINE void log_one_plus(const V* E, V* L) {   // ln(I + E) of a symmetric E
         V A[9], Q[9], l[3];
-        for (int k = 0; k < 9; ++k) A[k] = C[k];
+        for (int k = 0; k < 9; ++k) A[k] = E[k];
         eigen(A, Q);
-        for (int k = 0; k < 3; ++k) l[k] = log(floor(A[4 * k], 1e-6f));
+        for (int k = 0; k < 3; ++k) l[k] = log_one_plus(floor(A[4 * k], -0.999999f));
         for (int i = 0; i < 3; ++i)
             for (int j = 0; j < 3; ++j)
                 L[3 * i + j] = Q[3 * i] * l[0] * Q[3 * j] + Q[3 * i + 1] * l[1] * Q[3 * j + 1]
                     + Q[3 * i + 2] * l[2] * Q[3 * j + 2];
     }
-    static CUDA_CALLABLE void log_symmetric(const D* C, D* L) {
+    static PW_INLINE void log_one_plus(const D* E, D* L) {
         V A[9], Q[9], l[3], B[9], T[9];
-        for (int k = 0; k < 9; ++k) A[k] = C[k].a;
+        for (int k = 0; k < 9; ++k) A[k] = E[k].a;
         eigen(A, Q);
         for (int k = 0; k < 3; ++k) {
-            A[4 * k] = floor(A[4 * k], 1e-6f);
-            l[k] = log(A[4 * k]);
+            A[4 * k] = floor(A[4 * k], -0.999999f);
+            l[k] = log_one_plus(A[4 * k]);
         }
         for (int i = 0; i < 3; ++i)
             for (int j = 0; j < 3; ++j)
-                T[3 * i + j] = C[3 * i].b * Q[j] + C[3 * i + 1].b * Q[3 + j] + C[3 * i + 2].b * Q[6 + j];
+                T[3 * i + j] = E[3 * i].b * Q[j] + E[3 * i + 1].b * Q[3 + j] + E[3 * i + 2].b * Q[6 + j];
         for (int i = 0; i < 3; ++i)
             for (int j = 0; j < 3; ++j) {
-                // (ln a - ln b) / (a - b) = 2 artanh(z) / (z (a + b)), z = (a - b) / (a + b): a series for small z
-                const V a = A[4 * i], b = A[4 * j], sum = a + b, z = (a - b) / sum, z2 = z * z;
+                // (ln A - ln B) / (A - B) = 2 artanh(z) / (z (A + B)), z = (A - B) / (A + B): a series for small z
+                const V a = A[4 * i], b = A[4 * j], sum = a + b + 2.0f, z = (a - b) / sum, z2 = z * z;
                 const V series = (((z2 * 0.14285714f + 0.2f) * z2 + 0.33333333f) * z2 + 1.0f) * 2.0f / sum;
                 const V safe = where_positive(z2 - 0.01f, a - b, V{} + 1.0f);
                 const V slope = where_positive(z2 - 0.01f, (l[i] - l[j]) / safe, series);
@@ -86,11 +94,14 @@ _HELPERS = r"""
 """
 
 STRESS = Stress(
+    "hencky",
     r"""
-    S C[9], L[9];
+    S E[9], L[9];   // C - I = H + H^T + H^T H
     for (int i = 0; i < 3; ++i)
-        for (int j = 0; j < 3; ++j) C[3 * i + j] = F[i] * F[j] + F[3 + i] * F[3 + j] + F[6 + i] * F[6 + j];
-    lane::log_symmetric(C, L);
+        for (int j = 0; j < 3; ++j)
+            E[3 * i + j] = H[3 * i + j] + H[3 * j + i]
+                + H[i] * H[j] + H[3 + i] * H[3 + j] + H[6 + i] * H[6 + j];
+    lane::log_one_plus(E, L);
     const S pressure = (L[0] + L[4] + L[8]) * (c[1] * 0.5f);
     for (int k = 0; k < 9; ++k) L[k] = L[k] * c[0];
     for (int i = 0; i < 3; ++i) L[4 * i] = L[4 * i] + pressure;

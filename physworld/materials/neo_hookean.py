@@ -13,6 +13,7 @@ import numpy as np
 from physworld.materials.stress import Stress
 
 STRESS = Stress(
+    "neo_hookean",
     r"""
     const S inverse = lane::inverse(J);
     const S pressure = (lane::log(J) * c[1] - c[0]) * inverse;

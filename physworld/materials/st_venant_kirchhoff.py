@@ -17,14 +17,13 @@ from physworld.materials.solid import SolidLaw
 from physworld.materials.stress import Stress
 
 STRESS = Stress(
+    "st_venant_kirchhoff",
     r"""
-    S T[9];   // second Piola-Kirchhoff
+    S T[9];   // twice the Green strain, H + H^T + H^T H; then the second Piola-Kirchhoff stress
     for (int i = 0; i < 3; ++i)
-        for (int j = i; j < 3; ++j) {
-            S e = F[i] * F[j] + F[3 + i] * F[3 + j] + F[6 + i] * F[6 + j];
-            if (i == j) e = e - 1.0f;
-            T[3 * i + j] = e;
-        }
+        for (int j = i; j < 3; ++j)
+            T[3 * i + j] = H[3 * i + j] + H[3 * j + i]
+                + H[i] * H[j] + H[3 + i] * H[3 + j] + H[6 + i] * H[6 + j];
     const S trace = (T[0] + T[4] + T[8]) * (c[1] * 0.5f);
     for (int i = 0; i < 3; ++i)
         for (int j = i; j < 3; ++j) {
@@ -35,7 +34,7 @@ STRESS = Stress(
     for (int i = 0; i < 3; ++i)
         for (int j = 0; j < 3; ++j)
             P[3 * i + j] = F[3 * i] * T[j] + F[3 * i + 1] * T[3 + j] + F[3 * i + 2] * T[6 + j];
-    """
+    """,
 )
 
 

@@ -4,6 +4,7 @@ The text is written once over a scalar type ``S`` and compiled twice: with S a v
 stress, with S a dual number (value and derivative in one direction) it gives dP = (dP/dF) : dF. It may use
 
     F[9], cof[9], J     S: deformation gradient, its cofactor J F^-T, its determinant
+    H[9]                S: F - I, with all its digits at small strain
     c[]                 V: the law's moduli at the particle times its volume; P must be linear in them
     number[]            float: the law's other numbers, the same in the whole body
     lane::log, sqrt, inverse, floor(S, float), value(S) -> V          and the law's own ``helpers``
@@ -21,11 +22,13 @@ class Stress:
     """C++ of a stress.
 
     Attributes:
+        name: of the kernels that are built from it.
         body: statements that write P.
         helpers: members of the struct ``lane`` that the body calls.
         infinite_at_inversion: the energy is infinite at J = 0: a smaller J than 0.02 is reported, and floored there.
     """
 
+    name: str
     body: str
     helpers: str = ""
     infinite_at_inversion: bool = False

@@ -19,6 +19,7 @@ from physworld.materials.solid import SolidLaw
 from physworld.materials.stress import Stress
 
 STRESS = Stress(
+    "transversely_isotropic",
     neo_hookean.STRESS.body
     + r"""
     S along[3];

@@ -38,8 +38,10 @@ class InternalForces:
         self.cells = len(lattice.cells)
         measure = lattice.particle_measures * stiffness_factor
         self._nodes = wp.array(lattice.cell_nodes.reshape(-1), dtype=wp.int32, device=device)
+        self._solid_body = isinstance(law, SolidLaw)
         if isinstance(law, SolidLaw):
-            self._kernel, self._model, self._state = solid_forces, *self._solid(lattice, law, measure, rest)
+            self._kernel = solid_forces(law.stress, len(law.moduli))
+            self._model, self._state = self._solid(lattice, law, measure, rest)
         elif isinstance(law, SheetLaw):
             self._kernel, self._model, self._state = sheet_forces, *self._sheet(lattice, law, measure)
         else:
@@ -48,7 +50,7 @@ class InternalForces:
 
     def launch(self, x: wp.array, clock: wp.array, force: wp.array) -> None:
         """Add the forces [N] at nodal positions ``x`` (3n,) to ``force`` (3n,); ``clock[1]`` is 1/dt [1/s]."""
-        outputs = [force, self.inverted] if self._kernel is solid_forces else [force]
+        outputs = [force, self.inverted] if self._solid_body else [force]
         wp.launch(
             self._kernel,
             dim=self.cells,
@@ -63,14 +65,13 @@ class InternalForces:
     def _solid(
         self, lattice: Lattice, law: SolidLaw, measure: np.ndarray, rest: np.ndarray
     ) -> tuple[list, wp.array]:
-        mu, lam = law.lame
         slopes = np.stack([lattice.table(tuple(int(a == j) for a in range(3))) for j in range(3)], axis=1)
         model = [
             self._array(slopes, wp.float32),
             self._array(rest, wp.float64),
-            self._array(mu * measure, wp.float32),
-            self._array(lam * measure, wp.float32),
+            self._array(measure.reshape(self.cells, 1, 8) * np.array(law.moduli)[:, None], wp.float32),
             self._array(law.viscosity_pa_s * measure, wp.float32),
+            self._array(np.array([*law.numbers, 0.0]), wp.float32),
             wp.vec3f(*(1.0 / lattice.spacing)),
             int(law.viscosity_pa_s > 0),
         ]

@@ -1,6 +1,6 @@
-"""Device side of elastic solids: internal forces of a compressible neo-Hookean body, one cell a thread.
+"""Device side of elastic solids: internal forces of a body under one law, one cell a thread.
 
-    P = mu (F - F^-T) + lambda ln(J) F^-T + 2 eta d J F^-T          (first Piola-Kirchhoff, Kelvin-Voigt viscosity)
+    P = P(F) + 2 eta d J F^-T                    (first Piola-Kirchhoff; the law's stress, Kelvin-Voigt viscosity)
     f_a -= sum_q V_q P(F_q) grad N_a(q)
 
 The 8 particles of a cell are the 8 lanes of a vector; the B-spline gradients at them are the same 27 x 3 x 8 numbers
@@ -8,18 +8,23 @@ in every cell. On a CPU the lanes are one SIMD register, on CUDA they are a loop
 the cell's middle node before they are rounded to single precision (the gradients of a constant vanish), so a strain
 keeps 7 digits wherever the body is.
 
-Legend: F deformation gradient, J its determinant, cof = J F^-T, G gradients of the weights in units of the cell.
+The kernel is a template over the text of a law's stress (:mod:`physworld.materials.stress`): :func:`solid_forces`
+builds it once a law, in a Warp module of its own, so that a process compiles only the laws it uses. The pieces of the
+text are shared with the tangent (:mod:`physworld.mpm.solid_tangent_kernels`).
+
+Legend: F deformation gradient, J its determinant, cof = J F^-T, c moduli times volume, scale 1/dx of the axes.
 """
 
 from __future__ import annotations
 
+from functools import cache
+
 import warp as wp
 
-from physworld.mpm.lanes import LANES_FLOAT8
+from physworld.materials.stress import Stress
+from physworld.mpm.lanes import lanes_float8
 
-_SNIPPET = (
-    LANES_FLOAT8
-    + r"""
+LOAD_DISPLACEMENTS = r"""
     const int* node = &cell_nodes.data[cell * 27];
     const double* anchor = &x.data[3 * node[13]];
     const double* anchor_rest = &x_rest.data[3 * node[13]];
@@ -31,25 +36,32 @@ _SNIPPET = (
         }
     }
     const float scale[3] = {inv_dx0, inv_dx1, inv_dx2};
-    for (int q = 0; q < 8; q += LANES) {
-        V F[9];
-        for (int k = 0; k < 9; ++k) F[k] = V{};
+"""
+
+DEFORMATION = r"""
+        V H[9], F[9];
+        for (int k = 0; k < 9; ++k) H[k] = V{};
         for (int a = 0; a < 27; ++a) {
             const V g0 = *(const V*)&gradients.data[(3 * a + 0) * 8 + q];
             const V g1 = *(const V*)&gradients.data[(3 * a + 1) * 8 + q];
             const V g2 = *(const V*)&gradients.data[(3 * a + 2) * 8 + q];
             for (int i = 0; i < 3; ++i) {
                 const float ui = u[3 * a + i];
-                F[3 * i + 0] += ui * g0;
-                F[3 * i + 1] += ui * g1;
-                F[3 * i + 2] += ui * g2;
+                H[3 * i + 0] += ui * g0;
+                H[3 * i + 1] += ui * g1;
+                H[3 * i + 2] += ui * g2;
             }
         }
-        for (int i = 0; i < 3; ++i) {
-            for (int j = 0; j < 3; ++j) F[3 * i + j] = F[3 * i + j] * scale[j];
-            F[4 * i] += 1.0f;
+        for (int k = 0; k < 9; ++k) {
+            H[k] = H[k] * scale[k % 3];
+            F[k] = k % 4 == 0 ? H[k] + 1.0f : H[k];
         }
-        V cof[9];
+        V c[MODULI];
+        for (int m = 0; m < MODULI; ++m) c[m] = *(const V*)&moduli_volume.data[(cell * MODULI + m) * 8 + q];
+"""
+
+COFACTOR = r"""
+        S cof[9];
         cof[0] = F[4] * F[8] - F[5] * F[7];
         cof[1] = F[5] * F[6] - F[3] * F[8];
         cof[2] = F[3] * F[7] - F[4] * F[6];
@@ -59,21 +71,20 @@ _SNIPPET = (
         cof[6] = F[1] * F[5] - F[2] * F[4];
         cof[7] = F[2] * F[3] - F[0] * F[5];
         cof[8] = F[0] * F[4] - F[1] * F[3];
-        const int p = cell * 8 + q;
-        const V muV = *(const V*)&mu_volume.data[p];
-        V J = F[0] * cof[0] + F[1] * cof[1] + F[2] * cof[2];
-        J = PW_WHERE_POSITIVE(muV, J, 1.0f);   // a particle without material carries no stress, however it turns
-        if (PW_ANY_BELOW(J, 0.02f)) {
-            inverted.data[0] = 1;
-            J = PW_FLOOR(J, 0.02f);
-        }
-        const V lamV = *(const V*)&lambda_volume.data[p];
-        const V invJ = 1.0f / J;
-        const V pressure = (lamV * PW_LOG(J) - muV) * invJ;
-        V P[9];
-        for (int k = 0; k < 9; ++k) P[k] = muV * F[k] + pressure * cof[k];
+        S J = F[0] * cof[0] + F[1] * cof[1] + F[2] * cof[2];
+        J = lane::where_positive(c[0], J, V{} + 1.0f);   // without material no stress, however the particle turns
+"""
+
+FLOOR_J = "        J = lane::floor(J, 0.02f);\n"
+
+_REPORT = r"""
+        if (lane::any_below(J, 0.02f)) inverted.data[0] = 1;
+"""
+
+_VISCOSITY = r"""
         if (viscous) {
-            const V etaV = *(const V*)&eta_volume.data[p];
+            const V etaV = *(const V*)&eta_volume.data[cell * 8 + q];
+            const V invJ = 1.0f / lane::floor(J, 0.02f);
             V* old = (V*)&previous.data[cell * 72 + q];   // 9 rows of 8 lanes
             V rate[9];
             for (int k = 0; k < 9; ++k) {
@@ -91,6 +102,9 @@ _SNIPPET = (
                     for (int k = 0; k < 3; ++k)
                         P[3 * i + j] += etaV * (L[3 * i + k] + L[3 * k + i]) * cof[3 * k + j];
         }
+"""
+
+_SCATTER = r"""
         for (int k = 0; k < 9; ++k) P[k] = P[k] * scale[k % 3];
         for (int a = 0; a < 27; ++a) {
             const V g0 = *(const V*)&gradients.data[(3 * a + 0) * 8 + q];
@@ -98,75 +112,98 @@ _SNIPPET = (
             const V g2 = *(const V*)&gradients.data[(3 * a + 2) * 8 + q];
             for (int i = 0; i < 3; ++i) {
                 const V t = P[3 * i] * g0 + P[3 * i + 1] * g1 + P[3 * i + 2] * g2;
-                PW_ADD(force.data[3 * node[a] + i], -PW_SUM(t));
+                PW_ADD(force.data[3 * node[a] + i], -lane::sum(t));
             }
         }
-    }
 """
-)
 
 
-@wp.func_native(_SNIPPET)
-def solid_cell(
-    cell: int,
-    # model
-    cell_nodes: wp.array(dtype=wp.int32),
-    gradients: wp.array(dtype=wp.float32),
-    x_rest: wp.array(dtype=wp.float64),
-    mu_volume: wp.array(dtype=wp.float32),
-    lambda_volume: wp.array(dtype=wp.float32),
-    eta_volume: wp.array(dtype=wp.float32),
-    inv_dx0: float,
-    inv_dx1: float,
-    inv_dx2: float,
-    viscous: int,
-    inv_dt: float,
-    # in
-    x: wp.array(dtype=wp.float64),
-    # in, out
-    previous: wp.array(dtype=wp.float32),
-    # out
-    force: wp.array(dtype=wp.float64),
-    inverted: wp.array(dtype=wp.int32),
-): ...
-
-
-@wp.kernel
-def solid_forces(
-    # model
-    cell_nodes: wp.array(dtype=wp.int32),
-    gradients: wp.array(dtype=wp.float32),
-    x_rest: wp.array(dtype=wp.float64),
-    mu_volume: wp.array(dtype=wp.float32),
-    lambda_volume: wp.array(dtype=wp.float32),
-    eta_volume: wp.array(dtype=wp.float32),
-    inv_dx: wp.vec3f,
-    viscous: int,
-    clock: wp.array(dtype=wp.float64),
-    # in
-    x: wp.array(dtype=wp.float64),
-    # in, out
-    previous: wp.array(dtype=wp.float32),
-    # out
-    force: wp.array(dtype=wp.float64),
-    inverted: wp.array(dtype=wp.int32),
-):
-    """Add the internal forces [N] of one cell to its 27 nodes; ``clock[1]`` is 1/dt [1/s]."""
-    solid_cell(
-        wp.tid(),
-        cell_nodes,
-        gradients,
-        x_rest,
-        mu_volume,
-        lambda_volume,
-        eta_volume,
-        inv_dx[0],
-        inv_dx[1],
-        inv_dx[2],
-        viscous,
-        wp.float32(clock[1]),
-        x,
-        previous,
-        force,
-        inverted,
+def _snippet(stress: Stress, moduli: int) -> str:
+    return (
+        lanes_float8(stress.helpers)
+        + f"    const int MODULI = {moduli};\n    typedef V S;\n    const float* number = numbers.data;\n"
+        + LOAD_DISPLACEMENTS
+        + "    for (int q = 0; q < 8; q += LANES) {\n"
+        + DEFORMATION
+        + COFACTOR
+        + (_REPORT + FLOOR_J if stress.infinite_at_inversion else "")
+        + f"        V P[9];\n        {{\n{stress.body}\n        }}\n"
+        + _VISCOSITY
+        + _SCATTER
+        + "    }\n"
     )
+
+
+@cache
+def solid_forces(stress: Stress, moduli: int) -> wp.Kernel:
+    """The kernel that adds the internal forces [N] of one cell to its 27 nodes; ``clock[1]`` is 1/dt [1/s].
+
+    Args:
+        stress: text of the law's stress.
+        moduli: how many moduli it has.
+    """
+
+    @wp.func_native(_snippet(stress, moduli))
+    def solid_cell(
+        cell: int,
+        # model
+        cell_nodes: wp.array(dtype=wp.int32),
+        gradients: wp.array(dtype=wp.float32),
+        x_rest: wp.array(dtype=wp.float64),
+        moduli_volume: wp.array(dtype=wp.float32),
+        eta_volume: wp.array(dtype=wp.float32),
+        numbers: wp.array(dtype=wp.float32),
+        inv_dx0: float,
+        inv_dx1: float,
+        inv_dx2: float,
+        viscous: int,
+        inv_dt: float,
+        # in
+        x: wp.array(dtype=wp.float64),
+        # in, out
+        previous: wp.array(dtype=wp.float32),
+        # out
+        force: wp.array(dtype=wp.float64),
+        inverted: wp.array(dtype=wp.int32),
+    ): ...
+
+    @wp.kernel(module=f"physworld_solid_{stress.name}", enable_backward=False)
+    def forces(
+        # model
+        cell_nodes: wp.array(dtype=wp.int32),
+        gradients: wp.array(dtype=wp.float32),
+        x_rest: wp.array(dtype=wp.float64),
+        moduli_volume: wp.array(dtype=wp.float32),
+        eta_volume: wp.array(dtype=wp.float32),
+        numbers: wp.array(dtype=wp.float32),
+        inv_dx: wp.vec3f,
+        viscous: int,
+        clock: wp.array(dtype=wp.float64),
+        # in
+        x: wp.array(dtype=wp.float64),
+        # in, out
+        previous: wp.array(dtype=wp.float32),
+        # out
+        force: wp.array(dtype=wp.float64),
+        inverted: wp.array(dtype=wp.int32),
+    ):
+        solid_cell(
+            wp.tid(),
+            cell_nodes,
+            gradients,
+            x_rest,
+            moduli_volume,
+            eta_volume,
+            numbers,
+            inv_dx[0],
+            inv_dx[1],
+            inv_dx[2],
+            viscous,
+            wp.float32(clock[1]),
+            x,
+            previous,
+            force,
+            inverted,
+        )
+
+    return forces

@@ -8,11 +8,22 @@ from pathlib import Path
 import pytest
 import warp as wp
 
+from physworld.materials.library import SOLID_LAWS
+from physworld.mpm.solid_kernels import solid_forces
 
-@pytest.mark.parametrize("name", ["solid_kernels", "sheet_kernels", "rod_kernels", "node_kernels"])
-def test_the_kernels_compile_for_cuda(name: str, tmp_path: Path) -> None:
+
+def compiles(module: object, folder: Path) -> bool:
     wp.init()
-    wp.compile_aot_module(
-        import_module(f"physworld.mpm.{name}"), arch=80, module_dir=str(tmp_path), use_ptx=True
-    )
-    assert list(tmp_path.glob("*.ptx"))
+    wp.compile_aot_module(module, arch=80, module_dir=str(folder), use_ptx=True)
+    return bool(list(folder.glob("*.ptx")))
+
+
+@pytest.mark.parametrize("name", ["sheet_kernels", "rod_kernels", "node_kernels"])
+def test_the_kernels_compile_for_cuda(name: str, tmp_path: Path) -> None:
+    assert compiles(import_module(f"physworld.mpm.{name}"), tmp_path)
+
+
+@pytest.mark.parametrize("name", sorted(SOLID_LAWS))
+def test_the_kernels_of_every_law_of_solids_compile_for_cuda(name: str, tmp_path: Path) -> None:
+    law = SOLID_LAWS[name](1e5)
+    assert compiles(solid_forces(law.stress, len(law.moduli)).module, tmp_path)
