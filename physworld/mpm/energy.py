@@ -1,0 +1,237 @@
+"""Energy ledger of a run: where every joule went, and how much the numerics lost.
+
+    lost = - (change of kinetic + gravitational + elastic energy)
+           + work of the grips + work of terms - taken by drag - taken by internal friction
+
+Works are summed substep by substep inside the run by a meter that is the last of the problem's terms; stored energies
+come from the laws' energy densities at the frames. With no friction the remainder ``lost`` is the integrator's own: a
+leapfrog step conserves energy up to a bounded oscillation of second order in dt.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import warp as wp
+
+from physworld.materials.laws import Law, RodLaw, SheetLaw, SolidLaw
+from physworld.materials.rod import rod_strains
+from physworld.materials.sheet import sheet_strains
+from physworld.mpm.energy_kernels import keep_forces, sum_works
+from physworld.mpm.forces import InternalForces
+from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian
+
+_AFTER_S = 1e-4  # the meter reads a frame when the next one starts: one more, this short, follows the last
+
+
+@dataclass(frozen=True)
+class EnergyLedger:
+    """Energies at every frame [J], all (T,); works and losses are sums since the first frame.
+
+    Attributes:
+        times: frames [s].
+        kinetic: sum of m v^2 / 2 over the nodes.
+        gravitational: - sum of m g . x, zero at the first frame.
+        elastic: stored by the law.
+        grip_work: done by the prescribed nodes on the rest.
+        term_work: done by contacts and effects on the body (negative where they take energy).
+        drag: taken by linear air drag.
+        internal_friction: taken by the law's own friction.
+    """
+
+    times: np.ndarray
+    kinetic: np.ndarray
+    gravitational: np.ndarray
+    elastic: np.ndarray
+    grip_work: np.ndarray
+    term_work: np.ndarray
+    drag: np.ndarray
+    internal_friction: np.ndarray
+
+    @property
+    def mechanical(self) -> np.ndarray:
+        """Kinetic, gravitational and elastic energy together."""
+        return self.kinetic + self.gravitational + self.elastic
+
+    @property
+    def lost(self) -> np.ndarray:
+        """What the numerics lost (negative: gained) since the first frame."""
+        accounted = self.grip_work + self.term_work - self.drag - self.internal_friction
+        return accounted - (self.mechanical - self.mechanical[0])
+
+    @property
+    def turnover(self) -> float:
+        """Scale of the energies that were exchanged: the largest kinetic energy, or span of another column."""
+        columns = (
+            self.kinetic, self.gravitational, self.elastic, self.grip_work, self.term_work,
+            self.drag, self.internal_friction,
+        )  # fmt: skip
+        return max(float(np.ptp(column)) for column in columns)
+
+
+def run_with_ledger(
+    problem: Problem,
+    x: np.ndarray,
+    v: np.ndarray,
+    held: HeldNodes,
+    times: np.ndarray,
+    *,
+    time_step_s: float | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[np.ndarray, EnergyLedger]:
+    """Integrate a problem in the total Lagrangian form and account for its energy.
+
+    Args:
+        problem: what is integrated; its drag and its terms are accounted for apart.
+        x, v: nodal positions [m] and velocities [m/s] at the first time, (n, 3).
+        held: prescribed nodes at ``times``.
+        times: (T,) [s].
+        time_step_s: forced time step, or None for the stable one.
+        progress: as in :meth:`TotalLagrangian.run`.
+
+    Returns:
+        Nodal positions (T, n, 3) [m], the same as without a ledger, and the ledger.
+
+    Raises:
+        SimulationError: the run cannot be trusted.
+    """
+    meter = _Meter(len(times))
+    metered = replace(problem, terms=(_Marker(meter), *problem.terms, meter))
+    solver = TotalLagrangian(metered, time_step_s)
+    after = np.append(times, times[-1] + _AFTER_S)
+    longer = replace(
+        held,
+        positions=np.concatenate([held.positions, held.positions[-1:]]),
+        velocities=np.concatenate([held.velocities, 0 * held.velocities[-1:]]),
+    )
+    nodes = solver.run(x, v, longer, after, progress)[:-1]
+    work, velocity = meter.read()
+    velocity[:, held.nodes] = held.velocities
+    mass = solver.mass
+    kinetic = 0.5 * np.einsum("n,tni->tn", mass, velocity**2)
+    height = -np.einsum("n,tni,i->tn", mass, nodes - nodes[0], problem.gravity_m_s2)
+    of_grips = (kinetic + height)[:, held.nodes]
+    free = np.setdiff1d(np.arange(len(mass)), held.nodes)
+    return nodes, EnergyLedger(
+        times=np.asarray(times, dtype=float),
+        kinetic=kinetic.sum(axis=1),
+        gravitational=height.sum(axis=1),
+        elastic=elastic_energy(problem, nodes),
+        grip_work=(of_grips - of_grips[0]).sum(axis=1) - work[:, 2, held.nodes].sum(axis=1),
+        term_work=(work[:, 2] - work[:, 1]).sum(axis=1),
+        drag=work[:, 3, free].sum(axis=1),
+        internal_friction=(work[:, 0] - work[:, 1]).sum(axis=1),
+    )
+
+
+def elastic_energy(problem: Problem, nodes: np.ndarray) -> np.ndarray:
+    """Energy stored by the law [J], (T,), at nodal positions (T, n, 3) [m]."""
+    lattice, law = problem.lattice, problem.law
+    measure = lattice.particle_measures
+    if problem.stiffness_factor is not None:
+        measure = measure * problem.stiffness_factor
+    orders = {3: np.eye(3, dtype=int), 2: [(1, 0), (0, 1), (2, 0), (0, 2), (1, 1)], 1: [(1,), (2,)]}[
+        lattice.dim
+    ]
+    rows = [
+        lattice.interpolation(lattice.particle_coordinates, tuple(int(o) for o in order)) for order in orders
+    ]
+    solid = measure > 0
+    energies = np.empty(len(nodes))
+    for frame, x in enumerate(nodes):
+        moved = x - problem.rest if lattice.dim == 3 else x
+        derivatives = np.stack([row @ moved for row in rows], axis=1)[solid]
+        energies[frame] = measure[solid] @ _density(law, derivatives)
+    return energies
+
+
+def _density(law: Law, derivatives: np.ndarray) -> np.ndarray:
+    """Energy density (P,) of derivatives (P, k, 3): displacement gradients of a solid, or positions' of a thin body."""
+    if isinstance(law, SolidLaw):
+        return law.energy_density(np.eye(3) + derivatives.transpose(0, 2, 1))
+    if isinstance(law, SheetLaw):
+        return law.energy_density(*sheet_strains(derivatives))
+    assert isinstance(law, RodLaw)
+    return law.energy_density(*rod_strains(derivatives))
+
+
+class _Marker:
+    """The first of the terms: keeps the internal forces before anything else adds to them."""
+
+    frequency_rad_s = 0.0
+    friction_per_s = 0.0
+
+    def __init__(self, meter: _Meter) -> None:
+        self._meter = meter
+
+    def bind(self, problem: Problem) -> _Marker:
+        self._kept = self._meter.allocate(problem)
+        return self
+
+    def begin(self, times: np.ndarray) -> None:
+        return None
+
+    def launch(self, x: wp.array, v: wp.array, clock: wp.array, counter: wp.array, force: wp.array) -> None:
+        wp.launch(keep_forces, dim=len(force), inputs=[force], outputs=[self._kept], device=force.device)
+
+
+class _Meter:
+    """The last of the terms: adds no force, sums the works of all that came before it."""
+
+    frequency_rad_s = 0.0
+    friction_per_s = 0.0
+
+    def __init__(self, frames: int) -> None:
+        self._frames = frames
+
+    def allocate(self, problem: Problem) -> wp.array:
+        """Device arrays; returns where the internal forces are kept."""
+        n, device = len(problem.rest), problem.device
+
+        def zeros(shape: object) -> wp.array:
+            return wp.zeros(shape, dtype=wp.float64, device=device)
+
+        particles = problem.lattice.fill.size
+        stiffness = np.ones(particles) if problem.stiffness_factor is None else problem.stiffness_factor
+        self._device = device
+        self._elastic_law = InternalForces(
+            problem.lattice, _without_friction(problem.law), stiffness, problem.rest, device
+        )
+        self._constants = [
+            wp.array(problem.nodal_mass(), dtype=wp.float64, device=device),
+            wp.vec3d(*problem.gravity_m_s2),
+            wp.float64(problem.drag_per_s),
+        ]
+        self._internal, self._elastic = zeros(3 * n), zeros(3 * n)
+        self._state = [self._elastic, zeros(3 * n), zeros((3, 3 * n)), zeros(n), zeros((4, n))]
+        self._outputs = [zeros((self._frames + 1, 4, n)), zeros((self._frames + 1, 3 * n))]
+        return self._internal
+
+    def bind(self, problem: Problem) -> _Meter:
+        return self
+
+    def begin(self, times: np.ndarray) -> None:
+        return None
+
+    def launch(self, x: wp.array, v: wp.array, clock: wp.array, counter: wp.array, force: wp.array) -> None:
+        self._elastic_law.launch(x, clock, self._elastic)
+        wp.launch(
+            sum_works,
+            dim=len(x) // 3,
+            inputs=[*self._constants, x, v, clock, counter, self._internal, force, *self._state],
+            outputs=self._outputs,
+            device=self._device,
+        )
+
+    def read(self) -> tuple[np.ndarray, np.ndarray]:
+        """Works (T, 4, n) [J] and velocities (T, n, 3) [m/s] at the frames."""
+        work, velocity = (array.numpy()[: self._frames] for array in self._outputs)
+        return work.copy(), velocity.reshape(self._frames, -1, 3).copy()
+
+
+def _without_friction(law: Law) -> Law:
+    if isinstance(law, SolidLaw):
+        return replace(law, viscosity_pa_s=0.0)
+    return replace(law, relaxation_s=0.0)

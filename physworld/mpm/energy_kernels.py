@@ -1,0 +1,76 @@
+"""Device side of the energy ledger: work of every kind of force on every node, summed substep by substep.
+
+Works are taken by the trapezoidal rule along the path of a node, (f_n + f_(n+1))/2 . (x_(n+1) - x_n): the sum that a
+symplectic step conserves to second order in dt. The velocity of a step is the node's displacement over dt.
+
+Legend: column of a sum: 0 elastic, 1 internal (elastic and internal friction), 2 all forces, 3 drag.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+
+@wp.kernel
+def keep_forces(
+    # in
+    force: wp.array(dtype=wp.float64),
+    # out
+    kept: wp.array(dtype=wp.float64),
+):
+    """Copy the forces that have been added so far."""
+    i = wp.tid()
+    kept[i] = force[i]
+
+
+@wp.kernel
+def sum_works(
+    # model
+    mass: wp.array(dtype=wp.float64),
+    gravity: wp.vec3d,
+    drag: wp.float64,
+    # in
+    x: wp.array(dtype=wp.float64),
+    v: wp.array(dtype=wp.float64),
+    clock: wp.array(dtype=wp.float64),
+    counter: wp.array(dtype=wp.int32),
+    internal: wp.array(dtype=wp.float64),
+    total: wp.array(dtype=wp.float64),
+    # in, out
+    elastic: wp.array(dtype=wp.float64),
+    last_x: wp.array(dtype=wp.float64),
+    last_force: wp.array2d(dtype=wp.float64),
+    last_dt: wp.array(dtype=wp.float64),
+    work: wp.array2d(dtype=wp.float64),
+    # out
+    work_out: wp.array3d(dtype=wp.float64),
+    v_out: wp.array2d(dtype=wp.float64),
+):
+    """Add the works of the last substep at one node; at a frame, write them and the velocity at that very time."""
+    node = wp.tid()
+    first = counter[0] == 0 and counter[1] == 0
+    frame = counter[1] == 0
+    # velocities lag by half a step: of the new length at the start, of the old one later
+    half = wp.float64(0.5) * last_dt[node]
+    if first:
+        half = wp.float64(0.5) * clock[2]
+        for column in range(4):
+            work[column, node] = wp.float64(0.0)
+    for axis in range(3):
+        i = 3 * node + axis
+        moved = x[i] - last_x[i]
+        if first:
+            moved = wp.float64(0.0)
+        works = wp.vec3d(elastic[i], internal[i], total[i])
+        for column in range(3):
+            work[column, node] += wp.float64(0.5) * (works[column] + last_force[column, i]) * moved
+            last_force[column, i] = works[column]
+        work[3, node] += mass[node] * drag * v[i] * moved
+        if frame:
+            v_out[counter[0], i] = v[i] + half * (total[i] / mass[node] + gravity[axis] - drag * v[i])
+        last_x[i] = x[i]
+        elastic[i] = wp.float64(0.0)
+    if frame:
+        for column in range(4):
+            work_out[counter[0], column, node] = work[column, node]
+    last_dt[node] = clock[2]
