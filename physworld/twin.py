@@ -362,18 +362,21 @@ class Twin:
         return HeldNodes(np.concatenate(numbers), positions, velocities)
 
 
-def build_twin(scene: Scene, particle_budget: int = 2000, device: str = "cpu") -> Twin:
+def build_twin(
+    scene: Scene, particle_budget: int = 2000, device: str = "cpu", refinement: float = 1.0
+) -> Twin:
     """A twin of the scene with prior parameters, to be calibrated.
 
     Args:
         scene: the recording.
         particle_budget: about how many particles a solid gets; rods and sheets take what their shape needs.
         device: Warp device of the simulations.
+        refinement: cells are this many times smaller along every axis, whatever the body.
 
     Raises:
         SceneUnsupported: the scene declares too little for a body.
     """
-    body = reference_body(scene, particle_budget)
+    body = reference_body(scene, particle_budget, refinement)
     _, controls = scene.control_track()
     reach = 0.6 * float(np.ptp(body.start, axis=0).max())
     if scene.grips:

@@ -62,8 +62,13 @@ class ReferenceBody:
     notes: tuple[str, ...] = ()
 
 
-def reference_body(scene: Scene, particle_budget: int) -> ReferenceBody:
+def reference_body(scene: Scene, particle_budget: int, refinement: float = 1.0) -> ReferenceBody:
     """Build the body that the scene declares or shows.
+
+    Args:
+        scene: the recording.
+        particle_budget: about how many particles a solid gets.
+        refinement: cells are this many times smaller along every axis, whatever the body.
 
     Raises:
         SceneUnsupported: the scene shows or declares too little, with the missing key.
@@ -74,16 +79,16 @@ def reference_body(scene: Scene, particle_budget: int) -> ReferenceBody:
             f"{frames} frames with {count} points, {int(scene.visible.sum())} sightings in all: no motion to follow"
         )
     if scene.kind in ROD_KINDS:
-        return _rod(scene)
+        return _rod(scene, refinement)
     if scene.kind in SHEET_KINDS:
-        sheet = _sheet(scene)
+        sheet = _sheet(scene, refinement)
         if sheet is not None:
             return sheet
     if scene.kind == "branched_rope":
         raise SceneUnsupported(
             "branched ropes are not covered yet: a rod has two ends, this scene's topology has more"
         )
-    return _solid(scene, particle_budget)
+    return _solid(scene, round(particle_budget * refinement**3))
 
 
 def _first_points(scene: Scene) -> np.ndarray:
@@ -210,7 +215,7 @@ def _sampled_fill(cells: np.ndarray, origin: np.ndarray, spacing: np.ndarray, te
     return test(samples.reshape(-1, 3)).reshape(len(cells), 8, 8).mean(axis=2)
 
 
-def _rod(scene: Scene) -> ReferenceBody:
+def _rod(scene: Scene, refinement: float) -> ReferenceBody:
     points = _first_points(scene)
     notes: list[str] = []
     if scene.initial_state != AS_MEASURED and len(points) > 3:
@@ -225,7 +230,7 @@ def _rod(scene: Scene) -> ReferenceBody:
         base = centre + along.min() * direction
         off_axis = float(np.sqrt(np.mean(np.sum((cloud - centre - along[:, None] * direction) ** 2, axis=1))))
         radius = scene.body.radius_m or float(np.sqrt(2.0) * off_axis)
-        lattice = _rod_lattice(scene, length, (scene.controllers[0] - base) @ direction)
+        lattice = _rod_lattice(scene, length, (scene.controllers[0] - base) @ direction, refinement)
         start = base + lattice.node_coordinates * direction
         velocity = np.zeros_like(start)
     else:
@@ -235,7 +240,10 @@ def _rod(scene: Scene) -> ReferenceBody:
             notes.append(f"radius not declared: {radius} m assumed (only bending over mass matters)")
         nearest = np.argmin(np.linalg.norm(scene.controllers[0][:, None] - points[None], axis=2), axis=1)
         lattice = _rod_lattice(
-            scene, length, arc[nearest] if scene.body.segment_rest_lengths_m is not None else [0.0]
+            scene,
+            length,
+            arc[nearest] if scene.body.segment_rest_lengths_m is not None else [0.0],
+            refinement,
         )
         start, velocity = fit_nodes(scene, lattice, arc[:, None])
         notes.append("the rest shape is taken as straight")
@@ -267,7 +275,7 @@ def _marker_arc_lengths(scene: Scene, points: np.ndarray) -> tuple[np.ndarray, f
     return arc, max(float(scene.body.length_m or 0.0), float(arc.max()))
 
 
-def _rod_lattice(scene: Scene, length: float, grip_arcs) -> Lattice:
+def _rod_lattice(scene: Scene, length: float, grip_arcs, refinement: float) -> Lattice:
     if not length > 0:
         raise SceneUnsupported(f"the tracked points of the {scene.kind} span {length} m: no length")
     grips = np.clip(np.atleast_1d(grip_arcs), 0.0, length)
@@ -275,7 +283,7 @@ def _rod_lattice(scene: Scene, length: float, grip_arcs) -> Lattice:
     face = float(left.max()) if len(left) else 0.0
     right = grips[grips >= 0.5 * length]
     free = (float(right.min()) if len(right) else length) - face
-    count = max(4, round(_ROD_CELLS * free / length))
+    count = max(4, round(refinement * _ROD_CELLS * free / length))
     spacing = free / count
     origin = face - np.ceil(face / spacing - 1e-6) * spacing
     cells = np.arange(int(np.ceil((length - origin) / spacing - 1e-6)))[:, None]
@@ -320,7 +328,7 @@ def _tightest_turn(plane: np.ndarray) -> np.ndarray:
     return turns[np.argmin(areas)] if areas.min() < _TIGHTER * areas[0] else np.eye(2)
 
 
-def _sheet(scene: Scene) -> ReferenceBody | None:
+def _sheet(scene: Scene, refinement: float) -> ReferenceBody | None:
     points = _first_points(scene)
     notes: list[str] = []
     thickness = scene.body.thickness_m
@@ -344,7 +352,7 @@ def _sheet(scene: Scene) -> ReferenceBody | None:
             return None
         material = ((points - origin) @ axes.T)[:, :2]
         flat_map = (origin, axes)
-    cell = max(float(size.max()) / _SHEET_CELLS, 1e-4)
+    cell = max(float(size.max()) / (refinement * _SHEET_CELLS), 1e-4)
     counts = np.maximum(3, np.round(size / cell)).astype(int)
     cells = np.stack(np.meshgrid(*[np.arange(c) for c in counts], indexing="ij"), axis=-1).reshape(-1, 2)
     lattice = lattice_from_cells(np.zeros(2), size / counts, cells, np.ones((len(cells), 4)))
