@@ -23,6 +23,7 @@ from physworld.errors import EffectRefused
 from physworld.geometry.reference import ReferenceBody, reference_body
 from physworld.geometry.rigid import least_rotation, rigid_groups, rigid_motion
 from physworld.materials.laws import Law, RodLaw, SheetLaw, SolidLaw
+from physworld.materials.library import law_class
 from physworld.mpm.contact import GroundContact
 from physworld.mpm.lattice import Lattice
 from physworld.mpm.terms import Term
@@ -33,7 +34,6 @@ Progress = Callable[[int, int], None]
 
 PRIOR_DENSITY_KG_M3 = 1000.0
 PRIOR_FRICTION = 0.5
-_LAWS: dict[int, type[Law]] = {1: RodLaw, 2: SheetLaw, 3: SolidLaw}
 _RELEASE_SIGMAS = 10.0
 _RELEASE_SHARE = 2e-3  # motion below this share of the body's size is not a release
 _DRIVEN_SHARE = 5e-4  # controllers that moved this share of the body's size drive it
@@ -297,7 +297,7 @@ class Twin:
         """Everything as plain arrays, fit for an npz without pickle; :meth:`from_arrays` is the inverse."""
         lattice, body = self.lattice, self.body
         facts = {
-            "law": type(self.law).__name__,
+            "law": self.law.name,
             "law_parameters": asdict(self.law),
             "air_drag_per_s": self.air_drag_per_s,
             "ground_height_m": self.ground_height_m,
@@ -333,7 +333,7 @@ class Twin:
         )
         return cls(
             body=body,
-            law=_LAWS[lattice.dim](**facts["law_parameters"]),
+            law=law_class(facts["law"], lattice.dim)(**facts["law_parameters"]),
             gravity_m_s2=arrays["gravity"],
             air_drag_per_s=facts["air_drag_per_s"],
             ground_height_m=facts["ground_height_m"],

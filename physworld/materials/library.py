@@ -28,10 +28,14 @@ _OF_DIMENSION: dict[int, dict[str, type]] = {1: ROD_LAWS, 2: SHEET_LAWS, 3: SOLI
 def law_class(name: str, dimension: int) -> type[Law]:
     """The class of a law for bodies of ``dimension`` 1, 2 or 3.
 
+    Args:
+        name: as in the registries; archives of version 0.1 name the class (``SolidLaw``) instead.
+
     Raises:
         ValueError: there is no such law; the message lists those of that dimension.
     """
     laws = _OF_DIMENSION[dimension]
+    name = {law.__name__: key for key, law in laws.items()}.get(name, name)
     if name not in laws:
         raise ValueError(f"no law {name!r} for a body of dimension {dimension}; there are {sorted(laws)}")
     return laws[name]

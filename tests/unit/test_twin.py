@@ -10,6 +10,7 @@ import pytest
 from made_scene import FPS, box_body, made_scene
 from scipy.spatial.transform import Rotation
 
+from physworld.materials.library import with_law
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Ground, Scene
 from physworld.twin import Twin, build_twin
 
@@ -93,6 +94,24 @@ def test_a_twin_from_a_file_runs_as_the_one_that_was_written(name: str) -> None:
     nodes = simulated(twin, scene)
     np.testing.assert_array_equal(simulated(again, scene), nodes)
     np.testing.assert_array_equal(again.track_nodes(nodes), twin.track_nodes(nodes))
+
+
+@pytest.mark.parametrize(
+    ("name", "law", "changed"),
+    [
+        ("solid", "transversely_isotropic", {"fibre_modulus_pa": 3e5, "fibre_azimuth_rad": 0.2}),
+        ("sheet", "orthotropic_sheet", {"shear_ratio": 0.1}),
+    ],
+)
+def test_a_twin_of_another_law_is_written_and_read_with_it(name: str, law: str, changed: dict) -> None:
+    scene = SCENES[name]()
+    plain = build_twin(scene, 100)
+    twin = replace(plain, law=with_law(plain.law, law)).with_parameters(**changed)
+    arrays = twin.to_arrays()
+    assert Twin.from_arrays(arrays).law == twin.law
+    assert np.abs(simulated(twin, scene) - simulated(plain, scene)).max() > SAME_MOTION
+    first_version = str(plain.to_arrays()["facts"]).replace(type(plain.law).name, type(plain.law).__name__)
+    assert Twin.from_arrays({**arrays, "facts": np.array(first_version)}).law == plain.law
 
 
 @pytest.mark.parametrize("name", SCENES)
