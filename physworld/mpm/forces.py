@@ -86,7 +86,7 @@ class InternalForces:
             self._array(derivatives, wp.float64),
             self._array(law.membrane_n_m * measure, wp.float64),
             self._array(law.bending_n_m * measure, wp.float64),
-            wp.float64(law.poissons_ratio),
+            self._array(np.array([*law.membrane_shape, *law.bending_shape]), wp.float64),
             wp.float64(law.relaxation_s),
             int(law.relaxation_s > 0),
         ]

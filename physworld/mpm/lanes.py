@@ -3,9 +3,9 @@
 On a CPU a vector is one SIMD register (GCC vector extension, which Warp's compiler understands); on CUDA it is a
 scalar, the lanes become a loop, and nodal sums are atomic. The bodies of the kernels are the same text in both.
 
-The struct ``lane`` has the functions of V. The struct ``D`` is a dual number over V, value ``a`` and derivative ``b`` in
-one direction: text that is written over a type S gives a value with S = V and a directional derivative with S = D. A
-struct inside a function has no operators but members, so a D stands on the left of a product with a V or a float.
+The struct ``lane`` has the functions of V. The struct ``D`` is a dual number over V, value ``a`` and derivative ``b``
+in one direction: text that is written over a type S gives a value with S = V and a directional derivative with S = D.
+A struct inside a function has no operators but members, so a D stands on the left of a product with a V or a float.
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ from bodies import rest_nodes
 from scipy.spatial.transform import Rotation
 
 from physworld.materials.laws import Law, RodLaw, SheetLaw, SolidLaw
+from physworld.materials.sheet import OrthotropicSheetLaw
 from physworld.mpm.forces import InternalForces
 from physworld.mpm.lattice import Lattice, box_lattice
 
@@ -17,10 +18,14 @@ DOUBLE_DIFFERENCE = 2e-6  # central differences of the energy in float64
 
 SOLID = SolidLaw(9e4, 0.33, density_kg_m3=800.0)
 SHEET = SheetLaw(120.0, 2e-4, 0.3)
+CLOTH = OrthotropicSheetLaw(
+    120.0, 2e-4, 0.2, weft_ratio=0.6, shear_ratio=0.1, bending_weft_ratio=0.5, bending_twist_ratio=0.3
+)
 ROD = RodLaw(90.0, 3e-3)
 BODIES = {
     "solid": (box_lattice(np.zeros(3), np.array([0.2, 0.05, 0.04]), (5, 2, 1)), SOLID),
     "sheet": (box_lattice(np.zeros(2), np.array([0.2, 0.15]), (5, 4)), SHEET),
+    "cloth": (box_lattice(np.zeros(2), np.array([0.2, 0.15]), (5, 4)), CLOTH),
     "rod": (box_lattice(np.zeros(1), np.array([0.4]), (9,)), ROD),
 }
 
@@ -59,10 +64,14 @@ def energy(lattice: Lattice, law: Law, x: np.ndarray) -> float:
         k = [np.sum(normal * at(*o), 1) for o in ((2, 0), (0, 2), (1, 1))]
         nu = law.poissons_ratio
 
-        def form(s: list[np.ndarray]) -> np.ndarray:
-            return nu * (s[0] + s[1]) ** 2 + (1 - nu) * (s[0] ** 2 + s[1] ** 2 + 2 * s[2] ** 2)
+        def form(s: list[np.ndarray], weft: float, shear: float) -> np.ndarray:
+            coupling = 2 * nu * np.sqrt(weft) * s[0] * s[1]
+            return s[0] ** 2 + weft * s[1] ** 2 + coupling + 2 * (1 - nu) * shear * s[2] ** 2
 
-        density = 0.5 * law.membrane_n_m * form(e) + 0.5 * law.bending_n_m * form(k)
+        ratios = [1.0] * 4
+        if isinstance(law, OrthotropicSheetLaw):
+            ratios = [law.weft_ratio, law.shear_ratio, law.bending_weft_ratio, law.bending_twist_ratio]
+        density = 0.5 * law.membrane_n_m * form(e, *ratios[:2]) + 0.5 * law.bending_n_m * form(k, *ratios[2:])
     else:
         t, c = at(1), at(2)
         length = np.linalg.norm(t, axis=1)
