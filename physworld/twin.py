@@ -18,7 +18,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.sparse.linalg import splu
 
 from physworld.effects.base import Effect
-from physworld.effects.registry import effect
+from physworld.effects.registry import effect, in_order
 from physworld.errors import EffectRefused
 from physworld.geometry.reference import ReferenceBody, reference_body
 from physworld.geometry.rigid import least_rotation, rigid_groups, rigid_motion
@@ -79,7 +79,7 @@ class Twin:
         held_nodes: nodes that each grip holds, one array a group.
         controllers_start: controllers at the first frame [m], (K, 3).
         release_s: the body is held at its start until then (somebody let go of it).
-        effects: what acts beside the declared physics, in the order in which it is applied.
+        effects: what acts beside the declared physics.
         device: Warp device of the simulations; not part of the twin's identity.
     """
 
@@ -223,7 +223,7 @@ class Twin:
     ) -> Integration:
         """What :meth:`simulate_nodes` integrates, for whoever wants to integrate it otherwise: same arguments."""
         knots, frame_index = _knots(control_times, frame_times, 0.0 if from_rest else self.release_s)
-        active = [known for known in self.effects if known.active]
+        active = in_order(self.effects)
         for known in active:
             control_times, control_points = known.controls(control_times, control_points)
         controls = PchipInterpolator(control_times, control_points, axis=0)(
@@ -237,15 +237,16 @@ class Twin:
             drag_per_s=self.air_drag_per_s,
             stiffness_factor=None if properties is None else np.exp(properties[:, 0]),
             density_factor=None if properties is None else np.exp(properties[:, 1]),
-            terms=self._contacts(),
+            terms=self.contacts,
             device=self.device,
         )
         for known in active:
             problem = known.problem(problem, self)
         velocity = np.zeros_like(self.body.start) if from_rest else self.body.start_velocity
-        held = self._held(knots, controls)
+        gripped = self
         for known in active:
-            held = known.held(held, self)
+            gripped = known.grips(gripped)
+        held = gripped._held(knots, controls)
         for known in active:
             problem, held = known.attach(problem, held, self)
         return Integration(problem, velocity, held, knots, frame_index)
@@ -277,9 +278,8 @@ class Twin:
             times: their frames, (T,) [s].
         """
         tracks = self.track_nodes(nodes)
-        for known in self.effects:
-            if known.active:
-                tracks = known.measured(times, tracks, self)
+        for known in in_order(self.effects):
+            tracks = known.measured(times, tracks, self)
         return tracks
 
     def track(self, particles: np.ndarray) -> np.ndarray:
@@ -346,7 +346,9 @@ class Twin:
             device=device,
         )
 
-    def _contacts(self) -> tuple[Term, ...]:
+    @property
+    def contacts(self) -> tuple[Term, ...]:
+        """What the body touches, as terms."""
         if self.ground_height_m is None or not isinstance(self.law, SolidLaw):
             return ()
         return (GroundContact(self.lattice, self.law, self.ground_height_m, self.ground_friction),)

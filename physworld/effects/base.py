@@ -5,8 +5,9 @@ at zero :attr:`Effect.active` is false, no hook is called, and the simulation is
 strengths (a relaxation time, a place) only shape what an open gate lets in; ``None`` lets the effect choose a place
 from the twin.
 
-The hooks run in this order: :meth:`~Effect.controls`, :meth:`~Effect.problem`, :meth:`~Effect.held`,
-:meth:`~Effect.attach`, then the integration, then :meth:`~Effect.measured`. Each leaves what it does not change.
+The hooks run in this order: :meth:`~Effect.controls`, :meth:`~Effect.problem`, :meth:`~Effect.grips`,
+:meth:`~Effect.attach`, then the integration, then :meth:`~Effect.measured`; in each the effects take their turn in the
+order of the registry. A hook leaves what it does not change.
 """
 
 from __future__ import annotations
@@ -95,9 +96,9 @@ class Effect:
         """The problem with its fields, its gravity or its terms changed."""
         return problem
 
-    def held(self, held: HeldNodes, twin: Twin) -> HeldNodes:
-        """The prescribed nodes, changed."""
-        return held
+    def grips(self, twin: Twin) -> Twin:
+        """The twin whose grips prescribe the motion: other nodes held, or held from another start."""
+        return twin
 
     def attach(self, problem: Problem, held: HeldNodes, twin: Twin) -> tuple[Problem, HeldNodes]:
         """For a grip that pulls instead of prescribing: takes nodes out of ``held`` and adds a term."""

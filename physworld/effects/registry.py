@@ -1,21 +1,76 @@
-"""Every effect by name. A new one is a file beside this one and a line here."""
+"""Every effect by name, in the order in which a twin applies them. A new one is a file beside this one and a line here.
+
+Shape and fields come first, then what changes gravity (buoyancy scales it, wind adds to it), then forces and stresses,
+contacts and grips; the growth of the law's stiffness puts itself before every other term. A camera scales, then
+stamps, smooths and drifts.
+"""
 
 from __future__ import annotations
 
 from physworld.effects.actuation_lag import ActuationLag
+from physworld.effects.adhesion import Adhesion
 from physworld.effects.air_drag_linear import AirDragLinear
+from physworld.effects.air_drag_quadratic import AirDragQuadratic
+from physworld.effects.anisotropy import Anisotropy
 from physworld.effects.base import Effect
+from physworld.effects.buoyancy import Buoyancy
+from physworld.effects.clamp_offset import ClampOffset
 from physworld.effects.gravity_tilt import GravityTilt
+from physworld.effects.grip_slip import GripSlip
+from physworld.effects.ground_friction import GroundFriction
+from physworld.effects.mass_field import MassField
+from physworld.effects.measurement_clock import MeasurementClock
+from physworld.effects.measurement_drift import MeasurementDrift
+from physworld.effects.measurement_scale import MeasurementScale
+from physworld.effects.measurement_smoothing import MeasurementSmoothing
+from physworld.effects.plasticity import Plasticity
+from physworld.effects.region_force import RegionForce
+from physworld.effects.rest_shape import RestShape
+from physworld.effects.stiffness_field import StiffnessField
+from physworld.effects.strain_stiffening import StrainStiffening
+from physworld.effects.tether import Tether
+from physworld.effects.time_varying_stiffness import TimeVaryingStiffness
+from physworld.effects.viscoelastic_maxwell import ViscoelasticMaxwell
+from physworld.effects.viscosity_kelvin_voigt import ViscosityKelvinVoigt
+from physworld.effects.wind import Wind
 from physworld.errors import UnknownEffect
 
 EFFECTS: dict[str, type[Effect]] = {
     kind.name: kind
     for kind in (
-        AirDragLinear,
+        RestShape,
+        StiffnessField,
+        MassField,
         GravityTilt,
+        Buoyancy,
+        Wind,
+        AirDragLinear,
+        AirDragQuadratic,
+        ViscosityKelvinVoigt,
+        ViscoelasticMaxwell,
+        Anisotropy,
+        StrainStiffening,
+        Plasticity,
+        Tether,
+        RegionForce,
+        GroundFriction,
+        Adhesion,
         ActuationLag,
+        ClampOffset,
+        GripSlip,
+        TimeVaryingStiffness,
+        MeasurementScale,
+        MeasurementClock,
+        MeasurementSmoothing,
+        MeasurementDrift,
     )
 }
+
+
+def in_order(effects: tuple[Effect, ...]) -> list[Effect]:
+    """Those that are active, in the order of the registry."""
+    places = list(EFFECTS)
+    return sorted((e for e in effects if e.active), key=lambda e: places.index(e.name))
 
 
 def effect(name: str, **strengths: float | None) -> Effect:

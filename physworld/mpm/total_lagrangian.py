@@ -64,6 +64,10 @@ class Problem:
     terms: tuple[Term, ...] = ()
     device: str = field(default="cpu")
 
+    def nodal_mass(self) -> np.ndarray:
+        """Lumped nodal masses [kg], (n,)."""
+        return nodal_mass(self.lattice, self.law, self.density_factor)
+
 
 class Formulation(Protocol):
     """One way to integrate a :class:`Problem`; the engine chooses by the scene."""
@@ -98,7 +102,7 @@ class TotalLagrangian:
         particles = lattice.fill.size
         stiffness = np.ones(particles) if problem.stiffness_factor is None else problem.stiffness_factor
         self.problem = problem
-        self.mass = nodal_mass(lattice, law, problem.density_factor)
+        self.mass = problem.nodal_mass()
         self.forces = InternalForces(lattice, law, stiffness, problem.rest, device)
         cell = float(lattice.spacing.min())
         frequency = fastest_frequency(self.forces, problem.rest, self.mass, cell)
@@ -204,7 +208,13 @@ class TotalLagrangian:
         return max(1, int(np.ceil(interval / (self.time_step_s * _CHUNK))))
 
     def _half_a_step_back(
-        self, v: np.ndarray, x_d: wp.array, clock: wp.array, counter: wp.array, force: wp.array, interval: float
+        self,
+        v: np.ndarray,
+        x_d: wp.array,
+        clock: wp.array,
+        counter: wp.array,
+        force: wp.array,
+        interval: float,
     ) -> np.ndarray:
         """Velocities (n, 3) half a substep before the start, where a scheme of second order wants them.
 

@@ -1,0 +1,119 @@
+"""Adhesion to the ground: a traction that pulls the surface down until it has come off.
+
+    traction = Y max(0, 1 - gap / d) for gap > 0, Y below        (gap: height of the surface above the ground)
+
+A linear cohesive law; its work per area is Y d / 2. The ground's own pressure and friction stay as they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import warp as wp
+
+from physworld.effects.base import Effect, Strength
+from physworld.effects.ground_friction import no_ground
+from physworld.effects.places import body_size, gravity_size
+from physworld.mpm.contact import GroundContact, surface_points
+from physworld.mpm.terms import BoundTerm
+from physworld.mpm.total_lagrangian import Problem
+
+if TYPE_CHECKING:
+    from physworld.twin import Twin
+
+
+@wp.kernel
+def adhesion(
+    # model
+    row_start: wp.array(dtype=wp.int32),
+    columns: wp.array(dtype=wp.int32),
+    weights: wp.array(dtype=wp.float64),
+    area: wp.array(dtype=wp.float64),
+    height: wp.float64,
+    traction: wp.float64,
+    reach: wp.float64,
+    # in
+    x: wp.array(dtype=wp.float64),
+    # out
+    force: wp.array(dtype=wp.float64),
+):
+    """Pull one surface point towards the ground."""
+    point = wp.tid()
+    z = wp.float64(0.0)
+    for k in range(row_start[point], row_start[point + 1]):
+        z += weights[k] * x[3 * columns[k] + 2]
+    gap = wp.max(z - height, wp.float64(0.0))
+    if gap < reach:
+        pull = traction * area[point] * (wp.float64(1.0) - gap / reach)
+        for k in range(row_start[point], row_start[point + 1]):
+            wp.atomic_add(force, 3 * columns[k] + 2, -weights[k] * pull)
+
+
+@dataclass(frozen=True)
+class AdhesionTerm:
+    """Term of :class:`Adhesion` on the surface of the lattice."""
+
+    height_m: float
+    traction_pa: float
+    reach_m: float
+
+    def bind(self, problem: Problem) -> BoundAdhesion:
+        """Device arrays."""
+        points, areas = surface_points(problem.lattice)
+        matrix, device = problem.lattice.interpolation(points), problem.device
+        inputs = [
+            wp.array(matrix.indptr, dtype=wp.int32, device=device),
+            wp.array(matrix.indices, dtype=wp.int32, device=device),
+            wp.array(matrix.data, dtype=wp.float64, device=device),
+            wp.array(areas, dtype=wp.float64, device=device),
+            wp.float64(self.height_m), wp.float64(self.traction_pa), wp.float64(self.reach_m),
+        ]  # fmt: skip
+        return BoundAdhesion(len(points), inputs, device)
+
+
+@dataclass(frozen=True)
+class BoundAdhesion(BoundTerm):
+    """Surface points on the device. The traction falls with the gap: it adds no frequency."""
+
+    points: int
+    inputs: list
+    device: str
+
+    def launch(self, x: wp.array, v: wp.array, clock: wp.array, counter: wp.array, force: wp.array) -> None:
+        """Add the tractions [N]."""
+        wp.launch(adhesion, dim=self.points, inputs=[*self.inputs, x], outputs=[force], device=self.device)
+
+
+@dataclass(frozen=True)
+class Adhesion(Effect):
+    """``traction_pa``: Y; ``reach_m``: d."""
+
+    name = "adhesion"
+    title = "adhesion to the ground"
+    equation = "traction = Y max(0, 1 - gap / d)"
+    kind = "boundary"
+    gates = ("traction_pa",)
+
+    traction_pa: float = 0.0
+    reach_m: float = 0.002
+
+    @classmethod
+    def strengths(cls, twin: Twin) -> tuple[Strength, ...]:
+        """Up to a hundred times the pressure of the body's own weight."""
+        weight = twin.density * gravity_size(twin) * body_size(twin)
+        return (
+            Strength("traction_pa", "Pa", 0.0, 100.0 * weight, 0.1 * weight),
+            Strength("reach_m", "m", 1e-4, 0.05, 5e-4, gate=False),
+        )
+
+    @classmethod
+    def refuses(cls, twin: Twin) -> str | None:
+        """A twin that touches no ground."""
+        return no_ground(twin)
+
+    def problem(self, problem: Problem, twin: Twin) -> Problem:
+        """Adds the term at the height of the contact as it stands."""
+        grounds = [t for t in problem.terms if isinstance(t, GroundContact)]
+        added = [AdhesionTerm(t.height_m, self.traction_pa, self.reach_m) for t in grounds]
+        return replace(problem, terms=(*problem.terms, *added))

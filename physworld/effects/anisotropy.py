@@ -1,0 +1,88 @@
+"""Fibres: a material that is stiffer (or softer) along one direction of the undeformed body.
+
+    solid   S += r E E_ff f f        E_ff = f . E f        (E Young's modulus, E Green strain, f the fibre)
+    sheet   N += r K e_ff f f        M += r D k_ff f f     (warp over weft: about 1 + r)
+
+f lies at ``azimuth_rad`` from the first material axis towards the second, and ``elevation_rad`` up to the third; the
+material axes are the world's for a solid. Not for rods: they have one direction.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from physworld.effects.base import Effect, Strength
+from physworld.mpm.stress import StressTerm
+from physworld.mpm.stress_kernels import sheet_model, solid_model
+from physworld.mpm.total_lagrangian import Problem
+
+if TYPE_CHECKING:
+    from physworld.twin import Twin
+
+_MODELS = {
+    3: solid_model(r"""
+        V along = V{};
+        for (int k = 0; k < 6; ++k) along += (k < 3 ? 1.0f : 2.0f) * PARAMETER(1 + k) * E[k];
+        along = FIELD(0) * PARAMETER(0) * along;
+        for (int k = 0; k < 6; ++k) S[k] = PARAMETER(1 + k) * along;
+    """),
+    2: sheet_model(r"""
+        for (int k = 0; k < 6; k += 3) {
+            V along = V{};
+            for (int i = 0; i < 3; ++i) along += (i < 2 ? 1.0 : 2.0) * PARAMETER(2 + i) * strain[k + i];
+            along = FIELD(0) * PARAMETER(k / 3) * along;
+            for (int i = 0; i < 3; ++i) stress[k + i] = PARAMETER(2 + i) * along;
+        }
+    """),
+}
+
+
+@dataclass(frozen=True)
+class Anisotropy(Effect):
+    """``ratio``: r, fibre stiffness over the law's; ``azimuth_rad``, ``elevation_rad``: the fibre."""
+
+    name = "anisotropy"
+    title = "fibre stiffness"
+    equation = "S += r E (f . E f) f f"
+    kind = "stress"
+    gates = ("ratio",)
+
+    ratio: float = 0.0
+    azimuth_rad: float = 0.0
+    elevation_rad: float = 0.0
+
+    @classmethod
+    def strengths(cls, twin: Twin) -> tuple[Strength, ...]:
+        """Half as soft to twenty times as stiff; a direction and its opposite are the same."""
+        half_turn = 0.5 * np.pi
+        angles = [Strength("azimuth_rad", "rad", -half_turn, half_turn, 0.05, gate=False)]
+        if twin.lattice.dim == 3:
+            angles.append(Strength("elevation_rad", "rad", -half_turn, half_turn, 0.05, gate=False))
+        return (Strength("ratio", "1", -0.5, 20.0, 0.05), *angles)
+
+    @classmethod
+    def refuses(cls, twin: Twin) -> str | None:
+        """A rod."""
+        return "a rod has one material direction; fibres need two" if twin.lattice.dim == 1 else None
+
+    def fibre(self) -> np.ndarray:
+        """Unit vector in material axes, (3,)."""
+        level = np.cos(self.elevation_rad)
+        return np.array(
+            [level * np.cos(self.azimuth_rad), level * np.sin(self.azimuth_rad), np.sin(self.elevation_rad)]
+        )
+
+    def problem(self, problem: Problem, twin: Twin) -> Problem:
+        """Adds the fibres' stress."""
+        law, f = problem.law, self.fibre()
+        if twin.lattice.dim == 3:
+            pairs = (f[0] * f[0], f[1] * f[1], f[2] * f[2], f[1] * f[2], f[0] * f[2], f[0] * f[1])
+            numbers = (self.ratio * law.youngs_modulus_pa, *pairs)
+        else:
+            f = np.array([np.cos(self.azimuth_rad), np.sin(self.azimuth_rad)])
+            pairs = (f[0] * f[0], f[1] * f[1], f[0] * f[1])
+            numbers = (self.ratio * law.membrane_n_m, self.ratio * law.bending_n_m, *pairs)
+        return replace(problem, terms=(*problem.terms, StressTerm(_MODELS[twin.lattice.dim], numbers)))

@@ -1,0 +1,150 @@
+"""A grip that gives: held material hangs on a damped spring instead of being prescribed.
+
+    F = (path - x) / C + 2 zeta sqrt(M / C) (dpath/dt - v)        C compliance [m/N], M the held mass
+
+The spring is spread over the held nodes by their mass, so all of them have one frequency 1/sqrt(C M) and a pad of
+rubber turns as well as shifts. With several grips every one has the compliance C. The smaller C, the smaller the time
+step: below the probe the grip is stiffer than the body's own fastest mode and shows nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+
+from physworld.effects.base import Effect, Strength
+from physworld.effects.places import gravity_size, held_count
+from physworld.mpm.terms import BoundTerm
+from physworld.mpm.total_lagrangian import HeldNodes, Problem, nodal_mass
+
+if TYPE_CHECKING:
+    from physworld.twin import Twin
+
+
+@wp.func
+def on_path(
+    path_x: wp.array2d(dtype=wp.float64), path_v: wp.array2d(dtype=wp.float64), frame: int, k: int,
+    s: wp.float64, span: wp.float64,
+):  # fmt: skip
+    """Cubic Hermite between two frames at the share ``s`` of their interval ``span`` [s]."""
+    s2 = s * s
+    s3 = s2 * s
+    h01 = wp.float64(3.0) * s2 - wp.float64(2.0) * s3
+    start = path_x[frame, k]
+    goal = start + h01 * (path_x[frame + 1, k] - start)
+    goal += span * (s3 - wp.float64(2.0) * s2 + s) * path_v[frame, k]
+    return goal + span * (s3 - s2) * path_v[frame + 1, k]
+
+
+@wp.kernel
+def pull_of_grip(
+    # model
+    nodes: wp.array(dtype=wp.int32),
+    stiffness: wp.array(dtype=wp.float64),
+    friction: wp.array(dtype=wp.float64),
+    path_x: wp.array2d(dtype=wp.float64),
+    path_v: wp.array2d(dtype=wp.float64),
+    clock: wp.array(dtype=wp.float64),
+    counter: wp.array(dtype=wp.int32),
+    # in
+    x: wp.array(dtype=wp.float64),
+    v: wp.array(dtype=wp.float64),
+    # out
+    force: wp.array(dtype=wp.float64),
+):
+    """Pull one held node towards its path."""
+    held = wp.tid()
+    node = nodes[held]
+    substeps = wp.float64(counter[2])
+    s = wp.float64(counter[1]) / substeps
+    for i in range(3):
+        k = 3 * held + i
+        here = on_path(path_x, path_v, counter[0], k, s, clock[0])
+        next = on_path(path_x, path_v, counter[0], k, s + wp.float64(1.0) / substeps, clock[0])
+        speed = (next - here) * clock[1]
+        force[3 * node + i] += stiffness[held] * (here - x[3 * node + i])
+        force[3 * node + i] += friction[held] * (speed - v[3 * node + i])
+
+
+@dataclass(frozen=True)
+class GripSprings:
+    """Term of :class:`GripSlip`: the nodes that were held, and their paths."""
+
+    held: HeldNodes
+    stiffness_n_m: float
+    damping_ratio: float
+
+    def bind(self, problem: Problem) -> BoundGripSprings:
+        """Device arrays."""
+        device, frames = problem.device, len(self.held.positions)
+        mass = problem.nodal_mass()[self.held.nodes]
+        frequency = float(np.sqrt(self.stiffness_n_m / mass.sum()))
+        rate = 2 * self.damping_ratio * frequency
+        inputs = [
+            wp.array(self.held.nodes, dtype=wp.int32, device=device),
+            wp.array(mass * frequency**2, dtype=wp.float64, device=device),
+            wp.array(mass * rate, dtype=wp.float64, device=device),
+            wp.array(self.held.positions.reshape(frames, -1), dtype=wp.float64, device=device),
+            wp.array(self.held.velocities.reshape(frames, -1), dtype=wp.float64, device=device),
+        ]
+        return BoundGripSprings(inputs, device, frequency, rate)
+
+
+@dataclass(frozen=True)
+class BoundGripSprings(BoundTerm):
+    """Springs on the device."""
+
+    inputs: list
+    device: str
+    frequency_rad_s: float
+    friction_per_s: float
+
+    def launch(self, x: wp.array, v: wp.array, clock: wp.array, counter: wp.array, force: wp.array) -> None:
+        """Add the pulls [N]."""
+        inputs = [*self.inputs, clock, counter, x, v]
+        wp.launch(pull_of_grip, dim=len(self.inputs[0]), inputs=inputs, outputs=[force], device=self.device)
+
+
+@dataclass(frozen=True)
+class GripSlip(Effect):
+    """``compliance_m_n``: C of a grip [m/N]; ``damping_ratio``: zeta of the grip with its mass alone."""
+
+    name = "grip_slip"
+    title = "grip that gives"
+    equation = "F = (path - x) / C + 2 zeta sqrt(M / C) (dpath/dt - v)"
+    kind = "boundary"
+    gates = ("compliance_m_n",)
+
+    compliance_m_n: float = 0.0
+    damping_ratio: float = 0.5
+
+    @classmethod
+    def strengths(cls, twin: Twin) -> tuple[Strength, ...]:
+        """Up to giving way a tenth of the size under the weight; the probe is a spring as fast as a cell."""
+        weight = float(twin.particle_mass.sum()) * gravity_size(twin)
+        mass = nodal_mass(twin.lattice, twin.law, None)
+        held = np.concatenate([np.empty(0, dtype=int), *twin.held_nodes]).astype(int)
+        rate = twin.law.wave_speed_m_s / float(twin.lattice.spacing.min())
+        probe = 4.0 / (rate**2 * max(float(mass[held].sum()), 1e-12))
+        high = max(0.1 * float(np.ptp(twin.particles_start, axis=0).max()) / weight, 10.0 * probe)
+        return (
+            Strength("compliance_m_n", "m/N", 0.0, high, probe),
+            Strength("damping_ratio", "1", 0.0, 2.0, 0.1, gate=False),
+        )
+
+    @classmethod
+    def refuses(cls, twin: Twin) -> str | None:
+        """A body that nobody holds."""
+        held = held_count(twin)
+        return f"{held} nodes are held: no grip that could give" if held == 0 else None
+
+    def attach(self, problem: Problem, held: HeldNodes, twin: Twin) -> tuple[Problem, HeldNodes]:
+        """Frees the held nodes and pulls them instead."""
+        grips = sum(len(nodes) > 0 for nodes in twin.held_nodes)
+        term = GripSprings(held, grips / self.compliance_m_n, self.damping_ratio)
+        empty = np.empty((len(held.positions), 0, 3))
+        free = HeldNodes(np.empty(0, dtype=int), empty, empty)
+        return replace(problem, terms=(*problem.terms, term)), free

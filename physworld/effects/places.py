@@ -1,0 +1,62 @@
+"""Where on a twin an effect acts: scales, ends, regions and material coordinates."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from physworld.mpm.lattice import Lattice
+
+if TYPE_CHECKING:
+    from physworld.twin import Twin
+
+
+def body_size(twin: Twin) -> float:
+    """Largest extent of the body at the start [m]."""
+    return float(np.ptp(twin.particles_start, axis=0).max())
+
+
+def gravity_size(twin: Twin) -> float:
+    """Strength of gravity [m/s^2]; 9.81 where there is none, as a scale of forces."""
+    size = float(np.linalg.norm(twin.gravity_m_s2))
+    return size if size > 1e-6 else 9.81
+
+
+def free_end(twin: Twin) -> np.ndarray:
+    """Start of the material that lies farthest from what is held [m], (3,); of nothing is held, from the middle."""
+    particles = twin.particles_start[twin.particle_mass > 0]
+    held = np.concatenate([np.empty(0, dtype=int), *twin.held_nodes]).astype(int)
+    places = twin.body.start[held] if len(held) else particles.mean(axis=0, keepdims=True)
+    gap = np.linalg.norm(particles[:, None] - places[None], axis=2).min(axis=1)
+    return particles[int(np.argmax(gap))]
+
+
+def region_weights(twin: Twin, centre: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes (k,) and weights (k,), summing to 1, of the centroid of the material within ``radius`` [m] of ``centre``.
+
+    Places are those of the start; where nothing lies so near, the nearest particle is the region.
+    """
+    gap = np.linalg.norm(twin.particles_start - centre, axis=1)
+    mass = twin.particle_mass
+    inside = (gap <= radius) & (mass > 0)
+    if not inside.any():
+        inside = np.arange(len(gap)) == int(np.argmin(np.where(mass > 0, gap, np.inf)))
+    share = np.where(inside, mass, 0.0) / mass[inside].sum()
+    rows = twin.lattice.interpolation(twin.lattice.particle_coordinates)
+    weights = np.asarray(rows.T @ share)
+    nodes = np.nonzero(weights)[0]
+    return nodes, weights[nodes]
+
+
+def unit_coordinates(lattice: Lattice) -> np.ndarray:
+    """Material coordinates of the particles, -1 to 1 over the body along every axis, (P, d)."""
+    places = lattice.particle_coordinates
+    filled = places[lattice.particle_measures > 0]
+    low, high = filled.min(axis=0), filled.max(axis=0)
+    return (places - 0.5 * (low + high)) / np.maximum(0.5 * (high - low), 1e-12)
+
+
+def held_count(twin: Twin) -> int:
+    """Nodes that are held."""
+    return sum(len(nodes) for nodes in twin.held_nodes)

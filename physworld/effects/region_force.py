@@ -1,0 +1,111 @@
+"""A constant force on some material: a wire that pulls, a draught on one end, a magnet.
+
+    F on the centroid of the material that starts within ``radius_m`` of (``x_m``, ``y_m``, ``z_m``)
+
+Where no place is given it is the end that is farthest from the grips.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+
+from physworld.effects.base import Effect, Strength
+from physworld.effects.places import body_size, free_end, gravity_size, region_weights
+from physworld.mpm.terms import BoundTerm
+from physworld.mpm.total_lagrangian import Problem
+
+if TYPE_CHECKING:
+    from physworld.twin import Twin
+
+_RADIUS = 0.1  # of the body's size
+
+
+@wp.kernel
+def push_nodes(
+    # model
+    nodes: wp.array(dtype=wp.int32),
+    push: wp.array(dtype=wp.vec3d),
+    # out
+    force: wp.array(dtype=wp.float64),
+):
+    """Add a fixed force to one node of the region."""
+    k = wp.tid()
+    for i in range(3):
+        force[3 * nodes[k] + i] += push[k][i]
+
+
+@dataclass(frozen=True)
+class RegionForceTerm:
+    """Term of :class:`RegionForce`: nodes (k,) and their forces (k, 3) [N]."""
+
+    nodes: np.ndarray
+    push: np.ndarray
+
+    def bind(self, problem: Problem) -> BoundRegionForce:
+        """Device arrays."""
+        device = problem.device
+        return BoundRegionForce(
+            wp.array(self.nodes, dtype=wp.int32, device=device),
+            wp.array(self.push, dtype=wp.vec3d, device=device),
+        )
+
+
+@dataclass(frozen=True)
+class BoundRegionForce(BoundTerm):
+    """The region on the device."""
+
+    nodes: wp.array
+    push: wp.array
+
+    def launch(self, x: wp.array, v: wp.array, clock: wp.array, counter: wp.array, force: wp.array) -> None:
+        """Add the forces [N]."""
+        inputs = [self.nodes, self.push]
+        wp.launch(push_nodes, dim=len(self.nodes), inputs=inputs, outputs=[force], device=self.nodes.device)
+
+
+@dataclass(frozen=True)
+class RegionForce(Effect):
+    """``force_x_n`` …: F [N]; ``x_m`` …, ``radius_m``: the material."""
+
+    name = "region_force"
+    title = "hidden force on a region"
+    equation = "F constant on a region's centroid"
+    kind = "force"
+    gates = ("force_x_n", "force_y_n", "force_z_n")
+
+    force_x_n: float = 0.0
+    force_y_n: float = 0.0
+    force_z_n: float = 0.0
+    x_m: float | None = None
+    y_m: float | None = None
+    z_m: float | None = None
+    radius_m: float | None = None
+
+    @classmethod
+    def strengths(cls, twin: Twin) -> tuple[Strength, ...]:
+        """Up to the body's weight, anywhere on the body."""
+        weight = float(twin.particle_mass.sum()) * gravity_size(twin)
+        low, high = twin.particles_start.min(axis=0), twin.particles_start.max(axis=0)
+        step = 0.05 * body_size(twin)
+        return (
+            *(Strength(f"force_{a}_n", "N", -weight, weight, 5e-3 * weight) for a in "xyz"),
+            *(
+                Strength(f"{a}_m", "m", lo - step, hi + step, 0.5 * (lo + hi), gate=False)
+                for a, lo, hi in zip("xyz", low, high, strict=True)
+            ),
+        )
+
+    def problem(self, problem: Problem, twin: Twin) -> Problem:
+        """Adds the term."""
+        given = (self.x_m, self.y_m, self.z_m)
+        centre = np.array(
+            [c if value is None else value for value, c in zip(given, free_end(twin), strict=True)]
+        )
+        radius = _RADIUS * body_size(twin) if self.radius_m is None else self.radius_m
+        nodes, weights = region_weights(twin, centre, radius)
+        push = np.outer(weights, [self.force_x_n, self.force_y_n, self.force_z_n])
+        return replace(problem, terms=(*problem.terms, RegionForceTerm(nodes, push)))

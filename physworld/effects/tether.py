@@ -1,0 +1,137 @@
+"""A hidden tether: a spring from a fixed anchor to the centroid of some material.
+
+    F = -k (1 - l / |d|) d        d = centroid - anchor, l rest length; pulls and pushes
+
+The force is spread over the material as the centroid's weights, so it does the work of the spring. Where nothing is
+given the tether holds the end that is farthest from the grips, the anchor is where that end started, and l is 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+
+from physworld.effects.base import Effect, Strength
+from physworld.effects.places import body_size, free_end, gravity_size, region_weights
+from physworld.mpm.terms import BoundTerm
+from physworld.mpm.total_lagrangian import Problem
+
+if TYPE_CHECKING:
+    from physworld.twin import Twin
+
+_RADIUS = 0.1  # of the body's size
+
+
+@wp.kernel
+def pull_of_tether(
+    # model
+    nodes: wp.array(dtype=wp.int32),
+    weights: wp.array(dtype=wp.float64),
+    anchor: wp.vec3d,
+    stiffness: wp.float64,
+    rest_length: wp.float64,
+    # in
+    x: wp.array(dtype=wp.float64),
+    # out
+    force: wp.array(dtype=wp.float64),
+):
+    """Add the spring's force to the nodes of its region, in one thread: there are few."""
+    gap = -anchor
+    for k in range(nodes.shape[0]):
+        node = 3 * nodes[k]
+        gap += weights[k] * wp.vec3d(x[node], x[node + 1], x[node + 2])
+    length = wp.length(gap) + wp.float64(1.0e-12)
+    pull = -stiffness * (wp.float64(1.0) - rest_length / length) * gap
+    for k in range(nodes.shape[0]):
+        for i in range(3):
+            force[3 * nodes[k] + i] += weights[k] * pull[i]
+
+
+@dataclass(frozen=True)
+class TetherTerm:
+    """Term of :class:`Tether`: region (k,), (k,), anchor (3,) [m]."""
+
+    nodes: np.ndarray
+    weights: np.ndarray
+    anchor: np.ndarray
+    stiffness_n_m: float
+    rest_length_m: float
+
+    def bind(self, problem: Problem) -> BoundTether:
+        """Device arrays."""
+        device = problem.device
+        inputs = [
+            wp.array(self.nodes, dtype=wp.int32, device=device),
+            wp.array(self.weights, dtype=wp.float64, device=device),
+            wp.vec3d(*self.anchor), wp.float64(self.stiffness_n_m), wp.float64(self.rest_length_m),
+        ]  # fmt: skip
+        inverse_mass = float(np.sum(self.weights**2 / problem.nodal_mass()[self.nodes]))
+        return BoundTether(inputs, device, float(np.sqrt(self.stiffness_n_m * inverse_mass)))
+
+
+@dataclass(frozen=True)
+class BoundTether(BoundTerm):
+    """The region on the device."""
+
+    inputs: list
+    device: str
+    frequency_rad_s: float
+
+    def launch(self, x: wp.array, v: wp.array, clock: wp.array, counter: wp.array, force: wp.array) -> None:
+        """Add the tether's force [N]."""
+        wp.launch(pull_of_tether, dim=1, inputs=[*self.inputs, x], outputs=[force], device=self.device)
+
+
+@dataclass(frozen=True)
+class Tether(Effect):
+    """``stiffness_n_m``: k; ``anchor_x_m`` …; ``attach_x_m`` …, ``radius_m``: the material; ``rest_length_m``: l."""
+
+    name = "tether"
+    title = "hidden tether"
+    equation = "F = -k (1 - l / |d|) d"
+    kind = "force"
+    gates = ("stiffness_n_m",)
+
+    stiffness_n_m: float = 0.0
+    anchor_x_m: float | None = None
+    anchor_y_m: float | None = None
+    anchor_z_m: float | None = None
+    attach_x_m: float | None = None
+    attach_y_m: float | None = None
+    attach_z_m: float | None = None
+    radius_m: float | None = None
+    rest_length_m: float = 0.0
+
+    @classmethod
+    def strengths(cls, twin: Twin) -> tuple[Strength, ...]:
+        """Up to a thousand times the weight over the size; the anchor within three sizes of the free end."""
+        size, end = body_size(twin), free_end(twin)
+        scale = float(twin.particle_mass.sum()) * gravity_size(twin) / size
+        return (
+            Strength("stiffness_n_m", "N/m", 0.0, 1e3 * scale, 0.02 * scale),
+            *(
+                Strength(f"anchor_{a}_m", "m", c - 3 * size, c + 3 * size, c + 0.02 * size, gate=False)
+                for a, c in zip("xyz", end, strict=True)
+            ),
+            Strength("rest_length_m", "m", 0.0, 3 * size, 0.02 * size, gate=False),
+        )
+
+    def places(self, twin: Twin) -> tuple[np.ndarray, np.ndarray]:
+        """Anchor and centre of the material at the start [m], (3,) each."""
+        end = free_end(twin)
+        given = [(self.attach_x_m, self.attach_y_m, self.attach_z_m)]
+        given.append((self.anchor_x_m, self.anchor_y_m, self.anchor_z_m))
+        attach = np.array([c if value is None else value for value, c in zip(given[0], end, strict=True)])
+        anchor = np.array([c if value is None else value for value, c in zip(given[1], attach, strict=True)])
+        return anchor, attach
+
+    def problem(self, problem: Problem, twin: Twin) -> Problem:
+        """Adds the term."""
+        anchor, attach = self.places(twin)
+        radius = _RADIUS * body_size(twin) if self.radius_m is None else self.radius_m
+        nodes, weights = region_weights(twin, attach, radius)
+        term = TetherTerm(nodes, weights, anchor, self.stiffness_n_m, self.rest_length_m)
+        return replace(problem, terms=(*problem.terms, term))

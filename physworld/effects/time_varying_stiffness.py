@@ -1,0 +1,97 @@
+"""Stiffness that changes in time: a body that warms up, dries or tires.
+
+    stiffness(t) = exp(a t) stiffness(0)        t from the first frame of the recording
+
+It multiplies the law's own forces, its friction with them, before any other term acts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+
+from physworld.effects.base import Effect, Strength
+from physworld.errors import CFLViolation
+from physworld.mpm.terms import BoundTerm
+from physworld.mpm.total_lagrangian import Problem
+
+if TYPE_CHECKING:
+    from physworld.twin import Twin
+
+_MOST = 2.0  # growth of the stiffness that the stable time step's own margin covers
+
+
+@wp.kernel
+def scale_forces(
+    # model
+    times: wp.array(dtype=wp.float64),
+    rate: wp.float64,
+    clock: wp.array(dtype=wp.float64),
+    counter: wp.array(dtype=wp.int32),
+    # in, out
+    force: wp.array(dtype=wp.float64),
+):
+    """Multiply one component of the internal forces by exp(rate t)."""
+    k = wp.tid()
+    time = times[counter[0]] + wp.float64(counter[1]) * clock[2]
+    force[k] = force[k] * wp.exp(rate * time)
+
+
+@dataclass(frozen=True)
+class GrowingStiffness:
+    """Term of :class:`TimeVaryingStiffness`; has to be the first of its problem."""
+
+    rate_per_s: float
+
+    def bind(self, problem: Problem) -> BoundGrowth:
+        """Room for the times comes with the run."""
+        return BoundGrowth(self.rate_per_s, problem.device)
+
+
+@dataclass
+class BoundGrowth(BoundTerm):
+    """The rate, and the frames' times on the device once a run has begun."""
+
+    rate_per_s: float
+    device: str
+    times: wp.array | None = None
+
+    def begin(self, times: np.ndarray) -> None:
+        """Take the times. Raises CFLViolation where the stiffness would outgrow the time step's margin."""
+        growth = float(np.exp(self.rate_per_s * np.array([times[0], times[-1]])).max())
+        if growth > _MOST:
+            raise CFLViolation(
+                f"the stiffness grows {growth:.3g} times by a rate of {self.rate_per_s:.3g} 1/s until "
+                f"{times[-1]:.3g} s; the time step's margin covers {_MOST:g}"
+            )
+        self.times = wp.array(times, dtype=wp.float64, device=self.device)
+
+    def launch(self, x: wp.array, v: wp.array, clock: wp.array, counter: wp.array, force: wp.array) -> None:
+        """Multiply the forces that are there."""
+        inputs = [self.times, wp.float64(self.rate_per_s), clock, counter]
+        wp.launch(scale_forces, dim=len(force), inputs=inputs, outputs=[force], device=self.device)
+
+
+@dataclass(frozen=True)
+class TimeVaryingStiffness(Effect):
+    """``log_rate_per_s``: a [1/s]."""
+
+    name = "time_varying_stiffness"
+    title = "stiffness that changes in time"
+    equation = "stiffness(t) = exp(a t) stiffness(0)"
+    kind = "field"
+    gates = ("log_rate_per_s",)
+
+    log_rate_per_s: float = 0.0
+
+    @classmethod
+    def strengths(cls, twin: Twin) -> tuple[Strength, ...]:
+        """Up to a factor e in two seconds."""
+        return (Strength("log_rate_per_s", "1/s", -0.5, 0.5, 0.02),)
+
+    def problem(self, problem: Problem, twin: Twin) -> Problem:
+        """Puts the term before the others."""
+        return replace(problem, terms=(GrowingStiffness(self.log_rate_per_s), *problem.terms))

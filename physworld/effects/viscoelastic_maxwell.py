@@ -1,0 +1,103 @@
+"""Maxwell relaxation: a spring and a dashpot in series beside the law, so that part of the stiffness fades.
+
+    solid        S += 2 G1 dev(E - a)            da/dt = (E - a) / tau       (E Green strain)
+    sheet, rod   stress += g C (e - a)           da/dt = (e - a) / tau       (C the law's own stiffness)
+
+Fast motions feel G1 (or the share g) on top of the law, slow ones nothing; in between energy is lost, most of it at
+the frequency 1/tau. The branch starts relaxed. In a rod ``a`` holds curvature and turns with the tangent.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from physworld.effects.base import Effect, Strength
+from physworld.effects.places import body_size, gravity_size
+from physworld.mpm.stress import StressTerm
+from physworld.mpm.stress_kernels import rod_model, sheet_model, solid_model
+from physworld.mpm.total_lagrangian import Problem
+
+if TYPE_CHECKING:
+    from physworld.twin import Twin
+
+_MODELS = {
+    3: solid_model(
+        r"""
+        const float keep = PARAMETER(1) / (PARAMETER(1) + dt);
+        for (int k = 0; k < 6; ++k) {
+            STATE(k) = first ? E[k] : E[k] + (STATE(k) - E[k]) * keep;
+            S[k] = FIELD(0) * PARAMETER(0) * (E[k] - STATE(k));
+        }
+        const V mean = (S[0] + S[1] + S[2]) * (1.0f / 3.0f);
+        for (int k = 0; k < 3; ++k) S[k] -= mean;
+    """,
+        rows=6,
+    ),
+    2: sheet_model(
+        r"""
+        const double keep = PARAMETER(2) / (PARAMETER(2) + dt), nu = PARAMETER(3);
+        V e[6];
+        for (int k = 0; k < 6; ++k) {
+            STATE(k) = first ? strain[k] : strain[k] + (STATE(k) - strain[k]) * keep;
+            e[k] = strain[k] - STATE(k);
+        }
+        for (int k = 0; k < 6; k += 3) {
+            const V stiffness = FIELD(0) * PARAMETER(k / 3);
+            stress[k] = stiffness * (e[k] + nu * e[k + 1]);
+            stress[k + 1] = stiffness * (e[k + 1] + nu * e[k]);
+            stress[k + 2] = stiffness * (1.0 - nu) * e[k + 2];
+        }
+    """,
+        rows=6,
+    ),
+    1: rod_model(
+        r"""
+        CARRY(3, 4, 5);
+        const double keep = PARAMETER(2) / (PARAMETER(2) + dt);
+        for (int i = 0; i < 3; ++i) {
+            STATE(3 + i) = first ? kappa[i] : kappa[i] + (STATE(3 + i) - kappa[i]) * keep;
+            moment[i] = FIELD(0) * PARAMETER(1) * (kappa[i] - STATE(3 + i));
+        }
+        const V rest[3] = {STATE(3), STATE(4), STATE(5)};
+        for (int i = 0; i < 3; ++i) torque[i] = CROSS(rest, moment, i);
+        STATE(6) = first ? stretch : stretch + (STATE(6) - stretch) * keep;
+        axial = FIELD(0) * PARAMETER(0) * (stretch - STATE(6));
+    """,
+        rows=7,
+    ),
+}
+
+
+@dataclass(frozen=True)
+class ViscoelasticMaxwell(Effect):
+    """``shear_modulus_pa``: G1 of a solid; ``share``: g of a sheet or rod; ``relaxation_s``: tau."""
+
+    name = "viscoelastic_maxwell"
+    title = "Maxwell relaxation"
+    equation = "S += 2 G1 dev(E - a), da/dt = (E - a) / tau"
+    kind = "stress"
+    gates = ("shear_modulus_pa", "share")
+
+    shear_modulus_pa: float = 0.0
+    share: float = 0.0
+    relaxation_s: float = 0.1
+
+    @classmethod
+    def strengths(cls, twin: Twin) -> tuple[Strength, ...]:
+        """A branch up to the size of a stiff law, fading within 5 ms to 5 s."""
+        time = Strength("relaxation_s", "s", 5e-3, 5.0, 0.02, gate=False)
+        if twin.lattice.dim < 3:
+            return (Strength("share", "1", 0.0, 5.0, 0.02), time)
+        scale = twin.density * gravity_size(twin) * body_size(twin)
+        return (Strength("shear_modulus_pa", "Pa", 0.0, 1e4 * scale, 0.02 * twin.law.lame[0]), time)
+
+    def problem(self, problem: Problem, twin: Twin) -> Problem:
+        """Adds the branch."""
+        law, g, tau = problem.law, self.share, self.relaxation_s
+        numbers = {
+            3: lambda: (2.0 * self.shear_modulus_pa, tau),
+            2: lambda: (g * law.membrane_n_m, g * law.bending_n_m, tau, law.poissons_ratio),
+            1: lambda: (g * law.stretching_n, g * law.bending_n_m2, tau),
+        }[twin.lattice.dim]()
+        return replace(problem, terms=(*problem.terms, StressTerm(_MODELS[twin.lattice.dim], numbers)))

@@ -1,0 +1,104 @@
+"""Stresses beside a law's own as terms: a model of :mod:`physworld.mpm.stress_kernels` with its numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from physworld.mpm.stability import fastest_frequency
+from physworld.mpm.stress_kernels import StressModel
+from physworld.mpm.terms import BoundTerm
+
+if TYPE_CHECKING:
+    from physworld.mpm.total_lagrangian import Problem
+
+_DERIVATIVES = {2: [(1, 0), (0, 1), (2, 0), (0, 2), (1, 1)], 1: [(1,), (2,)]}
+
+
+@dataclass(frozen=True)
+class StressTerm:
+    """A model with its numbers.
+
+    Attributes:
+        model: one for every dimension that the effect covers, in any order.
+        parameters: what PARAMETER(k) reads.
+        fields: what FIELD(1), FIELD(2), … read, (k, P), or None.
+        frequency_rad_s: what it adds to the fastest mode; None: found by power iteration about the rest state, with
+            memory empty (a model that softens gives 0 there).
+    """
+
+    model: StressModel
+    parameters: tuple[float, ...]
+    fields: np.ndarray | None = None
+    frequency_rad_s: float | None = None
+
+    def bind(self, problem: Problem) -> BoundStress:
+        """Device arrays; raises ValueError where the model is of another dimension."""
+        lattice, device = problem.lattice, problem.device
+        if lattice.dim != self.model.dim:
+            raise ValueError(f"a model of dimension {self.model.dim} on a lattice of dimension {lattice.dim}")
+        real = wp.float32 if lattice.dim == 3 else wp.float64
+
+        def array(values: Any, dtype: Any = real) -> wp.array:
+            return wp.array(np.ascontiguousarray(values).reshape(-1), dtype=dtype, device=device)
+
+        factor = 1.0 if problem.stiffness_factor is None else problem.stiffness_factor
+        fields = [lattice.particle_measures * factor, *([] if self.fields is None else self.fields)]
+        cells, spacing = len(lattice.cells), lattice.spacing
+        inputs = [cells, self.model.rows, array(lattice.cell_nodes, wp.int32)]
+        if lattice.dim == 3:
+            slopes = np.stack([lattice.table(tuple(int(a == j) for a in range(3))) for j in range(3)], axis=1)
+            inputs += [array(slopes), array(problem.rest, wp.float64), wp.vec3f(*(1.0 / spacing))]
+        else:
+            orders = _DERIVATIVES[lattice.dim]
+            inputs += [
+                array(np.stack([lattice.table(o) / np.prod(spacing ** np.array(o)) for o in orders], axis=1))
+            ]
+        inputs += [array(self.parameters or (0.0,)), array(np.stack(fields))]
+        state = wp.zeros(max(1, self.model.rows * lattice.fill.size), dtype=real, device=device)
+        bound = BoundStress(self.model.kernel, cells, inputs, state, device, 0.0)
+        if self.frequency_rad_s is not None:
+            bound.frequency_rad_s = self.frequency_rad_s
+        else:
+            bound.frequency_rad_s = fastest_frequency(
+                _AboutRest(bound), problem.rest, problem.nodal_mass(), float(spacing.min())
+            )
+            state.zero_()
+        return bound
+
+
+@dataclass
+class BoundStress(BoundTerm):
+    """A stress term whose arrays live on a device."""
+
+    kernel: Any
+    cells: int
+    inputs: list
+    state: wp.array
+    device: str
+    frequency_rad_s: float
+
+    def launch(self, x: wp.array, v: wp.array, clock: wp.array, counter: wp.array, force: wp.array) -> None:
+        """Add the forces [N] of the model's stresses."""
+        wp.launch(
+            self.kernel,
+            dim=self.cells,
+            inputs=[*self.inputs, clock, counter, x, self.state],
+            outputs=[force],
+            device=self.device,
+        )
+
+
+class _AboutRest:
+    """A bound stress as power iteration takes it: in the middle of a run, no time passing."""
+
+    def __init__(self, bound: BoundStress) -> None:
+        self.device = bound.device
+        self._bound = bound
+        self._counter = wp.array([0, 1, 1], dtype=wp.int32, device=bound.device)
+
+    def launch(self, x: wp.array, clock: wp.array, force: wp.array) -> None:
+        self._bound.launch(x, x, clock, self._counter, force)
