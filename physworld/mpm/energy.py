@@ -197,7 +197,7 @@ class _Meter:
         stiffness = np.ones(particles) if problem.stiffness_factor is None else problem.stiffness_factor
         self._device = device
         self._elastic_law = InternalForces(
-            problem.lattice, _without_friction(problem.law), stiffness, problem.rest, device
+            problem.lattice, without_friction(problem.law), stiffness, problem.rest, device
         )
         self._constants = [
             wp.array(problem.nodal_mass(), dtype=wp.float64, device=device),
@@ -231,7 +231,8 @@ class _Meter:
         return work.copy(), velocity.reshape(self._frames, -1, 3).copy()
 
 
-def _without_friction(law: Law) -> Law:
+def without_friction(law: Law) -> Law:
+    """The law with its own friction off."""
     if isinstance(law, SolidLaw):
         return replace(law, viscosity_pa_s=0.0)
     return replace(law, relaxation_s=0.0)

@@ -1,0 +1,231 @@
+"""How much of a twin's prediction is the solver's own: its damping, and what a finer step or lattice would change.
+
+Three suspects are measured on the scene at hand, since no scheme is innocent in general:
+
+- *Damping*. The body swings freely: grips stand still, drag, friction and effects are off. The energy that the run
+  loses is stated as the linear drag c that would take as much, lost = 2 c * integral of the kinetic energy [1/s], and
+  as the damping ratio c / (2 omega) of the dominant mode, the tracked points' strongest frequency.
+- *Time step*. The recording is predicted with half the time step.
+- *Lattice*. The recording is predicted with finer cells.
+
+An effect whose strength or sign follows one of these is a numerical error.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from physworld.mpm.energy import EnergyLedger, run_with_ledger, without_friction
+from physworld.mpm.total_lagrangian import TotalLagrangian
+from physworld.scene import Scene
+from physworld.twin import Twin, build_twin
+
+REFINEMENT = 1.5  # cells of the finer lattice are this many times smaller
+_STILL = 1e-3  # a free run whose points move less than this share of the body's size is kicked
+_KICK_PER_S = 0.05  # speed of the kick, body sizes a second
+_LEAST_PERIODS = 1.5  # of the dominant mode, to tell its frequency
+
+
+@dataclass(frozen=True)
+class Numerics:
+    """What the numerics do to one twin's prediction of one scene.
+
+    Attributes:
+        equivalent_drag_per_s: linear drag that would lose as much energy as the scheme does [1/s]; negative: gain.
+        damping_ratio: that loss as a share of critical damping of the dominant mode; None without such a mode.
+        dominant_mode_hz: strongest frequency of the free swing; None where the run is too short to show one.
+        lost_share: energy that the scheme lost over the recording, over the largest energy exchanged.
+        time_step_s: the twin's largest time step.
+        half_step_m: root mean squared change of the predicted tracks when the time step is halved [m].
+        finer_cells_m: root mean squared change of the predicted tracks on the finer lattice [m].
+        refinement: factor between the two lattices; particles and finer_particles are their sizes.
+        simulations: runs used.
+        seconds: wall time.
+    """
+
+    equivalent_drag_per_s: float
+    damping_ratio: float | None
+    dominant_mode_hz: float | None
+    lost_share: float
+    time_step_s: float
+    half_step_m: float
+    finer_cells_m: float
+    refinement: float
+    particles: int
+    finer_particles: int
+    simulations: int
+    seconds: float
+
+    @property
+    def worst_m(self) -> float:
+        """The larger of the two changes of the prediction [m]: no residual below it means anything."""
+        return max(self.half_step_m, self.finer_cells_m)
+
+
+def measure_numerics(
+    scene: Scene,
+    twin: Twin,
+    *,
+    particle_budget: int = 2000,
+    refinement: float = REFINEMENT,
+    progress: Callable[[int, int, str], None] | None = None,
+) -> Numerics:
+    """Measure a calibrated twin's numerics on its scene.
+
+    Args:
+        scene: the recording; only its controls, times and declared facts are used.
+        twin: calibrated, total Lagrangian.
+        particle_budget: the one that the twin was built with.
+        refinement: cells of the finer lattice are this many times smaller.
+        progress: called with (runs done, runs in all, what comes next); may raise to stop.
+
+    Raises:
+        SimulationError: a run cannot be trusted.
+    """
+    begun = time.perf_counter()
+    tell = progress or (lambda done, most, text: None)
+    tell(0, 4, "free swing without friction")
+    damping = free_swing(scene, twin)
+    tell(1, 4, "prediction with its energy ledger")
+    control_times, controls = scene.control_track()
+    run = twin.integration(control_times, controls, scene.times)
+    nodes, ledger = run_with_ledger(run.problem, twin.body.start, run.velocity, run.held, run.knots)
+    track = twin.observe(run.at_frames(twin.body.start, nodes), scene.times)
+    step = TotalLagrangian(run.problem).time_step_s
+    tell(2, 4, "half the time step")
+    halved = TotalLagrangian(run.problem, 0.5 * step)
+    nodes = halved.run(twin.body.start, run.velocity, run.held, run.knots)
+    half_track = twin.observe(run.at_frames(twin.body.start, nodes), scene.times)
+    tell(3, 4, "finer cells")
+    finer = refined(scene, twin, particle_budget, refinement)
+    finer_track = finer.observe(finer.simulate_nodes(control_times, controls, scene.times), scene.times)
+    tell(4, 4, "done")
+    return Numerics(
+        equivalent_drag_per_s=damping.equivalent_drag_per_s,
+        damping_ratio=damping.damping_ratio,
+        dominant_mode_hz=damping.mode_hz,
+        lost_share=float(ledger.lost[-1] / max(ledger.turnover, 1e-300)),
+        time_step_s=step,
+        half_step_m=_rms(half_track - track),
+        finer_cells_m=_rms(finer_track - track),
+        refinement=refinement,
+        particles=twin.lattice.fill.size,
+        finer_particles=finer.lattice.fill.size,
+        simulations=4,
+        seconds=time.perf_counter() - begun,
+    )
+
+
+def refined(scene: Scene, twin: Twin, particle_budget: int, refinement: float = REFINEMENT) -> Twin:
+    """The same twin on a lattice whose cells are ``refinement`` times smaller, with the same material points."""
+    finer = build_twin(scene, particle_budget, twin.device, refinement)
+    body = replace(finer.body, points=twin.body.points, offsets=twin.body.offsets)
+    return replace(
+        finer,
+        body=body,
+        law=twin.law,
+        gravity_m_s2=twin.gravity_m_s2,
+        air_drag_per_s=twin.air_drag_per_s,
+        ground_height_m=twin.ground_height_m,
+        ground_friction=twin.ground_friction,
+        effects=twin.effects,
+    )
+
+
+@dataclass(frozen=True)
+class FreeSwing:
+    """A free swing without any physical friction.
+
+    Attributes:
+        equivalent_drag_per_s: linear drag that would lose as much energy [1/s].
+        mode_hz: strongest frequency of the tracked points; None where the run shows no whole period.
+        ledger: where the energy went.
+    """
+
+    equivalent_drag_per_s: float
+    mode_hz: float | None
+    ledger: EnergyLedger
+
+    @property
+    def damping_ratio(self) -> float | None:
+        """c / (2 omega): an amplitude loses exp(-2 pi ratio) in a period."""
+        return None if self.mode_hz is None else self.equivalent_drag_per_s / (4 * np.pi * self.mode_hz)
+
+
+def free_swing(scene: Scene, twin: Twin, *, time_step_s: float | None = None) -> FreeSwing:
+    """The twin's body, let go at the start of the scene with all physical friction off and its grips at rest.
+
+    A body that hangs in balance is kicked sideways first. Frames are those of the scene.
+
+    Raises:
+        SimulationError: the run cannot be trusted.
+    """
+    silent = replace(
+        twin,
+        law=without_friction(twin.law),
+        air_drag_per_s=0.0,
+        ground_friction=0.0,
+        effects=(),
+        release_s=0.0,
+    )
+    control_times, controls = scene.control_track()
+    still = np.repeat(controls[:1], len(control_times), axis=0)
+    run = silent.integration(control_times, still, scene.times)
+    start, velocity = twin.body.start, run.velocity.copy()
+    size = float(np.ptp(start, axis=0).max())
+    held = np.unique(run.held.nodes)
+    nodes, ledger = run_with_ledger(
+        run.problem, start, velocity, run.held, run.knots, time_step_s=time_step_s
+    )
+    if np.linalg.norm(nodes - nodes[0], axis=2).max() < _STILL * size:
+        free = np.setdiff1d(np.arange(len(start)), held)
+        velocity[free] += _KICK_PER_S * size * _sideways(twin.gravity_m_s2)
+        nodes, ledger = run_with_ledger(
+            run.problem, start, velocity, run.held, run.knots, time_step_s=time_step_s
+        )
+    spent = float(np.trapezoid(ledger.kinetic - ledger.kinetic.min(), ledger.times))
+    drag = 0.0 if spent == 0 else float(ledger.lost[-1]) / (2 * spent)
+    tracks = silent.track_nodes(run.at_frames(start, nodes))
+    return FreeSwing(drag, dominant_frequency(scene.times, tracks), ledger)
+
+
+def dominant_frequency(times: np.ndarray, tracks: np.ndarray) -> float | None:
+    """Strongest frequency [Hz] of the first principal motion of tracks (T, N, 3); None below 1.5 periods.
+
+    Args:
+        times: (T,) [s], even or not (they are made even by interpolation).
+        tracks: points, (T, N, 3) [m].
+    """
+    even = np.linspace(times[0], times[-1], len(times))
+    motion = (tracks - tracks.mean(axis=0)).reshape(len(tracks), -1)
+    first = np.linalg.svd(motion, full_matrices=False)
+    signal = np.interp(even, times, first[0][:, 0] * first[1][0])
+    if np.ptp(signal) == 0:
+        return None
+    padded = 8 * len(signal)
+    power = np.abs(np.fft.rfft((signal - signal.mean()) * np.hanning(len(signal)), padded))
+    frequency = np.fft.rfftfreq(padded, even[1] - even[0])
+    least = _LEAST_PERIODS / (times[-1] - times[0])
+    allowed = np.flatnonzero(frequency >= least)
+    peak = allowed[np.argmax(power[allowed])]
+    if peak == allowed[0] or peak + 1 >= len(power):
+        return None
+    left, middle, right = np.log(power[peak - 1 : peak + 2])
+    shift = 0.5 * (left - right) / (left - 2 * middle + right)
+    return float((peak + shift) * frequency[1])
+
+
+def _sideways(gravity: np.ndarray) -> np.ndarray:
+    down = gravity / max(float(np.linalg.norm(gravity)), 1e-12)
+    axis = np.eye(3)[int(np.argmin(np.abs(down)))]
+    side = axis - (axis @ down) * down
+    return side / np.linalg.norm(side)
+
+
+def _rms(difference: np.ndarray) -> float:
+    """Root mean squared length of vectors (T, N, 3)."""
+    return float(np.sqrt(np.mean(np.sum(difference**2, axis=-1))))
