@@ -27,6 +27,7 @@ class SolidLaw:
 
     name: ClassVar[str] = "neo_hookean"
     stress: ClassVar[Stress] = neo_hookean.STRESS
+    further_moduli: ClassVar[tuple[str, ...]] = ()  # names of the moduli after mu and lambda
 
     youngs_modulus_pa: float
     poissons_ratio: float = 0.35

@@ -46,6 +46,7 @@ class TransverselyIsotropic(SolidLaw):
 
     name: ClassVar[str] = "transversely_isotropic"
     stress: ClassVar[Stress] = STRESS
+    further_moduli: ClassVar[tuple[str, ...]] = ("fibre_modulus",)
 
     fibre_modulus_pa: float = 0.0
     fibre_azimuth_rad: float = 0.0

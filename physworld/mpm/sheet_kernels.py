@@ -39,15 +39,15 @@ SURFACE = r"""
 
 MODULI = r"""
         const V K = *(const V*)&membrane.data[cell * 4 + q];
-        const V D_ = *(const V*)&bending.data[cell * 4 + q];
+        const V Kb = *(const V*)&bending.data[cell * 4 + q];
         const double* C = shape.data;   // C11, C22, C12, C33, then those of bending
         #define PW_RESULTANTS(out, e) { \
             out[0] = (e[0] * C[0] + e[1] * C[2]) * K; \
             out[1] = (e[0] * C[2] + e[1] * C[1]) * K; \
             out[2] = e[2] * (K * C[3]); \
-            out[3] = (e[3] * C[4] + e[4] * C[6]) * D_; \
-            out[4] = (e[3] * C[6] + e[4] * C[5]) * D_; \
-            out[5] = e[5] * (D_ * C[7]); }
+            out[3] = (e[3] * C[4] + e[4] * C[6]) * Kb; \
+            out[4] = (e[3] * C[6] + e[4] * C[5]) * Kb; \
+            out[5] = e[5] * (Kb * C[7]); }
 """
 
 LOADS = r"""

@@ -12,7 +12,7 @@ The kernel is a template over the text of a law's stress (:mod:`physworld.materi
 builds it once a law, in a Warp module of its own, so that a process compiles only the laws it uses. The pieces of the
 text are shared with the tangent (:mod:`physworld.mpm.solid_tangent_kernels`).
 
-Legend: F deformation gradient, J its determinant, cof = J F^-T, c moduli times volume, scale 1/dx of the axes.
+Legend: F deformation gradient, H = F - I, J its determinant, cof = J F^-T, c moduli times volume, scale 1/dx.
 """
 
 from __future__ import annotations
@@ -38,30 +38,31 @@ LOAD_DISPLACEMENTS = r"""
     const float scale[3] = {inv_dx0, inv_dx1, inv_dx2};
 """
 
-DEFORMATION = r"""
-        V H[9], F[9];
-        for (int k = 0; k < 9; ++k) H[k] = V{};
+_GRADIENT = r"""
+        V INTO[9];
+        for (int k = 0; k < 9; ++k) INTO[k] = V{};
         for (int a = 0; a < 27; ++a) {
             const V g0 = *(const V*)&gradients.data[(3 * a + 0) * 8 + q];
             const V g1 = *(const V*)&gradients.data[(3 * a + 1) * 8 + q];
             const V g2 = *(const V*)&gradients.data[(3 * a + 2) * 8 + q];
             for (int i = 0; i < 3; ++i) {
-                const float ui = u[3 * a + i];
-                H[3 * i + 0] += ui * g0;
-                H[3 * i + 1] += ui * g1;
-                H[3 * i + 2] += ui * g2;
+                const float value = VALUES[3 * a + i];
+                INTO[3 * i + 0] += value * g0;
+                INTO[3 * i + 1] += value * g1;
+                INTO[3 * i + 2] += value * g2;
             }
         }
-        for (int k = 0; k < 9; ++k) {
-            H[k] = H[k] * scale[k % 3];
-            F[k] = k % 4 == 0 ? H[k] + 1.0f : H[k];
-        }
+        for (int k = 0; k < 9; ++k) INTO[k] = INTO[k] * scale[k % 3];
+"""
+
+LOAD_MODULI = r"""
         V c[MODULI];
         for (int m = 0; m < MODULI; ++m) c[m] = *(const V*)&moduli_volume.data[(cell * MODULI + m) * 8 + q];
 """
 
 COFACTOR = r"""
-        S cof[9];
+        S F[9], cof[9];
+        for (int k = 0; k < 9; ++k) F[k] = k % 4 == 0 ? H[k] + 1.0f : H[k];
         cof[0] = F[4] * F[8] - F[5] * F[7];
         cof[1] = F[5] * F[6] - F[3] * F[8];
         cof[2] = F[3] * F[7] - F[4] * F[6];
@@ -105,17 +106,27 @@ _VISCOSITY = r"""
 """
 
 _SCATTER = r"""
-        for (int k = 0; k < 9; ++k) P[k] = P[k] * scale[k % 3];
+        for (int k = 0; k < 9; ++k) STRESS[k] = STRESS[k] * scale[k % 3];
         for (int a = 0; a < 27; ++a) {
             const V g0 = *(const V*)&gradients.data[(3 * a + 0) * 8 + q];
             const V g1 = *(const V*)&gradients.data[(3 * a + 1) * 8 + q];
             const V g2 = *(const V*)&gradients.data[(3 * a + 2) * 8 + q];
             for (int i = 0; i < 3; ++i) {
-                const V t = P[3 * i] * g0 + P[3 * i + 1] * g1 + P[3 * i + 2] * g2;
-                PW_ADD(force.data[3 * node[a] + i], -lane::sum(t));
+                const V t = STRESS[3 * i] * g0 + STRESS[3 * i + 1] * g1 + STRESS[3 * i + 2] * g2;
+                PW_ADD(OUT.data[3 * node[a] + i], SIGN lane::sum(t));
             }
         }
 """
+
+
+def gradient(values: str, into: str) -> str:
+    """The text that finds the gradient ``into``[9] of 27 nodal vectors ``values`` at the particles."""
+    return _GRADIENT.replace("VALUES", values).replace("INTO", into)
+
+
+def scatter(stress: str, out: str, sign: str = "-") -> str:
+    """The text that adds ``sign`` the nodal forces of ``stress``[9] to ``out``; it scales the stress in place."""
+    return _SCATTER.replace("STRESS", stress).replace("OUT", out).replace("SIGN", sign)
 
 
 def _snippet(stress: Stress, moduli: int) -> str:
@@ -124,12 +135,13 @@ def _snippet(stress: Stress, moduli: int) -> str:
         + f"    const int MODULI = {moduli};\n    typedef V S;\n    const float* number = numbers.data;\n"
         + LOAD_DISPLACEMENTS
         + "    for (int q = 0; q < 8; q += LANES) {\n"
-        + DEFORMATION
+        + gradient("u", "H")
+        + LOAD_MODULI
         + COFACTOR
         + (_REPORT + FLOOR_J if stress.infinite_at_inversion else "")
         + f"        V P[9];\n        {{\n{stress.body}\n        }}\n"
         + _VISCOSITY
-        + _SCATTER
+        + scatter("P", "force")
         + "    }\n"
     )
 
