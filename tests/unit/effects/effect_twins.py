@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from made_scene import FPS, box_body, made_scene
 
+from physworld.mpm.total_lagrangian import nodal_mass
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Ground, Scene
 from physworld.twin import Twin, build_twin
 
@@ -57,4 +58,25 @@ def simulated(twin: Twin, scene: Scene) -> np.ndarray:
     return twin.simulate_nodes(*scene.control_track(), scene.times)
 
 
-__all__ = ["FPS", "FRAMES", "SCENES", "TWINS", "simulated"]
+def loose(name: str, gravity: tuple[float, float, float] = (0.0, 0.0, 0.0), **parameters: float) -> Twin:
+    """The twin held by nobody, far from the ground."""
+    twin = replace(TWINS[name], held_nodes=(), controller_groups=(), controllers_start=np.empty((0, 3)))
+    return replace(twin, ground_height_m=None, gravity_m_s2=np.array(gravity)).with_parameters(**parameters)
+
+
+def moved(twin: Twin, times: np.ndarray, start_velocity: np.ndarray | None = None) -> np.ndarray:
+    """Nodes (T, n, 3) under controls that stand still."""
+    if start_velocity is not None:
+        twin = replace(twin, body=replace(twin.body, start_velocity=start_velocity))
+    still = np.repeat(twin.controllers_start[None], 2, axis=0)
+    return twin.simulate_nodes(times[[0, -1]], still, times)
+
+
+def centroid(twin: Twin, nodes: np.ndarray) -> np.ndarray:
+    """Centre of mass relative to the first frame's, (T, 3)."""
+    mass = nodal_mass(twin.lattice, twin.law, None)
+    centre = np.einsum("n,tni->ti", mass, nodes) / mass.sum()
+    return centre - centre[0]
+
+
+__all__ = ["FPS", "FRAMES", "SCENES", "TWINS", "centroid", "loose", "moved", "simulated"]
