@@ -110,20 +110,9 @@ _FLOAT_FUNCTIONS = r"""
 """
 
 
-_MACROS = r"""
-    #define PW_SUM(v) lane::sum(v)
-    #define PW_SQRT(v) lane::sqrt(v)
-"""
-
-
 def lanes_float8(helpers: str = "") -> str:
     """Preamble for 8 particles in single precision: V, D, lane, LANES, PW_ADD; ``helpers`` become members of lane."""
-    return (
-        _FLOAT8 + _DUAL.replace("NUMBER", "float") + _FLOAT_FUNCTIONS.replace("// HELPERS", helpers) + _MACROS
-    )
-
-
-LANES_FLOAT8 = lanes_float8()
+    return _FLOAT8 + _DUAL.replace("NUMBER", "float") + _FLOAT_FUNCTIONS.replace("// HELPERS", helpers)
 
 
 def lanes_double(lanes: int) -> str:
@@ -160,5 +149,4 @@ def lanes_double(lanes: int) -> str:
             return D{{r, v.b * 0.5 / r}};
         }}
     }};
-{_MACROS}
 """

@@ -26,7 +26,7 @@ from typing import Any
 
 import warp as wp
 
-from physworld.mpm.lanes import LANES_FLOAT8, lanes_double
+from physworld.mpm.lanes import lanes_double, lanes_float8
 
 _ROWS = r"""
     #define FIELD(k) (*(const V*)&fields.data[((k) * cells + cell) * WIDTH + q])
@@ -52,7 +52,7 @@ _ROWS = r"""
 """
 
 _SOLID = (
-    LANES_FLOAT8
+    lanes_float8()
     + _ROWS.replace("WIDTH", "8")
     + r"""
     const int* node = &cell_nodes.data[cell * 27];
@@ -104,7 +104,7 @@ MODEL
             const V g2 = *(const V*)&table.data[(3 * a + 2) * 8 + q];
             for (int i = 0; i < 3; ++i) {
                 const V t = P[3 * i] * g0 + P[3 * i + 1] * g1 + P[3 * i + 2] * g2;
-                PW_ADD(force.data[3 * node[a] + i], -PW_SUM(t));
+                PW_ADD(force.data[3 * node[a] + i], -lane::sum(t));
             }
         }
     }
@@ -135,7 +135,7 @@ _SHEET = (
         V n[3] = {d[0][1] * d[1][2] - d[0][2] * d[1][1], d[0][2] * d[1][0] - d[0][0] * d[1][2],
                   d[0][0] * d[1][1] - d[0][1] * d[1][0]};
         const V area2 = DOT(n, n) + 1e-24;
-        const V inv_area = 1.0 / PW_SQRT(area2);
+        const V inv_area = 1.0 / lane::sqrt(area2);
         for (int i = 0; i < 3; ++i) n[i] = n[i] * inv_area;
         const V strain[6] = {0.5 * (g11 - 1.0), 0.5 * (g22 - 1.0), 0.5 * g12, DOT(n, d[2]), DOT(n, d[3]), DOT(n, d[4])};
         V stress[6] = {V{}, V{}, V{}, V{}, V{}, V{}};
@@ -163,7 +163,7 @@ MODEL
                 const V g = *(const V*)&table.data[(5 * a + k) * 4 + q];
                 for (int i = 0; i < 3; ++i) f[i] += S[k][i] * g;
             }
-            for (int i = 0; i < 3; ++i) PW_ADD(force.data[3 * node[a] + i], -PW_SUM(f[i]));
+            for (int i = 0; i < 3; ++i) PW_ADD(force.data[3 * node[a] + i], -lane::sum(f[i]));
         }
     }
     #undef DOT
@@ -204,7 +204,7 @@ _ROD = (
             }
         }
         const V a2 = DOT(t, t) + 1e-24;
-        const V length = PW_SQRT(a2);
+        const V length = lane::sqrt(a2);
         const V inv_length = 1.0 / length;
         const V inv_a2 = inv_length * inv_length;
         const V inv_a3 = inv_a2 * inv_length;
@@ -223,7 +223,7 @@ MODEL
         for (int a = 0; a < 3; ++a) {
             const V g = *(const V*)&table.data[(2 * a) * 2 + q];
             const V h = *(const V*)&table.data[(2 * a + 1) * 2 + q];
-            for (int i = 0; i < 3; ++i) PW_ADD(force.data[3 * node[a] + i], -PW_SUM(St[i] * g + Sc[i] * h));
+            for (int i = 0; i < 3; ++i) PW_ADD(force.data[3 * node[a] + i], -lane::sum(St[i] * g + Sc[i] * h));
         }
     }
     #undef CARRY
