@@ -146,100 +146,127 @@ class TotalLagrangian:
             UnstableSimulation: a cell inverted or a state is not finite.
             ParticlesLeftTheGrid: a node is absurdly far from its start.
         """
-        device = self.problem.device
-        nodes = len(self.mass)
-        slot = np.full(nodes, -1, dtype=np.int32)
-        slot[held.nodes] = np.arange(len(held.nodes), dtype=np.int32)
+        run = Run(self, x, v, held, times)
         frames = len(times)
-
-        def upload(values: np.ndarray, dtype: type = wp.float64) -> wp.array:
-            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
-
-        x_d, v_d = upload(x.reshape(-1)), upload(v.reshape(-1))
-        force = wp.zeros(3 * nodes, dtype=wp.float64, device=device)
-        clock = wp.zeros(3, dtype=wp.float64, device=device)
-        counter = wp.zeros(3, dtype=wp.int32, device=device)
-        width = max(3 * len(held.nodes), 1)
-        paths = np.zeros((2, frames, width))
-        paths[0, :, : 3 * len(held.nodes)] = held.positions.reshape(frames, -1)
-        paths[1, :, : 3 * len(held.nodes)] = held.velocities.reshape(frames, -1)
-        node_inputs = [
-            upload(self.mass), upload(slot, wp.int32), upload(paths[0]), upload(paths[1]),
-            wp.vec3d(*self.problem.gravity_m_s2), wp.float64(self.problem.drag_per_s), clock, counter,
-        ]  # fmt: skip
-
-        for term in self.terms:
-            term.begin(times)
-        self.forces.inverted.zero_()
-        self.forces.launch(x_d, clock, force)  # remembers the first strains, so that no friction acts yet
-        v_d.assign(self._half_a_step_back(v, x_d, clock, counter, force, times[1] - times[0]).reshape(-1))
-        force.zero_()
-
-        def substep() -> None:
-            self.forces.launch(x_d, clock, force)
-            for term in self.terms:
-                term.launch(x_d, v_d, clock, counter, force)
-            wp.launch(advance_nodes, dim=nodes, inputs=node_inputs, outputs=[force, x_d, v_d], device=device)
-            wp.launch(advance_counter, dim=1, inputs=[counter], device=device)
-
-        with wp.ScopedCapture(device=device) as capture:
-            for _ in range(_CHUNK):
-                substep()
-
-        recorded = np.empty((frames, nodes, 3))
+        recorded = np.empty((frames, *x.shape))
         recorded[0] = x
-        size = float(np.ptp(x, axis=0).max()) + float(self.problem.lattice.spacing.max())
         for frame in range(frames - 1):
-            interval = times[frame + 1] - times[frame]
-            chunks = self._chunks(interval)
-            dt = interval / (chunks * _CHUNK)
-            clock.assign(np.array([interval, 1.0 / dt, dt]))
-            counter.assign(np.array([frame, 0, chunks * _CHUNK], dtype=np.int32))
-            for _ in range(chunks):
-                wp.capture_launch(capture.graph)
-            self.substeps += chunks * _CHUNK
-            recorded[frame + 1] = x_d.numpy().reshape(nodes, 3)
-            self._check(recorded[frame + 1], x, size, times[frame + 1], dt)
+            recorded[frame + 1] = run.advance(frame)
             if progress is not None:
                 progress(frame + 1, frames - 1)
         return recorded
 
-    def _chunks(self, interval: float) -> int:
-        return max(1, int(np.ceil(interval / (self.time_step_s * _CHUNK))))
+    def substeps_of(self, interval: float) -> int:
+        """Substeps that an interval between two frames takes: whole chunks."""
+        return _CHUNK * max(1, int(np.ceil(interval / (self.time_step_s * _CHUNK))))
 
-    def _half_a_step_back(
-        self,
-        v: np.ndarray,
-        x_d: wp.array,
-        clock: wp.array,
-        counter: wp.array,
-        force: wp.array,
-        interval: float,
-    ) -> np.ndarray:
+
+class Run:
+    """One run of a solver on its device, frame by frame: see :meth:`TotalLagrangian.run` for the arguments.
+
+    Attributes:
+        x, v: the state, (3n,) float64 [m], [m/s]; velocities half a substep before the positions.
+        clock, counter: (frame interval [s], 1/dt [1/s], dt [s]) and (frame, substep, substeps).
+    """
+
+    def __init__(
+        self, solver: TotalLagrangian, x: np.ndarray, v: np.ndarray, held: HeldNodes, times: np.ndarray
+    ) -> None:
+        device, nodes, frames = solver.problem.device, len(solver.mass), len(times)
+        slot = np.full(nodes, -1, dtype=np.int32)
+        slot[held.nodes] = np.arange(len(held.nodes), dtype=np.int32)
+
+        def upload(values: np.ndarray, dtype: type = wp.float64) -> wp.array:
+            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
+
+        self._solver, self._start, self._times = solver, x, times
+        self._size = float(np.ptp(x, axis=0).max()) + float(solver.problem.lattice.spacing.max())
+        self.x, self.v = upload(x.reshape(-1)), upload(v.reshape(-1))
+        self.force = wp.zeros(3 * nodes, dtype=wp.float64, device=device)
+        self.clock = wp.zeros(3, dtype=wp.float64, device=device)
+        self.counter = wp.zeros(3, dtype=wp.int32, device=device)
+        width = max(3 * len(held.nodes), 1)
+        paths = np.zeros((2, frames, width))
+        paths[0, :, : 3 * len(held.nodes)] = held.positions.reshape(frames, -1)
+        paths[1, :, : 3 * len(held.nodes)] = held.velocities.reshape(frames, -1)
+        problem = solver.problem
+        self._node_inputs = [
+            upload(solver.mass), upload(slot, wp.int32), upload(paths[0]), upload(paths[1]),
+            wp.vec3d(*problem.gravity_m_s2), wp.float64(problem.drag_per_s), self.clock, self.counter,
+        ]  # fmt: skip
+
+        for term in solver.terms:
+            term.begin(times)
+        forces = solver.forces
+        forces.inverted.zero_()
+        forces.launch(self.x, self.clock, self.force)  # remembers the first strains: no friction acts yet
+        self.v.assign(self._half_a_step_back(v, times[1] - times[0]).reshape(-1))
+        self.force.zero_()
+        with wp.ScopedCapture(device=device) as capture:
+            for _ in range(_CHUNK):
+                self._substep()
+        self._graph = capture.graph
+
+    def advance(self, frame: int) -> np.ndarray:
+        """Integrate from ``times[frame]`` to the next; positions there, (n, 3) [m].
+
+        Raises:
+            UnstableSimulation: a cell inverted or a state is not finite.
+            ParticlesLeftTheGrid: a node is absurdly far from its start.
+        """
+        substeps = self._set_clock(frame)
+        for _ in range(substeps // _CHUNK):
+            wp.capture_launch(self._graph)
+        self._solver.substeps += substeps
+        now = self.x.numpy().reshape(-1, 3).copy()
+        self._check(now, self._times[frame + 1])
+        return now
+
+    def _substep(self) -> None:
+        solver, device = self._solver, self._solver.problem.device
+        solver.forces.launch(self.x, self.clock, self.force)
+        for term in solver.terms:
+            term.launch(self.x, self.v, self.clock, self.counter, self.force)
+        wp.launch(
+            advance_nodes,
+            dim=len(solver.mass),
+            inputs=self._node_inputs,
+            outputs=[self.force, self.x, self.v],
+            device=device,
+        )
+        wp.launch(advance_counter, dim=1, inputs=[self.counter], device=device)
+
+    def _set_clock(self, frame: int) -> int:
+        interval = self._times[frame + 1] - self._times[frame]
+        substeps = self._solver.substeps_of(interval)
+        dt = interval / substeps
+        self.clock.assign(np.array([interval, 1.0 / dt, dt]))
+        self.counter.assign(np.array([frame, 0, substeps], dtype=np.int32))
+        return substeps
+
+    def _half_a_step_back(self, v: np.ndarray, interval: float) -> np.ndarray:
         """Velocities (n, 3) half a substep before the start, where a scheme of second order wants them.
 
-        ``force`` holds the internal forces at the start; those of the terms are added.
+        ``self.force`` holds the internal forces at the start; those of the terms are added.
         """
-        substeps = self._chunks(interval) * _CHUNK
-        dt = interval / substeps
-        clock.assign(np.array([interval, 1.0 / dt, dt]))
-        counter.assign(np.array([0, 0, substeps], dtype=np.int32))
-        v_d = wp.array(np.ascontiguousarray(v).reshape(-1), dtype=wp.float64, device=self.problem.device)
-        for term in self.terms:
-            term.launch(x_d, v_d, clock, counter, force)
-        pull = force.numpy().reshape(-1, 3) / self.mass[:, None]
-        return v - 0.5 * dt * (pull + self.problem.gravity_m_s2 - self.problem.drag_per_s * v)
+        solver = self._solver
+        dt = interval / self._set_clock(0)
+        for term in solver.terms:
+            term.launch(self.x, self.v, self.clock, self.counter, self.force)
+        pull = self.force.numpy().reshape(-1, 3) / solver.mass[:, None]
+        return v - 0.5 * dt * (pull + solver.problem.gravity_m_s2 - solver.problem.drag_per_s * v)
 
-    def _check(self, now: np.ndarray, start: np.ndarray, size: float, time: float, dt: float) -> None:
-        if self.forces.inverted.numpy()[0] or not np.isfinite(now).all():
+    def _check(self, now: np.ndarray, time: float) -> None:
+        dt = float(self.clock.numpy()[2])
+        if self._solver.forces.inverted.numpy()[0] or not np.isfinite(now).all():
             raise UnstableSimulation(
                 f"the body inverted or blew up at t = {time:.4f} s with time step {dt:.3g} s "
                 f"({int((~np.isfinite(now)).any(axis=1).sum())} of {len(now)} nodes not finite)"
             )
-        farthest = float(np.abs(now - start).max())
-        if farthest > _REACH * size:
+        farthest = float(np.abs(now - self._start).max())
+        if farthest > _REACH * self._size:
             raise ParticlesLeftTheGrid(
-                f"a node is {farthest:.3g} m from its start at t = {time:.4f} s; the body is {size:.3g} m long"
+                f"a node is {farthest:.3g} m from its start at t = {time:.4f} s; the body is {self._size:.3g} m long"
             )
 
 
