@@ -1,5 +1,7 @@
 """Calibration of a twin on the training frames of a recording."""
 
-from physworld.calibrate.global_stage import CalibrationConfig, Estimate, FitResult, calibrate
+from physworld.calibrate.estimates import Correlations, Estimate
+from physworld.calibrate.global_stage import CalibrationConfig, FitResult, calibrate
+from physworld.calibrate.journal import Journal
 
-__all__ = ["CalibrationConfig", "Estimate", "FitResult", "calibrate"]
+__all__ = ["CalibrationConfig", "Correlations", "Estimate", "FitResult", "Journal", "calibrate"]

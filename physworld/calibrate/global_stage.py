@@ -3,33 +3,46 @@
 1. Scan the stiffness over its decades on a first window of frames, where phases have not slipped yet, and follow the
    three best starts there by Gauss-Newton.
 2. Gauss-Newton on all training frames from the two best.
-3. Add air drag and internal friction, the better one first, each only if it lowers the training cost by more
-   than 2 %; drop again what the others made needless.
+3. Free optional parameters (drag, internal friction, Poisson's ratio, an undeclared ground's friction), the best one
+   first. A screening by one run each skips those that cannot help to first order; of the others each must lower
+   the training cost by more than 2 % (Poisson's ratio: 15 %). Drop again what the others made needless.
 4. Shift the tracked points inside the body by their mean residual (frame 0 is noisy too), clipped at 3 sigma.
-5. Gauss-Newton again on all that were kept; intervals from blocks of frames.
+5. Gauss-Newton again on all that were kept; hold at its prior what the data turn out not to fix; intervals and
+   correlations from the sensitivities at the optimum.
 
-Only training frames enter. The simulation's budget counts every run.
+Only training frames enter. The simulation's budget counts every run. A journal of the finished steps makes it
+resumable: see :mod:`physworld.calibrate.journal`.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import numpy as np
 
-from physworld.calibrate.least_squares import Solution, block_covariance, interval_factor
+from physworld.calibrate.estimates import (
+    UNIDENTIFIED_HALF_WIDTH,
+    Correlations,
+    Estimate,
+    estimates,
+    held_at_priors,
+)
+from physworld.calibrate.journal import Journal
+from physworld.calibrate.least_squares import Solution
+from physworld.calibrate.losses import training_losses
 from physworld.calibrate.parameters import Parameter, parameters_of
-from physworld.calibrate.search import Progress, Search
+from physworld.calibrate.search import Optimum, Progress, Search
+from physworld.materials.library import with_law
 from physworld.scene import Scene
 from physworld.twin import Twin, build_twin
 
-_DAMPING_GAIN = 0.02  # share of the training cost that a damping parameter must remove
-_UNIDENTIFIED_LOG_WIDTH = (
-    1.5  # half width of a 95 % interval in the logarithm beyond which a value is not known
+_LEAST_SCREENED = (
+    0.1  # share of the gain that it needs which a parameter must show to first order to be tried
 )
+_NO_LOSS = 0.02  # relative rise of the training cost that holding a parameter at its prior may cause
 
 
 @dataclass(frozen=True)
@@ -41,23 +54,14 @@ class CalibrationConfig:
         max_simulations: at most this many runs over the training frames.
         device: Warp device of the simulations.
         damping: "auto" adds drag and internal friction where the data ask; "none" keeps the declared physics only.
+        law: name of the elastic law (:mod:`physworld.materials.library`); None for the shape's usual one.
     """
 
     particle_budget: int = 2000
     max_simulations: int = 160
     device: str = "cpu"
     damping: Literal["auto", "none"] = "auto"
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A calibrated number: value, unit, 95 % interval (None where none can be given), and whether data fix it."""
-
-    value: float
-    unit: str
-    ci95: tuple[float, float] | None = None
-    identified: bool = True
-    note: str = ""
+    law: str | None = None
 
 
 @dataclass(frozen=True)
@@ -66,9 +70,11 @@ class FitResult:
 
     Attributes:
         twin: with the calibrated parameters.
-        parameters: estimates by name.
+        parameters: estimates by name; what was searched first.
+        correlations: of the searched parameters.
         tracks: tracked points over all frames, open loop from the first, (T, N, 3) [m].
         particles: particles over all frames, (T, P, 3) [m].
+        losses: the paper's loss and the noise-weighted misfit on the training frames.
         simulations: runs used.
         seconds: wall time.
         loss_history: root mean squared training residual after each run [m], best so far.
@@ -77,8 +83,10 @@ class FitResult:
 
     twin: Twin
     parameters: dict[str, Estimate]
+    correlations: Correlations
     tracks: np.ndarray
     particles: np.ndarray
+    losses: dict[str, Any]
     simulations: int
     seconds: float
     loss_history: list[float]
@@ -90,6 +98,7 @@ def calibrate(
     config: CalibrationConfig | None = None,
     progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
+    journal: Journal | None = None,
 ) -> FitResult:
     """Fit a twin to the training frames of ``scene``.
 
@@ -98,58 +107,40 @@ def calibrate(
         config: settings; None for the defaults.
         progress: called with (runs done, runs at most, message).
         cancelled: polled every frame of every run.
+        journal: finished steps of an earlier attempt, which are not simulated again.
 
     Raises:
         CalibrationError: no start gave a usable simulation.
         Cancelled: ``cancelled`` returned true.
         SceneUnsupported: the scene declares too little for a body.
+        ValueError: there is no such law for the body.
     """
     config = config or CalibrationConfig()
     started = time.perf_counter()
-    search = Search(
-        scene,
-        build_twin(scene, config.particle_budget, config.device),
-        config.max_simulations,
-        progress,
-        cancelled,
+    search = Search(scene, prior_twin(scene, config), config.max_simulations, progress, cancelled, journal)
+    parameters = parameters_of(
+        search.twin,
+        separate_bending=scene.body.thickness_m is None and scene.body.size_m is None,
+        damping=config.damping == "auto",
+        ground_friction=scene.ground is not None and scene.ground.friction is None,
     )
-    separate = scene.body.thickness_m is None and scene.body.size_m is None
-    parameters = parameters_of(search.twin, separate)
-    stiffness = [p for p in parameters if p.stage == "stiffness"]
-    solution = search.scan(stiffness)
-    kept, rejected = list(stiffness), {}
-    candidates = [p for p in parameters if p.stage == "damping"] if config.damping == "auto" else []
-    while candidates:
-        trials = [
-            search.solve([*kept, c], np.append(solution.theta, np.log(c.start[0])), 4) for c in candidates
-        ]
-        costs = [t.cost if np.isfinite(t.cost) else np.inf for t in trials]  # not a number: the budget ended
-        best = int(np.argmin(costs))
-        if not costs[best] < (1.0 - _DAMPING_GAIN) * solution.cost:
-            rejected.update(
-                {c.name: 1.0 - t.cost / solution.cost for c, t in zip(candidates, trials, strict=True)}
-            )
-            break
-        kept, solution = [*kept, candidates.pop(best)], trials[best]
-    for needless in [p for p in kept if p.stage == "damping"]:
-        others = [k for k, p in enumerate(kept) if p is not needless]
-        trial = search.solve([kept[k] for k in others], solution.theta[others], 2)
-        if trial.cost * (1.0 - _DAMPING_GAIN) <= solution.cost:
-            rejected[needless.name] = 1.0 - solution.cost / trial.cost
-            kept, solution = [kept[k] for k in others], trial
-    if search.shift_points(kept, solution.theta):
-        solution = search.solve(kept, solution.theta, 3)
-    twin = search.twin_at(kept, solution.theta)
+    kept, optimum, rejected = _select(search, parameters)
+    if search.shift_points(kept, optimum.theta):
+        optimum = search.solve(kept, optimum.theta, 3)
+    kept, optimum, solution = _hold_the_unknown(search, kept, optimum, rejected)
+    twin = search.twin_at(kept, optimum.theta)
+    found, correlated = _estimates(search, kept, optimum, solution)
+    held = held_at_priors(scene, twin, rejected, {p.name: p.unit for p in parameters})
     times, controls = scene.control_track()
     nodes = twin.simulate_nodes(times, controls, scene.times)
+    tracks = twin.observe(nodes, scene.times)
     return FitResult(
         twin=twin,
-        parameters={
-            **_estimates(kept, solution, search.frame_of_residual(search.end)),
-            **_priors(scene, twin, rejected),
-        },
-        tracks=twin.track_nodes(nodes),
+        parameters={**found, **{name: e for name, e in held.items() if name not in found}},
+        correlations=correlated,
+        tracks=tracks,
         particles=twin.particles_at(nodes),
+        losses=training_losses(scene, tracks),
         simulations=search.simulations,
         seconds=time.perf_counter() - started,
         loss_history=search.history,
@@ -157,54 +148,90 @@ def calibrate(
     )
 
 
-def _estimates(parameters: list[Parameter], solution: Solution, frames: np.ndarray) -> dict[str, Estimate]:
-    covariance = block_covariance(solution, frames)
-    factor = interval_factor(len(np.unique(frames)), len(parameters))
-    found = {}
-    for k, parameter in enumerate(parameters):
-        value = float(np.exp(solution.theta[k]))
-        half = factor * float(np.sqrt(covariance[k, k])) if covariance[k, k] > 0 else float("inf")
-        insensitive = not np.any(solution.jacobian[:, k])
-        at_bound = not (parameter.low * 1.01 < value < parameter.high * 0.99)
-        identified = half < _UNIDENTIFIED_LOG_WIDTH and not at_bound and not insensitive
-        note = "" if identified else _why_not_identified(at_bound, insensitive)
-        interval = (
-            (value * float(np.exp(-min(half, 50))), value * float(np.exp(min(half, 50))))
-            if np.isfinite(half)
-            else None
+def prior_twin(scene: Scene, config: CalibrationConfig) -> Twin:
+    """The twin before its calibration, under the configured law."""
+    twin = build_twin(scene, config.particle_budget, config.device)
+    return twin if config.law is None else replace(twin, law=with_law(twin.law, config.law))
+
+
+def _select(search: Search, parameters: list[Parameter]) -> tuple[list[Parameter], Optimum, dict[str, float]]:
+    """Steps 1 to 3: the parameters to keep, their optimum, and what the others would have removed."""
+    kept = [p for p in parameters if p.stage == "stiffness"]
+    optimum = search.scan(kept)
+    candidates = [p for p in parameters if p.stage == "optional"]
+    rejected: dict[str, float] = {}
+    while candidates:
+        screened = search.screen(kept, optimum, candidates)
+        hopeful = [c for c in candidates if screened[c.name] >= _LEAST_SCREENED * c.least_gain]
+        trials = [
+            search.solve([*kept, c], np.append(optimum.theta, c.searched(c.start[0])), 4) for c in hopeful
+        ]
+        gains = dict(screened)
+        gains.update({c.name: 1.0 - t.cost / optimum.cost for c, t in zip(hopeful, trials, strict=True)})
+        # not a number: the budget ended
+        enough = [k for k, c in enumerate(hopeful) if gains[c.name] > c.least_gain]
+        if not enough:
+            rejected.update({c.name: gains[c.name] for c in candidates})
+            break
+        best = max(enough, key=lambda k: gains[hopeful[k].name])
+        kept, optimum = [*kept, hopeful[best]], trials[best]
+        candidates.remove(hopeful[best])
+    for needless in [p for p in kept if p.stage == "optional"]:
+        others = [k for k, p in enumerate(kept) if p is not needless]
+        trial = search.solve([kept[k] for k in others], optimum.theta[others], 2)
+        if trial.cost * (1.0 - needless.least_gain) <= optimum.cost:
+            rejected[needless.name] = 1.0 - optimum.cost / trial.cost
+            kept, optimum = [kept[k] for k in others], trial
+    return kept, optimum, rejected
+
+
+def _hold_the_unknown(
+    search: Search, kept: list[Parameter], optimum: Optimum, rejected: dict[str, float]
+) -> tuple[list[Parameter], Optimum, Solution | None]:
+    """Step 5: what the data do not fix goes back to its prior, if the training cost allows it.
+
+    The last searched parameter stays: something has to be searched.
+    """
+    solution = search.linearise(kept, optimum)
+    while solution is not None and len(kept) > 1:
+        found, _ = _estimates(search, kept, optimum, solution)
+        width = {
+            p.name: (e.ci95 is None or _half_width(p, e) >= UNIDENTIFIED_HALF_WIDTH[p.scale])
+            for p, e in ((p, found[p.name]) for p in kept)
+        }
+        unknown = [p for p in reversed(kept) if width[p.name] and p.name not in rejected]
+        if not unknown:
+            break
+        loose = unknown[0]
+        others = [k for k, p in enumerate(kept) if p is not loose]
+        before = search.twin
+        if loose.stage == "stiffness":
+            search.twin = loose.apply(before, loose.start[0])
+        trial = search.solve([kept[k] for k in others], optimum.theta[others], 3)
+        rejected[loose.name] = 1.0 - optimum.cost / trial.cost
+        if not trial.cost * (1.0 - _NO_LOSS) <= optimum.cost:
+            search.twin = before
+            del rejected[loose.name]
+            break
+        kept, optimum = [kept[k] for k in others], trial
+        solution = search.linearise(kept, optimum)
+    return kept, optimum, solution
+
+
+def _half_width(parameter: Parameter, estimate: Estimate) -> float:
+    low, high = estimate.ci95 or (0.0, np.inf)
+    if parameter.scale == "linear":
+        return 0.5 * (high - low)
+    return 0.5 * float(np.log(high / low)) if low > 0 else float("inf")
+
+
+def _estimates(
+    search: Search, kept: list[Parameter], optimum: Optimum, solution: Solution | None
+) -> tuple[dict[str, Estimate], Correlations]:
+    frames, points = search.frame_of_residual(search.end), search.point_of_residual()
+    if solution is None:
+        empty = Solution(
+            optimum.theta, optimum.cost, np.zeros(len(frames)), np.zeros((len(frames), len(kept)))
         )
-        found[parameter.name] = Estimate(value, parameter.unit, interval, identified, note)
-    return found
-
-
-def _why_not_identified(at_bound: bool, insensitive: bool) -> str:
-    if insensitive:
-        return "its sensitivity was not measured: the budget of simulations ended first"
-    return "at the bound of its search" if at_bound else "the data do not fix it"
-
-
-def _priors(scene: Scene, twin: Twin, rejected: dict[str, float]) -> dict[str, Estimate]:
-    """What was held: the density (only ratios to it show), Poisson's ratio, and damping that was not needed."""
-    unit = {3: "kg/m^3", 2: "kg/m^2", 1: "kg/m"}[twin.lattice.dim]
-    declared = scene.body.density_kg_m3 is not None or scene.body.mass_kg is not None
-    note = "as declared" if declared else "prior"
-    held = {
-        "density": Estimate(
-            twin.density, unit, None, False, f"{note}; only stiffness over density shows in the motion"
-        )
-    }
-    for name, value in twin.parameters.items():
-        if name == "poissons_ratio":
-            held[name] = Estimate(value, "1", None, False, "held at its prior")
-        elif name == "stretching_n":
-            held[name] = Estimate(
-                value, "N", None, False, "held: stiff enough to stretch by less than a percent"
-            )
-    for name, gain in rejected.items():
-        share = (
-            f"removes {max(gain, 0.0):.1%} of the training cost"
-            if np.isfinite(gain)
-            else "not tried to its end"
-        )
-        held[name] = Estimate(0.0, "", None, False, f"not needed: {share}")
-    return held
+        return estimates(kept, empty, frames, points, measured=False)
+    return estimates(kept, solution, frames, points, measured=True)

@@ -1,7 +1,9 @@
-"""Damped Gauss-Newton over a few log-parameters with finite differences, and intervals that respect correlation.
+"""Damped Gauss-Newton over a few parameters with finite differences, and intervals that respect correlation.
 
-Residuals of neighbouring frames and points are not independent, so the usual (J^T J)^-1 is far too small: scores are
-summed over blocks of frames first (a cluster-robust sandwich, White 1980, Liang and Zeger 1986).
+Residuals of neighbouring frames and of one tracked point are not independent, so the usual s^2 (J^T J)^-1 is far too
+small on real data. Scores are summed over clusters first (a sandwich: White 1980, Liang and Zeger 1986), over blocks
+of consecutive frames and, where there are enough, over tracked points too (two ways: Cameron, Gelbach, Miller 2011).
+With few clusters a sandwich may come out too small by chance; the variances are never below the usual ones.
 """
 
 from __future__ import annotations
@@ -17,11 +19,12 @@ Residual = Callable[[np.ndarray], np.ndarray]
 _TOLERANCE = 2e-4  # relative fall of the cost that ends the search
 _MAX_STEP = 1.5  # in the logarithm
 _BLOCKS = 10
+_FEWEST_POINTS = 10  # fewer tracked points than this are no clusters of their own
 
 
 @dataclass(frozen=True)
 class Solution:
-    """Optimum in the logarithm of the parameters.
+    """Optimum in the scale of the search.
 
     Attributes:
         theta: (p,).
@@ -44,14 +47,10 @@ def gauss_newton(
     steps: np.ndarray,
     max_iterations: int = 6,
 ) -> Solution:
-    """Minimise |residual(theta)|^2 within bounds; a residual that is not finite counts as no descent.
+    """Minimise the mean square of ``residual`` from ``theta`` within [low, high].
 
-    Args:
-        residual: (p,) -> (m,).
-        theta: start, (p,).
-        low, high: bounds, (p,).
-        steps: finite-difference steps, (p,).
-        max_iterations: Jacobians at most.
+    A residual that is not finite is a failed simulation: the step is shortened. One run per parameter and Jacobian,
+    one per trial step; ``max_iterations`` Jacobians at most.
     """
     theta = np.clip(theta, low, high)
     now = residual(theta)
@@ -59,12 +58,7 @@ def gauss_newton(
     damping = 1e-3
     jacobian = np.zeros((len(now), len(theta)))
     for _ in range(max_iterations):
-        for k in range(len(theta)):
-            probe = theta.copy()
-            sign = -1.0 if theta[k] + steps[k] > high[k] else 1.0
-            probe[k] += sign * steps[k]
-            jacobian[:, k] = sign * (residual(probe) - now) / steps[k]
-        jacobian = np.nan_to_num(jacobian, nan=0.0, posinf=0.0, neginf=0.0)
+        jacobian = finite_differences(residual, theta, now, high, steps)
         normal, gradient = jacobian.T @ jacobian, jacobian.T @ now
         improved = False
         for _ in range(5):
@@ -86,23 +80,74 @@ def gauss_newton(
     return Solution(theta, cost, now, jacobian)
 
 
-def block_covariance(solution: Solution, frame_of_residual: np.ndarray) -> np.ndarray:
-    """Covariance of theta, (p, p), with scores summed over blocks of consecutive frames."""
+def finite_differences(
+    residual: Residual, theta: np.ndarray, now: np.ndarray, high: np.ndarray, steps: np.ndarray
+) -> np.ndarray:
+    """Jacobian (m, p) at ``theta``, whose residual is ``now``; a column that blew up is zero."""
+    jacobian = np.zeros((len(now), len(theta)))
+    for k in range(len(theta)):
+        probe = theta.copy()
+        sign = -1.0 if theta[k] + steps[k] > high[k] else 1.0
+        probe[k] += sign * steps[k]
+        jacobian[:, k] = sign * (residual(probe) - now) / steps[k]
+    return np.nan_to_num(jacobian, nan=0.0, posinf=0.0, neginf=0.0)
+
+
+def block_covariance(
+    solution: Solution, frame_of_residual: np.ndarray, point_of_residual: np.ndarray | None = None
+) -> np.ndarray:
+    """Covariance of theta, (p, p): the correlations of the sensitivities, with the variances that clusters show.
+
+    Args:
+        solution: residual and Jacobian at the optimum.
+        frame_of_residual: frame of every residual, (m,).
+        point_of_residual: tracked point of every residual, (m,), or None.
+    """
     jacobian, residual = solution.jacobian, solution.residual
     inverse = np.linalg.pinv(jacobian.T @ jacobian)
-    frames = np.unique(frame_of_residual)
-    edges = np.array_split(frames, min(_BLOCKS, len(frames)))
-    meat = np.zeros_like(inverse)
-    for block in edges:
-        rows = (frame_of_residual >= block[0]) & (frame_of_residual <= block[-1])
-        score = jacobian[rows].T @ residual[rows]
-        meat += np.outer(score, score)
-    blocks = len(edges)
-    correction = blocks / max(blocks - len(solution.theta), 1)
-    return correction * inverse @ meat @ inverse
+    scores = jacobian * residual[:, None]
+    frames, frame_place = np.unique(frame_of_residual, return_inverse=True)
+    edges = np.array_split(np.arange(len(frames)), min(_BLOCKS, len(frames)))
+    block_of_frame = np.repeat(np.arange(len(edges)), [len(edge) for edge in edges])
+    block = block_of_frame[frame_place]
+    by_block = _sandwich(inverse, scores, block, len(solution.theta))
+    freedom = max(len(residual) - len(solution.theta), 1)
+    usual = inverse * float(residual @ residual) / freedom
+    variance = np.maximum(np.diag(by_block), np.diag(usual))
+    if point_of_residual is not None:
+        points, point = np.unique(point_of_residual, return_inverse=True)
+        if len(points) >= _FEWEST_POINTS:
+            by_point = _sandwich(inverse, scores, point, len(solution.theta))
+            by_both = _sandwich(inverse, scores, block * len(points) + point, len(solution.theta))
+            variance = np.maximum(variance, np.diag(by_block + by_point - by_both))
+    return _rescaled(usual, variance)
+
+
+def correlations(covariance: np.ndarray) -> np.ndarray:
+    """Correlation matrix (p, p); zero beside a parameter without variance."""
+    scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    outer = np.outer(scale, scale)
+    matrix = np.divide(covariance, outer, out=np.zeros_like(covariance), where=outer > 0)
+    np.fill_diagonal(matrix, 1.0)
+    return np.clip(matrix, -1.0, 1.0)
 
 
 def interval_factor(frames: int, parameters: int) -> float:
     """Student factor of a two-sided 95 % interval from blocks of ``frames``; infinite for too few of them."""
     blocks = min(_BLOCKS, frames)
     return float(student.ppf(0.975, blocks - 1)) if blocks > parameters else float("inf")
+
+
+def _sandwich(inverse: np.ndarray, scores: np.ndarray, cluster: np.ndarray, parameters: int) -> np.ndarray:
+    count = int(cluster.max()) + 1
+    sums = np.zeros((count, scores.shape[1]))
+    np.add.at(sums, cluster, scores)
+    correction = count / max(count - parameters, 1)
+    return correction * inverse @ (sums.T @ sums) @ inverse
+
+
+def _rescaled(covariance: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """The matrix with the same correlations and the given diagonal."""
+    now = np.diag(covariance)
+    factor = np.sqrt(np.divide(variance, now, out=np.zeros_like(variance), where=now > 0))
+    return covariance * np.outer(factor, factor)

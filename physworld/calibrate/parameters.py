@@ -1,14 +1,18 @@
 """Which numbers of a twin a global calibration may change, their scales, bounds and units.
 
-Stiffness and friction are positive and span decades: they are searched in the logarithm. With gravity, ground and
-prescribed grips only ratios to the density show, so the density is never a parameter here: it stays as declared, or
-at its prior, and the report says so.
+Stiffness and friction are positive and span decades: they are searched in the logarithm; Poisson's ratio is searched
+as it is. With gravity, ground and prescribed grips only ratios to the density show, so the density is never a
+parameter here: it stays as declared, or at its prior, and the report says so.
+
+A *stiffness* is always searched. The others are *optional*: air drag, internal friction, Poisson's ratio, and the
+friction of a ground that declares none; each is freed only if the data ask for it, and else stays at its prior.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -16,19 +20,27 @@ from physworld.materials.laws import RodLaw, SheetLaw, SolidLaw
 from physworld.twin import Twin
 
 _LOG_STEP = 0.02  # finite-difference step in the logarithm
+_POISSON_BOUNDS, _POISSON_STEP = (0.0, 0.48), 0.02
+_LEAST_GAIN = 0.02  # share of the training cost that an optional parameter must remove
+_POISSON_GAIN = 0.15  # the same of Poisson's ratio, which absorbs a little of whatever else is missing
+_FRICTION_BOUNDS = (0.02, 3.0)
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One searched number, positive.
+    """One searched number.
 
     Attributes:
-        name: what reports call it, with its unit in ``unit``.
+        name: what reports call it.
         unit: SI unit.
         low, high: bounds of the search.
-        start: starts of the search, best first by prior knowledge.
+        start: starts of the search, best first by prior knowledge; for an optional one the value that is tried first.
         apply: a twin with this value.
-        stage: "stiffness" parameters come first; "damping" ones are added only if the data ask for them.
+        stage: "stiffness" parameters come first; "optional" ones are freed only if the data ask for them.
+        scale: searched in the logarithm, or as it is.
+        step: of finite differences, in the searched scale.
+        prior: value of an optional parameter that is not freed.
+        least_gain: share of the training cost that freeing an optional one must remove.
     """
 
     name: str
@@ -37,41 +49,69 @@ class Parameter:
     high: float
     start: tuple[float, ...]
     apply: Callable[[Twin, float], Twin]
-    stage: str
+    stage: Literal["stiffness", "optional"]
     step: float = _LOG_STEP
+    scale: Literal["log", "linear"] = "log"
+    prior: float = 0.0
+    least_gain: float = _LEAST_GAIN
+
+    def searched(self, value: float) -> float:
+        """A value in the scale of the search."""
+        return float(np.log(value)) if self.scale == "log" else float(value)
+
+    def value(self, searched: float) -> float:
+        """The inverse of :meth:`searched`."""
+        return float(np.exp(searched)) if self.scale == "log" else float(searched)
 
 
-def parameters_of(twin: Twin, separate_bending: bool) -> list[Parameter]:
-    """Parameters of the twin's shape.
+def parameters_of(
+    twin: Twin, separate_bending: bool, damping: bool = True, ground_friction: bool = False
+) -> list[Parameter]:
+    """Parameters of the twin's shape, those of stiffness first.
 
     Args:
-        twin: the twin to calibrate.
+        twin: the twin to calibrate; its values are the priors of what is optional.
         separate_bending: sheets only: bending is searched apart from stretch (no thickness is declared).
+        damping: air drag and internal friction may be freed.
+        ground_friction: the friction of the ground is not declared and may be freed.
     """
+    law = twin.law
+    optional = []
+    if damping:
+        optional += [_positive("air_drag_per_s", "1/s", 1e-3, 30.0, 0.3), _internal_friction(twin)]
+    if isinstance(law, SolidLaw | SheetLaw):
+        prior, apply = law.poissons_ratio, _poissons_ratio(twin, separate_bending)
+        optional.append(
+            Parameter("poissons_ratio", "1", *_POISSON_BOUNDS, (prior,), apply, "optional", _POISSON_STEP, "linear",
+                      prior, _POISSON_GAIN)
+        )  # fmt: skip
+    if ground_friction and "ground_friction" in twin.parameters:
+        prior = twin.parameters["ground_friction"]
+        optional.append(
+            Parameter("ground_friction", "1", *_FRICTION_BOUNDS, (prior,), _set("ground_friction"), "optional",
+                      0.05, prior=prior)
+        )  # fmt: skip
+    return [*_stiffness(twin, separate_bending), *optional]
+
+
+def _stiffness(twin: Twin, separate_bending: bool) -> list[Parameter]:
     law, density = twin.law, twin.density
     length = float(np.ptp(twin.body.start, axis=0).max())
-    drag = Parameter("air_drag_per_s", "1/s", 1e-3, 30.0, (0.3,), _set("air_drag_per_s"), "damping", 0.1)
     if isinstance(law, SolidLaw):
         soft = density * 9.81 * length  # stress under the body's own weight
         grid = tuple(float(soft * f) for f in np.logspace(1.0, 4.0, 9))
         return [
             Parameter("youngs_modulus_pa", "Pa", soft * 1.5, soft * 1e5, grid, _set("youngs_modulus_pa"), "stiffness"),
-            drag,
-            Parameter("viscosity_pa_s", "Pa s", 1e-5 * soft, 0.1 * soft, (1e-3 * soft,), _set("viscosity_pa_s"),
-                      "damping", 0.1),
         ]  # fmt: skip
-    relaxation = Parameter("relaxation_s", "s", 1e-5, 0.1, (3e-3,), _set("relaxation_s"), "damping", 0.1)
     if isinstance(law, SheetLaw):
         unit = density * 9.81 * length
         grid = tuple(float(unit * f) for f in np.logspace(1.0, 3.5, 6))
         thickness = twin.body.thickness_m
         if not separate_bending:
-            linked = _sheet_modulus(thickness)
             scale = (1 - law.poissons_ratio**2) / thickness
             return [
                 Parameter("youngs_modulus_pa", "Pa", grid[0] * scale / 5, grid[-1] * scale * 5,
-                          tuple(g * scale for g in grid), linked, "stiffness"),
-                drag, relaxation,
+                          tuple(g * scale for g in grid), _sheet_modulus(thickness), "stiffness"),
             ]  # fmt: skip
         bend = unit * length**2
         return [
@@ -79,7 +119,6 @@ def parameters_of(twin: Twin, separate_bending: bool) -> list[Parameter]:
                       _set("bending_n_m"), "stiffness", 0.1),
             Parameter("membrane_n_m", "N/m", unit * 5, unit * 1e3, (unit * 60,), _set("membrane_n_m"), "stiffness",
                       0.1),
-            drag, relaxation,
         ]  # fmt: skip
     if not isinstance(law, RodLaw):
         raise TypeError(f"no parameters for {type(law).__name__}")
@@ -87,8 +126,18 @@ def parameters_of(twin: Twin, separate_bending: bool) -> list[Parameter]:
     return [
         Parameter("bending_n_m2", "N m^2", 1e-6 * unit, unit, tuple(unit * f for f in (1e-4, 1e-3, 1e-2, 1e-1)),
                   _set("bending_n_m2"), "stiffness", 0.05),
-        drag, relaxation,
     ]  # fmt: skip
+
+
+def _internal_friction(twin: Twin) -> Parameter:
+    if isinstance(twin.law, SolidLaw):
+        soft = twin.density * 9.81 * float(np.ptp(twin.body.start, axis=0).max())
+        return _positive("viscosity_pa_s", "Pa s", 1e-5 * soft, 0.1 * soft, 1e-3 * soft)
+    return _positive("relaxation_s", "s", 1e-5, 0.1, 3e-3)
+
+
+def _positive(name: str, unit: str, low: float, high: float, start: float) -> Parameter:
+    return Parameter(name, unit, low, high, (start,), _set(name), "optional", 0.1)
 
 
 def _set(name: str) -> Callable[[Twin, float], Twin]:
@@ -100,5 +149,22 @@ def _sheet_modulus(thickness: float) -> Callable[[Twin, float], Twin]:
         nu = twin.parameters["poissons_ratio"]
         membrane = modulus * thickness / (1 - nu**2)
         return twin.with_parameters(membrane_n_m=membrane, bending_n_m=membrane * thickness**2 / 12)
+
+    return apply
+
+
+def _poissons_ratio(twin: Twin, separate_bending: bool) -> Callable[[Twin, float], Twin]:
+    """Sheets of known thickness keep their modulus when the ratio changes: membrane and bending go along."""
+    if not isinstance(twin.law, SheetLaw) or separate_bending:
+        return _set("poissons_ratio")
+
+    def apply(changed: Twin, ratio: float) -> Twin:
+        now = changed.parameters
+        gain = (1 - now["poissons_ratio"] ** 2) / (1 - ratio**2)
+        return changed.with_parameters(
+            poissons_ratio=ratio,
+            membrane_n_m=now["membrane_n_m"] * gain,
+            bending_n_m=now["bending_n_m"] * gain,
+        )
 
     return apply

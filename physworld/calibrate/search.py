@@ -1,13 +1,19 @@
-"""The search of a calibration: residuals of a twin on the training frames, counted, reported and cancellable."""
+"""The search of a calibration: residuals of a twin on the training frames, counted, reported and cancellable.
+
+Steps of the search (a scan, an optimum, a screening, a shift of the points) go through a journal, so that a search
+that was killed goes on where it was.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from physworld.calibrate.least_squares import Solution, gauss_newton
+from physworld.calibrate.journal import Journal
+from physworld.calibrate.least_squares import Solution, finite_differences, gauss_newton
 from physworld.calibrate.parameters import Parameter
 from physworld.errors import CalibrationError, Cancelled, SimulationError
 from physworld.mpm.lattice import Lattice
@@ -22,6 +28,14 @@ _FIRST_WINDOW_FRAMES = 10
 _DISTINCT = 0.05  # starts that end closer than this in the logarithm are one
 
 
+@dataclass(frozen=True)
+class Optimum:
+    """Where a descent ended: theta (p,) in the scale of the search, and the mean squared residual there [m^2]."""
+
+    theta: np.ndarray
+    cost: float
+
+
 class Search:
     """Residuals of a twin on the training frames, counted, reported and cancellable."""
 
@@ -32,8 +46,10 @@ class Search:
         max_simulations: int,
         progress: Progress | None,
         cancelled: Callable[[], bool] | None,
+        journal: Journal | None = None,
     ) -> None:
         self.scene, self.twin, self.max_simulations = scene, twin, max_simulations
+        self.journal = journal or Journal()
         self.progress, self.cancelled = progress, cancelled
         self.simulations = 0
         self.history: list[float] = []
@@ -59,10 +75,16 @@ class Search:
         frames = np.broadcast_to(np.arange(self.begin, end)[:, None], visible.shape)
         return np.repeat(frames[visible], 3)
 
+    def point_of_residual(self) -> np.ndarray:
+        """Tracked point of every entry of a residual over all training frames."""
+        visible = self.scene.visible[self.begin : self.end]
+        points = np.broadcast_to(np.arange(visible.shape[1]), visible.shape)
+        return np.repeat(points[visible], 3)
+
     def twin_at(self, parameters: list[Parameter], theta: np.ndarray) -> Twin:
         twin = self.twin
-        for parameter, value in zip(parameters, np.exp(theta), strict=True):
-            twin = parameter.apply(twin, float(value))
+        for parameter, searched in zip(parameters, theta, strict=True):
+            twin = parameter.apply(twin, parameter.value(float(searched)))
         return twin
 
     def residual(self, parameters: list[Parameter], theta: np.ndarray, end: int | None = None) -> np.ndarray:
@@ -83,24 +105,29 @@ class Search:
             nodes = twin.simulate_nodes(times, controls, self.scene.times[:end], progress=self._poll)
         except SimulationError:
             return bad
-        residual = (twin.track_nodes(nodes)[self.begin :][visible] - target).reshape(-1)
+        observed = twin.observe(nodes, self.scene.times[:end])
+        residual = (observed[self.begin :][visible] - target).reshape(-1)
         loss = float(np.sqrt(np.mean(residual**2)))
         if end == self.end:
             self.history.append(min(loss, self.history[-1]) if self.history else loss)
         if self.progress is not None:
-            values = ", ".join(f"{p.name} {v:.3g}" for p, v in zip(parameters, np.exp(theta), strict=True))
+            pairs = zip(parameters, theta, strict=True)
+            values = ", ".join(f"{p.name} {p.value(float(t)):.3g}" for p, t in pairs)
             self.progress(self.simulations, self.max_simulations, f"{loss * 1e3:.2f} mm at {values}")
         return residual
 
-    def scan(self, parameters: list[Parameter]) -> Solution:
+    def scan(self, parameters: list[Parameter]) -> Optimum:
         """Multi-start over the first parameter's starts on the first window, then on all training frames."""
         window = self.first_window()
-        rest = [np.log(p.start[0]) for p in parameters[1:]]
-        costs = []
-        for value in parameters[0].start:
-            theta = np.array([np.log(value), *rest])
-            costs.append((float(np.mean(self.residual(parameters, theta, window) ** 2)), tuple(theta)))
-        usable = sorted(c for c in costs if np.isfinite(c[0]))
+        rest = [p.searched(p.start[0]) for p in parameters[1:]]
+        starts = [np.array([parameters[0].searched(value), *rest]) for value in parameters[0].start]
+        costs = self._step(
+            "scan",
+            lambda: {"costs": [float(np.mean(self.residual(parameters, t, window) ** 2)) for t in starts]},
+        )["costs"]
+        usable = sorted(
+            (cost, tuple(theta)) for cost, theta in zip(costs, starts, strict=True) if cost is not None
+        )
         if not usable:
             raise CalibrationError(
                 f"none of {len(costs)} starts of {parameters[0].name} from {parameters[0].start[0]:.3g} to "
@@ -115,16 +142,68 @@ class Search:
 
     def solve(
         self, parameters: list[Parameter], theta: np.ndarray, iterations: int, end: int | None = None
-    ) -> Solution:
+    ) -> Optimum:
         """Gauss-Newton over the frames up to ``end`` (all training frames by default)."""
-        return gauss_newton(
-            lambda t: self.residual(parameters, t, end),
-            theta,
-            np.log([p.low for p in parameters]),
-            np.log([p.high for p in parameters]),
+
+        def descend() -> dict[str, Any]:
+            found = gauss_newton(
+                lambda t: self.residual(parameters, t, end),
+                theta,
+                np.array([p.searched(p.low) for p in parameters]),
+                self._high(parameters),
+                np.array([p.step for p in parameters]),
+                iterations,
+            )
+            return {"theta": found.theta.tolist(), "cost": found.cost}
+
+        found = self._step("solve " + " ".join(p.name for p in parameters), descend)
+        cost = float("nan") if found["cost"] is None else found["cost"]
+        return Optimum(np.array(found["theta"]), cost)
+
+    def linearise(self, parameters: list[Parameter], optimum: Optimum) -> Solution | None:
+        """Residual and sensitivities at an optimum; None where the budget does not reach."""
+        if self.simulations + 1 + len(parameters) > self.max_simulations:
+            return None
+        now = self.residual(parameters, optimum.theta)
+        if not np.isfinite(now).all():
+            return None
+        jacobian = finite_differences(
+            lambda t: self.residual(parameters, t),
+            optimum.theta,
+            now,
+            self._high(parameters),
             np.array([p.step for p in parameters]),
-            iterations,
         )
+        return Solution(optimum.theta, float(np.mean(now**2)), now, jacobian)
+
+    def screen(
+        self, parameters: list[Parameter], optimum: Optimum, candidates: list[Parameter]
+    ) -> dict[str, float]:
+        """Share of the cost that each candidate can remove beyond the searched ones, to first order.
+
+        One run a candidate gives its effect on the residual; what the searched parameters can do as well is
+        projected out. NaN where a run failed or the budget ended.
+        """
+
+        def measure() -> dict[str, Any]:
+            solution = self.linearise(parameters, optimum)
+            if solution is None:
+                return {"gains": dict.fromkeys((c.name for c in candidates), float("nan"))}
+            basis = np.linalg.qr(solution.jacobian)[0]
+            left = solution.residual - basis @ (basis.T @ solution.residual)
+            gains = {}
+            for candidate in candidates:
+                theta = np.append(optimum.theta, _probe(candidate))
+                effect = self.residual([*parameters, candidate], theta) - solution.residual
+                effect = effect - basis @ (basis.T @ effect)
+                along = float(effect @ left)
+                helps = candidate.prior != 0.0 or along < 0.0  # drag and friction push one way only
+                size = float(effect @ effect) * float(left @ left)
+                gains[candidate.name] = along**2 / size if helps and size > 0 else 0.0 * size
+            return {"gains": gains}
+
+        found = self._step("screen " + " ".join(c.name for c in candidates), measure)["gains"]
+        return {name: float("nan") if gain is None else gain for name, gain in found.items()}
 
     def shift_points(self, parameters: list[Parameter], theta: np.ndarray) -> bool:
         """Move the tracked points inside the body by their mean residual, in the material's frame (solids)."""
@@ -132,16 +211,25 @@ class Search:
         lattice = self.twin.lattice
         if self.scene.initial_state != UNDEFORMED_AT_REST or lattice.dim != 3 or not sigma:
             return False
+        found = self._step("shift", lambda: {"shift": self._mean_offsets(parameters, theta, sigma)})["shift"]
+        if found is None:
+            return False
+        points = self.twin.body.points + np.array(found)
+        self.twin = replace(self.twin, body=replace(self.twin.body, points=points))
+        return True
+
+    def _mean_offsets(self, parameters: list[Parameter], theta: np.ndarray, sigma: float) -> list | None:
+        """Mean residual of every point in the material's frame [m], (N, 3), clipped; None where it cannot be had."""
         if self.simulations + 2 + len(parameters) > self.max_simulations:
-            return False  # the search on the moved points needs a residual and a Jacobian of its own
-        twin = self.twin_at(parameters, theta)
+            return None  # the search on the moved points needs a residual and a Jacobian of its own
+        twin, lattice = self.twin_at(parameters, theta), self.twin.lattice
         times, controls = self.scene.control_track()
         try:
             nodes = twin.simulate_nodes(
                 times, controls, self.scene.times[: self.scene.train[1]], progress=self._poll
             )
         except SimulationError:
-            return False
+            return None
         self.simulations += 1
         frames = slice(self.begin, self.end)
         mask = self.scene.visible[frames]
@@ -150,9 +238,22 @@ class Search:
         local = np.linalg.solve(gradient, error[..., None])[..., 0]
         seen = np.maximum(mask.sum(axis=0), 1)[:, None]
         limit = _OFFSET_CLIP_SIGMAS * sigma
-        shift = np.clip(local.sum(axis=0) / seen, -limit, limit)
-        self.twin = replace(self.twin, body=replace(self.twin.body, points=twin.body.points + shift))
-        return True
+        return np.clip(local.sum(axis=0) / seen, -limit, limit).tolist()
+
+    def _step(self, name: str, compute: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """A journalled step, which also brings the count of runs and their history to where they were after it."""
+
+        def counted() -> dict[str, Any]:
+            found = compute()
+            return {**found, "simulations": self.simulations, "history": list(self.history)}
+
+        found = self.journal.step(name, counted)
+        self.simulations, self.history = found["simulations"], list(found["history"])
+        return found
+
+    @staticmethod
+    def _high(parameters: list[Parameter]) -> np.ndarray:
+        return np.array([p.searched(p.high) for p in parameters])
 
     def _poll(self, done: int, total: int) -> None:
         if self.cancelled is not None and self.cancelled():
@@ -170,5 +271,11 @@ def _deformation(lattice: Lattice, points: np.ndarray, nodes: np.ndarray) -> np.
     return np.stack(columns, axis=-1)
 
 
-def _cost(solution: Solution) -> float:
-    return solution.cost if np.isfinite(solution.cost) else float("inf")
+def _probe(candidate: Parameter) -> float:
+    """Where a screening tries a candidate: its start, or a few steps beyond a prior that it starts from."""
+    searched = candidate.searched(candidate.start[0])
+    return searched if candidate.prior == 0.0 else searched + 2 * candidate.step
+
+
+def _cost(optimum: Optimum) -> float:
+    return optimum.cost if np.isfinite(optimum.cost) else float("inf")

@@ -1,0 +1,109 @@
+"""What a calibration says of each number: value, interval, whether the data fix it, and what was held and why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from physworld.calibrate.least_squares import Solution, block_covariance, correlations, interval_factor
+from physworld.calibrate.parameters import Parameter
+from physworld.scene import Scene
+from physworld.twin import Twin
+
+UNIDENTIFIED_HALF_WIDTH = {"log": 1.5, "linear": 0.25}
+"""Half width of a 95 % interval, in the scale of the search, beyond which the data do not fix a value."""
+
+_EDGE = 0.01  # closer than this to a bound, in the scale of the search, is at it
+
+RATIO_NOTE = "only stiffness over density shows in the motion under gravity, ground and prescribed grips"
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A calibrated number: value, unit, 95 % interval (None where none can be given), and whether data fix it."""
+
+    value: float
+    unit: str
+    ci95: tuple[float, float] | None = None
+    identified: bool = True
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Correlations:
+    """Correlations of the searched parameters: names (p) and matrix (p, p)."""
+
+    names: tuple[str, ...]
+    matrix: np.ndarray
+
+
+def estimates(
+    parameters: list[Parameter], solution: Solution, frames: np.ndarray, points: np.ndarray, measured: bool
+) -> tuple[dict[str, Estimate], Correlations]:
+    """Estimates and correlations of the searched parameters.
+
+    Args:
+        parameters: what was searched.
+        solution: the optimum with its sensitivities.
+        frames, points: frame and tracked point of every residual, (m,).
+        measured: the sensitivities were measured; without them no interval is given.
+    """
+    covariance = block_covariance(solution, frames, points)
+    factor = interval_factor(len(np.unique(frames)), len(parameters)) if measured else float("inf")
+    found = {}
+    for k, parameter in enumerate(parameters):
+        theta, value = float(solution.theta[k]), parameter.value(float(solution.theta[k]))
+        half = factor * float(np.sqrt(covariance[k, k])) if covariance[k, k] > 0 else float("inf")
+        insensitive = not measured or not np.any(solution.jacobian[:, k])
+        low, high = parameter.searched(parameter.low), parameter.searched(parameter.high)
+        at_bound = not (low + _EDGE < theta < high - _EDGE)
+        identified = half < UNIDENTIFIED_HALF_WIDTH[parameter.scale] and not at_bound and not insensitive
+        note = "" if identified else _why_not(at_bound, insensitive)
+        ends = (
+            (parameter.value(theta - min(half, 50.0)), parameter.value(theta + min(half, 50.0)))
+            if np.isfinite(half)
+            else None
+        )
+        found[parameter.name] = Estimate(value, parameter.unit, ends, identified, note)
+    return found, Correlations(tuple(p.name for p in parameters), correlations(covariance))
+
+
+def held_at_priors(
+    scene: Scene, twin: Twin, rejected: dict[str, float], units: dict[str, str]
+) -> dict[str, Estimate]:
+    """What was held: the density (only ratios to it show), what the data did not ask for, and a rod's stretch.
+
+    Args:
+        rejected: share of the training cost that freeing each of them removes.
+        units: unit of every parameter.
+    """
+    unit = {3: "kg/m^3", 2: "kg/m^2", 1: "kg/m"}[twin.lattice.dim]
+    declared = scene.body.density_kg_m3 is not None or scene.body.mass_kg is not None
+    held = {
+        "density": Estimate(
+            twin.density, unit, None, False, f"{'as declared' if declared else 'prior'}; {RATIO_NOTE}"
+        )
+    }
+    values = twin.parameters
+    if "stretching_n" in values:
+        note = "held: stiff enough to stretch by less than a percent"
+        held["stretching_n"] = Estimate(values["stretching_n"], "N", None, False, note)
+    for name, gain in rejected.items():
+        share = (
+            f"freeing it removes {max(gain, 0.0):.1%} of the training cost"
+            if np.isfinite(gain)
+            else "not tried to its end"
+        )
+        kept = "held at its prior" if values[name] else "not needed"
+        held[name] = Estimate(values[name], units[name], None, False, f"{kept}: {share}")
+    for name in ("poissons_ratio", "ground_friction"):
+        if name in values and name not in held:
+            held[name] = Estimate(values[name], "1", None, False, "held at its prior")
+    return held
+
+
+def _why_not(at_bound: bool, insensitive: bool) -> str:
+    if insensitive:
+        return "its sensitivity was not measured: the budget of simulations ended first"
+    return "at the bound of its search" if at_bound else "the data do not fix it"
