@@ -15,8 +15,9 @@ of memory; PARAMETER(k) a number; ROOT and POSITIVE the square root and the posi
 substep [s]; ``first`` is 1 in the first substep of a run.
 
 A rod carries vectors of its cross-section: CARRY(a, b, c) turns the rows a, b, c of memory with the tangent since the
-last substep (the least rotation; Bergou et al. 2008) and keeps the tangent in the first three rows. An energy
-B/2 |kappa - p|^2 with a carried p has moment B (kappa - p) and torque p x moment.
+last substep (the least rotation; Bergou et al. 2008) and keeps the tangent in the first three rows. Spin about the
+tangent is not carried: the rod has no twist. An energy B/2 |kappa - p|^2 with a carried p has moment B (kappa - p) and
+torque p x moment.
 """
 
 from __future__ import annotations
@@ -51,6 +52,26 @@ _ROWS = r"""
 #endif
 """
 
+SOLID_CORE = r"""
+        V E[6], S[6];   // E = (H + H^T + H^T H) / 2 with H = F - 1, before the 1 is added: small strains keep digits
+        for (int k = 0; k < 6; ++k) {
+            const int i = k < 3 ? k : (k == 3 ? 1 : 0);
+            const int j = k < 3 ? k : (k == 5 ? 1 : 2);
+            E[k] = 0.5f * (F[3 * i + j] + F[3 * j + i] + F[i] * F[j] + F[3 + i] * F[3 + j] + F[6 + i] * F[6 + j]);
+            S[k] = V{};
+        }
+        for (int i = 0; i < 3; ++i) F[4 * i] += 1.0f;
+        {
+MODEL
+        }
+        V P[9];
+        for (int i = 0; i < 3; ++i) {
+            P[3 * i + 0] = (F[3 * i] * S[0] + F[3 * i + 1] * S[5] + F[3 * i + 2] * S[4]) * scale[0];
+            P[3 * i + 1] = (F[3 * i] * S[5] + F[3 * i + 1] * S[1] + F[3 * i + 2] * S[3]) * scale[1];
+            P[3 * i + 2] = (F[3 * i] * S[4] + F[3 * i + 1] * S[3] + F[3 * i + 2] * S[2]) * scale[2];
+        }
+"""
+
 _SOLID = (
     lanes_float8()
     + _ROWS.replace("WIDTH", "8")
@@ -81,23 +102,9 @@ _SOLID = (
         }
         for (int i = 0; i < 3; ++i)
             for (int j = 0; j < 3; ++j) F[3 * i + j] = F[3 * i + j] * scale[j];
-        V E[6], S[6];   // E = (H + H^T + H^T H) / 2 with H = F - 1, before the 1 is added: small strains keep digits
-        for (int k = 0; k < 6; ++k) {
-            const int i = k < 3 ? k : (k == 3 ? 1 : 0);
-            const int j = k < 3 ? k : (k == 5 ? 1 : 2);
-            E[k] = 0.5f * (F[3 * i + j] + F[3 * j + i] + F[i] * F[j] + F[3 + i] * F[3 + j] + F[6 + i] * F[6 + j]);
-            S[k] = V{};
-        }
-        for (int i = 0; i < 3; ++i) F[4 * i] += 1.0f;
-        {
-MODEL
-        }
-        V P[9];
-        for (int i = 0; i < 3; ++i) {
-            P[3 * i + 0] = (F[3 * i] * S[0] + F[3 * i + 1] * S[5] + F[3 * i + 2] * S[4]) * scale[0];
-            P[3 * i + 1] = (F[3 * i] * S[5] + F[3 * i + 1] * S[1] + F[3 * i + 2] * S[3]) * scale[1];
-            P[3 * i + 2] = (F[3 * i] * S[4] + F[3 * i + 1] * S[3] + F[3 * i + 2] * S[2]) * scale[2];
-        }
+"""
+    + SOLID_CORE
+    + r"""
         for (int a = 0; a < 27; ++a) {
             const V g0 = *(const V*)&table.data[(3 * a + 0) * 8 + q];
             const V g1 = *(const V*)&table.data[(3 * a + 1) * 8 + q];
@@ -116,21 +123,7 @@ MODEL
 """
 )
 
-_SHEET = (
-    lanes_double(4)
-    + _ROWS.replace("WIDTH", "4")
-    + r"""
-    const int* node = &cell_nodes.data[cell * 9];
-    #define DOT(u, w) ((u)[0] * (w)[0] + (u)[1] * (w)[1] + (u)[2] * (w)[2])
-    for (int q = 0; q < 4; q += LANES) {
-        V d[5][3];   // a1, a2, x,11, x,22, x,12
-        for (int k = 0; k < 5; ++k)
-            for (int i = 0; i < 3; ++i) d[k][i] = V{};
-        for (int a = 0; a < 9; ++a)
-            for (int k = 0; k < 5; ++k) {
-                const V g = *(const V*)&table.data[(5 * a + k) * 4 + q];
-                for (int i = 0; i < 3; ++i) d[k][i] += x.data[3 * node[a] + i] * g;
-            }
+SHEET_CORE = r"""
         const V g11 = DOT(d[0], d[0]), g22 = DOT(d[1], d[1]), g12 = DOT(d[0], d[1]);
         V n[3] = {d[0][1] * d[1][2] - d[0][2] * d[1][1], d[0][2] * d[1][0] - d[0][0] * d[1][2],
                   d[0][0] * d[1][1] - d[0][1] * d[1][0]};
@@ -157,6 +150,26 @@ MODEL
             S[3][i] = stress[4] * n[i];
             S[4][i] = 2.0 * stress[5] * n[i];
         }
+"""
+
+_SHEET = (
+    lanes_double(4)
+    + _ROWS.replace("WIDTH", "4")
+    + r"""
+    const int* node = &cell_nodes.data[cell * 9];
+    #define DOT(u, w) ((u)[0] * (w)[0] + (u)[1] * (w)[1] + (u)[2] * (w)[2])
+    for (int q = 0; q < 4; q += LANES) {
+        V d[5][3];   // a1, a2, x,11, x,22, x,12
+        for (int k = 0; k < 5; ++k)
+            for (int i = 0; i < 3; ++i) d[k][i] = V{};
+        for (int a = 0; a < 9; ++a)
+            for (int k = 0; k < 5; ++k) {
+                const V g = *(const V*)&table.data[(5 * a + k) * 4 + q];
+                for (int i = 0; i < 3; ++i) d[k][i] += x.data[3 * node[a] + i] * g;
+            }
+"""
+    + SHEET_CORE
+    + r"""
         for (int a = 0; a < 9; ++a) {
             V f[3] = {V{}, V{}, V{}};
             for (int k = 0; k < 5; ++k) {
@@ -174,6 +187,26 @@ MODEL
     #undef POSITIVE
 """
 )
+
+ROD_CORE = r"""
+        const V a2 = DOT(t, t) + 1e-24;
+        const V length = lane::sqrt(a2);
+        const V inv_length = 1.0 / length;
+        const V inv_a2 = inv_length * inv_length;
+        const V inv_a3 = inv_a2 * inv_length;
+        const V stretch = length - 1.0;
+        V kappa[3], moment[3] = {V{}, V{}, V{}}, torque[3] = {V{}, V{}, V{}}, axial = V{};
+        for (int i = 0; i < 3; ++i) kappa[i] = CROSS(t, c, i) * inv_a3;
+        {
+MODEL
+        }
+        const V along = axial * inv_length - 3.0 * DOT(moment, kappa) * inv_a2;
+        V St[3], Sc[3];
+        for (int i = 0; i < 3; ++i) {
+            St[i] = CROSS(c, moment, i) * inv_a3 + along * t[i] - CROSS(torque, t, i) * inv_a2;
+            Sc[i] = CROSS(moment, t, i) * inv_a3;
+        }
+"""
 
 _ROD = (
     lanes_double(2)
@@ -203,23 +236,9 @@ _ROD = (
                 c[i] += x.data[3 * node[a] + i] * h;
             }
         }
-        const V a2 = DOT(t, t) + 1e-24;
-        const V length = lane::sqrt(a2);
-        const V inv_length = 1.0 / length;
-        const V inv_a2 = inv_length * inv_length;
-        const V inv_a3 = inv_a2 * inv_length;
-        const V stretch = length - 1.0;
-        V kappa[3], moment[3] = {V{}, V{}, V{}}, torque[3] = {V{}, V{}, V{}}, axial = V{};
-        for (int i = 0; i < 3; ++i) kappa[i] = CROSS(t, c, i) * inv_a3;
-        {
-MODEL
-        }
-        const V along = axial * inv_length - 3.0 * DOT(moment, kappa) * inv_a2;
-        V St[3], Sc[3];
-        for (int i = 0; i < 3; ++i) {
-            St[i] = CROSS(c, moment, i) * inv_a3 + along * t[i] - CROSS(torque, t, i) * inv_a2;
-            Sc[i] = CROSS(moment, t, i) * inv_a3;
-        }
+"""
+    + ROD_CORE
+    + r"""
         for (int a = 0; a < 3; ++a) {
             const V g = *(const V*)&table.data[(2 * a) * 2 + q];
             const V h = *(const V*)&table.data[(2 * a + 1) * 2 + q];
@@ -240,11 +259,15 @@ MODEL
 
 @dataclass(frozen=True)
 class StressModel:
-    """A kernel that adds a model's forces, for bodies of dimension ``dim``; ``rows`` rows of memory a particle."""
+    """A kernel that adds a model's forces, for bodies of dimension ``dim``; ``rows`` rows of memory a particle.
+
+    ``text`` is the model's own, for whoever differentiates it.
+    """
 
     dim: int
     rows: int
     kernel: Any
+    text: str
 
 
 def solid_model(model: str, rows: int = 0) -> StressModel:
@@ -300,21 +323,21 @@ def solid_model(model: str, rows: int = 0) -> StressModel:
             fields, first, wp.float32(clock[2]), x, state, force,
         )  # fmt: skip
 
-    return StressModel(3, rows, stress_forces)
+    return StressModel(3, rows, stress_forces, model)
 
 
 def sheet_model(model: str, rows: int = 0) -> StressModel:
     """A sheet's frame around ``model``, code that sets stress from strain."""
-    return _thin_model(2, _SHEET.replace("MODEL", model), rows)
+    return _thin_model(2, _SHEET, model, rows)
 
 
 def rod_model(model: str, rows: int = 0) -> StressModel:
     """A rod's frame around ``model``, code that sets axial, moment and torque from stretch and kappa."""
-    return _thin_model(1, _ROD.replace("MODEL", model), rows)
+    return _thin_model(1, _ROD, model, rows)
 
 
-def _thin_model(dim: int, snippet: str, rows: int) -> StressModel:
-    @wp.func_native(snippet)
+def _thin_model(dim: int, frame: str, model: str, rows: int) -> StressModel:
+    @wp.func_native(frame.replace("MODEL", model))
     def cell_stress(
         cell: int,
         # model
@@ -357,4 +380,4 @@ def _thin_model(dim: int, snippet: str, rows: int) -> StressModel:
             wp.tid(), cells, rows, cell_nodes, table, parameters, fields, first, clock[2], x, state, force
         )
 
-    return StressModel(dim, rows, stress_forces)
+    return StressModel(dim, rows, stress_forces, model)

@@ -63,7 +63,7 @@ def test_one_frame_is_measured_as_it_is_but_for_the_scale() -> None:
     first = line()[:1]
     for name in ("measurement_clock", "measurement_drift", "measurement_smoothing"):
         added = effect(name)
-        added = effect(name, **{gate: 0.1 for gate in added.gates})
+        added = effect(name, **dict.fromkeys(added.gates, 0.1))
         np.testing.assert_allclose(added.measured(TIMES[:1], first, TWIN), first, atol=1e-15)
 
 

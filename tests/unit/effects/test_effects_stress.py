@@ -1,0 +1,320 @@
+"""Stresses of effects: minus the derivative of their energy written in plain numpy, and how they relax, yield, turn."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import warp as wp
+from effect_twins import TWINS, loose, moved
+from scipy.spatial.transform import Rotation
+
+from physworld.effects.base import Effect
+from physworld.effects.registry import effect
+from physworld.mpm.terms import BoundTerm
+from physworld.mpm.total_lagrangian import Problem
+from physworld.twin import Twin
+
+SINGLE_PRECISION = 3e-4  # solids carry strains in float32; relative to the largest nodal force
+DOUBLE = 2e-6
+TOLERANCE = {"solid": SINGLE_PRECISION, "sheet": DOUBLE, "rope": DOUBLE}
+WEIGHT = {3: np.array([1, 1, 1, 2, 2, 2.0]), 2: np.array([1, 1, 2.0])}
+
+
+class Applied:
+    """The last term of an effect on a twin, driven by hand from the undeformed body."""
+
+    def __init__(self, twin: Twin, added: Effect) -> None:
+        self.twin = twin
+        problem = Problem(twin.lattice, twin.law, twin.body.rest, np.zeros(3))
+        self.bound: BoundTerm = added.problem(problem, twin).terms[-1].bind(problem)
+        self.substep = 0
+
+    def __call__(self, x: np.ndarray, dt: float = 0.0) -> np.ndarray:
+        """Forces (n, 3) [N] at nodes ``x`` (n, 3), ``dt`` after the last call."""
+        flat = wp.array(x.reshape(-1), dtype=wp.float64)
+        force = wp.zeros(x.size, dtype=wp.float64)
+        clock = wp.array([1.0, 1.0 / dt if dt else 0.0, dt], dtype=wp.float64)
+        counter = wp.array([0, self.substep, 1000000], dtype=wp.int32)
+        self.bound.launch(flat, flat, clock, counter, force)
+        self.substep += 1
+        return force.numpy().reshape(-1, 3)
+
+
+def strains(twin: Twin, x: np.ndarray) -> np.ndarray:
+    """Solid: Green strain (P, 6). Sheet: membrane and bending strain (P, 6). Rod: stretch and curvature (P, 4)."""
+    lattice = twin.lattice
+
+    def at(*orders: int) -> np.ndarray:
+        return lattice.interpolation(lattice.particle_coordinates, orders) @ x
+
+    if lattice.dim == 3:
+        F = np.stack([at(1, 0, 0), at(0, 1, 0), at(0, 0, 1)], axis=-1)
+        E = 0.5 * (np.einsum("pki,pkj->pij", F, F) - np.eye(3))
+        return np.stack([E[:, 0, 0], E[:, 1, 1], E[:, 2, 2], E[:, 1, 2], E[:, 0, 2], E[:, 0, 1]], axis=1)
+    if lattice.dim == 2:
+        a1, a2 = at(1, 0), at(0, 1)
+        n = np.cross(a1, a2)
+        n /= np.linalg.norm(n, axis=1, keepdims=True)
+        membrane = [0.5 * (np.sum(a1 * a1, 1) - 1), 0.5 * (np.sum(a2 * a2, 1) - 1), 0.5 * np.sum(a1 * a2, 1)]
+        return np.stack([*membrane, *(np.sum(n * at(*o), 1) for o in ((2, 0), (0, 2), (1, 1)))], axis=1)
+    t, c = at(1), at(2)
+    length = np.linalg.norm(t, axis=1, keepdims=True)
+    return np.concatenate([length - 1, np.cross(t, c) / length**3], axis=1)
+
+
+def plate(e: np.ndarray, nu: float) -> np.ndarray:
+    """nu (tr e)^2 + (1 - nu) e : e of strains (P, 3)."""
+    return nu * (e[:, 0] + e[:, 1]) ** 2 + (1 - nu) * (e**2 @ WEIGHT[2])
+
+
+def maxwell_energy(twin: Twin, e: np.ndarray) -> np.ndarray:
+    law = twin.law
+    if twin.lattice.dim == 3:
+        e = e - np.outer(e[:, :3].mean(axis=1), [1, 1, 1, 0, 0, 0])
+        return 4e3 * (e**2 @ WEIGHT[3])
+    if twin.lattice.dim == 2:
+        nu = law.poissons_ratio
+        return 0.3 * 0.5 * (law.membrane_n_m * plate(e[:, :3], nu) + law.bending_n_m * plate(e[:, 3:], nu))
+    return 0.3 * 0.5 * (law.stretching_n * e[:, 0] ** 2 + law.bending_n_m2 * np.sum(e[:, 1:] ** 2, axis=1))
+
+
+def fibre_energy(twin: Twin, e: np.ndarray) -> np.ndarray:
+    law, azimuth, elevation = twin.law, 0.4, 0.7
+    if twin.lattice.dim == 3:
+        level = np.cos(elevation)
+        f = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
+        E = e[:, [0, 5, 4, 5, 1, 3, 4, 3, 2]].reshape(-1, 3, 3)
+        return 0.5 * 1.5 * law.youngs_modulus_pa * np.einsum("i,pij,j->p", f, E, f) ** 2
+    f = np.array([np.cos(azimuth) ** 2, np.sin(azimuth) ** 2, 2 * np.cos(azimuth) * np.sin(azimuth)])
+    return 0.75 * (law.membrane_n_m * (e[:, :3] @ f) ** 2 + law.bending_n_m * (e[:, 3:] @ f) ** 2)
+
+
+def stiffening_energy(twin: Twin, e: np.ndarray) -> np.ndarray:
+    law, half = twin.law, 0.5 * twin.body.thickness_m
+    if twin.lattice.dim == 3:
+        return 50.0 / 4 * law.youngs_modulus_pa * (e**2 @ WEIGHT[3]) ** 2
+    if twin.lattice.dim == 2:
+        bending = law.bending_n_m * half**2 * (e[:, 3:] ** 2 @ WEIGHT[2]) ** 2
+        return 12.5 * (law.membrane_n_m * (e[:, :3] ** 2 @ WEIGHT[2]) ** 2 + bending)
+    bending = law.bending_n_m2 * (2 * half) ** 2 * np.sum(e[:, 1:] ** 2, axis=1) ** 2
+    return 12.5 * (law.stretching_n * e[:, 0] ** 4 + bending)
+
+
+SPRINGS = {
+    "viscoelastic_maxwell": (maxwell_energy, {"relaxation_s": 0.1}),
+    "anisotropy": (fibre_energy, {"ratio": 1.5, "azimuth_rad": 0.4}),
+    "strain_stiffening": (stiffening_energy, {"coefficient": 50.0}),
+}
+CASES = [(name, body) for name in SPRINGS for body in TWINS if (name, body) != ("anisotropy", "rope")]
+
+
+def spring(name: str, body: str) -> Effect:
+    values = dict(SPRINGS[name][1])
+    if name == "viscoelastic_maxwell":
+        values |= {"shear_modulus_pa": 4e3} if body == "solid" else {"share": 0.3}
+    if name == "anisotropy" and body == "solid":
+        values["elevation_rad"] = 0.7
+    return effect(name, **values)
+
+
+def deformed(twin: Twin, seed: int = 0, size: float = 0.1) -> np.ndarray:
+    """The undeformed body, stirred by a share of a cell."""
+    rng = np.random.default_rng(seed)
+    return twin.body.rest + size * float(twin.lattice.spacing.min()) * rng.normal(size=twin.body.rest.shape)
+
+
+def slope(twin: Twin, energy: object, x: np.ndarray) -> np.ndarray:
+    """Minus the derivative of the energy density's integral at a few coordinates: (k,) and their indices (k, 2)."""
+    picks = np.random.default_rng(1).integers(0, x.shape[0], 12)
+    measure, step = twin.lattice.particle_measures, 1e-6 * float(twin.lattice.spacing.min())
+    found = np.zeros((12, 3))
+    for row, node in enumerate(picks):
+        for i in range(3):
+            sides = []
+            for sign in (1, -1):
+                y = x.copy()
+                y[node, i] += sign * step
+                sides.append(float(measure @ energy(y)))
+            found[row, i] = -(sides[0] - sides[1]) / (2 * step)
+    return found, picks
+
+
+@pytest.mark.parametrize(("name", "body"), CASES)
+def test_forces_are_minus_the_derivative_of_the_energy(name: str, body: str) -> None:
+    twin, energy = TWINS[body], SPRINGS[name][0]
+    applied = Applied(twin, spring(name, body))
+    assert np.abs(applied(twin.body.rest)).max() < 1e-9
+    x = deformed(twin)
+    forces = applied(x)
+    expected, picks = slope(twin, lambda y: energy(twin, strains(twin, y)), x)
+    np.testing.assert_allclose(forces[picks], expected, atol=TOLERANCE[body] * np.abs(forces).max())
+    assert np.abs(forces.sum(axis=0)).max() < TOLERANCE[body] * np.abs(forces).max()
+
+
+@pytest.mark.parametrize("body", TWINS)
+def test_the_stress_of_a_held_stretched_body_relaxes_exponentially(body: str) -> None:
+    twin, tau, dt = TWINS[body], 0.1, 1e-4
+    applied = Applied(twin, spring("viscoelastic_maxwell", body))
+    applied(twin.body.rest)
+    x = deformed(twin)
+    first = np.linalg.norm(applied(x, 1e-9))
+    left = [np.linalg.norm(applied(x, dt)) / first for _ in range(2000)]
+    expected = np.exp(-np.arange(1, 2001) * dt / tau)
+    np.testing.assert_allclose(left, expected, rtol=2e-3)
+
+
+def test_a_relaxed_branch_lets_slow_motion_pass() -> None:
+    twin = TWINS["rope"]
+    applied = Applied(twin, spring("viscoelastic_maxwell", "rope"))
+    applied(twin.body.rest)
+    x = deformed(twin)
+    whole = np.linalg.norm(Applied(twin, spring("viscoelastic_maxwell", "rope"))(twin.body.rest))
+    for share in np.linspace(0.0, 1.0, 1001)[1:]:  # 10 s, a hundred relaxation times
+        slow = applied(twin.body.rest + share * (x - twin.body.rest), 1e-2)
+    fast = Applied(twin, spring("viscoelastic_maxwell", "rope"))
+    fast(twin.body.rest)
+    assert whole == 0.0
+    assert np.linalg.norm(slow) < 0.03 * np.linalg.norm(fast(x, 1e-6))
+
+
+def yielding(body: str) -> Effect:
+    if body == "solid":
+        return effect("plasticity", inverse_yield_per_pa=1 / 2e3, hardening=0.2)
+    return effect("plasticity", yield_radius_m=0.5, hardening=0.2)
+
+
+def plastic_part(twin: Twin, e: np.ndarray, p: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Radial return in plain numpy: plastic strain (P, k) and gathered strain (P,) after strains (P, ...)."""
+    if twin.lattice.dim == 3:
+        e = e - np.outer(e[:, :3].mean(axis=1), [1, 1, 1, 0, 0, 0])
+        limit, weight = np.sqrt(2 / 3) * 2e3 / (2 * twin.law.lame[0]), WEIGHT[3]
+    elif twin.lattice.dim == 2:
+        e, limit, weight = e[:, 3:], 2.0, WEIGHT[2]
+    else:
+        e, limit, weight = e[:, 1:], 2.0, np.ones(3)
+    size = np.sqrt((e - p) ** 2 @ weight)
+    flow = np.maximum(size - limit - 0.2 * g, 0.0) / 1.2
+    return p + (flow / np.maximum(size, 1e-30))[:, None] * (e - p), g + flow
+
+
+@pytest.mark.parametrize("body", TWINS)
+def test_plastic_strain_follows_the_radial_return_and_stays(body: str) -> None:
+    """Along a way whose tangents hardly turn, so that a rod's memory need not be carried."""
+    twin = TWINS[body]
+    applied, dim = Applied(twin, yielding(body)), twin.lattice.dim
+    assert np.abs(applied(twin.body.rest)).max() == 0.0
+    rest = twin.body.rest
+    bent = deformed(twin, size={3: 0.05, 2: 0.02, 1: 1e-3}[dim])
+    if dim == 1:
+        bent = rest + np.array([0.0, 0.0, 3.0]) * (rest[:, :1] - 0.15) ** 2 * 0.02
+        yielded = effect("plasticity", yield_radius_m=12.0, hardening=0.2)
+        applied = Applied(twin, yielded)
+        applied(rest)
+    width = {3: 6, 2: 3, 1: 3}[dim]
+    p, g = np.zeros((twin.lattice.fill.size, width)), np.zeros(twin.lattice.fill.size)
+    for share in (0.3, 1.0, 0.6, 0.0):
+        x = rest + share * (bent - rest)
+        forces = applied(x, 1e-3)
+        if dim == 1:
+            e = strains(twin, x)[:, 1:]
+            size = np.linalg.norm(e - p, axis=1)
+            flow = np.maximum(size - 1 / 12.0 - 0.2 * g, 0.0) / 1.2
+            p, g = p + (flow / np.maximum(size, 1e-30))[:, None] * (e - p), g + flow
+        else:
+            p, g = plastic_part(twin, strains(twin, x), p, g)
+
+    def energy(y: np.ndarray) -> np.ndarray:
+        e, law = strains(twin, y), twin.law
+        if dim == 3:
+            return -2 * law.lame[0] * np.sum(p * e * WEIGHT[3], axis=1)
+        if dim == 2:
+            nu, k = law.poissons_ratio, e[:, 3:]
+            mixed = nu * (p[:, 0] + p[:, 1]) * (k[:, 0] + k[:, 1]) + (1 - nu) * np.sum(
+                p * k * WEIGHT[2], axis=1
+            )
+            return -law.bending_n_m * mixed
+        return -law.bending_n_m2 * np.sum(p * e[:, 1:], axis=1)
+
+    assert np.abs(p).max() > 0 and np.abs(forces).max() > 0
+    expected, picks = slope(twin, energy, rest)
+    np.testing.assert_allclose(
+        forces[picks], expected, atol=max(2e-3, TOLERANCE[body]) * np.abs(forces).max()
+    )
+
+
+@pytest.mark.parametrize("name", ["plasticity", "viscoelastic_maxwell", "rest_shape"])
+@pytest.mark.parametrize("body", TWINS)
+def test_memory_turns_with_the_body(name: str, body: str) -> None:
+    """A rope is straight again when it is turned, about an axis across it: it carries no spin about its tangent."""
+    twin = TWINS[body]
+    if name == "rest_shape":
+        added = effect(name, curvature_1_per_m=2.0, curvature_2_per_m=-1.0)
+    else:
+        added = yielding(body) if name == "plasticity" else spring(name, body)
+    applied = Applied(twin, added)
+    applied(twin.body.rest)
+    x = deformed(twin, size=0.1 if body != "rope" else 0.02)
+    applied(x, 1e-3)
+    x = twin.body.rest if body == "rope" else x
+    forces = applied(x)
+    assert np.abs(forces).max() > 0
+    for share in np.linspace(0.0, 1.0, 201)[1:]:  # turn, no time passing
+        turn = Rotation.from_rotvec(share * np.array([0.0, 1.2, -0.9]))
+        turned = applied(turn.apply(x))
+    limit = {"solid": 2e-3, "sheet": 1e-9, "rope": 1e-9}[body] * np.abs(forces).max()
+    np.testing.assert_allclose(turned, turn.apply(forces), atol=limit)
+
+
+def stretched(twin: Twin, share: float) -> Twin:
+    start = twin.body.start.copy()
+    middle = start.mean(axis=0)
+    start[:, 0] = middle[0] + (1 + share) * (start[:, 0] - middle[0])
+    return replace(twin, body=replace(twin.body, start=start))
+
+
+def test_a_plastic_bar_does_not_return_to_its_length() -> None:
+    twin = loose("solid", youngs_modulus_pa=2e4, poissons_ratio=0.3, viscosity_pa_s=60.0)
+    times = np.linspace(0.0, 0.6, 4)
+    elastic = moved(stretched(twin, 0.1), times)
+    plastic = moved(
+        stretched(twin, 0.1).with_effect(effect("plasticity", inverse_yield_per_pa=1 / 400.0)), times
+    )
+    length = np.ptp(twin.body.rest[:, 0])
+    assert np.ptp(elastic[-1, :, 0]) / length - 1 == pytest.approx(0.0, abs=0.003)
+    assert 0.04 < np.ptp(plastic[-1, :, 0]) / length - 1 < 0.09
+
+
+def test_viscosity_damps_the_axial_mode_of_a_bar() -> None:
+    """u = cos(pi x / L), nu = 0: amplitude falls at eta k^2 / rho."""
+    density, eta = 500.0, 2.0
+    twin = loose("solid", youngs_modulus_pa=4e4, poissons_ratio=0.0)
+    twin = twin.with_effect(effect("viscosity_kelvin_voigt", viscosity_pa_s=eta))
+    low, high = 0.0, 0.16
+    mode = np.cos(np.pi * (twin.body.rest[:, 0] - low) / (high - low))
+    velocity = np.zeros_like(twin.body.rest)
+    velocity[:, 0] = 0.02 * mode
+    times = np.linspace(0.0, 0.4, 401)
+    mass = Problem(twin.lattice, twin.law, twin.body.rest, np.zeros(3)).nodal_mass()
+    amplitude = (moved(twin, times, velocity)[:, :, 0] - twin.body.rest[:, 0]) @ (mass * mode)
+    wave = np.pi / (high - low)
+    speed = np.sqrt(4e4 / density)
+    peaks = np.abs(amplitude)[1:-1][
+        (np.abs(amplitude)[1:-1] > np.abs(amplitude)[:-2])
+        & (np.abs(amplitude)[1:-1] >= np.abs(amplitude)[2:])
+    ]
+    rate = -np.log(peaks[-1] / peaks[0]) / ((len(peaks) - 1) * np.pi / (wave * speed))
+    assert rate == pytest.approx(eta * wave**2 / density, rel=0.05)
+
+
+@pytest.mark.parametrize("body", ["sheet", "rope"])
+def test_viscosity_of_thin_bodies_adds_to_the_laws_own(body: str) -> None:
+    times = np.linspace(0.0, 0.1, 4)
+    gravity = (0.0, 0.0, -9.81)
+    law = loose(body, gravity, relaxation_s=3e-3)
+    both = loose(body, gravity, relaxation_s=1e-3).with_effect(
+        effect("viscosity_kelvin_voigt", relaxation_s=2e-3)
+    )
+    thrown = np.random.default_rng(0).normal(scale=0.05, size=law.body.start.shape)
+    np.testing.assert_allclose(moved(both, times, thrown), moved(law, times, thrown), atol=1e-12)
