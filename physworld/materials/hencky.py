@@ -19,32 +19,31 @@ from physworld.materials.solid import SolidLaw
 from physworld.materials.stress import Stress
 
 _HELPERS = r"""
-    static PW_INLINE void rotate(V* A, V* Q, int p, int r) {   // makes A[p][r] zero
-        const V off = A[3 * p + r], gap = A[4 * r] - A[4 * p];
-        // tangent of the turn: sign(gap) 2 off / (|gap| + sqrt(gap^2 + 4 off^2))
-        const V far = absolute(gap) + sqrt(gap * gap + off * off * 4.0f) + 1e-30f;
-        const V t = where_positive(gap, off * 2.0f, off * -2.0f) / far;
+    // a symmetric matrix as its diagonal d and off[s], the entry that stands in neither row nor column s
+    static PW_INLINE void rotate(V* d, V* off, V* Q, int p, int r) {   // makes the entry (p, r) zero
+        const int s = 3 - p - r;
+        const V zeroed = off[s], gap = d[r] - d[p], a = off[r], b = off[p];
+        // tangent of the turn: sign(gap) 2 zeroed / (|gap| + sqrt(gap^2 + 4 zeroed^2))
+        const V far = absolute(gap) + sqrt(gap * gap + zeroed * zeroed * 4.0f) + 1e-30f;
+        const V t = where_positive(gap, zeroed * 2.0f, zeroed * -2.0f) / far;
         const V cosine = 1.0f / sqrt(t * t + 1.0f), sine = t * cosine;
+        d[p] = d[p] - t * zeroed;
+        d[r] = d[r] + t * zeroed;
+        off[s] = V{};
+        off[r] = cosine * a - sine * b;
+        off[p] = sine * a + cosine * b;
         for (int k = 0; k < 3; ++k) {
-            const V a = A[3 * k + p], b = A[3 * k + r];
-            A[3 * k + p] = cosine * a - sine * b;
-            A[3 * k + r] = sine * a + cosine * b;
-        }
-        for (int k = 0; k < 3; ++k) {
-            const V a = A[3 * p + k], b = A[3 * r + k];
-            A[3 * p + k] = cosine * a - sine * b;
-            A[3 * r + k] = sine * a + cosine * b;
             const V u = Q[3 * k + p], w = Q[3 * k + r];
             Q[3 * k + p] = cosine * u - sine * w;
             Q[3 * k + r] = sine * u + cosine * w;
         }
     }
-    static PW_INLINE void eigen(V* A, V* Q) {   // A (3 x 3, symmetric) becomes diagonal; Q holds its vectors
+    static PW_INLINE void eigen(V* d, V* off, V* Q) {   // d becomes the eigenvalues; Q has their vectors as columns
         for (int k = 0; k < 9; ++k) Q[k] = V{} + (k % 4 == 0 ? 1.0f : 0.0f);
         for (int sweep = 0; sweep < 4; ++sweep) {
-            rotate(A, Q, 0, 1);
-            rotate(A, Q, 0, 2);
-            rotate(A, Q, 1, 2);
+            rotate(d, off, Q, 0, 1);
+            rotate(d, off, Q, 0, 2);
+            rotate(d, off, Q, 1, 2);
         }
     }
     static PW_INLINE V log_one_plus(V x) {
@@ -52,30 +51,28 @@ _HELPERS = r"""
         return log(u) - ((u - 1.0f) - x) / u;
     }
     static PW_INLINE void log_one_plus(const V* E, V* L) {   // ln(I + E) of a symmetric E
-        V A[9], Q[9], l[3];
-        for (int k = 0; k < 9; ++k) A[k] = E[k];
-        eigen(A, Q);
-        for (int k = 0; k < 3; ++k) l[k] = log_one_plus(floor(A[4 * k], -0.999999f));
+        V d[3] = {E[0], E[4], E[8]}, off[3] = {E[5], E[2], E[1]}, Q[9], l[3];
+        eigen(d, off, Q);
+        for (int k = 0; k < 3; ++k) l[k] = log_one_plus(floor(d[k], -0.999999f));
         for (int i = 0; i < 3; ++i)
             for (int j = 0; j < 3; ++j)
                 L[3 * i + j] = Q[3 * i] * l[0] * Q[3 * j] + Q[3 * i + 1] * l[1] * Q[3 * j + 1]
                     + Q[3 * i + 2] * l[2] * Q[3 * j + 2];
     }
     static PW_INLINE void log_one_plus(const D* E, D* L) {
-        V A[9], Q[9], l[3], B[9], T[9];
-        for (int k = 0; k < 9; ++k) A[k] = E[k].a;
-        eigen(A, Q);
+        V d[3] = {E[0].a, E[4].a, E[8].a}, off[3] = {E[5].a, E[2].a, E[1].a}, Q[9], l[3], B[9], T[9];
+        eigen(d, off, Q);
         for (int k = 0; k < 3; ++k) {
-            A[4 * k] = floor(A[4 * k], -0.999999f);
-            l[k] = log_one_plus(A[4 * k]);
+            d[k] = floor(d[k], -0.999999f);
+            l[k] = log_one_plus(d[k]);
         }
         for (int i = 0; i < 3; ++i)
             for (int j = 0; j < 3; ++j)
                 T[3 * i + j] = E[3 * i].b * Q[j] + E[3 * i + 1].b * Q[3 + j] + E[3 * i + 2].b * Q[6 + j];
         for (int i = 0; i < 3; ++i)
             for (int j = 0; j < 3; ++j) {
-                // (ln A - ln B) / (A - B) = 2 artanh(z) / (z (A + B)), z = (A - B) / (A + B): a series for small z
-                const V a = A[4 * i], b = A[4 * j], sum = a + b + 2.0f, z = (a - b) / sum, z2 = z * z;
+                // (ln A - ln B) / (A - B) = 2 artanh(z) / (z (A + B)), z = (A - B) / (A + B), A = 1 + a: a series
+                const V a = d[i], b = d[j], sum = a + b + 2.0f, z = (a - b) / sum, z2 = z * z;
                 const V series = (((z2 * 0.14285714f + 0.2f) * z2 + 0.33333333f) * z2 + 1.0f) * 2.0f / sum;
                 const V safe = where_positive(z2 - 0.01f, a - b, V{} + 1.0f);
                 const V slope = where_positive(z2 - 0.01f, (l[i] - l[j]) / safe, series);
