@@ -5,9 +5,11 @@ PhysworldError
 ├── SimulationError         a simulation cannot be trusted
 │   ├── UnstableSimulation  a state is not finite, or an element inverted
 │   ├── CFLViolation        a forced time step exceeds the stable one
-│   └── ParticlesLeftTheGrid  material left the stated workspace
+│   ├── ParticlesLeftTheGrid  material left the stated workspace
+│   └── ContactFailed       a collider is too fast for its contact, or material came too deep into it
 ├── UnknownEffect           no effect or strength of that name
 ├── EffectRefused           the effect makes no sense for this twin
+├── NotDifferentiable       a gradient was asked of what has none
 ├── CalibrationError        no parameter gave a usable simulation
 ├── Cancelled               the caller asked to stop
 └── TrainingDiverged        a loss or a weight is not finite
@@ -40,12 +42,20 @@ class ParticlesLeftTheGrid(SimulationError):
     """Material left the stated workspace."""
 
 
+class ContactFailed(SimulationError):
+    """A collider is too fast for its contact, or material came too deep into it."""
+
+
 class UnknownEffect(PhysworldError):
     """No effect or strength of that name."""
 
 
 class EffectRefused(PhysworldError):
     """The effect makes no sense for this twin."""
+
+
+class NotDifferentiable(PhysworldError):
+    """A gradient was asked of what has none."""
 
 
 class CalibrationError(PhysworldError):

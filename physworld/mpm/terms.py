@@ -25,13 +25,19 @@ class BoundTerm(Protocol):
         frequency_rad_s: what the term adds to the fastest mode, sqrt of stiffness over mass (0 for none). Squares of
             frequencies add up in the stable time step.
         friction_per_s: fastest damping rate that it adds (0 for none). Rates add up in the stable time step.
+        memory: arrays that one substep leaves for the next; a gradient keeps and restores them.
     """
 
     frequency_rad_s: float = 0.0
     friction_per_s: float = 0.0
+    memory: tuple[wp.array, ...] = ()
 
     def begin(self, times: np.ndarray) -> None:
         """A run over the frames ``times`` (T,) [s] starts: for terms that need the absolute time. May raise."""
+        return None
+
+    def check(self, time_s: float) -> None:
+        """A frame ended at ``time_s``: raises a :class:`physworld.errors.SimulationError` if it cannot be trusted."""
         return None
 
     def launch(self, x: wp.array, v: wp.array, clock: wp.array, counter: wp.array, force: wp.array) -> None:
