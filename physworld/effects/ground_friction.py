@@ -61,6 +61,4 @@ def no_ground(twin: Twin) -> str | None:
     """Why nothing of the ground can act on this twin, or None."""
     if any(isinstance(contact, GroundContact) for contact in twin.contacts):
         return None
-    height = twin.ground_height_m
-    place = "no ground is declared" if height is None else f"the ground at {height:g} m carries solids only"
-    return f"{place}: {len(twin.contacts)} contacts"
+    return f"the body touches no ground ({len(twin.contacts)} contacts; ground height {twin.ground_height_m})"
