@@ -58,6 +58,7 @@ class BoundGrowth(BoundTerm):
     rate_per_s: float
     device: str
     times: wp.array | None = None
+    multiplies: bool = True
 
     def begin(self, times: np.ndarray) -> None:
         """Take the times. Raises CFLViolation where the stiffness would outgrow the time step's margin."""

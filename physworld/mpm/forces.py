@@ -45,7 +45,7 @@ class InternalForces:
         else:
             self._kernel = sheet_forces if isinstance(law, SheetLaw) else rod_forces
         self._solid = lattice.dim == 3
-        self._state = wp.zeros(
+        self.memory = wp.zeros(
             self.cells * _MEMORY[lattice.dim], dtype=wp.float32 if self._solid else wp.float64, device=device
         )
         self.inverted = wp.zeros(1, dtype=wp.int32, device=device)
@@ -55,7 +55,7 @@ class InternalForces:
         wp.launch(
             self._kernel,
             dim=self.cells,
-            inputs=[*self._model, clock, x, self._state],
+            inputs=[*self._model, clock, x, self.memory],
             outputs=[force, self.inverted] if self._solid else [force],
             device=self.device,
         )

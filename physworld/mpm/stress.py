@@ -59,7 +59,7 @@ class StressTerm:
             ]
         inputs += [array(self.parameters or (0.0,)), array(np.stack(fields))]
         state = wp.zeros(max(1, self.model.rows * lattice.fill.size), dtype=real, device=device)
-        bound = BoundStress(self.model.kernel, cells, inputs, state, device, 0.0)
+        bound = BoundStress(self.model, cells, inputs, state, device, 0.0)
         if self.frequency_rad_s is not None:
             bound.frequency_rad_s = self.frequency_rad_s
         else:
@@ -72,19 +72,34 @@ class StressTerm:
 
 @dataclass
 class BoundStress(BoundTerm):
-    """A stress term whose arrays live on a device."""
+    """A stress term whose arrays live on a device; the last two of its inputs are the numbers and the fields."""
 
-    kernel: Any
+    model: StressModel
     cells: int
     inputs: list
     state: wp.array
     device: str
     frequency_rad_s: float
 
+    @property
+    def memory(self) -> tuple[wp.array, ...]:
+        """The rows of memory, if the model has any."""
+        return (self.state,) if self.model.rows else ()
+
+    @property
+    def numbers(self) -> wp.array:
+        """What PARAMETER(k) reads."""
+        return self.inputs[-2]
+
+    @property
+    def fields(self) -> wp.array:
+        """What FIELD(k) reads, (layers * P,)."""
+        return self.inputs[-1]
+
     def launch(self, x: wp.array, v: wp.array, clock: wp.array, counter: wp.array, force: wp.array) -> None:
         """Add the forces [N] of the model's stresses."""
         wp.launch(
-            self.kernel,
+            self.model.kernel,
             dim=self.cells,
             inputs=[*self.inputs, clock, counter, x, self.state],
             outputs=[force],

@@ -26,11 +26,13 @@ class BoundTerm(Protocol):
             frequencies add up in the stable time step.
         friction_per_s: fastest damping rate that it adds (0 for none). Rates add up in the stable time step.
         memory: arrays that one substep leaves for the next; a gradient keeps and restores them.
+        multiplies: scales the internal forces instead of adding to them; such a term comes first.
     """
 
     frequency_rad_s: float = 0.0
     friction_per_s: float = 0.0
     memory: tuple[wp.array, ...] = ()
+    multiplies: bool = False
 
     def begin(self, times: np.ndarray) -> None:
         """A run over the frames ``times`` (T,) [s] starts: for terms that need the absolute time. May raise."""
