@@ -20,15 +20,17 @@ from scipy.sparse.linalg import splu
 from physworld.effects.base import Effect
 from physworld.effects.registry import effect, in_order
 from physworld.errors import EffectRefused
+from physworld.geometry.declared import grips_of
 from physworld.geometry.reference import ReferenceBody, reference_body
 from physworld.geometry.rigid import least_rotation, rigid_groups, rigid_motion
 from physworld.materials.laws import Law, RodLaw, SheetLaw, SolidLaw
 from physworld.materials.library import law_class
-from physworld.mpm.contact import GroundContact
+from physworld.mpm.colliders import Collider
+from physworld.mpm.contact import GroundContact, ground, touching
 from physworld.mpm.lattice import Lattice
 from physworld.mpm.terms import Term
 from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian
-from physworld.scene import AS_MEASURED, Scene
+from physworld.scene import AS_MEASURED, Grip, Scene
 
 Progress = Callable[[int, int], None]
 
@@ -237,6 +239,7 @@ class Twin:
             drag_per_s=self.air_drag_per_s,
             stiffness_factor=None if properties is None else np.exp(properties[:, 0]),
             density_factor=None if properties is None else np.exp(properties[:, 1]),
+            added_mass=self.body.added_mass,
             terms=self.contacts,
             device=self.device,
         )
@@ -318,6 +321,7 @@ class Twin:
                 f"body_{k}": getattr(body, k)
                 for k in ("rest", "start", "start_velocity", "points", "offsets")
             },
+            **({} if body.added_mass is None else {"body_added_mass": body.added_mass}),
         }
 
     @classmethod
@@ -329,6 +333,7 @@ class Twin:
             lattice=lattice,
             thickness_m=facts["thickness_m"],
             notes=tuple(facts["notes"]),
+            added_mass=arrays.get("body_added_mass"),
             **{k: arrays[f"body_{k}"] for k in ("rest", "start", "start_velocity", "points", "offsets")},
         )
         return cls(
@@ -348,10 +353,16 @@ class Twin:
 
     @property
     def contacts(self) -> tuple[Term, ...]:
-        """What the body touches, as terms."""
-        if self.ground_height_m is None or not isinstance(self.law, SolidLaw):
+        """The ground under the body, as a term; none where no ground is declared."""
+        if self.ground_height_m is None:
             return ()
-        return (GroundContact(self.lattice, self.law, self.ground_height_m, self.ground_friction),)
+        plane = ground(self.ground_height_m, self.ground_friction)
+        offsets = 0.0 if self.lattice.dim == 3 else self._touching(plane)
+        return (GroundContact(self.lattice, self.law, self.ground_height_m, self.ground_friction, offsets),)
+
+    def _touching(self, collider: Collider) -> np.ndarray:
+        half = {3: 0.0, 2: 0.5, 1: 1.0}[self.lattice.dim] * self.body.thickness_m
+        return touching(self.lattice, self.body.start, collider, self.release_s, half)
 
     def _held(self, times: np.ndarray, controls: np.ndarray) -> HeldNodes:
         numbers, paths = [np.empty(0, dtype=int)], [np.empty((len(times), 0, 3))]
@@ -381,13 +392,14 @@ def build_twin(
     body = reference_body(scene, particle_budget, refinement)
     _, controls = scene.control_track()
     reach = 0.6 * float(np.ptp(body.start, axis=0).max())
-    if scene.grips:
-        groups = tuple(np.array(g.controllers, dtype=int) for g in scene.grips)
+    grips = grips_of(scene)
+    if grips:
+        groups = tuple(np.array(g.controllers, dtype=int) for g in grips)
     else:
         groups = tuple(rigid_groups(controls, reach))
     held, taken = [], np.empty(0, dtype=int)
     for number, group in enumerate(groups):
-        region = scene.grips[number] if scene.grips else None
+        region = grips[number] if grips else None
         nodes = np.setdiff1d(_gripped_nodes(body, controls[0, group], region), taken)
         held.append(nodes)
         taken = np.concatenate([taken, nodes])
@@ -432,6 +444,8 @@ def _gripped_nodes(body: ReferenceBody, controllers: np.ndarray, grip: Any) -> n
     particles = lattice.interpolation(lattice.particle_coordinates) @ body.start
     slack = 1e-6
     declared = grip is not None and grip.region_min_m is not None
+    if declared and lattice.dim == 3 and np.any(grip.region_max_m <= grip.region_min_m):
+        return _bonded_nodes(body, grip)
     if declared:
         low, high = np.asarray(grip.region_min_m) - slack, np.asarray(grip.region_max_m) + slack
         margin = 0.5 * body.thickness_m if lattice.dim < 3 else 0.0
@@ -450,6 +464,14 @@ def _gripped_nodes(body: ReferenceBody, controllers: np.ndarray, grip: Any) -> n
         cells = np.zeros(len(lattice.cells), dtype=bool)
         cells[np.unique(_nearest(particles, controllers) // lattice.fill.shape[1])] = True
     return np.unique(lattice.cell_nodes[cells])
+
+
+def _bonded_nodes(body: ReferenceBody, grip: Grip) -> np.ndarray:
+    """The two layers of nodes whose splines fix an end face: of a grip without depth."""
+    axis = int(np.argmin(grip.region_max_m - grip.region_min_m))
+    lattice = body.lattice
+    distance = np.abs(lattice.node_coordinates[:, axis] - grip.region_min_m[axis]) / lattice.spacing[axis]
+    return np.flatnonzero(distance < 1.0)
 
 
 def _nearest(particles: np.ndarray, targets: np.ndarray) -> np.ndarray:

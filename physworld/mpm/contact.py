@@ -1,8 +1,14 @@
-"""Contact of a solid with a horizontal ground: penalty pressure and regularised Coulomb friction on surface points.
+"""What of a body touches: its contact points, how stiff they are, and the ground under them.
 
-Surface points sit on the exposed faces of the cells (2 x 2 a face). The pressure is (lambda + 2 mu) / dx times the
-depth: one more cell of material a cell's depth, so a block at rest sinks by its own compression over one cell. The
-friction is min(mu p, 0.3 rho c |v|) against the sliding velocity: below the Coulomb limit it is a viscous stick.
+A solid touches with points on the exposed faces of its cells (2 x 2 a face), a sheet or a rod with its particles, half
+its thickness or its radius before they reach the obstacle. The penalty is one more cell of the material:
+
+    solid          p = (lambda + 2 mu) / dx depth      shear mu / dx
+    sheet, rod     p = rho (c / dx)^2 depth            shear the same, both with half of critical damping
+
+with rho and c the law's own density (per area, per length) and fastest wave speed: a contact adds no mode much faster
+than the body's own. Thin bodies have no thickness in which an impact could ring: the damping stands for the energy that
+real ones lose there. Friction is Coulomb's, with an elastic slip that holds what sticks where it is (docs/contact.md).
 """
 
 from __future__ import annotations
@@ -11,88 +17,137 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import warp as wp
 
-from physworld.materials.laws import SolidLaw
+from physworld.geometry.sdf import half_space
+from physworld.materials.laws import Law, SolidLaw
 from physworld.mpm.bspline import GAUSS_POINTS
+from physworld.mpm.colliders import BoundCollider, Collider, ContactSurface
+from physworld.mpm.colliders_path import RigidPath
 from physworld.mpm.lattice import Lattice
-from physworld.mpm.node_kernels import ground_contact
-from physworld.mpm.terms import BoundTerm
 
 if TYPE_CHECKING:
     from physworld.mpm.total_lagrangian import Problem
 
-_STICK_IMPEDANCE = 0.3  # share of rho c
-_BOUNDARY_MASS = 6.0  # the outermost nodal layer of a quadratic spline carries 1/6 of a cell
+_THIN_DAMPING = 0.5  # share of critical damping in the contact of sheets and rods
 
 
 @dataclass(frozen=True)
 class GroundContact:
-    """Ground at ``height_m`` with Coulomb ``friction`` under the surface points of ``lattice``."""
+    """Ground at ``height_m`` with Coulomb ``friction`` under a body; see :class:`ColliderContact` for ``offsets``."""
 
     lattice: Lattice
-    law: SolidLaw
+    law: Law
     height_m: float
     friction: float
+    offsets: np.ndarray | float = 0.0
 
-    def bind(self, problem: Problem) -> BoundContact:
+    def bind(self, problem: Problem) -> BoundCollider:
         """Device arrays for one problem."""
-        device = problem.device
-        points, areas = surface_points(self.lattice)
-        matrix = self.lattice.interpolation(points)
-        mu, lam = self.law.lame
-        stiffness = (lam + 2 * mu) / float(self.lattice.spacing.min())
-        impedance = _STICK_IMPEDANCE * self.law.density_kg_m3 * self.law.wave_speed_m_s
-        return BoundContact(
-            points=len(points),
-            inputs=[
-                wp.array(matrix.indptr, dtype=wp.int32, device=device),
-                wp.array(matrix.indices, dtype=wp.int32, device=device),
-                wp.array(matrix.data, dtype=wp.float64, device=device),
-                wp.array(areas, dtype=wp.float64, device=device),
-                wp.float64(self.height_m), wp.float64(self.friction), wp.float64(stiffness), wp.float64(impedance),
-            ],
-            device=device,
-            frequency_rad_s=contact_frequency(self.law, self.lattice),
-        )  # fmt: skip
+        plane = ground(self.height_m, self.friction)
+        return BoundCollider(plane, contact_surface(self.lattice, self.law, self.offsets), problem)
+
+
+def ground(height_m: float, friction: float) -> Collider:
+    """The ground as a collider: everything below ``height_m``."""
+    return Collider("ground", half_space(), RigidPath.still((0.0, 0.0, height_m)), friction)
 
 
 @dataclass(frozen=True)
-class BoundContact(BoundTerm):
-    """A ground contact whose arrays live on a device."""
+class ColliderContact:
+    """A rigid collider beside a body.
 
-    points: int
-    inputs: list
-    device: str
-    frequency_rad_s: float
+    Attributes:
+        collider: what pushes.
+        offsets: distance at which the contact points touch [m]: half a sheet's thickness, a rod's radius, 0 for a
+            solid; one number, or one for each point (:func:`touching`).
+    """
 
-    def launch(self, x: wp.array, v: wp.array, clock: wp.array, counter: wp.array, force: wp.array) -> None:
-        """Add contact forces [N] at nodal positions and velocities (3n,) to ``force``."""
-        wp.launch(
-            ground_contact, dim=self.points, inputs=[*self.inputs, x, v], outputs=[force], device=self.device
+    collider: Collider
+    offsets: np.ndarray | float = 0.0
+
+    def bind(self, problem: Problem) -> BoundCollider:
+        """Device arrays for one problem."""
+        surface = contact_surface(problem.lattice, problem.law, self.offsets)
+        return BoundCollider(self.collider, surface, problem)
+
+
+def contact_surface(lattice: Lattice, law: Law, offsets: np.ndarray | float = 0.0) -> ContactSurface:
+    """Contact points of a body and their stiffness; see the module's text."""
+    points, measures, groups = contact_points(lattice)
+    dx = float(lattice.spacing.min())
+    if isinstance(law, SolidLaw):
+        mu, lam = law.lame
+        stiffness, shear, damping = (lam + 2 * mu) / dx, mu / dx, 0.0
+    else:
+        density = float(getattr(law, {2: "density_kg_m2", 1: "density_kg_m"}[lattice.dim]))
+        rate = law.wave_speed_m_s / dx
+        stiffness = shear = density * rate**2
+        damping = 2 * _THIN_DAMPING * density * rate
+    return ContactSurface(
+        points=points,
+        measures=measures,
+        groups=groups,
+        offsets=np.broadcast_to(np.asarray(offsets, dtype=float), len(points)),
+        stiffness=stiffness,
+        shear_stiffness=shear,
+        damping=damping,
+        rate_per_s=law.wave_speed_m_s / dx,
+    )
+
+
+def touching(
+    lattice: Lattice, nodes: np.ndarray, collider: Collider, time_s: float, thickness_m: float
+) -> np.ndarray:
+    """Offsets (S,) [m] with which nothing is pressed at nodal positions ``nodes`` (n, 3).
+
+    Points that start inside, by noise or by a thickness that is not quite right, touch there and further in: else the
+    penalty would throw them out.
+    """
+    points, _, _ = contact_points(lattice)
+    gap = collider.distance(lattice.interpolation(points) @ nodes, time_s)
+    return np.minimum(thickness_m, gap)
+
+
+def contact_points(lattice: Lattice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Reference coordinates (S, d) [m], measures (S,) [m**(d-1) of a solid, else m**d] and groups (S,) of the points
+    that touch; those of one group may touch at the same time.
+    """
+    if lattice.dim < 3:
+        solid = lattice.particle_measures > 0
+        return (
+            lattice.particle_coordinates[solid],
+            lattice.particle_measures[solid],
+            np.zeros(int(solid.sum()), dtype=int),
         )
-
-
-def contact_frequency(law: SolidLaw, lattice: Lattice) -> float:
-    """Angular frequency [rad/s] that the penalty adds to the outermost nodes."""
-    return float(np.sqrt(_BOUNDARY_MASS) * law.wave_speed_m_s / lattice.spacing.min())
-
-
-def surface_points(lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
-    """Reference coordinates (S, 3) [m] and areas (S,) [m^2] of points on the exposed faces of a solid's cells."""
-    present = {tuple(cell) for cell in lattice.cells}
-    points, areas = [], []
-    for axis in range(3):
+    points, areas, groups = [], [], []
+    for side, (axis, reference) in enumerate(_face_points(lattice)):
         others = [a for a in range(3) if a != axis]
         area = float(np.prod(lattice.spacing[others])) / 4
+        points.append(reference)
+        areas.append(np.full(len(reference), area))
+        groups.append(np.full(len(reference), side))
+    return np.concatenate(points), np.concatenate(areas), np.concatenate(groups)
+
+
+def _face_points(lattice: Lattice) -> list[tuple[int, np.ndarray]]:
+    """Axis and points of the exposed faces that look along each of the six directions."""
+    present = {tuple(cell) for cell in lattice.cells}
+    sides = []
+    for axis in range(3):
+        others = [a for a in range(3) if a != axis]
         for side in (0, 1):
             step = np.zeros(3, dtype=int)
             step[axis] = 1 if side else -1
             exposed = np.array([c for c in lattice.cells if tuple(c + step) not in present]).reshape(-1, 3)
-            for first in GAUSS_POINTS:
-                for second in GAUSS_POINTS:
-                    local = np.zeros(3)
-                    local[axis], local[others[0]], local[others[1]] = side, first, second
-                    points.append(lattice.origin + (exposed + local) * lattice.spacing)
-                    areas.append(np.full(len(exposed), area))
-    return np.concatenate(points), np.concatenate(areas)
+            local = np.zeros((4, 3))
+            local[:, axis] = side
+            local[:, others] = [(a, b) for a in GAUSS_POINTS for b in GAUSS_POINTS]
+            places = lattice.origin + (exposed[:, None] + local[None]) * lattice.spacing
+            sides.append((axis, places.reshape(-1, 3)))
+    return sides
+
+
+def surface_points(lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
+    """Reference coordinates (S, d) [m] and measures (S,) of the contact points."""
+    points, measures, _ = contact_points(lattice)
+    return points, measures

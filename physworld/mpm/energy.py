@@ -173,6 +173,9 @@ class _Marker:
     def begin(self, times: np.ndarray) -> None:
         return None
 
+    def check(self, time_s: float) -> None:
+        return None
+
     def launch(self, x: wp.array, v: wp.array, clock: wp.array, counter: wp.array, force: wp.array) -> None:
         wp.launch(keep_forces, dim=len(force), inputs=[force], outputs=[self._kept], device=force.device)
 
@@ -213,6 +216,9 @@ class _Meter:
         return self
 
     def begin(self, times: np.ndarray) -> None:
+        return None
+
+    def check(self, time_s: float) -> None:
         return None
 
     def launch(self, x: wp.array, v: wp.array, clock: wp.array, counter: wp.array, force: wp.array) -> None:

@@ -1,8 +1,7 @@
-"""Device side of the nodes: symplectic time step, prescribed motion, ground contact.
+"""Device side of the nodes: symplectic time step, prescribed motion.
 
 Nodes that gripped material touches follow a cubic Hermite path between the frames of the control track; all others
-obey m dv/dt = f + m g - m c v. The ground pushes on points of the body's surface: a penalty pressure of one cell of
-material a cell's depth, and regularised Coulomb friction.
+obey m dv/dt = f + m g - m c v.
 
 Legend: clock = (frame interval [s], 1/dt [1/s], dt [s]); counter = (frame, substep, substeps of this frame).
 """
@@ -62,42 +61,3 @@ def advance_nodes(
 def advance_counter(counter: wp.array(dtype=wp.int32)):
     """Next substep."""
     counter[1] = counter[1] + 1
-
-
-@wp.kernel
-def ground_contact(
-    # model
-    row_start: wp.array(dtype=wp.int32),
-    columns: wp.array(dtype=wp.int32),
-    weights: wp.array(dtype=wp.float64),
-    area: wp.array(dtype=wp.float64),
-    height: wp.float64,
-    friction: wp.float64,
-    stiffness: wp.float64,
-    impedance: wp.float64,
-    # in
-    x: wp.array(dtype=wp.float64),
-    v: wp.array(dtype=wp.float64),
-    # out
-    force: wp.array(dtype=wp.float64),
-):
-    """Push one surface point out of the ground: ``stiffness`` [Pa/m], ``impedance`` [Pa s/m] bounds the friction."""
-    point = wp.tid()
-    z = wp.float64(0.0)
-    vx = wp.float64(0.0)
-    vy = wp.float64(0.0)
-    for k in range(row_start[point], row_start[point + 1]):
-        node = columns[k]
-        z += weights[k] * x[3 * node + 2]
-        vx += weights[k] * v[3 * node]
-        vy += weights[k] * v[3 * node + 1]
-    depth = height - z
-    if depth > wp.float64(0.0):
-        normal = stiffness * depth * area[point]
-        speed = wp.sqrt(vx * vx + vy * vy) + wp.float64(1.0e-12)
-        tangential = wp.min(friction * normal, impedance * area[point] * speed) / speed
-        for k in range(row_start[point], row_start[point + 1]):
-            node = columns[k]
-            wp.atomic_add(force, 3 * node, -weights[k] * tangential * vx)
-            wp.atomic_add(force, 3 * node + 1, -weights[k] * tangential * vy)
-            wp.atomic_add(force, 3 * node + 2, weights[k] * normal)

@@ -51,6 +51,7 @@ class Problem:
         gravity_m_s2: (3,).
         drag_per_s: linear drag rate c of every node [1/s].
         stiffness_factor, density_factor: fields over the particles, (P,), or None for 1.
+        added_mass: lumped masses that hang from the nodes [kg], (n,), or None.
         terms: what else acts on the nodes, contacts and effects, in the order of their launches.
     """
 
@@ -61,12 +62,14 @@ class Problem:
     drag_per_s: float = 0.0
     stiffness_factor: np.ndarray | None = None
     density_factor: np.ndarray | None = None
+    added_mass: np.ndarray | None = None
     terms: tuple[Term, ...] = ()
     device: str = field(default="cpu")
 
     def nodal_mass(self) -> np.ndarray:
         """Lumped nodal masses [kg], (n,)."""
-        return nodal_mass(self.lattice, self.law, self.density_factor)
+        mass = nodal_mass(self.lattice, self.law, self.density_factor)
+        return mass if self.added_mass is None else mass + self.added_mass
 
 
 class Formulation(Protocol):
@@ -213,6 +216,7 @@ class Run:
         Raises:
             UnstableSimulation: a cell inverted or a state is not finite.
             ParticlesLeftTheGrid: a node is absurdly far from its start.
+            ContactFailed: material came too deep into a collider.
         """
         substeps = self._set_clock(frame)
         for _ in range(substeps // _CHUNK):
@@ -220,6 +224,8 @@ class Run:
         self._solver.substeps += substeps
         now = self.x.numpy().reshape(-1, 3).copy()
         self._check(now, self._times[frame + 1])
+        for term in self._solver.terms:
+            term.check(self._times[frame + 1])
         return now
 
     def _substep(self) -> None:
