@@ -20,6 +20,7 @@ from scipy.spatial import ConvexHull
 
 from physworld.errors import SceneUnsupported
 from physworld.geometry.curves import fit_nodes
+from physworld.geometry.declared import grips_of, load_of
 from physworld.geometry.filling import inside_surface_points, inside_volume_points
 from physworld.mpm.lattice import Lattice, lattice_from_cells
 from physworld.scene import AS_MEASURED, Scene
@@ -50,6 +51,7 @@ class ReferenceBody:
             zero columns for a solid.
         thickness_m: thickness of a sheet or radius of a rod, declared or assumed.
         notes: what was assumed, in words.
+        added_mass: declared loads as lumped nodal masses [kg], (n,), or None.
     """
 
     lattice: Lattice
@@ -60,6 +62,7 @@ class ReferenceBody:
     offsets: np.ndarray
     thickness_m: float
     notes: tuple[str, ...] = ()
+    added_mass: np.ndarray | None = None
 
 
 def reference_body(scene: Scene, particle_budget: int, refinement: float = 1.0) -> ReferenceBody:
@@ -148,9 +151,28 @@ def _solid(scene: Scene, budget: int) -> ReferenceBody:
             budget = int(budget / max(share, 0.05))
     lattice = _solid_lattice(scene, low, high, test, budget)
     start = lattice.node_coordinates
+    hanging = _hanging_mass(scene, lattice, notes)
     return ReferenceBody(
-        lattice, start, start, np.zeros_like(start), points, np.zeros((len(points), 0)), 0.0, tuple(notes)
+        lattice,
+        start,
+        start,
+        np.zeros_like(start),
+        points,
+        np.zeros((len(points), 0)),
+        0.0,
+        tuple(notes),
+        hanging,
     )
+
+
+def _hanging_mass(scene: Scene, lattice: Lattice, notes: list[str]) -> np.ndarray | None:
+    """The declared load on the nodes of a solid [kg], (n,)."""
+    load = load_of(scene)
+    if load is None:
+        return None
+    notes.append(f"a declared load of {load.mass_kg} kg hangs from it as a lumped mass")
+    weights = lattice.interpolation(load.points)
+    return np.asarray(weights.sum(axis=0)).reshape(-1) * (load.mass_kg / len(load.points))
 
 
 def _require_volume(cloud: np.ndarray, kind: str) -> None:
@@ -167,7 +189,7 @@ def _solid_lattice(scene: Scene, low: np.ndarray, high: np.ndarray, test, budget
     cell = float((8 * np.prod(size) / budget) ** (1 / 3))
     spacing = size / np.maximum(1, np.round(size / cell))
     origin = low.copy()
-    for grip in scene.grips:
+    for grip in grips_of(scene):
         if grip.region_min_m is None or grip.region_max_m is None:
             continue
         cover = (np.minimum(grip.region_max_m, high) - np.maximum(grip.region_min_m, low)) / size
@@ -178,7 +200,8 @@ def _solid_lattice(scene: Scene, low: np.ndarray, high: np.ndarray, test, budget
         face = grip.region_max_m[axis] if at_low else grip.region_min_m[axis]
         free = high[axis] - face if at_low else face - low[axis]
         depth = face - low[axis] if at_low else high[axis] - face
-        reach = _CLAMP_REACH if depth > (_CLAMP_REACH + _THINNEST_GRIP) * cell else 0.0
+        face_only = depth == 0.0  # bonded at its end: no material has to stay behind
+        reach = _CLAMP_REACH if face_only or depth > (_CLAMP_REACH + _THINNEST_GRIP) * cell else 0.0
         spacing[axis] = free / (max(1, round(free / cell + reach)) - reach)
         face -= (1 if at_low else -1) * reach * spacing[axis]
         behind = np.ceil((face - low[axis]) / spacing[axis] - 1e-6)
