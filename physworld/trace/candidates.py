@@ -1,0 +1,182 @@
+"""Candidates of a trace: every effect of the registry that makes sense for the twin, in the variants that are tried.
+
+A variant fixes the numbers that only shape an effect (a direction, a place, a time) and leaves its gates free, so that
+one simulation per gate shows what it does. Where one shape does not stand for all, an effect has several variants; a
+refit then frees the shape of the best.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from physworld.effects.base import Strength
+from physworld.effects.places import body_size, free_end
+from physworld.effects.registry import EFFECTS
+from physworld.trace.unknowns import Unknown, of_strength, with_strengths
+from physworld.twin import Twin
+
+Shape = dict[str, float]
+_SHAPE_STEP = 0.01  # difference step of a shape, of its range
+_RELAXATIONS_S = (0.02, 0.1, 0.5)
+_DIAGONAL = 0.25 * np.pi
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A variant of an effect.
+
+    Attributes:
+        effect: name in the registry.
+        variant: what tells it from others of the same effect.
+        gates: strengths that are free from the start.
+        fixed: shapes, as the variant has them.
+        shapes: which of them a refit frees.
+        kind: where the effect enters.
+    """
+
+    effect: str
+    variant: str
+    gates: tuple[Strength, ...]
+    fixed: Shape = field(default_factory=dict)
+    shapes: tuple[Strength, ...] = ()
+    kind: str = "force"
+
+    @property
+    def label(self) -> str:
+        """For reports."""
+        return self.effect if not self.variant else f"{self.effect} ({self.variant})"
+
+    def unknowns(self) -> list[Unknown]:
+        """The gates, in units of their probes."""
+        return [of_strength(self.effect, gate) for gate in self.gates]
+
+    def shape_unknowns(self) -> list[Unknown]:
+        """The shapes that a refit frees, from where the variant has them."""
+        return [
+            of_strength(self.effect, s, _SHAPE_STEP * (s.high - s.low), self.fixed[s.name])
+            for s in self.shapes
+        ]
+
+    def prepared(self, twin: Twin) -> Twin:
+        """The twin with the variant's shapes and closed gates."""
+        return with_strengths(twin, self.effect, self.fixed) if self.fixed else twin
+
+
+def candidates(twin: Twin, names: tuple[str, ...] = ()) -> tuple[list[Candidate], dict[str, str]]:
+    """Every variant of the named effects (all by default), and why the other effects were refused."""
+    found: list[Candidate] = []
+    refused: dict[str, str] = {}
+    for name, effect in EFFECTS.items():
+        if names and name not in names:
+            continue
+        reason = effect.refuses(twin)
+        if reason is not None:
+            refused[name] = reason
+            continue
+        known = {s.name: s for s in effect.strengths(twin)}
+        for variant in _VARIANTS.get(name, _plain)(twin, known):
+            gates = tuple(known[gate] for gate in variant.gates)
+            shapes = tuple(known[shape] for shape in variant.shapes)
+            found.append(Candidate(name, variant.label, gates, variant.fixed, shapes, effect.kind))
+    return found, refused
+
+
+@dataclass(frozen=True)
+class _Variant:
+    gates: tuple[str, ...]
+    label: str = ""
+    fixed: Shape = field(default_factory=dict)
+    shapes: tuple[str, ...] = ()
+
+
+Known = dict[str, Strength]
+
+
+def _plain(twin: Twin, known: Known) -> list[_Variant]:
+    return [_Variant(tuple(s.name for s in known.values() if s.gate))]
+
+
+def _one_by_one(*groups: tuple[str, ...]) -> Callable[[Twin, Known], list[_Variant]]:
+    """One variant a group of gates; a group's name is its first gate's."""
+
+    def variants(twin: Twin, known: Known) -> list[_Variant]:
+        present = [tuple(gate for gate in group if gate in known) for group in groups]
+        return [_Variant(group, group[0]) for group in present if group]
+
+    return variants
+
+
+def _relaxation(twin: Twin, known: Known) -> list[_Variant]:
+    gates = tuple(s.name for s in known.values() if s.gate)
+    return [
+        _Variant(gates, f"{time:g} s", {"relaxation_s": time}, ("relaxation_s",)) for time in _RELAXATIONS_S
+    ]
+
+
+def _fibres(twin: Twin, known: Known) -> list[_Variant]:
+    """Directions over the half circle, for a solid over the half sphere: axes and the diagonals between them."""
+    if "elevation_rad" not in known:
+        angles = [(azimuth, None) for azimuth in (0.0, _DIAGONAL, -_DIAGONAL, 2 * _DIAGONAL)]
+    else:
+        angles = [(a, 0.0) for a in (0.0, _DIAGONAL, -_DIAGONAL, 2 * _DIAGONAL)]
+        angles += [(0.0, 2 * _DIAGONAL), (0.0, _DIAGONAL), (0.0, -_DIAGONAL)]
+        angles += [(2 * _DIAGONAL, _DIAGONAL), (2 * _DIAGONAL, -_DIAGONAL)]
+    variants = []
+    for azimuth, elevation in angles:
+        fixed = {"azimuth_rad": azimuth}
+        label = f"{np.degrees(azimuth):.0f}°"
+        if elevation is not None:
+            fixed["elevation_rad"] = elevation
+            label += f", {np.degrees(elevation):.0f}°"
+        variants.append(_Variant(("ratio",), label, fixed, tuple(fixed)))
+    return variants
+
+
+def _tethers(twin: Twin, known: Known) -> list[_Variant]:
+    """Relaxed springs from the free end in every direction: axes, and the diagonals between them."""
+    end, reach = free_end(twin), body_size(twin)
+    axes = np.eye(3)
+    ways = [*axes]
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        ways += [axes[i] + axes[j], axes[i] - axes[j]]
+    variants = []
+    for way in ways:
+        unit = way / np.linalg.norm(way)
+        anchor = end + reach * unit
+        fixed = {f"anchor_{a}_m": float(p) for a, p in zip("xyz", anchor, strict=True)}
+        fixed |= {f"attach_{a}_m": float(p) for a, p in zip("xyz", end, strict=True)}
+        fixed["rest_length_m"] = reach
+        label = "towards " + " ".join(f"{p:+.0f}" for p in np.sign(np.round(way, 6)))
+        shapes = tuple(f"anchor_{a}_m" for a in "xyz")
+        variants.append(_Variant(("stiffness_n_m",), label, fixed, shapes))
+    return variants
+
+
+def _fields(twin: Twin, known: Known) -> list[_Variant]:
+    """A slope along the body's axes, and bumps along its longest."""
+    axes = "xyz"[: twin.lattice.dim]
+    span = np.ptp(twin.lattice.particle_coordinates, axis=0)
+    along = axes[int(np.argmax(span))]
+    variants = [_Variant(tuple(f"slope_{a}" for a in axes), "slope")]
+    for place in (-0.5, 0.0, 0.5):
+        fixed = {f"bump_{a}": 0.0 for a in axes} | {f"bump_{along}": place}
+        variants.append(_Variant(("bump",), f"bump at {place:+g}", fixed, (f"bump_{along}",)))
+    return variants
+
+
+_VARIANTS: dict[str, Callable[[Twin, Known], list[_Variant]]] = {
+    "rest_shape": _one_by_one(
+        ("strain_x", "strain_y", "strain_z"), ("curvature_1_per_m", "curvature_2_per_m")
+    ),
+    "stiffness_field": _fields,
+    "mass_field": _fields,
+    "gravity_tilt": _one_by_one(("tilt_x_rad", "tilt_y_rad"), ("magnitude",)),
+    "viscoelastic_maxwell": _relaxation,
+    "anisotropy": _fibres,
+    "tether": _tethers,
+    "ground_friction": _one_by_one(("change",), ("height_m",)),
+    "clamp_offset": _one_by_one(("reach_m",), ("angle_x_rad", "angle_y_rad", "angle_z_rad")),
+}

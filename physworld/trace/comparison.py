@@ -1,0 +1,69 @@
+"""Which of several refits predicts best, by blocks of training frames that it was not fitted to.
+
+Leaving a block out moves the optimum little, so the refit without it is the linear one from the optimum's own
+sensitivities; the block's error is measured with that. Differences between models are taken block by block, so what
+all of them suffer from cancels, and their standard error is that of the block means.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from physworld.trace.refit import Refit, prior_rows
+
+
+@dataclass(frozen=True)
+class CrossValidation:
+    """Mean squared whitened error of every block, (B,), and the blocks' sizes, (B,)."""
+
+    errors: np.ndarray
+    sizes: np.ndarray
+
+    @property
+    def mean(self) -> float:
+        """Over all rows."""
+        return float(np.average(self.errors, weights=self.sizes))
+
+
+def cross_validated(fitted: Refit, block_of_row: np.ndarray) -> CrossValidation:
+    """Leave-one-block-out errors of a refit."""
+    blocks = np.unique(block_of_row)
+    normal, gradient = [], []
+    for block in blocks:
+        rows = block_of_row == block
+        normal.append(fitted.jacobian[rows].T @ fitted.jacobian[rows])
+        gradient.append(fitted.jacobian[rows].T @ fitted.residual[rows])
+    prior_residual, prior_slope = prior_rows(fitted.unknowns, fitted.theta)
+    all_normal = sum(normal) + prior_slope.T @ prior_slope
+    all_gradient = sum(gradient) + prior_slope.T @ prior_residual
+    errors, sizes = [], []
+    for k, block in enumerate(blocks):
+        rows = block_of_row == block
+        without = all_normal - normal[k]
+        ridge = 1e-9 * np.diag(np.diag(all_normal) + 1e-30)
+        change = np.linalg.solve(without + ridge, all_gradient - gradient[k])
+        low = np.array([u.low for u in fitted.unknowns]) - fitted.theta
+        high = np.array([u.high for u in fitted.unknowns]) - fitted.theta
+        left = fitted.residual[rows] - fitted.jacobian[rows] @ np.clip(change, low, high)
+        errors.append(float(np.mean(left**2)))
+        sizes.append(int(rows.sum()))
+    return CrossValidation(np.array(errors), np.array(sizes))
+
+
+def difference(worse: CrossValidation, better: CrossValidation) -> tuple[float, float]:
+    """Mean of the blocks' differences of squared error, and its standard error."""
+    gap = worse.errors - better.errors
+    weights = worse.sizes / worse.sizes.sum()
+    mean = float(weights @ gap)
+    if len(gap) < 2:
+        return mean, float("inf")
+    spread = float(np.sqrt(np.sum(weights**2 * (gap - mean) ** 2) * len(gap) / (len(gap) - 1)))
+    return mean, spread
+
+
+def alikeness(first: np.ndarray, second: np.ndarray) -> float:
+    """Absolute correlation of two explained residuals (M,)."""
+    size = float(np.linalg.norm(first) * np.linalg.norm(second))
+    return abs(float(first @ second)) / size if size > 0 else 0.0

@@ -1,0 +1,58 @@
+"""Settings of a trace. None of them was chosen on a scene: each says what it stands for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from physworld.calibrate import CalibrationConfig
+
+
+def _declared() -> CalibrationConfig:
+    return CalibrationConfig(damping="none")
+
+
+@dataclass(frozen=True)
+class TraceConfig:
+    """Settings.
+
+    Attributes:
+        calibration: of the declared physics only.
+        family_wise_level: probability of naming an effect where residuals are without one.
+        resamples: sign patterns of the max statistic.
+        blocks: time blocks of the training frames, at most; never shorter than ``shortest_block`` frames.
+        shortest_block: frames.
+        decoys: random sensitivities that must not score.
+        material_share: share of the training misfit that an effect must explain beyond the calibrated parameters.
+            The method's prototype saw at most 0.01 on bodies without an effect and at least 0.09 with one.
+        near_floor: training misfit over the noise up to which a model is complete.
+        acceptable: misfit up to which a name is given although something remains, if the effect explains
+            ``most_of_it`` of the misfit above the noise.
+        most_of_it: share, see ``acceptable``.
+        alike: projected sensitivities that correlate more than this are suspected to be one effect.
+        confirmed: candidates that are refitted with the full simulator.
+        iterations: Gauss-Newton iterations of a refit.
+        effects_at_most: effects in one answer.
+        refinement: cells of the second resolution are this many times smaller.
+        bootstraps: resamples of the intervals.
+        seed: everything random follows from it.
+        candidates: names of the registry to try; empty for all.
+    """
+
+    calibration: CalibrationConfig = field(default_factory=_declared)
+    family_wise_level: float = 0.05
+    resamples: int = 2000
+    blocks: int = 12
+    shortest_block: int = 3
+    decoys: int = 20
+    material_share: float = 0.03
+    near_floor: float = 1.2
+    acceptable: float = 2.0
+    most_of_it: float = 0.7
+    alike: float = 0.95
+    confirmed: int = 4
+    iterations: int = 5
+    effects_at_most: int = 2
+    refinement: float = 1.25
+    bootstraps: int = 1000
+    seed: int = 0
+    candidates: tuple[str, ...] = ()

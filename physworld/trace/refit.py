@@ -1,0 +1,179 @@
+"""Refit: calibrated parameters and strengths together with the full simulator, by Gauss-Newton on whitened residuals.
+
+Linear strengths are not to be trusted (an effect of 1.5 may look like 2.0 while the stiffness still absorbs part of
+it), so nothing is named before this. The simulations of one Jacobian, and those of one line search, are independent of
+each other and go to the runner together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from physworld.trace.sensitivity import sensitivities
+from physworld.trace.simulations import Job, Simulations
+from physworld.trace.unknowns import Unknown, at
+from physworld.trace.whitening import Whitener
+from physworld.twin import Twin
+
+_SCALES = (1.0, 0.3)  # of a Gauss-Newton step, tried together
+_TOLERANCE = 2e-3  # relative fall of the cost that ends the search
+_BOUND = 1e-6
+
+
+@dataclass(frozen=True)
+class Refit:
+    """An optimum.
+
+    Attributes:
+        unknowns: what was estimated, starting at the optimum.
+        twin: at the optimum.
+        theta: (p,).
+        tracks: of the training frames, (frames, N, 3) [m].
+        residual: whitened, (M,).
+        jacobian: of the prediction, whitened, (M, p), at or one step before the optimum.
+    """
+
+    unknowns: list[Unknown]
+    twin: Twin
+    theta: np.ndarray
+    tracks: np.ndarray
+    residual: np.ndarray
+    jacobian: np.ndarray
+
+    @property
+    def misfit(self) -> float:
+        """Root mean squared whitened residual: 1 for a perfect model."""
+        return float(np.sqrt(np.mean(self.residual**2)))
+
+    @property
+    def free_jacobian(self) -> np.ndarray:
+        """The sensitivities of the unknowns that no bound holds, (M, r)."""
+        low, high = np.array([u.low for u in self.unknowns]), np.array([u.high for u in self.unknowns])
+        room = 1e-3 * (high - low)
+        return self.jacobian[:, (self.theta > low + room) & (self.theta < high - room)]
+
+    def value(self, name: str) -> float:
+        """The number of that name."""
+        names = [unknown.name for unknown in self.unknowns]
+        k = names.index(name)
+        return self.unknowns[k].value(float(self.theta[k]))
+
+
+def refit(
+    simulations: Simulations,
+    whitener: Whitener,
+    twin: Twin,
+    unknowns: list[Unknown],
+    frames: int,
+    iterations: int,
+    starts: list[np.ndarray] | None = None,
+    jacobian: np.ndarray | None = None,
+) -> Refit | None:
+    """Minimise the whitened misfit and the priors over the unknowns, from the best of the starts.
+
+    Args:
+        starts: places (p,) to try first, beside the unknowns' own.
+        jacobian: sensitivities at the unknowns' own start, if they are known, (M, p): the first step is free.
+
+    Returns:
+        The optimum; None where no start gave a usable run.
+    """
+    own = np.array([unknown.start for unknown in unknowns])
+    low, high = np.array([u.low for u in unknowns]), np.array([u.high for u in unknowns])
+    places = [own, *(np.clip(start, low, high) for start in starts or [])]
+    best = _best_of(simulations, whitener, twin, unknowns, places, frames)
+    if best is None:
+        return None
+    theta, tracks, residual, cost = best
+    usable = jacobian is not None and np.array_equal(theta, own)
+    slope = jacobian if usable and jacobian is not None else None
+    damping = 1e-3
+    for _ in range(iterations):
+        if slope is None:
+            here = [u.starting(t) for u, t in zip(unknowns, theta, strict=True)]
+            slope, _ = sensitivities(simulations, whitener, twin, tracks, here, frames)
+        step = _step(unknowns, theta, residual, slope, damping, low, high)
+        trials = [np.clip(theta + scale * step, low, high) for scale in _SCALES]
+        found = _best_of(simulations, whitener, twin, unknowns, trials, frames)
+        if found is None or not found[3] < cost:
+            if damping > 1.0:
+                break
+            damping *= 100.0
+            continue
+        gain = 1.0 - found[3] / cost
+        theta, tracks, residual, cost = found
+        damping = max(damping / 10.0, 1e-6)
+        if gain < _TOLERANCE:
+            break
+        slope = None
+    if slope is None:
+        here = [u.starting(t) for u, t in zip(unknowns, theta, strict=True)]
+        slope, _ = sensitivities(simulations, whitener, twin, tracks, here, frames)
+    final = [u.starting(t) for u, t in zip(unknowns, theta, strict=True)]
+    return Refit(final, at(twin, unknowns, theta), theta, tracks, residual, slope)
+
+
+Found = tuple[np.ndarray, np.ndarray, np.ndarray, float]
+
+
+def _best_of(
+    simulations: Simulations,
+    whitener: Whitener,
+    twin: Twin,
+    unknowns: list[Unknown],
+    places: list[np.ndarray],
+    frames: int,
+) -> Found | None:
+    runs = simulations.run([Job(at(twin, unknowns, place), frames) for place in places])
+    found: list[Found] = []
+    for place, tracks in zip(places, runs, strict=True):
+        if tracks is not None:
+            residual = whitener.residual(tracks)
+            found.append((place, tracks, residual, float(residual @ residual) + _prior_cost(unknowns, place)))
+    return min(found, key=lambda f: f[3]) if found else None
+
+
+def prior_rows(unknowns: list[Unknown], theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Priors as rows of a least-squares problem: (p,) residuals (mean minus theta over deviation), (p, p) slopes."""
+    residual, slope = np.zeros(len(unknowns)), np.zeros((len(unknowns), len(unknowns)))
+    for k, unknown in enumerate(unknowns):
+        if unknown.prior is not None:
+            mean, deviation = unknown.prior
+            residual[k], slope[k, k] = (mean - theta[k]) / deviation, 1.0 / deviation
+    return residual, slope
+
+
+def _prior_cost(unknowns: list[Unknown], theta: np.ndarray) -> float:
+    residual, _ = prior_rows(unknowns, theta)
+    return float(residual @ residual)
+
+
+def _step(
+    unknowns: list[Unknown],
+    theta: np.ndarray,
+    residual: np.ndarray,
+    slope: np.ndarray,
+    damping: float,
+    low: np.ndarray,
+    high: np.ndarray,
+) -> np.ndarray:
+    """Damped Gauss-Newton step (p,); an unknown that a bound holds back stays there."""
+    prior_residual, prior_slope = prior_rows(unknowns, theta)
+    normal = slope.T @ slope + prior_slope.T @ prior_slope
+    gradient = slope.T @ residual + prior_slope.T @ prior_residual
+    free = np.ones(len(theta), dtype=bool)
+    step = np.zeros(len(theta))
+    for _ in range(len(theta)):
+        step[:] = 0.0
+        inner = normal[np.ix_(free, free)]
+        inner = inner + damping * np.diag(np.diag(inner) + 1e-12 * np.trace(inner) + 1e-30)
+        if free.any():
+            step[free] = np.linalg.solve(inner, gradient[free])
+        room = _BOUND * (high - low)
+        stuck = free & (((theta >= high - room) & (step > 0)) | ((theta <= low + room) & (step < 0)))
+        if not stuck.any():
+            break
+        free &= ~stuck
+    return step

@@ -1,0 +1,86 @@
+"""What a trace found: everything that a report or a picture needs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from physworld.trace.candidates import Candidate
+from physworld.trace.confirm import Model
+from physworld.trace.held_out import HeldOut
+from physworld.trace.score import Scores
+from physworld.trace.split import Split
+from physworld.trace.verdict import Verdict
+
+
+@dataclass(frozen=True)
+class Number:
+    """A value with its unit and 95 % interval."""
+
+    value: float
+    unit: str
+    ci95: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Named:
+    """An effect in an answer: its name and its numbers."""
+
+    name: str
+    parameters: dict[str, Number]
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of the forward selection: the scores against what was left, and the model that was kept, or None."""
+
+    base: Model
+    scores: Scores
+    tried: tuple[Model, ...]
+    kept: Model | None
+
+
+@dataclass(frozen=True)
+class TraceResult:
+    """See :mod:`physworld.trace.run`.
+
+    Attributes:
+        scene: its name.
+        verdict: the answer with its models.
+        effects, equivalent: what is added, and what would do as well.
+        calibrated: the calibrated parameters of the model with the effects.
+        declared: the declared physics, refitted.
+        split, sigma: frozen split; noise [m], or None where it is unknown.
+        path: steps of the selection.
+        candidates, refused: what was tried, and why the rest was not.
+        numerics: root mean squared change of the training prediction by each numerical direction, over the noise.
+        finer: values at the second resolution by the unknowns' names, for each model that was refitted there.
+        before, after: open-loop tracks, (T, N, 3) [m].
+        held_out: errors on the held-out frames.
+        remainder_m, remainder: what is left on the training frames beyond the noise, and in words.
+        simulations, seconds: cost.
+        notes: what a reader has to know.
+    """
+
+    scene: str
+    verdict: Verdict
+    effects: tuple[Named, ...]
+    equivalent: tuple[tuple[Named, ...], ...]
+    calibrated: dict[str, Number]
+    declared: Model
+    split: Split
+    sigma: float | None
+    path: tuple[Step, ...]
+    candidates: list[Candidate]
+    refused: dict[str, str]
+    numerics: dict[str, float]
+    finer: dict[tuple[str, ...], dict[str, float]]
+    before: np.ndarray
+    after: np.ndarray
+    held_out: HeldOut
+    remainder_m: float
+    remainder: str
+    simulations: int
+    seconds: float
+    notes: tuple[str, ...] = field(default_factory=tuple)

@@ -1,0 +1,299 @@
+"""A trace from beginning to end: calibrate, find the residual, name the effect, add it, and measure what it brought.
+
+1. Freeze the split. Calibrate the declared physics on the training frames, with several starts and no damping.
+2. Noise; whitening by noise, by the points' own places, and by what finer cells and time steps change.
+3. Sensitivities of the calibrated parameters and of every candidate; scores, decoys, and what chance would reach.
+4. Refit the best candidates with everything; where the best single leaves too much, pairs.
+5. Refit the winner and its rivals on finer cells: the strength has to agree.
+6. The verdict; intervals; then, once, the held-out frames.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from physworld.calibrate import Journal, calibrate
+from physworld.calibrate.parameters import parameters_of
+from physworld.scene import Scene
+from physworld.trace.candidates import Candidate, candidates
+from physworld.trace.comparison import cross_validated
+from physworld.trace.config import TraceConfig
+from physworld.trace.confirm import Confirmation, Model, best_variants
+from physworld.trace.describe import describe
+from physworld.trace.held_out import measure
+from physworld.trace.intervals import calibrated, named, numbers
+from physworld.trace.noise import noise_sigma
+from physworld.trace.refit import refit
+from physworld.trace.result import Step, TraceResult
+from physworld.trace.score import Scores, orthonormal, scores
+from physworld.trace.sensitivity import (
+    Response,
+    candidate_responses,
+    decoys,
+    numerical_directions,
+    refinement_of,
+)
+from physworld.trace.simulations import Drive, Job, Memory, Progress, Runner, Simulations, in_turn, nodes_of
+from physworld.trace.split import Split, freeze
+from physworld.trace.unknowns import Unknown, clamp_reach, of_parameter
+from physworld.trace.verdict import NOTHING, UNEXPLAINED, Verdict, accounts, decide, helps, simplest
+from physworld.trace.whitening import Whitener, moved, responses, whitener
+from physworld.twin import Twin
+
+_POISSON_SPREAD = 0.08  # of what is known of a soft solid's Poisson's ratio beforehand
+_NUMERICS_AMPLITUDE = (
+    3.0  # true error over the change by cells 1.25 times finer, for second order: 1 / (1 - 1.25^-2)
+)
+_OTHER_STIFFNESSES = tuple(0.12 * k for k in (-6, -5, -4, -3, -2, -1, 1, 2, 3, 4, 5, 6))
+"""Logarithms: a phase that has slipped by a period is a local minimum, so others are looked at before a descent."""
+_AGREEMENT = 0.25  # share by which a strength may move with the resolution
+
+
+def trace(
+    scene: Scene,
+    config: TraceConfig | None = None,
+    *,
+    runner: Runner = in_turn,
+    memory: Memory | None = None,
+    journal: Journal | None = None,
+    calibrated_twin: Twin | None = None,
+    progress: Progress | None = None,
+    cancelled: Callable[[], bool] | None = None,
+) -> TraceResult:
+    """Trace a recording.
+
+    Args:
+        scene: the recording.
+        config: settings; None for the defaults.
+        runner: where simulations run.
+        memory: simulations that were run before; with the same memory a trace that was cut off goes on.
+        journal: of the calibration, likewise.
+        calibrated_twin: the declared physics, calibrated on the training frames; None to do that here.
+        progress: called with (simulations done, 0 while the number is open, stage).
+        cancelled: polled between simulations.
+
+    Raises:
+        CalibrationError: no start gave a usable simulation.
+        Cancelled: ``cancelled`` returned true.
+        SceneUnsupported: the scene declares too little for a body.
+    """
+    config = config or TraceConfig()
+    begun = time.perf_counter()
+    split = freeze(scene, config.blocks, config.shortest_block)
+    seen = replace(scene, train=split.train, test=split.test)
+    calibrated_runs = 0
+    if calibrated_twin is None:
+        fitted = calibrate(seen, config.calibration, progress, cancelled, journal)
+        calibrated_twin, calibrated_runs = fitted.twin, fitted.simulations
+    drive = Drive(*scene.control_track(), scene.times)
+    simulations = Simulations(drive, runner, memory, progress, cancelled)
+    work = _Trace(seen, split, config, simulations, calibrated_twin)
+    result = work.run()
+    return replace(
+        result, simulations=simulations.count + calibrated_runs, seconds=time.perf_counter() - begun
+    )
+
+
+class _Trace:
+    """State of one trace."""
+
+    def __init__(
+        self, scene: Scene, split: Split, config: TraceConfig, simulations: Simulations, twin: Twin
+    ) -> None:
+        self.scene, self.split, self.config, self.simulations = scene, split, config, simulations
+        self.frames = split.train[1]
+        self.twin = twin
+        self.notes: list[str] = []
+
+    def run(self) -> TraceResult:
+        config, simulations = self.config, self.simulations
+        simulations.stage = "declared physics"
+        job = Job(self.twin, self.frames)
+        nodes = nodes_of(job, simulations.drive)
+        tracks = self.twin.observe(nodes, simulations.drive.times[: self.frames])
+        sigma = noise_sigma(self.scene, self.split, tracks)
+        if sigma is None:
+            self.notes.append("no noise is declared and none can be estimated: no claim")
+        scale = sigma or float(np.sqrt(np.mean((tracks - self.scene.points[: self.frames]) ** 2))) or 1e-3
+        white = whitener(self.scene, self.split, scale, responses(self.twin, nodes))
+        simulations.stage = "numerics"
+        directions, finer = numerical_directions(
+            simulations, self.scene, self.twin, tracks, config.calibration.particle_budget, config.refinement
+        )
+        numerics = {name: float(np.sqrt(np.mean(white.change(d) ** 2))) for name, d in directions.items()}
+        white = white.with_numerics(list(directions.values()), _NUMERICS_AMPLITUDE)
+        block_of_row = self.split.block_of(white.frame_of_row)
+        declared = self._declared(white, block_of_row)
+        basis = orthonormal(declared.fitted.free_jacobian)
+        chosen, refused = candidates(declared.fitted.twin, config.candidates)
+        simulations.stage = "sensitivities"
+        found = candidate_responses(
+            simulations, white, declared.fitted.twin, declared.fitted.tracks, chosen, self.frames
+        )
+        usable = [response for response in found if not response.failed]
+        refused |= {r.candidate.label: "its simulation cannot be trusted" for r in found if r.failed}
+        path = self._select(declared, usable, white, block_of_row)
+        models = [model for step in path for model in step.tried]
+        finer_values, agreement = self._second_resolution(declared, models, white, finer)
+        verdict = decide(declared, models, basis, agreement, config, len({c.effect for c in chosen}))
+        if sigma is None and verdict.name not in (NOTHING, UNEXPLAINED):
+            verdict = Verdict(UNEXPLAINED, declared, (), "no noise estimate, no claim: " + verdict.reason)
+        return self._result(
+            verdict, declared, white, block_of_row, sigma, path, chosen, refused, numerics, finer_values
+        )
+
+    def _declared(self, white: Whitener, block_of_row: np.ndarray) -> Model:
+        """The declared physics under the trace's own misfit."""
+        self.simulations.stage = "declared physics"
+        unknowns = self._calibrated_unknowns(self.twin)
+        own = np.array([u.start for u in unknowns])
+        starts = [own + shift * np.eye(len(own))[0] for shift in _OTHER_STIFFNESSES]
+        fitted = refit(
+            self.simulations, white, self.twin, unknowns, self.frames, self.config.iterations, starts
+        )
+        if fitted is None:
+            raise RuntimeError("the calibrated twin cannot be simulated again")
+        return Model((), fitted, cross_validated(fitted, block_of_row))
+
+    def _calibrated_unknowns(self, twin: Twin) -> list[Unknown]:
+        body, ground = self.scene.body, self.scene.ground
+        known = parameters_of(
+            twin,
+            separate_bending=body.thickness_m is None and body.size_m is None,
+            damping=False,
+            ground_friction=ground is not None and ground.friction is None,
+        )
+        spread = {"poissons_ratio": _POISSON_SPREAD}
+        reach = clamp_reach(twin)
+        found = [of_parameter(p, twin, spread.get(p.name)) for p in known]
+        return found if reach is None else [*found, reach]
+
+    def _select(
+        self, declared: Model, usable: list[Response], white: Whitener, block_of_row: np.ndarray
+    ) -> tuple[Step, ...]:
+        """Forward selection."""
+        config, path, base = self.config, [], declared
+        confirmation = Confirmation(self.simulations, white, block_of_row, self.frames, config.iterations)
+        columns = {response.candidate.label: response.columns for response in usable}
+        for number in range(config.effects_at_most):
+            ranked = self._scores(base, usable, white, block_of_row)
+            least = max(config.material_share, ranked.threshold if number else 0.0)
+            hopeful = best_variants(ranked.ranked, least, config.confirmed, base.names)
+            tried = []
+            for score in hopeful:
+                self.simulations.stage = f"refit with {score.candidate.label}"
+                model = confirmation.model(base, score, columns[score.candidate.label])
+                if model is not None:
+                    tried.append(model)
+            good = [m for m in tried if helps(m, base, config)]
+            kept = min(good, key=lambda m: m.validated.mean) if good else None
+            path.append(Step(base, ranked, tuple(tried), kept))
+            if kept is None or kept.fitted.misfit <= config.near_floor:
+                break
+            base = kept
+        return tuple(path)
+
+    def _scores(
+        self, base: Model, usable: list[Response], white: Whitener, block_of_row: np.ndarray
+    ) -> Scores:
+        config = self.config
+        rest = [r for r in usable if r.candidate.effect not in base.names]
+        shape = (len(white.visible), white.visible.shape[1])
+        fakes = decoys(rest, white, shape, config.decoys, config.seed)
+        return scores(
+            base.fitted.residual, base.fitted.free_jacobian, rest, fakes, block_of_row,
+            config.family_wise_level, config.resamples, config.seed,
+        )  # fmt: skip
+
+    def _second_resolution(
+        self, declared: Model, models: list[Model], white: Whitener, finer: Twin
+    ) -> tuple[dict[tuple[str, ...], dict[str, float]], dict[tuple[str, ...], bool]]:
+        """Values and agreement of the best model on finer cells."""
+        real = [m for m in models if helps(m, declared, self.config) and accounts(m, declared, self.config)]
+        values: dict[tuple[str, ...], dict[str, float]] = {}
+        agreement: dict[tuple[str, ...], bool] = {}
+        if not real:
+            return values, agreement
+        best = simplest(real, declared)
+        self.simulations.stage = "second resolution"
+        twin = refinement_of(best.fitted.twin, finer)
+        found = refit(self.simulations, white, twin, best.fitted.unknowns, self.frames, 2)
+        if found is None:
+            agreement[best.names] = False
+            return values, agreement
+        names = [u.name for u in found.unknowns]
+        values[best.names] = {name: found.value(name) for name in names}
+        agreement[best.names] = all(_agrees(best, values[best.names], member) for member in best.members)
+        return values, agreement
+
+    def _result(
+        self,
+        verdict: Verdict,
+        declared: Model,
+        white: Whitener,
+        block_of_row: np.ndarray,
+        sigma: float | None,
+        path: tuple[Step, ...],
+        chosen: list[Candidate],
+        refused: dict[str, str],
+        numerics: dict[str, float],
+        finer: dict[tuple[str, ...], dict[str, float]],
+    ) -> TraceResult:
+        config, simulations = self.config, self.simulations
+        simulations.stage = "held-out frames"
+        before, after = (self._prediction(model, white) for model in (declared, verdict.model))
+        estimates = [
+            numbers(m.fitted, block_of_row, finer.get(m.names, {}), config.bootstraps, config.seed)
+            for m in (verdict.model, *verdict.equivalent)
+        ]
+        claimed = verdict.name not in (NOTHING, UNEXPLAINED)
+        held_out = measure(self.scene, self.split, before, after, sigma, config.bootstraps, config.seed)
+        remainder_m, remainder = describe(self.scene, after, self.split.train, white.sigma)
+        return TraceResult(
+            scene=self.scene.name,
+            verdict=verdict,
+            effects=named(verdict.model, estimates[0]) if claimed else (),
+            equivalent=tuple(named(m, e) for m, e in zip(verdict.equivalent, estimates[1:], strict=True)),
+            calibrated=calibrated(estimates[0]),
+            declared=declared,
+            split=self.split,
+            sigma=sigma,
+            path=path,
+            candidates=chosen,
+            refused=refused,
+            numerics=numerics,
+            finer=finer,
+            before=before,
+            after=after,
+            held_out=held_out,
+            remainder_m=remainder_m,
+            remainder=remainder,
+            simulations=0,
+            seconds=0.0,
+            notes=tuple(self.notes),
+        )
+
+    def _prediction(self, model: Model, white: Whitener) -> np.ndarray:
+        """Open loop over all frames, (T, N, 3), with the points' own places from the training frames."""
+        twin = moved(model.fitted.twin, white.place_errors(model.fitted.tracks))
+        tracks = self.simulations.run([Job(twin, self.scene.frame_count)])[0]
+        if tracks is not None:
+            return tracks
+        self.notes.append(
+            "the run over the held-out frames cannot be trusted: the last training frame is kept"
+        )
+        last = model.fitted.tracks
+        return np.concatenate([last, np.repeat(last[-1:], self.scene.frame_count - len(last), axis=0)])
+
+
+def _agrees(model: Model, finer: dict[str, float], member: Candidate) -> bool:
+    """Whether an effect's gates keep their sizes at the second resolution."""
+    coarse = np.array(
+        [model.fitted.value(f"{member.effect}.{gate.name}") / gate.probe for gate in member.gates]
+    )
+    fine = np.array([finer[f"{member.effect}.{gate.name}"] / gate.probe for gate in member.gates])
+    return bool(np.linalg.norm(fine - coarse) <= _AGREEMENT * np.linalg.norm(coarse))

@@ -1,0 +1,143 @@
+"""Efficient scores: the share of the residual that a candidate explains and the calibrated parameters cannot.
+
+Residual and sensitivities come whitened. The calibrated parameters' sensitivities are projected out of both; the
+candidate's strengths are fitted within their bounds; its score is the share R^2 of the squared residual that goes.
+
+Residuals of neighbouring frames are not independent, so significance comes from the residual itself: the contribution
+of every block of frames to the fit is given a random sign, the same for all candidates, and the best of all scores is
+kept (a sign-flip score test, Hemerik, Goeman and Finos 2020, with the max statistic of Westfall and Young). An effect
+that acts contributes with one sign all along; what matches by chance does not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from physworld.trace.candidates import Candidate
+from physworld.trace.sensitivity import Response
+
+
+@dataclass(frozen=True)
+class Score:
+    """A candidate's score.
+
+    Attributes:
+        candidate: which.
+        share: R^2, bounded fit.
+        strengths: linear estimate in the units of its unknowns, (k,).
+        direction: what it explains, (M,), after projection.
+        p_value: of its score alone under random signs.
+    """
+
+    candidate: Candidate
+    share: float
+    strengths: np.ndarray
+    direction: np.ndarray
+    p_value: float
+
+
+@dataclass(frozen=True)
+class Scores:
+    """All scores, best first, with what chance would reach.
+
+    Attributes:
+        ranked: best first.
+        threshold: family-wise quantile of the best score under random signs.
+        decoys: scores of the decoys.
+    """
+
+    ranked: list[Score]
+    threshold: float
+    decoys: list[float]
+
+
+def project(basis: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """``values`` (M,) or (M, k) less what the orthonormal ``basis`` (M, p) spans."""
+    return values - basis @ (basis.T @ values)
+
+
+def orthonormal(columns: np.ndarray) -> np.ndarray:
+    """A basis of the columns' span, (M, r)."""
+    if not columns.shape[1]:
+        return columns
+    size = np.linalg.norm(columns, axis=0)
+    u, s, _ = np.linalg.svd(columns[:, size > 0] / size[size > 0], full_matrices=False)
+    return u[:, s > 1e-8 * max(s.max(initial=0.0), 1e-30)]
+
+
+def scores(
+    residual: np.ndarray,
+    calibrated: np.ndarray,
+    responses: list[Response],
+    decoys: list[np.ndarray],
+    block_of_row: np.ndarray,
+    level: float,
+    resamples: int,
+    seed: int,
+) -> Scores:
+    """Score every candidate.
+
+    Args:
+        residual: (M,), whitened.
+        calibrated: sensitivities of what is estimated anyway, (M, p).
+        responses: the candidates'.
+        decoys: sensitivities that must not score, (M, 1) each.
+        block_of_row: block of every row, (M,).
+    """
+    basis = orthonormal(calibrated)
+    left = project(basis, residual)
+    total = float(left @ left)
+    rng = np.random.default_rng(seed)
+    signs = rng.choice([-1.0, 1.0], size=(resamples, int(block_of_row.max()) + 1))
+    best = np.zeros(resamples)
+    ranked = []
+    for response in responses:
+        columns = project(basis, response.columns)
+        gain, strengths = _bounded(columns, left, response.candidate)
+        flipped = _flipped(columns, left, block_of_row, signs, response.candidate) / total
+        best = np.maximum(best, flipped)
+        share = gain / total
+        p_value = float((1 + np.sum(flipped >= share)) / (1 + resamples))
+        ranked.append(Score(response.candidate, share, strengths, columns @ strengths, p_value))
+    ranked.sort(key=lambda s: -s.share)
+    decoy_shares = [_explained(project(basis, column), left) / total for column in decoys]
+    return Scores(ranked, float(np.quantile(best, 1.0 - level)), decoy_shares)
+
+
+def _bounded(columns: np.ndarray, left: np.ndarray, candidate: Candidate) -> tuple[float, np.ndarray]:
+    """Fall of the squared residual, and the strengths (k,), of the best fit within the bounds."""
+    normal, product = columns.T @ columns, columns.T @ left
+    if not np.any(normal):
+        return 0.0, np.zeros(len(product))
+    unknowns = candidate.unknowns()
+    low, high = (np.array([getattr(u, end) for u in unknowns]) for end in ("low", "high"))
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    root = np.linalg.cholesky(normal / np.outer(scale, scale) + 1e-9 * np.eye(len(scale)))
+    target = np.linalg.solve(root, product / scale)
+    if np.any(high - low <= 0):
+        return 0.0, np.zeros(len(product))
+    found = lsq_linear(root.T, target, bounds=(low * scale, high * scale)).x / scale
+    return float(2 * product @ found - found @ normal @ found), found
+
+
+def _explained(columns: np.ndarray, left: np.ndarray) -> float:
+    normal, product = columns.T @ columns, columns.T @ left
+    return float(product @ np.linalg.lstsq(normal, product, rcond=None)[0])
+
+
+def _flipped(
+    columns: np.ndarray, left: np.ndarray, block_of_row: np.ndarray, signs: np.ndarray, candidate: Candidate
+) -> np.ndarray:
+    """Squared residual explained under every sign pattern, (R,); one-sided where a strength has one sign."""
+    products = columns * left[:, None]
+    by_block = np.zeros((signs.shape[1], columns.shape[1]))
+    np.add.at(by_block, block_of_row, products)
+    summed = signs @ by_block
+    for k, unknown in enumerate(candidate.unknowns()):
+        if len(candidate.gates) == 1 and unknown.low >= 0:
+            summed[:, k] = np.maximum(summed[:, k], 0.0)
+    inverse = np.linalg.pinv(columns.T @ columns)
+    return np.einsum("rk,kl,rl->r", summed, inverse, summed)

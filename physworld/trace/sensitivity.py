@@ -1,0 +1,140 @@
+"""What every unknown does to the prediction, one simulation each; what the numerics do; what decoys would do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from physworld.evaluate.numerics import refined
+from physworld.scene import Scene
+from physworld.trace.candidates import Candidate
+from physworld.trace.simulations import Job, Simulations
+from physworld.trace.unknowns import Unknown, at
+from physworld.trace.whitening import Whitener
+from physworld.twin import Twin
+
+
+@dataclass(frozen=True)
+class Response:
+    """A candidate's whitened sensitivities per unit of its unknowns, (M, k), and where one run failed."""
+
+    candidate: Candidate
+    columns: np.ndarray
+    failed: bool = False
+
+
+def sensitivities(
+    simulations: Simulations,
+    whitener: Whitener,
+    twin: Twin,
+    base: np.ndarray,
+    unknowns: list[Unknown],
+    frames: int,
+) -> tuple[np.ndarray, list[bool]]:
+    """Whitened change of the prediction per unit of every unknown at its start, (M, p), and which runs failed.
+
+    Args:
+        base: tracks of the twin with every unknown at its start, (frames, N, 3).
+    """
+    steps = [_step(unknown) for unknown in unknowns]
+    start = np.array([unknown.start for unknown in unknowns])
+    jobs = []
+    for k, step in enumerate(steps):
+        probe = start.copy()
+        probe[k] += step
+        jobs.append(Job(at(twin, unknowns, probe), frames))
+    found = simulations.run(jobs)
+    rows = 3 * len(whitener.measured)
+    columns = [
+        np.zeros(rows) if tracks is None else whitener.change(tracks - base) / step
+        for tracks, step in zip(found, steps, strict=True)
+    ]
+    failed = [tracks is None for tracks in found]
+    return (np.stack(columns, axis=1) if columns else np.zeros((rows, 0))), failed
+
+
+def candidate_responses(
+    simulations: Simulations,
+    whitener: Whitener,
+    twin: Twin,
+    base: np.ndarray,
+    chosen: list[Candidate],
+    frames: int,
+) -> list[Response]:
+    """Sensitivities of every candidate's gates at zero, one batch of simulations for all."""
+    jobs, owners = [], []
+    for number, candidate in enumerate(chosen):
+        prepared = candidate.prepared(twin)
+        for unknown in candidate.unknowns():
+            step = _step(unknown)
+            jobs.append(Job(unknown.apply(prepared, unknown.start + step), frames))
+            owners.append((number, step))
+    found = simulations.run(jobs)
+    columns: list[list[np.ndarray]] = [[] for _ in chosen]
+    failed = [False] * len(chosen)
+    for (number, step), tracks in zip(owners, found, strict=True):
+        failed[number] |= tracks is None
+        change = (
+            np.zeros(3 * len(whitener.measured)) if tracks is None else whitener.change(tracks - base) / step
+        )
+        columns[number].append(change)
+    return [
+        Response(c, np.stack(own, axis=1), bad) for c, own, bad in zip(chosen, columns, failed, strict=True)
+    ]
+
+
+def numerical_directions(
+    simulations: Simulations, scene: Scene, twin: Twin, base: np.ndarray, budget: int, refinement: float
+) -> tuple[dict[str, np.ndarray], Twin]:
+    """Changes of the prediction (frames, N, 3) that are the solver's own, by name; and the twin on finer cells."""
+    frames = len(base)
+    finer = refined(scene, twin, budget, refinement)
+    variants = {
+        "finer cells": Job(finer, frames),
+        "coarser cells": Job(refined(scene, twin, budget, 1.0 / refinement), frames),
+        "half the time step": Job(twin, frames, 0.5),
+    }
+    found = zip(variants, simulations.run(list(variants.values())), strict=True)
+    return {name: tracks - base for name, tracks in found if tracks is not None}, finer
+
+
+def decoys(
+    responses: list[Response], whitener: Whitener, tracks_shape: tuple[int, int], count: int, seed: int
+) -> list[np.ndarray]:
+    """Sensitivities that are none, (M, 1): smooth in time and over the points, with the spectra of real ones.
+
+    Phases of a real sensitivity's time courses are drawn anew for every point pattern, which leaves the size, the
+    slowness and the shapes, and takes away every relation to what was measured.
+    """
+    rng = np.random.default_rng(seed)
+    frames, points = tracks_shape
+    usable = [r.columns[:, 0] for r in responses if not r.failed and np.any(r.columns[:, 0])]
+    made = []
+    for number in range(count if usable else 0):
+        source = usable[number * len(usable) // count]
+        field = np.zeros((frames, points, 3))
+        field[whitener.visible] = source.reshape(-1, 3)
+        u, s, vt = np.linalg.svd(field.reshape(frames, -1), full_matrices=False)
+        spectrum = np.fft.rfft(u * s, axis=0)
+        turn = np.exp(2j * np.pi * rng.uniform(size=spectrum.shape))
+        turn[0] = rng.choice([-1.0, 1.0], size=turn.shape[1])
+        fresh = np.fft.irfft(spectrum * turn, n=frames, axis=0) @ vt
+        made.append(fresh.reshape(frames, points, 3)[whitener.visible].reshape(-1, 1))
+    return made
+
+
+def refinement_of(twin: Twin, finer: Twin) -> Twin:
+    """``finer``'s lattice with the parameters and effects of ``twin``."""
+    return replace(
+        finer,
+        body=replace(finer.body, points=twin.body.points, offsets=twin.body.offsets),
+        law=twin.law,
+        air_drag_per_s=twin.air_drag_per_s,
+        ground_friction=twin.ground_friction,
+        effects=twin.effects,
+    )
+
+
+def _step(unknown: Unknown) -> float:
+    return -unknown.step if unknown.start + unknown.step > unknown.high else unknown.step

@@ -1,0 +1,209 @@
+"""Simulations of a trace: jobs that are independent of each other, counted, remembered, and run wherever there is room.
+
+A job says what to simulate; a *runner* maps jobs to tracks, in this process or in others. What was run is remembered
+under the job's fingerprint, so a trace that was cut off and starts again with the same memory goes on where it was.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from physworld.errors import Cancelled, SimulationError
+from physworld.mpm.total_lagrangian import TotalLagrangian
+from physworld.twin import Twin
+
+Progress = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True)
+class Job:
+    """One simulation.
+
+    Attributes:
+        twin: what moves.
+        frames: from the first frame to before this one.
+        step_share: time step over the stable one.
+    """
+
+    twin: Twin
+    frames: int
+    step_share: float = 1.0
+
+    def fingerprint(self, drive: bytes) -> str:
+        """Digest of everything that the result depends on; ``drive`` stands for times and controls."""
+        digest = hashlib.sha256(drive)
+        arrays = self.twin.to_arrays()
+        for name in sorted(arrays):
+            value = np.ascontiguousarray(arrays[name])
+            digest.update(f"{name} {value.dtype} {value.shape}".encode())
+            digest.update(value.tobytes())
+        digest.update(json.dumps([self.frames, self.step_share]).encode())
+        return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What drives every simulation of a scene: control track (Tc,), (Tc, K, 3) and frame times (T,)."""
+
+    control_times: np.ndarray
+    control_points: np.ndarray
+    times: np.ndarray
+
+    def digest(self) -> bytes:
+        """Fingerprint."""
+        digest = hashlib.sha256()
+        for value in (self.control_times, self.control_points, self.times):
+            digest.update(np.ascontiguousarray(value, dtype=float).tobytes())
+        return digest.digest()
+
+
+def nodes_of(job: Job, drive: Drive, poll: Callable[[int, int], None] | None = None) -> np.ndarray:
+    """Nodes (frames, n, 3) [m] of a job. Raises SimulationError."""
+    times = drive.times[: job.frames]
+    if job.step_share == 1.0:
+        return job.twin.simulate_nodes(drive.control_times, drive.control_points, times, progress=poll)
+    run = job.twin.integration(drive.control_times, drive.control_points, times)
+    step = job.step_share * TotalLagrangian(run.problem).time_step_s
+    solver = TotalLagrangian(run.problem, step)
+    nodes = solver.run(job.twin.body.start, run.velocity, run.held, run.knots, poll)
+    return run.at_frames(job.twin.body.start, nodes)
+
+
+def tracks_of(job: Job, drive: Drive, poll: Callable[[int, int], None] | None = None) -> np.ndarray | None:
+    """Observed points (frames, N, 3) [m] of a job; None where the run cannot be trusted."""
+    try:
+        nodes = nodes_of(job, drive, poll)
+    except SimulationError:
+        return None
+    tracks = job.twin.observe(nodes, drive.times[: job.frames])
+    return tracks if np.isfinite(tracks).all() else None
+
+
+class Runner(Protocol):
+    """Maps jobs to tracks; None for a run that cannot be trusted. ``poll`` may raise to stop."""
+
+    def __call__(
+        self, jobs: Sequence[Job], drive: Drive, poll: Callable[[], None]
+    ) -> list[np.ndarray | None]: ...
+
+
+def in_turn(jobs: Sequence[Job], drive: Drive, poll: Callable[[], None]) -> list[np.ndarray | None]:
+    """The runner of this process."""
+    return [tracks_of(job, drive, lambda done, total: poll()) for job in jobs]
+
+
+class Workers:
+    """A runner over processes of its own, which share Warp's cache of kernels; a context manager."""
+
+    def __init__(self, processes: int = 2) -> None:
+        self._pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=_quiet)
+
+    def __enter__(self) -> Workers:
+        return self
+
+    def __exit__(self, *failure: object) -> None:
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def __call__(
+        self, jobs: Sequence[Job], drive: Drive, poll: Callable[[], None]
+    ) -> list[np.ndarray | None]:
+        """Every job in a process; ``poll`` is called after each."""
+        futures = [
+            self._pool.submit(_work, job.twin.to_arrays(), job.twin.device, job.frames, job.step_share, drive)
+            for job in jobs
+        ]
+        found = []
+        for future in futures:
+            poll()
+            found.append(future.result())
+        return found
+
+
+def _quiet() -> None:
+    import warp as wp
+
+    wp.config.quiet = True
+
+
+def _work(
+    arrays: dict[str, np.ndarray], device: str, frames: int, step_share: float, drive: Drive
+) -> np.ndarray | None:
+    return tracks_of(Job(Twin.from_arrays(arrays, device), frames, step_share), drive)
+
+
+class Memory:
+    """Tracks by fingerprint, in a folder if one is given."""
+
+    def __init__(self, folder: Path | None = None) -> None:
+        self._folder, self._known = folder, {}  # type: ignore[var-annotated]
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+
+    def get(self, key: str) -> tuple[bool, np.ndarray | None]:
+        """Whether the run is known, and its tracks."""
+        if key in self._known:
+            return True, self._known[key]
+        if self._folder is None or not (self._folder / f"{key}.npy").exists():
+            return False, None
+        try:
+            tracks = np.load(self._folder / f"{key}.npy", allow_pickle=False)
+        except (OSError, ValueError, EOFError):  # cut off while it was written
+            return False, None
+        return True, tracks if tracks.size else None
+
+    def put(self, key: str, tracks: np.ndarray | None) -> None:
+        """Remember a run; one that failed as an empty array."""
+        if self._folder is None:
+            self._known[key] = tracks
+            return
+        part = self._folder / f"{key}.part.npy"
+        np.save(part, np.empty(0) if tracks is None else tracks, allow_pickle=False)
+        part.replace(self._folder / f"{key}.npy")
+
+
+class Simulations:
+    """Counts, remembers, reports and stops.
+
+    Attributes:
+        count: runs asked for, those remembered included.
+    """
+
+    def __init__(
+        self,
+        drive: Drive,
+        runner: Runner = in_turn,
+        memory: Memory | None = None,
+        progress: Progress | None = None,
+        cancelled: Callable[[], bool] | None = None,
+    ) -> None:
+        self.drive, self.count = drive, 0
+        self._runner, self._memory = runner, memory or Memory()
+        self._progress, self._cancelled, self._digest = progress, cancelled, drive.digest()
+        self.stage = ""
+
+    def run(self, jobs: Sequence[Job]) -> list[np.ndarray | None]:
+        """Tracks of every job. Raises Cancelled."""
+        keys = [job.fingerprint(self._digest) for job in jobs]
+        known = [self._memory.get(key) for key in keys]
+        missing = [k for k, (found, _) in enumerate(known) if not found]
+        fresh = self._runner([jobs[k] for k in missing], self.drive, self._poll) if missing else []
+        for k, tracks in zip(missing, fresh, strict=True):
+            self._memory.put(keys[k], tracks)
+        made = dict(zip(missing, fresh, strict=True))
+        self.count += len(jobs)
+        if self._progress is not None:
+            self._progress(self.count, 0, self.stage)
+        return [made.get(k, tracks) for k, (_, tracks) in enumerate(known)]
+
+    def _poll(self) -> None:
+        if self._cancelled is not None and self._cancelled():
+            raise Cancelled(f"trace cancelled after {self.count} simulations in the stage {self.stage!r}")

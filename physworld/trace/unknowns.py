@@ -1,0 +1,111 @@
+"""Numbers that a trace estimates: calibrated parameters and strengths of effects, in one scale of search."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from physworld.calibrate.parameters import Parameter
+from physworld.effects.base import Strength
+from physworld.effects.registry import EFFECTS
+from physworld.twin import Twin
+
+CLAMP = "clamp_offset"
+_CLAMP_STEP, _CLAMP_SPREAD = 0.25, 0.5  # cells: difference step, and deviation of what is known beforehand
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """One number.
+
+    Attributes:
+        name: of the parameter, or ``effect.strength``.
+        unit: SI unit.
+        low, high, start, step: bounds, start and difference step, in the scale of the search.
+        value: from the scale of the search to the number.
+        apply: a twin with the number at a place in the scale of the search.
+        prior: mean and deviation in the scale of the search of what is known beforehand, or None.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    start: float
+    step: float
+    value: Callable[[float], float]
+    apply: Callable[[Twin, float], Twin]
+    prior: tuple[float, float] | None = None
+
+    def starting(self, start: float) -> Unknown:
+        """The same from another start, clipped to the bounds."""
+        return replace(self, start=float(np.clip(start, self.low, self.high)))
+
+
+def of_parameter(parameter: Parameter, twin: Twin, spread: float | None) -> Unknown:
+    """A calibrated parameter from where the twin has it; ``spread``: deviation of its prior about that, or None."""
+    start = parameter.searched(max(_value(twin, parameter), parameter.low))
+    return Unknown(
+        parameter.name,
+        parameter.unit,
+        parameter.searched(parameter.low),
+        parameter.searched(parameter.high),
+        start,
+        parameter.step,
+        parameter.value,
+        lambda changed, searched: parameter.apply(changed, parameter.value(searched)),
+        None if spread is None else (start, spread),
+    )
+
+
+def _value(twin: Twin, parameter: Parameter) -> float:
+    known = twin.parameters
+    if parameter.name in known:
+        return known[parameter.name]
+    if parameter.name == "youngs_modulus_pa":  # of a sheet: what its membrane stiffness says
+        thickness = twin.body.thickness_m
+        return known["membrane_n_m"] * (1 - known["poissons_ratio"] ** 2) / thickness
+    raise KeyError(f"the twin has no {parameter.name}; it has {sorted(known)}")
+
+
+def of_strength(effect: str, strength: Strength, scale: float | None = None, start: float = 0.0) -> Unknown:
+    """A strength in units of ``scale`` (its probe unless given), from ``start``."""
+    unit = strength.probe if scale is None else scale
+    return Unknown(
+        f"{effect}.{strength.name}",
+        strength.unit,
+        strength.low / unit,
+        strength.high / unit,
+        start / unit,
+        1.0,
+        lambda searched: searched * unit,
+        lambda twin, searched: with_strengths(twin, effect, {strength.name: searched * unit}),
+    )
+
+
+def clamp_reach(twin: Twin) -> Unknown | None:
+    """How far the clamps hold, within a cell: no lattice knows it better, so it is calibrated. None without one."""
+    clamp = EFFECTS[CLAMP]
+    if clamp.refuses(twin) is not None:
+        return None
+    cell = float(twin.lattice.spacing.max())
+    reach = next(s for s in clamp.strengths(twin) if s.name == "reach_m")
+    known = replace(reach, low=max(reach.low, -cell), high=min(reach.high, cell))
+    unknown = of_strength(CLAMP, known, _CLAMP_STEP * cell)
+    return replace(unknown, prior=(0.0, _CLAMP_SPREAD / _CLAMP_STEP))
+
+
+def with_strengths(twin: Twin, effect: str, strengths: dict[str, float]) -> Twin:
+    """A twin whose effect of that name has these strengths, its others as they are."""
+    present = [known for known in twin.effects if known.name == effect]
+    now = present[0] if present else EFFECTS[effect]()
+    return twin.with_effect(replace(now, **strengths))
+
+
+def at(twin: Twin, unknowns: list[Unknown], theta: np.ndarray) -> Twin:
+    """The twin with every unknown at its place (p,)."""
+    for unknown, searched in zip(unknowns, theta, strict=True):
+        twin = unknown.apply(twin, float(searched))
+    return twin

@@ -1,0 +1,139 @@
+"""The verdict: from refitted models to one honest answer.
+
+========================  ============================================================================================
+``nothing_to_explain``    the declared physics is near the noise, and no effect explains a share that matters
+``named``                 one model of effects reaches the noise, or removes most of what is above it, and no other does
+``equivalent_set``        other effects do as well: these data cannot tell them apart
+``data_issue``            the best are faults of the measurement only
+``numerical_issue``       the strength moves, or goes, with the resolution
+``unexplained``           something is there and no effect of the library accounts for it
+========================  ============================================================================================
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from physworld.trace.comparison import alikeness, difference
+from physworld.trace.config import TraceConfig
+from physworld.trace.confirm import Model, beats, explained_direction
+
+NAMED, EQUIVALENT, DATA, NUMERICAL = "named", "equivalent_set", "data_issue", "numerical_issue"
+UNEXPLAINED, NOTHING = "unexplained", "nothing_to_explain"
+_DISCREPANCY = 0.05
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """An answer.
+
+    Attributes:
+        name: of the verdict.
+        model: what is added; the declared physics where nothing is.
+        equivalent: models that do as well.
+        reason: one sentence for people.
+    """
+
+    name: str
+    model: Model
+    equivalent: tuple[Model, ...] = ()
+    reason: str = ""
+
+
+def decide(
+    declared: Model,
+    models: list[Model],
+    basis: np.ndarray,
+    agreement: dict[tuple[str, ...], bool],
+    config: TraceConfig,
+    tried: int,
+) -> Verdict:
+    """The verdict.
+
+    Args:
+        declared: the declared physics alone, refitted.
+        models: refitted models with effects.
+        basis: orthonormal sensitivities of what is calibrated anyway, (M, p).
+        agreement: for models that were refitted at a second resolution (by their names), whether it agreed.
+        tried: number of candidate effects.
+    """
+    before = declared.fitted.misfit
+    real = [model for model in models if helps(model, declared, config)]
+    if not real:
+        if before <= config.near_floor:
+            reason = f"the declared physics leaves {before:.2f} of the noise and none of {tried} effects explains more"
+            return Verdict(NOTHING, declared, (), reason)
+        reason = (
+            f"the declared physics leaves {before:.2f} of the noise; none of {tried} effects accounts for it"
+        )
+        return Verdict(UNEXPLAINED, declared, (), reason)
+    best = simplest(real, declared)
+    after = best.fitted.misfit
+    what = " and ".join(best.names)
+    figures = f"misfit {before:.2f} to {after:.2f} of the noise"
+    if not accounts(best, declared, config):
+        reason = f"{what} fits best among {tried} effects but leaves too much to be named: {figures}"
+        return Verdict(UNEXPLAINED, declared, (), reason)
+    if agreement.get(best.names) is False:
+        reason = f"the strength of {what} moves with the resolution: {figures}"
+        return Verdict(NUMERICAL, declared, (), reason)
+    same = tuple(
+        m for m in real if m is not best and indistinguishable(m, best, basis, declared, config.alike)
+    )
+    family = (best, *same)
+    measured = [all(member.kind == "measurement" for member in model.members) for model in family]
+    if all(measured):
+        return Verdict(
+            DATA, best, same, f"best supported among {tried}: {what}, a fault of the data; {figures}"
+        )
+    if same:
+        others = ", ".join(" and ".join(model.names) for model in same)
+        return Verdict(EQUIVALENT, best, same, f"{what} or {others}: these data cannot tell; {figures}")
+    return Verdict(NAMED, best, (), f"best supported among {tried} candidates: {what}; {figures}")
+
+
+def helps(model: Model, declared: Model, config: TraceConfig) -> bool:
+    """Left-out blocks are predicted better than by the declared physics, by more than chance and by a share that
+    matters.
+    """
+    share = 1.0 - model.validated.mean / declared.validated.mean
+    return beats(model, declared) and share >= config.material_share
+
+
+def accounts(model: Model, declared: Model, config: TraceConfig) -> bool:
+    """The model is complete, or nearly so and has removed most of what was above the noise."""
+    after, before = model.fitted.misfit, declared.fitted.misfit
+    if after <= config.near_floor:
+        return True
+    removed = (before**2 - after**2) / max(before**2 - 1.0, 1e-12)
+    return after <= config.acceptable and removed >= config.most_of_it
+
+
+def simplest(models: list[Model], declared: Model) -> Model:
+    """The model with fewest members, then fewest unknowns, among those that are as good as the best."""
+    best = min(models, key=lambda m: m.validated.mean)
+    near = [m for m in models if as_good(m, best, declared)]
+    return min(near, key=lambda m: (len(m.members), len(m.fitted.unknowns), m.validated.mean))
+
+
+def as_good(model: Model, best: Model, declared: Model) -> bool:
+    """Whether a model's errors on left-out blocks are within one standard error of the best model's.
+
+    A model of the body's numerics is never exact, and one more number absorbs some of that: a difference below
+    ``_DISCREPANCY`` of what the best model explains does not count either.
+    """
+    gap, spread = difference(model.validated, best.validated)
+    explained = declared.validated.mean - best.validated.mean
+    return gap <= max(spread, _DISCREPANCY * explained)
+
+
+def indistinguishable(model: Model, best: Model, basis: np.ndarray, declared: Model, alike: float) -> bool:
+    """Whether another model that is no less simple does as well, and by explaining the same."""
+    if len(model.members) != len(best.members) or len(model.fitted.unknowns) > len(best.fitted.unknowns):
+        return False
+    same = alikeness(explained_direction(model, declared, basis), explained_direction(best, declared, basis))
+    return same > alike and difference(model.validated, best.validated)[0] <= max(
+        difference(model.validated, best.validated)[1], 0.0
+    )

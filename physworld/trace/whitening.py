@@ -1,0 +1,152 @@
+"""Whitened residuals: what is known to be wrong without any effect is taken out by its covariance.
+
+The covariance of measured minus predicted is
+
+    sigma^2 (I + G G^T) + D D^T
+
+sigma the tracking noise; G the response of a tracked point to its own place in the body, which frame 0 gives with the
+same noise (a rigid body shows it as a shift that turns with it); D the numerical directions: what a finer lattice or
+time step changes in the prediction. W with W^T W the inverse is applied to residuals and to sensitivities alike, so
+that ordinary least squares of whitened quantities is the generalised one. G acts point by point; D has few columns:
+both need thin factors only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from physworld.scene import Scene
+from physworld.trace.split import Split
+from physworld.twin import Twin
+
+_SHIFT_M = 1e-4  # of a tracked point, to see how its track answers
+
+
+@dataclass(frozen=True)
+class Place:
+    """A tracked point's own place: its sightings (k,), and the thin factors of its part of the covariance.
+
+    ``response`` (3k, r) is G, ``basis`` (3k, r) spans it, ``shrink`` (r,) is what whitening takes from each direction.
+    """
+
+    rows: np.ndarray
+    response: np.ndarray
+    basis: np.ndarray
+    shrink: np.ndarray
+
+
+@dataclass(frozen=True)
+class Whitener:
+    """See the module's text. M = 3 x number of sightings V in the training frames, in the order of ``visible``.
+
+    Attributes:
+        measured: (V, 3) [m].
+        visible: of the training frames, (T, N) bool.
+        frames: of every sighting, (V,).
+        points: tracked point of every sighting, (V,).
+        sigma: [m].
+        first: first of the training frames.
+        places: one a tracked point.
+        numerics: orthonormal directions after the points' own, (M, d), and what whitening takes from each, (d,).
+    """
+
+    measured: np.ndarray
+    visible: np.ndarray
+    frames: np.ndarray
+    points: np.ndarray
+    sigma: float
+    first: int
+    places: tuple[Place, ...]
+    numerics: tuple[np.ndarray, np.ndarray] | None = None
+
+    def residual(self, tracks: np.ndarray) -> np.ndarray:
+        """Whitened measured minus predicted, (M,), of tracks (frames, N, 3) from frame 0."""
+        return self._whiten((self.measured - self._seen(tracks)) / self.sigma)
+
+    def change(self, difference: np.ndarray) -> np.ndarray:
+        """Whitened change of a prediction, (M,), of a difference of tracks (frames, N, 3)."""
+        return self._whiten(self._seen(difference) / self.sigma)
+
+    def with_numerics(self, differences: list[np.ndarray], amplitude: float) -> Whitener:
+        """Takes the numerical directions out: changes of tracks (frames, N, 3), each known up to ``amplitude``."""
+        plain = replace(self, numerics=None)
+        if not differences:
+            return plain
+        columns = [amplitude * plain.change(difference) for difference in differences]
+        u, s, _ = np.linalg.svd(np.stack(columns, axis=1), full_matrices=False)
+        keep = s > 1e-6
+        return replace(self, numerics=(u[:, keep], 1.0 - 1.0 / np.sqrt(1.0 + s[keep] ** 2)))
+
+    @property
+    def frame_of_row(self) -> np.ndarray:
+        """Frame of every row, (M,)."""
+        return np.repeat(self.frames, 3)
+
+    def place_errors(self, tracks: np.ndarray) -> np.ndarray:
+        """Most probable error of every point's own place [m], (N, r), given a prediction; within three sigma."""
+        error = (self.measured - self._seen(tracks)) / self.sigma
+        found = []
+        for place in self.places:
+            normal = place.response.T @ place.response + np.eye(place.response.shape[1])
+            found.append(np.linalg.solve(normal, place.response.T @ error[place.rows].reshape(-1)))
+        return np.clip(np.array(found), -3.0, 3.0) * self.sigma
+
+    def _seen(self, tracks: np.ndarray) -> np.ndarray:
+        return tracks[self.first : self.first + len(self.visible)][self.visible]
+
+    def _whiten(self, values: np.ndarray) -> np.ndarray:
+        out = values.copy()
+        for place in self.places:
+            block = out[place.rows].reshape(-1)
+            out[place.rows] = (block - place.basis @ (place.shrink * (place.basis.T @ block))).reshape(-1, 3)
+        flat = out.reshape(-1)
+        if self.numerics is None:
+            return flat
+        directions, shrink = self.numerics
+        return flat - directions @ (shrink * (directions.T @ flat))
+
+
+def whitener(scene: Scene, split: Split, sigma: float, responses: np.ndarray) -> Whitener:
+    """The whitener of the training frames.
+
+    Args:
+        scene, split: what was measured, and which of it counts.
+        sigma: tracking noise [m].
+        responses: of every tracked point to its own place, (frames, N, 3, r), from :func:`responses`.
+    """
+    first, end = split.train
+    visible = scene.visible[first:end]
+    frames, points = np.nonzero(visible)
+    places = []
+    for point in range(visible.shape[1]):
+        rows = np.nonzero(points == point)[0]
+        response = responses[first:end][visible[:, point], point].reshape(3 * len(rows), -1)
+        u, s, _ = np.linalg.svd(response, full_matrices=False)
+        places.append(Place(rows, response, u, 1.0 - 1.0 / np.sqrt(1.0 + s**2)))
+    measured = scene.points[first:end][visible]
+    return Whitener(measured, visible, frames + first, points, sigma, first, tuple(places))
+
+
+def responses(twin: Twin, nodes: np.ndarray) -> np.ndarray:
+    """Change of every track per change of its point's own place in the body, (frames, N, 3, r), r = 3.
+
+    The place is its material coordinates, and for a sheet or a rod its offset from it.
+    """
+    still, columns = twin.track_nodes(nodes), []
+    for axis in range(3):
+        columns.append((moved(twin, np.eye(3)[axis] * _SHIFT_M).track_nodes(nodes) - still) / _SHIFT_M)
+    return np.stack(columns, axis=-1)
+
+
+def moved(twin: Twin, shift: np.ndarray) -> Twin:
+    """The twin with its tracked points at other places in the body: ``shift`` (3,) or (N, 3) [m]."""
+    body = twin.body
+    shift = np.broadcast_to(shift, (len(body.points), 3))
+    if twin.lattice.dim == 3:
+        return replace(twin, body=replace(body, points=body.points + shift))
+    if twin.lattice.dim == 2:
+        body = replace(body, points=body.points + shift[:, :2], offsets=body.offsets + shift[:, 2:])
+        return replace(twin, body=body)
+    return replace(twin, body=replace(body, offsets=body.offsets + shift))

@@ -1,0 +1,105 @@
+"""``python -m workers.commands.trace SCENE --out report.json``: trace a recording's residual to a named effect.
+
+The report is :func:`physworld.trace.document`; ``--predictions FILE`` keeps the open-loop tracks before and after.
+Simulations run in two processes unless ``--processes`` says otherwise; ``--resume DIR`` keeps every simulation there,
+so that the same command goes on where an earlier one was cut off. Ctrl-C cancels; nothing is written before the end.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import sys
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+PROCESSES = 2
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Parse the command line, trace, write."""
+    given = _parser().parse_args(arguments)
+    from workers.commands.terminal import guarded
+
+    return guarded(lambda: _trace(given))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="physworld trace", description="Trace what a calibrated twin leaves to an effect that it lacks."
+    )
+    parser.add_argument("scene", type=Path, help="folder, archive, final_data.pkl or C3D file")
+    parser.add_argument("--out", type=Path, default=None, help="write the report to this file")
+    parser.add_argument("--predictions", type=Path, default=None, help="npz with the tracks before and after")
+    parser.add_argument("--particles", type=_count, default=None, help="particles of the twin, about")
+    parser.add_argument("--processes", type=_count, default=PROCESSES, help="processes that simulate")
+    parser.add_argument("--resume", type=Path, default=None, help="folder that remembers every simulation")
+    return parser
+
+
+def _count(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{value} is below 1")
+    return value
+
+
+def _trace(given: argparse.Namespace) -> None:
+    import warp as wp
+
+    wp.config.quiet = True  # before the first import that starts it
+    import numpy as np
+
+    from physworld.calibrate import CalibrationConfig, Journal
+    from physworld.trace import Memory, TraceConfig, Workers, document, trace
+    from physworld.trace.simulations import in_turn
+    from workers.commands.terminal import progress_bar, read_scene
+
+    scene = read_scene(given.scene)
+    config = TraceConfig()
+    if given.particles is not None:
+        config = TraceConfig(calibration=CalibrationConfig(particle_budget=given.particles, damping="none"))
+    memory = journal = None
+    if given.resume is not None:
+        memory = Memory(given.resume / "simulations")
+        stored = given.resume / "calibration.json"
+        key = hashlib.sha256(scene.points.tobytes() + repr(config.calibration).encode()).hexdigest()
+        journal = Journal(key, stored.read_text() if stored.exists() else None, stored.write_text)
+    pool = Workers(given.processes) if given.processes > 1 else nullcontext(in_turn)
+    with progress_bar(f"trace {scene.name}") as shown, pool as runner:
+        result = trace(scene, config, runner=runner, memory=memory, journal=journal, progress=shown)
+    report = document(result)
+    _print(report)
+    if given.predictions is not None:
+        given.predictions.parent.mkdir(parents=True, exist_ok=True)
+        with given.predictions.open("wb") as file:
+            np.savez(file, before=result.before, after=result.after)
+    if given.out is not None:
+        given.out.parent.mkdir(parents=True, exist_ok=True)
+        given.out.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n")
+
+
+def _print(report: dict[str, Any]) -> None:
+    print(f"{report['verdict']}: {report['reason']}")
+    for title in ("effects", "equivalent"):
+        for effect in report[title]:
+            for name, number in effect["parameters"].items():
+                interval = number["ci95"]
+                shown = "" if interval is None else f"  [{interval[0]:.4g}, {interval[1]:.4g}]"
+                print(
+                    f"  {title:<11} {effect['name']:<24} {name:<22} {number['value']:.4g} {number['unit']}{shown}"
+                )
+    held_out = report["held_out"]
+    floor = held_out["noise_floor"]
+    print(
+        f"held-out error [mm]: before {1e3 * held_out['before']:.4g}, after {1e3 * held_out['after']:.4g}"
+        + ("" if floor is None else f", noise {1e3 * floor:.4g}")
+    )
+    print(f"remains: {report['unexplained']['description']}")
+    print(f"{report['simulations']} simulations, {report['seconds']:.0f} s")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
