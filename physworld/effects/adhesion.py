@@ -2,7 +2,8 @@
 
     traction = Y max(0, 1 - gap / d) for gap > 0, Y below        (gap: height of the surface above the ground)
 
-A linear cohesive law; its work per area is Y d / 2. The ground's own pressure and friction stay as they are.
+A linear cohesive law; its work per area is Y d / 2. The ground's own pressure and friction stay as they are. Where thin
+bodies touch the ground, a sheet does with its area and a rod with its diameter times its length.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+import numpy as np
 import warp as wp
 
 from physworld.effects.base import Effect, Strength
@@ -30,7 +32,7 @@ def adhesion(
     columns: wp.array(dtype=wp.int32),
     weights: wp.array(dtype=wp.float64),
     area: wp.array(dtype=wp.float64),
-    height: wp.float64,
+    surface: wp.array(dtype=wp.float64),
     traction: wp.float64,
     reach: wp.float64,
     # in
@@ -43,7 +45,7 @@ def adhesion(
     z = wp.float64(0.0)
     for k in range(row_start[point], row_start[point + 1]):
         z += weights[k] * x[3 * columns[k] + 2]
-    gap = wp.max(z - height, wp.float64(0.0))
+    gap = wp.max(z - surface[point], wp.float64(0.0))
     if gap < reach:
         pull = traction * area[point] * (wp.float64(1.0) - gap / reach)
         for k in range(row_start[point], row_start[point + 1]):
@@ -52,22 +54,25 @@ def adhesion(
 
 @dataclass(frozen=True)
 class AdhesionTerm:
-    """Term of :class:`Adhesion` on the surface of the lattice."""
+    """Term of :class:`Adhesion` under a ground contact's points; ``width_m``: diameter of a rod, else 1."""
 
-    height_m: float
+    ground: GroundContact
     traction_pa: float
     reach_m: float
+    width_m: float
 
     def bind(self, problem: Problem) -> BoundAdhesion:
         """Device arrays."""
         points, areas = surface_points(problem.lattice)
         matrix, device = problem.lattice.interpolation(points), problem.device
+        offsets = np.broadcast_to(self.ground.offsets, len(points))
         inputs = [
             wp.array(matrix.indptr, dtype=wp.int32, device=device),
             wp.array(matrix.indices, dtype=wp.int32, device=device),
             wp.array(matrix.data, dtype=wp.float64, device=device),
-            wp.array(areas, dtype=wp.float64, device=device),
-            wp.float64(self.height_m), wp.float64(self.traction_pa), wp.float64(self.reach_m),
+            wp.array(self.width_m * areas, dtype=wp.float64, device=device),
+            wp.array(self.ground.height_m + offsets, dtype=wp.float64, device=device),
+            wp.float64(self.traction_pa), wp.float64(self.reach_m),
         ]  # fmt: skip
         return BoundAdhesion(len(points), inputs, device)
 
@@ -104,7 +109,7 @@ class Adhesion(Effect):
         weight = twin.density * gravity_size(twin) * body_size(twin)
         return (
             Strength("traction_pa", "Pa", 0.0, 100.0 * weight, 0.1 * weight),
-            Strength("reach_m", "m", 1e-4, 0.05, 5e-4, gate=False),
+            Strength("reach_m", "m", 1e-4, 0.05, 5e-4, gate=False, start=2e-3),
         )
 
     @classmethod
@@ -115,5 +120,6 @@ class Adhesion(Effect):
     def problem(self, problem: Problem, twin: Twin) -> Problem:
         """Adds the term at the height of the contact as it stands."""
         grounds = [t for t in problem.terms if isinstance(t, GroundContact)]
-        added = [AdhesionTerm(t.height_m, self.traction_pa, self.reach_m) for t in grounds]
+        width = 2.0 * twin.body.thickness_m if twin.lattice.dim == 1 else 1.0
+        added = [AdhesionTerm(t, self.traction_pa, self.reach_m, width) for t in grounds]
         return replace(problem, terms=(*problem.terms, *added))

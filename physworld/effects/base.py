@@ -35,6 +35,7 @@ class Strength:
         low, high: bounds of a search.
         probe: a step for sensitivities, large enough to show in a simulation and small enough to stay linear.
         gate: zero switches the effect off; False for a number that only shapes it.
+        start: where a search starts: 0 of a gate, else the field's default or the place that ``None`` chooses.
     """
 
     name: str
@@ -43,6 +44,7 @@ class Strength:
     high: float
     probe: float
     gate: bool = True
+    start: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -132,7 +132,7 @@ class GripSlip(Effect):
         high = max(0.1 * float(np.ptp(twin.particles_start, axis=0).max()) / weight, 10.0 * probe)
         return (
             Strength("compliance_m_n", "m/N", 0.0, high, probe),
-            Strength("damping_ratio", "1", 0.0, 2.0, 0.1, gate=False),
+            Strength("damping_ratio", "1", 0.0, 2.0, 0.1, gate=False, start=0.5),
         )
 
     @classmethod

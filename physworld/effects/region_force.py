@@ -94,8 +94,8 @@ class RegionForce(Effect):
         return (
             *(Strength(f"force_{a}_n", "N", -weight, weight, 5e-3 * weight) for a in "xyz"),
             *(
-                Strength(f"{a}_m", "m", lo - step, hi + step, 0.5 * (lo + hi), gate=False)
-                for a, lo, hi in zip("xyz", low, high, strict=True)
+                Strength(f"{a}_m", "m", lo - step, hi + step, step, gate=False, start=c)
+                for a, lo, hi, c in zip("xyz", low, high, free_end(twin), strict=True)
             ),
         )
 

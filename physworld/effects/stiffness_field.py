@@ -62,7 +62,7 @@ def field_strengths(dim: int) -> tuple[Strength, ...]:
         *(Strength(f"slope_{a}", "1", -1.5, 1.5, 0.05) for a in axes),
         Strength("bump", "1", -1.5, 1.5, 0.05),
         *(Strength(f"bump_{a}", "1", -1.0, 1.0, 0.1, gate=False) for a in axes),
-        Strength("bump_width", "1", 0.05, 1.0, 0.05, gate=False),
+        Strength("bump_width", "1", 0.05, 1.0, 0.05, gate=False, start=0.3),
     )
 
 

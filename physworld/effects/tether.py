@@ -113,7 +113,7 @@ class Tether(Effect):
         return (
             Strength("stiffness_n_m", "N/m", 0.0, 1e3 * scale, 0.02 * scale),
             *(
-                Strength(f"anchor_{a}_m", "m", c - 3 * size, c + 3 * size, c + 0.02 * size, gate=False)
+                Strength(f"anchor_{a}_m", "m", c - 3 * size, c + 3 * size, 0.02 * size, gate=False, start=c)
                 for a, c in zip("xyz", end, strict=True)
             ),
             Strength("rest_length_m", "m", 0.0, 3 * size, 0.02 * size, gate=False),

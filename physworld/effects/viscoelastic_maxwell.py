@@ -86,7 +86,7 @@ class ViscoelasticMaxwell(Effect):
     @classmethod
     def strengths(cls, twin: Twin) -> tuple[Strength, ...]:
         """A branch up to the size of a stiff law, fading within 5 ms to 5 s."""
-        time = Strength("relaxation_s", "s", 5e-3, 5.0, 0.02, gate=False)
+        time = Strength("relaxation_s", "s", 5e-3, 5.0, 0.02, gate=False, start=0.1)
         if twin.lattice.dim < 3:
             return (Strength("share", "1", 0.0, 5.0, 0.02), time)
         scale = twin.density * gravity_size(twin) * body_size(twin)

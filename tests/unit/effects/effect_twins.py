@@ -33,20 +33,36 @@ def solid() -> Scene:
 
 
 def sheet() -> Scene:
-    """A square sheet, one corner held."""
+    """A square sheet above the ground, one corner held."""
     plane = np.stack(np.meshgrid(*[np.linspace(0, 0.2, 3)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
     points = np.concatenate([plane, np.zeros((9, 1))], axis=1)
     scene = made_scene(
-        points, "sheet", PLATE, FRAMES, body=Body(thickness_m=2e-3), initial_state=UNDEFORMED_AT_REST
+        points,
+        "sheet",
+        PLATE,
+        FRAMES,
+        body=Body(thickness_m=2e-3),
+        initial_state=UNDEFORMED_AT_REST,
+        ground=Ground(-0.01, 0.4),
     )
     return _moved(scene)
 
 
 def rope() -> Scene:
-    """A rope held at its first end."""
+    """A rope above the ground, held at its first end."""
     points = np.linspace([0.0, 0.0, 0.0], [0.3, 0.0, 0.0], 5)
     body = Body(radius_m=0.004)
-    return _moved(made_scene(points, "rope", PLATE[:1], FRAMES, body=body, initial_state=UNDEFORMED_AT_REST))
+    return _moved(
+        made_scene(
+            points,
+            "rope",
+            PLATE[:1],
+            FRAMES,
+            body=body,
+            initial_state=UNDEFORMED_AT_REST,
+            ground=Ground(-0.01, 0.4),
+        )
+    )
 
 
 SCENES = {"solid": solid, "sheet": sheet, "rope": rope}

@@ -29,7 +29,7 @@ def block(friction: float, speed: float = 0.0, gravity: float = -9.81) -> Twin:
 def cantilever(bending_n_m2: float = 0.1, gravity: float = 0.0) -> tuple[Twin, float]:
     """The rope as a rod held at its first end, and its free length [m]."""
     twin = TWINS["rope"].with_parameters(bending_n_m2=bending_n_m2, stretching_n=30.0)
-    twin = replace(twin, gravity_m_s2=np.array([0.0, 0.0, gravity]))
+    twin = replace(twin, gravity_m_s2=np.array([0.0, 0.0, gravity]), ground_height_m=None)
     held = twin.held_nodes[0]
     cells = np.isin(twin.lattice.cell_nodes, held).all(axis=1)
     face = float((twin.lattice.origin + (twin.lattice.cells[cells].max() + 1) * twin.lattice.spacing)[0])
@@ -236,7 +236,7 @@ def test_a_grip_that_gives_sinks_under_the_weight_by_its_compliance(name: str) -
 
 
 def test_a_grip_that_gives_follows_a_slow_gripper() -> None:
-    twin = replace(TWINS["rope"], gravity_m_s2=np.zeros(3))
+    twin = replace(TWINS["rope"], gravity_m_s2=np.zeros(3), ground_height_m=None)
     soft = twin.with_effect(effect("grip_slip", compliance_m_n=2e-3))
     times = np.linspace(0.0, 2.0, 21)
     controls = twin.controllers_start + 0.02 * np.sin(0.5 * np.pi * times / 2.0)[:, None, None] ** 2

@@ -82,20 +82,18 @@ def test_an_effect_at_its_probe_shows_and_stays_small(name: str, body: str) -> N
 
 
 @pytest.mark.parametrize(("name", "body"), CASES)
-def test_strengths_are_fields_with_bounds_around_zero_or_their_default(name: str, body: str) -> None:
+def test_strengths_are_fields_with_bounds_around_their_start(name: str, body: str) -> None:
     kind = EFFECTS[name]
     strengths = kind.strengths(TWINS[body])
     defaults = {f.name: f.default for f in fields(kind)}
     gates = {s.name for s in strengths if s.gate}
     assert gates and gates <= set(kind.gates)
     for strength in strengths:
-        assert strength.low < strength.high and strength.unit
-        assert strength.low <= strength.probe <= strength.high
-        if strength.gate:
-            assert defaults[strength.name] == 0.0
-            assert strength.low <= 0.0 <= strength.high and strength.probe != 0.0
-        elif defaults[strength.name] is not None:
-            assert strength.low <= defaults[strength.name] <= strength.high
+        assert strength.low <= strength.start <= strength.high and strength.low < strength.high
+        assert strength.unit and strength.probe > 0 and strength.start + strength.probe <= strength.high
+        assert defaults[strength.name] == (0.0 if strength.gate else strength.start) or (
+            not strength.gate and defaults[strength.name] is None
+        )
     assert all(defaults[gate] == 0.0 for gate in kind.gates)
     assert not kind().active
 
