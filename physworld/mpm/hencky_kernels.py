@@ -1,5 +1,6 @@
 """Device side of plastic materials: Hencky strain, return mapping, Kirchhoff stress, one particle a thread.
 
+    F <- (I + dt C) F                                                 trial
     B = F F^T = sum sigma_i^2 n_i n_i^T      eps_i = ln sigma_i             principal Hencky (logarithmic) strains
     eps <- return mapping (:mod:`physworld.materials.plastic`)
     tau = sum (2 mu eps_i + lambda tr eps) n_i n_i^T                         St. Venant-Kirchhoff in Hencky strain
@@ -7,8 +8,8 @@
 
 The left singular vectors of F are the eigenvectors of B, and the right ones are not needed, so no singular value
 decomposition is taken: Jacobi rotations of B in double precision (Golub and Van Loan, section 8.5) cost a quarter of
-Warp's ``svd3`` and are exact to rounding. F is written only where the return mapping changed the strain: an elastic
-particle does not drift.
+Warp's ``svd3`` and are exact to rounding. F is turned back only where the return mapping changed the
+strain: an elastic particle does not drift.
 
 Legend: F deformation gradient (elastic part), B left Cauchy-Green tensor, n its eigenvectors.
 """
@@ -30,7 +31,7 @@ _JACOBI = r"""
     for (int sweep = 0; sweep < 12; ++sweep) {
         const double off = A[0][1] * A[0][1] + A[0][2] * A[0][2] + A[1][2] * A[1][2];
         const double trace = A[0][0] + A[1][1] + A[2][2];
-        if (off <= 1.0e-30 * trace * trace) break;
+        if (off <= 1.0e-22 * trace * trace) break;
         for (int k = 0; k < 3; ++k) {
             const int p = first[k], q = second[k], r = 3 - p - q;
             if (A[p][q] == 0.0) continue;
@@ -97,10 +98,17 @@ def plastic_kernel(project: Any) -> Any:
         state: wp.array(dtype=wp.float64),
         # out
         stress: wp.array(dtype=wp.float32),
+        ratio: wp.array(dtype=wp.float32),
         flags: wp.array(dtype=wp.int32),
     ):
         p = wp.tid()
-        trial = F[p]
+        c = 9 * p
+        gradient = wp.mat33d(
+            wp.float64(C[c]), wp.float64(C[c + 1]), wp.float64(C[c + 2]),
+            wp.float64(C[c + 3]), wp.float64(C[c + 4]), wp.float64(C[c + 5]),
+            wp.float64(C[c + 6]), wp.float64(C[c + 7]), wp.float64(C[c + 8]),
+        )  # fmt: skip
+        trial = F[p] + clock[2] * (gradient * F[p])
         eigen = symmetric_eigen(trial * wp.transpose(trial))
         least = wp.min(eigen[3, 0], wp.min(eigen[3, 1], eigen[3, 2]))
         if not (least > wp.float64(1.0e-8)):
@@ -116,7 +124,11 @@ def plastic_kernel(project: Any) -> Any:
         if new[0] != eps[0] or new[1] != eps[1] or new[2] != eps[2]:
             change = wp.vec3d(wp.exp(new[0] - eps[0]), wp.exp(new[1] - eps[1]), wp.exp(new[2] - eps[2]))
             F[p] = outer_sum(eigen, change) * trial
-        pressure = l * (new[0] + new[1] + new[2])
+        else:
+            F[p] = trial
+        trace = new[0] + new[1] + new[2]
+        ratio[p] = wp.float32(wp.exp(trace))
+        pressure = l * trace
         two = wp.float64(2.0)
         principal = wp.vec3d(
             two * m * new[0] + pressure, two * m * new[1] + pressure, two * m * new[2] + pressure
@@ -124,7 +136,6 @@ def plastic_kernel(project: Any) -> Any:
         tau = wp.float64(volume[p]) * outer_sum(eigen, principal)
         friction = eta[p]
         at = 6 * p
-        c = 9 * p
         stress[at] = wp.float32(tau[0, 0]) + 2.0 * friction * C[c]
         stress[at + 1] = wp.float32(tau[1, 1]) + 2.0 * friction * C[c + 4]
         stress[at + 2] = wp.float32(tau[2, 2]) + 2.0 * friction * C[c + 8]

@@ -2,24 +2,37 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import warp as wp
 
 from physworld.materials.laws import SolidLaw
 from physworld.materials.plastic import Plasticity
-from physworld.mpm.elastic_stress_kernels import neo_hookean_stress
+from physworld.mpm.elastic_stress_kernels import elastic_stress
 from physworld.mpm.hencky_kernels import plastic_kernel
+
+LANES = 8  # particles that an elastic kernel takes at once: arrays are padded to a multiple
+
+
+def padded(count: int) -> int:
+    """Length of the particles' arrays for ``count`` particles."""
+    return -(-count // LANES) * LANES
 
 
 class ParticleStress:
-    """Turns trial deformation gradients into elastic ones and volume times Kirchhoff stress.
+    """Advances deformation gradients, lets them flow, and gives volume times Kirchhoff stress.
 
     Args:
         law: elastic constants and friction.
-        plasticity: return mapping in Hencky strain, or None for the law's own elastic energy.
+        plasticity: return mapping in Hencky strain with the law's mu and lambda, or None for the law's own stress.
         volume: undeformed volume of every particle [m^3], (P,).
         stiffness_factor: factor on stiffness and friction, (P,).
         device: Warp device.
+
+    Attributes:
+        ratio: volume ratio of the elastic deformation, (P padded,) float32, as of the last launch.
+        memory: the plastic law's scalar, (P,) float64.
     """
 
     def __init__(
@@ -30,30 +43,37 @@ class ParticleStress:
         stiffness_factor: np.ndarray,
         device: str,
     ) -> None:
-        mu, lam = law.lame
         self._device = device
         self._count = len(volume)
         self._plasticity = plasticity
-        self._model = [
-            wp.array(values.astype(np.float32), dtype=wp.float32, device=device)
-            for values in (
-                mu * stiffness_factor,
-                lam * stiffness_factor,
-                volume,
-                law.viscosity_pa_s * volume * stiffness_factor,
-            )
-        ]
+
+        def array(values: Any) -> wp.array:
+            return wp.array(np.asarray(values, dtype=np.float32).reshape(-1), dtype=wp.float32, device=device)
+
+        measure = np.zeros(padded(self._count))
+        measure[: self._count] = volume * stiffness_factor
+        friction = array(law.viscosity_pa_s * measure)
+        self.ratio = wp.full(len(measure), 1.0, dtype=wp.float32, device=device)
         start = 0.0 if plasticity is None else plasticity.initial_memory
         self.memory = wp.full(self._count, wp.float64(start), dtype=wp.float64, device=device)
+        if plasticity is None:
+            moduli = measure.reshape(-1, 1, LANES) * np.array(law.moduli)[:, None]
+            self._model = [array(moduli), friction, array([*law.numbers, 0.0])]
+            self._kernel = elastic_stress(law.stress, len(law.moduli))
+        else:
+            mu, lam = law.lame
+            self._model = [
+                array(mu * stiffness_factor), array(lam * stiffness_factor), array(volume), friction,
+                wp.vec3d(*plasticity.parameters()),
+            ]  # fmt: skip
+            self._kernel = plastic_kernel(type(plasticity).project)
 
     def launch(self, F: wp.array, C: wp.array, stress: wp.array, clock: wp.array, flags: wp.array) -> None:
-        """Map ``F`` (P mat33d, in place) and write ``stress`` (6P,) [J]; ``C`` (9P,) [1/s] feeds the friction."""
+        """Advance ``F`` (P padded, mat33d) by ``clock[2]`` [s] of ``C`` [1/s], and write ``stress`` [J], (6P,)."""
+        outputs = [stress, self.ratio, flags]
         if self._plasticity is None:
-            flat = wp.array(ptr=F.ptr, dtype=wp.float64, shape=9 * self._count, device=self._device)
-            inputs, outputs = [*self._model, C, flat], [stress, flags]
-            kernel = neo_hookean_stress
+            flat = wp.array(ptr=F.ptr, dtype=wp.float64, shape=9 * len(F), device=self._device)
+            dim, inputs = len(F) // LANES, [*self._model, clock, C, flat]
         else:
-            parameters = wp.vec3d(*self._plasticity.parameters())
-            inputs, outputs = [*self._model, parameters, clock, C, F, self.memory], [stress, flags]
-            kernel = plastic_kernel(type(self._plasticity).project)
-        wp.launch(kernel, dim=self._count, inputs=inputs, outputs=outputs, device=self._device)
+            dim, inputs = self._count, [*self._model, clock, C, F, self.memory]
+        wp.launch(self._kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._device)

@@ -4,12 +4,12 @@
     g2p   v = sum w v_i   C = sum w v_i (x_i - x)^T D^-1    D = dx^2 / 4           APIC, Jiang et al. 2015
 
 The grid is a flat box of nodes (momentum, mass), four floats each, z fastest. The three nodes of a row are twelve
-neighbouring floats: on a CPU one 512-bit register takes a row, a fourth node's lanes multiply by zero, and a transfer
-is nine rows. On CUDA one thread loops over the 27 nodes and adds atomically. Cell c spans [c, c + 1] dx from the grid's
-origin, its node sits in the middle (:mod:`physworld.mpm.bspline`).
+neighbouring floats: on a CPU a vector of eight and one of four take a row, and a transfer is nine rows. On CUDA
+one thread loops over the 27 nodes and adds atomically. Cell c spans [c, c + 1] dx from the grid's origin, its node
+sits in the middle (:mod:`physworld.mpm.bspline`).
 
-Positions and deformation gradients are double precision (small increments of a slow motion would be rounded away),
-velocities and the grid single.
+Positions are double precision (small increments of a slow motion would be rounded away), velocities and the
+grid single.
 
 Legend: t local coordinate in the cell, w weights, d distances to the three nodes, Q affine momentum, box = first cell
 (3) and nodes (3) of the box an axis and the width of its rim; flags: see ``RIM`` to ``INVERTED``.
@@ -34,9 +34,10 @@ _LOCATE = r"""
     for (int j = 0; j < 3; ++j) {
         const double s = (x.data[3 * p + j] - origin[j]) * (double)inv_dx[j];
         if (!(s > -1.0e9 && s < 1.0e9)) { flags.data[2] = 1; return; }
-        const double cell = floor(s);
-        const float t = (float)(s - cell);
-        b[j] = (int)cell - 1 - box.data[j];
+        int cell = (int)s;
+        cell -= s < (double)cell;
+        const float t = (float)(s - (double)cell);
+        b[j] = cell - 1 - box.data[j];
         w[j][0] = 0.5f * (1.0f - t) * (1.0f - t);
         w[j][1] = 0.5f + t - t * t;
         w[j][2] = 0.5f * t * t;
@@ -49,14 +50,12 @@ _LOCATE = r"""
 
 _ROW = r"""
 #if !defined(__CUDA_ARCH__)
-    typedef float W __attribute__((vector_size(64), aligned(4)));
-    typedef float Q4 __attribute__((vector_size(16), aligned(4)));
-    auto repeat = [](Q4 q) -> W {
-        return __builtin_shufflevector(q, q, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3);
+    typedef float V8 __attribute__((vector_size(32), aligned(4)));
+    typedef float V4 __attribute__((vector_size(16), aligned(4)));
+    auto twice = [](V4 q) __attribute__((always_inline)) -> V8 {
+        return __builtin_shufflevector(q, q, 0, 1, 2, 3, 0, 1, 2, 3);
     };
-    auto lanes = [](float a, float b, float c) -> W {
-        return W{a, a, a, a, b, b, b, b, c, c, c, c, 0.0f, 0.0f, 0.0f, 0.0f};
-    };
+    auto pair = [](float a, float b) __attribute__((always_inline)) -> V8 { return V8{a, a, a, a, b, b, b, b}; };
 #endif
 """
 
@@ -95,27 +94,24 @@ _SCATTER = (
                 atomicAdd(&grid[at + 3], weight * m);
             }
 #else
-    const W wz = lanes(w[2][0], w[2][1], w[2][2]);
-    const W dz = lanes(d[2][0], d[2][1], d[2][2]);
-    auto spread = [&](const float* A, const float* base, float weight, float* target) {
-        const W ax = wz * repeat(Q4{A[0], A[3], A[6], 0.0f}), ay = wz * repeat(Q4{A[1], A[4], A[7], 0.0f});
-        const W az = wz * repeat(Q4{A[2], A[5], A[8], 0.0f});
-        const W first = wz * repeat(Q4{base[0], base[1], base[2], weight}) + az * dz;
+    const V8 w8 = pair(w[2][0], w[2][1]), d8 = pair(d[2][0], d[2][1]);
+    const float w4 = w[2][2], d4 = d[2][2];
+    auto spread = [&](const float* A, V4 base, float* target) __attribute__((always_inline)) {
+        const V4 ax = V4{A[0], A[3], A[6], 0.0f}, ay = V4{A[1], A[4], A[7], 0.0f}, az = V4{A[2], A[5], A[8], 0.0f};
+        const V8 first8 = w8 * (twice(base) + twice(az) * d8), ax8 = w8 * twice(ax), ay8 = w8 * twice(ay);
+        const V4 first4 = w4 * (base + az * d4), ax4 = w4 * ax, ay4 = w4 * ay;
         for (int i = 0; i < 3; ++i) {
-            const W plane = (first + ax * d[0][i]) * w[0][i];
-            const W tilt = ay * w[0][i];
+            const V8 plane8 = (first8 + ax8 * d[0][i]) * w[0][i], tilt8 = ay8 * w[0][i];
+            const V4 plane4 = (first4 + ax4 * d[0][i]) * w[0][i], tilt4 = ay4 * w[0][i];
             float* at = target + 4 * (((b[0] + i) * n1 + b[1]) * n2 + b[2]);
-            for (int j = 0; j < 3; ++j) {
-                W* row = (W*)(at + 4 * j * n2);
-                *row = *row + (plane + tilt * d[1][j]) * w[1][j];
+            for (int j = 0; j < 3; ++j, at += 4 * n2) {
+                *(V8*)at = *(V8*)at + (plane8 + tilt8 * d[1][j]) * w[1][j];
+                *(V4*)(at + 8) = *(V4*)(at + 8) + (plane4 + tilt4 * d[1][j]) * w[1][j];
             }
         }
     };
-    spread(Q, mv, m, grid);
-    if (split) {
-        const float none[3] = {0.0f, 0.0f, 0.0f};
-        spread(S, none, 0.0f, push);
-    }
+    spread(Q, V4{mv[0], mv[1], mv[2], m}, grid);
+    if (split) spread(S, V4{}, push);
 #endif
 """
 )
@@ -145,29 +141,47 @@ _GATHER = (
                 }
             }
 #else
-    const W wz = lanes(w[2][0], w[2][1], w[2][2]);
-    const W wdz = wz * lanes(d[2][0], d[2][1], d[2][2]);
-    W sum = W{}, sumx = W{}, sumy = W{}, sumold = W{};
-    for (int i = 0; i < 3; ++i) {
-        const int at = 4 * (((b[0] + i) * n1 + b[1]) * n2 + b[2]);
-        W plane = W{}, tilt = W{}, before = W{};
-        for (int j = 0; j < 3; ++j) {
-            const W row = *(const W*)(grid + at + 4 * j * n2) * w[1][j];
-            plane += row;
-            tilt += row * d[1][j];
-            if (split) before += *(const W*)(old + at + 4 * j * n2) * w[1][j];
-        }
-        plane *= w[0][i];
-        sum += plane;
-        sumx += plane * d[0][i];
-        sumy += tilt * w[0][i];
-        if (split) sumold += before * w[0][i];
+    float wd[3], xd[3];
+    for (int j = 0; j < 3; ++j) {
+        wd[j] = w[1][j] * d[1][j];
+        xd[j] = w[0][j] * d[0][j];
     }
-    auto fold = [](W r) -> Q4 {
-        return __builtin_shufflevector(r, r, 0, 1, 2, 3) + __builtin_shufflevector(r, r, 4, 5, 6, 7)
-             + __builtin_shufflevector(r, r, 8, 9, 10, 11);
+    V8 sum8 = V8{}, x8 = V8{}, y8 = V8{}, o8 = V8{};
+    V4 sum4 = V4{}, x4 = V4{}, y4 = V4{}, o4 = V4{};
+    for (int i = 0; i < 3; ++i) {
+        const int row = 4 * (((b[0] + i) * n1 + b[1]) * n2 + b[2]);
+        V8 plane8 = V8{}, tilt8 = V8{}, before8 = V8{};
+        V4 plane4 = V4{}, tilt4 = V4{}, before4 = V4{};
+        for (int j = 0; j < 3; ++j) {
+            const V8 r8 = *(const V8*)(grid + row + 4 * j * n2);
+            const V4 r4 = *(const V4*)(grid + row + 4 * j * n2 + 8);
+            plane8 += r8 * w[1][j];
+            plane4 += r4 * w[1][j];
+            tilt8 += r8 * wd[j];
+            tilt4 += r4 * wd[j];
+            if (split) {
+                before8 += *(const V8*)(old + row + 4 * j * n2) * w[1][j];
+                before4 += *(const V4*)(old + row + 4 * j * n2 + 8) * w[1][j];
+            }
+        }
+        sum8 += plane8 * w[0][i];
+        sum4 += plane4 * w[0][i];
+        x8 += plane8 * xd[i];
+        x4 += plane4 * xd[i];
+        y8 += tilt8 * w[0][i];
+        y4 += tilt4 * w[0][i];
+        if (split) {
+            o8 += before8 * w[0][i];
+            o4 += before4 * w[0][i];
+        }
+    }
+    const V8 w8 = pair(w[2][0], w[2][1]), wd8 = pair(w[2][0] * d[2][0], w[2][1] * d[2][1]);
+    const float w4 = w[2][2], wd4 = w[2][2] * d[2][2];
+    auto fold = [](V8 p, V4 q) __attribute__((always_inline)) -> V4 {
+        return __builtin_shufflevector(p, p, 0, 1, 2, 3) + __builtin_shufflevector(p, p, 4, 5, 6, 7) + q;
     };
-    const Q4 f = fold(sum * wz), fx = fold(sumx * wz), fy = fold(sumy * wz), fz = fold(sum * wdz);
+    const V4 f = fold(sum8 * w8, sum4 * w4), fx = fold(x8 * w8, x4 * w4), fy = fold(y8 * w8, y4 * w4);
+    const V4 fz = fold(sum8 * wd8, sum4 * wd4);
     for (int a = 0; a < 3; ++a) {
         nv[a] = f[a];
         A[3 * a] = fx[a];
@@ -175,34 +189,27 @@ _GATHER = (
         A[3 * a + 2] = fz[a];
     }
     if (split) {
-        const Q4 fo = fold(sumold * wz);
+        const V4 fo = fold(o8 * w8, o4 * w4);
         for (int a = 0; a < 3; ++a) ov[a] = fo[a];
     }
 #endif
     for (int a = 0; a < 3; ++a)
         for (int j = 0; j < 3; ++j) A[3 * a + j] *= 4.0f * inv_dx[j] * inv_dx[j];
     for (int k = 0; k < 9; ++k) C.data[9 * p + k] = A[k];
-    double* G = &F.data[9 * p];
-    double N[9];
-    for (int i = 0; i < 3; ++i)
-        for (int j = 0; j < 3; ++j)
-            N[3 * i + j] = G[3 * i + j] + dt * ((double)A[3 * i] * G[j] + (double)A[3 * i + 1] * G[3 + j]
-                                                + (double)A[3 * i + 2] * G[6 + j]);
     float keep = 0.0f, shift = 0.0f;
     if (split) {
         keep = adjustment;
-        const double J = N[0] * (N[4] * N[8] - N[5] * N[7]) - N[1] * (N[3] * N[8] - N[5] * N[6])
-                       + N[2] * (N[3] * N[7] - N[4] * N[6]);
-        shift = J > separating && x.data[3 * p + 2] > clear ? adjustment : 0.0f;
+        const float opened = ratio.data[p] * (1.0f + (float)dt * (A[0] + A[4] + A[8]));
+        shift = opened > separating && x.data[3 * p + 2] > clear ? adjustment : 0.0f;
     }
-    for (int k = 0; k < 9; ++k) G[k] = N[k];
     float most = 0.0f;
     for (int j = 0; j < 3; ++j) {
         const float difference = split ? v.data[3 * p + j] - ov[j] : 0.0f;
         const double step = dt * ((double)nv[j] + (double)(shift * difference));
         v.data[3 * p + j] = nv[j] + keep * difference;
         x.data[3 * p + j] += step;
-        const float crossed = fabsf((float)step * inv_dx[j]);
+        const float along = (float)step * inv_dx[j];
+        const float crossed = along < 0.0f ? -along : along;
         if (!(crossed < 1.0e9f)) flags.data[2] = 1;
         most = crossed > most ? crossed : most;
     }
@@ -247,18 +254,18 @@ def _gather(
     dx: wp.vec3f,
     split: int,
     adjustment: float,
-    separating: wp.float64,
+    separating: float,
     clear: wp.float64,
     clock: wp.array(dtype=wp.float64),
     box: wp.array(dtype=wp.int32),
     # in
     velocity: wp.array(dtype=wp.vec4f),
     velocity_old: wp.array(dtype=wp.vec4f),
+    ratio: wp.array(dtype=wp.float32),
     # in, out
     x: wp.array(dtype=wp.float64),
     v: wp.array(dtype=wp.float32),
     C: wp.array(dtype=wp.float32),
-    F: wp.array(dtype=wp.float64),
     # out
     flags: wp.array(dtype=wp.int32),
     extremes: wp.array(dtype=wp.float32),
@@ -301,28 +308,29 @@ def grid_to_particles(
     dx: wp.vec3f,
     split: int,
     adjustment: float,
-    separating: wp.float64,
+    separating: float,
     clear: wp.float64,
     clock: wp.array(dtype=wp.float64),
     box: wp.array(dtype=wp.int32),
     # in
     velocity: wp.array(dtype=wp.vec4f),
     velocity_old: wp.array(dtype=wp.vec4f),
+    ratio: wp.array(dtype=wp.float32),
     # in, out
     x: wp.array(dtype=wp.float64),
     v: wp.array(dtype=wp.float32),
     C: wp.array(dtype=wp.float32),
-    F: wp.array(dtype=wp.float64),
     # out
     flags: wp.array(dtype=wp.int32),
     extremes: wp.array(dtype=wp.float32),
 ):
-    """Velocity, its gradient, position and trial deformation gradient of one particle after the substep.
+    """Velocity, its gradient and position of one particle after the substep.
 
-    With ``split``: v = sum w v_i + a (v - sum w v_i_old), and the same difference moves the particle where its volume
-    ratio exceeds ``separating`` and its height ``clear``, a cell above the ground (ASFLIP, Fei et al. 2021, section 4).
+    With ``split``: v = sum w v_i + a (v - sum w v_i_old), and the same difference moves the particle where its elastic
+    volume ratio exceeds ``separating`` and its height ``clear``, a cell above the ground (ASFLIP, Fei et al.
+    2021, section 4).
     """
     _gather(
         wp.tid(), origin, inv_dx, dx, split, adjustment, separating, clear, clock, box,
-        velocity, velocity_old, x, v, C, F, flags, extremes,
+        velocity, velocity_old, ratio, x, v, C, flags, extremes,
     )  # fmt: skip

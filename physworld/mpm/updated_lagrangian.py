@@ -29,7 +29,7 @@ from physworld.mpm.grid_box import GridBox, GridLattice
 from physworld.mpm.grid_kernels import advance_grid, clear_gaps, measure_gaps, place_grips, scatter_grips
 from physworld.mpm.node_kernels import advance_counter
 from physworld.mpm.particle_grips import ParticleGrips, particle_grips
-from physworld.mpm.particle_stress import ParticleStress
+from physworld.mpm.particle_stress import ParticleStress, padded
 from physworld.mpm.stability import stable_time_step
 from physworld.mpm.total_lagrangian import HeldNodes, Problem
 from physworld.mpm.transfer import Apic, Transfer
@@ -48,13 +48,17 @@ _SAFETY = 0.45  # share of the limit that is used: dt = 0.4 dx / c
 _CROSSING = 0.4  # share of a cell that the fastest particle may be expected to cross in a substep
 _GRAIN_SHARE = 0.99  # of a velocity that the grid does not see, kept a substep (Fei et al. 2021)
 _OPENING = 0.999  # elastic volume ratio of grains above which ASFLIP lets them part
+_INSTANT = 1e-12  # [s], in which the first stress is found
 _SMOOTHING = 1e-9  # of fitted nodes: felt only by what particles do not see
 _AXES = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 
 
 @dataclass(frozen=True)
 class Particles:
-    """Device arrays of the particles' state: positions (3P,), velocities (3P,), C (9P,), F (P,), stress (6P,)."""
+    """Device arrays of the particles' state: positions (3P,), velocities (3P,), C (9P,), F (P,), stress (6P,);
+
+    the last three padded to a multiple of 8 particles.
+    """
 
     x: wp.array
     v: wp.array
@@ -194,13 +198,15 @@ class UpdatedLagrangian:
         shape, rest = gradient(x), gradient(self.problem.rest)
         C = gradient(v) @ np.linalg.inv(shape)
         F = shape @ np.linalg.inv(rest)
-        count = len(self.solid)
+        room = padded(len(self.solid))
+        F = np.concatenate([F, np.repeat(np.eye(3)[None], room - len(F), axis=0)])
+        C = np.concatenate([C, np.zeros((room - len(C), 3, 3))])
         return Particles(
             x=wp.array((value @ x).reshape(-1), dtype=wp.float64, device=device),
             v=wp.array((value @ v).reshape(-1).astype(np.float32), dtype=wp.float32, device=device),
             C=wp.array(C.reshape(-1).astype(np.float32), dtype=wp.float32, device=device),
             F=wp.array(np.ascontiguousarray(F), dtype=wp.mat33d, device=device),
-            stress=wp.zeros(6 * count, dtype=wp.float32, device=device),
+            stress=wp.zeros(6 * room, dtype=wp.float32, device=device),
         )
 
 
@@ -224,6 +230,8 @@ class ParticleRun:
         self.extremes = wp.zeros(1, dtype=wp.float32, device=device)
         self.crossing = 0.0
         self.graph = None
+        instant = wp.array([_INSTANT, 1.0 / _INSTANT, _INSTANT], dtype=wp.float64, device=device)
+        stress.launch(particles.F, particles.C, particles.stress, instant, self.flags)
 
     def record(self, times: np.ndarray, progress: Callable[[int, int], None] | None) -> np.ndarray:
         """Particles at ``times``, (T, P, 3); see :meth:`UpdatedLagrangian.run_particles`."""
@@ -330,7 +338,6 @@ class ParticleRun:
         def launch(kernel: object, dim: int, inputs: list, outputs: list) -> None:
             wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
-        self.stress.launch(q.F, q.C, q.stress, self.clock, self.flags)
         launch(
             particles_to_grid, count,
             [self.mass, origin, *space, split, self.clock, box, q.x, q.v, q.C, q.stress],
@@ -361,11 +368,11 @@ class ParticleRun:
              self.momentum, self.impulse, self.grip],
             [self.velocity, self.velocity_old, split],
         )  # fmt: skip
-        flat = wp.array(ptr=q.F.ptr, dtype=wp.float64, shape=9 * count, device=self.device)
-        sharing = [split, engine.velocity_share, wp.float64(engine.separating_volume), wp.float64(clear)]
+        sharing = [split, engine.velocity_share, engine.separating_volume, wp.float64(clear)]
         launch(
             grid_to_particles, count,
-            [origin, *space, *sharing, self.clock, box, self.velocity, self.velocity_old, q.x, q.v, q.C, flat],
+            [origin, *space, *sharing, self.clock, box, self.velocity, self.velocity_old,
+             self.stress.ratio, q.x, q.v, q.C],
             [self.flags, self.extremes],
         )  # fmt: skip
         if self.gripped:
@@ -375,6 +382,7 @@ class ParticleRun:
                 [numbers, path_gradient, path_v, self.counter, self.goal],
                 [q.x, q.v, q.C],
             )
+        self.stress.launch(q.F, q.C, q.stress, self.clock, self.flags)
         launch(advance_counter, 1, [self.counter], [])
 
 

@@ -33,7 +33,7 @@ def momenta(engine: UpdatedLagrangian, run: object) -> tuple[np.ndarray, np.ndar
     """Linear and angular momentum of particles with their affine fields (Jiang et al. 2015), and their scales."""
     q = run.particles  # type: ignore[attr-defined]
     x, v = q.x.numpy().reshape(-1, 3), q.v.numpy().reshape(-1, 3).astype(float)
-    spin = q.C.numpy().reshape(-1, 3, 3).astype(float) * engine.grid.spacing**2 / 4
+    spin = q.C.numpy().reshape(-1, 3, 3)[: len(x)].astype(float) * engine.grid.spacing**2 / 4
     curl = np.stack(
         [spin[:, 2, 1] - spin[:, 1, 2], spin[:, 0, 2] - spin[:, 2, 0], spin[:, 1, 0] - spin[:, 0, 1]], axis=1
     )
@@ -163,7 +163,7 @@ def sand(angle_deg: float, transfer: Transfer) -> tuple[np.ndarray, np.ndarray]:
         transfer=transfer,
         plasticity=DruckerPrager(np.radians(angle_deg)),
     )
-    path = engine.run_particles(rest, np.zeros_like(rest), unheld(3), np.array([0.0, 0.6, 0.7]))
+    path = engine.run_particles(rest, np.zeros_like(rest), unheld(3), np.array([0.0, 0.5, 0.6]))
     return path[-1], path[-1] - path[-2]
 
 
