@@ -18,6 +18,7 @@ from physworld.effects.base import Effect, Strength
 from physworld.effects.ground_friction import no_ground
 from physworld.effects.places import body_size, gravity_size
 from physworld.mpm.contact import GroundContact, surface_points
+from physworld.mpm.node_kernels import weighted_sum
 from physworld.mpm.terms import BoundTerm
 from physworld.mpm.total_lagrangian import Problem
 
@@ -42,10 +43,8 @@ def adhesion(
 ):
     """Pull one surface point towards the ground."""
     point = wp.tid()
-    z = wp.float64(0.0)
-    for k in range(row_start[point], row_start[point + 1]):
-        z += weights[k] * x[3 * columns[k] + 2]
-    gap = wp.max(z - surface[point], wp.float64(0.0))
+    here = weighted_sum(x, columns, weights, row_start[point], row_start[point + 1])
+    gap = wp.max(here[2] - surface[point], wp.float64(0.0))
     if gap < reach:
         pull = traction * area[point] * (wp.float64(1.0) - gap / reach)
         for k in range(row_start[point], row_start[point + 1]):

@@ -16,6 +16,7 @@ import warp as wp
 
 from physworld.effects.base import Effect, Strength
 from physworld.effects.places import body_size, free_end, gravity_size, region_weights
+from physworld.mpm.node_kernels import weighted_sum
 from physworld.mpm.terms import BoundTerm
 from physworld.mpm.total_lagrangian import Problem
 
@@ -39,10 +40,7 @@ def pull_of_tether(
     force: wp.array(dtype=wp.float64),
 ):
     """Add the spring's force to the nodes of its region, in one thread: there are few."""
-    gap = -anchor
-    for k in range(nodes.shape[0]):
-        node = 3 * nodes[k]
-        gap += weights[k] * wp.vec3d(x[node], x[node + 1], x[node + 2])
+    gap = weighted_sum(x, nodes, weights, 0, nodes.shape[0]) - anchor
     length = wp.length(gap) + wp.float64(1.0e-12)
     pull = -stiffness * (wp.float64(1.0) - rest_length / length) * gap
     for k in range(nodes.shape[0]):

@@ -10,6 +10,7 @@ from __future__ import annotations
 import warp as wp
 
 from physworld.geometry.sdf_kernels import signed_distance
+from physworld.mpm.node_kernels import weighted_sum
 
 
 @wp.func
@@ -153,10 +154,7 @@ def touch_collider(
     """
     point = wp.tid()
     zero = wp.float64(0.0)
-    here = wp.vec3d()
-    for k in range(row_start[point], row_start[point + 1]):
-        node = 3 * columns[k]
-        here += weights[k] * wp.vec3d(x[node], x[node + 1], x[node + 2])
+    here = weighted_sum(x, columns, weights, row_start[point], row_start[point + 1])
     found = collider_distance(kind, size, values, low, inverse, pose, here)
     depth = offset[point] - found[3]
     if depth <= zero:
@@ -164,10 +162,7 @@ def touch_collider(
         return
     along = wp.vec3d(found[0], found[1], found[2])
     normal = wp.normalize(along)
-    slide = wp.vec3d()
-    for k in range(row_start[point], row_start[point + 1]):
-        node = 3 * columns[k]
-        slide += weights[k] * wp.vec3d(v[node], v[node + 1], v[node + 2])
+    slide = weighted_sum(v, columns, weights, row_start[point], row_start[point + 1])
     slide -= collider_velocity(pose, here)
     approach = wp.dot(slide, along)
     slide -= wp.dot(slide, normal) * normal

@@ -11,6 +11,25 @@ from __future__ import annotations
 import warp as wp
 
 
+@wp.func
+def weighted_sum(
+    values: wp.array(dtype=wp.float64),
+    nodes: wp.array(dtype=wp.int32),
+    weights: wp.array(dtype=wp.float64),
+    first: int,
+    last: int,
+) -> wp.vec3d:
+    """Sum of weights times the vectors of nodes, entries ``first`` to ``last``.
+
+    A function of its own since Warp's adjoint kernels do not run a loop of unknown length again for what follows it.
+    """
+    total = wp.vec3d()
+    for k in range(first, last):
+        node = 3 * nodes[k]
+        total += weights[k] * wp.vec3d(values[node], values[node + 1], values[node + 2])
+    return total
+
+
 @wp.kernel
 def advance_nodes(
     # model
