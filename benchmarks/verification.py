@@ -31,7 +31,8 @@ NOTES = (
     "follows), shares of the default time step (dt), or what the row names.",
     "Order: slope of log error against log step. Where the closed form idealises the body (beam theory of a solid), "
     "the order at which successive results approach each other, and in brackets the limit's distance from theory.",
-    "No order is given where the error is rounding.",
+    "No order is given where the error is rounding, or where two errors of opposite sign make it meaningless (the "
+    "clamp's and the lumped mass's in the bending frequency, the rope's stretch and its grip in its swing).",
     "“Cell face on the clamp” is how grips were held before: every node of the gripped cells is prescribed, which also "
     "fixes the slope at their face. Cell faces now lie 1/(2√3) of a cell inside the grip.",
     "The torsional frequency converges slowly because lumped masses make a cross-section of n cells too heavy to turn, "
@@ -98,26 +99,35 @@ def draw(outcomes: list[Outcome], path: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
+    figure, (left, right) = plt.subplots(1, 2, figsize=(12, 4.2), layout="constrained")
+    clamps: dict[str, str] = {}
     for outcome in outcomes:
         case = outcome.case
-        if outcome.order is None or case.least_order is None or case.refined != "dx":
+        name = case.name.removesuffix("_old_clamp")
+        clamp = name in ("axial_frequency", "bending_frequency", "chain")
+        if case.refined != "dx" or not (clamp or (outcome.order and case.least_order)):
             continue
-        clamp = case.name.removesuffix("_old_clamp") in ("axial_frequency", "bending_frequency", "chain")
-        axes = left if clamp else right
         size = case.size or (lambda step: 1.0 / step)
         sizes = [size(step) / size(outcome.steps[0]) for step in outcome.steps]
-        style = "o--" if case.name.endswith("_old_clamp") else "o-"
-        axes.loglog(
-            sizes, [abs(e) for e in outcome.errors], style, label=case.title, markersize=4, linewidth=1.2
+        before = name != case.name
+        (line,) = (left if clamp else right).loglog(
+            sizes,
+            [abs(e) for e in outcome.errors],
+            "o--" if before else "o-",
+            color=clamps.get(name),
+            label=None if before and name in clamps else case.title,
+            markersize=4,
+            linewidth=1.2,
         )
-    for axes, title in ((left, "the clamp: before (dashed) and now"), (right, "other cases refined in dx")):
-        axes.loglog([1, 0.25], [3e-2, 3e-2 / 16], color="0.6", linewidth=3, alpha=0.5, label="second order")
+        clamps[name] = line.get_color()
+    for axes, title in ((left, "clamp, before (dashed) and now"), (right, "other cases refined in dx")):
+        axes.loglog([1, 0.25], [3e-2, 3e-2 / 16], color="0.6", linewidth=4, alpha=0.5, label="second order")
         axes.set_title(title, fontsize=10)
         axes.set_xlabel("cell size over the coarsest")
         axes.set_ylabel("error")
         axes.grid(alpha=0.3, which="both")
-        axes.legend(fontsize=6)
+    left.legend(fontsize=7, loc="lower right")
+    right.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
     plt.close(figure)
