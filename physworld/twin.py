@@ -2,7 +2,9 @@
 
 A twin is immutable; :meth:`Twin.with_parameters` gives a changed one. Positions go in and out in world coordinates
 [m]; a twin's *particles* are the quadrature points of its lattice, and its *tracked points* are the measured points of
-the scene followed as material points.
+the scene followed as material points. What a simulation returns are its *carriers*: the nodes of the lattice in the
+total Lagrangian form, the particles in the updated one (:mod:`physworld.mpm.choose` says which is taken);
+:meth:`particles_at`, :meth:`track_nodes` and :meth:`observe` read either.
 """
 
 from __future__ import annotations
@@ -25,11 +27,15 @@ from physworld.geometry.reference import ReferenceBody, reference_body
 from physworld.geometry.rigid import least_rotation, rigid_groups, rigid_motion
 from physworld.materials.laws import Law, RodLaw, SheetLaw, SolidLaw
 from physworld.materials.library import law_class
+from physworld.materials.plastic import PLASTICITIES, Plasticity
+from physworld.mpm.choose import FormulationName, choose_formulation
 from physworld.mpm.colliders import Collider
 from physworld.mpm.contact import GroundContact, ground, touching
+from physworld.mpm.following import follow
 from physworld.mpm.lattice import Lattice
 from physworld.mpm.terms import Term
 from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian
+from physworld.mpm.updated_lagrangian import UpdatedLagrangian
 from physworld.scene import AS_MEASURED, Grip, Scene
 
 Progress = Callable[[int, int], None]
@@ -62,7 +68,7 @@ class Integration:
     frame_index: np.ndarray
 
     def at_frames(self, start: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-        """Nodes (T, n, 3) at the frames from those at the knots; before the release they are at ``start`` (n, 3)."""
+        """Carriers (T, n, 3) at the frames from those at the knots; before the release they are at ``start`` (n, 3)."""
         held_back = np.repeat(start[None], int(np.sum(self.frame_index < 0)), axis=0)
         return np.concatenate([held_back, nodes[self.frame_index[self.frame_index >= 0]]])
 
@@ -82,6 +88,8 @@ class Twin:
         controllers_start: controllers at the first frame [m], (K, 3).
         release_s: the body is held at its start until then (somebody let go of it).
         effects: what acts beside the declared physics.
+        plasticity: flow law, or None; updated Lagrangian only.
+        formulation: which form integrates the body.
         device: Warp device of the simulations; not part of the twin's identity.
     """
 
@@ -96,6 +104,8 @@ class Twin:
     controllers_start: np.ndarray
     release_s: float = 0.0
     effects: tuple[Effect, ...] = ()
+    plasticity: Plasticity | None = None
+    formulation: FormulationName = "total_lagrangian"
     device: str = "cpu"
 
     @property
@@ -133,6 +143,8 @@ class Twin:
     def parameters(self) -> dict[str, float]:
         """Every scalar that a calibration may change, by name (units in the names)."""
         values = {**asdict(self.law), "air_drag_per_s": self.air_drag_per_s}
+        if self.plasticity is not None:
+            values.update(asdict(self.plasticity))
         if self.ground_height_m is not None:
             values["ground_friction"] = self.ground_friction
         return values
@@ -141,11 +153,16 @@ class Twin:
         """A twin with other parameters; names are those of :attr:`parameters`. Raises KeyError for an unknown one."""
         law_names = {f.name for f in fields(self.law)}
         own = {"air_drag_per_s"} if self.ground_height_m is None else {"air_drag_per_s", "ground_friction"}
-        unknown = set(values) - law_names - own
+        flow_names = set() if self.plasticity is None else {f.name for f in fields(self.plasticity)}
+        unknown = set(values) - law_names - own - flow_names
         if unknown:
             raise KeyError(f"unknown parameters {sorted(unknown)}; this twin has {sorted(self.parameters)}")
         law = replace(self.law, **{k: float(v) for k, v in values.items() if k in law_names})
-        return replace(self, law=law, **{k: float(v) for k, v in values.items() if k in own})
+        flow = self.plasticity
+        if flow is not None:
+            flow = replace(flow, **{k: float(v) for k, v in values.items() if k in flow_names})
+        own_values = {k: float(v) for k, v in values.items() if k in own}
+        return replace(self, law=law, plasticity=flow, **own_values)
 
     def with_effect(self, added: Effect) -> Twin:
         """A twin with this effect, in the place of one of the same name if there is one.
@@ -193,7 +210,7 @@ class Twin:
         progress: Progress | None = None,
         from_rest: bool = False,
     ) -> np.ndarray:
-        """Integrate under a control track and return the nodes at the frames.
+        """Integrate under a control track and return the carriers at the frames.
 
         Args:
             control_times, control_points: (Tc,) [s] and (Tc, K, 3) [m]; first time is the start.
@@ -203,16 +220,27 @@ class Twin:
             from_rest: start with zero velocity and release at once.
 
         Returns:
-            (T, n, 3) [m].
+            (T, n, 3) [m]: nodes, or in the updated Lagrangian form the particles, (T, P, 3).
 
         Raises:
             SimulationError: the run cannot be trusted; the message has the numbers.
+            SceneUnsupported: the updated Lagrangian form lacks what acts on this twin.
         """
         run = self.integration(
             control_times, control_points, frame_times, properties=properties, from_rest=from_rest
         )
-        nodes = TotalLagrangian(run.problem).run(self.body.start, run.velocity, run.held, run.knots, progress)
-        return run.at_frames(self.body.start, nodes)
+        start = self.body.start
+        if self.formulation == "total_lagrangian":
+            nodes = TotalLagrangian(run.problem).run(start, run.velocity, run.held, run.knots, progress)
+            return run.at_frames(start, nodes)
+        form = UpdatedLagrangian(run.problem, plasticity=self.plasticity)
+        solid = form.run_particles(start, run.velocity, run.held, run.knots, progress)
+        particles = np.empty((len(solid), len(self.particles_start), 3))
+        particles[:, form.solid] = solid
+        empty = np.setdiff1d(np.arange(particles.shape[1]), form.solid)  # no material there; they go along
+        if len(empty):
+            particles[:, empty] = follow(self.particles_start[empty], solid)
+        return run.at_frames(self.particles_start, particles)
 
     def integration(
         self,
@@ -255,12 +283,17 @@ class Twin:
         return Integration(problem, velocity, held, knots, frame_index)
 
     def particles_at(self, nodes: np.ndarray) -> np.ndarray:
-        """Particles (T, P, 3) of nodal trajectories (T, n, 3)."""
+        """Particles (T, P, 3) of the carriers' trajectories (T, n, 3)."""
+        if self.formulation == "updated_lagrangian":
+            return nodes
         return _apply(self._particle_rows, nodes)
 
     def track_nodes(self, nodes: np.ndarray) -> np.ndarray:
-        """Tracked points (T, N, 3) of nodal trajectories (T, n, 3)."""
+        """Tracked points (T, N, 3) of the carriers' trajectories (T, n, 3), from the first frame on."""
         body, lattice = self.body, self.lattice
+        if self.formulation == "updated_lagrangian":
+            material = lattice.particle_measures > 0
+            return follow(lattice.interpolation(body.points) @ body.start, nodes[:, material])
         tracks = _apply(lattice.interpolation(body.points), nodes)
         if lattice.dim == 2 and np.any(body.offsets):
             first = _apply(lattice.interpolation(body.points, (1, 0)), nodes)
@@ -277,7 +310,7 @@ class Twin:
         """Tracked points (T, N, 3) as the camera reports them: :meth:`track_nodes` and the measurement's effects.
 
         Args:
-            nodes: nodal trajectories, (T, n, 3) [m].
+            nodes: the carriers' trajectories, (T, n, 3) [m].
             times: their frames, (T,) [s].
         """
         tracks = self.track_nodes(nodes)
@@ -288,8 +321,11 @@ class Twin:
     def track(self, particles: np.ndarray) -> np.ndarray:
         """Tracked points (T, N, 3) of particle trajectories (T, P, 3), through the nodes that carry them.
 
-        Where a body is one cell thick its particles do not fix the nodes: the smoothest of them are taken.
+        Where a body is one cell thick its particles do not fix the nodes: the smoothest of them are taken. In the
+        updated Lagrangian form the particles are the carriers, and the first frame must be the start.
         """
+        if self.formulation == "updated_lagrangian":
+            return self.track_nodes(np.asarray(particles, dtype=float))
         rows, bends = self._particle_rows, self.lattice.second_differences()
         factor = splu((rows.T @ rows + _SMOOTHING * bends.T @ bends).tocsc())
         flat = np.asarray(particles, dtype=float).transpose(1, 0, 2).reshape(rows.shape[0], -1)
@@ -311,6 +347,10 @@ class Twin:
             "groups": [g.tolist() for g in self.controller_groups],
             "held": [h.tolist() for h in self.held_nodes],
             "effects": [{"name": known.name, "strengths": known.values} for known in self.effects],
+            "formulation": self.formulation,
+            "plasticity": None
+            if self.plasticity is None
+            else {"name": self.plasticity.name, "parameters": asdict(self.plasticity)},
         }
         return {
             "facts": np.array(json.dumps(facts)),
@@ -328,6 +368,7 @@ class Twin:
     def from_arrays(cls, arrays: dict[str, np.ndarray], device: str = "cpu") -> Twin:
         """The twin that :meth:`to_arrays` took apart, to be simulated on ``device``."""
         facts = json.loads(str(arrays["facts"]))
+        flow = facts.get("plasticity")
         lattice = Lattice(**{f.name: arrays[f"lattice_{f.name}"] for f in fields(Lattice)})
         body = ReferenceBody(
             lattice=lattice,
@@ -348,6 +389,8 @@ class Twin:
             controllers_start=arrays["controllers_start"],
             release_s=facts["release_s"],
             effects=tuple(effect(e["name"], **e["strengths"]) for e in facts.get("effects", ())),
+            plasticity=None if flow is None else PLASTICITIES[flow["name"]](**flow["parameters"]),
+            formulation=facts.get("formulation", "total_lagrangian"),
             device=device,
         )
 
@@ -376,7 +419,12 @@ class Twin:
 
 
 def build_twin(
-    scene: Scene, particle_budget: int = 2000, device: str = "cpu", refinement: float = 1.0
+    scene: Scene,
+    particle_budget: int = 2000,
+    device: str = "cpu",
+    refinement: float = 1.0,
+    plasticity: Plasticity | None = None,
+    formulation: str = "auto",
 ) -> Twin:
     """A twin of the scene with prior parameters, to be calibrated.
 
@@ -385,11 +433,17 @@ def build_twin(
         particle_budget: about how many particles a solid gets; rods and sheets take what their shape needs.
         device: Warp device of the simulations.
         refinement: cells are this many times smaller along every axis, whatever the body.
+        plasticity: flow law, or None.
+        formulation: "total_lagrangian", "updated_lagrangian", or "auto": by the law and the scene. The body's notes say
+            which was taken and why.
 
     Raises:
-        SceneUnsupported: the scene declares too little for a body.
+        SceneUnsupported: the scene declares too little for a body, or the formulation cannot hold it.
     """
     body = reference_body(scene, particle_budget, refinement)
+    choice = choose_formulation(body.lattice.dim, scene.kind, scene.declared, plasticity, formulation)
+    taken_form = f"{choice.formulation.replace('_', ' ')} form: {choice.reason}"
+    body = replace(body, notes=(*body.notes, taken_form))
     _, controls = scene.control_track()
     reach = 0.6 * float(np.ptp(body.start, axis=0).max())
     grips = grips_of(scene)
@@ -415,6 +469,8 @@ def build_twin(
         held_nodes=tuple(held),
         controllers_start=controls[0],
         release_s=_release_time(scene),
+        plasticity=plasticity,
+        formulation=choice.formulation,
         device=device,
     )
 

@@ -43,26 +43,26 @@ class StVenantKirchhoff:
 
     Attributes:
         yield_stress_pa: sigma_y, stress at which simple tension starts to flow; infinite for an elastic solid.
-        viscosity_pa_s: eta of the flow.
+        flow_viscosity_pa_s: eta.
 
     Raises:
         ValueError: a negative yield stress or viscosity.
     """
 
     yield_stress_pa: float = float("inf")
-    viscosity_pa_s: float = 0.0
+    flow_viscosity_pa_s: float = 0.0
 
     name: ClassVar[str] = "st_venant_kirchhoff"
     project: ClassVar[Any] = _project
     initial_memory: ClassVar[float] = 0.0
 
     def __post_init__(self) -> None:
-        if not (self.yield_stress_pa >= 0 and self.viscosity_pa_s >= 0):
+        if not (self.yield_stress_pa >= 0 and self.flow_viscosity_pa_s >= 0):
             raise ValueError(
                 f"yield stress and viscosity must not be negative, got {self.yield_stress_pa:.4g} Pa and "
-                f"{self.viscosity_pa_s:.4g} Pa s"
+                f"{self.flow_viscosity_pa_s:.4g} Pa s"
             )
 
     def parameters(self) -> tuple[float, float, float]:
         """(sigma_y, eta, unused)."""
-        return self.yield_stress_pa, self.viscosity_pa_s, 0.0
+        return self.yield_stress_pa, self.flow_viscosity_pa_s, 0.0

@@ -110,7 +110,7 @@ def test_nothing_changes_inside_the_yield_surface(law: Plasticity) -> None:
 
 
 def test_viscous_flow_decays_to_the_yield_surface_at_its_rate() -> None:
-    law, steps, dt = StVenantKirchhoff(yield_stress_pa=3e3, viscosity_pa_s=800.0), 50, 1e-5
+    law, steps, dt = StVenantKirchhoff(yield_stress_pa=3e3, flow_viscosity_pa_s=800.0), 50, 1e-5
     F = gradients(0.1, seed=3)
     surface = np.sqrt(2 / 3) * 3e3
     trace, size, _ = hencky(F)
