@@ -32,6 +32,7 @@ from physworld.mpm.adjoint_kernels import (
 from physworld.mpm.adjoint_pairs import ForcePair
 from physworld.mpm.adjoint_terms import Memory, Reverse, StressAdjoint, adjoint_of, memories_of
 from physworld.mpm.tangent import InternalTangent
+from physworld.mpm.terms import BoundTerm
 from physworld.mpm.total_lagrangian import HeldNodes, Problem, Run, TotalLagrangian
 
 _CHUNK = 8  # substeps in one captured graph: a divisor of every frame's
@@ -160,6 +161,16 @@ class RecordedRun:
             + self.nodes.nbytes
             + sum(point.nbytes for point in self._checkpoints)
         )
+
+    @property
+    def problem(self) -> Problem:
+        """What was integrated."""
+        return self._adjoint.problem
+
+    @property
+    def bound_terms(self) -> tuple[BoundTerm, ...]:
+        """The problem's terms on the device."""
+        return self._adjoint.solver.terms[:-1]
 
     def gradient(self, seed: np.ndarray, pairs: Sequence[ForcePair] = ()) -> Gradient:
         """Derivatives of L from those by the positions at the frames, ``seed`` (T, n, 3).

@@ -31,8 +31,8 @@ _FRAME = r"""
     const int layers = fields.shape[0] / (cells * WIDTH);
     const double* before = &state.data[(long long)row * state.shape[1]];
     for (int q = 0; q < WIDTH; q += LANES) {
-        V y[INPUTS], along[INPUTS];
-        for (int m = 0; m < INPUTS; ++m) y[m] = along[m] = V{};
+        V y[INPUTS], w_slope[INPUTS];
+        for (int m = 0; m < INPUTS; ++m) y[m] = w_slope[m] = V{};
         for (int a = 0; a < NODES; ++a)
             for (int k = 0; k < ORDERS; ++k) {
                 V g;
@@ -40,7 +40,7 @@ _FRAME = r"""
                 for (int i = 0; i < 3; ++i) {
                     const int n = 3 * node[a] + i;
                     y[SLOT(k, i)] += (OFFSET) * g * SCALE(k);
-                    along[SLOT(k, i)] += w.data[n] * g * SCALE(k);
+                    w_slope[SLOT(k, i)] += w.data[n] * g * SCALE(k);
                 }
             }
         V memory[ROWS_OR_ONE], field[MOST], next[ROWS_OR_ONE];
@@ -166,21 +166,21 @@ _SHAPES: dict[int, dict[str, str]] = {
         "SLOT(k, i)": "(3 * (i) + (k))", "SCALE(k)": "scale[k]", "OFFSET": "x.data[n] - x_rest.data[n]",
         "STEP_OF(m)": "STEP",
         "UNPACK": "V F[9]; for (int m = 0; m < 9; ++m) F[m] = y[m]; const double scale[3] = {1.0, 1.0, 1.0};",
-        "PACK": "for (int m = 0; m < 9; ++m) total += P[m] * along[m] * -1.0;",
+        "PACK": "for (int m = 0; m < 9; ++m) total += P[m] * w_slope[m] * -1.0;",
     },
     2: {
         "NODES": "9", "WIDTH": "4", "ORDERS": "5", "INPUTS": "15",
         "SLOT(k, i)": "(3 * (k) + (i))", "SCALE(k)": "1.0", "OFFSET": "x.data[n]",
         "STEP_OF(m)": "((m) < 6 ? STEP : 10.0 * STEP)",
         "UNPACK": "V d[5][3]; for (int m = 0; m < 15; ++m) d[m / 3][m % 3] = y[m];",
-        "PACK": "for (int m = 0; m < 15; ++m) total += S[m / 3][m % 3] * along[m] * -1.0;",
+        "PACK": "for (int m = 0; m < 15; ++m) total += S[m / 3][m % 3] * w_slope[m] * -1.0;",
     },
     1: {
         "NODES": "3", "WIDTH": "2", "ORDERS": "2", "INPUTS": "6",
         "SLOT(k, i)": "(3 * (k) + (i))", "SCALE(k)": "1.0", "OFFSET": "x.data[n]",
         "STEP_OF(m)": "((m) < 3 ? STEP : 10.0 * STEP)",
         "UNPACK": "V t[3] = {y[0], y[1], y[2]}, c[3] = {y[3], y[4], y[5]};",
-        "PACK": "for (int i = 0; i < 3; ++i) total += (St[i] * along[i] + Sc[i] * along[3 + i]) * -1.0;",
+        "PACK": "for (int i = 0; i < 3; ++i) total += (St[i] * w_slope[i] + Sc[i] * w_slope[3 + i]) * -1.0;",
     },
 }  # fmt: skip
 
