@@ -1,13 +1,13 @@
 """Plastic flow: strain beyond the yield point stays.
 
-    solid   s = 2 mu (dev E - p)    |s| <= sqrt(2/3) Y + 2 mu h g    S -= 2 mu p       (E Green strain, p plastic part)
-    sheet   |k - p| <= k_y + h g    M -= C p                                           (bending only)
-    rod     |kappa - p| <= k_y + h g    moment -= B p                                  (p turns with the tangent)
+    solid   S += mu (Cp^-1 - 1)     |mu dev b| <= sqrt(2/3) Y + mu h g,  b = F Cp^-1 F^T
+    sheet   M -= C p                |k - p| <= k_y + h g                                  (bending only)
+    rod     moment -= B p           |kappa - p| <= k_y + h g                              (p turns with the tangent)
 
-g is the plastic strain that has been gathered; the return is radial (Green and Naghdi 1965 for the additive split;
-Simo and Hughes ch. 3 for the return). The strengths vanish where the body is elastic: 1/Y for a solid and the bend
-radius 1/k_y, above which a thin body stays elastic, for sheets and rods. Small to moderate strains; the elastic law
-carries the volume. Material that flows far belongs to the updated Lagrangian form.
+Cp is the plastic right Cauchy-Green strain, det Cp = 1, p a plastic curvature, g what has flowed; the return is radial
+(Simo and Hughes, box 9.1). With a neo-Hookean law the solid's form is exact at finite strain, with others to first
+order. The strengths vanish where the body is elastic: 1/Y for a solid, and the bend radius 1/k_y above which a sheet
+or rod stays elastic. A body that tears, melts or touches itself belongs to the updated Lagrangian form.
 """
 
 from __future__ import annotations
@@ -29,20 +29,50 @@ if TYPE_CHECKING:
 _MODELS = {
     3: solid_model(
         r"""
-        const V mean = (E[0] + E[1] + E[2]) * (1.0f / 3.0f);
-        V e[6], size = V{} + 1e-20f;
+        V G[6], B[9], A[9], cof[9], b[6], e[6], D[9];   // G = Cp^-1 - 1, B = Cp^-1, b = F B F^T
+        if (first) for (int k = 0; k < 7; ++k) STATE(k) = V{};
+        for (int k = 0; k < 6; ++k) G[k] = STATE(k);
+        const int at[9] = {0, 5, 4, 5, 1, 3, 4, 3, 2}, row[6] = {0, 1, 2, 1, 0, 0}, column[6] = {0, 1, 2, 2, 2, 1};
+        for (int k = 0; k < 9; ++k) B[k] = G[at[k]] + (k % 4 ? 0.0f : 1.0f);
+        for (int i = 0; i < 3; ++i)
+            for (int j = 0; j < 3; ++j) {
+                A[3 * i + j] = F[3 * i] * B[j] + F[3 * i + 1] * B[3 + j] + F[3 * i + 2] * B[6 + j];
+                const int r = (i + 1) % 3, s = (i + 2) % 3, c = (j + 1) % 3, d = (j + 2) % 3;
+                cof[3 * i + j] = F[3 * r + c] * F[3 * s + d] - F[3 * r + d] * F[3 * s + c];
+            }
         for (int k = 0; k < 6; ++k) {
-            if (first) STATE(k) = V{};
-            e[k] = (k < 3 ? E[k] - mean : E[k]) - STATE(k);
+            const int i = 3 * row[k], j = 3 * column[k];
+            b[k] = A[i] * F[j] + A[i + 1] * F[j + 1] + A[i + 2] * F[j + 2];
+        }
+        const V mean = (b[0] + b[1] + b[2]) * (1.0f / 3.0f);
+        V size = V{} + 1e-20f;
+        for (int k = 0; k < 6; ++k) {
+            e[k] = k < 3 ? b[k] - mean : b[k];
             size += (k < 3 ? 1.0f : 2.0f) * e[k] * e[k];
         }
-        if (first) STATE(6) = V{};
         size = ROOT(size);
-        const V flow = POSITIVE(size - PARAMETER(1) - PARAMETER(2) * STATE(6)) * (1.0f / (1.0f + PARAMETER(2)));
+        const V filled = FIELD(0) / (FIELD(0) + 1e-30f);
+        const V flow = POSITIVE(size - PARAMETER(1) - PARAMETER(2) * STATE(6)) * (filled / (1.0f + PARAMETER(2)));
         STATE(6) += flow;
+        const V J = POSITIVE(F[0] * cof[0] + F[1] * cof[1] + F[2] * cof[2] - 0.02f) + 0.02f;
+        const V share = flow / (size * J * J);
+        for (int i = 0; i < 3; ++i)   // B -= (flow / size) F^-1 e F^-T, F^-1 = cof^T / J
+            for (int j = 0; j < 3; ++j)
+                D[3 * i + j] = e[at[3 * i]] * cof[j] + e[at[3 * i + 1]] * cof[3 + j] + e[at[3 * i + 2]] * cof[6 + j];
         for (int k = 0; k < 6; ++k) {
-            STATE(k) += flow * e[k] / size;
-            S[k] = -FIELD(0) * PARAMETER(0) * STATE(k);
+            const int i = row[k], j = column[k];
+            G[k] -= share * (cof[i] * D[j] + cof[3 + i] * D[3 + j] + cof[6 + i] * D[6 + j]);
+        }
+        // det B = 1 by one step of Newton, where it flowed: det(1 + G) - 1 = tr G + second invariant + det G
+        const V minors = G[0] * G[1] + G[1] * G[2] + G[0] * G[2] - G[3] * G[3] - G[4] * G[4] - G[5] * G[5];
+        const V trace = G[0] + G[1] + G[2];
+        const V det = G[0] * (G[1] * G[2] - G[3] * G[3]) - G[5] * (G[5] * G[2] - G[3] * G[4])
+                      + G[4] * (G[5] * G[3] - G[1] * G[4]);
+        const V excess = (trace + minors + det) / (3.0f + 2.0f * trace + minors) * (flow / (flow + 1e-20f));
+        for (int k = 0; k < 6; ++k) {
+            if (k < 3) G[k] -= excess;
+            STATE(k) = G[k];
+            S[k] = FIELD(0) * PARAMETER(0) * G[k];
         }
     """,
         rows=7,
@@ -98,7 +128,7 @@ class Plasticity(Effect):
 
     name = "plasticity"
     title = "plastic flow"
-    equation = "|2 mu (dev E - p)| <= sqrt(2/3) Y"
+    equation = "|mu dev b| <= sqrt(2/3) Y, b = F Cp^-1 F^T"
     kind = "stress"
     gates = ("inverse_yield_per_pa", "yield_radius_m")
 
@@ -118,12 +148,12 @@ class Plasticity(Effect):
 
     @classmethod
     def strengths(cls, twin: Twin) -> tuple[Strength, ...]:
-        """A solid's probe yields at a third of the stress under which its own weight bends it, rho g L^2 / h."""
+        """By rho g L^2 / h, a third of a level beam's bending stress: at two thirds such a beam collapses."""
         hardening = Strength("hardening", "1", 0.0, 10.0, 0.05, gate=False)
         if twin.lattice.dim == 3:
             slender = body_size(twin) / float(np.ptp(twin.particles_start, axis=0).min())
             soft = 1.0 / (twin.density * gravity_size(twin) * body_size(twin) * slender)
-            return (Strength("inverse_yield_per_pa", "1/Pa", 0.0, 100.0 * soft, soft), hardening)
+            return (Strength("inverse_yield_per_pa", "1/Pa", 0.0, 40.0 * soft, 0.7 * soft), hardening)
         size = body_size(twin)
         return (Strength("yield_radius_m", "m", 0.0, 20.0 * size, size), hardening)
 
@@ -134,7 +164,7 @@ class Plasticity(Effect):
             if not self.inverse_yield_per_pa:
                 return problem
             mu = law.lame[0]
-            numbers: tuple[float, ...] = (2 * mu, np.sqrt(2 / 3) / self.inverse_yield_per_pa / (2 * mu), h)
+            numbers: tuple[float, ...] = (mu, np.sqrt(2 / 3) / self.inverse_yield_per_pa / mu, h)
         else:
             if not self.yield_radius_m:
                 return problem
