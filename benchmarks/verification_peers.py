@@ -111,14 +111,14 @@ def peer_frequency(across: int = 3) -> float:
     return float(np.sqrt(eigsh(stiffness, k=1, M=peer.inertia(), sigma=0.0)[0][0]))
 
 
-def sag(cells: float) -> float:
-    """Distance between our tip and the peer's, over the sag."""
+def sag(cells: float, across: int = 3) -> float:
+    """Distance between our tip and the peer's, over the sag; the peer is ``across`` elements thick."""
     count = int(cells)
     lattice = clamped_lattice(SAG_SIZE[0], SAG_SIZE[1:], (count, count // 5, count // 5), CLAMP_REACH)
     times = np.linspace(0.0, 2.5, 26)
     nodes = run(lattice, SAG_LAW, times, gripped(lattice), drag_per_s=12.0)
     place = (SAG_SIZE[0], SAG_SIZE[1] / 2, SAG_SIZE[2] / 2)
-    exact = peer_sag()
+    exact = peer_sag(across)
     return float(np.linalg.norm(path(lattice, nodes, place)[-1] - place - exact) / np.linalg.norm(exact))
 
 

@@ -10,7 +10,7 @@ from benchmarks import verification_peers as peers
 
 def test_a_fall_with_drag_follows_its_closed_form_at_first_order_in_the_step() -> None:
     coarse, fine = effects.drag(1.0), effects.drag(0.5)
-    assert fine < 6e-4
+    assert fine < 5.8e-4
     assert np.log2(coarse / fine) > 0.9
 
 
@@ -19,7 +19,7 @@ def test_drag_takes_half_its_rate_from_a_swing() -> None:
 
 
 def test_internal_friction_damps_as_kelvin_and_voigt_say() -> None:
-    assert abs(effects.viscosity(20)) < 2e-3
+    assert abs(effects.viscosity(20)) < 1.8e-3
     assert abs(effects.rod_friction(10)) < 0.015
 
 
@@ -32,4 +32,4 @@ def test_a_lagging_grip_does_what_the_record_said_before() -> None:
 
 
 def test_a_sagging_soft_beam_ends_where_finite_elements_put_it() -> None:
-    assert peers.sag(10) < 0.025
+    assert peers.sag(10, across=2) < 0.025

@@ -9,7 +9,6 @@ from benchmarks import verification_solids as solids
 from benchmarks.verification_cases import observed_order
 
 ROUND_OFF = 1e-12
-TIMOSHENKO_SLACK = 2e-3  # beam theory is an idealisation of the body
 
 
 def order(coarse: float, fine: float, ratio: float = 2.0) -> float:
@@ -35,8 +34,8 @@ def test_the_clamp_is_second_order_and_a_tenth_of_what_it_was() -> None:
 
 
 def test_a_clamped_bar_swings_and_sags_as_timoshenko_s_beam() -> None:
-    assert abs(solids.bending_frequency(20)) < 2 * TIMOSHENKO_SLACK
-    assert abs(solids.static_sag(20)) < 7e-3
+    assert abs(solids.bending_frequency(20)) < 2.9e-3
+    assert abs(solids.static_sag(20)) < 6.5e-3
 
 
 def test_timoshenko_s_frequency_goes_to_euler_s_for_a_slender_beam() -> None:
@@ -54,15 +53,15 @@ def test_torsion_converges_at_second_order_from_below() -> None:
 
 
 def test_a_uniform_strain_under_a_large_rotation_leaves_inner_nodes_free_of_force() -> None:
-    assert solids.rotation_patch(3) < 1e-6
+    assert solids.rotation_patch(3) < 1e-7
 
 
 def test_a_free_spin_of_three_turns_keeps_its_angular_momentum() -> None:
-    assert abs(solids.spin(1.0)) < 2e-6
+    assert abs(solids.spin(1.0)) < 1.4e-6
 
 
 def test_a_sliding_block_stops_where_coulomb_says() -> None:
-    assert abs(solids.sliding_block(2)) < 1e-3
+    assert abs(solids.sliding_block(2)) < 6e-4
 
 
 def test_the_silicone_beam_is_not_damped_by_the_scheme() -> None:
