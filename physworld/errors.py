@@ -11,6 +11,8 @@ PhysworldError
 ├── EffectRefused           the effect makes no sense for this twin
 ├── NotDifferentiable       a gradient was asked of what has none
 ├── CalibrationError        no parameter gave a usable simulation
+├── LawAnswerRefused        a model's answer names no law of the library, or not in the asked form
+├── LawAnswerUnavailable    the model that was asked gave no answer
 ├── Cancelled               the caller asked to stop
 └── TrainingDiverged        a loss or a weight is not finite
 """
@@ -60,6 +62,14 @@ class NotDifferentiable(PhysworldError):
 
 class CalibrationError(PhysworldError):
     """No parameter gave a usable simulation."""
+
+
+class LawAnswerRefused(PhysworldError):
+    """A model's answer names no law of the library, or not in the asked form."""
+
+
+class LawAnswerUnavailable(PhysworldError):
+    """The model that was asked gave no answer."""
 
 
 class Cancelled(PhysworldError):

@@ -71,6 +71,7 @@ class FitResult:
     Attributes:
         twin: with the calibrated parameters.
         parameters: estimates by name; what was searched first.
+        searched: what was searched, in the order of ``correlations``.
         correlations: of the searched parameters.
         tracks: tracked points over all frames, open loop from the first, (T, N, 3) [m].
         particles: particles over all frames, (T, P, 3) [m].
@@ -83,6 +84,7 @@ class FitResult:
 
     twin: Twin
     parameters: dict[str, Estimate]
+    searched: tuple[Parameter, ...]
     correlations: Correlations
     tracks: np.ndarray
     particles: np.ndarray
@@ -118,13 +120,8 @@ def calibrate(
     config = config or CalibrationConfig()
     started = time.perf_counter()
     search = Search(scene, prior_twin(scene, config), config.max_simulations, progress, cancelled, journal)
-    parameters = parameters_of(
-        search.twin,
-        separate_bending=scene.body.thickness_m is None and scene.body.size_m is None,
-        damping=config.damping == "auto",
-        ground_friction=scene.ground is not None and scene.ground.friction is None,
-    )
-    kept, optimum, rejected = _select(search, parameters)
+    parameters = searched_parameters(scene, search.twin, config)
+    kept, optimum, rejected = select(search, parameters)
     if search.shift_points(kept, optimum.theta):
         optimum = search.solve(kept, optimum.theta, 3)
     kept, optimum, solution = _hold_the_unknown(search, kept, optimum, rejected)
@@ -137,6 +134,7 @@ def calibrate(
     return FitResult(
         twin=twin,
         parameters={**found, **{name: e for name, e in held.items() if name not in found}},
+        searched=tuple(kept),
         correlations=correlated,
         tracks=tracks,
         particles=twin.particles_at(nodes),
@@ -154,7 +152,17 @@ def prior_twin(scene: Scene, config: CalibrationConfig) -> Twin:
     return twin if config.law is None else replace(twin, law=with_law(twin.law, config.law))
 
 
-def _select(search: Search, parameters: list[Parameter]) -> tuple[list[Parameter], Optimum, dict[str, float]]:
+def searched_parameters(scene: Scene, twin: Twin, config: CalibrationConfig) -> list[Parameter]:
+    """What may be searched in this scene."""
+    return parameters_of(
+        twin,
+        separate_bending=scene.body.thickness_m is None and scene.body.size_m is None,
+        damping=config.damping == "auto",
+        ground_friction=scene.ground is not None and scene.ground.friction is None,
+    )
+
+
+def select(search: Search, parameters: list[Parameter]) -> tuple[list[Parameter], Optimum, dict[str, float]]:
     """Steps 1 to 3: the parameters to keep, their optimum, and what the others would have removed."""
     kept = [p for p in parameters if p.stage == "stiffness"]
     optimum = search.scan(kept)

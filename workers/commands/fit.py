@@ -2,6 +2,9 @@
 
 The figures are those of :func:`fit_document`; ``--out DIR`` also keeps the twin and its prediction, the files of
 the service's fit. Ctrl-C cancels; nothing is written before the end.
+
+``--law auto`` chooses the law first: by the model behind PHYSWORLD_LAW_URL where one is set (see
+:mod:`workers.law_endpoint`), else by cross-validation.
 """
 
 from __future__ import annotations
@@ -9,8 +12,14 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from physworld.calibrate import CalibrationConfig
+    from physworld.calibrate.law_choice import LawChoice
+    from physworld.scene import Scene
 
 SCHEMA_VERSION = 1
 
@@ -30,6 +39,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--out", type=Path, default=None, help="folder for the twin and its prediction")
     parser.add_argument("--particles", type=_count, default=None, help="particles of the twin, about")
     parser.add_argument("--simulations", type=_count, default=None, help="most simulations of the search")
+    parser.add_argument("--law", default=None, help="elastic law by name, or auto: choose it by the data")
+    parser.add_argument(
+        "--quick", action="store_true", help="leave out the runs on finer cells and time steps"
+    )
     return parser
 
 
@@ -45,16 +58,28 @@ def _fit(given: argparse.Namespace) -> None:
 
     wp.config.quiet = True  # before the first import that starts it
     from physworld.calibrate import CalibrationConfig, calibrate
+    from physworld.calibrate.discretisation import converged_parameters
+    from physworld.evaluate.numerics import measure_numerics
     from workers.commands.terminal import progress_bar, read_scene
-    from workers.tasks.fit_report import fit_files, fit_report
+    from workers.tasks.fit_report import fit_files, fit_report, json_safe, parameter_json
 
     scene = read_scene(given.scene)
     numbers = {"particle_budget": given.particles, "max_simulations": given.simulations}
     config = CalibrationConfig(**{name: value for name, value in numbers.items() if value is not None})
+    choice = _chosen_law(given.law, scene, config)
+    config = replace(config, law=choice.elastic if choice.decided_by != "default" else None)
     with progress_bar(f"fit {scene.name}") as shown:
         fitted = calibrate(scene, config, progress=shown)
-    report = fit_report(scene, fitted)
+    report = fit_report(scene, fitted, choice)
     document = fit_document(scene.name, report)
+    if not given.quick:
+        budget = config.particle_budget
+        with progress_bar(f"numerics {scene.name}") as shown:
+            numerics = measure_numerics(scene, fitted.twin, particle_budget=budget, progress=shown)
+            shown(4, 4, "sensitivities")
+            converged = converged_parameters(scene, fitted, budget)
+        document["numerics"] = json_safe(asdict(numerics))
+        document["converged"] = {name: parameter_json(estimate) for name, estimate in converged.items()}
     _print(document)
     if given.out is not None:
         given.out.mkdir(parents=True, exist_ok=True)
@@ -63,6 +88,23 @@ def _fit(given: argparse.Namespace) -> None:
     if given.json is not None:
         given.json.parent.mkdir(parents=True, exist_ok=True)
         given.json.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n")
+
+
+def _chosen_law(asked: str | None, scene: Scene, config: CalibrationConfig) -> LawChoice:
+    """The law that was asked for, chosen where it is ``auto``; its record."""
+    from physworld.calibrate.global_stage import prior_twin
+    from physworld.calibrate.law_choice import LawChoice, choose_law
+    from workers.commands.terminal import progress_bar
+    from workers.law_endpoint import law_endpoint
+    from workers.motion_picture import motion_pictures
+
+    if asked == "auto":
+        with progress_bar(f"law {scene.name}") as shown:
+            return choose_law(scene, config, law_endpoint(), motion_pictures, progress=shown)
+    twin = prior_twin(scene, replace(config, law=asked))
+    if asked is None:
+        return LawChoice(twin.law.name)
+    return LawChoice(asked, decided_by="given", reason="named by the caller")
 
 
 def fit_document(scene_name: str, report: dict[str, Any]) -> dict[str, Any]:
@@ -74,6 +116,8 @@ def fit_document(scene_name: str, report: dict[str, Any]) -> dict[str, Any]:
         "parameters": report["parameters"],
         **metrics,
         "notes": report["notes"],
+        "numerics": None,
+        "converged": None,
     }
 
 
@@ -88,6 +132,17 @@ def _print(document: dict[str, Any]) -> None:
     print(f"held-out track error [mm]{'' if floor is None else f', noise floor {1e3 * floor:.4g}'}:")
     for name, error in sorted(held_out["track_m"].items(), key=lambda item: item[1] or 0.0):
         print(f"  {name:<20} {'-' if error is None else format(1e3 * error, '.4g')}")
+    law, numerics = document["law"], document["numerics"]
+    print(f"law {law['elastic']}, decided by {law['decided_by']}: {law['reason']}")
+    if numerics is not None:
+        drag, cells = numerics["equivalent_drag_per_s"], numerics["finer_cells_m"]
+        print(
+            f"the engine's own damping: a drag of {drag:.3g} 1/s; finer cells move points by {1e3 * cells:.3g} mm"
+        )
+    for name, parameter in (document["converged"] or {}).items():
+        low, high = parameter["ci95"] or (float("nan"), float("nan"))
+        value = f"{parameter['value']:.5g} {parameter['unit']} [{low:.5g}, {high:.5g}]"
+        print(f"{name} without the lattice's error: {value}")
     print(f"{document['simulations']} simulations, {document['seconds']:.0f} s")
 
 

@@ -1,11 +1,18 @@
 """Calibrates a twin on a scene's training frames and measures it on the frames that were held out.
 
-Artifacts: ``twin.npz``, ``prediction.npz`` and ``report.json``, see :mod:`workers.tasks.fit_report`.
+Artifacts: ``twin.npz``, ``prediction.npz`` and ``report.json``, see :mod:`workers.tasks.fit_report`. The journal of
+the search lies in the data folder until the fit is stored: a killed worker's fit goes on where it was.
 """
 
 from __future__ import annotations
 
-from physworld.calibrate import CalibrationConfig, calibrate
+import json
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+from physworld.calibrate import CalibrationConfig, Journal, calibrate
 from schemas.fit import FitConfig
 from workers.context import TaskContext
 from workers.lineage import lineage_of
@@ -13,6 +20,8 @@ from workers.registry import HandlerResult
 from workers.stores import Stores
 from workers.tasks.fit_report import MEDIA_TYPES, fit_files, fit_report
 from workers.tasks.inputs import scene_of, scene_reference
+
+JOURNAL = "fit.json"
 
 
 def run(context: TaskContext, stores: Stores) -> HandlerResult:
@@ -30,7 +39,9 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
         device=stores.settings.device,
         damping=config.damping,
     )
-    fitted = calibrate(scene, calibration, progress=progress, cancelled=context.cancelled)
+    folder = Path(stores.settings.data_dir) / "checkpoints" / context.lease.job_id
+    journal = stored_journal(folder / JOURNAL, payload)
+    fitted = calibrate(scene, calibration, progress, context.cancelled, journal)
     context.check()
     report = fit_report(scene, fitted)
     artifacts = [
@@ -44,4 +55,18 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
         "seconds": fitted.seconds,
         "lineage": lineage_of([scene_reference(stores, payload["scene_id"])], payload["config"], {}),
     }
+    shutil.rmtree(folder, ignore_errors=True)
     return HandlerResult(result, artifacts[0].sha256)
+
+
+def stored_journal(path: Path, payload: dict[str, Any]) -> Journal:
+    """The journal of an earlier attempt at the same payload, or an empty one; written at ``path`` after every step."""
+
+    def save(text: str) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_suffix(f".{os.getpid()}")
+        partial.write_text(text)
+        partial.replace(path)
+
+    stored = path.read_text() if path.exists() else None
+    return Journal(json.dumps(payload, sort_keys=True), stored, save)

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from physworld.calibrate import Estimate, FitResult
+from physworld.calibrate.law_choice import LawChoice
 from physworld.evaluate.table import held_out_table
 from physworld.scene import Scene
 from schemas.fit import Parameter
@@ -25,8 +27,11 @@ SHOWN_PARTICLES = 1500
 MEDIA_TYPES = {TWIN: "application/x-npz", PREDICTION: "application/x-npz", REPORT: "application/json"}
 
 
-def fit_report(scene: Scene, fitted: FitResult) -> dict[str, Any]:
-    """``parameters``, ``metrics`` and ``notes`` as plain JSON; a number that is not finite is None."""
+def fit_report(scene: Scene, fitted: FitResult, law: LawChoice | None = None) -> dict[str, Any]:
+    """``parameters``, ``metrics`` and ``notes`` as plain JSON; a number that is not finite is None.
+
+    ``law`` is how the law was chosen; None: it is the usual one.
+    """
     metrics = {
         "held_out": held_out_table(scene, {"twin": fitted.tracks}),
         "simulations": fitted.simulations,
@@ -34,9 +39,19 @@ def fit_report(scene: Scene, fitted: FitResult) -> dict[str, Any]:
         "training_loss_m": fitted.loss_history,
         "not_needed": fitted.rejected,
         "particles": fitted.particles.shape[1],
+        "correlations": {
+            "names": list(fitted.correlations.names),
+            "matrix": fitted.correlations.matrix,
+        },
+        "training": fitted.losses,
+        "law": asdict(law or LawChoice(fitted.twin.law.name)),
+        "formulation": {
+            "name": "total_lagrangian",
+            "reason": "elastic and followed in its undeformed shape: no transfers, so none of their damping",
+        },
     }
     return {
-        "parameters": {name: _parameter(estimate) for name, estimate in fitted.parameters.items()},
+        "parameters": {name: parameter_json(estimate) for name, estimate in fitted.parameters.items()},
         "metrics": json_safe(metrics),
         "notes": list(fitted.twin.body.notes),
     }
@@ -72,7 +87,8 @@ def json_safe(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _parameter(estimate: Estimate) -> dict[str, Any]:
+def parameter_json(estimate: Estimate) -> dict[str, Any]:
+    """An estimate in the wire's form."""
     interval = estimate.ci95
     if interval is not None and not all(math.isfinite(end) for end in interval):
         interval = None

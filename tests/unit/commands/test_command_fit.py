@@ -63,11 +63,30 @@ def test_the_figures_and_the_files_of_a_fit(
         assert len(held_out["per_frame"][metric]["twin"]) == held_out["frames"][1] - held_out["frames"][0]
     assert held_out["track_m"]["twin"] < 1.5 * held_out["noise_floor_m"]  # frame 0 is as noisy
     assert 0 < found["simulations"] <= SIMULATIONS
+    assert found["correlations"] == {"names": ["youngs_modulus_pa"], "matrix": [[1.0]]}
+    assert 0.5 < found["training"]["chi2_per_residual"] < 2.5
+    assert found["law"]["elastic"] == "neo_hookean" and found["law"]["decided_by"] == "default"
+    assert found["formulation"]["name"] == "total_lagrangian"
+    assert abs(found["numerics"]["equivalent_drag_per_s"]) < 0.5
+    assert found["converged"]["youngs_modulus_pa"]["unit"] == "Pa"
     with np.load(out / "twin.npz", allow_pickle=False) as arrays:
         twin = Twin.from_arrays(dict(arrays))
     assert twin.parameters["youngs_modulus_pa"] == modulus["value"]
     assert {path.name for path in out.iterdir()} == {"twin.npz", "prediction.npz", "report.json"}
     assert "youngs_modulus_pa" in capsys.readouterr().out
+
+
+def test_a_given_law_is_used_and_an_unknown_one_refused(
+    bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    figures = tmp_path / "fit.json"
+    assert fit.main(arguments(bundle, "--quick", "--law", "hencky", "--json", str(figures))) == 0
+    found = json.loads(figures.read_text())
+    assert found["law"]["elastic"] == "hencky" and found["law"]["decided_by"] == "given"
+    assert found["numerics"] is None and found["converged"] is None
+    capsys.readouterr()
+    assert fit.main(arguments(bundle, "--law", "jelly")) == 2
+    assert "no law 'jelly'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

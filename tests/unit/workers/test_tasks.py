@@ -18,6 +18,7 @@ from storage.tables import EpisodeRow
 from workers.execute import Runtime, run_shard
 from workers.stores import Stores
 from workers.tasks import dataset as dataset_task
+from workers.tasks.fit import stored_journal
 from workers.tasks.inputs import named, npz_arrays, npz_bytes
 
 EPISODES = 3
@@ -84,8 +85,20 @@ def test_a_fit_without_damping_keeps_the_declared_physics(
     assert _drain(runtime_with()) == ["done"]
     with stores.database.reading() as session:
         fit = resources.get_fit(session, job.outputs[0].id)
-    assert fit.config == config and fit.metrics["not_needed"] == {}
+    assert fit.config == config and set(fit.metrics["not_needed"]) == {"poissons_ratio"}
     assert not {"air_drag_per_s", "viscosity_pa_s"} & set(fit.parameters)
+
+
+def test_the_journal_of_a_fit_outlives_its_worker_and_not_the_fit(
+    fit: Fit, stores: Stores, tmp_path: Path
+) -> None:
+    path = tmp_path / "job" / "fit.json"
+    first = stored_journal(path, {"scene_id": "a"})
+    assert first.step("scan", lambda: {"cost": 1.0}) == {"cost": 1.0}
+    assert stored_journal(path, {"scene_id": "a"}).step("scan", lambda: {"cost": 2.0}) == {"cost": 1.0}
+    assert stored_journal(path, {"scene_id": "b"}).step("scan", lambda: {"cost": 2.0}) == {"cost": 2.0}
+    checkpoints = stores.settings.data_dir / "checkpoints"
+    assert not (checkpoints / fit.job_id).exists()
 
 
 def test_a_dataset_is_sealed_under_the_digest_of_its_manifest(runtime_with, fit: Fit, stores: Stores) -> None:

@@ -25,11 +25,23 @@ def fit(
     out: Annotated[Path | None, typer.Option(help="Folder for the twin and its prediction.")] = None,
     particles: Annotated[int | None, typer.Option(min=50, help="Particles of the twin, about.")] = None,
     simulations: Annotated[int | None, typer.Option(min=1, help="Most simulations of the search.")] = None,
+    law: Annotated[
+        str | None, typer.Option(help="Elastic law by name, or auto: choose it by the data.")
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Leave out the runs on finer cells and steps.")
+    ] = False,
 ) -> None:
     """Calibrate a twin in this process and measure it on the held-out frames; needs no service."""
-    given = {"--json": json, "--out": out, "--particles": particles, "--simulations": simulations}
+    given = {
+        "--json": json,
+        "--out": out,
+        "--particles": particles,
+        "--simulations": simulations,
+        "--law": law,
+    }
     options = [text for name, value in given.items() if value is not None for text in (name, str(value))]
-    become(MODULE, [*options, "--", str(scene)])
+    become(MODULE, [*options, *(["--quick"] if quick else []), "--", str(scene)])
 
 
 def become(module: str, arguments: list[str]) -> None:
