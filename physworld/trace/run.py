@@ -37,9 +37,19 @@ from physworld.trace.sensitivity import (
     numerical_directions,
     refinement_of,
 )
-from physworld.trace.simulations import Drive, Job, Memory, Progress, Runner, Simulations, in_turn, nodes_of
+from physworld.trace.simulations import (
+    Drive,
+    Job,
+    Memory,
+    Progress,
+    Runner,
+    Simulations,
+    in_turn,
+    nodes_of,
+    stable_step_s,
+)
 from physworld.trace.split import Split, freeze
-from physworld.trace.unknowns import Unknown, clamp_reach, of_parameter
+from physworld.trace.unknowns import Unknown, bending_factor, clamp_reach, of_parameter
 from physworld.trace.verdict import NOTHING, UNEXPLAINED, Verdict, accounts, decide, helps, simplest
 from physworld.trace.whitening import Whitener, moved, responses, whitener
 from physworld.twin import Twin
@@ -50,6 +60,9 @@ _NUMERICS_AMPLITUDE = (
 )
 _OTHER_STIFFNESSES = tuple(0.12 * k for k in (-6, -5, -4, -3, -2, -1, 1, 2, 3, 4, 5, 6))
 """Logarithms: a phase that has slipped by a period is a local minimum, so others are looked at before a descent."""
+_SLOWEST = (
+    8.0  # times the cost of the declared physics that a run may take: explicit friction shrinks the time step
+)
 _AGREEMENT = 0.25  # share by which a strength may move with the resolution
 
 
@@ -112,6 +125,7 @@ class _Trace:
     def run(self) -> TraceResult:
         config, simulations = self.config, self.simulations
         simulations.stage = "declared physics"
+        simulations.least_step_s = stable_step_s(self.twin, simulations.drive) / _SLOWEST
         job = Job(self.twin, self.frames)
         nodes = nodes_of(job, simulations.drive)
         tracks = self.twin.observe(nodes, simulations.drive.times[: self.frames])
@@ -169,8 +183,9 @@ class _Trace:
         )
         spread = {"poissons_ratio": _POISSON_SPREAD}
         reach = clamp_reach(twin)
+        bending = None if any(p.name == "bending_n_m" for p in known) else bending_factor(twin)
         found = [of_parameter(p, twin, spread.get(p.name)) for p in known]
-        return found if reach is None else [*found, reach]
+        return [*found, *(unknown for unknown in (bending, reach) if unknown is not None)]
 
     def _select(
         self, declared: Model, usable: list[Response], white: Whitener, block_of_row: np.ndarray

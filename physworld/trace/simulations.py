@@ -8,16 +8,16 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
-from physworld.errors import Cancelled, SimulationError
+from physworld.errors import Cancelled, CFLViolation, SimulationError
 from physworld.mpm.total_lagrangian import TotalLagrangian
 from physworld.twin import Twin
 
@@ -32,11 +32,13 @@ class Job:
         twin: what moves.
         frames: from the first frame to before this one.
         step_share: time step over the stable one.
+        least_step_s: a twin whose stable time step is smaller is not run: nothing waits for it.
     """
 
     twin: Twin
     frames: int
     step_share: float = 1.0
+    least_step_s: float = 0.0
 
     def fingerprint(self, drive: bytes) -> str:
         """Digest of everything that the result depends on; ``drive`` stands for times and controls."""
@@ -68,14 +70,22 @@ class Drive:
 
 def nodes_of(job: Job, drive: Drive, poll: Callable[[int, int], None] | None = None) -> np.ndarray:
     """Nodes (frames, n, 3) [m] of a job. Raises SimulationError."""
-    times = drive.times[: job.frames]
-    if job.step_share == 1.0:
-        return job.twin.simulate_nodes(drive.control_times, drive.control_points, times, progress=poll)
-    run = job.twin.integration(drive.control_times, drive.control_points, times)
-    step = job.step_share * TotalLagrangian(run.problem).time_step_s
-    solver = TotalLagrangian(run.problem, step)
+    run = job.twin.integration(drive.control_times, drive.control_points, drive.times[: job.frames])
+    solver = TotalLagrangian(run.problem)
+    if solver.time_step_s < job.least_step_s:
+        raise CFLViolation(
+            f"a time step of {solver.time_step_s:.3g} s is below {job.least_step_s:.3g} s, which a trace waits for"
+        )
+    if job.step_share != 1.0:
+        solver = TotalLagrangian(run.problem, job.step_share * solver.time_step_s)
     nodes = solver.run(job.twin.body.start, run.velocity, run.held, run.knots, poll)
     return run.at_frames(job.twin.body.start, nodes)
+
+
+def stable_step_s(twin: Twin, drive: Drive) -> float:
+    """Stable time step of a twin [s]."""
+    run = twin.integration(drive.control_times, drive.control_points, drive.times[:2])
+    return TotalLagrangian(run.problem).time_step_s
 
 
 def tracks_of(job: Job, drive: Drive, poll: Callable[[int, int], None] | None = None) -> np.ndarray | None:
@@ -89,16 +99,17 @@ def tracks_of(job: Job, drive: Drive, poll: Callable[[int, int], None] | None = 
 
 
 class Runner(Protocol):
-    """Maps jobs to tracks; None for a run that cannot be trusted. ``poll`` may raise to stop."""
+    """Yields the tracks of jobs in their order; None for a run that cannot be trusted. ``poll`` may raise to stop."""
 
     def __call__(
         self, jobs: Sequence[Job], drive: Drive, poll: Callable[[], None]
-    ) -> list[np.ndarray | None]: ...
+    ) -> Iterator[np.ndarray | None]: ...
 
 
-def in_turn(jobs: Sequence[Job], drive: Drive, poll: Callable[[], None]) -> list[np.ndarray | None]:
+def in_turn(jobs: Sequence[Job], drive: Drive, poll: Callable[[], None]) -> Iterator[np.ndarray | None]:
     """The runner of this process."""
-    return [tracks_of(job, drive, lambda done, total: poll()) for job in jobs]
+    for job in jobs:
+        yield tracks_of(job, drive, lambda done, total: poll())
 
 
 class Workers:
@@ -115,17 +126,15 @@ class Workers:
 
     def __call__(
         self, jobs: Sequence[Job], drive: Drive, poll: Callable[[], None]
-    ) -> list[np.ndarray | None]:
-        """Every job in a process; ``poll`` is called after each."""
+    ) -> Iterator[np.ndarray | None]:
+        """Every job in a process; ``poll`` is called before each is waited for."""
         futures = [
-            self._pool.submit(_work, job.twin.to_arrays(), job.twin.device, job.frames, job.step_share, drive)
+            self._pool.submit(_work, job.twin.to_arrays(), job.twin.device, _facts(job), drive)
             for job in jobs
         ]
-        found = []
         for future in futures:
             poll()
-            found.append(future.result())
-        return found
+            yield future.result()
 
 
 def _quiet() -> None:
@@ -134,10 +143,14 @@ def _quiet() -> None:
     wp.config.quiet = True
 
 
+def _facts(job: Job) -> tuple[int, float, float]:
+    return job.frames, job.step_share, job.least_step_s
+
+
 def _work(
-    arrays: dict[str, np.ndarray], device: str, frames: int, step_share: float, drive: Drive
+    arrays: dict[str, np.ndarray], device: str, facts: tuple[int, float, float], drive: Drive
 ) -> np.ndarray | None:
-    return tracks_of(Job(Twin.from_arrays(arrays, device), frames, step_share), drive)
+    return tracks_of(Job(Twin.from_arrays(arrays, device), *facts), drive)
 
 
 class Memory:
@@ -175,6 +188,8 @@ class Simulations:
 
     Attributes:
         count: runs asked for, those remembered included.
+        stage: what they are for.
+        least_step_s: a twin that needs a smaller time step is not run.
     """
 
     def __init__(
@@ -188,21 +203,24 @@ class Simulations:
         self.drive, self.count = drive, 0
         self._runner, self._memory = runner, memory or Memory()
         self._progress, self._cancelled, self._digest = progress, cancelled, drive.digest()
-        self.stage = ""
+        self.stage, self.least_step_s = "", 0.0
 
     def run(self, jobs: Sequence[Job]) -> list[np.ndarray | None]:
         """Tracks of every job. Raises Cancelled."""
         keys = [job.fingerprint(self._digest) for job in jobs]
         known = [self._memory.get(key) for key in keys]
         missing = [k for k, (found, _) in enumerate(known) if not found]
-        fresh = self._runner([jobs[k] for k in missing], self.drive, self._poll) if missing else []
-        for k, tracks in zip(missing, fresh, strict=True):
-            self._memory.put(keys[k], tracks)
-        made = dict(zip(missing, fresh, strict=True))
-        self.count += len(jobs)
-        if self._progress is not None:
-            self._progress(self.count, 0, self.stage)
-        return [made.get(k, tracks) for k, (_, tracks) in enumerate(known)]
+        tracks = [found for _, found in known]
+        self.count += len(jobs) - len(missing)
+        waiting = [replace(jobs[k], least_step_s=self.least_step_s) for k in missing]
+        fresh = self._runner(waiting, self.drive, self._poll) if missing else iter(())
+        for k, made in zip(missing, fresh, strict=True):
+            self._memory.put(keys[k], made)
+            tracks[k] = made
+            self.count += 1
+            if self._progress is not None:
+                self._progress(self.count, 0, self.stage)
+        return tracks
 
     def _poll(self) -> None:
         if self._cancelled is not None and self._cancelled():

@@ -12,6 +12,7 @@ from physworld.effects.base import Strength
 from physworld.effects.registry import EFFECTS
 from physworld.twin import Twin
 
+_BENDING_SPREAD, _BENDING_RANGE = 0.5, 2.0
 CLAMP = "clamp_offset"
 _CLAMP_STEP, _CLAMP_SPREAD = 0.25, 0.5  # cells: difference step, and deviation of what is known beforehand
 
@@ -82,6 +83,34 @@ def of_strength(effect: str, strength: Strength, scale: float | None = None, sta
         1.0,
         lambda searched: searched * unit,
         lambda twin, searched: with_strengths(twin, effect, {strength.name: searched * unit}),
+    )
+
+
+def bending_factor(twin: Twin) -> Unknown | None:
+    """How much stiffer a sheet bends than its thickness says, as a logarithm; None for other bodies.
+
+    The thickness of a sheet is declared roughly and enters with its cube, and what bends may not be what stretches.
+    """
+    if twin.lattice.dim != 2:
+        return None
+    stretch = twin.parameters["membrane_n_m"] * twin.body.thickness_m**2 / 12.0
+
+    def apply(changed: Twin, searched: float) -> Twin:
+        implied = changed.parameters["membrane_n_m"] * changed.body.thickness_m**2 / 12.0
+        return changed.with_parameters(bending_n_m=implied * float(np.exp(searched)))
+
+    start = float(np.log(twin.parameters["bending_n_m"] / stretch))
+    low, high = -_BENDING_RANGE, _BENDING_RANGE
+    return Unknown(
+        "bending_factor",
+        "1",
+        low,
+        high,
+        start,
+        0.05,
+        lambda s: float(np.exp(s)),
+        apply,
+        (0.0, _BENDING_SPREAD),
     )
 
 

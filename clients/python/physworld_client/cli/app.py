@@ -15,7 +15,7 @@ from typing import NoReturn
 
 import typer
 
-from physworld_client.cli import effects, fit, lists, run, up
+from physworld_client.cli import effects, fit, lists, run, trace, up
 from physworld_client.cli.output import stderr
 from physworld_client.errors import PhysWorldError
 
@@ -30,6 +30,7 @@ app = typer.Typer(
 app.command("up")(up.up)
 app.command("run")(run.run)
 app.command("fit")(fit.fit)
+app.command("trace")(trace.trace)
 app.add_typer(effects.effects, name="effects")
 app.add_typer(lists.scenes, name="scenes")
 app.add_typer(lists.fits, name="fits")

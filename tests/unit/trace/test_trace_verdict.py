@@ -1,0 +1,79 @@
+"""Verdicts from made refits: each answer has a case, and the same case without its reason has another."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from physworld.trace.candidates import Candidate
+from physworld.trace.comparison import cross_validated
+from physworld.trace.config import TraceConfig
+from physworld.trace.confirm import Model
+from physworld.trace.refit import Refit
+from physworld.trace.unknowns import Unknown
+from physworld.trace.verdict import decide
+
+BLOCKS, ROWS = 10, 2000
+BLOCK_OF_ROW = np.repeat(np.arange(BLOCKS), ROWS // BLOCKS)
+RNG = np.random.default_rng(5)
+NOISE, DRAG, OTHER = RNG.normal(size=(3, ROWS))
+CONFIG = TraceConfig()
+
+
+def model(residual: np.ndarray, *effects: str, kind: str = "force", unknowns: int = 1) -> Model:
+    """A model whose refit left ``residual``."""
+    known = [
+        Unknown(str(k), "1", -9.0, 9.0, 0.0, 1.0, float, lambda twin, value: twin) for k in range(unknowns)
+    ]
+    slope = np.full((ROWS, unknowns), 1e-3)
+    fitted = Refit(known, None, np.zeros(unknowns), np.zeros((1, 1, 3)), residual, slope)
+    members = tuple(Candidate(name, "", (), kind=kind) for name in effects)
+    return Model(members, fitted, cross_validated(fitted, BLOCK_OF_ROW))
+
+
+def answer(models: list[Model], declared: np.ndarray, agree: bool = True) -> tuple[str, tuple[str, ...]]:
+    agreement = {m.names: agree for m in models}
+    found = decide(model(declared), models, np.zeros((ROWS, 0)), agreement, CONFIG, 20)
+    return found.name, found.model.names
+
+
+def test_noise_is_nothing_and_a_share_that_no_effect_takes_is_unexplained() -> None:
+    assert answer([model(NOISE, "drag")], NOISE) == ("nothing_to_explain", ())
+    assert answer([model(NOISE + 2 * DRAG, "drag")], NOISE + 2 * DRAG) == ("unexplained", ())
+
+
+def test_an_effect_is_named_if_it_reaches_the_noise_and_no_other_does() -> None:
+    before = NOISE + 2 * DRAG
+    assert answer([model(NOISE, "drag"), model(NOISE + 1.5 * DRAG, "wind")], before) == ("named", ("drag",))
+
+
+def test_what_leaves_too_much_is_not_named() -> None:
+    before = NOISE + 4 * DRAG + 3 * OTHER
+    assert answer([model(NOISE + 3 * OTHER, "drag")], before) == ("unexplained", ())
+
+
+@pytest.mark.parametrize(("kinds", "verdict"), [(("force", "force"), "equivalent_set"),
+                                                (("boundary", "measurement"), "equivalent_set"),
+                                                (("measurement", "measurement"), "data_issue")])  # fmt: skip
+def test_effects_that_do_the_same_are_a_set_and_faults_of_the_data_are_called_so(
+    kinds: tuple[str, str], verdict: str
+) -> None:
+    before = NOISE + 2 * DRAG
+    rivals = [model(NOISE, "lag", kind=kinds[0]), model(NOISE + 1e-3 * OTHER, "clock", kind=kinds[1])]
+    assert answer(rivals, before)[0] == verdict
+
+
+def test_a_strength_that_moves_with_the_resolution_is_numerical() -> None:
+    assert answer([model(NOISE, "drag")], NOISE + 2 * DRAG, agree=False)[0] == "numerical_issue"
+
+
+def test_the_simpler_of_two_that_do_as_well_is_named() -> None:
+    rich = model(NOISE * 0.999, "wind", unknowns=4)
+    assert answer([rich, model(NOISE, "tilt")], NOISE + 2 * DRAG) == ("named", ("tilt",))
+
+
+def test_two_effects_are_named_only_where_one_leaves_too_much() -> None:
+    before = NOISE + 2 * DRAG + 2 * OTHER
+    both = model(NOISE, "drag", "viscosity", unknowns=2)
+    assert answer([model(NOISE + 2 * OTHER, "drag"), both], before) == ("named", ("drag", "viscosity"))
+    assert answer([model(NOISE + 0.1 * OTHER, "drag"), both], before) == ("named", ("drag",))
