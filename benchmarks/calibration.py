@@ -1,0 +1,73 @@
+"""``python -m benchmarks.calibration --json FILE``: what calibration recovers, and what it says of its own doubt.
+
+Every part is one table of ``docs/calibration.md`` (``--docs`` replaces it there); ``--only NAME ...`` runs some of
+them. Parts that need the recordings beside the repository are left out, and said so, where these are absent.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import warp as wp
+
+from benchmarks import calibration_known, calibration_measured
+from benchmarks.harness import Report
+
+SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+PARTS: dict[str, Callable[[int, Path], Report]] = {
+    "recovery": calibration_known.recovery,
+    "coverage": calibration_known.coverage,
+    "identifiability": calibration_known.identifiability,
+    "undeclared": calibration_measured.undeclared,
+    "beam": calibration_measured.beam,
+    "ropes_and_cloths": calibration_measured.ropes_and_cloths,
+}
+NEEDS_RECORDINGS = ("undeclared", "beam", "ropes_and_cloths")
+BEGIN, END = "<!-- calibration {}: begin -->", "<!-- calibration {}: end -->"
+
+
+def main() -> int:
+    """Run the chosen parts."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.calibration", description=__doc__)
+    parser.add_argument("--json", type=Path, default=None, help="write all figures there")
+    parser.add_argument("--docs", type=Path, default=None, help="Markdown file whose tables are replaced")
+    parser.add_argument("--only", nargs="*", choices=sorted(PARTS), default=list(PARTS))
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    wp.config.quiet = True
+    figures: dict[str, object] = {}
+    for name in given.only:
+        if name in NEEDS_RECORDINGS and not SHARED.exists():
+            print(f"{name}: left out, the recordings are not at {SHARED}", file=sys.stderr)
+            continue
+        begun = time.perf_counter()
+        report = PARTS[name](given.seed, SHARED)
+        print(report.markdown(), flush=True)
+        figures[name] = {**report.figures, "seconds": time.perf_counter() - begun, "machine": report.machine}
+        if given.json is not None:
+            given.json.parent.mkdir(parents=True, exist_ok=True)
+            given.json.write_text(json.dumps(figures, indent=2) + "\n")
+        if given.docs is not None:
+            write_part(name, report, given.docs)
+    return 0
+
+
+def write_part(name: str, report: Report, path: Path) -> None:
+    """Replace a part's table between its markers, or append it."""
+    begin, end = BEGIN.format(name), END.format(name)
+    text = path.read_text() if path.exists() else ""
+    part = f"{begin}\n{report.markdown()}{end}"
+    if begin in text and end in text:
+        before, rest = text.split(begin, 1)
+        path.write_text(before + part + rest.split(end, 1)[1])
+    else:
+        path.write_text(f"{text.rstrip()}\n\n{part}\n")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
