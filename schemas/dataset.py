@@ -13,16 +13,20 @@ from schemas.base import Artifact, Lineage, Request, Resource, Seed
 class DatasetConfig(Request):
     """How many episodes, and how strongly the calibrated properties are perturbed (log-space sigma)."""
 
-    episodes: int = Field(default=40, ge=1, le=20_000)
+    episodes: int = Field(default=100, ge=1, le=20_000)
     frames: int | None = Field(default=None, ge=2, le=5000)
     property_sigma: float = Field(default=0.2, ge=0.0, le=2.0)
     seed: Seed = 0
 
 
 class DatasetCreate(Request):
-    """Body of POST /v1/datasets."""
+    """Body of POST /v1/datasets.
+
+    ``trace_id`` names a ready trace of the fit's scene: where it named an effect, its twin demonstrates.
+    """
 
     fit_id: str
+    trace_id: str | None = None
     config: DatasetConfig = Field(default_factory=DatasetConfig)
 
 
@@ -44,6 +48,7 @@ class Dataset(Resource):
 
     id: str
     fit_id: str
+    trace_id: str | None = None
     scene_id: str
     state: Literal["pending", "writing", "sealed", "failed"]
     created_at: datetime

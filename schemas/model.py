@@ -19,11 +19,11 @@ class TrainingConfig(Request):
     hidden: int = Field(default=64, ge=8, le=1024)
     message_passing_steps: int = Field(default=7, ge=1, le=20)
     history: int = Field(default=3, ge=1, le=10)
-    look_ahead: int = Field(default=8, ge=1, le=20)
+    look_ahead: int = Field(default=24, ge=1, le=200)
     vertices: int = Field(default=100, ge=4, le=1000)
-    steps: int = Field(default=800, ge=1, le=1_000_000)
-    batch_size: int = Field(default=8, ge=1, le=256)
-    learning_rate: float = Field(default=2e-3, gt=0, le=1)
+    steps: int = Field(default=240, ge=1, le=1_000_000)
+    batch_size: int = Field(default=6, ge=1, le=256)
+    learning_rate: float = Field(default=1e-3, gt=0, le=1)
     fine_tune_steps: int = Field(default=60, ge=0, le=10_000)
     seed: Seed = 0
 
@@ -49,6 +49,7 @@ class ModelVersion(Resource):
     job_id: str | None = None
     scene_id: str | None = None
     fit_id: str | None = None
+    trace_id: str | None = None
     dataset_id: str | None = None
     description: str = ""
     tags: list[str] = Field(default_factory=list)

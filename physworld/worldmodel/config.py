@@ -49,7 +49,7 @@ class TrainingConfig:
     Attributes:
         steps: optimiser steps.
         batch_size: sub-sequences a step.
-        look_ahead: τ of the loss Σ_{i=1..τ} ‖x_pred − x‖².
+        look_ahead: τ, the steps that a sub-sequence is unrolled for the loss.
         learning_rate: Adam's, decayed by a cosine to ``learning_rate_floor`` of itself.
         gradient_clip: largest norm of the gradient.
         noise_history: standard deviation of the random walk's end on the history, in units of the data's
@@ -63,15 +63,15 @@ class TrainingConfig:
         seed: of initial weights, batches and noise.
     """
 
-    steps: int = 800
-    batch_size: int = 8
-    look_ahead: int = 8
-    learning_rate: float = 2e-3
+    steps: int = 240
+    batch_size: int = 6
+    look_ahead: int = 24
+    learning_rate: float = 1e-3
     learning_rate_floor: float = 0.01
     gradient_clip: float = 1.0
-    noise_history: float = 0.1
+    noise_history: float = 0.02
     noise_properties: float = 0.05
-    average_decay: float = 0.998
+    average_decay: float = 0.99
     validation_fraction: float = 0.1
     validation_every: int = 250
     checkpoint_every: int = 250

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from physworld.worldmodel.messages import warp_module
+from physworld.worldmodel.modal import softness
 from physworld.worldmodel.model import WorldModel
 
 REGISTER = 16
@@ -34,6 +35,7 @@ class RolloutEngine:
             "basis": _floats(prior.basis),
             "shape": _floats(prior.shape),
             "prior_weight": _floats(prior.weight),
+            "prior_response": _floats(prior.response),
         }
         self._property_scale = norm.properties.numpy()
         change, velocity, length = (float(x) for x in (norm.change, norm.velocity, norm.length))
@@ -74,9 +76,10 @@ class RolloutEngine:
         }
         arrays = self._fixed | {name: np.zeros(count, dtype=np.float32) for name, count in scratch.items()}
         arrays |= {"path": path, "phi": np.ascontiguousarray(phi / self._property_scale, dtype=np.float32)}
+        scalars = np.append(self._scalars, np.float32(softness(phi)))
         table = np.array([arrays[name].ctypes.data for name in kernels.ARRAYS], dtype=np.int64)
         numbers = np.array([sizes[name] for name in kernels.SIZES], dtype=np.int32)
-        addresses = [numbers.ctypes.data, self._scalars.ctypes.data, table.ctypes.data]
+        addresses = [numbers.ctypes.data, scalars.ctypes.data, table.ctypes.data]
         warp_module().launch(kernels.rollout, dim=1, inputs=addresses, device="cpu", record_tape=False)
         return path
 

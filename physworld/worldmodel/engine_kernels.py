@@ -15,10 +15,10 @@ SIZES = (
     "first", "frames", "history", "objects", "vertices", "edges", "layers", "hidden", "modes", "controls",
     "inputs", "places_width", "grounded",
 )  # fmt: skip
-SCALARS = ("per_velocity", "change", "per_length")
+SCALARS = ("per_velocity", "change", "per_length", "softness")
 ARRAYS = (
     "path", "amplitudes", "offsets", "edge_sender", "edge_receiver", "edge_offset", "share",
-    "reference", "phi", "mean", "basis", "shape", "prior_weight",
+    "reference", "phi", "mean", "basis", "shape", "prior_weight", "prior_response",
     "encode_in", "encode_in_bias", "encode_out", "encode_out_bias",
     "receive", "receive_bias", "send", "position", "edge_bias", "edge_length",
     "update_in", "update_in_bias", "update_out", "update_out_bias",
@@ -129,6 +129,10 @@ _ROLLOUT = (
         for (int m = 0; m < R; ++m) {
             float a = 0.0f;
             for (int k = 0; k < f; ++k) a += prior_weight[(long long)m * f + k] * regressors[k];
+            const int lagged = (history + 1) * R;
+            const float* answer = prior_response + (long long)m * (lagged + 1);
+            for (int k = 0; k < lagged; ++k) a += softness * answer[k] * regressors[k];
+            a += softness * answer[lagged];
             for (int i = 0; i < 3 * N; ++i) ahead[i] += a * basis[(long long)m * N * 3 + i];
         }
         for (int i = 3 * N; i < 3 * VN; ++i) ahead[i] = next[i];

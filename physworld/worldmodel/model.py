@@ -43,6 +43,7 @@ where s = t+1 takes c^{t+1}.
     d^s = c^s - c̄^s - prior.shape                                  (C, 3), s = t+1, t … t-h
     e^s = c̄^s - c̄^t                                                (3,), s = t+1, t-1 … t-h
     a^{t+1} = prior.weight [a^t … a^{t-h}, d^{t+1}, d^t … d^{t-h}, e^{t+1}, e^{t-1} … e^{t-h}, 1]
+            + ζ prior.response [a^t … a^{t-h}, 1],   ζ = mean_i (φ_i0 - φ_i1)
     x̂_i^{t+1} = c̄^{t+1} + prior.mean_i + Σ_r a_r^{t+1} prior.basis[r, i]
 
 **Tensors** of ``model.safetensors`` (float32 unless said; ``.weight`` is (out, in)):
@@ -54,7 +55,7 @@ where s = t+1 takes c^{t+1}.
     norm.velocity, norm.change, norm.length (1,), norm.relative, norm.strain, norm.stretch (3,),
     norm.properties (2,);
     prior.mean (n, 3), prior.basis (R, n, 3), prior.shape (C, 3), prior.weight (R, F) with
-    F = (h+1) R + (h+2) 3C + (h+1) 3 + 1;
+    F = (h+1) R + (h+2) 3C + (h+1) 3 + 1, prior.response (R, (h+1) R + 1);
     graph.neighbours (V, D) int64, V where the slot is empty; graph.edge_kind (V, D) int64;
     graph.rest_relative (V, D, 3).
 What a published version adds for its scene is told in ``physworld.worldmodel.published``.
@@ -202,7 +203,7 @@ class WorldModel(nn.Module):
         3).
         """
         n = self.spec.object_count
-        ahead = torch.cat([self.prior(window, control_next), control_next])
+        ahead = torch.cat([self.prior(window, control_next, phi), control_next])
         correction = self.forward(window, ahead, phi, constants)
         return torch.cat([ahead[:n] + self.norm.change * correction, control_next])
 
@@ -246,11 +247,11 @@ class PriorStep(nn.Module):
     def __init__(self, prior: ModalPrior, history: int) -> None:
         super().__init__()
         self.history = history
-        for name in ("mean", "basis", "shape", "weight"):
+        for name in ("mean", "basis", "shape", "weight", "response"):
             self.register_buffer(name, _single(getattr(prior, name)))
 
-    def forward(self, window: Tensor, control_next: Tensor) -> Tensor:
-        """x̂^{t+1} (n, B, 3) from x^{t-h} … x^t (h+1, V, B, 3) and c^{t+1} (C, B, 3)."""
+    def forward(self, window: Tensor, control_next: Tensor, phi: Tensor) -> Tensor:
+        """x̂^{t+1} (n, B, 3) from x^{t-h} … x^t (h+1, V, B, 3), c^{t+1} (C, B, 3) and Φ (n, B, 2)."""
         n, batch = self.mean.shape[0], window.shape[2]
         controls = torch.cat([control_next[None], window[:, n:].flip(0)])
         centre = controls.mean(dim=1)
@@ -267,16 +268,19 @@ class PriorStep(nn.Module):
             ],
             dim=1,
         )
-        ahead = torch.tensordot(regressors @ self.weight.T, self.basis, dims=1)
+        lagged = regressors[:, : self.response.shape[1] - 1]
+        answer = lagged @ self.response[:, :-1].T + self.response[:, -1]
+        softness = (phi[..., 0] - phi[..., 1]).mean(dim=0)
+        ahead = torch.tensordot(regressors @ self.weight.T + softness[:, None] * answer, self.basis, dims=1)
         return ahead.transpose(0, 1) + self.mean[:, None] + centre[0]
 
-    def residual(self, positions: Tensor) -> Tensor:
-        """What the prior leaves of each step of a track (T, V, 3): x^{t+1} - x̂^{t+1}, (n, T-1-h, 3)."""
+    def residual(self, positions: Tensor, phi: Tensor) -> Tensor:
+        """What the prior leaves of each step of a track (T, V, 3) with Φ (n, 2): x^{t+1} - x̂^{t+1}, (n, T-1-h, 3)."""
         n, h = self.mean.shape[0], self.history
         count = positions.shape[0] - 1 - h
         window = torch.stack([positions[k : k + count].transpose(0, 1) for k in range(h + 1)])
         following = positions[h + 1 :].transpose(0, 1)
-        return following[:n] - self(window, following[n:])
+        return following[:n] - self(window, following[n:], phi[:, None].expand(-1, count, -1))
 
 
 class _EdgeWeights(nn.Module):

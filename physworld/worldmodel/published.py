@@ -122,7 +122,7 @@ class PublishedModel:
             edge_radius_m=facts["edge_radius_m"],
             ground_height_m=facts["ground_height_m"],
         )
-        prior = ModalPrior(*(tensors[f"prior.{part}"] for part in ("mean", "basis", "shape", "weight")))
+        prior = ModalPrior(**{part: tensors[f"prior.{part}"] for part in ModalPrior.__dataclass_fields__})
         model = WorldModel(config, spec, prior=prior)
         network = {name: value for name, value in tensors.items() if not name.startswith(_OWN)}
         model.load_state_dict({name: torch.as_tensor(value) for name, value in network.items()})

@@ -1,10 +1,12 @@
 """Training the graph network on demonstration episodes (paper, section Model Training).
 
-    loss = Σ_{i=1..τ} mean ‖x_pred^{t+i} - x^{t+i}‖² / σ_change²
+    loss = mean_b Σ_{i=1..τ} ‖x_pred^{t+i} - x^{t+i}‖² / (Σ_{i=1..τ} ‖x̂^{t+i} - x^{t+i}‖² + τ σ_change²)
 
 unrolled from a random frame t whose history carries random-walk noise, so that training sees the kind of
-errors that a rollout makes; Φ carries noise too, so that it can be fine-tuned later. τ grows from 1 to
-``look_ahead`` over the first two thirds. A running average of the weights is what is validated (open-loop
+errors that a rollout makes; Φ carries noise too, so that it can be fine-tuned later. x̂ is the modal prior unrolled
+alone from the same frame: a sub-sequence counts by the share of the prior's error that is left, so that the few in
+which small errors grow fast do not drown the others. With a τ of a few frames the network learns corrections that do
+not last: τ is long from the first step. A running average of the weights is what is validated (open-loop
 rollouts of whole held-out episodes) and returned; the best one wins. The same seed, data and settings give
 the same weights, and so does a run that was interrupted and resumed from a checkpoint.
 """
@@ -34,7 +36,6 @@ from physworld.worldmodel.modal import ModalPrior, fit_prior
 from physworld.worldmodel.model import Normalisation, PriorStep, WorldModel
 from physworld.worldmodel.rollout import rollout_tracks
 
-GROWTH_SHARE = 2.0 / 3.0
 WARM_UP_SHARE = 0.1
 
 
@@ -91,8 +92,11 @@ def train(
     torch.set_num_threads(training.threads)
     fitting, held_out = split_tracks(tracks, training.validation_fraction, training.seed)
     n, h = spec.object_count, config.history
-    prior = fit_prior([track.positions.numpy() for track in fitting], n, h, config.modes)
-    scales = measure_scales(fitting, spec, lambda track: PriorStep(prior, h).residual(track.positions))
+    positions, phis = [track.positions.numpy() for track in fitting], [track.phi.numpy() for track in fitting]
+    prior = fit_prior(positions, phis, n, h, config.modes)
+    scales = measure_scales(
+        fitting, spec, lambda track: PriorStep(prior, h).residual(track.positions, track.phi)
+    )
     run = _start(config, spec, scales, prior, training)
     identity = _identity(config, training, scales)
     if checkpoint is not None:
@@ -104,7 +108,7 @@ def train(
     while run.step < training.steps:
         if cancelled is not None and cancelled():
             raise TrainingCancelled(run.step)
-        loss = _train_step(run, sampler, training, min(_look_ahead(run.step, training), longest))
+        loss = _train_step(run, sampler, training, min(training.look_ahead, longest))
         run.step += 1
         if run.step % training.validation_every == 0 or run.step == training.steps:
             run.losses.append((run.step, loss))
@@ -147,12 +151,6 @@ def _start(
     return _Run(model, copy.deepcopy(model), optimiser, generator)
 
 
-def _look_ahead(step: int, training: TrainingConfig) -> int:
-    """τ at a step: in equal stages from 1 to ``look_ahead``."""
-    grown = 1 + int(step / max(1.0, GROWTH_SHARE * training.steps) * (training.look_ahead - 1) + 0.5)
-    return min(grown, training.look_ahead)
-
-
 def _train_step(run: _Run, sampler: WindowSampler, training: TrainingConfig, look_ahead: int) -> float:
     """One optimiser step; the loss. Raises TrainingDiverged."""
     model, h = run.model, run.model.config.history
@@ -162,12 +160,17 @@ def _train_step(run: _Run, sampler: WindowSampler, training: TrainingConfig, loo
     noise = torch.randn(batch.phi.shape, generator=run.generator) * model.norm.properties
     phi = batch.phi + training.noise_properties * noise
     constants = model.edge_constants()
-    loss = torch.zeros(())
-    for i in range(look_ahead):
-        truth = batch.positions[h + 1 + i]
+    alone = window
+    left = beside = torch.zeros(training.batch_size)
+    for truth in batch.positions[h + 1 :]:
         predicted = model.step(window, truth[n:], phi, constants)
-        loss = loss + ((predicted[:n] - truth[:n]) / change).square().sum(dim=-1).mean()
+        left = left + _squared(predicted[:n] - truth[:n])
         window = torch.cat([window[1:], predicted[None]])
+        with torch.no_grad():
+            ahead = model.prior(alone, truth[n:], phi)
+            beside = beside + _squared(ahead - truth[:n])
+            alone = torch.cat([alone[1:], torch.cat([ahead, truth[n:]])[None]])
+    loss = (left / (beside + look_ahead * change.square())).mean()
     share = run.step / training.steps
     floor = training.learning_rate_floor
     warm = min(1.0, (run.step + 1) / (WARM_UP_SHARE * training.steps))
@@ -184,6 +187,11 @@ def _train_step(run: _Run, sampler: WindowSampler, training: TrainingConfig, loo
     with torch.no_grad():
         torch._foreach_lerp_(list(run.average.parameters()), list(model.parameters()), 1.0 - keep)
     return loss.item()
+
+
+def _squared(gap: Tensor) -> Tensor:
+    """Mean over vertices of the squared length of (n, B, 3), (B,)."""
+    return gap.square().sum(dim=-1).mean(dim=0)
 
 
 def _with_noise(window: Tensor, n: int, scale: Tensor, generator: torch.Generator) -> Tensor:

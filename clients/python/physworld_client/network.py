@@ -60,7 +60,7 @@ class Network:
             phi: log property ratios of the object vertices, (n, 2).
         """
         n = self.object_count
-        ahead = np.concatenate([self._modal_prior(window, control_next), control_next])
+        ahead = np.concatenate([self._modal_prior(window, control_next, phi), control_next])
         features = self._vertex_features(window, ahead, phi)
         state = self._mlp("encoder", features)
         edges = self._edge_terms(window)
@@ -74,7 +74,7 @@ class Network:
         ahead[:n] += self._scale("change") * correction.astype(np.float64)
         return ahead
 
-    def _modal_prior(self, window: np.ndarray, control_next: np.ndarray) -> np.ndarray:
+    def _modal_prior(self, window: np.ndarray, control_next: np.ndarray, phi: np.ndarray) -> np.ndarray:
         """x̂^{t+1} of the object vertices [m], (n, 3)."""
         n = self.object_count
         basis = self._tensor("prior.basis").astype(np.float64)
@@ -89,7 +89,9 @@ class Network:
         weight = self._tensor("prior.weight").astype(np.float64)
         if weight.shape != (len(basis), len(regressors)):
             raise ModelUnreadable(f"prior.weight is {weight.shape}, not {(len(basis), len(regressors))}")
-        next_amplitudes = weight @ regressors
+        response = self._tensor("prior.response").astype(np.float64)
+        softness = float(np.mean(phi[:, 0] - phi[:, 1]))
+        next_amplitudes = weight @ regressors + softness * (response @ np.append(amplitudes.ravel(), 1.0))
         return np.asarray(centre[0] + mean + np.tensordot(next_amplitudes, basis, axes=1))
 
     def _sort_edges(self, vertex_count: int) -> None:

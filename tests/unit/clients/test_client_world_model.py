@@ -75,7 +75,8 @@ def some_prior(spec: GraphSpec, history: int, rng: np.random.Generator) -> Modal
     weight = rng.normal(0.0, 0.02, (modes, regressor_count(modes, spec.control_count, history)))
     weight[:, :modes] += 1.8 * np.eye(modes)
     weight[:, modes : 2 * modes] -= 0.85 * np.eye(modes)
-    return dataclasses.replace(prior, basis=basis, weight=weight)
+    response = rng.normal(0.0, 0.005, (modes, (history + 1) * modes + 1))
+    return dataclasses.replace(prior, basis=basis, weight=weight, response=response)
 
 
 def write(folder: Path, model: PublishedModel) -> str:

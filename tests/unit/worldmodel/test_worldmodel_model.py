@@ -37,6 +37,7 @@ def _model(spec: GraphSpec, hidden: int = SMALL.hidden) -> WorldModel:
             parameter.normal_(0.0, 0.2)
         model.prior.basis.normal_(0.0, 0.1)
         model.prior.weight.normal_(0.0, 0.1)
+        model.prior.response.normal_(0.0, 0.1)
     return model
 
 
@@ -57,7 +58,7 @@ def test_the_split_form_is_the_same_function_as_the_plain_one(ground: float | No
     spec = graph(ground_height_m=ground)
     model = _model(spec)
     window, control_next, phi = _state(spec)
-    ahead = torch.cat([model.prior(window, control_next), control_next])
+    ahead = torch.cat([model.prior(window, control_next, phi), control_next])
     plain = NaiveWorldModel(model)(window, ahead, phi)
     assert torch.allclose(
         model(window, ahead, phi), plain, atol=SAME_FUNCTION * float(plain.detach().abs().max())
@@ -68,7 +69,7 @@ def test_both_forms_have_the_same_gradients() -> None:
     spec = graph()
     model = _model(spec)
     window, control_next, phi = _state(spec)
-    ahead = torch.cat([model.prior(window, control_next), control_next])
+    ahead = torch.cat([model.prior(window, control_next, phi), control_next])
     weights = list(model.parameters())
     split = torch.autograd.grad(model(window, ahead, phi).square().sum(), weights)
     plain = torch.autograd.grad(NaiveWorldModel(model)(window, ahead, phi).square().sum(), weights)
@@ -120,16 +121,16 @@ def test_an_untrained_network_leaves_the_prior_as_it_is() -> None:
     window, control_next, phi = _state(spec)
     with torch.inference_mode():
         moved = model.step(window, control_next, phi)
-        assert torch.equal(moved[: spec.object_count], model.prior(window, control_next))
+        assert torch.equal(moved[: spec.object_count], model.prior(window, control_next, phi))
 
 
 def test_the_rigid_prior_follows_the_grip() -> None:
     spec = graph()
     prior = rigid_prior(spec.rest_vertices, spec.rest_vertices[: spec.control_count], SMALL.history)
     model = WorldModel(SMALL, spec, SCALES, prior)
-    window, control_next, _ = _state(spec)
+    window, control_next, phi = _state(spec)
     with torch.inference_mode():
-        moved = model.prior(window, control_next)
+        moved = model.prior(window, control_next, phi)
     gap = moved - control_next.mean(dim=0)
     rest = spec.rest_vertices - spec.rest_vertices[: spec.control_count].mean(axis=0)
     assert gap[:, 0].numpy() == pytest.approx(rest, abs=1e-6)
