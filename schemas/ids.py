@@ -7,7 +7,9 @@ from ulid import ULID
 PREFIXES = {
     "scene": "scn",
     "fit": "fit",
+    "trace": "trc",
     "dataset": "dst",
+    "assessment": "ass",
     "job": "job",
     "shard": "shd",
     "key": "key",

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from schemas.base import Problem, Reference, Resource
 
-JobKind = Literal["fit", "dataset", "training", "pipeline"]
+JobKind = Literal["fit", "trace", "dataset", "training", "assessment", "pipeline"]
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelling", "cancelled"]
 TERMINAL_STATES: frozenset[str] = frozenset({"succeeded", "failed", "cancelled"})
 
@@ -24,7 +24,7 @@ class Progress(Resource):
 
 
 class Job(Resource):
-    """A piece of work. A pipeline job owns child jobs (fit, dataset, training)."""
+    """A piece of work. A pipeline job owns child jobs (fit, trace, dataset, training)."""
 
     id: str
     kind: JobKind

@@ -1,4 +1,4 @@
-"""The whole chain in one call: fit, dataset, training."""
+"""The whole chain in one call: fit, trace where it is asked for, dataset, training."""
 
 from __future__ import annotations
 
@@ -10,14 +10,23 @@ from schemas.base import Request, Resource
 from schemas.dataset import DatasetConfig
 from schemas.fit import FitConfig
 from schemas.model import TrainingConfig
+from schemas.trace import TraceConfig
 
 
 class PipelineCreate(Request):
-    """Body of POST /v1/pipelines. ``model_name`` null takes the scene's name."""
+    """Body of POST /v1/pipelines. ``model_name`` null takes the scene's name.
+
+    ``close_the_loop`` traces what the fit leaves unexplained; where an effect is named, the twin that carries it
+    demonstrates. ``compare`` then also trains a model on the fit's own twin, unless a version of the same name, scene
+    and settings is there, so that the card can say what the effect brought.
+    """
 
     scene_id: str
     model_name: str | None = Field(default=None, pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$")
     fit: FitConfig = Field(default_factory=FitConfig)
+    close_the_loop: bool = False
+    compare: bool = True
+    trace: TraceConfig = Field(default_factory=TraceConfig)
     dataset: DatasetConfig = Field(default_factory=DatasetConfig)
     training: TrainingConfig = Field(default_factory=TrainingConfig)
 
@@ -35,7 +44,8 @@ class RunReport(Resource):
 
     ``held_out`` maps a metric (``track_m``, ``chamfer_phystwin_m``, ``chamfer_l2_m``, all in metres) to the
     figures of ``static``, ``rigid_follow``, ``constant_velocity``, ``twin``, ``world_model`` and
-    ``world_model_finetuned``.
+    ``world_model_finetuned``. ``closed_loop`` is the card's: the verdict, the effects that were added, and the
+    errors before and after; null where no trace was asked for.
     """
 
     schema_version: int = 1
@@ -48,3 +58,4 @@ class RunReport(Resource):
     episodes: int
     parameters: dict[str, Any] = Field(default_factory=dict)
     notes: list[str] = Field(default_factory=list)
+    closed_loop: dict[str, Any] | None = None

@@ -8,8 +8,11 @@ TASK_NAME = "physworld.run_shard"
 
 QUEUE_OF_SHARD = {
     "fit": SIMULATION,
+    "trace": SIMULATION,
+    "simulation": SIMULATION,
     "dataset_plan": SIMULATION,
     "episode": SIMULATION,
     "dataset_seal": SIMULATION,
     "training": TRAINING,
+    "assessment": TRAINING,
 }

@@ -3,11 +3,13 @@
 ::
 
     fit        stage 0  one `fit` shard
+    trace      stage 0  one `trace` shard, which puts up `simulation` helpers (``storage.helpers``)
     dataset    stage 0  one `dataset_plan` shard, whose result says how many episodes follow
                stage 1  one `episode` shard each
                stage 2  one `dataset_seal` shard
     training   stage 0  one `training` shard
-    pipeline   child jobs fit -> dataset -> training, each opened by the success of the one before
+    assessment stage 0  one `assessment` shard, whose result may open a trace
+    pipeline   child jobs, each opened by the success of the one before (``storage.chain``)
 
 Everything here runs in the transaction that changes the shard, under the lock of the job and, before it, of
 the job's parent (``lock_job``). Rows below a job are touched only under that lock, so two workers that finish
@@ -22,12 +24,13 @@ from typing import Any
 from sqlalchemy import exists, select, update
 from sqlalchemy.orm import Session
 
+from schemas.assessment import AssessmentCreate
 from schemas.base import Problem, Reference
 from schemas.dataset import Episode
+from schemas.fit import FitConfig
 from schemas.job import TERMINAL_STATES, Progress
-from schemas.model import TrainingCreate
-from schemas.pipeline import PipelineCreate
-from storage import registry, resources
+from storage import helpers, registry, resources, traces
+from storage.chain import open_next, share_done
 from storage.errors import Conflict, NotFound
 from storage.events import append_event
 from storage.opening import (
@@ -35,15 +38,23 @@ from storage.opening import (
     QUEUED,
     RUNNING,
     add_shards,
-    fit_digest,
-    open_dataset,
-    open_training,
+    open_trace,
 )
-from storage.results import EpisodeResult, FitResult, PlanResult, SealResult, ShardResult, TrainingResult
+from storage.results import (
+    AssessmentResult,
+    EpisodeResult,
+    FitResult,
+    PlanResult,
+    SealResult,
+    ShardResult,
+    SimulationResult,
+    TraceResult,
+    TrainingResult,
+)
 from storage.tables import FitRow, JobRow, ShardRow
 
-PIPELINE_SHARES = {"fit": 0.35, "dataset": 0.35, "training": 0.30}  # of a pipeline's progress
-LONG_SHARDS = frozenset({"fit", "training"})  # alone in their stage: their own progress is the job's
+# Alone in their stage: their own progress is the job's.
+LONG_SHARDS = frozenset({"fit", "trace", "training", "assessment"})
 
 
 def lock_job(session: Session, job_id: str) -> JobRow:
@@ -70,8 +81,10 @@ def shard_succeeded(
     session: Session, job: JobRow, shard: ShardRow, result: ShardResult, now: datetime
 ) -> None:
     """Apply a shard's result; when it was the stage's last, start the next stage or finish the job."""
-    job.stage_done += 1
     job.heartbeat_at = now
+    if isinstance(result, SimulationResult):
+        return
+    job.stage_done += 1
     result.lineage.job_id = job.id
     if not result.lineage.inputs:
         result.lineage.inputs = [Reference.model_validate(item) for item in job.inputs]
@@ -147,7 +160,17 @@ def _apply(session: Session, job: JobRow, shard: ShardRow, result: ShardResult) 
             session, fit_id, result.parameters, result.metrics, result.artifacts, result.lineage
         )
         fit = session.get_one(FitRow, fit_id)
-        _set_output(job, Reference(kind="fit", id=fit_id, digest=fit_digest(fit)))
+        _set_output(job, Reference(kind="fit", id=fit_id, digest=traces.fit_digest(fit)))
+    elif isinstance(result, TraceResult):
+        helpers.call_off(session, job.id)
+        trace_id = payload["trace_id"]
+        traces.mark_trace_ready(
+            session, trace_id, result.verdict, result.report, result.artifacts, result.lineage
+        )
+        digest = traces.trace_digest(traces.trace_row(session, trace_id))
+        _set_output(job, Reference(kind="trace", id=trace_id, digest=digest))
+    elif isinstance(result, AssessmentResult):
+        _apply_assessment(session, job, payload["assessment_id"], result)
     elif isinstance(result, PlanResult):
         resources.start_writing(session, payload["dataset_id"])
     elif isinstance(result, EpisodeResult):
@@ -178,6 +201,19 @@ def _apply(session: Session, job: JobRow, shard: ShardRow, result: ShardResult) 
         _set_output(job, output)
 
 
+def _apply_assessment(session: Session, job: JobRow, assessment_id: str, result: AssessmentResult) -> None:
+    """Keep the figures; a recording that the model predicts worse than expected is traced, if that was asked for."""
+    figures = result.model_dump(mode="json", exclude={"lineage"})
+    row = traces.mark_assessment_ready(session, assessment_id, figures, result.lineage)
+    request = AssessmentCreate.model_validate(job.config)
+    if result.outcome != "worse_than_expected" or not request.open_trace:
+        return
+    opened = open_trace(session, row.scene_id, FitConfig(damping="none"), request.trace)
+    row.trace_id = opened.outputs[0]["id"]
+    job.outputs = [*job.outputs, *opened.outputs]
+    append_event(session, job.id, "log", {"message": "trace queued", "child": opened.id, "kind": "trace"})
+
+
 def _start_next_stage(session: Session, job: JobRow, shard: ShardRow, result: ShardResult) -> bool:
     """Open what follows the stage that ended with this shard; False when nothing does."""
     if isinstance(result, PlanResult):
@@ -206,33 +242,16 @@ def _child_succeeded(session: Session, child: JobRow, now: datetime) -> None:
     append_event(session, parent.id, "log", {"message": message, "child": child.id, "kind": child.kind})
     progress = _pipeline_progress(session, parent, child)
     _set_progress(session, parent, progress.model_copy(update={"message": message}))
-    request = PipelineCreate.model_validate(parent.config)
-    output = child.outputs[0]["id"]
-    if child.kind == "fit":
-        open_dataset(session, output, request.dataset, parent=parent)
-    elif child.kind == "dataset":
-        name = request.model_name or ""
-        training = TrainingCreate(name=name, dataset_id=output, config=request.training)
-        open_training(session, training, parent=parent)
-    else:
+    if not open_next(session, parent, _children(session, parent)):
         parent.finished_at = now
         _set_state(session, parent, "succeeded")
 
 
 def _pipeline_progress(session: Session, parent: JobRow, active: JobRow) -> Progress:
-    fraction = 0.0
-    for child in _children(session, parent):
-        fraction += PIPELINE_SHARES[child.kind] * _fraction(child)
+    share = share_done(parent, _children(session, parent))
     own = Progress.model_validate(active.progress)
     message = f"{active.kind}: {own.done:g} of {own.total:g} {own.unit}"
-    return Progress(done=round(100 * fraction, 2), total=100, unit="percent", message=message)
-
-
-def _fraction(job: JobRow) -> float:
-    if job.state == "succeeded":
-        return 1.0
-    progress = Progress.model_validate(job.progress)
-    return min(1.0, max(0.0, progress.done / progress.total)) if progress.total > 0 else 0.0
+    return Progress(done=round(100 * share, 2), total=100, unit="percent", message=message)
 
 
 def _set_progress(session: Session, job: JobRow, progress: Progress) -> None:
@@ -259,6 +278,10 @@ def _fail_output(session: Session, job: JobRow, message: str) -> None:
     output = job.outputs[0]["id"]
     if job.kind == "fit":
         resources.fail_fit(session, output)
+    elif job.kind == "trace":
+        traces.fail_trace(session, output)
+    elif job.kind == "assessment":
+        traces.fail_assessment(session, output)
     elif job.kind == "dataset":
         resources.fail_dataset(session, output)
     else:

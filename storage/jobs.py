@@ -8,25 +8,36 @@ from __future__ import annotations
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from schemas.assessment import AssessmentCreate
 from schemas.base import Page
 from schemas.dataset import DatasetConfig
 from schemas.fit import FitConfig
 from schemas.job import Job
 from schemas.model import TrainingCreate
 from schemas.pipeline import PipelineCreate
+from schemas.trace import TraceCreate
 from storage.errors import NotFound
 from storage.events import append_event, events_after
 from storage.flow import lock_job, request_cancel
-from storage.opening import open_dataset, open_fit, open_pipeline, open_training
+from storage.opening import (
+    open_assessment,
+    open_dataset,
+    open_fit,
+    open_pipeline,
+    open_trace,
+    open_training,
+)
 from storage.pages import page_of
 from storage.tables import JobRow, columns_of, utc_now
 
 __all__ = [
     "append_event",
     "cancel_job",
+    "create_assessment",
     "create_dataset",
     "create_fit",
     "create_pipeline",
+    "create_trace",
     "create_training",
     "events_after",
     "get_job",
@@ -39,9 +50,20 @@ def create_fit(session: Session, scene_id: str, config: FitConfig, parent: JobRo
     return _job(session, open_fit(session, scene_id, config, parent))
 
 
-def create_dataset(session: Session, fit_id: str, config: DatasetConfig, parent: JobRow | None = None) -> Job:
-    """Open a dataset. Raises NotFound, or Conflict when the fit is not ready."""
-    return _job(session, open_dataset(session, fit_id, config, parent))
+def create_trace(session: Session, request: TraceCreate) -> Job:
+    """Open a trace. Raises NotFound, or Conflict when the fit is not ready or of another scene."""
+    opened = open_trace(session, request.scene_id, request.fit, request.config, request.fit_id)
+    return _job(session, opened)
+
+
+def create_dataset(session: Session, fit_id: str, config: DatasetConfig, trace_id: str | None = None) -> Job:
+    """Open a dataset. Raises NotFound, or Conflict when the fit or the trace is not ready."""
+    return _job(session, open_dataset(session, fit_id, config, trace_id))
+
+
+def create_assessment(session: Session, name: str, version: int, request: AssessmentCreate) -> Job:
+    """Open an assessment of a model version. Raises NotFound, or Conflict when it is not ready."""
+    return _job(session, open_assessment(session, name, version, request))
 
 
 def create_training(session: Session, request: TrainingCreate, parent: JobRow | None = None) -> Job:

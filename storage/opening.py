@@ -12,6 +12,7 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
+from schemas.assessment import AssessmentCreate
 from schemas.base import Lineage, Reference
 from schemas.dataset import DatasetConfig
 from schemas.fit import FitConfig
@@ -19,11 +20,22 @@ from schemas.ids import new_id
 from schemas.job import JobKind, Progress
 from schemas.model import TrainingCreate
 from schemas.pipeline import PipelineCreate
+from schemas.trace import TraceConfig
 from storage.database import DEFAULT_MAX_ATTEMPTS, MAX_ATTEMPTS
 from storage.errors import Conflict, NotFound
 from storage.events import append_event
-from storage.registry import allot_version, reference_id
-from storage.tables import DatasetRow, FitRow, JobRow, SceneRow, ShardRow, utc_now
+from storage.registry import allot_version, baseline_of, reference_id, version_row
+from storage.tables import (
+    AssessmentRow,
+    DatasetRow,
+    FitRow,
+    JobRow,
+    SceneRow,
+    ShardRow,
+    TraceRow,
+    utc_now,
+)
+from storage.traces import fit_digest, trace_digest, trace_row
 
 QUEUED, RUNNING, DONE, FAILED, CANCELLED = "QUEUED", "RUNNING", "DONE", "FAILED", "CANCELLED"
 NAME_LENGTH = 64
@@ -59,21 +71,78 @@ def open_fit(session: Session, scene_id: str, config: FitConfig, parent: JobRow 
     return job
 
 
-def open_dataset(
-    session: Session, fit_id: str, config: DatasetConfig, parent: JobRow | None = None
+def open_trace(
+    session: Session,
+    scene_id: str,
+    fit: FitConfig,
+    config: TraceConfig,
+    fit_id: str | None = None,
+    parent: JobRow | None = None,
 ) -> JobRow:
-    """A dataset of demonstrations in a ready fit. Raises NotFound, or Conflict when the fit is not ready."""
-    fit = session.get(FitRow, fit_id)
-    if fit is None:
-        raise NotFound("fit", fit_id)
-    if fit.state != "ready":
-        raise Conflict(f"fit {fit_id} is {fit.state}; a dataset needs a ready fit")
+    """A trace of a scene, from a ready fit of it or its own. Raises NotFound, or Conflict when the fit does not do."""
+    scene = _scene(session, scene_id)
+    inputs = [Reference(kind="scene", id=scene_id, digest=scene.digest)]
+    if fit_id is not None:
+        known = _ready_fit(session, fit_id, "a trace")
+        if known.scene_id != scene_id:
+            raise Conflict(f"fit {fit_id} is of scene {known.scene_id}, not of {scene_id}")
+        inputs.append(Reference(kind="fit", id=fit_id, digest=fit_digest(known)))
+    trace_id = new_id("trace")
+    settings = {"fit": fit.model_dump(mode="json"), "trace": config.model_dump(mode="json")}
+    job = _open_job(
+        session,
+        "trace",
+        parent=parent,
+        inputs=inputs,
+        outputs=[Reference(kind="trace", id=trace_id)],
+        config=settings,
+        progress=Progress(total=100, unit="percent"),
+    )
+    row = TraceRow(
+        id=trace_id,
+        scene_id=scene_id,
+        fit_id=fit_id,
+        state="pending",
+        created_at=utc_now(),
+        job_id=job.id,
+        config=settings["trace"],
+        fit=settings["fit"],
+        report={},
+        lineage=_lineage(job),
+        artifacts=[],
+    )
+    session.add(row)
+    payload = {"trace_id": trace_id, "scene_id": scene_id, "fit_id": fit_id, **settings}
+    add_shards(session, job, "trace", [payload])
+    return job
+
+
+def open_dataset(
+    session: Session,
+    fit_id: str,
+    config: DatasetConfig,
+    trace_id: str | None = None,
+    parent: JobRow | None = None,
+) -> JobRow:
+    """A dataset of demonstrations in a ready fit, or in the twin that a trace made of it.
+
+    Raises NotFound, or Conflict when the fit or the trace is not ready or they are of different scenes.
+    """
+    fit = _ready_fit(session, fit_id, "a dataset")
+    inputs = [Reference(kind="fit", id=fit_id, digest=fit_digest(fit))]
+    if trace_id is not None:
+        trace = trace_row(session, trace_id)
+        if trace.state != "ready":
+            raise Conflict(f"trace {trace_id} is {trace.state}; a dataset needs a ready trace")
+        if trace.scene_id != fit.scene_id:
+            raise Conflict(f"trace {trace_id} is of scene {trace.scene_id}, fit {fit_id} of {fit.scene_id}")
+        inputs.append(Reference(kind="trace", id=trace_id, digest=trace_digest(trace)))
     dataset_id = new_id("dataset")
     job = _open_job(
         session,
         "dataset",
         parent=parent,
-        inputs=[Reference(kind="fit", id=fit_id, digest=fit_digest(fit))],
+        inputs=inputs,
         outputs=[Reference(kind="dataset", id=dataset_id)],
         config=config.model_dump(mode="json"),
         progress=Progress(total=config.episodes, unit="episodes"),
@@ -81,6 +150,7 @@ def open_dataset(
     row = DatasetRow(
         id=dataset_id,
         fit_id=fit_id,
+        trace_id=trace_id,
         scene_id=fit.scene_id,
         state="pending",
         created_at=utc_now(),
@@ -91,7 +161,13 @@ def open_dataset(
         artifacts=[],
     )
     session.add(row)
-    payload = {"dataset_id": dataset_id, "fit_id": fit_id, "scene_id": fit.scene_id, "config": job.config}
+    payload = {
+        "dataset_id": dataset_id,
+        "fit_id": fit_id,
+        "trace_id": trace_id,
+        "scene_id": fit.scene_id,
+        "config": job.config,
+    }
     add_shards(session, job, "dataset_plan", [payload])
     return job
 
@@ -112,6 +188,7 @@ def open_training(session: Session, request: TrainingCreate, parent: JobRow | No
         config=request.model_dump(mode="json"),
         progress=Progress(total=request.config.steps, unit="steps"),
     )
+    baseline = baseline_of(session, request.name, dataset, request.config)
     version = allot_version(
         session,
         request.name,
@@ -119,6 +196,7 @@ def open_training(session: Session, request: TrainingCreate, parent: JobRow | No
         job_id=job.id,
         scene_id=dataset.scene_id,
         fit_id=dataset.fit_id,
+        trace_id=dataset.trace_id,
         dataset_id=dataset.id,
         description=request.description,
         tags=request.tags,
@@ -130,10 +208,57 @@ def open_training(session: Session, request: TrainingCreate, parent: JobRow | No
         "version": version.version,
         "dataset_id": dataset.id,
         "fit_id": dataset.fit_id,
+        "trace_id": dataset.trace_id,
+        "baseline": None if baseline is None else baseline.version,
         "scene_id": dataset.scene_id,
         "config": version.config,
     }
     add_shards(session, job, "training", [payload])
+    return job
+
+
+def open_assessment(session: Session, name: str, version: int, request: AssessmentCreate) -> JobRow:
+    """A recording held against a model version. Raises NotFound, or Conflict when the version is not ready."""
+    model = version_row(session, name, version)
+    if model.state != "ready" or model.fit_id is None or model.scene_id is None:
+        raise Conflict(f"version {version} of {name} is {model.state}; an assessment needs a ready version")
+    scene = _scene(session, request.scene_id)
+    assessment_id = new_id("assessment")
+    job = _open_job(
+        session,
+        "assessment",
+        parent=None,
+        inputs=[
+            Reference(kind="model", id=reference_id(name, version), digest=model.sha256),
+            Reference(kind="scene", id=scene.id, digest=scene.digest),
+        ],
+        outputs=[Reference(kind="assessment", id=assessment_id)],
+        config=request.model_dump(mode="json"),
+        progress=Progress(total=1, unit="rollouts"),
+    )
+    row = AssessmentRow(
+        id=assessment_id,
+        name=name,
+        version=version,
+        scene_id=scene.id,
+        state="pending",
+        created_at=utc_now(),
+        job_id=job.id,
+        config=job.config,
+        figures={},
+        lineage=_lineage(job),
+    )
+    session.add(row)
+    payload = {
+        "assessment_id": assessment_id,
+        "name": name,
+        "version": version,
+        "scene_id": scene.id,
+        "model_scene_id": model.scene_id,
+        "fit_id": model.fit_id,
+        "trace_id": model.trace_id,
+    }
+    add_shards(session, job, "assessment", [payload])
     return job
 
 
@@ -177,12 +302,6 @@ def add_shards(session: Session, job: JobRow, kind: str, payloads: Iterable[dict
     session.flush()
 
 
-def fit_digest(fit: FitRow) -> str | None:
-    """The digest by which others refer to a fit: that of its twin."""
-    digests = {artifact["name"]: artifact["sha256"] for artifact in fit.artifacts}
-    return digests.get("twin.npz")
-
-
 def model_name_of(scene_name: str) -> str:
     """A valid model name from a scene's: lower case, other characters become dashes."""
     plain = re.sub(r"[^a-z0-9._-]+", "-", scene_name.lower()).strip("._-")
@@ -217,6 +336,15 @@ def _open_job(
     if parent is not None:
         append_event(session, parent.id, "log", {"message": f"{kind} queued", "child": job.id, "kind": kind})
     return job
+
+
+def _ready_fit(session: Session, fit_id: str, for_what: str) -> FitRow:
+    fit = session.get(FitRow, fit_id)
+    if fit is None:
+        raise NotFound("fit", fit_id)
+    if fit.state != "ready":
+        raise Conflict(f"fit {fit_id} is {fit.state}; {for_what} needs a ready fit")
+    return fit
 
 
 def _scene(session: Session, scene_id: str) -> SceneRow:

@@ -16,7 +16,18 @@ from schemas.base import Artifact, Lineage, Page
 from schemas.model import Model, ModelVersion, TrainingConfig
 from storage.errors import Conflict, NotFound
 from storage.pages import page_of
-from storage.tables import AliasRow, ModelRow, ModelVersionRow, columns_of, insert_if_absent, utc_now
+from storage.tables import (
+    AliasRow,
+    DatasetRow,
+    FitRow,
+    ModelRow,
+    ModelVersionRow,
+    TraceRow,
+    columns_of,
+    insert_if_absent,
+    utc_now,
+)
+from storage.traces import adds_effects, fit_digest
 
 LATEST = "latest"
 ALIAS_PATTERN = re.compile(r"[a-z][a-z0-9_-]{0,31}")
@@ -35,6 +46,7 @@ def allot_version(
     job_id: str | None = None,
     scene_id: str | None = None,
     fit_id: str | None = None,
+    trace_id: str | None = None,
     dataset_id: str | None = None,
     description: str = "",
     tags: list[str] | None = None,
@@ -51,6 +63,7 @@ def allot_version(
         job_id=job_id,
         scene_id=scene_id,
         fit_id=fit_id,
+        trace_id=trace_id,
         dataset_id=dataset_id,
         description=description,
         tags=list(tags or []),
@@ -75,7 +88,7 @@ def publish(
     lineage: Lineage,
 ) -> ModelVersion:
     """Make a pending version ready. Raises Conflict when it is not pending: versions are immutable."""
-    row = _version_row(session, name, version)
+    row = version_row(session, name, version)
     if row.state != "pending":
         raise Conflict(f"version {version} of {name} is {row.state}; only a pending version is published")
     row.state = "ready"
@@ -89,7 +102,7 @@ def publish(
 
 def fail_version(session: Session, name: str, version: int, message: str) -> None:
     """Mark a pending version failed; a ready one stays as it is."""
-    row = _version_row(session, name, version)
+    row = version_row(session, name, version)
     if row.state == "pending":
         row.state = "failed"
         row.message = message
@@ -110,7 +123,7 @@ def list_models(session: Session, *, limit: int = 50, cursor: str | None = None)
 
 def get_version(session: Session, name: str, version: int | str) -> ModelVersion:
     """A version by number, alias or ``latest`` (the newest that is ready)."""
-    row = _version_row(session, name, resolve(session, name, version))
+    row = version_row(session, name, resolve(session, name, version))
     return _version(row, _aliases_of(session, name, row.version))
 
 
@@ -152,11 +165,51 @@ def resolve(session: Session, name: str, version: int | str) -> int:
     return alias.version
 
 
+def baseline_of(
+    session: Session, name: str, dataset: DatasetRow, config: TrainingConfig
+) -> ModelVersionRow | None:
+    """What a version of ``name`` on ``dataset`` is to be compared with, None where there is nothing.
+
+    See ``find_baseline``; a dataset whose twin carries no effects has none.
+    """
+    trace = session.get(TraceRow, dataset.trace_id) if dataset.trace_id else None
+    if trace is None or not adds_effects(trace):
+        return None
+    return find_baseline(session, name, dataset.fit_id, dataset.config, config)
+
+
+def find_baseline(
+    session: Session, name: str, fit_id: str, dataset_config: dict[str, Any], config: TrainingConfig
+) -> ModelVersionRow | None:
+    """The newest ready version of ``name`` that learned from the fit's own twin with these settings.
+
+    The fit may be another one, if its twin is equal to the last bit.
+    """
+    fit = session.get_one(FitRow, fit_id)
+    statement = (
+        select(ModelVersionRow, DatasetRow, FitRow)
+        .join(DatasetRow, DatasetRow.id == ModelVersionRow.dataset_id)
+        .join(FitRow, FitRow.id == ModelVersionRow.fit_id)
+        .where(
+            ModelVersionRow.name == name,
+            ModelVersionRow.state == "ready",
+            ModelVersionRow.scene_id == fit.scene_id,
+            ModelVersionRow.trace_id.is_(None),
+        )
+        .order_by(ModelVersionRow.version.desc())
+    )
+    wanted = (config.model_dump(mode="json"), dataset_config, fit_digest(fit))
+    for version, dataset, other in session.execute(statement):
+        if (version.config, dataset.config, fit_digest(other)) == wanted:
+            return version
+    return None
+
+
 def set_alias(session: Session, name: str, alias: str, version: int) -> Model:
     """Point ``alias`` at a ready version; it moves when it exists already."""
     if alias == LATEST or not ALIAS_PATTERN.fullmatch(alias):
         raise Conflict(f"{alias!r} cannot be an alias: it is reserved or not [a-z][a-z0-9_-]{{0,31}}")
-    row = _version_row(session, name, version)
+    row = version_row(session, name, version)
     if row.state != "ready":
         raise Conflict(f"version {version} of {name} is {row.state}; an alias needs a ready version")
     _lock_model(session, name)
@@ -195,7 +248,8 @@ def _model_row(session: Session, name: str) -> ModelRow:
     return row
 
 
-def _version_row(session: Session, name: str, version: int) -> ModelVersionRow:
+def version_row(session: Session, name: str, version: int) -> ModelVersionRow:
+    """The row, or NotFound."""
     row = session.get(ModelVersionRow, (name, version))
     if row is None:
         raise NotFound("model version", reference_id(name, version))

@@ -8,8 +8,10 @@ from typing import Any
 
 from pydantic import Field, ValidationError
 
+from schemas.assessment import ErrorFigure, Outcome
 from schemas.base import Artifact, Lineage, Resource
 from schemas.fit import Parameter
+from schemas.trace import Verdict
 from storage.errors import ResultInvalid
 
 MAX_EPISODES = 20_000
@@ -28,6 +30,20 @@ class FitResult(ShardResult):
     metrics: dict[str, Any]
     artifacts: list[Artifact]
     seconds: float | None = None
+
+
+class TraceResult(ShardResult):
+    """Of a ``trace`` shard: the whole report, and the files."""
+
+    verdict: Verdict
+    report: dict[str, Any]
+    artifacts: list[Artifact]
+
+
+class SimulationResult(ShardResult):
+    """Of a ``simulation`` shard, a trace's helper: whether the run can be trusted; its tracks are in the scratch."""
+
+    trusted: bool
 
 
 class PlanResult(ShardResult):
@@ -67,12 +83,29 @@ class TrainingResult(ShardResult):
     metrics: dict[str, Any] = Field(default_factory=dict)
 
 
+class AssessmentResult(ShardResult):
+    """Of an ``assessment`` shard."""
+
+    outcome: Outcome
+    reason: str
+    measured: ErrorFigure
+    expected: ErrorFigure
+    excess_m2: float
+    excess_ci95_m2: tuple[float, float]
+    baselines_m: dict[str, float | None] = Field(default_factory=dict)
+    twin_m: float | None = None
+    start_mismatch_m: float
+
+
 RESULT_OF_SHARD: dict[str, type[ShardResult]] = {
     "fit": FitResult,
+    "trace": TraceResult,
+    "simulation": SimulationResult,
     "dataset_plan": PlanResult,
     "episode": EpisodeResult,
     "dataset_seal": SealResult,
     "training": TrainingResult,
+    "assessment": AssessmentResult,
 }
 
 

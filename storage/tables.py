@@ -208,6 +208,26 @@ class FitRow(Base):
     artifacts: Mapped[JsonList]
 
 
+class TraceRow(Base):
+    """A residual traced to an effect; ``report`` is the whole answer."""
+
+    __tablename__ = "traces"
+    __table_args__ = (Index(None, "created_at"),)
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    scene_id: Mapped[str] = mapped_column(ForeignKey("scenes.id"), index=True)
+    fit_id: Mapped[str | None] = mapped_column(ForeignKey("fits.id"))
+    state: Mapped[str]
+    created_at: Mapped[datetime]
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
+    config: Mapped[Json]
+    fit: Mapped[Json]
+    verdict: Mapped[str | None]
+    report: Mapped[Json]
+    lineage: Mapped[Json]
+    artifacts: Mapped[JsonList]
+
+
 class DatasetRow(Base):
     """A set of episodes, immutable once sealed."""
 
@@ -216,6 +236,7 @@ class DatasetRow(Base):
 
     id: Mapped[str] = mapped_column(primary_key=True)
     fit_id: Mapped[str] = mapped_column(ForeignKey("fits.id"), index=True)
+    trace_id: Mapped[str | None]
     scene_id: Mapped[str] = mapped_column(ForeignKey("scenes.id"), index=True)
     state: Mapped[str]
     created_at: Mapped[datetime]
@@ -270,6 +291,7 @@ class ModelVersionRow(Base):
     job_id: Mapped[str | None] = mapped_column(ForeignKey("jobs.id"), index=True)
     scene_id: Mapped[str | None] = mapped_column(ForeignKey("scenes.id"))
     fit_id: Mapped[str | None] = mapped_column(ForeignKey("fits.id"))
+    trace_id: Mapped[str | None]
     dataset_id: Mapped[str | None] = mapped_column(ForeignKey("datasets.id"))
     description: Mapped[str]
     tags: Mapped[JsonList]
@@ -292,6 +314,28 @@ class AliasRow(Base):
     alias: Mapped[str] = mapped_column(primary_key=True)
     version: Mapped[int]
     updated_at: Mapped[datetime]
+
+
+class AssessmentRow(Base):
+    """A new recording held against a model version; ``figures`` is the answer."""
+
+    __tablename__ = "assessments"
+    __table_args__ = (
+        ForeignKeyConstraint(["name", "version"], ["model_versions.name", "model_versions.version"]),
+        Index(None, "name", "version", "created_at"),
+    )
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    name: Mapped[str]
+    version: Mapped[int]
+    scene_id: Mapped[str] = mapped_column(ForeignKey("scenes.id"))
+    state: Mapped[str]
+    created_at: Mapped[datetime]
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
+    config: Mapped[Json]
+    figures: Mapped[Json]
+    trace_id: Mapped[str | None]
+    lineage: Mapped[Json]
 
 
 class ApiKeyRow(Base):

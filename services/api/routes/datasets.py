@@ -28,7 +28,7 @@ EpisodeIndex = Annotated[int, Path(ge=0, lt=2**31, description="number of the ep
 def create_dataset(body: DatasetCreate, idempotency: IdempotencyDep) -> Response:
     """Start the demonstrations of a ready fit; the dataset's id is in the job's `outputs`."""
     return idempotency.run(
-        body, lambda session: accepted(jobs.create_dataset(session, body.fit_id, body.config))
+        body, lambda session: accepted(jobs.create_dataset(session, body.fit_id, body.config, body.trace_id))
     )
 
 

@@ -42,7 +42,7 @@ def test_an_upgrade_twice_is_one(database: Database) -> None:
     revision = database.revision()
     database.upgrade()
     database.check()
-    assert database.revision() == revision == "0001"
+    assert database.revision() == revision == "0002"
 
 
 def test_processes_that_upgrade_at_once_do_not_collide(tmp_path: Path) -> None:
@@ -58,7 +58,7 @@ def test_processes_that_upgrade_at_once_do_not_collide(tmp_path: Path) -> None:
 def test_a_database_without_tables_is_not_ready(tmp_path: Path) -> None:
     database = Database(f"sqlite:///{tmp_path / 'empty.db'}")
     assert database.revision() is None
-    with pytest.raises(DatabaseUnavailable, match="has revision None, this code needs 0001"):
+    with pytest.raises(DatabaseUnavailable, match="has revision None, this code needs 0002"):
         database.check()
     database.dispose()
 

@@ -1,0 +1,93 @@
+"""Traces: a calibrated twin's residual traced to a named effect, and the twin that carries it."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any, Literal
+
+from pydantic import ConfigDict, Field
+
+from schemas.base import Artifact, Lineage, Request, Resource, Seed
+from schemas.fit import FitConfig
+
+Verdict = Literal[
+    "named", "equivalent_set", "data_issue", "numerical_issue", "unexplained", "nothing_to_explain"
+]
+NAMED: Verdict = "named"
+
+
+class TraceConfig(Request):
+    """Settings of a trace; the same scene and settings give the same answer.
+
+    ``candidates`` are names of the effects' registry, none for all of them. The best ``confirmed`` are refitted with
+    the full simulator, in ``iterations`` Gauss-Newton steps; an answer has ``effects_at_most`` effects.
+    """
+
+    candidates: list[str] = Field(default_factory=list, max_length=64)
+    effects_at_most: int = Field(default=2, ge=1, le=4)
+    confirmed: int = Field(default=4, ge=1, le=32)
+    iterations: int = Field(default=5, ge=1, le=50)
+    resamples: int = Field(default=2000, ge=100, le=100_000)
+    seed: Seed = 0
+
+
+class TraceCreate(Request):
+    """Body of POST /v1/traces.
+
+    A trace calibrates the declared physics itself, with ``fit``'s budgets and never with damping. ``fit_id`` names a
+    ready fit of the scene: its twin is taken instead where it holds no damping.
+    """
+
+    scene_id: str
+    fit_id: str | None = None
+    fit: FitConfig = Field(default_factory=lambda: FitConfig(damping="none"))
+    config: TraceConfig = Field(default_factory=TraceConfig)
+
+
+class Figure(Resource):
+    """A value with its unit and 95 % interval."""
+
+    value: float | None
+    unit: str
+    ci95: tuple[float | None, float | None] | None = None
+
+
+class FoundEffect(Resource):
+    """An effect of the registry with its strengths."""
+
+    name: str
+    parameters: dict[str, Figure] = Field(default_factory=dict)
+
+
+class Trace(Resource):
+    """A trace. Once ready it holds every key of its ``report.json``, also those that are not named here.
+
+    ``held_out`` are errors on frames that nothing before the report has seen; ``twin.npz`` is among the artifacts where
+    the verdict is ``named``.
+    """
+
+    model_config = ConfigDict(extra="allow")
+
+    id: str
+    scene_id: str
+    fit_id: str | None = None
+    state: Literal["pending", "ready", "failed"]
+    created_at: datetime
+    job_id: str
+    config: TraceConfig
+    fit: FitConfig
+    schema_version: int = 1
+    scene: str = ""
+    verdict: Verdict | None = None
+    reason: str = ""
+    effects: list[FoundEffect] = Field(default_factory=list)
+    equivalent: list[FoundEffect] = Field(default_factory=list)
+    candidates: list[dict[str, Any]] = Field(default_factory=list)
+    held_out: dict[str, Any] | None = None
+    calibrated: dict[str, Figure] = Field(default_factory=dict)
+    unexplained: dict[str, Any] | None = None
+    suggested_experiment: dict[str, Any] | None = None
+    seconds: float | None = None
+    simulations: int | None = None
+    lineage: Lineage = Field(default_factory=Lineage)
+    artifacts: list[Artifact] = Field(default_factory=list)

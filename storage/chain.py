@@ -1,0 +1,91 @@
+"""The order of a pipeline's child jobs.
+
+::
+
+    fit -> dataset -> training                                           without a trace
+    fit -> trace -> dataset -> training                                  ``close_the_loop``, nothing named
+    fit -> trace -> dataset -> training -> dataset -> training           ... an effect named: first on the fit's own
+                                                                         twin, for comparison, then with the effect
+
+The comparison is left out when it was not asked for (``compare``) or when a ready version of the same name on an equal
+twin with the same settings is there already.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sqlalchemy.orm import Session
+
+from schemas.job import Progress
+from schemas.model import TrainingCreate
+from schemas.pipeline import PipelineCreate
+from storage.opening import open_dataset, open_trace, open_training
+from storage.registry import find_baseline
+from storage.tables import JobRow, TraceRow
+from storage.traces import adds_effects, trace_row
+
+_SHARES = {"fit": 0.35, "trace": 0.6, "dataset": 0.35, "training": 0.30}  # of a pipeline's time, about
+
+
+def open_next(session: Session, parent: JobRow, children: Sequence[JobRow]) -> bool:
+    """Open what follows the last child, which has succeeded; False when nothing does."""
+    request = PipelineCreate.model_validate(parent.config)
+    outputs = {job.kind: str(job.outputs[0]["id"]) for job in children}
+    last = children[-1]
+    if last.kind == "fit" and request.close_the_loop:
+        scene_id = request.scene_id
+        open_trace(session, scene_id, request.fit, request.trace, outputs["fit"], parent=parent)
+    elif last.kind == "dataset":
+        name = request.model_name or ""
+        training = TrainingCreate(name=name, dataset_id=outputs["dataset"], config=request.training)
+        open_training(session, training, parent=parent)
+    elif last.kind == "training" and not _is_comparison(session, children):
+        return False
+    else:
+        trace = trace_row(session, outputs["trace"]) if "trace" in outputs else None
+        own = (
+            last.kind == "trace" and trace is not None and _wants_comparison(session, request, trace, outputs)
+        )
+        trace_id = None if trace is None or own else trace.id
+        open_dataset(session, outputs["fit"], request.dataset, trace_id, parent=parent)
+    return True
+
+
+def share_done(parent: JobRow, children: Sequence[JobRow]) -> float:
+    """How much of the pipeline is done, 0 to 1; a comparison counts until it is known to be left out."""
+    request = PipelineCreate.model_validate(parent.config)
+    kinds = ["fit", "dataset", "training"]
+    if request.close_the_loop:
+        kinds.append("trace")
+        if request.compare:
+            kinds += ["dataset", "training"]
+    done = sum(_SHARES[child.kind] * _fraction(child) for child in children)
+    return float(min(1.0, done / sum(_SHARES[kind] for kind in kinds)))
+
+
+def _wants_comparison(
+    session: Session, request: PipelineCreate, trace: TraceRow, outputs: dict[str, str]
+) -> bool:
+    if not request.compare or not adds_effects(trace):
+        return False
+    dataset = request.dataset.model_dump(mode="json")
+    name = request.model_name or ""
+    return find_baseline(session, name, outputs["fit"], dataset, request.training) is None
+
+
+def _is_comparison(session: Session, children: Sequence[JobRow]) -> bool:
+    """Whether the training that has just ended was the one without the effects that the trace named."""
+    kinds = [job.kind for job in children]
+    if "trace" not in kinds or kinds.count("training") > 1:
+        return False
+    trace = trace_row(session, str(children[kinds.index("trace")].outputs[0]["id"]))
+    last_dataset = next(job for job in reversed(children) if job.kind == "dataset")
+    return adds_effects(trace) and all(item["kind"] != "trace" for item in last_dataset.inputs)
+
+
+def _fraction(job: JobRow) -> float:
+    if job.state == "succeeded":
+        return 1.0
+    progress = Progress.model_validate(job.progress)
+    return min(1.0, max(0.0, progress.done / progress.total)) if progress.total > 0 else 0.0

@@ -1,0 +1,159 @@
+"""Traces and assessments: rows in, wire models out; born pending, filled in by the commit of their shard."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from schemas.assessment import Assessment
+from schemas.base import Artifact, Lineage, Page
+from schemas.trace import NAMED, Trace
+from storage.errors import Conflict, NotFound
+from storage.pages import page_of
+from storage.tables import AssessmentRow, FitRow, TraceRow, columns_of
+
+TWIN = "twin.npz"
+TRACKS = "tracks.npz"
+REPORT = "report.json"
+
+
+def get_trace(session: Session, trace_id: str) -> Trace:
+    """The trace, or NotFound."""
+    return _trace(trace_row(session, trace_id))
+
+
+def list_traces(
+    session: Session,
+    *,
+    limit: int = 50,
+    cursor: str | None = None,
+    state: str | None = None,
+    scene_id: str | None = None,
+    verdict: str | None = None,
+) -> Page[Trace]:
+    """Traces, newest first."""
+    statement = select(TraceRow)
+    for column, wanted in (
+        (TraceRow.state, state),
+        (TraceRow.scene_id, scene_id),
+        (TraceRow.verdict, verdict),
+    ):
+        if wanted is not None:
+            statement = statement.where(column == wanted)
+    return page_of(session, statement, (TraceRow.created_at, TraceRow.id), _trace, limit=limit, cursor=cursor)
+
+
+def mark_trace_ready(
+    session: Session,
+    trace_id: str,
+    verdict: str,
+    report: dict[str, Any],
+    artifacts: list[Artifact],
+    lineage: Lineage,
+) -> None:
+    """Fill in a pending trace. Raises Conflict when it is not pending."""
+    row = trace_row(session, trace_id)
+    if row.state != "pending":
+        raise Conflict(f"trace {trace_id} is {row.state}; only a pending trace can become ready")
+    row.state = "ready"
+    row.verdict = verdict
+    row.report = report
+    row.artifacts = [artifact.model_dump(mode="json") for artifact in artifacts]
+    row.lineage = lineage.model_dump(mode="json")
+    session.flush()
+
+
+def fail_trace(session: Session, trace_id: str) -> None:
+    """Mark a pending trace failed; a ready one stays as it is."""
+    row = trace_row(session, trace_id)
+    if row.state == "pending":
+        row.state = "failed"
+
+
+def trace_row(session: Session, trace_id: str) -> TraceRow:
+    """The row, or NotFound."""
+    row = session.get(TraceRow, trace_id)
+    if row is None:
+        raise NotFound("trace", trace_id)
+    return row
+
+
+def adds_effects(trace: Trace | TraceRow) -> bool:
+    """Whether the trace named an effect, so that its own twin is the better one."""
+    return trace.state == "ready" and trace.verdict == NAMED
+
+
+def fit_digest(fit: FitRow) -> str | None:
+    """The digest by which others refer to a fit: that of its twin."""
+    return _digest(fit.artifacts, TWIN)
+
+
+def trace_digest(trace: TraceRow) -> str | None:
+    """The digest by which others refer to a trace: that of its report."""
+    return _digest(trace.artifacts, REPORT)
+
+
+def get_assessment(session: Session, assessment_id: str) -> Assessment:
+    """The assessment, or NotFound."""
+    return _assessment(assessment_row(session, assessment_id))
+
+
+def list_assessments(
+    session: Session, name: str, version: int, *, limit: int = 50, cursor: str | None = None
+) -> Page[Assessment]:
+    """Assessments of a model version, newest first."""
+    statement = select(AssessmentRow).where(AssessmentRow.name == name, AssessmentRow.version == version)
+    keys = (AssessmentRow.created_at, AssessmentRow.id)
+    return page_of(session, statement, keys, _assessment, limit=limit, cursor=cursor)
+
+
+def mark_assessment_ready(
+    session: Session, assessment_id: str, figures: dict[str, Any], lineage: Lineage
+) -> AssessmentRow:
+    """Fill in a pending assessment. Raises Conflict when it is not pending."""
+    row = assessment_row(session, assessment_id)
+    if row.state != "pending":
+        raise Conflict(f"assessment {assessment_id} is {row.state}; only a pending one can become ready")
+    row.state = "ready"
+    row.figures = figures
+    row.lineage = lineage.model_dump(mode="json")
+    session.flush()
+    return row
+
+
+def fail_assessment(session: Session, assessment_id: str) -> None:
+    """Mark a pending assessment failed; a ready one stays as it is."""
+    row = assessment_row(session, assessment_id)
+    if row.state == "pending":
+        row.state = "failed"
+
+
+def assessment_row(session: Session, assessment_id: str) -> AssessmentRow:
+    """The row, or NotFound."""
+    row = session.get(AssessmentRow, assessment_id)
+    if row is None:
+        raise NotFound("assessment", assessment_id)
+    return row
+
+
+def _digest(artifacts: list[Any], name: str) -> str | None:
+    return next((str(item["sha256"]) for item in artifacts if item["name"] == name), None)
+
+
+def _trace(row: TraceRow) -> Trace:
+    columns = columns_of(row)
+    return Trace.model_validate({**columns.pop("report"), **columns})
+
+
+def _assessment(row: AssessmentRow) -> Assessment:
+    columns = columns_of(row)
+    links = {
+        "self": f"/v1/assessments/{row.id}",
+        "job": f"/v1/jobs/{row.job_id}",
+        "model": f"/v1/models/{row.name}/versions/{row.version}",
+    }
+    if row.trace_id is not None:
+        links["trace"] = f"/v1/traces/{row.trace_id}"
+    return Assessment.model_validate({**columns.pop("figures"), **columns, "links": links})
