@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.harness import Report
+from physworld.build import build_twin
 from physworld.calibrate import CalibrationConfig, FitResult, calibrate
 from physworld.calibrate.discretisation import converged_parameters
 from physworld.calibrate.least_squares import Solution, block_covariance, interval_factor
 from physworld.evaluate.numerics import refined
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Ground, Scene
-from physworld.twin import Twin, build_twin
+from physworld.twin import Twin
 from storage.scene_bundle import read_bundle
 
 SAMPLE = Path(__file__).resolve().parents[1] / "sample" / "soft_beam"

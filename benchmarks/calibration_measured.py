@@ -10,13 +10,13 @@ import numpy as np
 
 from benchmarks.calibration_known import MODULUS, kilo, searched_words, with_interval
 from benchmarks.harness import Report
+from physworld.build import build_twin
 from physworld.calibrate import CalibrationConfig, calibrate
 from physworld.calibrate.discretisation import converged_parameters
 from physworld.evaluate.metrics import track_error
 from physworld.evaluate.numerics import dominant_frequency
 from physworld.evaluate.table import held_out_table
 from physworld.scene import Scene
-from physworld.twin import build_twin
 from storage.scene_bundle import read_bundle
 
 CLEAN = ("d02", "d07")

@@ -14,10 +14,11 @@ import numpy as np
 import warp as wp
 
 from benchmarks.harness import Report, interleave, run_alone
+from physworld.build import build_twin
 from physworld.effects.base import Effect
 from physworld.effects.registry import EFFECTS, effect
 from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian
-from physworld.twin import Twin, build_twin
+from physworld.twin import Twin
 from workers.commands.effects import everyday_scenes
 
 PARTICLES = 2000

@@ -20,9 +20,10 @@ import taichi as ti
 import warp as wp
 
 from benchmarks.harness import Report, interleave, run_alone
+from physworld.build import build_twin
 from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian
 from physworld.scene import UNDEFORMED_AT_REST, Body, Scene
-from physworld.twin import Twin, build_twin
+from physworld.twin import Twin
 
 SIZE_M = np.array([0.25, 0.125, 0.125])
 MODULUS_PA, POISSON, DENSITY_KG_M3 = 1e5, 0.35, 1000.0

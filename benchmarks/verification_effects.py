@@ -15,11 +15,12 @@ from benchmarks.verification_cases import (
     ringing,
     run,
 )
+from physworld.build import build_twin
 from physworld.effects.registry import effect
 from physworld.materials.laws import RodLaw, SolidLaw
 from physworld.mpm.total_lagrangian import Problem, TotalLagrangian
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Scene
-from physworld.twin import Twin, build_twin
+from physworld.twin import Twin
 
 SIDE = 0.06
 DRAG_PER_S = 1.7

@@ -22,13 +22,13 @@ from scipy.sparse.linalg import splu
 from physworld.effects.base import Effect
 from physworld.effects.registry import effect, in_order
 from physworld.errors import EffectRefused
-from physworld.geometry.declared import grips_of
-from physworld.geometry.reference import ReferenceBody, reference_body
-from physworld.geometry.rigid import least_rotation, rigid_groups, rigid_motion
-from physworld.materials.laws import Law, RodLaw, SheetLaw, SolidLaw
+from physworld.geometry.reference import ReferenceBody
+from physworld.geometry.rigid import least_rotation, rigid_motion
+from physworld.integration import Integration, solver_knots
+from physworld.materials.laws import Law
 from physworld.materials.library import law_class
 from physworld.materials.plastic import PLASTICITIES, Plasticity
-from physworld.mpm.choose import FormulationName, choose_formulation
+from physworld.mpm.choose import FormulationName
 from physworld.mpm.colliders import Collider
 from physworld.mpm.contact import GroundContact, ground, touching
 from physworld.mpm.following import follow
@@ -36,41 +36,10 @@ from physworld.mpm.lattice import Lattice
 from physworld.mpm.terms import Term
 from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian
 from physworld.mpm.updated_lagrangian import UpdatedLagrangian
-from physworld.scene import AS_MEASURED, Grip, Scene
 
 Progress = Callable[[int, int], None]
 
-PRIOR_DENSITY_KG_M3 = 1000.0
-PRIOR_FRICTION = 0.5
-_RELEASE_SIGMAS = 10.0
-_RELEASE_SHARE = 2e-3  # motion below this share of the body's size is not a release
-_DRIVEN_SHARE = 5e-4  # controllers that moved this share of the body's size drive it
 _SMOOTHING = 1e-9  # against particle positions: felt only by what particles do not see
-_MERGE_S = 1e-6  # control and frame times closer than this are one
-
-
-@dataclass(frozen=True)
-class Integration:
-    """A run of a twin before it is run.
-
-    Attributes:
-        problem: what is integrated.
-        velocity: of the nodes at the first knot [m/s], (n, 3).
-        held: prescribed nodes at the knots.
-        knots: times at which the solver stops [s].
-        frame_index: each frame's place among the knots, (T,); -1 before the release.
-    """
-
-    problem: Problem
-    velocity: np.ndarray
-    held: HeldNodes
-    knots: np.ndarray
-    frame_index: np.ndarray
-
-    def at_frames(self, start: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-        """Carriers (T, n, 3) at the frames from those at the knots; before the release they are at ``start`` (n, 3)."""
-        held_back = np.repeat(start[None], int(np.sum(self.frame_index < 0)), axis=0)
-        return np.concatenate([held_back, nodes[self.frame_index[self.frame_index >= 0]]])
 
 
 @dataclass(frozen=True)
@@ -252,7 +221,7 @@ class Twin:
         from_rest: bool = False,
     ) -> Integration:
         """What :meth:`simulate_nodes` integrates, for whoever wants to integrate it otherwise: same arguments."""
-        knots, frame_index = _knots(control_times, frame_times, 0.0 if from_rest else self.release_s)
+        knots, frame_index = solver_knots(control_times, frame_times, 0.0 if from_rest else self.release_s)
         active = in_order(self.effects)
         for known in active:
             control_times, control_points = known.controls(control_times, control_points)
@@ -416,165 +385,6 @@ class Twin:
         positions = np.concatenate(paths, axis=1)
         velocities = np.gradient(positions, times, axis=0, edge_order=2 if len(times) > 2 else 1)
         return HeldNodes(np.concatenate(numbers), positions, velocities)
-
-
-def build_twin(
-    scene: Scene,
-    particle_budget: int = 2000,
-    device: str = "cpu",
-    refinement: float = 1.0,
-    plasticity: Plasticity | None = None,
-    formulation: str = "auto",
-) -> Twin:
-    """A twin of the scene with prior parameters, to be calibrated.
-
-    Args:
-        scene: the recording.
-        particle_budget: about how many particles a solid gets; rods and sheets take what their shape needs.
-        device: Warp device of the simulations.
-        refinement: cells are this many times smaller along every axis, whatever the body.
-        plasticity: flow law, or None.
-        formulation: "total_lagrangian", "updated_lagrangian", or "auto": by the law and the scene. The body's notes say
-            which was taken and why.
-
-    Raises:
-        SceneUnsupported: the scene declares too little for a body, or the formulation cannot hold it.
-    """
-    body = reference_body(scene, particle_budget, refinement)
-    choice = choose_formulation(body.lattice.dim, scene.kind, scene.declared, plasticity, formulation)
-    taken_form = f"{choice.formulation.replace('_', ' ')} form: {choice.reason}"
-    body = replace(body, notes=(*body.notes, taken_form))
-    _, controls = scene.control_track()
-    reach = 0.6 * float(np.ptp(body.start, axis=0).max())
-    grips = grips_of(scene)
-    if grips:
-        groups = tuple(np.array(g.controllers, dtype=int) for g in grips)
-    else:
-        groups = tuple(rigid_groups(controls, reach))
-    held, taken = [], np.empty(0, dtype=int)
-    for number, group in enumerate(groups):
-        region = grips[number] if grips else None
-        nodes = np.setdiff1d(_gripped_nodes(body, controls[0, group], region), taken)
-        held.append(nodes)
-        taken = np.concatenate([taken, nodes])
-    friction = scene.ground.friction if scene.ground is not None else None
-    return Twin(
-        body=body,
-        law=_prior_law(scene, body),
-        gravity_m_s2=np.asarray(scene.gravity_m_s2, dtype=float),
-        air_drag_per_s=0.0,
-        ground_height_m=scene.ground.height_m if scene.ground is not None else None,
-        ground_friction=PRIOR_FRICTION if friction is None else friction,
-        controller_groups=groups,
-        held_nodes=tuple(held),
-        controllers_start=controls[0],
-        release_s=_release_time(scene),
-        plasticity=plasticity,
-        formulation=choice.formulation,
-        device=device,
-    )
-
-
-def _prior_law(scene: Scene, body: ReferenceBody) -> Law:
-    facts, lattice = scene.body, body.lattice
-    measure = float(lattice.particle_measures.sum())
-    section = {3: 1.0, 2: body.thickness_m, 1: np.pi * body.thickness_m**2}[lattice.dim]
-    if facts.density_kg_m3 is not None:
-        density = facts.density_kg_m3 * section
-    elif facts.mass_kg is not None:
-        density = facts.mass_kg / measure
-    else:
-        density = PRIOR_DENSITY_KG_M3 * section
-    modulus = 1e5
-    if lattice.dim == 3:
-        return SolidLaw(youngs_modulus_pa=modulus, density_kg_m3=density)
-    if lattice.dim == 2:
-        membrane = modulus * section / (1 - 0.3**2)
-        return SheetLaw(membrane, membrane * section**2 / 12, density_kg_m2=density)
-    return RodLaw(stretching_n=density * 40.0**2, bending_n_m2=density * 1e-2, density_kg_m=density)
-
-
-def _gripped_nodes(body: ReferenceBody, controllers: np.ndarray, grip: Any) -> np.ndarray:
-    """Every node that gripped material touches: all nodes of cells most of whose particles are in the grip."""
-    lattice = body.lattice
-    particles = lattice.interpolation(lattice.particle_coordinates) @ body.start
-    slack = 1e-6
-    declared = grip is not None and grip.region_min_m is not None
-    if declared and lattice.dim == 3 and np.any(grip.region_max_m <= grip.region_min_m):
-        return _bonded_nodes(body, grip)
-    if declared:
-        low, high = np.asarray(grip.region_min_m) - slack, np.asarray(grip.region_max_m) + slack
-        margin = 0.5 * body.thickness_m if lattice.dim < 3 else 0.0
-        inside = np.all((particles >= low - margin) & (particles <= high + margin), axis=1)
-    else:
-        nearest = lattice.particle_coordinates[_nearest(particles, controllers)]
-        reach = 0.5 * lattice.spacing
-        low, high = nearest.min(axis=0) - reach, nearest.max(axis=0) + reach
-        coordinates = lattice.particle_coordinates
-        inside = np.all((coordinates >= low) & (coordinates <= high), axis=1)
-    solid = lattice.fill > 0
-    share = (inside.reshape(solid.shape) & solid).sum(axis=1) / np.maximum(solid.sum(axis=1), 1)
-    most = share > 0.5 if declared else share >= 0.5
-    cells = most if np.any(most) else share > 0
-    if not np.any(cells):
-        cells = np.zeros(len(lattice.cells), dtype=bool)
-        cells[np.unique(_nearest(particles, controllers) // lattice.fill.shape[1])] = True
-    return np.unique(lattice.cell_nodes[cells])
-
-
-def _bonded_nodes(body: ReferenceBody, grip: Grip) -> np.ndarray:
-    """The two layers of nodes whose splines fix an end face: of a grip without depth."""
-    axis = int(np.argmin(grip.region_max_m - grip.region_min_m))
-    lattice = body.lattice
-    distance = np.abs(lattice.node_coordinates[:, axis] - grip.region_min_m[axis]) / lattice.spacing[axis]
-    return np.flatnonzero(distance < 1.0)
-
-
-def _nearest(particles: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    return np.argmin(np.linalg.norm(targets[:, None] - particles[None], axis=2), axis=1)
-
-
-def _release_time(scene: Scene) -> float:
-    """When a body that is held by nobody known starts to move [s]; 0 where it moves from the start.
-
-    A body that neither moves nor is moved stays where it is in any case, so holding it changes nothing; one that
-    starts out of balance (kept level by a hand, say) falls only when it is let go.
-    """
-    if scene.initial_state != AS_MEASURED:
-        return 0.0
-    first = np.concatenate([scene.points[0][scene.visible[0]], scene.controllers[0]])
-    size = float(np.ptp(first, axis=0).max())
-    limit = max(_RELEASE_SIGMAS * (scene.noise_sigma_m or 0.0), _RELEASE_SHARE * size)
-    moved = np.linalg.norm(scene.points - scene.points[0], axis=2)
-    seen = np.where(scene.visible & scene.visible[0], moved, np.nan)
-    usable = ~np.isnan(seen).all(axis=1)
-    moved = np.zeros(len(seen), dtype=bool)
-    moved[usable] = (
-        np.nanmedian(seen[usable], axis=1) > limit
-    )  # one point's jump is a tracker's, not a release
-    driven = (
-        np.linalg.norm(scene.controllers - scene.controllers[0], axis=2).max(axis=1, initial=0.0)
-        > _DRIVEN_SHARE * size
-    )
-    released = int(np.argmax(moved)) if moved.any() else 0
-    if released >= scene.train[1] or driven[: released + 1].any():
-        return 0.0
-    return float(scene.times[max(released - 1, 0)])
-
-
-def _knots(
-    control_times: np.ndarray, frame_times: np.ndarray, release: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Times at which the solver stops, and each frame's place among them (-1 before the release)."""
-    start = max(float(frame_times[0]), release)
-    inner = control_times[(control_times > start) & (control_times < frame_times[-1])]
-    knots = np.unique(np.concatenate([[start], inner, frame_times[frame_times >= start]]))
-    keep = np.concatenate([[True], np.diff(knots) > _MERGE_S])
-    knots = knots[keep]
-    if len(knots) < 2:
-        knots = np.array([start, start + 1e-3])
-    index = np.clip(np.searchsorted(knots, frame_times + _MERGE_S, side="right") - 1, 0, len(knots) - 1)
-    return knots, np.where(frame_times < start - _MERGE_S, -1, index)
 
 
 def _apply(matrix: Any, nodes: np.ndarray) -> np.ndarray:

@@ -23,6 +23,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from physworld.build import build_twin
 from physworld.calibrate.estimates import (
     UNIDENTIFIED_HALF_WIDTH,
     Correlations,
@@ -37,7 +38,7 @@ from physworld.calibrate.parameters import Parameter, parameters_of
 from physworld.calibrate.search import Optimum, Progress, Search
 from physworld.materials.library import with_law
 from physworld.scene import Scene
-from physworld.twin import Twin, build_twin
+from physworld.twin import Twin
 
 _LEAST_SCREENED = (
     0.1  # share of the gain that it needs which a parameter must show to first order to be tried

@@ -19,10 +19,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from physworld.build import build_twin
 from physworld.mpm.energy import EnergyLedger, run_with_ledger, without_friction
 from physworld.mpm.total_lagrangian import TotalLagrangian
 from physworld.scene import Scene
-from physworld.twin import Twin, build_twin
+from physworld.twin import Twin
 
 REFINEMENT = 1.5  # cells of the finer lattice are this many times smaller
 _STILL = 1e-3  # a free run whose points move less than this share of the body's size is kicked

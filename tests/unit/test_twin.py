@@ -10,9 +10,10 @@ import pytest
 from made_scene import FPS, box_body, made_scene
 from scipy.spatial.transform import Rotation
 
+from physworld.build import build_twin
 from physworld.materials.library import with_law
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Ground, Scene
-from physworld.twin import Twin, build_twin
+from physworld.twin import Twin
 
 SAME_RUN = 1e-12  # [m] two runs of the same numbers
 SAME_MOTION = 1e-8  # [m] the same numbers by another way

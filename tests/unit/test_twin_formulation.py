@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from tiny_scene import tiny_scene
 
+from physworld.build import build_twin
 from physworld.effects.registry import effect
 from physworld.errors import SceneUnsupported
 from physworld.materials.plastic import DruckerPrager, VonMises
 from physworld.scene import Body, Ground
-from physworld.twin import Twin, build_twin
+from physworld.twin import Twin
 
 BUDGET = 300
 

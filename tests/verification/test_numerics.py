@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from made_scene import box_body, made_scene
 
+from physworld.build import build_twin
 from physworld.evaluate.numerics import dominant_frequency, free_swing, measure_numerics, refined
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
-from physworld.twin import build_twin
 
 LOW, HIGH = np.array([0.0, -0.015, -0.015]), np.array([0.15, 0.015, 0.015])
 FRAMES = 45

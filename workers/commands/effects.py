@@ -41,7 +41,7 @@ def _list(given: argparse.Namespace) -> None:
     import warp as wp
 
     wp.config.quiet = True  # before the first import that starts it
-    from physworld.twin import build_twin
+    from physworld.build import build_twin
     from workers.commands.terminal import read_scene
 
     scenes = everyday_scenes() if given.scene is None else {"scene": read_scene(given.scene)}

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from benchmarks.calibration_known import BAR_PA, SIGMA_M, bar, linear_draw, predicted
+from physworld.build import build_twin
 from physworld.calibrate.discretisation import converged_parameters
 from physworld.calibrate.estimates import Correlations, Estimate
 from physworld.calibrate.global_stage import FitResult
 from physworld.calibrate.least_squares import Solution, block_covariance, correlations
 from physworld.calibrate.parameters import parameters_of
 from physworld.evaluate.numerics import refined
-from physworld.twin import build_twin
 
 DRAWS, COVERED = 100, 90
 BUDGET = 500  # particles of the coarse twin

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from made_scene import box_body, made_scene, recorded_by
 
+from physworld.build import build_twin
 from physworld.calibrate import CalibrationConfig, calibrate
 from physworld.errors import CalibrationError, Cancelled, SceneUnsupported
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
-from physworld.twin import Twin, build_twin
+from physworld.twin import Twin
 
 FRAMES, FPS = 40, 30.0
 SIGMA_M = 2e-4

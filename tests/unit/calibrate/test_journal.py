@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from made_scene import box_body, made_scene, recorded_by
 
+from physworld.build import build_twin
 from physworld.calibrate import CalibrationConfig, Journal, calibrate
 from physworld.errors import Cancelled
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
-from physworld.twin import build_twin
 
 CONFIG = CalibrationConfig(particle_budget=60, max_simulations=60)
 LOW, HIGH = np.array([0.0, -0.015, -0.015]), np.array([0.12, 0.015, 0.015])

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 from made_scene import box_body, made_scene, recorded_by
 
+from physworld.build import build_twin
 from physworld.scene import UNDEFORMED_AT_REST, Grip
-from physworld.twin import Twin, build_twin
+from physworld.twin import Twin
 from storage.scene_bundle import write_bundle
 from workers.commands import fit
 

@@ -13,7 +13,7 @@ import pytest
 from safetensors.numpy import load
 from tiny_scene import register, tiny_scene
 
-from physworld.twin import build_twin
+from physworld.build import build_twin
 from physworld.worldmodel import PublishedModel
 from schemas.dataset import DatasetConfig
 from schemas.fit import FitConfig

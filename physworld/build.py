@@ -1,0 +1,127 @@
+"""Makes a twin of a scene: its body, its grips, its formulation, and prior parameters that a calibration changes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from physworld.geometry.declared import grips_of
+from physworld.geometry.reference import ReferenceBody, reference_body
+from physworld.geometry.rigid import rigid_groups
+from physworld.grips import gripped_nodes
+from physworld.materials.laws import Law, RodLaw, SheetLaw, SolidLaw
+from physworld.materials.plastic import Plasticity
+from physworld.mpm.choose import choose_formulation
+from physworld.scene import AS_MEASURED, Scene
+from physworld.twin import Twin
+
+PRIOR_DENSITY_KG_M3 = 1000.0
+PRIOR_FRICTION = 0.5
+_RELEASE_SIGMAS = 10.0
+_RELEASE_SHARE = 2e-3  # motion below this share of the body's size is not a release
+_DRIVEN_SHARE = 5e-4  # controllers that moved this share of the body's size drive it
+
+
+def build_twin(
+    scene: Scene,
+    particle_budget: int = 2000,
+    device: str = "cpu",
+    refinement: float = 1.0,
+    plasticity: Plasticity | None = None,
+    formulation: str = "auto",
+) -> Twin:
+    """A twin of the scene with prior parameters, to be calibrated.
+
+    Args:
+        scene: the recording.
+        particle_budget: about how many particles a solid gets; rods and sheets take what their shape needs.
+        device: Warp device of the simulations.
+        refinement: cells are this many times smaller along every axis, whatever the body.
+        plasticity: flow law, or None.
+        formulation: "total_lagrangian", "updated_lagrangian", or "auto": by the law and the scene. The body's notes say
+            which was taken and why.
+
+    Raises:
+        SceneUnsupported: the scene declares too little for a body, or the formulation cannot hold it.
+    """
+    body = reference_body(scene, particle_budget, refinement)
+    choice = choose_formulation(body.lattice.dim, scene.kind, scene.declared, plasticity, formulation)
+    taken_form = f"{choice.formulation.replace('_', ' ')} form: {choice.reason}"
+    body = replace(body, notes=(*body.notes, taken_form))
+    _, controls = scene.control_track()
+    reach = 0.6 * float(np.ptp(body.start, axis=0).max())
+    grips = grips_of(scene)
+    if grips:
+        groups = tuple(np.array(g.controllers, dtype=int) for g in grips)
+    else:
+        groups = tuple(rigid_groups(controls, reach))
+    held, taken = [], np.empty(0, dtype=int)
+    for number, group in enumerate(groups):
+        region = grips[number] if grips else None
+        nodes = np.setdiff1d(gripped_nodes(body, controls[0, group], region), taken)
+        held.append(nodes)
+        taken = np.concatenate([taken, nodes])
+    friction = scene.ground.friction if scene.ground is not None else None
+    return Twin(
+        body=body,
+        law=_prior_law(scene, body),
+        gravity_m_s2=np.asarray(scene.gravity_m_s2, dtype=float),
+        air_drag_per_s=0.0,
+        ground_height_m=scene.ground.height_m if scene.ground is not None else None,
+        ground_friction=PRIOR_FRICTION if friction is None else friction,
+        controller_groups=groups,
+        held_nodes=tuple(held),
+        controllers_start=controls[0],
+        release_s=_release_time(scene),
+        plasticity=plasticity,
+        formulation=choice.formulation,
+        device=device,
+    )
+
+
+def _prior_law(scene: Scene, body: ReferenceBody) -> Law:
+    facts, lattice = scene.body, body.lattice
+    measure = float(lattice.particle_measures.sum())
+    section = {3: 1.0, 2: body.thickness_m, 1: np.pi * body.thickness_m**2}[lattice.dim]
+    if facts.density_kg_m3 is not None:
+        density = facts.density_kg_m3 * section
+    elif facts.mass_kg is not None:
+        density = facts.mass_kg / measure
+    else:
+        density = PRIOR_DENSITY_KG_M3 * section
+    modulus = 1e5
+    if lattice.dim == 3:
+        return SolidLaw(youngs_modulus_pa=modulus, density_kg_m3=density)
+    if lattice.dim == 2:
+        membrane = modulus * section / (1 - 0.3**2)
+        return SheetLaw(membrane, membrane * section**2 / 12, density_kg_m2=density)
+    return RodLaw(stretching_n=density * 40.0**2, bending_n_m2=density * 1e-2, density_kg_m=density)
+
+
+def _release_time(scene: Scene) -> float:
+    """When a body that is held by nobody known starts to move [s]; 0 where it moves from the start.
+
+    A body that neither moves nor is moved stays where it is in any case, so holding it changes nothing; one that
+    starts out of balance (kept level by a hand, say) falls only when it is let go.
+    """
+    if scene.initial_state != AS_MEASURED:
+        return 0.0
+    first = np.concatenate([scene.points[0][scene.visible[0]], scene.controllers[0]])
+    size = float(np.ptp(first, axis=0).max())
+    limit = max(_RELEASE_SIGMAS * (scene.noise_sigma_m or 0.0), _RELEASE_SHARE * size)
+    moved = np.linalg.norm(scene.points - scene.points[0], axis=2)
+    seen = np.where(scene.visible & scene.visible[0], moved, np.nan)
+    usable = ~np.isnan(seen).all(axis=1)
+    moved = np.zeros(len(seen), dtype=bool)
+    moved[usable] = (
+        np.nanmedian(seen[usable], axis=1) > limit
+    )  # one point's jump is a tracker's, not a release
+    driven = (
+        np.linalg.norm(scene.controllers - scene.controllers[0], axis=2).max(axis=1, initial=0.0)
+        > _DRIVEN_SHARE * size
+    )
+    released = int(np.argmax(moved)) if moved.any() else 0
+    if released >= scene.train[1] or driven[: released + 1].any():
+        return 0.0
+    return float(scene.times[max(released - 1, 0)])
