@@ -4,9 +4,9 @@
     g2p   v = sum w v_i   C = sum w v_i (x_i - x)^T D^-1    D = dx^2 / 4           APIC, Jiang et al. 2015
 
 The grid is a flat box of nodes (momentum, mass), four floats each, z fastest. The three nodes of a row are twelve
-neighbouring floats: on a CPU a vector of eight and one of four take a row, and a transfer is nine rows. On CUDA
-one thread loops over the 27 nodes and adds atomically. Cell c spans [c, c + 1] dx from the grid's origin, its node
-sits in the middle (:mod:`physworld.mpm.bspline`).
+neighbouring floats: on a CPU a vector of eight and one of four take a row, and a transfer is nine rows; a thread takes
+``group`` particles in turn. On CUDA one thread loops over the 27 nodes and adds atomically. Cell c spans [c, c + 1] dx
+from the grid's origin, its node sits in the middle (:mod:`physworld.mpm.bspline`).
 
 Positions are double precision (small increments of a slow motion would be rounded away), velocities and the
 grid single.
@@ -27,13 +27,14 @@ RIM, ESCAPED, NOT_FINITE, INVERTED = (
 )  # places in ``flags``; ``extremes[0]``: cells crossed in a substep
 
 _LOCATE = r"""
+    for (int p = group * turn; p < group * (turn + 1) && p < count; ++p) {
     const int n0 = box.data[3], n1 = box.data[4], n2 = box.data[5], rim = box.data[6];
     int b[3];
     float w[3][3], d[3][3];
-    bool inside = true, near = false;
+    bool inside = true, near = false, finite = true;
     for (int j = 0; j < 3; ++j) {
         const double s = (x.data[3 * p + j] - origin[j]) * (double)inv_dx[j];
-        if (!(s > -1.0e9 && s < 1.0e9)) { flags.data[2] = 1; return; }
+        if (!(s > -1.0e9 && s < 1.0e9)) { flags.data[2] = 1; finite = false; break; }
         int cell = (int)s;
         cell -= s < (double)cell;
         const float t = (float)(s - (double)cell);
@@ -45,7 +46,8 @@ _LOCATE = r"""
         inside = inside && b[j] >= 0 && b[j] + 2 < box.data[3 + j];
         near = near || b[j] < rim || b[j] + 2 >= box.data[3 + j] - rim;
     }
-    if (!inside) { flags.data[1] = 1; return; }
+    if (!finite) continue;
+    if (!inside) { flags.data[1] = 1; continue; }
 """
 
 _ROW = r"""
@@ -113,6 +115,7 @@ _SCATTER = (
     spread(Q, V4{mv[0], mv[1], mv[2], m}, grid);
     if (split) spread(S, V4{}, push);
 #endif
+    }
 """
 )
 
@@ -218,13 +221,16 @@ _GATHER = (
 #else
     if (most > extremes.data[0]) extremes.data[0] = most;
 #endif
+    }
 """
 )
 
 
 @wp.func_native(_SCATTER)
 def _scatter(
-    p: int,
+    turn: int,
+    group: int,
+    count: int,
     # model
     mass: wp.array(dtype=wp.float32),
     origin: wp.vec3d,
@@ -247,7 +253,9 @@ def _scatter(
 
 @wp.func_native(_GATHER)
 def _gather(
-    p: int,
+    turn: int,
+    group: int,
+    count: int,
     # model
     origin: wp.vec3d,
     inv_dx: wp.vec3f,
@@ -274,6 +282,8 @@ def _gather(
 
 @wp.kernel(enable_backward=False)
 def particles_to_grid(
+    group: int,
+    count: int,
     # model
     mass: wp.array(dtype=wp.float32),
     origin: wp.vec3d,
@@ -297,11 +307,31 @@ def particles_to_grid(
     ``stress`` is volume times Kirchhoff stress [J], (6P,) in the order xx yy zz yz xz xy. With ``split`` what the
     stress gives goes to ``impulse`` instead, so that the velocity before forces is known.
     """
-    _scatter(wp.tid(), mass, origin, inv_dx, dx, split, clock, box, x, v, C, stress, momentum, impulse, flags)
+    _scatter(
+        wp.tid(),
+        group,
+        count,
+        mass,
+        origin,
+        inv_dx,
+        dx,
+        split,
+        clock,
+        box,
+        x,
+        v,
+        C,
+        stress,
+        momentum,
+        impulse,
+        flags,
+    )
 
 
 @wp.kernel(enable_backward=False)
 def grid_to_particles(
+    group: int,
+    count: int,
     # model
     origin: wp.vec3d,
     inv_dx: wp.vec3f,
@@ -331,6 +361,6 @@ def grid_to_particles(
     2021, section 4).
     """
     _gather(
-        wp.tid(), origin, inv_dx, dx, split, adjustment, separating, clear, clock, box,
+        wp.tid(), group, count, origin, inv_dx, dx, split, adjustment, separating, clear, clock, box,
         velocity, velocity_old, ratio, x, v, C, flags, extremes,
     )  # fmt: skip

@@ -48,6 +48,7 @@ _SAFETY = 0.45  # share of the limit that is used: dt = 0.4 dx / c
 _CROSSING = 0.4  # share of a cell that the fastest particle may be expected to cross in a substep
 _GRAIN_SHARE = 0.99  # of a velocity that the grid does not see, kept a substep (Fei et al. 2021)
 _OPENING = 0.999  # elastic volume ratio of grains above which ASFLIP lets them part
+_GROUP = 32  # particles that a thread takes in turn on a CPU: what a thread costs is shared
 _INSTANT = 1e-12  # [s], in which the first stress is found
 _SMOOTHING = 1e-9  # of fitted nodes: felt only by what particles do not see
 _AXES = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
@@ -331,6 +332,8 @@ class ParticleRun:
         engine, q, box = self.engine, self.particles, self.box.device_box
         problem, transfer, grid = engine.problem, engine.transfer, engine.grid
         ground, count, split = engine.ground, len(engine.solid), int(transfer.split)
+        group = 1 if wp.get_device(self.device).is_cuda else _GROUP
+        groups = -(-count // group)
         origin, inverse = wp.vec3d(*grid.origin), 1.0 / grid.spacing
         clear = -np.inf if ground is None else ground.height_m + grid.spacing[2]
         space = [wp.vec3f(*inverse), wp.vec3f(*grid.spacing)]
@@ -339,8 +342,8 @@ class ParticleRun:
             wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
         launch(
-            particles_to_grid, count,
-            [self.mass, origin, *space, split, self.clock, box, q.x, q.v, q.C, q.stress],
+            particles_to_grid, groups,
+            [group, count, self.mass, origin, *space, split, self.clock, box, q.x, q.v, q.C, q.stress],
             [self.momentum, self.impulse, self.flags],
         )  # fmt: skip
         if self.gripped:
@@ -370,8 +373,8 @@ class ParticleRun:
         )  # fmt: skip
         sharing = [split, engine.velocity_share, engine.separating_volume, wp.float64(clear)]
         launch(
-            grid_to_particles, count,
-            [origin, *space, *sharing, self.clock, box, self.velocity, self.velocity_old,
+            grid_to_particles, groups,
+            [group, count, origin, *space, *sharing, self.clock, box, self.velocity, self.velocity_old,
              self.stress.ratio, q.x, q.v, q.C],
             [self.flags, self.extremes],
         )  # fmt: skip

@@ -1,0 +1,37 @@
+"""The particle kernels' CUDA text compiles (no GPU is needed for that)."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+import warp as wp
+
+from physworld.materials.plastic import PLASTICITIES
+from physworld.materials.solid import SolidLaw
+from physworld.mpm.elastic_stress_kernels import elastic_stress
+from physworld.mpm.hencky_kernels import plastic_kernel
+
+
+def compiled(module: object, folder: Path) -> bool:
+    wp.compile_aot_module(module, arch=80, module_dir=str(folder), use_ptx=True)
+    return bool(list(folder.glob("*.ptx")))
+
+
+@pytest.mark.parametrize("name", ["transfer_kernels", "grid_kernels"])
+def test_the_transfers_compile_for_cuda(name: str, tmp_path: Path) -> None:
+    wp.init()
+    assert compiled(import_module(f"physworld.mpm.{name}"), tmp_path)
+
+
+def test_the_stresses_compile_for_cuda(tmp_path: Path) -> None:
+    wp.init()
+    law = SolidLaw(1e5)
+    assert compiled(elastic_stress(law.stress, len(law.moduli)).module, tmp_path)
+
+
+@pytest.mark.parametrize("name", sorted(PLASTICITIES))
+def test_the_return_mappings_compile_for_cuda(name: str, tmp_path: Path) -> None:
+    wp.init()
+    assert compiled(plastic_kernel(PLASTICITIES[name].project).module, tmp_path)
