@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 from storage.artifacts import ArtifactStore
 from storage.database import Database
 from storage.episodes import EpisodeStore
+from storage.scratch import ScratchStore
 from storage.settings import Settings
 
 Value = TypeVar("Value")
@@ -19,7 +20,7 @@ class Stores:
     """Database, artifacts and episodes of one installation.
 
     Attributes:
-        settings, database, artifacts, episodes: the opened stores.
+        settings, database, artifacts, episodes, scratch: the opened stores.
     """
 
     def __init__(self, settings: Settings, database: Database) -> None:
@@ -27,6 +28,7 @@ class Stores:
         self.database = database
         self.artifacts = ArtifactStore(settings)
         self.episodes = EpisodeStore(settings)
+        self.scratch = ScratchStore(settings)
         self._cache: OrderedDict[Hashable, Any] = OrderedDict()
 
     def cached(self, key: Hashable, make: Callable[[], Value]) -> Value:

@@ -24,7 +24,7 @@ from workers.errors import DatasetIncomplete, NotEnoughDisk
 from workers.lineage import lineage_of
 from workers.registry import HandlerResult
 from workers.stores import Stores
-from workers.tasks.inputs import fit_reference, scene_of, scene_reference, twin_of
+from workers.tasks.inputs import made_from, scene_of, twin_of
 
 ATTEMPTS = 5
 FLOAT_BYTES = 4
@@ -38,7 +38,7 @@ def plan(context: TaskContext, stores: Stores) -> HandlerResult:
     payload = context.lease.payload
     config = DatasetConfig.model_validate(payload["config"])
     scene = scene_of(stores, payload["scene_id"])
-    twin = twin_of(stores, payload["fit_id"])
+    twin = twin_of(stores, payload["fit_id"], payload.get("trace_id"))
     frames = episode_frames(scene, _demonstration(config))
     particles, controllers = len(twin.particles_rest), scene.controllers.shape[1]
     per_frame = 3 * FLOAT_BYTES * (particles + controllers) + 8
@@ -56,7 +56,7 @@ def episode(context: TaskContext, stores: Stores) -> HandlerResult:
     config = DatasetConfig.model_validate(payload["config"])
     index = int(payload["index"])
     scene = scene_of(stores, payload["scene_id"])
-    twin = twin_of(stores, payload["fit_id"])
+    twin = twin_of(stores, payload["fit_id"], payload.get("trace_id"))
 
     def progress(done: int, total: int) -> None:
         context.check()
@@ -106,7 +106,7 @@ def seal(context: TaskContext, stores: Stores) -> HandlerResult:
     manifest = stores.episodes.write_manifest(dataset_id, episodes)
     context.check()
     stores.episodes.remove_orphans(dataset_id, [committed.path for committed in episodes])
-    inputs = [scene_reference(stores, payload["scene_id"]), fit_reference(stores, payload["fit_id"])]
+    inputs = made_from(stores, payload)
     result = {
         "digest": manifest.sha256,
         "statistics": _statistics(episodes),

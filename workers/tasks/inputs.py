@@ -10,7 +10,7 @@ import numpy as np
 
 from physworld.scene import Scene
 from schemas.base import Artifact, Reference
-from storage import resources
+from storage import resources, traces
 from storage.errors import Conflict, NotFound
 from storage.scene_bundle import bundle_from_bytes
 from workers.stores import Stores
@@ -26,9 +26,9 @@ def scene_of(stores: Stores, scene_id: str) -> Scene:
     return stores.cached(("scene", scene_id), lambda: _read_scene(stores, scene_id))
 
 
-def twin_of(stores: Stores, fit_id: str) -> Twin:
-    """The calibrated twin of a ready fit. Raises NotFound, Conflict."""
-    return stores.cached(("twin", fit_id), lambda: _read_twin(stores, fit_id))
+def twin_of(stores: Stores, fit_id: str, trace_id: str | None = None) -> Twin:
+    """The calibrated twin of a ready fit, or of the trace where that named an effect. Raises NotFound, Conflict."""
+    return stores.cached(("twin", fit_id, trace_id), lambda: _read_twin(stores, fit_id, trace_id))
 
 
 def scene_reference(stores: Stores, scene_id: str) -> Reference:
@@ -43,6 +43,22 @@ def fit_reference(stores: Stores, fit_id: str) -> Reference:
         artifacts = resources.get_fit(session, fit_id).artifacts
     digests = {artifact.name: artifact.sha256 for artifact in artifacts}
     return Reference(kind="fit", id=fit_id, digest=digests.get(TWIN))
+
+
+def trace_reference(stores: Stores, trace_id: str) -> Reference:
+    """The trace as an input in a lineage; its digest is its report's."""
+    with stores.database.reading() as session:
+        artifacts = traces.get_trace(session, trace_id).artifacts
+    digests = {artifact.name: artifact.sha256 for artifact in artifacts}
+    return Reference(kind="trace", id=trace_id, digest=digests.get(traces.REPORT))
+
+
+def made_from(stores: Stores, payload: dict[str, Any]) -> list[Reference]:
+    """Scene, fit and trace of a payload as inputs in a lineage."""
+    found = [scene_reference(stores, payload["scene_id"]), fit_reference(stores, payload["fit_id"])]
+    if payload.get("trace_id") is not None:
+        found.append(trace_reference(stores, payload["trace_id"]))
+    return found
 
 
 def npz_bytes(arrays: Mapping[str, Any]) -> bytes:
@@ -73,12 +89,14 @@ def _read_scene(stores: Stores, scene_id: str) -> Scene:
     return scene
 
 
-def _read_twin(stores: Stores, fit_id: str) -> Twin:
+def _read_twin(stores: Stores, fit_id: str, trace_id: str | None) -> Twin:
     from physworld.twin import Twin
 
     with stores.database.reading() as session:
         fit = resources.get_fit(session, fit_id)
+        trace = None if trace_id is None else traces.get_trace(session, trace_id)
     if fit.state != "ready":
         raise Conflict(f"fit {fit_id} is {fit.state}; its twin exists once it is ready")
-    data = stores.artifacts.read_bytes(named(fit.artifacts, TWIN, fit_id).sha256)
+    owner = trace if trace is not None and traces.adds_effects(trace) else fit
+    data = stores.artifacts.read_bytes(named(owner.artifacts, TWIN, owner.id).sha256)
     return Twin.from_arrays(npz_arrays(data), stores.settings.device)

@@ -1,0 +1,149 @@
+"""A trace in real handlers: its simulations as helper shards, what it leaves, going on after a kill, and a cancel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+
+import numpy as np
+import pytest
+
+from physworld.trace import Memory
+from physworld.twin import Twin
+from schemas.dataset import DatasetConfig
+from schemas.fit import FitConfig
+from schemas.job import Job
+from schemas.trace import Trace, TraceConfig, TraceCreate
+from storage import helpers, jobs, leases, resources, traces
+from storage.tables import ShardRow, TraceRow
+from workers.execute import Runtime, run_shard
+from workers.stores import Stores
+from workers.tasks import trace as task
+from workers.tasks.inputs import named, npz_arrays, npz_bytes, twin_of
+
+SMALL = TraceConfig(candidates=["air_drag_linear"], confirmed=1, iterations=1, resamples=100)
+FIT = FitConfig(particle_budget=60, max_simulations=2, damping="none")
+
+
+def _open(stores: Stores, scene_id: str) -> Job:
+    with stores.database.session() as session:
+        return jobs.create_trace(session, TraceCreate(scene_id=scene_id, fit=FIT, config=SMALL))
+
+
+def _waiting(stores: Stores) -> list[str]:
+    with stores.database.reading() as session:
+        return [found.shard_id for found in leases.publishable(session, datetime.now(UTC))]
+
+
+def _job(stores: Stores, job: Job) -> Job:
+    with stores.database.reading() as session:
+        return jobs.get_job(session, job.id)
+
+
+def _trace(stores: Stores, job: Job) -> Trace:
+    with stores.database.reading() as session:
+        return traces.get_trace(session, job.outputs[0].id)
+
+
+def _shards(stores: Stores, job: Job) -> list[ShardRow]:
+    with stores.database.reading() as session:
+        return session.query(ShardRow).where(ShardRow.job_id == job.id).all()
+
+
+def test_a_trace_reports_shares_its_simulations_and_tidies_up(
+    runtime_with: Callable[..., Runtime], stores: Stores, scene_id: str
+) -> None:
+    job = _open(stores, scene_id)
+    (driver,) = _waiting(stores)
+    assert run_shard(runtime_with(), driver) == "done"
+    assert _job(stores, job).state == "succeeded"
+    trace = _trace(stores, job)
+    assert trace.state == "ready" and trace.verdict is not None and trace.scene == "tiny bar"
+    assert trace.held_out is not None and trace.held_out["before"] > 0
+    data = stores.artifacts.read_bytes(named(trace.artifacts, "tracks.npz", trace.id).sha256)
+    tracks = npz_arrays(data)
+    assert tracks["before"].shape == tracks["after"].shape == (len(tracks["times"]), 4, 3)
+    helped = [shard for shard in _shards(stores, job) if shard.kind == helpers.SIMULATION]
+    assert len(helped) > 3 and {shard.state for shard in helped} == {"DONE"}
+    assert trace.simulations is not None and trace.simulations >= len(helped)
+    assert stores.scratch.jobs() == []
+
+
+def test_a_killed_trace_goes_on_without_repeating_simulations(
+    runtime_with: Callable[..., Runtime], stores: Stores, scene_id: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = _open(stores, scene_id)
+    (driver,) = _waiting(stores)
+    keys: list[str] = []
+    put = task.SharedMemory.put
+
+    class Killed(BaseException):
+        pass
+
+    def dying(self: Memory, key: str, tracks: np.ndarray | None) -> None:
+        put(self, key, tracks)
+        keys.append(key)
+        if len(set(keys)) == 5:
+            raise Killed
+
+    monkeypatch.setattr(task.SharedMemory, "put", dying)
+    with pytest.raises(Killed):
+        run_shard(runtime_with(), driver)
+    assert stores.scratch.jobs() == [job.id]
+    before = set(keys)
+    keys.clear()
+    monkeypatch.setattr(
+        task.SharedMemory, "put", lambda self, key, tracks: (keys.append(key), put(self, key, tracks))
+    )
+    with stores.database.session() as session:
+        leases.reap(session, datetime.now(UTC) + timedelta(minutes=5))
+    assert run_shard(runtime_with(), driver) == "done"
+    assert not before & set(keys), "a simulation was run again"
+    assert _trace(stores, job).state == "ready"
+    assert {s.state for s in _shards(stores, job)} <= {"DONE", "CANCELLED"}
+
+
+def test_a_cancelled_trace_stops_at_its_next_simulation(
+    runtime_with: Callable[..., Runtime], stores: Stores, scene_id: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = _open(stores, scene_id)
+    (driver,) = _waiting(stores)
+    put_up = helpers.put_up
+
+    def cancelled_meanwhile(*arguments: object) -> list[str]:
+        shards = put_up(*arguments)  # type: ignore[arg-type]
+        jobs.cancel_job(arguments[0], job.id)  # type: ignore[arg-type]
+        return shards
+
+    monkeypatch.setattr(helpers, "put_up", cancelled_meanwhile)
+    assert run_shard(runtime_with(), driver) == "cancelled"
+    assert _job(stores, job).state == "cancelled"
+    assert _trace(stores, job).state == "failed"
+    assert {s.state for s in _shards(stores, job)} == {"CANCELLED"}
+    assert stores.scratch.jobs() == []
+
+
+def test_a_dataset_comes_from_the_twin_with_the_named_effect(
+    runtime_with: Callable[..., Runtime], stores: Stores, scene_id: str
+) -> None:
+    from physworld.effects.registry import effect
+
+    with stores.database.session() as session:
+        made = jobs.create_fit(session, scene_id, FIT)
+    run_shard(runtime_with(), _waiting(stores)[0])
+    fit_id = made.outputs[0].id
+    with_drag = twin_of(stores, fit_id).with_effect(effect("air_drag_linear", rate_per_s=1.5))
+    artifact = stores.artifacts.put_bytes(npz_bytes(with_drag.to_arrays()), "twin.npz")
+    job = _open(stores, scene_id)
+    trace_id = job.outputs[0].id
+    for verdict, effects in (("named", 1), ("equivalent_set", 0)):
+        with stores.database.session() as session:
+            row = session.get_one(TraceRow, trace_id)
+            row.state, row.verdict, row.artifacts = "ready", verdict, [artifact.model_dump()]
+        fresh = Stores(stores.settings, stores.database)
+        twin: Twin = twin_of(fresh, fit_id, trace_id)
+        assert len(twin.effects) == effects
+    with stores.database.session() as session:
+        opened = jobs.create_dataset(session, fit_id, DatasetConfig(episodes=1), trace_id)
+        assert [item.kind for item in opened.inputs] == ["fit", "trace"]
+        assert resources.get_dataset(session, opened.outputs[0].id).trace_id == trace_id

@@ -1,0 +1,39 @@
+"""What a trace leaves behind on the service: the report and its files.
+
+Files: ``report.json`` (:func:`physworld.trace.document`), ``tracks.npz`` (``times`` (T,) f8 [s], ``before`` and
+``after`` (T, N, 3) f8 [m]: open loop from frame 0 without and with the effects, each calibrated on the training
+frames), and, where the verdict is ``named``, ``twin.npz``: the twin that carries the effects (``Twin.to_arrays``).
+"""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+from physworld.trace import document
+from schemas.trace import NAMED
+from storage.traces import REPORT, TRACKS, TWIN
+from workers.tasks.inputs import npz_bytes
+
+if TYPE_CHECKING:
+    from physworld.scene import Scene
+    from physworld.trace import TraceResult
+
+JSON, NPZ = "application/json", "application/x-npz"
+
+
+def trace_report(result: TraceResult) -> dict[str, Any]:
+    """The machine-readable answer, the same as that of ``physworld trace``."""
+    return document(result)
+
+
+def trace_files(scene: Scene, result: TraceResult, report: dict[str, Any]) -> list[tuple[str, str, bytes]]:
+    """Name, media type and content of every file, the report first."""
+    tracks = {"times": scene.times, "before": result.before, "after": result.after}
+    files = [
+        (REPORT, JSON, json.dumps(report, indent=1, allow_nan=False).encode()),
+        (TRACKS, NPZ, npz_bytes(tracks)),
+    ]
+    if report["verdict"] == NAMED:
+        files.append((TWIN, NPZ, npz_bytes(result.verdict.model.fitted.twin.to_arrays())))
+    return files
