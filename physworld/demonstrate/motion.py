@@ -146,7 +146,7 @@ def random_motion(
             points[:, group] = rigid_points(first_pose[group], scale * displacement, scale * turn)
         return points
 
-    scale = _largest(lambda share: broken_limit(place(share), limits, times) is None)
+    scale = largest_share(lambda share: broken_limit(place(share), limits, times) is None)
     return Motion(pattern, place(scale), scale)
 
 
@@ -270,7 +270,7 @@ def _random_turn(limit_rad: float, generator: np.random.Generator) -> np.ndarray
     return axis / np.linalg.norm(axis) * limit_rad * generator.uniform()
 
 
-def _largest(kept: Callable[[float], bool]) -> float:
+def largest_share(kept: Callable[[float], bool]) -> float:
     """The largest share in [0, 1] that bisection finds to be kept; 0 is taken to be."""
     if kept(1.0):
         return 1.0
