@@ -14,6 +14,7 @@ Verdict = Literal[
     "named", "equivalent_set", "data_issue", "numerical_issue", "unexplained", "nothing_to_explain"
 ]
 NAMED: Verdict = "named"
+TraceState = Literal["pending", "ready", "failed"]
 
 
 class TraceConfig(Request):
@@ -71,7 +72,7 @@ class Trace(Resource):
     id: str
     scene_id: str
     fit_id: str | None = None
-    state: Literal["pending", "ready", "failed"]
+    state: TraceState
     created_at: datetime
     job_id: str
     config: TraceConfig

@@ -14,6 +14,7 @@ from services.api.metrics import Metrics
 from services.api.openapi import describe
 from services.api.routes import (
     artifacts,
+    assessments,
     datasets,
     fits,
     health,
@@ -23,6 +24,7 @@ from services.api.routes import (
     models,
     pipelines,
     scenes,
+    traces,
 )
 from services.api.security import Authentication, bearer
 from services.stores import Stores
@@ -52,7 +54,19 @@ def create_api(settings: Settings, database: Database, stores: Stores) -> FastAP
     app.state.metrics = Metrics(database)
     app.state.upload_slots = anyio.CapacityLimiter(PARALLEL_UPLOADS)
     versioned = APIRouter(prefix=PREFIX, dependencies=[bearer])
-    for module in (scenes, fits, datasets, models, pipelines, jobs, artifacts, library, keys):
+    for module in (
+        scenes,
+        fits,
+        traces,
+        datasets,
+        models,
+        assessments,
+        pipelines,
+        jobs,
+        artifacts,
+        library,
+        keys,
+    ):
         versioned.include_router(module.router)
     app.include_router(versioned)
     app.include_router(health.router)

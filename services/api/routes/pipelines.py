@@ -1,4 +1,4 @@
-"""The whole chain in one call: fit, dataset, training."""
+"""The whole chain in one call: fit, trace where it is asked for, dataset, training."""
 
 from __future__ import annotations
 
@@ -15,5 +15,8 @@ router = APIRouter(prefix="/pipelines", tags=["pipelines"])
 
 @router.post("", status_code=202, response_model=Job, responses=documented(401, 403, 404, 409, 413, 422))
 def create_pipeline(body: PipelineCreate, idempotency: IdempotencyDep) -> Response:
-    """Calibrate a twin of a scene, let it demonstrate, train a world model on it and publish that."""
+    """Calibrate a twin of a scene, let it demonstrate, train a world model on it and publish that.
+
+    With `close_the_loop` what the twin leaves is traced first, and the twin with the named effect demonstrates.
+    """
     return idempotency.run(body, lambda session: accepted(jobs.create_pipeline(session, body)))

@@ -24,6 +24,31 @@ from storage.tables import utc_now
 
 LEASE_S = 30.0
 FRAMES, POINTS = 20, 9
+REPORT: dict[str, Any] = {
+    "schema_version": 1,
+    "scene": "strip",
+    "reason": "best supported among 20 candidates: air_drag_linear",
+    "effects": [
+        {
+            "name": "air_drag_linear",
+            "parameters": {"rate_per_s": {"value": 1.9, "ci95": [1.6, 2.2], "unit": "1/s"}},
+        }
+    ],
+    "equivalent": [],
+    "candidates": [{"name": "air_drag_linear", "score": 0.4, "threshold": 0.02, "selected": True}],
+    "held_out": {"metric": "track_rmse_m", "noise_floor": 1e-4, "before": 2e-3, "after": 3e-4},
+    "calibrated": {"youngs_modulus_pa": {"value": 1e5, "ci95": [9e4, 1.1e5], "unit": "Pa"}},
+    "unexplained": {"rms_m": 1e-4, "description": "nothing above the noise"},
+    "suggested_experiment": None,
+    "seconds": 1.5,
+    "simulations": 40,
+    "decoys": [0.001],
+}
+TRACKS = {
+    "times": np.arange(3) / 30.0,
+    "before": np.zeros((3, 2, 3)),
+    "after": np.ones((3, 2, 3)),
+}
 EPISODE = {
     "times": np.arange(4) / 30.0,
     "particles": np.arange(4 * 5 * 3, dtype=np.float32).reshape(4, 5, 3),
@@ -41,6 +66,8 @@ class Service:
     database: Database
     stores: Stores
     tokens: dict[str, str] = field(default_factory=dict)
+    verdict: str = "named"
+    outcome: str = "as_expected"
 
     def client(self, role: Role | None = "admin") -> httpx.Client:
         """A client with a key of this role, or without any."""
@@ -82,6 +109,20 @@ class Service:
             parameter = {"value": 2.0e5, "unit": "Pa", "ci95": [1.8e5, 2.2e5]}
             artifacts = [put(lease.shard_id.encode(), "twin.npz").model_dump()]
             return {"parameters": {"E": parameter}, "metrics": {}, "artifacts": artifacts}, None
+        if lease.kind == "trace":
+            report = {**REPORT, "verdict": self.verdict}
+            tracks = io.BytesIO()
+            np.savez(tracks, allow_pickle=False, **TRACKS)
+            files = {"report.json": json.dumps(report).encode(), "tracks.npz": tracks.getvalue()}
+            if self.verdict == "named":
+                files["twin.npz"] = lease.shard_id.encode()
+            artifacts = [put(content, name).model_dump() for name, content in files.items()]
+            return {"verdict": self.verdict, "report": report, "artifacts": artifacts}, None
+        if lease.kind == "assessment":
+            figure = {"error_m": 2e-3, "ci95_m": [1e-3, 3e-3], "noise_floor_m": 1e-4, "frames": 10}
+            excess = {"excess_m2": 0.0, "excess_ci95_m2": [-1e-6, 1e-6], "start_mismatch_m": 0.0}
+            named = {"outcome": self.outcome, "reason": "it is so", "measured": figure, "expected": figure}
+            return {**named, **excess}, None
         if lease.kind == "dataset_plan":
             return {"episodes": payload["config"]["episodes"], "frames": 4, "particles": 5}, None
         if lease.kind == "episode":
