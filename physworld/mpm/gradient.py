@@ -85,7 +85,7 @@ class _Comparison:
         self._stresses: list[tuple[int, np.ndarray, np.ndarray]] = []
         sides = self._matched(terms, high, low)
         grows = any(_multiplies(term) for side in sides for _, term in side)
-        launched = grows or not (self._by_columns or _same_material(high, low))
+        launched = grows or not (self._by_columns or same_internal_forces(high, low))
         if launched:
             self._by_columns = False
         if launched and not grows and terms and _multiplies(terms[0]):
@@ -94,7 +94,7 @@ class _Comparison:
             )
         self.pair = None
         if launched or any(sides):
-            internal = [_internal(p) if launched else None for p in (high, low)]
+            internal = [internal_forces(p) if launched else None for p in (high, low)]
             self.pair = ForcePair(ForceSide(internal[0], sides[0]), ForceSide(internal[1], sides[1]))
 
     def host_share(self, g: Gradient) -> float:
@@ -188,7 +188,8 @@ def _same(a: Any, b: Any) -> bool:
     return bool(np.all(a == b))
 
 
-def _internal(problem: Problem) -> InternalForces:
+def internal_forces(problem: Problem) -> InternalForces:
+    """Internal forces of a problem, with a memory of their own."""
     factor = problem.stiffness_factor
     factor = np.ones(problem.lattice.fill.size) if factor is None else factor
     return InternalForces(problem.lattice, problem.law, factor, problem.rest, problem.device)
@@ -223,7 +224,8 @@ def _moduli_alone_differ(base: Problem, high: Problem, low: Problem) -> bool:
     return all(a == b or known != 0.0 for known, a, b in values)
 
 
-def _same_material(high: Problem, low: Problem) -> bool:
+def same_internal_forces(high: Problem, low: Problem) -> bool:
+    """Whether two problems have the same internal forces."""
     factors = [_factor(p) for p in (high, low)]
     return (
         _same_lattice(high, low)

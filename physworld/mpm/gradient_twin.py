@@ -18,7 +18,8 @@ from physworld.mpm.adjoint import MEMORY_MB, Adjoint, Gradient
 from physworld.mpm.gradient import Direction, gradients
 from physworld.twin import Twin
 
-_STEP = 1e-3  # relative change of a parameter between its two neighbours, and of a strength in its probes
+_STEP = 1e-3  # relative change of a parameter between its two neighbours
+_PROBE_STEP = 0.02  # of a strength, in its probes or in itself: forces of solids are single precision
 _SLOPE_STEP = 1e-6
 
 
@@ -51,7 +52,7 @@ def strength(twin: Twin, effect: str, name: str) -> Neighbours:
     facts = {s.name: s for s in known.strengths(twin)}[name]
     value = known.values[name]
     value = 0.0 if value is None else value
-    step = _STEP * max(abs(value), abs(facts.probe))
+    step = _PROBE_STEP * max(abs(value), abs(facts.probe))
     high, low = min(value + step, facts.high), max(value - step, facts.low)
     return Neighbours(
         twin.with_effect(replace(known, **{name: high})),
