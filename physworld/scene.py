@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from physworld.geometry.surface_mesh import SurfaceMesh
+
 UNDEFORMED_AT_REST = "undeformed"
 AS_MEASURED = "as measured"
 
@@ -65,6 +67,39 @@ class Grip:
     points: tuple[int, ...] = ()
 
 
+@dataclass(frozen=True, eq=False)
+class DeclaredCollider:
+    """A rigid body beside the object: a pusher, a table, a peg.
+
+    Its frame lies at ``position_m`` and ``quaternion_wxyz`` at the first frame. There it stays; or it is carried by
+    controllers as by one rigid hand; or it follows the poses of an array.
+
+    Attributes:
+        name: its own.
+        shape: sphere, box, capsule, cylinder, half_space or mesh.
+        size_m: sides of a box, (3,).
+        radius_m, length_m: of a sphere, capsule or cylinder; the axis is z, the ends of a capsule come on top.
+        mesh: closed boundary in the collider's frame.
+        friction: Coulomb's coefficient against the object; None: not known.
+        position_m, quaternion_wxyz: pose at the first frame, (3,) and (4,).
+        controllers: those that carry it.
+        poses: name of the array in ``Scene.extra_arrays`` that holds its poses, (T, 7) at the frames or (Tc, 7) at
+            the control samples: position [m] and unit quaternion, scalar first.
+    """
+
+    name: str
+    shape: str
+    size_m: np.ndarray | None = None
+    radius_m: float | None = None
+    length_m: float | None = None
+    mesh: SurfaceMesh | None = None
+    friction: float | None = None
+    position_m: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    quaternion_wxyz: np.ndarray = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
+    controllers: tuple[int, ...] = ()
+    poses: str | None = None
+
+
 @dataclass(frozen=True)
 class Scene:
     """One recording.
@@ -104,6 +139,7 @@ class Scene:
     body: Body = field(default_factory=Body)
     ground: Ground | None = None
     grips: tuple[Grip, ...] = ()
+    colliders: tuple[DeclaredCollider, ...] = ()
     controller_velocities: np.ndarray | None = None
     control_times: np.ndarray | None = None
     control_points: np.ndarray | None = None

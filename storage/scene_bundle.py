@@ -1,6 +1,7 @@
 """Scene bundles: ``scene.json`` (what is declared) and ``scene.npz`` (what was measured), SI units, z up.
 
-A bundle is a folder, a zip or a tar (plain or gzip); in an archive the two files may lie in one top folder.
+A bundle is a folder, a zip or a tar (plain or gzip); in an archive the files may lie in one top folder. Meshes of
+colliders lie beside the two.
 Reading validates; a scene with a fault is never returned. ``canonical_archive`` writes the one archive that a
 scene's content has: its digest addresses the scene. Nothing is lost on the way through: keys and arrays that
 no code here knows stay in ``Scene.declared`` and ``Scene.extra_arrays``.
@@ -15,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from physworld.geometry.surface_mesh import SurfaceMesh
 from physworld.scene import AS_MEASURED, UNDEFORMED_AT_REST, Body, Grip, Ground, Scene
 from schemas.base import FieldError
 from storage.archives import (
@@ -28,7 +30,9 @@ from storage.archives import (
     write_zip,
 )
 from storage.errors import SceneInvalid
+from storage.meshes import MAX_MESH_BYTES
 from storage.scene_checks_measured import hold
+from storage.scene_colliders import Fetch, collider_facts, colliders_of, fetch_meshes, mesh_files, meshes_of
 from storage.scene_declaration import SCHEMA_VERSION, UNDEFORMED_TEXT, parse_json
 from storage.scene_validation import check_scene
 
@@ -73,7 +77,14 @@ def read_bundle(path: Path | str, limits: ArchiveLimits = DEFAULT_LIMITS) -> Sce
         size = (path / name).stat().st_size
         if size > limits.total_bytes:
             raise _refused(name, f"has {size} bytes, at most {limits.total_bytes} are read")
-    return scene_from_files((path / JSON_NAME).read_bytes(), (path / ARRAYS_NAME).read_bytes(), limits)[0]
+
+    def fetch(name: str) -> bytes | None:
+        file = (path / name).resolve()
+        inside = file.is_relative_to(path.resolve()) and file.is_file()
+        return file.read_bytes() if inside and file.stat().st_size <= MAX_MESH_BYTES else None
+
+    json_text, npz = (path / JSON_NAME).read_bytes(), (path / ARRAYS_NAME).read_bytes()
+    return scene_from_files(json_text, npz, limits, fetch)[0]
 
 
 def bundle_from_bytes(data: bytes, limits: ArchiveLimits = DEFAULT_LIMITS) -> tuple[Scene, list[str]]:
@@ -90,13 +101,23 @@ def bundle_from_bytes(data: bytes, limits: ArchiveLimits = DEFAULT_LIMITS) -> tu
             raise ArchiveRefused(f"holds no {ARRAYS_NAME} beside {JSON_NAME}")
     except ArchiveRefused as error:
         raise _refused("archive", str(error)) from error
-    return scene_from_files(files[f"{folder}/{JSON_NAME}".lstrip("/")], files[arrays_path], limits)
+
+    def fetch(name: str) -> bytes | None:
+        named = read_archive(data, frozenset({name.rpartition("/")[2]}), limits)
+        return named.get(f"{folder}/{name}".lstrip("/"))
+
+    return scene_from_files(files[f"{folder}/{JSON_NAME}".lstrip("/")], files[arrays_path], limits, fetch)
 
 
 def scene_from_files(
-    json_text: bytes, npz: bytes, limits: ArchiveLimits = DEFAULT_LIMITS
+    json_text: bytes, npz: bytes, limits: ArchiveLimits = DEFAULT_LIMITS, fetch: Fetch = lambda name: None
 ) -> tuple[Scene, list[str]]:
     """The scene in the contents of ``scene.json`` and ``scene.npz``, and its warnings.
+
+    Args:
+        json_text, npz: the two files.
+        limits: of what the arrays may hold.
+        fetch: reads a further file of the bundle, for the meshes of colliders.
 
     Raises:
         SceneInvalid: with every fault that the reading found.
@@ -109,15 +130,16 @@ def scene_from_files(
         faults.append(FieldError(loc=[ARRAYS_NAME], msg=str(error)))
     if faults:
         raise SceneInvalid(faults)
-    faults, warnings = check_scene(declared, arrays)
-    if faults:
-        raise SceneInvalid(faults)
-    return scene_from_parts(declared, arrays), warnings
+    meshes, unread = fetch_meshes(declared, fetch)
+    faults, warnings = check_scene(declared, arrays, meshes)
+    if unread or faults:
+        raise SceneInvalid(unread + faults)
+    return scene_from_parts(declared, arrays, meshes), warnings
 
 
 def validate(scene: Scene) -> tuple[list[FieldError], list[str]]:
     """Faults and warnings of a scene in memory, by the same checks as a bundle's."""
-    return check_scene(*parts_of(scene))
+    return check_scene(*parts_of(scene), meshes_of(scene))
 
 
 def checked(scene: Scene) -> tuple[Scene, list[str]]:
@@ -133,7 +155,7 @@ def checked(scene: Scene) -> tuple[Scene, list[str]]:
 
 
 def canonical_archive(scene: Scene) -> bytes:
-    """The archive that this content, and no other, has: a stored zip of ``scene.json`` and ``scene.npz``.
+    """The archive that this content, and no other, has: a stored zip of ``scene.json``, ``scene.npz`` and meshes.
 
     Reading it gives the scene back exactly, and writing that again gives the same bytes, on any machine.
     """
@@ -141,14 +163,16 @@ def canonical_archive(scene: Scene) -> bytes:
 
 
 def write_bundle(scene: Scene, folder: Path | str) -> None:
-    """Write ``scene.json`` and ``scene.npz`` into ``folder`` (made if absent)."""
+    """Write ``scene.json``, ``scene.npz`` and the meshes of colliders into ``folder`` (made if absent)."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     for name, content in _files_of(scene).items():
         (folder / name).write_bytes(content)
 
 
-def scene_from_parts(declared: dict[str, Any], arrays: dict[str, np.ndarray]) -> Scene:
+def scene_from_parts(
+    declared: dict[str, Any], arrays: dict[str, np.ndarray], meshes: dict[str, SurfaceMesh] | None = None
+) -> Scene:
     """A ``Scene`` out of parts that have passed the validator."""
     fields: dict[str, Any] = {}
     for name, array in arrays.items():
@@ -170,6 +194,7 @@ def scene_from_parts(declared: dict[str, Any], arrays: dict[str, np.ndarray]) ->
         body=_body(declared.get("body") or {}),
         ground=None if ground is None else Ground(float(ground["height_m"]), _number(ground.get("friction"))),
         grips=tuple(_grip(grip) for grip in declared.get("grips") or []),
+        colliders=colliders_of(declared, meshes or {}),
         extra_arrays={name: array for name, array in arrays.items() if name not in FIELD_OF_ARRAY},
         declared=declared,
         **fields,
@@ -201,6 +226,8 @@ def parts_of(scene: Scene) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         "ground": _ground_facts(scene.ground, declared.get("ground") or {}),
         "grips": _grip_facts(scene.grips, declared.get("grips")),
     }
+    if scene.colliders or "colliders" in declared:
+        declared["colliders"] = collider_facts(scene) or None
     return declared, arrays | scene.extra_arrays
 
 
@@ -210,6 +237,7 @@ def _files_of(scene: Scene) -> dict[str, bytes]:
     return {
         JSON_NAME: text.encode("ascii"),
         ARRAYS_NAME: write_arrays({name: _stored(name, array) for name, array in arrays.items()}),
+        **mesh_files(scene),
     }
 
 

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import json
 import math
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from schemas.base import FieldError
 
@@ -87,6 +87,33 @@ class GripForm(Form):
     points: list[Index] = Field(default_factory=list)
 
 
+class ColliderForm(Form):
+    """A rigid body beside the object."""
+
+    name: Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_-]+$")]
+    shape: Literal["sphere", "box", "capsule", "cylinder", "half_space", "mesh"]
+    size_m: Size | None = None
+    radius_m: Positive | None = None
+    length_m: Positive | None = None
+    mesh: str | None = None
+    friction: Annotated[float, Field(allow_inf_nan=False, ge=0)] | None = None
+    position_m: Vector = (0.0, 0.0, 0.0)
+    quaternion_wxyz: tuple[Number, Number, Number, Number] = (1.0, 0.0, 0.0, 0.0)
+    controllers: list[Index] = Field(default_factory=list)
+    poses: str | None = None
+
+    @model_validator(mode="after")
+    def _sizes_of_the_shape(self) -> Self:
+        needs = {
+            "sphere": ("radius_m",), "box": ("size_m",), "capsule": ("radius_m", "length_m"),
+            "cylinder": ("radius_m", "length_m"), "half_space": (), "mesh": ("mesh",),
+        }[self.shape]  # fmt: skip
+        missing = [name for name in needs if getattr(self, name) is None]
+        if missing:
+            raise ValueError(f"is a {self.shape} without {' and '.join(missing)}")
+        return self
+
+
 class Declaration(Form):
     """``scene.json``."""
 
@@ -102,6 +129,7 @@ class Declaration(Form):
     body: BodyForm = Field(default_factory=BodyForm)
     ground: GroundForm | None = None
     grips: list[GripForm] | None = None
+    colliders: list[ColliderForm] | None = None
     notes: dict[str, Any] | None = None
 
 

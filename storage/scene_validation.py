@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from physworld.geometry.surface_mesh import SurfaceMesh
 from schemas.base import FieldError
+from storage.scene_checks_colliders import check_colliders
 from storage.scene_checks_declared import (
     check_body,
     check_gravity,
@@ -35,13 +37,14 @@ from storage.scene_declaration import Declaration, check_form
 
 
 def check_scene(
-    declared: dict[str, Any], arrays: dict[str, np.ndarray]
+    declared: dict[str, Any], arrays: dict[str, np.ndarray], meshes: dict[str, SurfaceMesh] | None = None
 ) -> tuple[list[FieldError], list[str]]:
-    """Faults and warnings of a scene as it lies in its two files.
+    """Faults and warnings of a scene as it lies in its files.
 
     Args:
         declared: the object in ``scene.json``.
         arrays: the arrays in ``scene.npz`` under the names that they have there.
+        meshes: meshes of colliders that could be read, by the path that ``scene.json`` names.
     """
     declaration, form_faults = check_form(declared)
     findings = Findings(faults=form_faults)
@@ -50,12 +53,16 @@ def check_scene(
     with np.errstate(over="ignore", invalid="ignore"):  # absurd values overflow, and are then named
         measured = check_arrays(arrays, findings)
         if measured is not None:
-            _check_measured(declaration, arrays, measured, findings)
+            _check_measured(declaration, arrays, meshes or {}, measured, findings)
     return findings.faults, findings.warnings
 
 
 def _check_measured(
-    declaration: Declaration | None, arrays: dict[str, np.ndarray], measured: Measured, findings: Findings
+    declaration: Declaration | None,
+    arrays: dict[str, np.ndarray],
+    meshes: dict[str, SurfaceMesh],
+    measured: Measured,
+    findings: Findings,
 ) -> None:
     check_times(measured.times, None if declaration is None else declaration.fps, findings)
     check_control_times(arrays, measured.times, findings)
@@ -71,5 +78,6 @@ def _check_measured(
     check_noise(declaration, size, findings)
     check_body(declaration, measured, findings)
     check_grips(declaration, arrays, measured, findings)
+    check_colliders(declaration, arrays, meshes, measured, size, findings)
     if declaration.ground is not None and measured.seen.any():
         check_ground(declaration.ground, max(declaration.noise_sigma_m or 0.0, 0.0), measured, findings)

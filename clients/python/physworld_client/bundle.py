@@ -1,7 +1,7 @@
 """Packing a local scene for the upload.
 
-A folder with ``scene.json`` and ``scene.npz`` becomes a zip of exactly these two files, with fixed time
-stamps, so that the same scene always gives the same bytes. A file (archive, PhysTwin ``final_data.pkl``, C3D)
+A folder with ``scene.json`` and ``scene.npz`` becomes a zip of these two files and the meshes beside them, with fixed
+time stamps, so that the same scene always gives the same bytes. A file (archive, PhysTwin ``final_data.pkl``, C3D)
 is sent as it is; the service tells by its content what it is and checks it. Nothing is unpickled here.
 """
 
@@ -17,6 +17,7 @@ from typing import IO
 from physworld_client.errors import BundleUnreadable
 
 BUNDLE_FILES = ("scene.json", "scene.npz")
+MESH_SUFFIXES = (".obj", ".off", ".ply", ".stl")
 SPOOL_LIMIT_BYTES = 64 * 2**20
 ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
 MEDIA_TYPES = {".zip": "application/zip", ".gz": "application/gzip", ".tgz": "application/gzip"}
@@ -71,7 +72,7 @@ def _pack_folder(folder: Path) -> Upload:
     stream = tempfile.SpooledTemporaryFile(max_size=SPOOL_LIMIT_BYTES)  # noqa: SIM115 (the upload closes it)
     try:
         with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
-            for name in BUNDLE_FILES:
+            for name in (*BUNDLE_FILES, *_meshes(folder)):
                 entry = zipfile.ZipInfo(name, ZIP_EPOCH)
                 entry.compress_type = zipfile.ZIP_DEFLATED
                 archive.writestr(entry, (folder / name).read_bytes())
@@ -80,3 +81,9 @@ def _pack_folder(folder: Path) -> Upload:
         raise BundleUnreadable(f"{folder} cannot be read: {error.strerror}") from error
     stream.seek(0)
     return Upload(stream, f"{folder.resolve().name}.zip", "application/zip")
+
+
+def _meshes(folder: Path) -> list[str]:
+    """Mesh files of colliders anywhere below the folder, by their path in it."""
+    files = (path for path in folder.rglob("*") if path.suffix.lower() in MESH_SUFFIXES and path.is_file())
+    return sorted(path.relative_to(folder).as_posix() for path in files)

@@ -26,6 +26,15 @@ def test_a_folder_becomes_a_zip_of_exactly_its_two_files(tmp_path: Path) -> None
             assert archive.read("scene.npz") == b"scene.npz"
 
 
+def test_meshes_of_colliders_travel_along(tmp_path: Path) -> None:
+    folder = make_folder(tmp_path / "push", "hand.STL")
+    (folder / "tools").mkdir()
+    (folder / "tools" / "peg.off").write_bytes(b"peg")
+    with open_bundle(folder) as upload, zipfile.ZipFile(upload.stream) as archive:
+        assert archive.namelist() == ["scene.json", "scene.npz", "hand.STL", "tools/peg.off"]
+        assert archive.read("tools/peg.off") == b"peg"
+
+
 def test_the_same_scene_packs_to_the_same_bytes(tmp_path: Path) -> None:
     first, second = make_folder(tmp_path / "a" / "s"), make_folder(tmp_path / "b" / "s")
     with open_bundle(first) as one, open_bundle(second) as two:
