@@ -9,6 +9,7 @@ PhysworldError
 │   └── ContactFailed       a collider is too fast for its contact, or material came too deep into it
 ├── UnknownEffect           no effect or strength of that name
 ├── EffectRefused           the effect makes no sense for this twin
+├── BatchRefused            the episodes cannot be integrated side by side
 ├── NotDifferentiable       a gradient was asked of what has none
 ├── CalibrationError        no parameter gave a usable simulation
 ├── LawAnswerRefused        a model's answer names no law of the library, or not in the asked form
@@ -54,6 +55,10 @@ class UnknownEffect(PhysworldError):
 
 class EffectRefused(PhysworldError):
     """The effect makes no sense for this twin."""
+
+
+class BatchRefused(PhysworldError):
+    """The episodes cannot be integrated side by side."""
 
 
 class NotDifferentiable(PhysworldError):

@@ -6,17 +6,24 @@ spline derivatives) and launches the kernel of its dimension. It knows nothing o
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import warp as wp
 
+from physworld.errors import BatchRefused
 from physworld.materials.laws import Law, RodLaw, SheetLaw, SolidLaw
 from physworld.mpm.lattice import Lattice
 from physworld.mpm.rod_kernels import rod_forces
 from physworld.mpm.sheet_kernels import sheet_forces
 from physworld.mpm.solid_kernels import solid_forces
 
+_SHARED = {
+    3: {1: "gradients", 5: "numbers", 6: "cell size"},
+    2: {1: "derivatives", 4: "shape ratios", 5: "relaxation time"},
+    1: {1: "derivatives", 4: "relaxation time"},
+}  # the model inputs that belong to a law and a lattice, not to a particle: place and name
 _MEMORY = {3: 72, 2: 24, 1: 12}  # numbers a cell that friction remembers from the last substep
 
 
@@ -37,18 +44,20 @@ class InternalForces:
     def __init__(
         self, lattice: Lattice, law: Law, stiffness_factor: np.ndarray, rest: np.ndarray, device: str
     ) -> None:
-        self.device = device
-        self.cells = len(lattice.cells)
-        self._model = model_inputs(lattice, law, stiffness_factor, rest, device)
+        self._own(lattice, law, model_inputs(lattice, law, stiffness_factor, rest, device), 1, device)
+
+    def _own(self, lattice: Lattice, law: Law, model: list[Any], bodies: int, device: str) -> None:
+        cells = bodies * len(lattice.cells)
+        self.device, self.cells, self._model = device, cells, model
         if isinstance(law, SolidLaw):
             self._kernel = solid_forces(law.stress, len(law.moduli))
         else:
             self._kernel = sheet_forces if isinstance(law, SheetLaw) else rod_forces
         self._solid = lattice.dim == 3
         self.memory = wp.zeros(
-            self.cells * _MEMORY[lattice.dim], dtype=wp.float32 if self._solid else wp.float64, device=device
+            cells * _MEMORY[lattice.dim], dtype=wp.float32 if self._solid else wp.float64, device=device
         )
-        self.inverted = wp.zeros(1, dtype=wp.int32, device=device)
+        self.inverted = wp.zeros(cells, dtype=wp.int32, device=device)
 
     def launch(self, x: wp.array, clock: wp.array, force: wp.array) -> None:
         """Add the forces [N] at nodal positions ``x`` (3n,) to ``force`` (3n,); ``clock[1]`` is 1/dt [1/s]."""
@@ -59,6 +68,67 @@ class InternalForces:
             outputs=[force, self.inverted] if self._solid else [force],
             device=self.device,
         )
+
+
+class ForcesSideBySide(InternalForces):
+    """Forces of several bodies on copies of one lattice, in one launch: body after body, nodes and cells alike.
+
+    Args:
+        lattice: the reference body of all of them.
+        laws: one for each; they may differ in what is multiplied with a particle's measure (moduli, viscosity), not in
+            what the whole law shares (:data:`_SHARED`).
+        stiffness_factors: (P,) for each.
+        rests: nodal positions of the undeformed bodies in the world [m], (n, 3) for each.
+        device: Warp device.
+
+    Raises:
+        BatchRefused: the laws differ in what they must share.
+    """
+
+    def __init__(
+        self,
+        lattice: Lattice,
+        laws: Sequence[Law],
+        stiffness_factors: Sequence[np.ndarray],
+        rests: Sequence[np.ndarray],
+        device: str,
+    ) -> None:
+        for law in laws:
+            if law.name != laws[0].name:
+                raise BatchRefused(f"one kernel integrates one law; here are {laws[0].name} and {law.name}")
+        bodies = [
+            model_inputs(lattice, law, factor, rest, device)
+            for law, factor, rest in zip(laws, stiffness_factors, rests, strict=True)
+        ]
+        model = _joined(lattice, laws[0], bodies, device)
+        self._own(lattice, laws[0], model, len(laws), device)
+
+
+def _joined(lattice: Lattice, law: Law, bodies: list[list[Any]], device: str) -> list[Any]:
+    """The model inputs of bodies side by side from those of each; see :func:`model_inputs` for their order."""
+    offsets = np.arange(len(bodies))[:, None] * len(lattice.nodes)
+    nodes = (lattice.cell_nodes.reshape(1, -1) + offsets).reshape(-1)
+    joined: list[Any] = [wp.array(nodes, dtype=wp.int32, device=device)]
+    for place, first in enumerate(bodies[0][1:-1], start=1):
+        each = [body[place] for body in bodies]
+        if place not in _SHARED[lattice.dim]:
+            values = np.concatenate([values.numpy() for values in each])
+            joined.append(wp.array(values, dtype=first.dtype, device=device))
+            continue
+        for number, other in enumerate(each):
+            if not np.array_equal(_numbers(first), _numbers(other)):
+                raise BatchRefused(
+                    f"bodies side by side share the {_SHARED[lattice.dim][place]} of their law ({law.name}): "
+                    f"{_numbers(first)} of the first, {_numbers(other)} of number {number}"
+                )
+        joined.append(first)
+    return [*joined, max(body[-1] for body in bodies)]
+
+
+def _numbers(value: Any) -> np.ndarray:
+    if isinstance(value, wp.array):
+        return value.numpy()
+    return np.atleast_1d(np.array(getattr(value, "value", value), dtype=float))
 
 
 def model_inputs(

@@ -30,9 +30,9 @@ def weighted_sum(
     return total
 
 
-@wp.kernel
-def advance_nodes(
-    # model
+@wp.func
+def advance(
+    node: int,
     mass: wp.array(dtype=wp.float64),
     slot: wp.array(dtype=wp.int32),
     path_x: wp.array2d(dtype=wp.float64),
@@ -41,13 +41,11 @@ def advance_nodes(
     drag: wp.float64,
     clock: wp.array(dtype=wp.float64),
     counter: wp.array(dtype=wp.int32),
-    # in, out
     force: wp.array(dtype=wp.float64),
     x: wp.array(dtype=wp.float64),
     v: wp.array(dtype=wp.float64),
 ):
     """One symplectic Euler step of a node; its force is read and cleared."""
-    node = wp.tid()
     dt = clock[2]
     held = slot[node]
     if held >= 0:
@@ -74,6 +72,49 @@ def advance_nodes(
             v[k] = speed
             x[k] = x[k] + dt * speed
             force[k] = wp.float64(0.0)
+
+
+@wp.kernel
+def advance_nodes(
+    # model
+    mass: wp.array(dtype=wp.float64),
+    slot: wp.array(dtype=wp.int32),
+    path_x: wp.array2d(dtype=wp.float64),
+    path_v: wp.array2d(dtype=wp.float64),
+    gravity: wp.vec3d,
+    drag: wp.float64,
+    clock: wp.array(dtype=wp.float64),
+    counter: wp.array(dtype=wp.int32),
+    # in, out
+    force: wp.array(dtype=wp.float64),
+    x: wp.array(dtype=wp.float64),
+    v: wp.array(dtype=wp.float64),
+):
+    """One step of a node of one body."""
+    advance(wp.tid(), mass, slot, path_x, path_v, gravity, drag, clock, counter, force, x, v)
+
+
+@wp.kernel
+def advance_nodes_side_by_side(
+    # model
+    mass: wp.array(dtype=wp.float64),
+    slot: wp.array(dtype=wp.int32),
+    path_x: wp.array2d(dtype=wp.float64),
+    path_v: wp.array2d(dtype=wp.float64),
+    gravity: wp.array(dtype=wp.vec3d),
+    drag: wp.array(dtype=wp.float64),
+    clock: wp.array(dtype=wp.float64),
+    counter: wp.array(dtype=wp.int32),
+    nodes: int,
+    # in, out
+    force: wp.array(dtype=wp.float64),
+    x: wp.array(dtype=wp.float64),
+    v: wp.array(dtype=wp.float64),
+):
+    """One step of a node of bodies with ``nodes`` nodes each, whose gravity and drag may differ."""
+    node = wp.tid()
+    body = node // nodes
+    advance(node, mass, slot, path_x, path_v, gravity[body], drag[body], clock, counter, force, x, v)
 
 
 @wp.kernel

@@ -79,7 +79,7 @@ COFACTOR = r"""
 FLOOR_J = "        J = lane::floor(J, 0.02f);\n"
 
 _REPORT = r"""
-        if (lane::any_below(J, 0.02f)) inverted.data[0] = 1;
+        if (lane::any_below(J, 0.02f)) inverted.data[cell] = 1;
 """
 
 _VISCOSITY = r"""

@@ -31,21 +31,35 @@ def fastest_frequency(forces: InternalForces, rest: np.ndarray, mass: np.ndarray
         mass: lumped nodal masses [kg], (n,).
         spacing: smallest cell size [m], the scale of the probe.
     """
-    device = forces.device
-    clock = wp.zeros(3, dtype=wp.float64, device=device)  # 1/dt = 0: friction silent
+    return float(fastest_frequencies(forces, rest[None], mass[None], spacing)[0])
+
+
+def fastest_frequencies(
+    forces: InternalForces, rest: np.ndarray, mass: np.ndarray, spacing: float
+) -> np.ndarray:
+    """Highest angular frequencies [rad/s], (B,), of B bodies that ``forces`` holds side by side.
+
+    Args:
+        forces: internal forces of all of them.
+        rest: nodal positions without stress [m], (B, n, 3).
+        mass: lumped nodal masses [kg], (B, n).
+        spacing: smallest cell size [m], the scale of the probe.
+    """
+    clock = wp.zeros(3, dtype=wp.float64, device=forces.device)  # 1/dt = 0: friction silent
     scale = 1e-4 * spacing
-    mode = np.random.default_rng(0).normal(size=rest.shape)
-    frequency_squared = 0.0
+    mode = np.repeat(np.random.default_rng(0).normal(size=rest.shape[1:])[None], len(rest), axis=0)
+    squares = np.zeros(len(rest))
     for _ in range(_ITERATIONS):
-        mode /= np.abs(mode).max()
+        mode /= np.abs(mode).max(axis=(1, 2), keepdims=True)
         pushed = _forces_at(forces, rest + scale * mode, clock) - _forces_at(
             forces, rest - scale * mode, clock
         )
-        response = -pushed / (2 * scale) / mass[:, None]
-        weighted = mass[:, None] * mode
-        frequency_squared = float(np.sum(weighted * response) / np.sum(weighted * mode))
+        response = -pushed / (2 * scale) / mass[..., None]
+        weighted = mass[..., None] * mode
+        for body in range(len(rest)):
+            squares[body] = np.sum(weighted[body] * response[body]) / np.sum(weighted[body] * mode[body])
         mode = response
-    return _MARGIN * float(np.sqrt(max(frequency_squared, 1e-12)))
+    return _MARGIN * np.sqrt(np.maximum(squares, 1e-12))
 
 
 def stable_time_step(frequency_rad_s: float, friction_per_s: float, safety: float = SAFETY) -> float:
@@ -57,4 +71,4 @@ def stable_time_step(frequency_rad_s: float, friction_per_s: float, safety: floa
 def _forces_at(forces: InternalForces, x: np.ndarray, clock: wp.array) -> np.ndarray:
     force = wp.zeros(x.size, dtype=wp.float64, device=forces.device)
     forces.launch(wp.array(x.reshape(-1), dtype=wp.float64, device=forces.device), clock, force)
-    return force.numpy().reshape(-1, 3)
+    return force.numpy().reshape(x.shape)

@@ -104,7 +104,7 @@ class TotalLagrangian:
         lattice, law, device = problem.lattice, problem.law, problem.device
         particles = lattice.fill.size
         stiffness = np.ones(particles) if problem.stiffness_factor is None else problem.stiffness_factor
-        self.problem = problem
+        self.problem, self.device = problem, device
         self.mass = problem.nodal_mass()
         self.forces = InternalForces(lattice, law, stiffness, problem.rest, device)
         cell = float(lattice.spacing.min())
@@ -160,8 +160,8 @@ class TotalLagrangian:
         return recorded
 
     def substeps_of(self, interval: float) -> int:
-        """Substeps that an interval between two frames takes: whole chunks."""
-        return _CHUNK * max(1, int(np.ceil(interval / (self.time_step_s * _CHUNK))))
+        """Substeps that an interval between two frames takes."""
+        return whole_chunks(interval, self.time_step_s)
 
 
 class Run:
@@ -175,7 +175,7 @@ class Run:
     def __init__(
         self, solver: TotalLagrangian, x: np.ndarray, v: np.ndarray, held: HeldNodes, times: np.ndarray
     ) -> None:
-        device, nodes, frames = solver.problem.device, len(solver.mass), len(times)
+        device, nodes, frames = solver.device, len(solver.mass), len(times)
         slot = np.full(nodes, -1, dtype=np.int32)
         slot[held.nodes] = np.arange(len(held.nodes), dtype=np.int32)
 
@@ -183,7 +183,6 @@ class Run:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
 
         self._solver, self._start, self._times = solver, x, times
-        self._size = float(np.ptp(x, axis=0).max()) + float(solver.problem.lattice.spacing.max())
         self.x, self.v = upload(x.reshape(-1)), upload(v.reshape(-1))
         self.force = wp.zeros(3 * nodes, dtype=wp.float64, device=device)
         self.clock = wp.zeros(3, dtype=wp.float64, device=device)
@@ -192,14 +191,8 @@ class Run:
         paths = np.zeros((2, frames, width))
         paths[0, :, : 3 * len(held.nodes)] = held.positions.reshape(frames, -1)
         paths[1, :, : 3 * len(held.nodes)] = held.velocities.reshape(frames, -1)
-        problem = solver.problem
-        self._node_inputs = [
-            upload(solver.mass), upload(slot, wp.int32), upload(paths[0]), upload(paths[1]),
-            wp.vec3d(*problem.gravity_m_s2), wp.float64(problem.drag_per_s), self.clock, self.counter,
-        ]  # fmt: skip
-
-        for term in solver.terms:
-            term.begin(times)
+        self._nodes = [upload(solver.mass), upload(slot, wp.int32), upload(paths[0]), upload(paths[1])]
+        self._begin()
         forces = solver.forces
         forces.inverted.zero_()
         forces.launch(self.x, self.clock, self.force)  # remembers the first strains: no friction acts yet
@@ -224,23 +217,32 @@ class Run:
         self._solver.substeps += substeps
         now = self.x.numpy().reshape(-1, 3).copy()
         self._check(now, self._times[frame + 1])
-        for term in self._solver.terms:
-            term.check(self._times[frame + 1])
         return now
 
+    def _begin(self) -> None:
+        for term in self._solver.terms:
+            term.begin(self._times)
+
     def _substep(self) -> None:
-        solver, device = self._solver, self._solver.problem.device
-        solver.forces.launch(self.x, self.clock, self.force)
-        for term in solver.terms:
+        self._solver.forces.launch(self.x, self.clock, self.force)
+        self._launch_terms()
+        self._launch_nodes()
+        wp.launch(advance_counter, dim=1, inputs=[self.counter], device=self._solver.device)
+
+    def _launch_terms(self) -> None:
+        for term in self._solver.terms:
             term.launch(self.x, self.v, self.clock, self.counter, self.force)
+
+    def _launch_nodes(self) -> None:
+        problem = self._solver.problem
+        gravity, drag = wp.vec3d(*problem.gravity_m_s2), wp.float64(problem.drag_per_s)
         wp.launch(
             advance_nodes,
-            dim=len(solver.mass),
-            inputs=self._node_inputs,
+            dim=len(self._solver.mass),
+            inputs=[*self._nodes, gravity, drag, self.clock, self.counter],
             outputs=[self.force, self.x, self.v],
-            device=device,
+            device=self._solver.device,
         )
-        wp.launch(advance_counter, dim=1, inputs=[self.counter], device=device)
 
     def _set_clock(self, frame: int) -> int:
         interval = self._times[frame + 1] - self._times[frame]
@@ -257,23 +259,54 @@ class Run:
         """
         solver = self._solver
         dt = interval / self._set_clock(0)
-        for term in solver.terms:
-            term.launch(self.x, self.v, self.clock, self.counter, self.force)
+        self._launch_terms()
         pull = self.force.numpy().reshape(-1, 3) / solver.mass[:, None]
-        return v - 0.5 * dt * (pull + solver.problem.gravity_m_s2 - solver.problem.drag_per_s * v)
+        gravity, drag = self._fall()
+        return v - 0.5 * dt * (pull + gravity - drag * v)
+
+    def _fall(self) -> tuple[np.ndarray, np.ndarray | float]:
+        """Gravity [m/s^2] and drag rate [1/s]; they fit velocities (n, 3)."""
+        return self._solver.problem.gravity_m_s2, self._solver.problem.drag_per_s
 
     def _check(self, now: np.ndarray, time: float) -> None:
-        dt = float(self.clock.numpy()[2])
-        if self._solver.forces.inverted.numpy()[0] or not np.isfinite(now).all():
-            raise UnstableSimulation(
-                f"the body inverted or blew up at t = {time:.4f} s with time step {dt:.3g} s "
-                f"({int((~np.isfinite(now)).any(axis=1).sum())} of {len(now)} nodes not finite)"
-            )
-        farthest = float(np.abs(now - self._start).max())
-        if farthest > _REACH * self._size:
-            raise ParticlesLeftTheGrid(
-                f"a node is {farthest:.3g} m from its start at t = {time:.4f} s; the body is {self._size:.3g} m long"
-            )
+        solver, dt = self._solver, float(self.clock.numpy()[2])
+        inverted = int(np.count_nonzero(solver.forces.inverted.numpy()))
+        check_state(now, self._start, inverted, float(solver.problem.lattice.spacing.max()), time, dt)
+        for term in solver.terms:
+            term.check(time)
+
+
+def whole_chunks(interval: float, time_step_s: float) -> int:
+    """Substeps of at most ``time_step_s`` that an interval [s] takes: whole chunks, the captured graph's length."""
+    return _CHUNK * max(1, int(np.ceil(interval / (time_step_s * _CHUNK))))
+
+
+def check_state(
+    now: np.ndarray, start: np.ndarray, inverted: int, spacing: float, time: float, dt: float
+) -> None:
+    """Refuse nodal positions that cannot be trusted.
+
+    Args:
+        now, start: nodal positions of one body now and at its start [m], (n, 3).
+        inverted: how many of its cells inverted.
+        spacing: its largest cell size [m].
+        time, dt: of the end of the frame, and the time step [s]; for the message.
+
+    Raises:
+        UnstableSimulation: a cell inverted or a state is not finite.
+        ParticlesLeftTheGrid: a node is absurdly far from its start.
+    """
+    if inverted or not np.isfinite(now).all():
+        raise UnstableSimulation(
+            f"the body inverted or blew up at t = {time:.4f} s with time step {dt:.3g} s ({inverted} cells inverted, "
+            f"{int((~np.isfinite(now)).any(axis=1).sum())} of {len(now)} nodes not finite)"
+        )
+    size = float(np.ptp(start, axis=0).max()) + spacing
+    farthest = float(np.abs(now - start).max())
+    if farthest > _REACH * size:
+        raise ParticlesLeftTheGrid(
+            f"a node is {farthest:.3g} m from its start at t = {time:.4f} s; the body is {size:.3g} m long"
+        )
 
 
 def nodal_mass(lattice: Lattice, law: Law, density_factor: np.ndarray | None) -> np.ndarray:
