@@ -49,7 +49,7 @@ class TraceConfig:
     acceptable: float = 2.0
     most_of_it: float = 0.7
     alike: float = 0.95
-    confirmed: int = 4
+    confirmed: int = 6
     iterations: int = 5
     effects_at_most: int = 2
     refinement: float = 1.25

@@ -118,13 +118,13 @@ def _away_from_zero(strengths: np.ndarray, gates: list[Unknown]) -> np.ndarray:
 def best_variants(
     ranked: list[Score], least: float, count: int, besides: tuple[str, ...] = ()
 ) -> list[Score]:
-    """The best variant of every effect that scores at least ``least``, ``count`` at most."""
+    """The best variant of every effect whose variants together score at least ``least``, ``count`` at most."""
     found: list[Score] = []
     for score in ranked:
         taken = {s.candidate.effect for s in found} | set(besides)
-        if score.share >= least and score.candidate.effect not in taken:
+        if score.family >= least and score.share > 0.0 and score.candidate.effect not in taken:
             found.append(score)
-    return found[:count]
+    return sorted(found, key=lambda s: -s.family)[:count]
 
 
 def explained_direction(model: Model, base: Model, basis: np.ndarray) -> np.ndarray:

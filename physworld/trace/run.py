@@ -29,7 +29,7 @@ from physworld.trace.intervals import calibrated, named, numbers
 from physworld.trace.noise import noise_sigma
 from physworld.trace.refit import refit
 from physworld.trace.result import Step, TraceResult
-from physworld.trace.score import Scores, orthonormal, scores
+from physworld.trace.score import Scores, orthonormal, project, scores
 from physworld.trace.sensitivity import (
     Response,
     candidate_responses,
@@ -138,11 +138,16 @@ class _Trace:
         directions, finer = numerical_directions(
             simulations, self.scene, self.twin, tracks, config.calibration.particle_budget, config.refinement
         )
-        numerics = {name: float(np.sqrt(np.mean(white.change(d) ** 2))) for name, d in directions.items()}
         white = white.with_numerics(list(directions.values()), _NUMERICS_AMPLITUDE)
         block_of_row = self.split.block_of(white.frame_of_row)
         declared = self._declared(white, block_of_row)
         basis = orthonormal(declared.fitted.free_jacobian)
+        plain = white.with_numerics([], 1.0)
+        plain_misfit = float(np.sqrt(np.mean(plain.residual(declared.fitted.tracks) ** 2)))
+        numerics = {
+            name: float(np.sqrt(np.mean(project(basis, plain.change(d)) ** 2)))
+            for name, d in directions.items()
+        }
         chosen, refused = candidates(declared.fitted.twin, config.candidates)
         simulations.stage = "sensitivities"
         found = candidate_responses(
@@ -153,7 +158,9 @@ class _Trace:
         path = self._select(declared, usable, white, block_of_row)
         models = [model for step in path for model in step.tried]
         finer_values, agreement = self._second_resolution(declared, models, white, finer)
-        verdict = decide(declared, models, basis, agreement, config, len({c.effect for c in chosen}))
+        verdict = decide(
+            declared, models, basis, agreement, plain_misfit, config, len({c.effect for c in chosen})
+        )
         if sigma is None and verdict.name not in (NOTHING, UNEXPLAINED):
             verdict = Verdict(UNEXPLAINED, declared, (), "no noise estimate, no claim: " + verdict.reason)
         return self._result(
@@ -205,7 +212,7 @@ class _Trace:
                 if model is not None:
                     tried.append(model)
             good = [m for m in tried if helps(m, base, config)]
-            kept = min(good, key=lambda m: m.validated.mean) if good else None
+            kept = simplest(good, base) if good else None
             path.append(Step(base, ranked, tuple(tried), kept))
             if kept is None or kept.fitted.misfit <= config.near_floor:
                 break

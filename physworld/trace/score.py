@@ -11,7 +11,7 @@ that acts contributes with one sign all along; what matches by chance does not.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import lsq_linear
@@ -30,6 +30,7 @@ class Score:
         strengths: linear estimate in the units of its unknowns, (k,).
         direction: what it explains, (M,), after projection.
         p_value: of its score alone under random signs.
+        family: share that all variants of its effect explain together, which bounds what a shape between them can.
     """
 
     candidate: Candidate
@@ -37,6 +38,7 @@ class Score:
     strengths: np.ndarray
     direction: np.ndarray
     p_value: float
+    family: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -102,9 +104,23 @@ def scores(
         share = gain / total
         p_value = float((1 + np.sum(flipped >= share)) / (1 + resamples))
         ranked.append(Score(response.candidate, share, strengths, columns @ strengths, p_value))
+    families = _families(responses, basis, left)
+    ranked = [replace(s, family=max(s.share, families[s.candidate.effect] / total)) for s in ranked]
     ranked.sort(key=lambda s: -s.share)
     decoy_shares = [_explained(project(basis, column), left) / total for column in decoys]
     return Scores(ranked, float(np.quantile(best, 1.0 - level)), decoy_shares)
+
+
+def _families(responses: list[Response], basis: np.ndarray, left: np.ndarray) -> dict[str, float]:
+    """Squared residual that all variants with shapes of each effect explain together."""
+    columns: dict[str, list[np.ndarray]] = {}
+    for response in responses:
+        shaped = [response.columns] if response.candidate.shapes else []
+        columns.setdefault(response.candidate.effect, []).extend(shaped)
+    return {
+        effect: _explained(project(basis, np.concatenate(own, axis=1)), left) if own else 0.0
+        for effect, own in columns.items()
+    }
 
 
 def _bounded(columns: np.ndarray, left: np.ndarray, candidate: Candidate) -> tuple[float, np.ndarray]:

@@ -81,8 +81,8 @@ def of_strength(effect: str, strength: Strength, scale: float | None = None, sta
         strength.high / unit,
         start / unit,
         1.0,
-        lambda searched: searched * unit,
-        lambda twin, searched: with_strengths(twin, effect, {strength.name: searched * unit}),
+        lambda searched: float(searched * unit),
+        lambda twin, searched: with_strengths(twin, effect, {strength.name: float(searched * unit)}),
     )
 
 

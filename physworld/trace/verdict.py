@@ -22,6 +22,7 @@ from physworld.trace.confirm import Model, beats, explained_direction
 
 NAMED, EQUIVALENT, DATA, NUMERICAL = "named", "equivalent_set", "data_issue", "numerical_issue"
 UNEXPLAINED, NOTHING = "unexplained", "nothing_to_explain"
+FASTEST_WIND_M_S = 20.0
 _DISCREPANCY = 0.05
 
 
@@ -47,6 +48,7 @@ def decide(
     models: list[Model],
     basis: np.ndarray,
     agreement: dict[tuple[str, ...], bool],
+    plain: float,
     config: TraceConfig,
     tried: int,
 ) -> Verdict:
@@ -57,18 +59,20 @@ def decide(
         models: refitted models with effects.
         basis: orthonormal sensitivities of what is calibrated anyway, (M, p).
         agreement: for models that were refitted at a second resolution (by their names), whether it agreed.
+        plain: misfit of the declared physics before numerical directions are taken out.
         tried: number of candidate effects.
     """
     before = declared.fitted.misfit
     real = [model for model in models if helps(model, declared, config)]
     if not real:
-        if before <= config.near_floor:
-            reason = f"the declared physics leaves {before:.2f} of the noise and none of {tried} effects explains more"
-            return Verdict(NOTHING, declared, (), reason)
-        reason = (
-            f"the declared physics leaves {before:.2f} of the noise; none of {tried} effects accounts for it"
-        )
-        return Verdict(UNEXPLAINED, declared, (), reason)
+        if before > config.near_floor:
+            reason = f"misfit {before:.2f} of the noise; none of {tried} effects accounts for it"
+            return Verdict(UNEXPLAINED, declared, (), reason)
+        if plain > config.acceptable:
+            reason = f"misfit {plain:.2f} of the noise, {before:.2f} without what finer cells and time steps change"
+            return Verdict(NUMERICAL, declared, (), reason)
+        reason = f"misfit {before:.2f} of the noise, and none of {tried} effects explains more"
+        return Verdict(NOTHING, declared, (), reason)
     best = simplest(real, declared)
     after = best.fitted.misfit
     what = " and ".join(best.names)
@@ -96,10 +100,28 @@ def decide(
 
 def helps(model: Model, declared: Model, config: TraceConfig) -> bool:
     """Left-out blocks are predicted better than by the declared physics, by more than chance and by a share that
-    matters.
+    matters, and its numbers can be believed.
     """
+    if implausible(model) is not None:
+        return False
     share = 1.0 - model.validated.mean / declared.validated.mean
     return beats(model, declared) and share >= config.material_share
+
+
+def implausible(model: Model) -> str | None:
+    """Why nobody would believe a model's numbers; None where one may.
+
+    A wind is a push with the drag that it comes with: without the drag the push is other gravity, which has its own
+    name, and a push over a drag that is a gale is no wind in a room.
+    """
+    for known in model.fitted.twin.effects:
+        if known.name == "wind" and "wind" in model.names:
+            values = known.values
+            push = float(np.linalg.norm([values[f"push_{axis}_m_s2"] for axis in "xyz"]))
+            speed = push / max(float(values["rate_per_s"] or 0.0), 1e-9)
+            if speed > FASTEST_WIND_M_S:
+                return f"a wind of {speed:.3g} m/s is not believed"
+    return None
 
 
 def accounts(model: Model, declared: Model, config: TraceConfig) -> bool:
@@ -125,7 +147,7 @@ def as_good(model: Model, best: Model, declared: Model) -> bool:
     ``_DISCREPANCY`` of what the best model explains does not count either.
     """
     gap, spread = difference(model.validated, best.validated)
-    explained = declared.validated.mean - best.validated.mean
+    explained = max(declared.validated.mean - best.validated.mean, 0.0)
     return gap <= max(spread, _DISCREPANCY * explained)
 
 

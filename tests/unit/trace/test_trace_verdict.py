@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -26,14 +28,17 @@ def model(residual: np.ndarray, *effects: str, kind: str = "force", unknowns: in
         Unknown(str(k), "1", -9.0, 9.0, 0.0, 1.0, float, lambda twin, value: twin) for k in range(unknowns)
     ]
     slope = np.full((ROWS, unknowns), 1e-3)
-    fitted = Refit(known, None, np.zeros(unknowns), np.zeros((1, 1, 3)), residual, slope)
+    twin = SimpleNamespace(effects=())
+    fitted = Refit(known, twin, np.zeros(unknowns), np.zeros((1, 1, 3)), residual, slope)
     members = tuple(Candidate(name, "", (), kind=kind) for name in effects)
     return Model(members, fitted, cross_validated(fitted, BLOCK_OF_ROW))
 
 
-def answer(models: list[Model], declared: np.ndarray, agree: bool = True) -> tuple[str, tuple[str, ...]]:
+def answer(
+    models: list[Model], declared: np.ndarray, agree: bool = True, plain: float = 1.0
+) -> tuple[str, tuple[str, ...]]:
     agreement = {m.names: agree for m in models}
-    found = decide(model(declared), models, np.zeros((ROWS, 0)), agreement, CONFIG, 20)
+    found = decide(model(declared), models, np.zeros((ROWS, 0)), agreement, plain, CONFIG, 20)
     return found.name, found.model.names
 
 
@@ -65,6 +70,11 @@ def test_effects_that_do_the_same_are_a_set_and_faults_of_the_data_are_called_so
 
 def test_a_strength_that_moves_with_the_resolution_is_numerical() -> None:
     assert answer([model(NOISE, "drag")], NOISE + 2 * DRAG, agree=False)[0] == "numerical_issue"
+
+
+def test_a_misfit_that_only_the_resolution_explains_is_numerical() -> None:
+    assert answer([], NOISE, plain=3.0)[0] == "numerical_issue"
+    assert answer([], NOISE, plain=1.1)[0] == "nothing_to_explain"
 
 
 def test_the_simpler_of_two_that_do_as_well_is_named() -> None:
