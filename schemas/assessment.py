@@ -36,9 +36,9 @@ class ErrorFigure(Resource):
 class Assessment(Resource):
     """Whether a model predicts a new recording as well as it promised.
 
-    ``measured`` is the error on the new recording, ``expected`` the held-out error of the model's card. ``excess_m2``
-    is the difference of the two squared errors, each less its squared noise floor, with ``excess_ci95_m2``; it is
-    above zero where the model has become worse than noise and its own error allow.
+    ``measured`` is the error on the new recording, ``expected`` the held-out error of the model's card. ``excess_m``
+    is the difference of the two, noise taken off each in squares, with ``excess_ci95_m``; it is above zero where the
+    model errs more than noise and its card allow.
     """
 
     id: str
@@ -53,8 +53,8 @@ class Assessment(Resource):
     reason: str = ""
     measured: ErrorFigure | None = None
     expected: ErrorFigure | None = None
-    excess_m2: float | None = None
-    excess_ci95_m2: tuple[float, float] | None = None
+    excess_m: float | None = None
+    excess_ci95_m: tuple[float, float] | None = None
     baselines_m: dict[str, float | None] = Field(default_factory=dict)
     twin_m: float | None = None
     start_mismatch_m: float | None = None

@@ -90,8 +90,8 @@ class AssessmentResult(ShardResult):
     reason: str
     measured: ErrorFigure
     expected: ErrorFigure
-    excess_m2: float
-    excess_ci95_m2: tuple[float, float]
+    excess_m: float
+    excess_ci95_m: tuple[float, float]
     baselines_m: dict[str, float | None] = Field(default_factory=dict)
     twin_m: float | None = None
     start_mismatch_m: float

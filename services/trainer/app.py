@@ -1,4 +1,4 @@
-"""The trainer service: a worker on the ``train`` queue that knows how to do ``training`` shards.
+"""The trainer service: a worker on the ``train`` queue that knows how to do ``training`` and ``assessment`` shards.
 
 It consumes the episodes of a sealed dataset and publishes a version of a model. A dataset's last commit opens
 its training job, so the trainer starts as soon as there is something to learn from.
@@ -11,10 +11,14 @@ from storage.settings import Settings
 from workers.app import run_worker
 from workers.registry import register
 
-HANDLER = "services.trainer.training:run"
+HANDLERS = {
+    "training": "services.trainer.training:run",
+    "assessment": "services.trainer.assessment:run",
+}
 
 
 def serve(settings: Settings, name: str) -> int:
     """Serve the training queue until told to stop; returns the exit code."""
-    register("training", HANDLER)
+    for kind, handler in HANDLERS.items():
+        register(kind, handler)
     return run_worker(settings, TRAINING, name)

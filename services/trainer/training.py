@@ -39,12 +39,13 @@ from physworld.worldmodel.scene_view import SceneView, view_scene
 from physworld.worldmodel.training import TrainingResult, train
 from schemas.base import Artifact, Reference
 from schemas.model import TrainingConfig
+from services.trainer.closed_loop import closed_loop
 from storage import resources
 from workers.context import TaskContext
 from workers.lineage import lineage_of
 from workers.registry import HandlerResult
 from workers.stores import Stores
-from workers.tasks.inputs import fit_reference, npz_bytes, scene_of, scene_reference, twin_of
+from workers.tasks.inputs import made_from, npz_bytes, scene_of, twin_of
 
 logger = logging.getLogger(__name__)
 
@@ -69,7 +70,8 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     payload = context.lease.payload
     config = TrainingConfig.model_validate(payload["config"])
     architecture, training, tuning = translate(config)
-    scene, twin = scene_of(stores, payload["scene_id"]), twin_of(stores, payload["fit_id"])
+    scene = scene_of(stores, payload["scene_id"])
+    twin = twin_of(stores, payload["fit_id"], payload.get("trace_id"))
     context.progress(0, config.steps, "steps", "reading the dataset")
     view = view_scene(scene, twin, architecture)
     dataset = _dataset_reference(stores, payload["dataset_id"])
@@ -92,8 +94,8 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     measured = measure(view, published)
     seconds = {"training": training_s, "fine_tuning": tuning_s}
     metrics = json_safe(_metrics(view, trained, tuned, measured, seconds, len(tracks)))
-    inputs = [dataset, fit_reference(stores, payload["fit_id"]), scene_reference(stores, payload["scene_id"])]
-    lineage = lineage_of(inputs, payload["config"], {"training": config.seed})
+    metrics["closed_loop"] = json_safe(closed_loop(stores, payload, metrics, architecture))
+    lineage = lineage_of([dataset, *made_from(stores, payload)], payload["config"], {"training": config.seed})
     card = _card(payload, config, published, metrics, lineage)
     artifacts = _store(stores, payload, published, view, measured, card)
     context.check()
@@ -296,12 +298,14 @@ def _card(
         "version": payload["version"],
         "scene_id": payload["scene_id"],
         "fit_id": payload["fit_id"],
+        "trace_id": payload.get("trace_id"),
         "dataset_id": payload["dataset_id"],
+        "closed_loop": metrics["closed_loop"],
         "dt_s": published.spec.dt_s,
         "architecture": published.facts(),
         "training": config.model_dump(mode="json"),
         "library_settings": [asdict(part) for part in translate(config)],
-        "metrics": metrics,
+        "metrics": {name: value for name, value in metrics.items() if name != "closed_loop"},
         "lineage": lineage,
         "seeds": {"training": config.seed},
         "versions": {

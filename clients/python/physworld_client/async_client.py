@@ -9,6 +9,7 @@ from typing import TypeVar
 import httpx
 
 from physworld_client import transport as wire
+from physworld_client.async_loop import AsyncAssessments, AsyncTraces
 from physworld_client.async_resources import (
     AsyncArtifacts,
     AsyncDatasets,
@@ -40,8 +41,10 @@ class AsyncClient:
         self.http = httpx.AsyncClient(transport=transport, **wire.client_options(base_url, token, timeout))
         self.scenes = AsyncScenes(self)
         self.fits = AsyncFits(self)
+        self.traces = AsyncTraces(self)
         self.datasets = AsyncDatasets(self)
         self.models = AsyncModels(self)
+        self.assessments = AsyncAssessments(self)
         self.jobs = AsyncJobs(self)
         self.pipelines = AsyncPipelines(self)
         self.artifacts = AsyncArtifacts(self)

@@ -86,9 +86,11 @@ class AsyncFits(AsyncResource):
 class AsyncDatasets(AsyncResource):
     """Datasets of demonstration episodes."""
 
-    async def create(self, fit_id: str, config: DatasetConfig | None = None) -> Job:
-        """Starts writing a dataset; its job's output is the dataset."""
-        return await self._client.send(calls.dataset_create(fit_id, config))
+    async def create(
+        self, fit_id: str, config: DatasetConfig | None = None, *, trace_id: str | None = None
+    ) -> Job:
+        """Starts writing a dataset, in the twin that the trace made where it named an effect."""
+        return await self._client.send(calls.dataset_create(fit_id, config, trace_id))
 
     async def get(self, dataset_id: str) -> Dataset:
         """One dataset."""

@@ -13,6 +13,7 @@ from urllib.parse import quote
 from pydantic import BaseModel, TypeAdapter
 
 from physworld_client.bundle import Upload
+from schemas.assessment import Assessment, AssessmentCreate
 from schemas.base import Page
 from schemas.dataset import Dataset, DatasetConfig, DatasetCreate, Episode
 from schemas.fit import Fit, FitConfig, FitCreate
@@ -20,6 +21,7 @@ from schemas.job import Job
 from schemas.model import AliasSet, Model, ModelVersion, TrainingConfig, TrainingCreate
 from schemas.pipeline import PipelineCreate
 from schemas.scene import Scene
+from schemas.trace import Trace, TraceConfig, TraceCreate
 
 Answer = TypeVar("Answer")
 Item = TypeVar("Item")
@@ -47,16 +49,20 @@ ListCall = Callable[[str | None], Call[Page[Item]]]
 
 _SCENE = TypeAdapter(Scene)
 _FIT = TypeAdapter(Fit)
+_TRACE = TypeAdapter(Trace)
 _DATASET = TypeAdapter(Dataset)
 _MODEL = TypeAdapter(Model)
 _VERSION = TypeAdapter(ModelVersion)
+_ASSESSMENT = TypeAdapter(Assessment)
 _JOB = TypeAdapter(Job)
 _SCENES = TypeAdapter(Page[Scene])
 _FITS = TypeAdapter(Page[Fit])
+_TRACES = TypeAdapter(Page[Trace])
 _DATASETS = TypeAdapter(Page[Dataset])
 _EPISODES = TypeAdapter(Page[Episode])
 _MODELS = TypeAdapter(Page[Model])
 _VERSIONS = TypeAdapter(Page[ModelVersion])
+_ASSESSMENTS = TypeAdapter(Page[Assessment])
 _JOBS = TypeAdapter(Page[Job])
 BYTES = TypeAdapter(bytes)
 """An answer that is no JSON: its bytes as they are."""
@@ -102,9 +108,59 @@ def fit_list(*, limit: int | None, cursor: str | None, state: str | None = None)
     return Call("GET", "/v1/fits", _FITS, query=_given(limit=limit, cursor=cursor, state=state))
 
 
-def dataset_create(fit_id: str, config: DatasetConfig | None) -> Call[Job]:
+def trace_create(
+    scene_id: str, config: TraceConfig | None, fit: FitConfig | None, fit_id: str | None
+) -> Call[Job]:
+    """POST /v1/traces."""
+    body = TraceCreate(scene_id=scene_id, fit_id=fit_id, config=config or TraceConfig())
+    return Call(
+        "POST", "/v1/traces", _JOB, body=body if fit is None else body.model_copy(update={"fit": fit})
+    )
+
+
+def trace_get(trace_id: str) -> Call[Trace]:
+    """GET /v1/traces/{id}."""
+    return Call("GET", f"/v1/traces/{_part(trace_id)}", _TRACE)
+
+
+def trace_list(
+    *, limit: int | None, cursor: str | None, scene_id: str | None = None, verdict: str | None = None
+) -> Call[Page[Trace]]:
+    """GET /v1/traces."""
+    query = _given(limit=limit, cursor=cursor, scene_id=scene_id, verdict=verdict)
+    return Call("GET", "/v1/traces", _TRACES, query=query)
+
+
+def trace_tracks(trace_id: str) -> Call[bytes]:
+    """GET /v1/traces/{id}/tracks: an npz."""
+    return Call("GET", f"/v1/traces/{_part(trace_id)}/tracks", BYTES)
+
+
+def assessment_create(
+    name: str, version: int | str, scene_id: str, open_trace: bool, trace: TraceConfig | None
+) -> Call[Job]:
+    """POST /v1/models/{name}/versions/{version}/assessments."""
+    body = AssessmentCreate(scene_id=scene_id, open_trace=open_trace, trace=trace or TraceConfig())
+    path = f"/v1/models/{_part(name)}/versions/{_part(version)}/assessments"
+    return Call("POST", path, _JOB, body=body)
+
+
+def assessment_get(assessment_id: str) -> Call[Assessment]:
+    """GET /v1/assessments/{id}."""
+    return Call("GET", f"/v1/assessments/{_part(assessment_id)}", _ASSESSMENT)
+
+
+def assessment_list(
+    name: str, version: int | str, *, limit: int | None, cursor: str | None
+) -> Call[Page[Assessment]]:
+    """GET /v1/models/{name}/versions/{version}/assessments."""
+    path = f"/v1/models/{_part(name)}/versions/{_part(version)}/assessments"
+    return Call("GET", path, _ASSESSMENTS, query=_given(limit=limit, cursor=cursor))
+
+
+def dataset_create(fit_id: str, config: DatasetConfig | None, trace_id: str | None = None) -> Call[Job]:
     """POST /v1/datasets."""
-    body = DatasetCreate(fit_id=fit_id, config=config or DatasetConfig())
+    body = DatasetCreate(fit_id=fit_id, trace_id=trace_id, config=config or DatasetConfig())
     return Call("POST", "/v1/datasets", _JOB, body=body)
 
 

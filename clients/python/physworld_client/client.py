@@ -10,6 +10,7 @@ import httpx
 
 from physworld_client import transport as wire
 from physworld_client.calls import Call
+from physworld_client.loop import Assessments, Traces
 from physworld_client.resources import Artifacts, Datasets, Fits, Jobs, Models, Pipelines, Scenes
 
 Answer = TypeVar("Answer")
@@ -26,7 +27,7 @@ class Client:
         transport: a transport of httpx, for tests or a Unix socket.
 
     Attributes:
-        scenes, fits, datasets, models, jobs, pipelines, artifacts: the resources.
+        scenes, fits, traces, datasets, models, assessments, jobs, pipelines, artifacts: the resources.
     """
 
     def __init__(
@@ -43,8 +44,10 @@ class Client:
         self.http = httpx.Client(transport=transport, **wire.client_options(base_url, token, timeout))
         self.scenes = Scenes(self)
         self.fits = Fits(self)
+        self.traces = Traces(self)
         self.datasets = Datasets(self)
         self.models = Models(self)
+        self.assessments = Assessments(self)
         self.jobs = Jobs(self)
         self.pipelines = Pipelines(self)
         self.artifacts = Artifacts(self)

@@ -89,9 +89,9 @@ class Fits(Resource):
 class Datasets(Resource):
     """Datasets of demonstration episodes."""
 
-    def create(self, fit_id: str, config: DatasetConfig | None = None) -> Job:
-        """Starts writing a dataset; its job's output is the dataset."""
-        return self._client.send(calls.dataset_create(fit_id, config))
+    def create(self, fit_id: str, config: DatasetConfig | None = None, *, trace_id: str | None = None) -> Job:
+        """Starts writing a dataset, in the twin that the trace made where it named an effect."""
+        return self._client.send(calls.dataset_create(fit_id, config, trace_id))
 
     def get(self, dataset_id: str) -> Dataset:
         """One dataset."""

@@ -120,7 +120,7 @@ class Service:
             return {"verdict": self.verdict, "report": report, "artifacts": artifacts}, None
         if lease.kind == "assessment":
             figure = {"error_m": 2e-3, "ci95_m": [1e-3, 3e-3], "noise_floor_m": 1e-4, "frames": 10}
-            excess = {"excess_m2": 0.0, "excess_ci95_m2": [-1e-6, 1e-6], "start_mismatch_m": 0.0}
+            excess = {"excess_m": 0.0, "excess_ci95_m": [-1e-6, 1e-6], "start_mismatch_m": 0.0}
             named = {"outcome": self.outcome, "reason": "it is so", "measured": figure, "expected": figure}
             return {**named, **excess}, None
         if lease.kind == "dataset_plan":

@@ -1,0 +1,91 @@
+"""Closing the loop, asynchronous: traces of what a twin leaves, and recordings held against published models.
+
+The classes of ``loop`` with the same names and arguments; a test compares them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from physworld_client import calls
+from physworld_client.arrays import arrays_of
+from physworld_client.async_resources import AsyncResource
+from physworld_client.pages import AsyncListPage
+from physworld_client.resources import LATEST
+from schemas.assessment import Assessment
+from schemas.fit import FitConfig
+from schemas.job import Job
+from schemas.trace import Trace, TraceConfig
+
+
+class AsyncTraces(AsyncResource):
+    """Residuals traced to effects."""
+
+    async def create(
+        self,
+        scene_id: str,
+        config: TraceConfig | None = None,
+        *,
+        fit: FitConfig | None = None,
+        fit_id: str | None = None,
+    ) -> Job:
+        """Starts a trace; its job's output is the trace."""
+        return await self._client.send(calls.trace_create(scene_id, config, fit, fit_id))
+
+    async def get(self, trace_id: str) -> Trace:
+        """One trace: the verdict and every figure of its report."""
+        return await self._client.send(calls.trace_get(trace_id))
+
+    async def list(
+        self,
+        *,
+        limit: int | None = None,
+        cursor: str | None = None,
+        scene_id: str | None = None,
+        verdict: str | None = None,
+    ) -> AsyncListPage[Trace]:
+        """Traces, newest first."""
+        return await self._page(
+            lambda at: calls.trace_list(limit=limit, cursor=at, scene_id=scene_id, verdict=verdict), cursor
+        )
+
+    async def tracks(self, trace_id: str) -> dict[str, np.ndarray]:
+        """``times`` (T,) [s], ``before`` and ``after`` (T, N, 3) [m]: open-loop tracks without and with the effects."""
+        return arrays_of(await self._client.send(calls.trace_tracks(trace_id)))
+
+    async def cancel(self, trace_id: str) -> Job:
+        """Asks for the end of the trace's job."""
+        return await self._client.send(calls.job_cancel((await self.get(trace_id)).job_id))
+
+
+class AsyncAssessments(AsyncResource):
+    """New recordings held against published models."""
+
+    async def create(
+        self,
+        name: str,
+        scene_id: str,
+        version: int | str = LATEST,
+        *,
+        open_trace: bool = True,
+        trace: TraceConfig | None = None,
+    ) -> Job:
+        """Starts an assessment; its job's outputs are the assessment and the trace that it may open."""
+        return await self._client.send(calls.assessment_create(name, version, scene_id, open_trace, trace))
+
+    async def get(self, assessment_id: str) -> Assessment:
+        """One assessment."""
+        return await self._client.send(calls.assessment_get(assessment_id))
+
+    async def list(
+        self,
+        name: str,
+        version: int | str = LATEST,
+        *,
+        limit: int | None = None,
+        cursor: str | None = None,
+    ) -> AsyncListPage[Assessment]:
+        """Assessments of a version, newest first."""
+        return await self._page(
+            lambda at: calls.assessment_list(name, version, limit=limit, cursor=at), cursor
+        )

@@ -1,0 +1,69 @@
+"""A twin put where another recording of its object starts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tiny_scene import tiny_scene
+
+from physworld.build import build_twin
+from physworld.effects.registry import effect
+from physworld.errors import SceneUnsupported
+from physworld.scene import Body, Scene
+from physworld.worldmodel.foreign import start_mismatch, twin_on
+
+TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+SHIFT = np.array([0.3, -0.2, 0.0])
+
+
+def moved(scene: Scene) -> Scene:
+    """The same recording a quarter turn farther on, of a body that declares no box any more."""
+    corners = np.stack([scene.body.box_min_m, scene.body.box_max_m])
+    fill = np.stack(np.meshgrid(*corners.T, indexing="ij"), axis=-1).reshape(-1, 3)
+    return replace(
+        scene,
+        points=scene.points @ TURN.T + SHIFT,
+        controllers=scene.controllers @ TURN.T + SHIFT,
+        body=Body(density_kg_m3=300.0),
+        surface_points=fill @ TURN.T + SHIFT,
+        grips=(),
+    )
+
+
+def test_the_same_body_takes_its_new_start_and_keeps_what_was_learned() -> None:
+    home = tiny_scene()
+    lifted = replace(home, points=home.points + 1e-3, name="again")
+    twin = build_twin(home, 60).with_parameters(youngs_modulus_pa=3e4, air_drag_per_s=0.4)
+    twin = twin.with_effect(effect("air_drag_quadratic", coefficient_per_m=0.2))
+    placed = twin_on(lifted, home, twin, 60)
+    assert placed.parameters == twin.parameters
+    assert placed.effects == twin.effects
+    np.testing.assert_array_equal(placed.particles_rest, twin.particles_rest)
+
+
+def test_a_body_that_looks_different_is_moved_as_a_whole() -> None:
+    home = tiny_scene()
+    twin = build_twin(home, 60).with_parameters(youngs_modulus_pa=3e4)
+    elsewhere = moved(home)
+    placed = twin_on(elsewhere, home, twin, 60)
+    np.testing.assert_allclose(placed.particles_start, twin.particles_start @ TURN.T + SHIFT, atol=1e-9)
+    np.testing.assert_allclose(placed.controllers_start, elsewhere.controllers[0])
+    assert start_mismatch(elsewhere, placed) == pytest.approx(start_mismatch(home, twin), abs=1e-6)
+    times = home.times[:6]
+    particles = [
+        t.simulate(scene.times, scene.controllers, times) for t, scene in ((twin, home), (placed, elsewhere))
+    ]
+    np.testing.assert_allclose(particles[1], particles[0] @ TURN.T + SHIFT, atol=1e-6)
+
+
+def test_other_controllers_or_points_are_refused_with_their_numbers() -> None:
+    home = tiny_scene()
+    twin = build_twin(home, 60)
+    with pytest.raises(SceneUnsupported, match="3 controllers, the model was trained with 4"):
+        twin_on(replace(home, controllers=home.controllers[:, :3], grips=()), home, twin, 60)
+    fewer = moved(home)
+    fewer = replace(fewer, points=fewer.points[:, :3], visible=fewer.visible[:, :3])
+    with pytest.raises(SceneUnsupported, match="shows 3 points"):
+        twin_on(fewer, home, twin, 60)
