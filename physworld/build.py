@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from physworld.colliders import carried, twin_colliders
 from physworld.geometry.declared import grips_of
 from physworld.geometry.reference import ReferenceBody, reference_body
 from physworld.geometry.rigid import rigid_groups
@@ -55,7 +56,8 @@ def build_twin(
     if grips:
         groups = tuple(np.array(g.controllers, dtype=int) for g in grips)
     else:
-        groups = tuple(rigid_groups(controls, reach))
+        free = np.setdiff1d(np.arange(controls.shape[1]), carried(scene))
+        groups = tuple(free[group] for group in rigid_groups(controls[:, free], reach))
     held, taken = [], np.empty(0, dtype=int)
     for number, group in enumerate(groups):
         region = grips[number] if grips else None
@@ -74,6 +76,7 @@ def build_twin(
         held_nodes=tuple(held),
         controllers_start=controls[0],
         release_s=_release_time(scene),
+        colliders=twin_colliders(scene, body.half_thickness_m, PRIOR_FRICTION),
         plasticity=plasticity,
         formulation=choice.formulation,
         device=device,

@@ -19,6 +19,7 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.sparse.linalg import splu
 
+from physworld.colliders import TwinCollider, from_parts, to_parts
 from physworld.effects.base import Effect
 from physworld.effects.registry import effect, in_order
 from physworld.errors import EffectRefused
@@ -29,7 +30,6 @@ from physworld.materials.laws import Law
 from physworld.materials.library import law_class
 from physworld.materials.plastic import PLASTICITIES, Plasticity
 from physworld.mpm.choose import FormulationName
-from physworld.mpm.colliders import Collider
 from physworld.mpm.contact import GroundContact, ground, touching
 from physworld.mpm.following import follow
 from physworld.mpm.lattice import Lattice
@@ -57,6 +57,7 @@ class Twin:
         controllers_start: controllers at the first frame [m], (K, 3).
         release_s: the body is held at its start until then (somebody let go of it).
         effects: what acts beside the declared physics.
+        colliders: rigid bodies that push, still, on their own track or carried by controllers.
         plasticity: flow law, or None; updated Lagrangian only.
         formulation: which form integrates the body.
         device: Warp device of the simulations; not part of the twin's identity.
@@ -73,6 +74,7 @@ class Twin:
     controllers_start: np.ndarray
     release_s: float = 0.0
     effects: tuple[Effect, ...] = ()
+    colliders: tuple[TwinCollider, ...] = ()
     plasticity: Plasticity | None = None
     formulation: FormulationName = "total_lagrangian"
     device: str = "cpu"
@@ -237,7 +239,7 @@ class Twin:
             stiffness_factor=None if properties is None else np.exp(properties[:, 0]),
             density_factor=None if properties is None else np.exp(properties[:, 1]),
             added_mass=self.body.added_mass,
-            terms=self.contacts,
+            terms=(*self.contacts, *self._pushes(control_times, control_points)),
             device=self.device,
         )
         for known in active:
@@ -304,6 +306,7 @@ class Twin:
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Everything as plain arrays, fit for an npz without pickle; :meth:`from_arrays` is the inverse."""
         lattice, body = self.lattice, self.body
+        collider_facts, collider_arrays = to_parts(self.colliders)
         facts = {
             "law": self.law.name,
             "law_parameters": asdict(self.law),
@@ -316,6 +319,7 @@ class Twin:
             "groups": [g.tolist() for g in self.controller_groups],
             "held": [h.tolist() for h in self.held_nodes],
             "effects": [{"name": known.name, "strengths": known.values} for known in self.effects],
+            "colliders": collider_facts,
             "formulation": self.formulation,
             "plasticity": None
             if self.plasticity is None
@@ -331,6 +335,7 @@ class Twin:
                 for k in ("rest", "start", "start_velocity", "points", "offsets")
             },
             **({} if body.added_mass is None else {"body_added_mass": body.added_mass}),
+            **collider_arrays,
         }
 
     @classmethod
@@ -358,6 +363,7 @@ class Twin:
             controllers_start=arrays["controllers_start"],
             release_s=facts["release_s"],
             effects=tuple(effect(e["name"], **e["strengths"]) for e in facts.get("effects", ())),
+            colliders=from_parts(facts.get("colliders", []), arrays, body.half_thickness_m),
             plasticity=None if flow is None else PLASTICITIES[flow["name"]](**flow["parameters"]),
             formulation=facts.get("formulation", "total_lagrangian"),
             device=device,
@@ -369,12 +375,24 @@ class Twin:
         if self.ground_height_m is None:
             return ()
         plane = ground(self.ground_height_m, self.ground_friction)
-        offsets = 0.0 if self.lattice.dim == 3 else self._touching(plane)
+        offsets: np.ndarray | float = 0.0
+        if self.lattice.dim < 3:
+            offsets = touching(
+                self.lattice, self.body.start, plane, self.release_s, self.body.half_thickness_m
+            )
         return (GroundContact(self.lattice, self.law, self.ground_height_m, self.ground_friction, offsets),)
 
-    def _touching(self, collider: Collider) -> np.ndarray:
-        half = {3: 0.0, 2: 0.5, 1: 1.0}[self.lattice.dim] * self.body.thickness_m
-        return touching(self.lattice, self.body.start, collider, self.release_s, half)
+    def _pushes(self, times: np.ndarray, points: np.ndarray) -> list[Term]:
+        """Contacts with the colliders under a control track."""
+        terms = []
+        for known in self.colliders:
+            moving = known.on_its_way(self.controllers_start, times, points)
+            terms.append(
+                known.contact(
+                    moving, self.lattice, self.body.start, self.release_s, self.body.half_thickness_m
+                )
+            )
+        return terms
 
     def _held(self, times: np.ndarray, controls: np.ndarray) -> HeldNodes:
         numbers, paths = [np.empty(0, dtype=int)], [np.empty((len(times), 0, 3))]

@@ -1,7 +1,8 @@
 """What of a body touches: its contact points, how stiff they are, and the ground under them.
 
-A solid touches with points on the exposed faces of its cells (2 x 2 a face), a sheet or a rod with its particles, half
-its thickness or its radius before they reach the obstacle. The penalty is one more cell of the material:
+A solid touches with points on the exposed faces of its cells (2 x 2 a face, drawn in where a cell is not full), a sheet
+or a rod with its particles, half its thickness or its radius before they reach the obstacle. The penalty is one more cell
+of the material:
 
     solid          p = (lambda + 2 mu) / dx depth      shear mu / dx
     sheet, rod     p = rho (c / dx)^2 depth            shear the same, both with half of critical damping
@@ -28,6 +29,7 @@ from physworld.mpm.lattice import Lattice
 if TYPE_CHECKING:
     from physworld.mpm.total_lagrangian import Problem
 
+_EMPTY = 0.02  # an eighth of a cell with less material has no surface
 _THIN_DAMPING = 0.5  # share of critical damping in the contact of sheets and rods
 
 
@@ -130,20 +132,29 @@ def contact_points(lattice: Lattice) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def _face_points(lattice: Lattice) -> list[tuple[int, np.ndarray]]:
-    """Axis and points of the exposed faces that look along each of the six directions."""
+    """Axis and points of the exposed faces that look along each of the six directions.
+
+    Where a cell is filled in part, the surface lies as far behind its face as the two eighths of the cell there are
+    empty; a quarter of a face with nothing behind it has no point.
+    """
     present = {tuple(cell) for cell in lattice.cells}
+    eighths = lattice.fill.reshape(-1, 2, 2, 2)
     sides = []
     for axis in range(3):
         others = [a for a in range(3) if a != axis]
         for side in (0, 1):
             step = np.zeros(3, dtype=int)
             step[axis] = 1 if side else -1
-            exposed = np.array([c for c in lattice.cells if tuple(c + step) not in present]).reshape(-1, 3)
-            local = np.zeros((4, 3))
-            local[:, axis] = side
-            local[:, others] = [(a, b) for a in GAUSS_POINTS for b in GAUSS_POINTS]
-            places = lattice.origin + (exposed[:, None] + local[None]) * lattice.spacing
-            sides.append((axis, places.reshape(-1, 3)))
+            exposed = np.array([tuple(c + step) not in present for c in lattice.cells])
+            behind = np.moveaxis(eighths[exposed], 1 + axis, 1)
+            outer, inner = (behind[:, side], behind[:, 1 - side])
+            depth = 0.5 * (1 - outer) * (2 - inner)
+            local = np.zeros((int(exposed.sum()), 2, 2, 3))
+            local[..., axis] = np.abs(side - depth)
+            local[..., others[0]] = np.array(GAUSS_POINTS)[:, None]
+            local[..., others[1]] = np.array(GAUSS_POINTS)[None, :]
+            places = lattice.origin + (lattice.cells[exposed][:, None, None] + local) * lattice.spacing
+            sides.append((axis, places[np.maximum(outer, inner) > _EMPTY]))
     return sides
 
 
