@@ -21,7 +21,7 @@ from scipy.spatial import ConvexHull
 from physworld.errors import SceneUnsupported
 from physworld.geometry.curves import fit_nodes
 from physworld.geometry.declared import grips_of, load_of
-from physworld.geometry.filling import inside_surface_points, inside_volume_points
+from physworld.geometry.filling import filled_body, inside_surface_points
 from physworld.mpm.lattice import Lattice, lattice_from_cells
 from physworld.scene import AS_MEASURED, Scene
 
@@ -63,6 +63,11 @@ class ReferenceBody:
     thickness_m: float
     notes: tuple[str, ...] = ()
     added_mass: np.ndarray | None = None
+
+    @property
+    def half_thickness_m(self) -> float:
+        """Distance of the surface from a sheet's middle or a rod's axis [m]; 0 for a solid."""
+        return {3: 0.0, 2: 0.5, 1: 1.0}[self.lattice.dim] * self.thickness_m
 
 
 def reference_body(scene: Scene, particle_budget: int, refinement: float = 1.0) -> ReferenceBody:
@@ -121,9 +126,8 @@ def _solid(scene: Scene, budget: int) -> ReferenceBody:
         cloud = scene.rest_volume_points
         if cloud is not None and len(cloud) >= 20:
             _require_volume(cloud, scene.kind)
-
-            def test(q: np.ndarray) -> np.ndarray:
-                return inside_volume_points(cloud, q)
+            filled = filled_body(cloud)
+            test, reach, volume = filled.contains, filled.growth_m, filled.volume_m3
         else:
             cloud = points if scene.surface_points is None else np.concatenate([points, scene.surface_points])
             if len(cloud) < 30:
@@ -138,9 +142,12 @@ def _solid(scene: Scene, budget: int) -> ReferenceBody:
             def test(q: np.ndarray) -> np.ndarray:
                 return inside_surface_points(cloud, q, cell)
 
+            reach = 0.0
+            probe = np.random.default_rng(0).uniform(cloud.min(axis=0), cloud.max(axis=0), size=(4000, 3))
+            volume = float(test(probe).mean() * np.prod(np.ptp(cloud, axis=0)))
+
         low, high = cloud.min(axis=0), cloud.max(axis=0)
-        probe = np.random.default_rng(0).uniform(low, high, size=(4000, 3))
-        share = float(test(probe).mean())
+        share = min(volume / float(np.prod(high - low)), 1.0)
         if share >= _BOX_FILL or (scene.kind in _BOX_KINDS and share >= 0.7):
             test = None
             if body.size_m is not None and np.allclose(body.size_m, high - low, rtol=0.05):
@@ -149,6 +156,7 @@ def _solid(scene: Scene, budget: int) -> ReferenceBody:
         else:
             notes.append(f"the body fills {share:.0%} of its bounding box")
             budget = int(budget / max(share, 0.05))
+            low, high = low - reach, high + reach
     lattice = _solid_lattice(scene, low, high, test, budget)
     start = lattice.node_coordinates
     hanging = _hanging_mass(scene, lattice, notes)
