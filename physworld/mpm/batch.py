@@ -53,6 +53,7 @@ class Batch:
             if problem.device != first.device:
                 raise BatchRefused(f"problem {number} is for {problem.device}, the first for {first.device}")
         self.problems, self.device, self.lattice = tuple(problems), first.device, first.lattice
+        self.cell_m = float(first.lattice.spacing.max())
         self.masses = np.stack([problem.nodal_mass() for problem in problems])
         self.mass = self.masses.reshape(-1)
         ones = np.ones(first.lattice.fill.size)
@@ -163,6 +164,8 @@ class _BatchRun(Run):
             wp.array(self._gravity, dtype=wp.vec3d, device=batch.device),
             wp.array(self._drag, dtype=wp.float64, device=batch.device),
         ]
+        starts = x.reshape(len(batch.problems), -1, 3)
+        self._sizes = [float(np.ptp(start, axis=0).max()) + batch.cell_m for start in starts]
         self._acting: list[tuple[tuple[BoundTerm, ...], list[wp.array]]] = []
         super().__init__(batch, x, v, held, times)
 
@@ -198,15 +201,15 @@ class _BatchRun(Run):
         return np.repeat(self._gravity, nodes, axis=0), np.repeat(self._drag, nodes)[:, None]
 
     def _check(self, now: np.ndarray, time: float) -> None:
-        batch, dt = self._solver, float(self.clock.numpy()[2])
-        bodies, spacing = len(batch.problems), float(batch.lattice.spacing.max())
+        batch, dt = self._solver, float(self._clocks[0].numpy()[2])
+        bodies = len(batch.problems)
         inverted = np.count_nonzero(batch.forces.inverted.numpy().reshape(bodies, -1), axis=1)
         states, starts = now.reshape(bodies, -1, 3), self._start.reshape(bodies, -1, 3)
         for body in range(bodies):
             if self.errors[body] is not None or not self.awaited[body]:
                 continue
             try:
-                check_state(states[body], starts[body], int(inverted[body]), spacing, time, dt)
+                check_state(states[body], starts[body], int(inverted[body]), self._sizes[body], time, dt)
                 for term in batch.terms[body]:
                     term.check(time)
             except SimulationError as error:

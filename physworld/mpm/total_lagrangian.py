@@ -104,7 +104,7 @@ class TotalLagrangian:
         lattice, law, device = problem.lattice, problem.law, problem.device
         particles = lattice.fill.size
         stiffness = np.ones(particles) if problem.stiffness_factor is None else problem.stiffness_factor
-        self.problem, self.device = problem, device
+        self.problem, self.device, self.cell_m = problem, device, float(lattice.spacing.max())
         self.mass = problem.nodal_mass()
         self.forces = InternalForces(lattice, law, stiffness, problem.rest, device)
         cell = float(lattice.spacing.min())
@@ -187,6 +187,8 @@ class Run:
         self.force = wp.zeros(3 * nodes, dtype=wp.float64, device=device)
         self.clock = wp.zeros(3, dtype=wp.float64, device=device)
         self.counter = wp.zeros(3, dtype=wp.int32, device=device)
+        self._clocks = wp.zeros(3, dtype=wp.float64, device="cpu"), wp.zeros(3, dtype=wp.int32, device="cpu")
+        self._size = float(np.ptp(x, axis=0).max()) + solver.cell_m
         width = max(3 * len(held.nodes), 1)
         paths = np.zeros((2, frames, width))
         paths[0, :, : 3 * len(held.nodes)] = held.positions.reshape(frames, -1)
@@ -248,8 +250,11 @@ class Run:
         interval = self._times[frame + 1] - self._times[frame]
         substeps = self._solver.substeps_of(interval)
         dt = interval / substeps
-        self.clock.assign(np.array([interval, 1.0 / dt, dt]))
-        self.counter.assign(np.array([frame, 0, substeps], dtype=np.int32))
+        clock, counter = self._clocks
+        clock.numpy()[:] = interval, 1.0 / dt, dt
+        counter.numpy()[:] = frame, 0, substeps
+        wp.copy(self.clock, clock)
+        wp.copy(self.counter, counter)
         return substeps
 
     def _half_a_step_back(self, v: np.ndarray, interval: float) -> np.ndarray:
@@ -269,9 +274,9 @@ class Run:
         return self._solver.problem.gravity_m_s2, self._solver.problem.drag_per_s
 
     def _check(self, now: np.ndarray, time: float) -> None:
-        solver, dt = self._solver, float(self.clock.numpy()[2])
+        solver, dt = self._solver, float(self._clocks[0].numpy()[2])
         inverted = int(np.count_nonzero(solver.forces.inverted.numpy()))
-        check_state(now, self._start, inverted, float(solver.problem.lattice.spacing.max()), time, dt)
+        check_state(now, self._start, inverted, self._size, time, dt)
         for term in solver.terms:
             term.check(time)
 
@@ -282,14 +287,14 @@ def whole_chunks(interval: float, time_step_s: float) -> int:
 
 
 def check_state(
-    now: np.ndarray, start: np.ndarray, inverted: int, spacing: float, time: float, dt: float
+    now: np.ndarray, start: np.ndarray, inverted: int, size: float, time: float, dt: float
 ) -> None:
     """Refuse nodal positions that cannot be trusted.
 
     Args:
         now, start: nodal positions of one body now and at its start [m], (n, 3).
         inverted: how many of its cells inverted.
-        spacing: its largest cell size [m].
+        size: of the body at its start [m].
         time, dt: of the end of the frame, and the time step [s]; for the message.
 
     Raises:
@@ -301,7 +306,6 @@ def check_state(
             f"the body inverted or blew up at t = {time:.4f} s with time step {dt:.3g} s ({inverted} cells inverted, "
             f"{int((~np.isfinite(now)).any(axis=1).sum())} of {len(now)} nodes not finite)"
         )
-    size = float(np.ptp(start, axis=0).max()) + spacing
     farthest = float(np.abs(now - start).max())
     if farthest > _REACH * size:
         raise ParticlesLeftTheGrid(
