@@ -1,8 +1,8 @@
 """What of a body touches: its contact points, how stiff they are, and the ground under them.
 
 A solid touches with points on the exposed faces of its cells (2 x 2 a face, drawn in where a cell is not full), a sheet
-or a rod with its particles, half its thickness or its radius before they reach the obstacle. The penalty is one more cell
-of the material:
+or a rod with its particles, half its thickness or its radius before they reach the obstacle. The penalty is that of one
+more cell of the material:
 
     solid          p = (lambda + 2 mu) / dx depth      shear mu / dx
     sheet, rod     p = rho (c / dx)^2 depth            shear the same, both with half of critical damping
