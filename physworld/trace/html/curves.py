@@ -1,0 +1,97 @@
+"""What the page's pictures show, from a scene and two predictions: residuals over time and over the body."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from physworld.evaluate.baselines import constant_velocity, rigid_follow, static
+from physworld.scene import Scene
+
+BASELINES = {"static": static, "rigid_follow": rigid_follow, "constant_velocity": constant_velocity}
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Measured minus predicted, NaN where a point was not seen.
+
+    Attributes:
+        times: (T,) [s].
+        before, after: (T, N, 3) [m].
+        baselines: root mean squared coordinate error of every frame by name, (T,) [m].
+        split: first held-out frame.
+        order: tracked points along the body's longest axis, (N,).
+    """
+
+    times: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+    baselines: dict[str, np.ndarray]
+    split: int
+    order: np.ndarray
+
+    @property
+    def same(self) -> bool:
+        """Whether nothing was added: one prediction only."""
+        return bool(np.array_equal(self.before, self.after, equal_nan=True))
+
+    @property
+    def split_s(self) -> float | None:
+        """Time of the first held-out frame [s]; None where nothing is held out."""
+        return float(self.times[self.split]) if self.split < len(self.times) else None
+
+
+def residuals(scene: Scene, before: np.ndarray, after: np.ndarray, split: int) -> Residuals:
+    """Residuals of two predictions (T, N, 3) [m].
+
+    Raises:
+        ValueError: a prediction is not shaped as the scene's points.
+    """
+    for tracks in (before, after):
+        if tracks.shape != scene.points.shape:
+            raise ValueError(f"tracks of shape {tracks.shape} for points of shape {scene.points.shape}")
+    seen = scene.visible[..., None]
+    first = scene.points[0] - scene.points[0].mean(axis=0)
+    axis = np.linalg.svd(first, full_matrices=False)[2][0]
+    return Residuals(
+        times=scene.times,
+        before=np.where(seen, scene.points - before, np.nan),
+        after=np.where(seen, scene.points - after, np.nan),
+        baselines={
+            name: per_frame(np.where(seen, scene.points - predict(scene), np.nan))
+            for name, predict in BASELINES.items()
+        },
+        split=split,
+        order=np.argsort(first @ axis, kind="stable"),
+    )
+
+
+def per_frame(residual: np.ndarray) -> np.ndarray:
+    """Root mean squared coordinate of (T, N, 3) in every frame, (T,); NaN where nothing was seen."""
+    return _root_mean(residual, (1, 2))
+
+
+def per_point(residual: np.ndarray) -> np.ndarray:
+    """Root mean squared coordinate of (T, N, 3) of every point, (N,); NaN where it was never seen."""
+    return _root_mean(residual, (0, 2))
+
+
+def carpet(residual: np.ndarray, order: np.ndarray) -> np.ndarray:
+    """Length of the residual (T, N, 3) over points in their order and frames, (N, T)."""
+    return np.linalg.norm(residual, axis=2).T[order]
+
+
+def mean_component(residual: np.ndarray, axis: int) -> np.ndarray:
+    """Mean over the seen points of one component, (T,), with its sign."""
+    values = residual[..., axis]
+    seen = np.isfinite(values)
+    total = np.where(seen, values, 0.0).sum(axis=1)
+    return np.where(seen.any(axis=1), total / np.maximum(seen.sum(axis=1), 1), np.nan)
+
+
+def _root_mean(residual: np.ndarray, axes: tuple[int, int]) -> np.ndarray:
+    seen = np.isfinite(residual)
+    count = seen.sum(axis=axes)
+    square = np.where(seen, residual, 0.0) ** 2
+    return np.where(count > 0, np.sqrt(square.sum(axis=axes) / np.maximum(count, 1)), np.nan)
