@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from services.web import create_app
 from storage.scene_bundle import FIELD_OF_ARRAY
-from storage.scene_declaration import BodyForm, Declaration, GripForm, GroundForm
+from storage.scene_declaration import BodyForm, ColliderForm, Declaration, GripForm, GroundForm
 from storage.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -94,6 +94,6 @@ def test_the_table_of_addresses_is_the_api(tmp_path: Path) -> None:
 
 def test_every_key_of_a_scene_is_documented() -> None:
     page = (ROOT / "docs" / "scenes.md").read_text()
-    forms = (Declaration, BodyForm, GroundForm, GripForm)
+    forms = (Declaration, BodyForm, GroundForm, GripForm, ColliderForm)
     keys = {key for form in forms for key in form.model_fields} | set(FIELD_OF_ARRAY)
     assert {key for key in keys if f"`{key}`" not in page} == set()
