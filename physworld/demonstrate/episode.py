@@ -121,6 +121,10 @@ class EpisodePlan:
             "log_modulus_mean": float(self.properties[:, 0].mean()),
         }
 
+    def rejection(self, error: SimulationError) -> dict[str, Any]:
+        """What is recorded of a plan that was not accepted; JSON types only."""
+        return {"seed": self.seed, "motion": self.motion, "reason": str(error)}
+
 
 def plan_episode(scene: Scene, twin: Twin, config: DemonstrationConfig, seed: int) -> EpisodePlan:
     """The episode that ``seed`` stands for."""
@@ -174,6 +178,11 @@ def run_episode(twin: Twin, plan: EpisodePlan, progress: Progress | None = None)
         progress=progress,
         from_rest=plan.from_rest,
     )
+    return episode_arrays(plan, particles)
+
+
+def episode_arrays(plan: EpisodePlan, particles: np.ndarray) -> dict[str, np.ndarray]:
+    """What is stored of a simulated plan, as :func:`run_episode` gives it; refuses what ``check_episode`` refuses."""
     check_episode(particles, plan)
     return {
         "times": plan.times,
@@ -194,7 +203,7 @@ def make_episode(
         try:
             return run_episode(twin, plan, progress), {**plan.attributes(), "rejected": rejected}
         except SimulationError as error:
-            rejected.append({"seed": plan.seed, "motion": plan.motion, "reason": str(error)})
+            rejected.append(plan.rejection(error))
             if len(rejected) == config.attempts:
                 raise
 

@@ -125,6 +125,28 @@ def test_the_same_seed_makes_the_same_episodes(runtime_with, fit: Fit, stores: S
     assert digests[0] == digests[1]
 
 
+def test_a_block_of_episodes_is_simulated_once_and_makes_the_same_demonstrations(
+    runtime_with, fit: Fit, stores: Stores, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    blocks: list[int] = []
+    make_episodes = dataset_task.make_episodes
+
+    def counted(scene, twin, config, seeds, progress):
+        blocks.append(len(seeds))
+        return make_episodes(scene, twin, config, seeds, progress)
+
+    episodes: dict[int, list[tuple[int, str]]] = {}
+    for width in (1, 2):
+        monkeypatch.setitem(dataset_task.WIDTHS, "cpu", width)
+        monkeypatch.setattr(dataset_task, "make_episodes", counted)
+        _, dataset = _make_dataset(runtime_with(), fit, episodes=3, frames=8, seed=11)
+        with stores.database.reading() as session:
+            made = resources.all_episodes(session, dataset.id)
+        episodes[width] = [(episode.seed, episode.motion) for episode in made]
+    assert blocks == [2, 1]
+    assert episodes[1] == episodes[2]
+
+
 def test_what_a_dead_attempt_wrote_is_removed_at_sealing(
     runtime_with, fit: Fit, stores: Stores, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,0 +1,91 @@
+"""Many episodes at once: the plans of many seeds, simulated side by side by the twin.
+
+Each is what :func:`physworld.demonstrate.make_episode` makes of its seed, but for the time step, the smallest of those
+that are simulated together: the same plan, the same checks, and where a plan is rejected the same next one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from physworld.batch import Episode, simulate_batch
+from physworld.demonstrate.episode import (
+    DemonstrationConfig,
+    EpisodePlan,
+    Progress,
+    derived_seed,
+    episode_arrays,
+    plan_episode,
+)
+from physworld.errors import SimulationError
+from physworld.scene import Scene
+
+if TYPE_CHECKING:
+    from physworld.twin import Twin
+
+Made = tuple[dict[str, np.ndarray], dict[str, Any]]
+
+
+def make_episodes(
+    scene: Scene,
+    twin: Twin,
+    config: DemonstrationConfig,
+    seeds: Sequence[int],
+    progress: Progress | None = None,
+) -> list[Made | SimulationError]:
+    """Arrays and attributes of an accepted episode for each seed, or the error of its last attempt.
+
+    Raises:
+        BatchRefused: the twin cannot be simulated side by side.
+    """
+    made: list[Made | SimulationError | None] = [None] * len(seeds)
+    rejected: list[list[dict[str, Any]]] = [[] for _ in seeds]
+    waiting = list(range(len(seeds)))
+    while waiting:
+        plans = {}
+        for place in waiting:
+            tried = len(rejected[place])
+            seed = seeds[place] if tried == 0 else derived_seed(seeds[place], tried)
+            plans[place] = plan_episode(scene, twin, config, seed)
+        waiting = []
+        for together in _starting_together(twin, plans):
+            for place, result in _simulated(twin, {k: plans[k] for k in together}, progress).items():
+                if not isinstance(result, SimulationError):
+                    made[place] = (result, {**plans[place].attributes(), "rejected": rejected[place]})
+                    continue
+                rejected[place].append(plans[place].rejection(result))
+                if len(rejected[place]) == config.attempts:
+                    made[place] = result
+                else:
+                    waiting.append(place)
+    return [one for one in made if one is not None]
+
+
+def _starting_together(twin: Twin, plans: dict[int, EpisodePlan]) -> list[list[int]]:
+    """Plans that start at the same time: those from rest at once, a recording's own start at its release."""
+    late = [k for k, plan in plans.items() if twin.release_s > 0.0 and not plan.from_rest]
+    at_once = [k for k in plans if k not in late]
+    return [places for places in (at_once, late) if places]
+
+
+def _simulated(
+    twin: Twin, plans: dict[int, EpisodePlan], progress: Progress | None
+) -> dict[int, dict[str, np.ndarray] | SimulationError]:
+    """Arrays of the plans, or why they cannot be trusted."""
+    episodes = [
+        Episode(
+            plan.control_times, plan.control_points, plan.times, plan.properties, from_rest=plan.from_rest
+        )
+        for plan in plans.values()
+    ]
+    results: dict[int, dict[str, np.ndarray] | SimulationError] = {}
+    outcomes = simulate_batch(twin, episodes, progress=progress)
+    for (place, plan), outcome in zip(plans.items(), outcomes, strict=True):
+        try:
+            results[place] = episode_arrays(plan, twin.particles_at(outcome.trusted()))
+        except SimulationError as error:
+            results[place] = error
+    return results
