@@ -6,6 +6,7 @@ that the SDK sees every state of a job without simulations.
 
 from __future__ import annotations
 
+import io
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,6 +83,22 @@ class Service:
                 "metrics": {},
                 "artifacts": [twin.model_dump()],
             }
+        if lease.kind == "trace":
+            return self._traced()
+        if lease.kind == "assessment":
+            figure = {"error_m": 0.009, "ci95_m": [0.008, 0.01], "noise_floor_m": 0.0005, "frames": 10}
+            promised = {**figure, "error_m": 0.001, "ci95_m": [0.0009, 0.0012]}
+            return {
+                "outcome": "worse_than_expected",
+                "reason": "The model errs more than noise and its card allow",
+                "measured": figure,
+                "expected": promised,
+                "excess_m": 0.008,
+                "excess_ci95_m": [0.006, 0.009],
+                "baselines_m": {"static": 0.05},
+                "twin_m": 0.008,
+                "start_mismatch_m": 0.0,
+            }
         if lease.kind == "dataset_plan":
             return {"episodes": lease.payload["config"]["episodes"], "frames": 10, "particles": 20}
         if lease.kind == "episode":
@@ -99,6 +116,27 @@ class Service:
             manifest = self._put("manifest.json", lease.shard_id.encode())
             return {"digest": manifest.sha256, "artifacts": [manifest.model_dump()]}
         return self._published(lease.payload["name"], lease.payload["version"])
+
+    def _traced(self) -> dict[str, Any]:
+        number = {"value": 1.9, "ci95": [1.6, 2.2], "unit": "1/s"}
+        report = {
+            "scene": "strip",
+            "verdict": "named",
+            "reason": "best supported among 20 candidates: air_drag_linear",
+            "effects": [{"name": "air_drag_linear", "parameters": {"rate_per_s": number}}],
+            "held_out": {"before": 0.021, "after": 0.006, "noise_floor": 0.001},
+            "unexplained": {"rms_m": 0.004, "description": "little, at the free end"},
+            "simulations": 57,
+            "seconds": 12.0,
+        }
+        tracks = io.BytesIO()
+        np.savez(tracks, allow_pickle=False, times=np.arange(3.0), before=np.zeros((3, 2, 3)))
+        files = [
+            self._put("report.json", json.dumps(report).encode()),
+            self._put("tracks.npz", tracks.getvalue()),
+            self._put("twin.npz", b"twin"),
+        ]
+        return {"verdict": "named", "report": report, "artifacts": [file.model_dump() for file in files]}
 
     def _published(self, name: str, version: int) -> dict[str, Any]:
         files = [self._put("model.safetensors", f"{name} {version}".encode()), self._put("card.json", b"{}")]

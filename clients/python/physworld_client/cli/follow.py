@@ -7,7 +7,7 @@ The pipeline's child jobs are looked at once a second. A service that goes away 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Protocol
 
@@ -35,18 +35,23 @@ class View(Protocol):
     ) -> None: ...
 
     def show(self, stages: dict[str, Job]) -> None:
-        """Shows the child jobs as they are now, by kind."""
+        """Shows the child jobs as they are now, by stage."""
 
 
-def follow(client: Client, pipeline_id: str, alive: Callable[[], bool]) -> tuple[Job, dict[str, Job]]:
-    """Follows a pipeline to its end; returns it and its child jobs by kind.
+def follow(
+    client: Client, pipeline_id: str, alive: Callable[[], bool], expected: Sequence[str] = STAGES
+) -> tuple[Job, dict[str, Job]]:
+    """Follows a pipeline to its end; returns it and its child jobs by stage.
+
+    A stage is named by its job's kind; the second of a kind (with the effects that a trace named) is ``kind_2``.
 
     Args:
         alive: whether a service that this command started still runs.
+        expected: stages that are shown before they begin.
     """
     ended: dict[str, Job] = {}
     answered = time.monotonic()
-    with _view() as view:
+    with _view(expected) as view:
         while True:
             try:
                 pipeline = client.jobs.get(pipeline_id)
@@ -54,9 +59,10 @@ def follow(client: Client, pipeline_id: str, alive: Callable[[], bool]) -> tuple
                 for child in pipeline.children:
                     if all(job.id != child for job in ended.values()):
                         job = client.jobs.get(child)
-                        stages[job.kind] = job
+                        stage = job.kind if job.kind not in ended else f"{job.kind}_2"
+                        stages[stage] = job
                         if job.state in TERMINAL_STATES:
-                            ended[job.kind] = job
+                            ended[stage] = job
                 answered = time.monotonic()
             except ConnectionFailed:
                 if not alive() or time.monotonic() - answered > PATIENCE_S:
@@ -68,26 +74,23 @@ def follow(client: Client, pipeline_id: str, alive: Callable[[], bool]) -> tuple
             time.sleep(LOOK_INTERVAL_S)
 
 
-def _view() -> View:
-    return Bars() if stdout.is_terminal else Lines()
+def _view(expected: Sequence[str]) -> View:
+    return Bars(expected) if stdout.is_terminal else Lines()
 
 
 class Bars:
     """Rich progress bars, redrawn in place."""
 
-    def __init__(self) -> None:
+    def __init__(self, expected: Sequence[str]) -> None:
         self._progress = Progress(
-            TextColumn("{task.description:<9}"),
+            TextColumn("{task.description:<10}"),
             BarColumn(bar_width=30),
             TextColumn("{task.fields[state]:<9}"),
             TextColumn("{task.fields[seconds]:>6}"),
             TextColumn("{task.fields[text]}"),
             console=stdout,
         )
-        self._tasks: dict[str, TaskID] = {
-            stage: self._progress.add_task(stage, total=1.0, state="waiting", seconds="", text="")
-            for stage in STAGES
-        }
+        self._tasks: dict[str, TaskID] = {stage: self._add(stage) for stage in expected}
 
     def __enter__(self) -> Bars:
         self._progress.start()
@@ -103,6 +106,8 @@ class Bars:
         for kind, job in stages.items():
             total = job.progress.total or 1.0
             done = total if job.state == "succeeded" else min(job.progress.done, total)
+            if kind not in self._tasks:
+                self._tasks[kind] = self._add(kind)
             self._progress.update(
                 self._tasks[kind],
                 total=total,
@@ -111,6 +116,9 @@ class Bars:
                 seconds=f"{duration_s(job):.0f} s" if job.started_at else "",
                 text=progress_text(job),
             )
+
+    def _add(self, stage: str) -> TaskID:
+        return self._progress.add_task(stage, total=1.0, state="waiting", seconds="", text="")
 
 
 class Lines:
@@ -137,7 +145,7 @@ class Lines:
             text = progress_text(job)
             if job.state in TERMINAL_STATES:
                 text = f"{duration_s(job):.1f} s{', ' if text else ''}{text}"
-            line = f"{kind:<9}{job.state:<11}{text}".rstrip()
+            line = f"{kind:<8} {job.state:<11}{text}".rstrip()
             if changed or (due and self._printed.get(kind) != line):
                 stdout.print(line, markup=False, soft_wrap=True)
                 self._printed[kind] = line

@@ -53,7 +53,7 @@ def scenes_list(
         return (scene.id, scene.name, scene.kind, *counts, ago(scene.created_at))
 
     with service.connect(url, token, data) as client:
-        _show_list(client.scenes.list(limit=min(limit, PAGE)).auto_paging_iter(), limit, json, headings, row)
+        show_list(client.scenes.list(limit=min(limit, PAGE)).auto_paging_iter(), limit, json, headings, row)
 
 
 @scenes.command("add")
@@ -66,16 +66,16 @@ def scenes_add(
 ) -> None:
     """Upload a scene."""
     with service.connect(url, token, data) as client:
-        _show(client.scenes.create(path), json)
+        show(client.scenes.create(path), json)
 
 
 @scenes.command("show")
-def scenes_show(
+def scenesshow(
     scene_id: str, json: Json = False, url: Url = None, token: Token = None, data: Data = None
 ) -> None:
     """One scene."""
     with service.connect(url, token, data) as client:
-        _show(client.scenes.get(scene_id), json)
+        show(client.scenes.get(scene_id), json)
 
 
 @scenes.command("download")
@@ -84,7 +84,7 @@ def scenes_download(
 ) -> None:
     """Download the files of a scene."""
     with service.connect(url, token, data) as client:
-        _download(client, client.scenes.get(scene_id).artifacts, out or Path(scene_id))
+        download(client, client.scenes.get(scene_id).artifacts, out or Path(scene_id))
 
 
 @fits.command("list")
@@ -99,16 +99,16 @@ def fits_list(
         return (fit.id, fit.scene_id, fit.state, shown, ago(fit.created_at))
 
     with service.connect(url, token, data) as client:
-        _show_list(client.fits.list(limit=min(limit, PAGE)).auto_paging_iter(), limit, json, headings, row)
+        show_list(client.fits.list(limit=min(limit, PAGE)).auto_paging_iter(), limit, json, headings, row)
 
 
 @fits.command("show")
-def fits_show(
+def fitsshow(
     fit_id: str, json: Json = False, url: Url = None, token: Token = None, data: Data = None
 ) -> None:
     """One fit."""
     with service.connect(url, token, data) as client:
-        _show(client.fits.get(fit_id), json)
+        show(client.fits.get(fit_id), json)
 
 
 @fits.command("download")
@@ -117,7 +117,7 @@ def fits_download(
 ) -> None:
     """Download the files of a fit: the twin and its report."""
     with service.connect(url, token, data) as client:
-        _download(client, client.fits.get(fit_id).artifacts, out or Path(fit_id))
+        download(client, client.fits.get(fit_id).artifacts, out or Path(fit_id))
 
 
 @datasets.command("list")
@@ -132,18 +132,16 @@ def datasets_list(
         return (dataset.id, dataset.fit_id, dataset.state, episodes, ago(dataset.created_at))
 
     with service.connect(url, token, data) as client:
-        _show_list(
-            client.datasets.list(limit=min(limit, PAGE)).auto_paging_iter(), limit, json, headings, row
-        )
+        show_list(client.datasets.list(limit=min(limit, PAGE)).auto_paging_iter(), limit, json, headings, row)
 
 
 @datasets.command("show")
-def datasets_show(
+def datasetsshow(
     dataset_id: str, json: Json = False, url: Url = None, token: Token = None, data: Data = None
 ) -> None:
     """One dataset."""
     with service.connect(url, token, data) as client:
-        _show(client.datasets.get(dataset_id), json)
+        show(client.datasets.get(dataset_id), json)
 
 
 @datasets.command("episodes")
@@ -158,7 +156,7 @@ def datasets_episodes(
     """The committed episodes of a dataset."""
     headings = ("index", "motion", "seed", "frames", "particles", "attempt", "digest")
     with service.connect(url, token, data) as client:
-        _show_list(
+        show_list(
             client.datasets.episodes(dataset_id, limit=min(limit, PAGE)).auto_paging_iter(),
             limit,
             json,
@@ -183,7 +181,7 @@ def datasets_download(
     """Download the manifest of a dataset, and its episodes when asked."""
     folder = out or Path(dataset_id)
     with service.connect(url, token, data) as client:
-        _download(client, client.datasets.get(dataset_id).artifacts, folder)
+        download(client, client.datasets.get(dataset_id).artifacts, folder)
         if not episodes:
             return
         folder.mkdir(parents=True, exist_ok=True)
@@ -207,7 +205,7 @@ def models_list(
 
     with service.connect(url, token, data) as client:
         pages = client.models.list(limit=min(limit, PAGE)).auto_paging_iter()
-        _show_list(pages, limit, json, ("name", "latest", "aliases", "age"), row)
+        show_list(pages, limit, json, ("name", "latest", "aliases", "age"), row)
 
 
 @models.command("versions")
@@ -233,11 +231,11 @@ def models_versions(
 
     with service.connect(url, token, data) as client:
         pages = client.models.versions(name, limit=min(limit, PAGE)).auto_paging_iter()
-        _show_list(pages, limit, json, ("version", "state", "aliases", "sha256", "age"), row)
+        show_list(pages, limit, json, ("version", "state", "aliases", "sha256", "age"), row)
 
 
 @models.command("show")
-def models_show(
+def modelsshow(
     name: str,
     version: VersionName = LATEST,
     json: Json = False,
@@ -247,7 +245,7 @@ def models_show(
 ) -> None:
     """One version of a model."""
     with service.connect(url, token, data) as client:
-        _show(client.models.version(name, version), json)
+        show(client.models.version(name, version), json)
 
 
 @models.command("download")
@@ -296,16 +294,16 @@ def jobs_list(
 
     with service.connect(url, token, data) as client:
         pages = client.jobs.list(limit=min(limit, PAGE), state=state, kind=kind).auto_paging_iter()
-        _show_list(pages, limit, json, ("id", "kind", "state", "progress", "age"), row)
+        show_list(pages, limit, json, ("id", "kind", "state", "progress", "age"), row)
 
 
 @jobs.command("show")
-def jobs_show(
+def jobsshow(
     job_id: str, json: Json = False, url: Url = None, token: Token = None, data: Data = None
 ) -> None:
     """One job."""
     with service.connect(url, token, data) as client:
-        _show(client.jobs.get(job_id), json)
+        show(client.jobs.get(job_id), json)
 
 
 @jobs.command("wait")
@@ -353,13 +351,14 @@ def progress_text(job: Job) -> str:
     return ", ".join(parts)
 
 
-def _show_list(
+def show_list(
     items: Iterable[Item],
     limit: int,
     json: bool,
     headings: tuple[str, ...],
     row: Callable[[Item], tuple[str, ...]],
 ) -> None:
+    """The first ``limit`` items as a table, or as JSON."""
     chosen = list(islice(items, limit))
     if json:
         print_json(chosen)
@@ -367,14 +366,16 @@ def _show_list(
         print_table(headings, map(row, chosen))
 
 
-def _show(value: BaseModel, json: bool) -> None:
+def show(value: BaseModel, json: bool) -> None:
+    """One object, field by field, or as JSON."""
     if json:
         print_json(value)
     else:
         print_fields(value)
 
 
-def _download(client: Client, artifacts: list[Artifact], folder: Path) -> None:
+def download(client: Client, artifacts: list[Artifact], folder: Path) -> None:
+    """Every file into a folder, named as it comes."""
     for artifact in artifacts:
         path = client.artifacts.download(artifact, folder / checked_name(artifact.name))
         stdout.print(f"{path.absolute()}  {artifact.size} bytes", soft_wrap=True)

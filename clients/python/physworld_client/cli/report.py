@@ -34,6 +34,7 @@ ROWS = {
 OPTIONAL_ROWS = frozenset({"persistence"})
 SPEEDS = {"twin": "twin", "world_model": "world model"}
 STAGES = ("fit", "dataset", "training")
+CLOSED_LOOP = ("fit", "trace", "dataset", "training")
 
 
 def build_report(
@@ -42,7 +43,7 @@ def build_report(
     """The figures of a succeeded pipeline.
 
     Args:
-        stages: the pipeline's child jobs by kind; their times give ``seconds``.
+        stages: the pipeline's child jobs by stage; their times give ``seconds``.
         episodes: committed episodes of the dataset.
 
     Raises:
@@ -57,7 +58,7 @@ def build_report(
     speeds = _table(metrics, "steps_per_second", version)
     if version.sha256 is None:
         raise PhysWorldError(f"{_label(version)} is not published")
-    seconds = {kind: duration_s(stages[kind]) for kind in STAGES if kind in stages}
+    seconds = {stage: duration_s(job) for stage, job in stages.items()}
     seconds["total"] = duration_s(pipeline)
     noise_floor = metrics.get("noise_floor_m", held_out.get("noise_floor_m"))
     return RunReport(
@@ -70,6 +71,7 @@ def build_report(
         episodes=episodes,
         parameters={name: value.model_dump(mode="json") for name, value in fit.parameters.items()},
         notes=[str(note) for note in metrics.get("notes", [])],
+        closed_loop=metrics.get("closed_loop"),
     )
 
 
@@ -96,7 +98,9 @@ def print_report(report: RunReport) -> None:
     stdout.print(f"steps per second: {', '.join(speeds)}")
     for name, parameter in report.parameters.items():
         stdout.print(_parameter_line(name, parameter), markup=False, soft_wrap=True)
-    parts = [f"{kind} {report.seconds[kind]:.0f}" for kind in (*STAGES, "total") if kind in report.seconds]
+    if report.closed_loop is not None:
+        _print_closed_loop(report.closed_loop)
+    parts = [f"{stage} {seconds:.0f}" for stage, seconds in report.seconds.items()]
     stdout.print(f"seconds: {', '.join(parts)}; episodes: {report.episodes}")
     for note in report.notes:
         stdout.print(f"note: {note}", markup=False, soft_wrap=True)
@@ -117,6 +121,28 @@ def duration_s(job: Job) -> float:
     start = job.started_at or job.created_at
     end = job.finished_at or datetime.now(UTC)
     return max(0.0, (end - start).total_seconds())
+
+
+def _print_closed_loop(section: Mapping[str, Any]) -> None:
+    """The verdict in a sentence, and the errors before and after."""
+    stdout.print(f"closed loop: {section['statement']}", markup=False, soft_wrap=True)
+    for name, title in (("twin", "twin"), ("world_model", "world model")):
+        figures = section.get(name)
+        if figures is None:
+            continue
+        if figures["before_m"] is None:
+            stdout.print(
+                f"  {title}: after {_millimetres(figures['after_m'])} mm, nothing to compare it with"
+            )
+            continue
+        gain = figures["gain_ci95_m"]
+        interval = (
+            "" if gain is None else f", gain {_millimetres(gain[0])} to {_millimetres(gain[1])} mm (95 %)"
+        )
+        before, after = _millimetres(figures["before_m"]), _millimetres(figures["after_m"])
+        stdout.print(
+            f"  {title}: held-out error {before} mm before, {after} mm after{interval}", soft_wrap=True
+        )
 
 
 def _table(metrics: Mapping[str, Any], key: str, version: ModelVersion) -> Mapping[str, Any]:

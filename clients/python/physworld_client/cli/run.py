@@ -14,7 +14,7 @@ from physworld_client.cli import service
 from physworld_client.cli.follow import follow
 from physworld_client.cli.options import Data, Token, Url
 from physworld_client.cli.output import stderr, stdout
-from physworld_client.cli.report import build_report, print_report, write_report
+from physworld_client.cli.report import CLOSED_LOOP, STAGES, build_report, print_report, write_report
 from physworld_client.cli.up import require_service_code
 from physworld_client.client import Client
 from physworld_client.errors import JobFailed, PhysWorldError
@@ -38,6 +38,13 @@ def run(
     simulations: Annotated[int | None, typer.Option(min=1, help="Most simulations of the fit.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of demonstration and training.")] = None,
     name: Annotated[str | None, typer.Option(help="Name of the model [the scene's name].")] = None,
+    close_the_loop: Annotated[
+        bool,
+        typer.Option("--close-the-loop", help="Trace what the twin leaves, and add a named effect to it."),
+    ] = False,
+    compare: Annotated[
+        bool, typer.Option(help="Train a model without the effect too, so that the card can compare.")
+    ] = True,
     json: Annotated[Path | None, typer.Option(help="Write the figures to this file.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the model [DATA/models/NAME-VERSION].")] = None,
     workers: Annotated[int, typer.Option(min=1, help="Workers, if the service must be started.")] = 2,
@@ -51,7 +58,8 @@ def run(
     numbers |= {"particle_budget": particles, "max_simulations": simulations}
     with _service(url, token, data, workers, keep_up) as (address, alive):
         with Client(address.url, address.token) as client:
-            report, folder = _run(client, scene, name, numbers, out, address.data, alive)
+            loop = {"close_the_loop": True, "compare": compare} if close_the_loop else {}
+            report, folder = _run(client, scene, name, numbers, loop, out, address.data, alive)
     print_report(report)
     if json is not None:
         write_report(report, json)
@@ -96,6 +104,7 @@ def _run(
     scene: Path,
     name: str | None,
     numbers: dict[str, int | None],
+    loop: dict[str, bool],
     out: Path | None,
     data: Path | None,
     alive: Callable[[], bool],
@@ -110,10 +119,10 @@ def _run(
     )
     for warning in uploaded.warnings:
         stdout.print(f"warning: {warning}", markup=False, soft_wrap=True)
-    pipeline = client.pipelines.create(_pipeline(uploaded.id, name, numbers))
+    pipeline = client.pipelines.create(_pipeline(uploaded.id, name, numbers, loop))
     stdout.print(f"job: {pipeline.id}")
     try:
-        pipeline, stages = follow(client, pipeline.id, alive)
+        pipeline, stages = follow(client, pipeline.id, alive, CLOSED_LOOP if loop else STAGES)
     except KeyboardInterrupt:
         _cancel(client, pipeline.id)
         raise
@@ -130,10 +139,12 @@ def _run(
     return build_report(uploaded.name, pipeline, stages, fit, version, dataset.episodes_done), folder
 
 
-def _pipeline(scene_id: str, name: str | None, numbers: dict[str, int | None]) -> PipelineCreate:
+def _pipeline(
+    scene_id: str, name: str | None, numbers: dict[str, int | None], loop: dict[str, bool]
+) -> PipelineCreate:
     """The body of the request: only what was given; the service fills in its defaults."""
     given = {key: value for key, value in numbers.items() if value is not None}
-    body: dict[str, object] = {"scene_id": scene_id}
+    body: dict[str, object] = {"scene_id": scene_id, **loop}
     if name is not None:
         body["model_name"] = name
     for key, config in (("fit", FitConfig), ("dataset", DatasetConfig), ("training", TrainingConfig)):

@@ -1,0 +1,85 @@
+"""Traces, assessments and the closed loop through the SDK and the command line, against the real API."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from pathlib import Path
+
+import pytest
+from physworld_client import AsyncClient, Client
+from physworld_client.errors import Conflict, NotFound
+from sdk_service import Service, write_scene
+from test_command_line import output_of, physworld, worker
+
+from schemas.dataset import DatasetConfig
+from schemas.fit import FitConfig
+from schemas.trace import TraceConfig
+
+
+def test_a_trace_step_by_step(service: Service, client: Client, tmp_path: Path) -> None:
+    scene = client.scenes.create(write_scene(tmp_path / "traced", "traced"))
+    fitting = client.fits.create(scene.id)
+    service.work()
+    fit_id = fitting.outputs[0].id
+    config = TraceConfig(candidates=["air_drag_linear"], seed=3)
+    job = client.traces.create(scene.id, config, fit=FitConfig(particle_budget=300), fit_id=fit_id)
+    trace_id = job.outputs[0].id
+    with pytest.raises(Conflict):
+        client.traces.tracks(trace_id)
+    service.work()
+    client.jobs.wait(job, timeout=30)
+    trace = client.traces.get(trace_id)
+    assert (trace.verdict, trace.fit_id, trace.config.seed) == ("named", fit_id, 3)
+    assert trace.fit.particle_budget == 300
+    assert trace.effects[0].parameters["rate_per_s"].ci95 == (1.6, 2.2)
+    assert client.traces.tracks(trace_id)["before"].shape == (3, 2, 3)
+    assert [item.id for item in client.traces.list(scene_id=scene.id, verdict="named").data] == [trace_id]
+    writing = client.datasets.create(fit_id, DatasetConfig(episodes=1), trace_id=trace_id)
+    assert client.datasets.get(writing.outputs[0].id).trace_id == trace_id
+    client.jobs.cancel(writing.id)
+    with pytest.raises(Conflict):
+        client.traces.cancel(trace_id)
+
+    async def same() -> None:
+        async with AsyncClient(service.url, service.token) as other:
+            assert await other.traces.get(trace_id) == trace
+            with pytest.raises(NotFound):
+                await other.assessments.get("ass_none")
+
+    asyncio.run(same())
+
+
+def test_the_loop_on_the_command_line(service: Service, tmp_path: Path) -> None:
+    scene = write_scene(tmp_path / "looped", "looped")
+    small = ("--episodes", "1", "--json", "report.json")
+    with worker(service):
+        done = physworld(service, tmp_path, "run", scene, "--close-the-loop", *small)
+    assert done.returncode == 0, done.stderr
+    for stage in ("trace", "dataset_2", "training_2"):
+        assert any(line.startswith(f"{stage} ") for line in done.stdout.splitlines()), done.stdout
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert set(report["seconds"]) == {
+        "fit", "trace", "dataset", "training", "dataset_2", "training_2", "total",
+    }  # fmt: skip
+    assert report["model"]["version"] == 2
+    with service.client() as client:
+        assert client.models.version("looped").trace_id is not None
+
+    with worker(service):
+        done = physworld(service, tmp_path, "models", "assess", "looped", scene, "--version", "1")
+    assert done.returncode == 0, done.stderr
+    assert "worse_than_expected: The model errs more" in done.stdout
+    opened = done.stdout.rpartition("trace opened: ")[2].strip()
+    [newest] = output_of(service, tmp_path, "traces", "list", "-n", "1")
+    assert newest["id"] == opened
+    service.work()
+    shown = physworld(service, tmp_path, "traces", "show", opened).stdout
+    assert "effect      air_drag_linear: rate_per_s 1.9 1/s (95 %: 1.6 to 2.2)" in shown
+    assert "held-out error [mm]: 21 → 6 (noise 1)" in shown
+    done = physworld(service, tmp_path, "traces", "download", opened, "-o", "files")
+    assert done.returncode == 0, done.stderr
+    assert {path.name for path in (tmp_path / "files").iterdir()} == {"report.json", "tracks.npz", "twin.npz"}
+    job = output_of(service, tmp_path, "traces", "add", newest["scene_id"])
+    cancelled = output_of(service, tmp_path, "traces", "cancel", job["outputs"][0]["id"])
+    assert (cancelled["id"], cancelled["state"]) == (job["id"], "cancelled")
