@@ -18,7 +18,7 @@ from physworld.mpm.gradient_twin import TwinRun, parameter, strength
 from physworld.mpm.total_lagrangian import TotalLagrangian
 from physworld.twin import Twin
 
-FRAMES = 4
+FRAMES = 3
 NOT_SMOOTH = {
     ("clamp_offset", "reach_m"),
     ("plasticity", "inverse_yield_per_pa"),
