@@ -51,6 +51,7 @@ def estimates(
     """
     covariance = block_covariance(solution, frames, points)
     factor = interval_factor(len(np.unique(frames)), len(parameters)) if measured else float("inf")
+    due = np.abs(np.linalg.lstsq(solution.jacobian, -solution.residual, rcond=None)[0])
     found = {}
     for k, parameter in enumerate(parameters):
         theta, value = float(solution.theta[k]), parameter.value(float(solution.theta[k]))
@@ -58,8 +59,11 @@ def estimates(
         insensitive = not measured or not np.any(solution.jacobian[:, k])
         low, high = parameter.searched(parameter.low), parameter.searched(parameter.high)
         at_bound = not (low + _EDGE < theta < high - _EDGE)
-        identified = half < UNIDENTIFIED_HALF_WIDTH[parameter.scale] and not at_bound and not insensitive
-        note = "" if identified else _why_not(at_bound, insensitive)
+        moving = bool(due[k] > max(half, parameter.step))
+        identified = half < UNIDENTIFIED_HALF_WIDTH[parameter.scale] and not (
+            at_bound or insensitive or moving
+        )
+        note = "" if identified else _why_not(at_bound, insensitive, moving)
         ends = (
             (parameter.value(theta - min(half, 50.0)), parameter.value(theta + min(half, 50.0)))
             if np.isfinite(half)
@@ -103,7 +107,9 @@ def held_at_priors(
     return held
 
 
-def _why_not(at_bound: bool, insensitive: bool) -> str:
+def _why_not(at_bound: bool, insensitive: bool, moving: bool) -> str:
     if insensitive:
         return "its sensitivity was not measured: the budget of simulations ended first"
-    return "at the bound of its search" if at_bound else "the data do not fix it"
+    if at_bound:
+        return "at the bound of its search"
+    return "the search had not converged on it" if moving else "the data do not fix it"

@@ -5,7 +5,8 @@
 2. Gauss-Newton on all training frames from the two best.
 3. Free optional parameters (drag, internal friction, Poisson's ratio, an undeclared ground's friction), the best one
    first. A screening by one run each skips those that cannot help to first order; of the others each must lower
-   the training cost by more than 2 % (Poisson's ratio: 15 %). Drop again what the others made needless.
+   the training cost by more than 2 % (Poisson's ratio: 15 %). After one that removed half of it, start again from a
+   quarter and four times the stiffness: the first scan knew less. Drop again what the others made needless.
 4. Shift the tracked points inside the body by their mean residual (frame 0 is noisy too), clipped at 3 sigma.
 5. Gauss-Newton again on all that were kept; hold at its prior what the data turn out not to fix; intervals and
    correlations from the sensitivities at the optimum.
@@ -43,6 +44,10 @@ from physworld.twin import Twin
 _LEAST_SCREENED = (
     0.1  # share of the gain that it needs which a parameter must show to first order to be tried
 )
+_RESTARTS = (0.25, 4.0)  # factors on the stiffness that is tried again once something else was freed
+_RESTART_GAIN = 0.5  # share of the cost that this must have removed
+_PROMISING = 4.0  # times the best cost: a restart that is worse after two steps is left
+_KEPT_BACK = 12  # runs that the selection leaves for what follows
 _NO_LOSS = 0.02  # relative rise of the training cost that holding a parameter at its prior may cause
 
 
@@ -56,6 +61,7 @@ class CalibrationConfig:
         device: Warp device of the simulations.
         damping: "auto" adds drag and internal friction where the data ask; "none" keeps the declared physics only.
         law: name of the elastic law (:mod:`physworld.materials.library`); None for the shape's usual one.
+        formulation: "auto", "total_lagrangian" or "updated_lagrangian": see :mod:`physworld.mpm.choose`.
     """
 
     particle_budget: int = 2000
@@ -63,6 +69,7 @@ class CalibrationConfig:
     device: str = "cpu"
     damping: Literal["auto", "none"] = "auto"
     law: str | None = None
+    formulation: str = "auto"
 
 
 @dataclass(frozen=True)
@@ -122,9 +129,12 @@ def calibrate(
     started = time.perf_counter()
     search = Search(scene, prior_twin(scene, config), config.max_simulations, progress, cancelled, journal)
     parameters = searched_parameters(scene, search.twin, config)
+    search.limit = config.max_simulations - min(_KEPT_BACK, config.max_simulations // 4)
     kept, optimum, rejected = select(search, parameters)
+    search.limit = config.max_simulations - (len(kept) + 1 if config.max_simulations > _KEPT_BACK else 0)
     if search.shift_points(kept, optimum.theta):
         optimum = search.solve(kept, optimum.theta, 3)
+    search.limit = config.max_simulations
     kept, optimum, solution = _hold_the_unknown(search, kept, optimum, rejected)
     twin = search.twin_at(kept, optimum.theta)
     found, correlated = _estimates(search, kept, optimum, solution)
@@ -149,7 +159,7 @@ def calibrate(
 
 def prior_twin(scene: Scene, config: CalibrationConfig) -> Twin:
     """The twin before its calibration, under the configured law."""
-    twin = build_twin(scene, config.particle_budget, config.device)
+    twin = build_twin(scene, config.particle_budget, config.device, formulation=config.formulation)
     return twin if config.law is None else replace(twin, law=with_law(twin.law, config.law))
 
 
@@ -185,6 +195,8 @@ def select(search: Search, parameters: list[Parameter]) -> tuple[list[Parameter]
         best = max(enough, key=lambda k: gains[hopeful[k].name])
         kept, optimum = [*kept, hopeful[best]], trials[best]
         candidates.remove(hopeful[best])
+        if gains[hopeful[best].name] > _RESTART_GAIN:
+            optimum = _restarted(search, kept, optimum)
     for needless in [p for p in kept if p.stage == "optional"]:
         others = [k for k, p in enumerate(kept) if p is not needless]
         trial = search.solve([kept[k] for k in others], optimum.theta[others], 2)
@@ -192,6 +204,21 @@ def select(search: Search, parameters: list[Parameter]) -> tuple[list[Parameter]
             rejected[needless.name] = 1.0 - optimum.cost / trial.cost
             kept, optimum = [kept[k] for k in others], trial
     return kept, optimum, rejected
+
+
+def _restarted(search: Search, kept: list[Parameter], optimum: Optimum) -> Optimum:
+    """The better of the optimum and of descents from other stiffnesses: the first scan knew less."""
+    found = [optimum]
+    for factor in _RESTARTS:
+        theta = optimum.theta.copy()
+        theta[0] = np.clip(
+            theta[0] + np.log(factor), *(kept[0].searched(end) for end in (kept[0].low, kept[0].high))
+        )
+        trial = search.solve(kept, theta, 2)
+        if trial.cost < _PROMISING * optimum.cost:
+            trial = search.solve(kept, trial.theta, 3)
+        found.append(trial)
+    return min(found, key=lambda o: o.cost if np.isfinite(o.cost) else np.inf)
 
 
 def _hold_the_unknown(

@@ -51,7 +51,7 @@ class Search:
         self.scene, self.twin, self.max_simulations = scene, twin, max_simulations
         self.journal = journal or Journal()
         self.progress, self.cancelled = progress, cancelled
-        self.simulations = 0
+        self.simulations, self.limit = 0, max_simulations
         self.history: list[float] = []
         self.begin, self.end = (
             max(scene.train[0], 1),
@@ -90,13 +90,13 @@ class Search:
     def residual(self, parameters: list[Parameter], theta: np.ndarray, end: int | None = None) -> np.ndarray:
         """Predicted minus measured [m] over the training frames up to ``end``, flat.
 
-        NaN where the run blew up or the budget is spent.
+        NaN where the run blew up or the budget (``limit``) is spent.
         """
         end = self.end if end is None else end
         visible = self.scene.visible[self.begin : end]
         target = self.scene.points[self.begin : end][visible]
         bad = np.full(target.size, np.nan)
-        if self.simulations >= self.max_simulations:
+        if self.simulations >= self.limit:
             return bad
         self.simulations += 1
         times, controls = self.scene.control_track()
@@ -162,7 +162,7 @@ class Search:
 
     def linearise(self, parameters: list[Parameter], optimum: Optimum) -> Solution | None:
         """Residual and sensitivities at an optimum; None where the budget does not reach."""
-        if self.simulations + 1 + len(parameters) > self.max_simulations:
+        if self.simulations + 1 + len(parameters) > self.limit:
             return None
         now = self.residual(parameters, optimum.theta)
         if not np.isfinite(now).all():
@@ -220,7 +220,7 @@ class Search:
 
     def _mean_offsets(self, parameters: list[Parameter], theta: np.ndarray, sigma: float) -> list | None:
         """Mean residual of every point in the material's frame [m], (N, 3), clipped; None where it cannot be had."""
-        if self.simulations + 2 + len(parameters) > self.max_simulations:
+        if self.simulations + 2 + len(parameters) > self.limit:
             return None  # the search on the moved points needs a residual and a Jacobian of its own
         twin, lattice = self.twin_at(parameters, theta), self.twin.lattice
         times, controls = self.scene.control_track()

@@ -40,6 +40,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--particles", type=_count, default=None, help="particles of the twin, about")
     parser.add_argument("--simulations", type=_count, default=None, help="most simulations of the search")
     parser.add_argument("--law", default=None, help="elastic law by name, or auto: choose it by the data")
+    parser.add_argument("--formulation", default="auto", help="total_lagrangian, updated_lagrangian or auto")
     parser.add_argument(
         "--quick", action="store_true", help="leave out the runs on finer cells and time steps"
     )
@@ -65,14 +66,16 @@ def _fit(given: argparse.Namespace) -> None:
 
     scene = read_scene(given.scene)
     numbers = {"particle_budget": given.particles, "max_simulations": given.simulations}
-    config = CalibrationConfig(**{name: value for name, value in numbers.items() if value is not None})
+    config = CalibrationConfig(
+        **{name: value for name, value in numbers.items() if value is not None}, formulation=given.formulation
+    )
     choice = _chosen_law(given.law, scene, config)
     config = replace(config, law=choice.elastic if choice.decided_by != "default" else None)
     with progress_bar(f"fit {scene.name}") as shown:
         fitted = calibrate(scene, config, progress=shown)
     report = fit_report(scene, fitted, choice)
     document = fit_document(scene.name, report)
-    if not given.quick:
+    if not given.quick and fitted.twin.formulation == "total_lagrangian":
         budget = config.particle_budget
         with progress_bar(f"numerics {scene.name}") as shown:
             numerics = measure_numerics(scene, fitted.twin, particle_budget=budget, progress=shown)

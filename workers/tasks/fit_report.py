@@ -45,10 +45,7 @@ def fit_report(scene: Scene, fitted: FitResult, law: LawChoice | None = None) ->
         },
         "training": fitted.losses,
         "law": asdict(law or LawChoice(fitted.twin.law.name)),
-        "formulation": {
-            "name": "total_lagrangian",
-            "reason": "elastic and followed in its undeformed shape: no transfers, so none of their damping",
-        },
+        "formulation": {"name": fitted.twin.formulation, "reason": _formulation_reason(fitted)},
     }
     return {
         "parameters": {name: parameter_json(estimate) for name, estimate in fitted.parameters.items()},
@@ -85,6 +82,12 @@ def json_safe(value: Any) -> Any:
     if isinstance(value, np.generic):
         value = value.item()
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _formulation_reason(fitted: FitResult) -> str:
+    """The note in which the body says why it is integrated that way."""
+    start = fitted.twin.formulation.replace("_", " ")
+    return next((note for note in fitted.twin.body.notes if note.startswith(start)), "")
 
 
 def parameter_json(estimate: Estimate) -> dict[str, Any]:

@@ -67,7 +67,7 @@ def test_the_figures_and_the_files_of_a_fit(
     assert found["correlations"] == {"names": ["youngs_modulus_pa"], "matrix": [[1.0]]}
     assert 0.5 < found["training"]["chi2_per_residual"] < 2.5
     assert found["law"]["elastic"] == "neo_hookean" and found["law"]["decided_by"] == "default"
-    assert found["formulation"]["name"] == "total_lagrangian"
+    assert found["formulation"]["name"] == "total_lagrangian" and found["formulation"]["reason"]
     assert abs(found["numerics"]["equivalent_drag_per_s"]) < 0.5
     assert found["converged"]["youngs_modulus_pa"]["unit"] == "Pa"
     with np.load(out / "twin.npz", allow_pickle=False) as arrays:

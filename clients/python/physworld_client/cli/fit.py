@@ -28,6 +28,9 @@ def fit(
     law: Annotated[
         str | None, typer.Option(help="Elastic law by name, or auto: choose it by the data.")
     ] = None,
+    formulation: Annotated[
+        str | None, typer.Option(help="total_lagrangian, updated_lagrangian or auto.")
+    ] = None,
     quick: Annotated[
         bool, typer.Option("--quick", help="Leave out the runs on finer cells and steps.")
     ] = False,
@@ -39,6 +42,7 @@ def fit(
         "--particles": particles,
         "--simulations": simulations,
         "--law": law,
+        "--formulation": formulation,
     }
     options = [text for name, value in given.items() if value is not None for text in (name, str(value))]
     become(MODULE, [*options, *(["--quick"] if quick else []), "--", str(scene)])
