@@ -48,6 +48,8 @@ class TraceCreate(Request):
 class Figure(Resource):
     """A value with its unit and 95 % interval."""
 
+    model_config = ConfigDict(extra="allow")
+
     value: float | None
     unit: str
     ci95: tuple[float | None, float | None] | None = None
@@ -55,6 +57,8 @@ class Figure(Resource):
 
 class FoundEffect(Resource):
     """An effect of the registry with its strengths."""
+
+    model_config = ConfigDict(extra="allow")
 
     name: str
     parameters: dict[str, Figure] = Field(default_factory=dict)

@@ -80,6 +80,7 @@ def subjects_of(session: Session, jobs: Sequence[Job]) -> dict[str, str]:
             statement = select(table.id, SceneRow.name).join(SceneRow, SceneRow.id == table.scene_id)
             names.update((row[0], row[1]) for row in session.execute(statement.where(table.id.in_(wanted))))
     subjects = {job_id: names[item.id] for job_id, item in inputs.items() if item.id in names}
+    subjects.update({job_id: item.id for job_id, item in inputs.items() if item.kind == "model"})
     subjects.update({job.id: str(job.config["name"]) for job in jobs if job.kind == "training"})
     return subjects
 

@@ -17,6 +17,7 @@ from storage.tables import AssessmentRow, FitRow, TraceRow, columns_of
 TWIN = "twin.npz"
 TRACKS = "tracks.npz"
 REPORT = "report.json"
+PAGE = "report.html"
 
 
 def get_trace(session: Session, trace_id: str) -> Trace:

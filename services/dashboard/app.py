@@ -25,6 +25,7 @@ from services.dashboard import (
     pages_jobs,
     pages_models,
     pages_scenes,
+    pages_traces,
 )
 from services.dashboard.site import BASE, STATIC, Site
 from services.stores import Stores
@@ -62,7 +63,7 @@ def create_dashboard(site: Site) -> FastAPI:
     app = FastAPI(openapi_url=None, docs_url=None, redoc_url=None)
     app.state.sessions = access.Sessions(site)
     app.include_router(access.router(site))
-    for module in (pages_jobs, pages_scenes, pages_datasets, pages_models, pages_files):
+    for module in (pages_jobs, pages_scenes, pages_traces, pages_datasets, pages_models, pages_files):
         app.include_router(module.router(site), dependencies=[Depends(access.require_viewer)])
     app.mount("/static", GZipMiddleware(StaticFiles(directory=STATIC), minimum_size=1024))
     app.add_middleware(SecurityHeaders)
@@ -71,7 +72,7 @@ def create_dashboard(site: Site) -> FastAPI:
 
 
 class SecurityHeaders:
-    """ASGI middleware: the policy on every answer, streams too; pages are not kept by any cache."""
+    """ASGI middleware: the policy on every answer that has none of its own; pages are not kept by any cache."""
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
@@ -87,7 +88,7 @@ class SecurityHeaders:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
                 for name, value in HEADERS.items():
-                    headers[name] = value
+                    headers.setdefault(name, value)
                 fresh = is_static and b"v=" in scope["query_string"]
                 headers.setdefault(
                     "Cache-Control", FOREVER if fresh else "no-cache" if is_static else "no-store"

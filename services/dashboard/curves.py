@@ -16,11 +16,13 @@ LABELS = {
     "static": ("Static", "static"),
     "rigid_follow": ("Rigid follow", "rigid"),
     "constant_velocity": ("Constant velocity", "velocity"),
+    "before": ("Before", "other"),
+    "after": ("After", "predicted"),
     "twin": ("Twin", "predicted"),
     "world_model": ("World model", "other"),
     "world_model_finetuned": ("World model, fine-tuned", "model"),
 }
-PREDICTORS = ("twin", "world_model", "world_model_finetuned")
+PREDICTORS = ("after", "twin", "world_model", "world_model_finetuned")
 TIMES_KEY = "times_s"
 
 

@@ -20,7 +20,7 @@ from services.dashboard.clouds import (
 )
 from services.dashboard.curves import chart, frame_errors, given_curves, onto
 from services.dashboard.site import BASE, Site
-from storage import resources
+from storage import resources, traces
 from storage.errors import NotFound
 
 if TYPE_CHECKING:
@@ -58,6 +58,7 @@ def router(site: Site) -> APIRouter:
         with site.database.reading() as session:
             fits = resources.list_fits(session, scene_id=scene_id, limit=RELATED_SHOWN).data
             datasets = resources.list_datasets(session, scene_id=scene_id, limit=RELATED_SHOWN).data
+            traced = traces.list_traces(session, scene_id=scene_id, limit=RELATED_SHOWN).data
         return site.page(
             request,
             "scene.html",
@@ -66,6 +67,7 @@ def router(site: Site) -> APIRouter:
             has_curve=shown is not None and _has_curve(shown),
             fits=fits,
             datasets=datasets,
+            traces=traced,
             declared=_declared(record),
         )
 

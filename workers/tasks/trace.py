@@ -49,7 +49,8 @@ _STAGES = (  # of a trace, with the share of its work that is done when one begi
     ("numerics", 0.45),
     ("sensitivities", 0.5),
     ("refit", 0.6),
-    ("second resolution", 0.9),
+    ("second resolution", 0.85),
+    ("experiment", 0.9),
     ("held-out", 0.97),
 )
 

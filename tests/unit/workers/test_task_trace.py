@@ -60,6 +60,8 @@ def test_a_trace_reports_shares_its_simulations_and_tidies_up(
     trace = _trace(stores, job)
     assert trace.state == "ready" and trace.verdict is not None and trace.scene == "tiny bar"
     assert trace.held_out is not None and trace.held_out["before"] > 0
+    page = stores.artifacts.read_bytes(named(trace.artifacts, "report.html", trace.id).sha256)
+    assert page.startswith(b"<!doctype html>") and trace.verdict.replace("_", " ").encode() in page.lower()
     data = stores.artifacts.read_bytes(named(trace.artifacts, "tracks.npz", trace.id).sha256)
     tracks = npz_arrays(data)
     assert tracks["before"].shape == tracks["after"].shape == (len(tracks["times"]), 4, 3)
