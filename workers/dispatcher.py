@@ -3,7 +3,7 @@
 Every 0.1 s: publish the shards that wait (an outbox: publish first, then mark; a crash in between publishes
 twice, which a claim by compare-and-set makes harmless). Every second: take back leases that ran out, at once
 those whose owner on this host is provably dead, and look how deep the broker's queues are. Every hour: forget
-the idempotency keys of more than a day ago.
+the idempotency keys of more than a day ago, and remove what jobs that have ended left in the scratch.
 
 A queue that is empty in two looks while shards of it wait has lost their messages: they are published again
 after two seconds instead of ``republish_seconds``. A queue that is deep gets nothing more, so the broker
@@ -27,11 +27,14 @@ from types import FrameType
 from celery import Celery
 from kombu.exceptions import OperationalError as BrokerError
 
+from schemas.job import TERMINAL_STATES
 from schemas.queues import SIMULATION, TASK_NAME, TRAINING
 from storage import idempotency, leases
 from storage.database import Database, open_database
-from storage.errors import DatabaseUnavailable
+from storage.errors import DatabaseUnavailable, StoreError
+from storage.scratch import ScratchStore
 from storage.settings import Settings, get_settings
+from storage.tables import JobRow
 from workers.app import READY_FILE_VARIABLE, create_app
 from workers.owner import owner_is_gone
 
@@ -70,8 +73,8 @@ class Dispatcher:
                 self._connection.close()
                 self._connection = self._app.connection_for_write()
                 stop.wait(PAUSE_AFTER_ERROR_S)
-            except DatabaseUnavailable as error:
-                logger.warning("database away: %s", error)
+            except (DatabaseUnavailable, StoreError) as error:
+                logger.warning("database or store away: %s", error)
                 stop.wait(PAUSE_AFTER_ERROR_S)
             stop.wait(TICK_S)
 
@@ -85,8 +88,9 @@ class Dispatcher:
             self._publish(LOST_AFTER_S, lost_in)
         self._publish(self._settings.republish_seconds, set(self._depth))
         if time.monotonic() >= self._forget_due:
-            self._forget_old_keys()
             self._forget_due = time.monotonic() + FORGET_EVERY_S
+            self._forget_old_keys()
+            remove_ended_scratch(ScratchStore(self._settings), self._database)
 
     def _publish(self, republish_seconds: float, queues: set[str]) -> None:
         open_queues = {queue for queue in queues if self._depth[queue] < MAX_DEPTH}
@@ -132,6 +136,18 @@ class Dispatcher:
             depth = channel.queue_declare(queue=queue, durable=True, auto_delete=False).message_count
             self._depth[queue] = depth
             self._empty_looks[queue] = 0 if depth else self._empty_looks[queue] + 1
+
+
+def remove_ended_scratch(scratch: ScratchStore, database: Database) -> list[str]:
+    """Remove scratch files of jobs that have ended while nobody could tidy up; the jobs."""
+    ended = []
+    for job_id in scratch.jobs():
+        with database.reading() as session:
+            job = session.get(JobRow, job_id)
+        if job is None or job.state in TERMINAL_STATES:
+            scratch.remove(job_id)
+            ended.append(job_id)
+    return ended
 
 
 def main() -> int:

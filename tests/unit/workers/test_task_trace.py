@@ -16,6 +16,7 @@ from schemas.job import Job
 from schemas.trace import Trace, TraceConfig, TraceCreate
 from storage import helpers, jobs, leases, resources, traces
 from storage.tables import ShardRow, TraceRow
+from workers.dispatcher import remove_ended_scratch
 from workers.execute import Runtime, run_shard
 from workers.stores import Stores
 from workers.tasks import trace as task
@@ -123,6 +124,16 @@ def test_a_cancelled_trace_stops_at_its_next_simulation(
     assert _trace(stores, job).state == "failed"
     assert {s.state for s in _shards(stores, job)} == {"CANCELLED"}
     assert stores.scratch.jobs() == []
+
+
+def test_what_an_ended_job_left_in_the_scratch_is_swept(stores: Stores, scene_id: str) -> None:
+    running, ended = _open(stores, scene_id), _open(stores, scene_id)
+    with stores.database.session() as session:
+        jobs.cancel_job(session, ended.id)
+    for job_id in (running.id, ended.id, "job_nobody"):
+        stores.scratch.put(job_id, "x.npy", b"1")
+    assert sorted(remove_ended_scratch(stores.scratch, stores.database)) == sorted([ended.id, "job_nobody"])
+    assert stores.scratch.jobs() == [running.id]
 
 
 def test_a_dataset_comes_from_the_twin_with_the_named_effect(

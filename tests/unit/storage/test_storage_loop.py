@@ -1,0 +1,184 @@
+"""Traces in the database: helper shards, the scratch store, what follows what in a closed loop."""
+
+from __future__ import annotations
+
+from datetime import timedelta
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from schemas.dataset import DatasetConfig
+from schemas.job import Job
+from schemas.model import TrainingConfig
+from schemas.pipeline import PipelineCreate
+from schemas.trace import TraceCreate
+from storage import helpers, jobs, leases, registry, traces
+from storage.database import Database
+from storage.errors import Conflict, ResultInvalid
+from storage.scratch import ScratchStore
+from storage.settings import Settings
+from storage.tables import ShardRow, utc_now
+
+if TYPE_CHECKING:
+    from conftest import Work
+
+REPORT = {"verdict": "named", "report": {"reason": "so"}, "artifacts": []}
+
+
+def trace_job(work: Work, database: Database) -> Job:
+    scene = work.scene()
+    with database.session() as session:
+        return jobs.create_trace(session, TraceCreate(scene_id=scene.id))
+
+
+def put_up(database: Database, driver: leases.Lease, count: int, first: int = 0) -> list[str]:
+    with database.session() as session:
+        return helpers.put_up(session, driver, first, [{"key": f"k{n}"} for n in range(count)])
+
+
+def states(database: Database, job: Job) -> list[str]:
+    with database.reading() as session:
+        rows = session.query(ShardRow).where(ShardRow.job_id == job.id, ShardRow.kind == helpers.SIMULATION)
+        return sorted(row.state for row in rows)
+
+
+def test_helpers_are_anybodys_and_do_not_end_their_job(work: Work, database: Database) -> None:
+    job = trace_job(work, database)
+    driver = work.claim()
+    shards = put_up(database, driver, 3)
+    assert set(work.waiting()) == set(shards)
+    for shard, owner in zip(shards, ("driver", "other", "other"), strict=True):
+        lease = work.claim(shard, owner=owner)
+        with database.session() as session:
+            assert leases.complete(session, lease, {"trusted": True})
+    assert work.job(job).state == "running"
+    assert len(put_up(database, driver, 2, first=3)) == 2
+    with database.session() as session:
+        assert leases.complete(session, driver, REPORT)
+    assert work.job(job).state == "succeeded"
+    assert states(database, job) == ["CANCELLED", "CANCELLED", "DONE", "DONE", "DONE"]
+    assert work.waiting() == []
+
+
+def test_a_driver_that_lost_its_lease_puts_nothing_up(work: Work, database: Database) -> None:
+    job = trace_job(work, database)
+    first = work.claim()
+    assert len(put_up(database, first, 2)) == 2
+    with database.session() as session:
+        leases.reap(session, utc_now() + timedelta(hours=1))
+    assert put_up(database, first, 1, first=2) == []
+    second = work.claim(first.shard_id)
+    with database.session() as session:
+        helpers.call_off(session, job.id)
+    assert states(database, job) == ["CANCELLED", "CANCELLED"]
+    assert len(put_up(database, second, 2)) == 2, "the indices of an earlier attempt are no hindrance"
+
+
+def test_a_helper_that_fails_fails_the_trace(work: Work, database: Database) -> None:
+    job = trace_job(work, database)
+    driver = work.claim()
+    (shard, _) = put_up(database, driver, 2)
+    work.fail(work.claim(shard), retry=False, detail="a bug")
+    failed = work.job(job)
+    assert failed.state == "failed" and failed.error is not None and "a bug" in failed.error.detail
+    with database.session() as session:
+        assert not leases.complete(session, driver, REPORT)
+        assert traces.get_trace(session, job.outputs[0].id).state == "failed"
+    assert states(database, job) == ["CANCELLED", "FAILED"]
+
+
+def test_a_cancel_waits_for_helpers_that_run(work: Work, database: Database) -> None:
+    job = trace_job(work, database)
+    driver = work.claim()
+    running, _ = put_up(database, driver, 2)
+    lease = work.claim(running)
+    work.cancel(job)
+    with database.session() as session:
+        leases.mark_cancelled(session, driver)
+    assert work.job(job).state == "cancelling"
+    with database.session() as session:
+        leases.mark_cancelled(session, lease)
+    assert work.job(job).state == "cancelled"
+    assert states(database, job) == ["CANCELLED", "CANCELLED"]
+
+
+@pytest.mark.parametrize("change", [{"verdict": "perhaps"}, {"report": {"score": float("nan")}}])
+def test_a_report_of_the_wrong_form_is_refused_before_anything_changes(
+    work: Work, database: Database, change: dict[str, Any]
+) -> None:
+    job = trace_job(work, database)
+    driver = work.claim()
+    with pytest.raises(ResultInvalid), database.session() as session:
+        leases.complete(session, driver, {**REPORT, **change})
+    assert work.job(job).state == "running"
+
+
+def finish(work: Work, database: Database, job: Job, verdict: str) -> list[str]:
+    """Do the whole pipeline with this verdict; the kinds of its children."""
+    while work.job(job).state in {"queued", "running"}:
+        lease = work.claim()
+        result = {**REPORT, "verdict": verdict} if lease.kind == "trace" else work.result(lease)
+        with database.session() as session:
+            assert leases.complete(session, lease, result)
+    return [work.job(child).kind for child in work.job(job).children]
+
+
+def closed_loop(work: Work, database: Database, scene_id: str, **more: Any) -> Job:
+    request = PipelineCreate(
+        scene_id=scene_id, model_name="beam", close_the_loop=True, dataset=DatasetConfig(episodes=1), **more
+    )
+    with database.session() as session:
+        return jobs.create_pipeline(session, request)
+
+
+def test_the_comparison_is_made_once_and_found_again(work: Work, database: Database) -> None:
+    scene = work.scene()
+    long = ["fit", "trace", "dataset", "training", "dataset", "training"]
+    short = long[:4]
+    assert finish(work, database, closed_loop(work, database, scene.id), "unexplained") == short
+    assert finish(work, database, closed_loop(work, database, scene.id), "named") == long
+    with database.reading() as session:
+        plain, named = (registry.get_version(session, "beam", number) for number in (2, 3))
+    assert plain.trace_id is None and named.trace_id is not None
+    assert finish(work, database, closed_loop(work, database, scene.id), "named") == short
+    other = TrainingConfig(steps=7)
+    assert finish(work, database, closed_loop(work, database, scene.id, training=other), "named") == long
+
+
+def test_the_training_is_told_what_to_compare_with(work: Work, database: Database) -> None:
+    job = closed_loop(work, database, work.scene().id)
+    finish(work, database, job, "named")
+    with database.reading() as session:
+        payloads = [row.payload for row in session.query(ShardRow).where(ShardRow.kind == "training")]
+    assert sorted((p["version"], p["baseline"], p["trace_id"] is not None) for p in payloads) == [
+        (1, None, False),
+        (2, 1, True),
+    ]
+
+
+def test_a_dataset_takes_a_ready_trace_of_its_own_scene(work: Work, database: Database) -> None:
+    fit = work.finish(work.fit())
+    pending = trace_job(work, database)
+    with pytest.raises(Conflict, match="needs a ready trace"), database.session() as session:
+        jobs.create_dataset(session, fit.outputs[0].id, DatasetConfig(), pending.outputs[0].id)
+    driver = work.claim()
+    with database.session() as session:
+        assert leases.complete(session, driver, REPORT)
+    with pytest.raises(Conflict, match="is of scene"), database.session() as session:
+        jobs.create_dataset(session, fit.outputs[0].id, DatasetConfig(), pending.outputs[0].id)
+
+
+def test_scratch_files_are_kept_apart_by_job_and_removed_together(tmp_path: Any) -> None:
+    scratch = ScratchStore(Settings(data_dir=tmp_path))
+    assert scratch.jobs() == []
+    scratch.put("job_a", "x.npy", b"1")
+    scratch.put("job_a", "y.npy", b"2")
+    scratch.put("job_b", "x.npy", b"3")
+    assert scratch.get("job_a", "x.npy") == b"1" and scratch.has("job_b", "x.npy")
+    assert scratch.get("job_a", "z.npy") is None and not scratch.has("job_c", "x.npy")
+    assert sorted(scratch.jobs()) == ["job_a", "job_b"]
+    assert scratch.remove("job_a") == 2
+    assert scratch.get("job_a", "y.npy") is None and scratch.jobs() == ["job_b"]
+    for job, name in (("../x", "a"), ("job_a", "../a"), ("job_a", ".hidden"), ("", "a")):
+        with pytest.raises(ValueError, match="is not the"):
+            scratch.put(job, name, b"")
