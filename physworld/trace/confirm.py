@@ -20,6 +20,7 @@ from physworld.trace.unknowns import Unknown
 from physworld.trace.whitening import Whitener
 
 _MEANINGFUL = 2.0  # standard errors by which a model must predict better than a simpler one
+_STARTS, _GLANCE = 3, 2  # variants of an effect that are tried, and iterations after which the best goes on
 _NUDGE = 0.1  # of a probe: where a search starts if the linear estimate says none, so that shapes can show
 
 
@@ -64,16 +65,29 @@ class Confirmation:
     frames: int
     iterations: int
 
-    def model(self, base: Model, score: Score, columns: np.ndarray) -> Model | None:
-        """``base`` with one candidate more, everything refitted; None where no run was usable.
+    def model(self, base: Model, variants: list[Score], columns: dict[str, np.ndarray]) -> Model | None:
+        """``base`` with one effect more, everything refitted; None where no run was usable.
 
         Args:
-            score: the candidate's score against the base's residual.
-            columns: its whitened sensitivities at zero, (M, k).
+            variants: scores of the effect's variants against the base's residual, the ones to start from.
+            columns: whitened sensitivities at zero of every variant, by label, (M, k).
         """
+        brief = self.iterations if len(variants) == 1 else _GLANCE
+        starts = [self._with_gates(base, score, columns[score.candidate.label], brief) for score in variants]
+        usable = [(s.candidate, f) for s, f in zip(variants, starts, strict=True) if f is not None]
+        if not usable:
+            return None
+        candidate, found = min(usable, key=lambda pair: pair[1].misfit)
+        unknowns = [*found.unknowns, *candidate.shape_unknowns()]
+        if candidate.shapes or len(variants) > 1:
+            again = refit(self.simulations, self.whitener, found.twin, unknowns, self.frames, self.iterations)
+            found = again or found
+        return Model((*base.members, candidate), found, cross_validated(found, self.block_of_row))
+
+    def _with_gates(self, base: Model, score: Score, columns: np.ndarray, iterations: int) -> Refit | None:
+        """The refit of a variant whose shape stays as it is."""
         candidate = score.candidate
-        prepared = candidate.prepared(base.fitted.twin)
-        gates, shapes = candidate.unknowns(), candidate.shape_unknowns()
+        gates = candidate.unknowns()
         freed = {gate.name for gate in gates}
         keep = [k for k, u in enumerate(base.fitted.unknowns) if u.name not in freed]
         known = [base.fitted.unknowns[k] for k in keep]
@@ -83,21 +97,10 @@ class Confirmation:
         own = np.concatenate([[u.start for u in known], strengths])
         half = np.concatenate([0.5 * (linear + own[: len(known)]), 0.5 * strengths])
         unknowns = [u.starting(t) for u, t in zip([*known, *gates], start, strict=True)]
-        found = refit(
-            self.simulations, self.whitener, prepared, unknowns, self.frames, self.iterations, [own, half]
+        prepared = candidate.prepared(base.fitted.twin)
+        return refit(
+            self.simulations, self.whitener, prepared, unknowns, self.frames, iterations, [own, half]
         )
-        if found is not None and shapes:
-            found = refit(
-                self.simulations,
-                self.whitener,
-                found.twin,
-                [*found.unknowns, *shapes],
-                self.frames,
-                self.iterations,
-            )
-        if found is None:
-            return None
-        return Model((*base.members, candidate), found, cross_validated(found, self.block_of_row))
 
 
 def _linear(fitted: Refit, strengths: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -117,14 +120,20 @@ def _away_from_zero(strengths: np.ndarray, gates: list[Unknown]) -> np.ndarray:
 
 def best_variants(
     ranked: list[Score], least: float, count: int, besides: tuple[str, ...] = ()
-) -> list[Score]:
-    """The best variant of every effect whose variants together score at least ``least``, ``count`` at most."""
-    found: list[Score] = []
+) -> list[list[Score]]:
+    """The best variants of every effect whose variants together score at least ``least``, ``count`` effects at most.
+
+    One variant where the effect has no shapes to free, else the best three: a linear score does not tell which of them
+    leads to the right shape.
+    """
+    found: dict[str, list[Score]] = {}
     for score in ranked:
-        taken = {s.candidate.effect for s in found} | set(besides)
-        if score.family >= least and score.share > 0.0 and score.candidate.effect not in taken:
-            found.append(score)
-    return sorted(found, key=lambda s: -s.family)[:count]
+        own = found.setdefault(score.candidate.effect, [])
+        most = _STARTS if score.candidate.shapes else 1
+        wanted = score.family >= least and score.share > 0.0 and score.candidate.effect not in besides
+        if wanted and len(own) < most:
+            own.append(score)
+    return sorted((own for own in found.values() if own), key=lambda own: -own[0].family)[:count]
 
 
 def explained_direction(model: Model, base: Model, basis: np.ndarray) -> np.ndarray:

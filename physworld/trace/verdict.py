@@ -48,7 +48,7 @@ def decide(
     models: list[Model],
     basis: np.ndarray,
     agreement: dict[tuple[str, ...], bool],
-    plain: float,
+    resolved: float,
     config: TraceConfig,
     tried: int,
 ) -> Verdict:
@@ -59,20 +59,20 @@ def decide(
         models: refitted models with effects.
         basis: orthonormal sensitivities of what is calibrated anyway, (M, p).
         agreement: for models that were refitted at a second resolution (by their names), whether it agreed.
-        plain: misfit of the declared physics before numerical directions are taken out.
+        resolved: misfit of the declared physics once what other cells and time steps change is taken out.
         tried: number of candidate effects.
     """
     before = declared.fitted.misfit
     real = [model for model in models if helps(model, declared, config)]
     if not real:
-        if before > config.near_floor:
-            reason = f"misfit {before:.2f} of the noise; none of {tried} effects accounts for it"
-            return Verdict(UNEXPLAINED, declared, (), reason)
-        if plain > config.acceptable:
-            reason = f"misfit {plain:.2f} of the noise, {before:.2f} without what finer cells and time steps change"
+        if before <= config.near_floor:
+            reason = f"misfit {before:.2f} of the noise, and none of {tried} effects explains more"
+            return Verdict(NOTHING, declared, (), reason)
+        if resolved <= config.near_floor:
+            reason = f"misfit {before:.2f} of the noise, {resolved:.2f} without what other cells and time steps change"
             return Verdict(NUMERICAL, declared, (), reason)
-        reason = f"misfit {before:.2f} of the noise, and none of {tried} effects explains more"
-        return Verdict(NOTHING, declared, (), reason)
+        reason = f"misfit {before:.2f} of the noise; none of {tried} effects accounts for it"
+        return Verdict(UNEXPLAINED, declared, (), reason)
     best = simplest(real, declared)
     after = best.fitted.misfit
     what = " and ".join(best.names)

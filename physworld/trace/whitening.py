@@ -1,14 +1,9 @@
 """Whitened residuals: what is known to be wrong without any effect is taken out by its covariance.
 
-The covariance of measured minus predicted is
-
-    sigma^2 (I + G G^T) + D D^T
-
-sigma the tracking noise; G the response of a tracked point to its own place in the body, which frame 0 gives with the
-same noise (a rigid body shows it as a shift that turns with it); D the numerical directions: what a finer lattice or
-time step changes in the prediction. W with W^T W the inverse is applied to residuals and to sensitivities alike, so
-that ordinary least squares of whitened quantities is the generalised one. G acts point by point; D has few columns:
-both need thin factors only.
+The covariance of measured minus predicted is sigma^2 (I + G G^T): sigma the tracking noise; G the response of a tracked
+point to its own place in the body, which frame 0 gives with the same noise (a rigid body shows it as a shift that turns
+with it). W with W^T W the inverse is applied to residuals and to sensitivities alike, so that ordinary least squares of
+whitened quantities is the generalised one. G acts point by point, so thin factors do.
 """
 
 from __future__ import annotations
@@ -49,7 +44,6 @@ class Whitener:
         sigma: [m].
         first: first of the training frames.
         places: one a tracked point.
-        numerics: orthonormal directions after the points' own, (M, d), and what whitening takes from each, (d,).
     """
 
     measured: np.ndarray
@@ -59,7 +53,6 @@ class Whitener:
     sigma: float
     first: int
     places: tuple[Place, ...]
-    numerics: tuple[np.ndarray, np.ndarray] | None = None
 
     def residual(self, tracks: np.ndarray) -> np.ndarray:
         """Whitened measured minus predicted, (M,), of tracks (frames, N, 3) from frame 0."""
@@ -68,16 +61,6 @@ class Whitener:
     def change(self, difference: np.ndarray) -> np.ndarray:
         """Whitened change of a prediction, (M,), of a difference of tracks (frames, N, 3)."""
         return self._whiten(self._seen(difference) / self.sigma)
-
-    def with_numerics(self, differences: list[np.ndarray], amplitude: float) -> Whitener:
-        """Takes the numerical directions out: changes of tracks (frames, N, 3), each known up to ``amplitude``."""
-        plain = replace(self, numerics=None)
-        if not differences:
-            return plain
-        columns = [amplitude * plain.change(difference) for difference in differences]
-        u, s, _ = np.linalg.svd(np.stack(columns, axis=1), full_matrices=False)
-        keep = s > 1e-6
-        return replace(self, numerics=(u[:, keep], 1.0 - 1.0 / np.sqrt(1.0 + s[keep] ** 2)))
 
     @property
     def frame_of_row(self) -> np.ndarray:
@@ -101,11 +84,7 @@ class Whitener:
         for place in self.places:
             block = out[place.rows].reshape(-1)
             out[place.rows] = (block - place.basis @ (place.shrink * (place.basis.T @ block))).reshape(-1, 3)
-        flat = out.reshape(-1)
-        if self.numerics is None:
-            return flat
-        directions, shrink = self.numerics
-        return flat - directions @ (shrink * (directions.T @ flat))
+        return out.reshape(-1)
 
 
 def whitener(scene: Scene, split: Split, sigma: float, responses: np.ndarray) -> Whitener:

@@ -35,10 +35,10 @@ def model(residual: np.ndarray, *effects: str, kind: str = "force", unknowns: in
 
 
 def answer(
-    models: list[Model], declared: np.ndarray, agree: bool = True, plain: float = 1.0
+    models: list[Model], declared: np.ndarray, agree: bool = True, resolved: float = 9.0
 ) -> tuple[str, tuple[str, ...]]:
     agreement = {m.names: agree for m in models}
-    found = decide(model(declared), models, np.zeros((ROWS, 0)), agreement, plain, CONFIG, 20)
+    found = decide(model(declared), models, np.zeros((ROWS, 0)), agreement, resolved, CONFIG, 20)
     return found.name, found.model.names
 
 
@@ -72,9 +72,10 @@ def test_a_strength_that_moves_with_the_resolution_is_numerical() -> None:
     assert answer([model(NOISE, "drag")], NOISE + 2 * DRAG, agree=False)[0] == "numerical_issue"
 
 
-def test_a_misfit_that_only_the_resolution_explains_is_numerical() -> None:
-    assert answer([], NOISE, plain=3.0)[0] == "numerical_issue"
-    assert answer([], NOISE, plain=1.1)[0] == "nothing_to_explain"
+def test_a_misfit_that_other_cells_explain_is_numerical() -> None:
+    before = NOISE + 2 * DRAG
+    assert answer([], before, resolved=1.1)[0] == "numerical_issue"
+    assert answer([], before, resolved=1.9)[0] == "unexplained"
 
 
 def test_the_simpler_of_two_that_do_as_well_is_named() -> None:

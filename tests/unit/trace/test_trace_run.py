@@ -1,0 +1,114 @@
+"""A trace from beginning to end on small beams that were recorded by a twin of another resolution, with noise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_scene import box_body, made_scene
+
+from physworld.build import build_twin
+from physworld.calibrate import CalibrationConfig
+from physworld.effects.registry import effect
+from physworld.errors import Cancelled
+from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
+from physworld.trace import Memory, TraceConfig, TraceResult, document, trace
+from physworld.twin import Twin
+
+LOW, HIGH = np.array([0.0, -0.015, -0.015]), np.array([0.16, 0.015, 0.015])
+FRAMES, SIGMA, YOUNGS_MODULUS_PA = 32, 1e-3, 1.5e5
+LIBRARY = ("air_drag_linear", "viscosity_kelvin_voigt", "gravity_tilt", "actuation_lag", "measurement_clock",
+           "measurement_scale")  # fmt: skip
+CONFIG = TraceConfig(
+    calibration=CalibrationConfig(particle_budget=120, damping="none"), candidates=LIBRARY, bootstraps=200
+)
+
+
+def beam(stroke: float) -> Scene:
+    """A bar whose clamp is moved up and down and sideways by ``stroke`` [m]."""
+    times = np.arange(FRAMES) / 30.0
+    grip = np.array([[0.0, y, z] for y in (-0.01, 0.01) for z in (-0.01, 0.01)])
+    points = [[x, y, z] for x in np.linspace(0.04, 0.16, 6) for y in (-0.015, 0.015) for z in (-0.015, 0.015)]
+    scene = made_scene(
+        points,
+        "beam",
+        grip,
+        FRAMES,
+        body=box_body(LOW, HIGH, density_kg_m3=300.0),
+        grips=(Grip((0, 1, 2, 3), LOW, np.array([0.02, 0.015, 0.015])),),
+        initial_state=UNDEFORMED_AT_REST,
+    )
+    path = stroke * np.stack([0 * times, np.sin(9 * times), 1 - np.cos(7 * times)], axis=1)
+    return replace(scene, controllers=grip + path[:, None])
+
+
+def recorded(scene: Scene, *effects, sigma: float = SIGMA) -> Scene:
+    """The scene as a finer twin with these effects moves in it."""
+    twin: Twin = build_twin(scene, 240).with_parameters(youngs_modulus_pa=YOUNGS_MODULUS_PA)
+    for known in effects:
+        twin = twin.with_effect(known)
+    tracks = twin.observe(twin.simulate_nodes(*scene.control_track(), scene.times), scene.times)
+    noise = np.random.default_rng(0).normal(scale=sigma, size=tracks.shape)
+    return replace(scene, points=tracks + noise, noise_sigma_m=sigma)
+
+
+def traced(*effects, stroke: float = 0.015, config: TraceConfig = CONFIG) -> TraceResult:
+    return trace(recorded(beam(stroke), *effects), config)
+
+
+def test_where_nothing_acts_nothing_is_named() -> None:
+    found = trace(recorded(beam(0.015), sigma=2 * SIGMA), CONFIG)
+    assert found.verdict.name == "nothing_to_explain" and not found.effects
+
+
+def test_a_drag_is_named_with_its_strength_and_the_held_out_error_falls() -> None:
+    report = document(traced(effect("air_drag_linear", rate_per_s=6.0), stroke=0.03))
+    assert report["verdict"] == "named" and [e["name"] for e in report["effects"]] == ["air_drag_linear"]
+    rate = report["effects"][0]["parameters"]["rate_per_s"]
+    assert rate["value"] == pytest.approx(6.0, rel=0.15) and rate["unit"] == "1/s"
+    assert rate["ci95"][0] <= rate["value"] <= rate["ci95"][1]
+    out = report["held_out"]
+    assert out["explained_fraction"] > 0.8 and out["after_ci95"][0] <= out["after"] <= out["after_ci95"][1]
+    assert out["noise_floor"] == SIGMA and set(out["baselines"]) == {
+        "static",
+        "rigid_follow",
+        "constant_velocity",
+    }
+
+
+def test_a_clock_that_is_off_is_a_fault_of_the_data() -> None:
+    found = traced(effect("measurement_clock", offset_s=0.03))
+    assert found.verdict.name == "data_issue"
+    assert found.effects[0].name == "measurement_clock"
+    assert found.effects[0].parameters["offset_s"].value == pytest.approx(0.03, rel=0.2)
+
+
+def test_an_effect_outside_the_library_is_described_and_not_named() -> None:
+    config = replace(CONFIG, candidates=("gravity_tilt", "measurement_scale"))
+    found = traced(effect("air_drag_linear", rate_per_s=6.0), stroke=0.03, config=config)
+    assert found.verdict.name == "unexplained" and not found.effects
+    assert found.remainder_m > SIGMA and "over time" in found.remainder
+
+
+def test_a_trace_that_was_cut_off_goes_on_from_its_memory(tmp_path: Path) -> None:
+    scene = recorded(beam(0.015))
+    calls = 0
+
+    def stop() -> bool:
+        nonlocal calls
+        calls += 1
+        return calls > 900
+
+    memory = Memory(tmp_path)
+    config = replace(CONFIG, candidates=("air_drag_linear", "measurement_scale"))
+    twin = build_twin(scene, 120).with_parameters(youngs_modulus_pa=YOUNGS_MODULUS_PA)
+    with pytest.raises(Cancelled, match="simulations"):
+        trace(scene, config, memory=memory, calibrated_twin=twin, cancelled=stop)
+    remembered = {path.name for path in tmp_path.iterdir()}
+    assert remembered
+    again = trace(scene, config, memory=memory, calibrated_twin=twin)
+    fresh = trace(scene, config, calibrated_twin=twin)
+    assert np.array_equal(again.after, fresh.after) and again.verdict.name == fresh.verdict.name
+    assert remembered <= {path.name for path in tmp_path.iterdir()}
