@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from physworld.calibrate import CalibrationConfig
+from physworld.trace.experiment_search import ExperimentConfig
 
 
 def _declared() -> CalibrationConfig:
@@ -36,6 +37,7 @@ class TraceConfig:
         bootstraps: resamples of the intervals.
         seed: everything random follows from it.
         candidates: names of the registry to try; empty for all.
+        experiment: of the search for a motion that tells an equivalent set apart; None for no search.
     """
 
     calibration: CalibrationConfig = field(default_factory=_declared)
@@ -56,3 +58,4 @@ class TraceConfig:
     bootstraps: int = 1000
     seed: int = 0
     candidates: tuple[str, ...] = ()
+    experiment: ExperimentConfig | None = field(default_factory=ExperimentConfig)

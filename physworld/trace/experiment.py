@@ -8,7 +8,8 @@ be refitted before anybody called it wrong, so what counts is the difference tha
 f the predicted tracks, J_b the sensitivities of b's unknowns under u, H_b what the recording at hand already says of
 them. With white noise d_ab is the distance of the two hypotheses in standard deviations (T-optimal design, Atkinson
 and Fedorov 1975, to first order about the optima). The least of it over both directions and all pairs is maximised:
-random motions of every family first, by their plain difference (an upper bound), then neighbours of the best. Motions
+random motions of every family first, by their plain difference (an upper bound), then neighbours of the best; the
+winner is confirmed by refitting each rival to what the other predicts, with the full simulator. Motions
 keep the limits of :mod:`physworld.demonstrate.limits`, so the experiment asks of a rig nothing that it has not done.
 
 Where even the best motion tells nothing, that is the answer, with what else could be measured.
@@ -23,8 +24,9 @@ from typing import Any
 import numpy as np
 
 from physworld.scene import Scene
-from physworld.trace.experiment_search import ExperimentConfig, Rival, Search, Tried, rival_of
-from physworld.trace.simulations import Memory, Progress, Runner, in_turn
+from physworld.trace.experiment_search import ExperimentConfig, Search, Tried
+from physworld.trace.rivals import Rival, rival_of
+from physworld.trace.simulations import Drive, Simulations
 from physworld.twin import Twin
 
 __all__ = ["Experiment", "ExperimentConfig", "Rival", "propose", "rival_of"]
@@ -104,11 +106,9 @@ def propose(
     *,
     discrepancy: float = 0.0,
     finer: Twin | None = None,
+    cost: Callable[[Twin], float] | None = None,
     config: ExperimentConfig | None = None,
-    runner: Runner = in_turn,
-    memory: Memory | None = None,
-    progress: Progress | None = None,
-    cancelled: Callable[[], bool] | None = None,
+    simulations: Simulations | None = None,
 ) -> Experiment:
     """The motion that tells the rivals apart best.
 
@@ -120,22 +120,25 @@ def propose(
             beyond the noise; a difference below it settles nothing, whatever its number of coordinates.
         finer: a twin of the same body on finer cells; what those change is the solver's own error, and a difference
             that looks like it settles nothing either.
-        runner, memory, progress, cancelled: as for a trace.
+        cost: squared whitened misfit of a twin in the recording: rivals that differ in what the recording leaves open
+            are brought together first.
+        simulations: those of a trace, whose runner, memory and count are used on; None for this process.
 
     Raises:
         ValueError: fewer than two rivals.
-        Cancelled: ``cancelled`` returned true.
+        Cancelled: the trace was.
     """
     if len(rivals) < 2:
         raise ValueError(f"{len(rivals)} rivals: an experiment tells two or more apart")
     config = config or ExperimentConfig()
+    simulations = simulations or Simulations(Drive(*scene.control_track(), scene.times))
     labels = tuple(rival.label for rival in rivals)
     instead = tuple(dict.fromkeys(_INSTEAD[n] for r in rivals for n in r.names if n in _INSTEAD))
     first = rivals[0].twin
     if not first.controller_groups or not any(len(nodes) for nodes in first.held_nodes):
         reason = "Nothing holds this body, so no motion of a grip can be proposed."
         return Experiment(labels, False, reason + _otherwise(instead), instead=instead)
-    search = Search(scene, rivals, sigma, finer, config, runner, memory, progress, cancelled)
+    search = Search(scene, rivals, sigma, finer, cost, config, simulations)
     best = search.best()
     recorded = _of_recording(rivals)
     if best is None or best.refitted is None:
@@ -189,8 +192,8 @@ def _words(
     search: Search,
     instead: tuple[str, ...],
 ) -> str:
-    known = "" if recorded is None else f" (the recording at hand: {recorded:.1f})"
-    figure = f"{best.refitted:.1f} standard deviations of the noise after every refit{known}"
+    known = "" if recorded is None else f" (the recording at hand: {_figure(recorded)})"
+    figure = f"{_figure(best.refitted)} standard deviations of the noise after every refit{known}"
     what = " from ".join((", ".join(labels[:-1]), labels[-1]))
     if separates:
         start = best.motion.words[0].upper() + best.motion.words[1:]
@@ -210,6 +213,11 @@ def _words(
         f"No motion of the grips within this recording's reach and speed tells {what}: {why}."
         + _otherwise(instead)
     )
+
+
+def _figure(value: float) -> str:
+    """Three digits at most, without an exponent."""
+    return f"{value:.1f}" if value < 100 else f"{float(f'{value:.3g}'):.0f}"
 
 
 def _otherwise(instead: tuple[str, ...]) -> str:

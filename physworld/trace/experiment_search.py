@@ -15,18 +15,18 @@ import numpy as np
 
 from physworld.demonstrate.limits import MotionLimits, limits_of
 from physworld.scene import Scene
-from physworld.trace.confirm import Model
 from physworld.trace.probing import COORDINATES, Motion, Probe, motion_of, nudged, random_probe
-from physworld.trace.refit import prior_rows
+from physworld.trace.rivals import Rival, reconciled, refit_of
 from physworld.trace.sensitivity import refinement_of
-from physworld.trace.simulations import Drive, Job, Memory, Progress, Runner, Simulations
-from physworld.trace.unknowns import Unknown, at
+from physworld.trace.simulations import Drive, Job, Simulations
+from physworld.trace.unknowns import at
 from physworld.twin import Twin
 
 STAGE = "experiment"
 NUMERICS_AMPLITUDE = 3.0  # deviation of the solver's own error, over the change by finer cells
 _CONTROL_RATE_HZ = 100.0  # control points are given, and predictions made, at least this often
-_RIDGE = 1e-9
+_ROUNDS = 2  # Gauss-Newton steps of the confirmation
+_SHARES = (1.0, 0.3)  # of such a step, tried together
 
 
 @dataclass(frozen=True)
@@ -53,38 +53,6 @@ class ExperimentConfig:
 
 
 @dataclass(frozen=True)
-class Rival:
-    """A model to be told from others.
-
-    Attributes:
-        names: its effects.
-        twin: at its optimum.
-        unknowns: what a refit would change, starting at the optimum.
-        information: what the recording at hand says of them, (p, p); None: nothing.
-        residual: whitened, of the recording at hand, (M,), or None.
-    """
-
-    names: tuple[str, ...]
-    twin: Twin
-    unknowns: tuple[Unknown, ...] = ()
-    information: np.ndarray | None = None
-    residual: np.ndarray | None = None
-
-    @property
-    def label(self) -> str:
-        """For people."""
-        return " and ".join(self.names) or "the declared physics"
-
-
-def rival_of(model: Model) -> Rival:
-    """A refitted model as a rival."""
-    fitted = model.fitted
-    _, slope = prior_rows(fitted.unknowns, fitted.theta)
-    information = fitted.jacobian.T @ fitted.jacobian + slope.T @ slope
-    return Rival(model.names, fitted.twin, tuple(fitted.unknowns), information, fitted.residual)
-
-
-@dataclass(frozen=True)
 class Tried:
     """A motion with every rival's prediction (T, N, 3), its plain separation and that after refits (None: open)."""
 
@@ -104,20 +72,22 @@ class Search:
         rivals: list[Rival],
         sigma: float,
         finer: Twin | None,
+        cost: Callable[[Twin], float] | None,
         config: ExperimentConfig,
-        runner: Runner,
-        memory: Memory | None,
-        progress: Progress | None,
-        cancelled: Callable[[], bool] | None,
+        simulations: Simulations,
     ) -> None:
-        self.rivals = [replace(rival, twin=from_rest(rival.twin)) for rival in rivals]
+        self._simulations, self._before, self.tried = simulations, simulations.count, 0
+        self.rivals = [replace(rival, twin=from_rest(rival.twin)) for rival in reconciled(rivals, cost)]
         self.finer = None if finer is None else from_rest(refinement_of(rivals[0].twin, finer))
         self.sigma, self.config = sigma, config
         self.limits: MotionLimits = limits_of(scene, rivals[0].twin)
         self.pose = rivals[0].twin.controllers_start
         self.frame_times, self.control_times = clock_of(scene, config.longest_s)
-        self._run = (runner, memory or Memory(), progress, cancelled)
-        self.count = self.tried = 0
+
+    @property
+    def count(self) -> int:
+        """Simulations of this search so far."""
+        return self._simulations.count - self._before
 
     def best(self) -> Tried | None:
         """The best motion found within the budget; None where no motion could be simulated."""
@@ -143,7 +113,8 @@ class Search:
             near = self._try(nudged(best.probe, size, generator))
             if near is not None and near.plain > (best.refitted or 0.0):
                 best = _better(best, self._refitted(near))
-        return best
+        claims = best is not None and (best.refitted or 0.0) >= config.enough_sigmas
+        return self.confirmed(best) if claims else best
 
     def _try(self, probe: Probe) -> Tried | None:
         """A motion's predictions; None where a rival's run fails or the budget is spent."""
@@ -162,62 +133,101 @@ class Search:
 
     def _refitted(self, tried: Tried, forced: bool = False) -> Tried | None:
         """The separation after refits; None where the budget is spent (``forced``: never) or a run fails."""
-        jobs = [
-            (k, unknown, step)
-            for k, rival in enumerate(self.rivals)
-            for unknown in rival.unknowns
-            for step in (-unknown.step if unknown.start + unknown.step > unknown.high else unknown.step,)
-        ]
-        if self.count + len(jobs) + 1 > self.config.simulations and not forced:
+        cost = sum(len(rival.unknowns) for rival in self.rivals) + 1
+        if self.count + cost > self.config.simulations and not forced:
             return None
-        twins = [at(self.rivals[k].twin, [u], np.array([u.start + step])) for k, u, step in jobs]
-        found = self._simulate(tried.motion, twins + ([] if self.finer is None else [self.finer]))
-        if any(tracks is None for tracks in found):
+        slopes = [self._slopes(tried, k, rival) for k, rival in enumerate(self.rivals)]
+        numerics = self._numerics(tried)
+        if numerics is None or any(slope is None for slope in slopes):
             return None
-        slopes: list[list[np.ndarray]] = [[] for _ in self.rivals]
-        for (k, _, step), tracks in zip(jobs, found, strict=False):
-            slopes[k].append((tracks - tried.tracks[k]).reshape(-1) / (step * self.sigma))
-        numerics = [] if self.finer is None else [(found[-1] - tried.tracks[0]).reshape(-1) / self.sigma]
         least = np.inf
         for a, b in permutations(range(len(self.rivals)), 2):
             gap = (tried.tracks[a] - tried.tracks[b]).reshape(-1) / self.sigma
-            slope = np.array([*slopes[b], *numerics]).reshape(-1, gap.size).T
-            least = min(least, separation(gap, slope, self._known(b, len(numerics))))
+            known, offset = _known(self.rivals[b], numerics.shape[1])
+            least = min(least, refit_of(gap, np.hstack([slopes[b], numerics]), known, offset)[1])
         return replace(tried, refitted=least)
 
-    def _known(self, rival: int, numerics: int) -> np.ndarray:
-        """What is known beforehand of a rival's unknowns and of the solver's error, (p + numerics,) squared."""
-        unknowns, given = len(self.rivals[rival].unknowns), self.rivals[rival].information
-        known = np.diag(np.full(unknowns + numerics, NUMERICS_AMPLITUDE**-2))
-        known[:unknowns, :unknowns] = 0.0 if given is None else given
-        return known
+    def confirmed(self, tried: Tried) -> Tried:
+        """The separation with the full simulator: each rival refitted to what each other predicts."""
+        least = tried.refitted or 0.0
+        numerics = self._numerics(tried)
+        if numerics is None:
+            return replace(tried, refitted=0.0)
+        for a, b in permutations(range(len(self.rivals)), 2):
+            least = min(least, self._imitated(tried, a, b, numerics))
+        return replace(tried, refitted=least)
+
+    def _imitated(self, tried: Tried, truth: int, number: int, numerics: np.ndarray) -> float:
+        """What is left of the prediction of ``truth`` after Gauss-Newton steps of the rival ``number``."""
+        rival, tracks = self.rivals[number], tried.tracks[number]
+        left = self._left(rival, tried.tracks[truth], tracks, numerics)
+        for _ in range(_ROUNDS):
+            slope = self._slopes(replace(tried, tracks=(tracks,)), 0, rival)
+            if slope is None:
+                break
+            gap = (tried.tracks[truth] - tracks).reshape(-1) / self.sigma
+            known, offset = _known(rival, numerics.shape[1])
+            change, _ = refit_of(gap, np.hstack([slope, numerics]), known, offset)
+            trials = [rival.moved(share * change[: len(rival.unknowns)]) for share in _SHARES]
+            found = self._simulate(tried.motion, [trial.twin for trial in trials])
+            ends = [
+                (self._left(trial, tried.tracks[truth], made, numerics), trial, made)
+                for trial, made in zip(trials, found, strict=True)
+                if made is not None
+            ]
+            best = min(ends, key=lambda end: end[0]) if ends else None
+            if best is None or best[0] >= left:
+                break
+            left, rival, tracks = best
+        return left
+
+    def _left(self, rival: Rival, truth: np.ndarray, tracks: np.ndarray, numerics: np.ndarray) -> float:
+        """Norm of the difference that the solver's error does not hide, with the way from the recording's optimum."""
+        gap = (truth - tracks).reshape(-1) / self.sigma
+        known, _ = _known(replace(rival, unknowns=(), information=None, offset=None), numerics.shape[1])
+        _, open_ = refit_of(gap, numerics, known)
+        away = rival.offset if rival.offset is not None else np.zeros(len(rival.unknowns))
+        moved = 0.0 if rival.information is None else float(away @ rival.information @ away)
+        return float(np.sqrt(open_**2 + moved))
+
+    def _slopes(self, tried: Tried, number: int, rival: Rival) -> np.ndarray | None:
+        """Change of a rival's prediction per unknown over the noise, (M, p); None where a run fails."""
+        steps = [-u.step if u.start + u.step > u.high else u.step for u in rival.unknowns]
+        probes = zip(rival.unknowns, steps, strict=True)
+        twins = [at(rival.twin, [u], np.array([u.start + step])) for u, step in probes]
+        base = tried.tracks[number]
+        columns = []
+        for tracks, step in zip(self._simulate(tried.motion, twins), steps, strict=True):
+            if tracks is None:
+                return None
+            columns.append((tracks - base).reshape(-1) / (step * self.sigma))
+        return np.stack(columns, axis=1) if columns else np.empty((base.size, 0))
+
+    def _numerics(self, tried: Tried) -> np.ndarray | None:
+        """What finer cells change over the noise, (M, 1), or (M, 0) without them; None where the run fails."""
+        if self.finer is None:
+            return np.empty((tried.tracks[0].size, 0))
+        (finer,) = self._simulate(tried.motion, [self.finer])
+        return None if finer is None else (finer - tried.tracks[0]).reshape(-1, 1) / self.sigma
 
     def _simulate(self, motion: Motion, twins: list[Twin]) -> list[np.ndarray | None]:
-        runner, memory, progress, cancelled = self._run
         # between the frames too: a clock that is off by a part of a frame must not show as interpolation
-        drive = Drive(self.control_times, motion.points, self.control_times)
-        simulations = Simulations(drive, runner, memory, _onward(progress, self.count), cancelled)
-        simulations.stage = STAGE
-        found = simulations.run([Job(twin, len(self.control_times)) for twin in twins])
-        self.count += simulations.count
+        there = self._simulations.elsewhere(Drive(self.control_times, motion.points, self.control_times))
+        there.stage = STAGE
+        found = there.run([Job(twin, len(self.control_times)) for twin in twins])
+        self._simulations.count = there.count
         every = (len(self.control_times) - 1) // (len(self.frame_times) - 1)
         return [None if tracks is None else tracks[::every] for tracks in found]
 
 
-def separation(difference: np.ndarray, slope: np.ndarray, information: np.ndarray | None) -> float:
-    """Norm of a difference (M,) over the noise that the unknowns with ``slope`` (M, p) cannot hide.
-
-    Args:
-        information: what else is known of the unknowns, (p, p); None: nothing.
-    """
-    if not slope.shape[1]:
-        return float(np.linalg.norm(difference))
-    normal = slope.T @ slope + (0.0 if information is None else information)
-    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    ridged = normal / np.outer(scale, scale) + _RIDGE * np.eye(len(scale))
-    product = slope.T @ difference / scale
-    left = float(difference @ difference) - float(product @ np.linalg.solve(ridged, product))
-    return float(np.sqrt(max(left, 0.0)))
+def _known(rival: Rival, numerics: int) -> tuple[np.ndarray, np.ndarray]:
+    """What is known beforehand of a rival's unknowns and of the solver's error: information and offset."""
+    count = len(rival.unknowns)
+    known = np.diag(np.full(count + numerics, NUMERICS_AMPLITUDE**-2))
+    known[:count, :count] = 0.0 if rival.information is None else rival.information
+    offset = np.zeros(count + numerics)
+    offset[:count] = 0.0 if rival.offset is None else rival.offset
+    return known, offset
 
 
 def from_rest(twin: Twin) -> Twin:
@@ -238,9 +248,3 @@ def _better(best: Tried | None, other: Tried | None) -> Tried | None:
     if best is None or other is None:
         return other or best
     return other if (other.refitted or 0.0) > (best.refitted or 0.0) else best
-
-
-def _onward(progress: Progress | None, before: int) -> Progress | None:
-    if progress is None:
-        return None
-    return lambda done, total, stage: progress(before + done, total, stage)

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from physworld.effects.registry import EFFECTS
 from physworld.trace.held_out import METRIC
 from physworld.trace.result import Named, Number, TraceResult
 
 SCHEMA_VERSION = 1
+_SHOWN = 10  # best scores of a step
 
 
 def document(result: TraceResult) -> dict[str, Any]:
@@ -23,10 +25,12 @@ def document(result: TraceResult) -> dict[str, Any]:
             name,
             {
                 "name": name,
+                "title": EFFECTS[name].title,
                 "variant": score.candidate.variant or None,
                 "score": score.share,
                 "threshold": max(ranked.threshold, 0.0) if ranked else 0.0,
                 "p_value": score.p_value,
+                "absorbed": score.absorbed,
                 "selected": name in selected,
             },
         )
@@ -43,6 +47,11 @@ def document(result: TraceResult) -> dict[str, Any]:
         "path": [
             {
                 "base": list(step.base.names),
+                "threshold": step.scores.threshold,
+                "scores": [
+                    {"name": s.candidate.effect, "variant": s.candidate.variant or None, "score": s.share}
+                    for s in step.scores.ranked[:_SHOWN]
+                ],
                 "tried": [
                     {
                         "effects": list(model.names),
@@ -57,6 +66,7 @@ def document(result: TraceResult) -> dict[str, Any]:
             }
             for step in result.path
         ],
+        "split": {"train": list(result.split.train), "test": list(result.split.test)},
         "training": {
             "misfit_before": result.declared.fitted.misfit,
             "misfit_after": result.verdict.model.fitted.misfit,
@@ -77,7 +87,7 @@ def document(result: TraceResult) -> dict[str, Any]:
         },
         "calibrated": {name: _number(number) for name, number in result.calibrated.items()},
         "unexplained": {"rms_m": result.remainder_m, "description": result.remainder},
-        "suggested_experiment": None,
+        "suggested_experiment": None if result.experiment is None else result.experiment.document(),
         "notes": list(result.notes),
         "seconds": result.seconds,
         "simulations": result.simulations,
@@ -86,7 +96,12 @@ def document(result: TraceResult) -> dict[str, Any]:
 
 
 def _effect(effect: Named) -> dict[str, Any]:
-    return {"name": effect.name, "parameters": {k: _number(n) for k, n in effect.parameters.items()}}
+    title = EFFECTS[effect.name].title
+    return {
+        "name": effect.name,
+        "title": title,
+        "parameters": {k: _number(n) for k, n in effect.parameters.items()},
+    }
 
 
 def _number(number: Number) -> dict[str, Any]:

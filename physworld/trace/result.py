@@ -8,6 +8,7 @@ import numpy as np
 
 from physworld.trace.candidates import Candidate
 from physworld.trace.confirm import Model
+from physworld.trace.experiment import Experiment
 from physworld.trace.held_out import HeldOut
 from physworld.trace.score import Scores
 from physworld.trace.split import Split
@@ -59,6 +60,7 @@ class TraceResult:
         before, after: open-loop tracks, (T, N, 3) [m].
         held_out: errors on the held-out frames.
         remainder_m, remainder: what is left on the training frames beyond the noise, and in words.
+        experiment: what would tell an equivalent set apart, or None.
         simulations, seconds: cost.
         notes: what a reader has to know.
     """
@@ -83,4 +85,5 @@ class TraceResult:
     remainder: str
     simulations: int
     seconds: float
+    experiment: Experiment | None = None
     notes: tuple[str, ...] = field(default_factory=tuple)

@@ -1,7 +1,7 @@
 """A trace from beginning to end: calibrate, find the residual, name the effect, add it, and measure what it brought.
 
 1. Freeze the split. Calibrate the declared physics on the training frames, with several starts and no damping.
-2. Noise; whitening by noise and by the points' own places; what other cells and time steps change.
+2. Noise; whitening by noise, by the points' own places, and by what finer cells and time steps change.
 3. Sensitivities of the calibrated parameters and of every candidate; scores, decoys, and what chance would reach.
 4. Refit the best candidates with everything; where the best single leaves too much, pairs.
 5. Refit the winner and its rivals on finer cells: the strength has to agree.
@@ -24,6 +24,7 @@ from physworld.trace.comparison import cross_validated
 from physworld.trace.config import TraceConfig
 from physworld.trace.confirm import Confirmation, Model, best_variants
 from physworld.trace.describe import describe
+from physworld.trace.experiment import Experiment, propose, rival_of
 from physworld.trace.held_out import measure
 from physworld.trace.intervals import calibrated, named, numbers
 from physworld.trace.noise import noise_sigma
@@ -55,9 +56,14 @@ from physworld.trace.whitening import Whitener, moved, responses, whitener
 from physworld.twin import Twin
 
 _POISSON_SPREAD = 0.08  # of what is known of a soft solid's Poisson's ratio beforehand
+_NUMERICS_AMPLITUDE = (
+    3.0  # true error over the change by cells 1.25 times finer, for second order: 1 / (1 - 1.25^-2)
+)
 _OTHER_STIFFNESSES = tuple(0.12 * k for k in (-6, -5, -4, -3, -2, -1, 1, 2, 3, 4, 5, 6))
 """Logarithms: a phase that has slipped by a period is a local minimum, so others are looked at before a descent."""
-_SLOWEST = 8.0  # times the cost of the declared physics that a run may take: explicit friction is dear
+_SLOWEST = (
+    8.0  # times the cost of the declared physics that a run may take: explicit friction shrinks the time step
+)
 _AGREEMENT = 0.25  # share by which a strength may move with the resolution
 
 
@@ -133,13 +139,16 @@ class _Trace:
         directions, finer = numerical_directions(
             simulations, self.scene, self.twin, tracks, config.calibration.particle_budget, config.refinement
         )
+        white = white.with_numerics(list(directions.values()), _NUMERICS_AMPLITUDE)
         block_of_row = self.split.block_of(white.frame_of_row)
         declared = self._declared(white, block_of_row)
         basis = orthonormal(declared.fitted.free_jacobian)
-        shifts = [project(basis, white.change(direction)) for direction in directions.values()]
-        numerics = {n: float(np.sqrt(np.mean(shift**2))) for n, shift in zip(directions, shifts, strict=True)}
-        solver = orthonormal(np.stack(shifts, axis=1)) if shifts else basis[:, :0]
-        resolved = float(np.sqrt(np.mean(project(solver, project(basis, declared.fitted.residual)) ** 2)))
+        plain = white.with_numerics([], 1.0)
+        plain_misfit = float(np.sqrt(np.mean(plain.residual(declared.fitted.tracks) ** 2)))
+        numerics = {
+            name: float(np.sqrt(np.mean(project(basis, plain.change(d)) ** 2)))
+            for name, d in directions.items()
+        }
         chosen, refused = candidates(declared.fitted.twin, config.candidates)
         simulations.stage = "sensitivities"
         found = candidate_responses(
@@ -151,13 +160,36 @@ class _Trace:
         models = [model for step in path for model in step.tried]
         finer_values, agreement = self._second_resolution(declared, models, white, finer)
         verdict = decide(
-            declared, models, basis, agreement, resolved, config, len({c.effect for c in chosen})
+            declared, models, basis, agreement, plain_misfit, config, len({c.effect for c in chosen})
         )
         if sigma is None and verdict.name not in (NOTHING, UNEXPLAINED):
             verdict = Verdict(UNEXPLAINED, declared, (), "no noise estimate, no claim: " + verdict.reason)
-        return self._result(
+        found = self._result(
             verdict, declared, white, block_of_row, sigma, path, chosen, refused, numerics, finer_values
         )
+        return replace(found, experiment=self._experiment(verdict, white, finer))
+
+    def _experiment(self, verdict: Verdict, white: Whitener, finer: Twin) -> Experiment | None:
+        """What would tell the models of an equivalent set apart."""
+        if not verdict.equivalent or self.config.experiment is None:
+            return None
+        models = (verdict.model, *verdict.equivalent)
+        left = max(model.fitted.misfit for model in models)
+        return propose(
+            self.scene,
+            [rival_of(model) for model in models],
+            white.sigma,
+            discrepancy=float(np.sqrt(max(left**2 - 1.0, 0.0))),
+            finer=finer,
+            cost=lambda twin: self._cost(twin, white),
+            config=self.config.experiment,
+            simulations=self.simulations,
+        )
+
+    def _cost(self, twin: Twin, white: Whitener) -> float:
+        """Squared whitened misfit on the training frames; infinite where the run cannot be trusted."""
+        tracks = self.simulations.run([Job(twin, self.frames)])[0]
+        return float("inf") if tracks is None else float(np.sum(white.residual(tracks) ** 2))
 
     def _declared(self, white: Whitener, block_of_row: np.ndarray) -> Model:
         """The declared physics under the trace's own misfit."""
@@ -198,9 +230,9 @@ class _Trace:
             least = max(config.material_share, ranked.threshold if number else 0.0)
             hopeful = best_variants(ranked.ranked, least, config.confirmed, base.names)
             tried = []
-            for variants in hopeful:
-                self.simulations.stage = f"refit with {variants[0].candidate.effect}"
-                model = confirmation.model(base, variants, columns)
+            for score in hopeful:
+                self.simulations.stage = f"refit with {score.candidate.label}"
+                model = confirmation.model(base, score, columns[score.candidate.label])
                 if model is not None:
                     tried.append(model)
             good = [m for m in tried if helps(m, base, config)]

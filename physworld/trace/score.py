@@ -30,6 +30,7 @@ class Score:
         strengths: linear estimate in the units of its unknowns, (k,).
         direction: what it explains, (M,), after projection.
         p_value: of its score alone under random signs.
+        absorbed: part of its squared sensitivity that the calibrated parameters can imitate.
         family: share that all variants of its effect explain together, which bounds what a shape between them can.
     """
 
@@ -39,6 +40,7 @@ class Score:
     direction: np.ndarray
     p_value: float
     family: float = 0.0
+    absorbed: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,12 @@ def scores(
         best = np.maximum(best, flipped)
         share = gain / total
         p_value = float((1 + np.sum(flipped >= share)) / (1 + resamples))
-        ranked.append(Score(response.candidate, share, strengths, columns @ strengths, p_value))
+        whole = float(np.sum(response.columns**2))
+        absorbed = 1.0 - float(np.sum(columns**2)) / whole if whole > 0 else 0.0
+        direction = columns @ strengths
+        ranked.append(
+            Score(response.candidate, share, strengths, direction, p_value, absorbed=max(absorbed, 0.0))
+        )
     families = _families(responses, basis, left)
     ranked = [replace(s, family=max(s.share, families[s.candidate.effect] / total)) for s in ranked]
     ranked.sort(key=lambda s: -s.share)

@@ -222,6 +222,12 @@ class Simulations:
                 self._progress(self.count, 0, self.stage)
         return tracks
 
+    def elsewhere(self, drive: Drive) -> Simulations:
+        """Simulations under another drive, with the same runner, memory and watchers; their count goes on from here."""
+        other = Simulations(drive, self._runner, self._memory, self._progress, self._cancelled)
+        other.count, other.stage, other.least_step_s = self.count, self.stage, self.least_step_s
+        return other
+
     def _poll(self) -> None:
         if self._cancelled is not None and self._cancelled():
             raise Cancelled(f"trace cancelled after {self.count} simulations in the stage {self.stage!r}")

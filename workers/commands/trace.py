@@ -1,6 +1,7 @@
 """``python -m workers.commands.trace SCENE --out report.json``: trace a recording's residual to a named effect.
 
-The report is :func:`physworld.trace.document`; ``--predictions FILE`` keeps the open-loop tracks before and after.
+The report is :func:`physworld.trace.document`; ``--predictions FILE`` keeps the open-loop tracks before and after,
+``--html FILE`` shows all of it as one self-contained page.
 Simulations run in two processes unless ``--processes`` says otherwise; ``--resume DIR`` keeps every simulation there,
 so that the same command goes on where an earlier one was cut off. Ctrl-C cancels; nothing is written before the end.
 """
@@ -33,6 +34,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("scene", type=Path, help="folder, archive, final_data.pkl or C3D file")
     parser.add_argument("--out", type=Path, default=None, help="write the report to this file")
     parser.add_argument("--predictions", type=Path, default=None, help="npz with the tracks before and after")
+    parser.add_argument("--html", type=Path, default=None, help="write the report as a page to this file")
     parser.add_argument("--particles", type=_count, default=None, help="particles of the twin, about")
     parser.add_argument("--processes", type=_count, default=PROCESSES, help="processes that simulate")
     parser.add_argument("--resume", type=Path, default=None, help="folder that remembers every simulation")
@@ -54,6 +56,7 @@ def _trace(given: argparse.Namespace) -> None:
 
     from physworld.calibrate import CalibrationConfig, Journal
     from physworld.trace import Memory, TraceConfig, Workers, document, trace
+    from physworld.trace.html import render
     from physworld.trace.simulations import in_turn
     from workers.commands.terminal import progress_bar, read_scene
 
@@ -76,6 +79,9 @@ def _trace(given: argparse.Namespace) -> None:
         given.predictions.parent.mkdir(parents=True, exist_ok=True)
         with given.predictions.open("wb") as file:
             np.savez(file, before=result.before, after=result.after)
+    if given.html is not None:
+        given.html.parent.mkdir(parents=True, exist_ok=True)
+        given.html.write_text(render(report, scene, result.before, result.after), encoding="utf-8")
     if given.out is not None:
         given.out.parent.mkdir(parents=True, exist_ok=True)
         given.out.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n")
@@ -98,6 +104,8 @@ def _print(report: dict[str, Any]) -> None:
         + ("" if floor is None else f", noise {1e3 * floor:.4g}")
     )
     print(f"remains: {report['unexplained']['description']}")
+    if report["suggested_experiment"] is not None:
+        print(f"next: {report['suggested_experiment']['description']}")
     print(f"{report['simulations']} simulations, {report['seconds']:.0f} s")
 
 

@@ -16,9 +16,10 @@ from physworld.demonstrate.motion import broken_limit
 from physworld.effects.registry import effect
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
 from physworld.trace.experiment import Experiment, ExperimentConfig, Rival, propose
-from physworld.trace.experiment_search import clock_of, separation
+from physworld.trace.experiment_search import clock_of
 from physworld.trace.probing import COORDINATES, motion_of, nudged, random_probe
 from physworld.trace.refit import Refit, refit
+from physworld.trace.rivals import reconciled, refit_of
 from physworld.trace.simulations import Drive, Job, Simulations, nodes_of
 from physworld.trace.split import Split
 from physworld.trace.unknowns import Unknown, of_parameter, of_strength
@@ -161,10 +162,38 @@ def test_every_probe_and_its_neighbours_keep_the_limits(family: str) -> None:
 
 def test_the_separation_is_what_no_refit_hides() -> None:
     rng = np.random.default_rng(0)
-    slope, gap = rng.normal(size=(50, 3)), rng.normal(size=50)
+    slope, gap, away = rng.normal(size=(50, 3)), rng.normal(size=50), rng.normal(size=3)
     prior = np.diag([4.0, 1.0, 9.0])
-    x = np.linalg.lstsq(np.vstack([slope, np.sqrt(prior)]), np.concatenate([gap, np.zeros(3)]), rcond=None)[0]
-    left = np.sqrt(np.sum((gap - slope @ x) ** 2) + x @ prior @ x)
-    assert separation(gap, slope, prior) == pytest.approx(left, rel=1e-6)
-    assert separation(gap, slope, None) < left < separation(gap, slope[:, :0], None)
-    assert separation(slope @ np.ones(3), slope, None) < 1e-3 * np.linalg.norm(slope @ np.ones(3))
+    rows, ends = np.vstack([slope, np.sqrt(prior)]), np.concatenate([gap, -np.sqrt(prior) @ away])
+    x = np.linalg.lstsq(rows, ends, rcond=None)[0]
+    change, left = refit_of(gap, slope, prior, away)
+    assert np.allclose(change, x, rtol=1e-6) and left == pytest.approx(
+        np.linalg.norm(ends - rows @ x), rel=1e-6
+    )
+    assert (
+        refit_of(gap, slope, None)[1] < refit_of(gap, slope, prior)[1] < refit_of(gap, slope[:, :0], None)[1]
+    )
+    assert refit_of(slope @ np.ones(3), slope, None)[1] < 1e-3 * np.linalg.norm(slope @ np.ones(3))
+
+
+def test_rivals_that_differ_in_what_the_recording_leaves_open_are_brought_together() -> None:
+    twin = build_twin(gentle_beam(), 60).with_parameters(youngs_modulus_pa=YOUNGS_MODULUS_PA)
+    drag = effect("air_drag_linear")
+    rate = next(s for s in drag.strengths(twin) if s.gate)
+    soft = Unknown(
+        "soft", "Pa", 1e3, 9e4, 4e4, 1.0, float, lambda t, v: t.with_parameters(youngs_modulus_pa=v)
+    )
+    gate = of_strength(drag.name, rate).starting(20.0)
+    first = Rival(("tether",), twin, (soft.starting(5e4),))
+    other = Rival((drag.name,), twin, (soft, gate), np.diag([1.0, 4.0]))
+
+    def valley(there: Twin) -> float:
+        return 100.0 + abs(there.parameters["youngs_modulus_pa"] - 4e4) * slope
+
+    slope = 1e-5
+    together = reconciled([first, other], valley)[1]
+    assert together.start == pytest.approx([5e4, 20.0]) and together.twin.effects[0].active
+    assert together.twin.parameters["youngs_modulus_pa"] == pytest.approx(5e4)
+    slope = 1.0
+    assert reconciled([first, other], valley)[1] is other
+    assert reconciled([first, other], None) == [first, other]

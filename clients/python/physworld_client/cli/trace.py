@@ -18,6 +18,7 @@ def trace(
     predictions: Annotated[
         Path | None, typer.Option(help="Write the tracks before and after to this npz.")
     ] = None,
+    html: Annotated[Path | None, typer.Option(help="Write the report as a page to this file.")] = None,
     particles: Annotated[int | None, typer.Option(min=50, help="Particles of the twin, about.")] = None,
     processes: Annotated[int | None, typer.Option(min=1, help="Processes that simulate.")] = None,
     resume: Annotated[
@@ -28,6 +29,7 @@ def trace(
     given = {
         "--out": out,
         "--predictions": predictions,
+        "--html": html,
         "--particles": particles,
         "--processes": processes,
         "--resume": resume,
