@@ -1,7 +1,7 @@
 """A trace from beginning to end: calibrate, find the residual, name the effect, add it, and measure what it brought.
 
 1. Freeze the split. Calibrate the declared physics on the training frames, with several starts and no damping.
-2. Noise; whitening by noise, by the points' own places, and by what finer cells and time steps change.
+2. Noise; whitening by noise and by the points' own places; what other cells and time steps change.
 3. Sensitivities of the calibrated parameters and of every candidate; scores, decoys, and what chance would reach.
 4. Refit the best candidates with everything; where the best single leaves too much, pairs.
 5. Refit the winner and its rivals on finer cells: the strength has to agree.
@@ -56,14 +56,9 @@ from physworld.trace.whitening import Whitener, moved, responses, whitener
 from physworld.twin import Twin
 
 _POISSON_SPREAD = 0.08  # of what is known of a soft solid's Poisson's ratio beforehand
-_NUMERICS_AMPLITUDE = (
-    3.0  # true error over the change by cells 1.25 times finer, for second order: 1 / (1 - 1.25^-2)
-)
 _OTHER_STIFFNESSES = tuple(0.12 * k for k in (-6, -5, -4, -3, -2, -1, 1, 2, 3, 4, 5, 6))
 """Logarithms: a phase that has slipped by a period is a local minimum, so others are looked at before a descent."""
-_SLOWEST = (
-    8.0  # times the cost of the declared physics that a run may take: explicit friction shrinks the time step
-)
+_SLOWEST = 8.0  # times the cost of the declared physics that a run may take: explicit friction is dear
 _AGREEMENT = 0.25  # share by which a strength may move with the resolution
 
 
@@ -139,16 +134,13 @@ class _Trace:
         directions, finer = numerical_directions(
             simulations, self.scene, self.twin, tracks, config.calibration.particle_budget, config.refinement
         )
-        white = white.with_numerics(list(directions.values()), _NUMERICS_AMPLITUDE)
         block_of_row = self.split.block_of(white.frame_of_row)
         declared = self._declared(white, block_of_row)
         basis = orthonormal(declared.fitted.free_jacobian)
-        plain = white.with_numerics([], 1.0)
-        plain_misfit = float(np.sqrt(np.mean(plain.residual(declared.fitted.tracks) ** 2)))
-        numerics = {
-            name: float(np.sqrt(np.mean(project(basis, plain.change(d)) ** 2)))
-            for name, d in directions.items()
-        }
+        shifts = [project(basis, white.change(direction)) for direction in directions.values()]
+        numerics = {n: float(np.sqrt(np.mean(shift**2))) for n, shift in zip(directions, shifts, strict=True)}
+        solver = orthonormal(np.stack(shifts, axis=1)) if shifts else basis[:, :0]
+        resolved = float(np.sqrt(np.mean(project(solver, project(basis, declared.fitted.residual)) ** 2)))
         chosen, refused = candidates(declared.fitted.twin, config.candidates)
         simulations.stage = "sensitivities"
         found = candidate_responses(
@@ -160,7 +152,7 @@ class _Trace:
         models = [model for step in path for model in step.tried]
         finer_values, agreement = self._second_resolution(declared, models, white, finer)
         verdict = decide(
-            declared, models, basis, agreement, plain_misfit, config, len({c.effect for c in chosen})
+            declared, models, basis, agreement, resolved, config, len({c.effect for c in chosen})
         )
         if sigma is None and verdict.name not in (NOTHING, UNEXPLAINED):
             verdict = Verdict(UNEXPLAINED, declared, (), "no noise estimate, no claim: " + verdict.reason)
@@ -230,9 +222,9 @@ class _Trace:
             least = max(config.material_share, ranked.threshold if number else 0.0)
             hopeful = best_variants(ranked.ranked, least, config.confirmed, base.names)
             tried = []
-            for score in hopeful:
-                self.simulations.stage = f"refit with {score.candidate.label}"
-                model = confirmation.model(base, score, columns[score.candidate.label])
+            for variants in hopeful:
+                self.simulations.stage = f"refit with {variants[0].candidate.effect}"
+                model = confirmation.model(base, variants, columns)
                 if model is not None:
                     tried.append(model)
             good = [m for m in tried if helps(m, base, config)]
