@@ -206,16 +206,19 @@ class Search:
         return {name: float("nan") if gain is None else gain for name, gain in found.items()}
 
     def shift_points(self, parameters: list[Parameter], theta: np.ndarray) -> bool:
-        """Move the tracked points inside the body by their mean residual, in the material's frame (solids)."""
+        """Move the tracked points by their mean residual: inside a solid, within a sheet and across it."""
         sigma = self.scene.noise_sigma_m
         lattice = self.twin.lattice
-        if self.scene.initial_state != UNDEFORMED_AT_REST or lattice.dim != 3 or not sigma:
+        if self.scene.initial_state != UNDEFORMED_AT_REST or lattice.dim == 1 or not sigma:
             return False
         found = self._step("shift", lambda: {"shift": self._mean_offsets(parameters, theta, sigma)})["shift"]
         if found is None:
             return False
-        points = self.twin.body.points + np.array(found)
-        self.twin = replace(self.twin, body=replace(self.twin.body, points=points))
+        body, shift = self.twin.body, np.array(found)
+        body = replace(
+            body, points=body.points + shift[:, : lattice.dim], offsets=body.offsets + shift[:, lattice.dim :]
+        )
+        self.twin = replace(self.twin, body=body)
         return True
 
     def _mean_offsets(self, parameters: list[Parameter], theta: np.ndarray, sigma: float) -> list | None:
@@ -261,13 +264,16 @@ class Search:
 
 
 def _deformation(lattice: Lattice, points: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """Deformation gradients at material points, (T, N, 3, 3)."""
+    """Where material directions point, (T, N, 3, 3): columns of the deformation gradient; a sheet's normal last."""
     frames = nodes.shape[0]
     flat = nodes.transpose(1, 0, 2).reshape(nodes.shape[1], -1)
     columns = []
-    for axis in range(3):
-        slope = lattice.interpolation(points, tuple(int(a == axis) for a in range(3)))
+    for axis in range(lattice.dim):
+        slope = lattice.interpolation(points, tuple(int(a == axis) for a in range(lattice.dim)))
         columns.append((slope @ flat).reshape(len(points), frames, 3).transpose(1, 0, 2))
+    if lattice.dim == 2:
+        normal = np.cross(*columns)
+        columns.append(normal / np.linalg.norm(normal, axis=-1, keepdims=True))
     return np.stack(columns, axis=-1)
 
 

@@ -10,8 +10,9 @@ from made_scene import box_body, made_scene, recorded_by
 
 from physworld.build import build_twin
 from physworld.calibrate import CalibrationConfig, calibrate
+from physworld.calibrate.search import Search
 from physworld.errors import CalibrationError, Cancelled, SceneUnsupported
-from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
+from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Scene
 from physworld.twin import Twin
 
 FRAMES, FPS = 40, 30.0
@@ -159,3 +160,30 @@ def test_hidden_points_do_not_count(undamped: Scene) -> None:
 def test_a_scene_without_a_body_is_refused_before_any_run() -> None:
     with pytest.raises(SceneUnsupported, match="3 points"):
         calibrate(made_scene(np.eye(3), "blob"), CONFIG)
+
+
+def test_the_noise_of_frame_0_is_taken_out_of_a_sheet_s_points() -> None:
+    """A hanging sheet's points lie where frame 0 saw them, noise included, in its plane and across it."""
+    side, sigma = 0.2, 1e-3
+    x, z = np.meshgrid(np.linspace(0, side, 7), np.linspace(0, side, 7), indexing="ij")
+    flat = np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1)
+    corners = np.array([[0.0, 0.0, side], [side, 0.0, side]])
+    times = np.arange(24) / FPS
+    sway = 0.02 * np.sin(2 * np.pi * 1.0 * times)[:, None, None] * np.array([0.0, 1.0, 0.0])
+    scene = made_scene(
+        flat,
+        "sheet",
+        corners,
+        24,
+        body=Body(thickness_m=0.004, density_kg_m3=300.0),
+        initial_state=UNDEFORMED_AT_REST,
+    )
+    scene = replace(scene, controllers=scene.controllers + sway)
+    twin = build_twin(scene).with_parameters(membrane_n_m=400.0, bending_n_m=2e-3)
+    recorded = recorded_by(twin, scene, sigma, seed=3)
+    search = Search(recorded, build_twin(recorded), 60, None, None)
+    search.twin = search.twin.with_parameters(membrane_n_m=400.0, bending_n_m=2e-3)
+    before = np.sqrt(np.mean(search.residual([], np.zeros(0)) ** 2))
+    assert search.shift_points([], np.zeros(0))
+    after = np.sqrt(np.mean(search.residual([], np.zeros(0)) ** 2))
+    assert before == pytest.approx(np.sqrt(2) * sigma, rel=0.15) and after < 1.1 * sigma
