@@ -21,5 +21,6 @@ class Effect(Resource):
 
     name: str
     title: str
+    kind: str = ""
     law: str
     parameters: dict[str, str] = Field(default_factory=dict)

@@ -40,7 +40,7 @@ def main(arguments: list[str] | None = None) -> int:
 def _list(given: argparse.Namespace) -> None:
     import warp as wp
 
-    wp.config.quiet = True  # before the first import that starts it
+    wp.config.log_level = wp.LOG_WARNING  # before the first import that starts it
     from physworld.build import build_twin
     from workers.commands.terminal import read_scene
 

@@ -11,6 +11,7 @@ from services.api.dependencies import DatabaseDep, ModelName, ObjectId, PageDep
 from services.api.errors import documented
 from services.api.idempotency import IdempotencyDep, accepted
 from services.api.routes.models import Version
+from services.api.routes.traces import require_known
 from storage import jobs, registry, traces
 
 router = APIRouter(tags=["assessments"])
@@ -29,6 +30,7 @@ def create_assessment(
 
     Where the error is above noise and above what the version's card lets expect, a trace of the recording is opened.
     """
+    require_known(body.trace, ("body", "trace", "candidates"))
     return idempotency.run(
         body,
         lambda session: accepted(

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from functools import cache
+from pathlib import Path
+
 from fastapi import APIRouter
+from pydantic import TypeAdapter
 
 from schemas.base import Page
 from schemas.library import Effect, Material
@@ -56,5 +60,11 @@ def list_materials() -> Page[Material]:
 
 @router.get("/effects")
 def list_effects() -> Page[Effect]:
-    """Effects that a residual can be traced to; none in this version."""
-    return Page(data=[])
+    """Effects that a residual can be traced to, with their strengths' units."""
+    return Page(data=known_effects())
+
+
+@cache
+def known_effects() -> list[Effect]:
+    """The registry, as the file beside this package has it (``workers.commands.effects_wire`` writes it)."""
+    return TypeAdapter(list[Effect]).validate_json((Path(__file__).parents[1] / "effects.json").read_bytes())

@@ -8,6 +8,7 @@ from schemas.job import Job
 from schemas.pipeline import PipelineCreate
 from services.api.errors import documented
 from services.api.idempotency import IdempotencyDep, accepted
+from services.api.routes.traces import require_known
 from storage import jobs
 
 router = APIRouter(prefix="/pipelines", tags=["pipelines"])
@@ -19,4 +20,5 @@ def create_pipeline(body: PipelineCreate, idempotency: IdempotencyDep) -> Respon
 
     With `close_the_loop` what the twin leaves is traced first, and the twin with the named effect demonstrates.
     """
+    require_known(body.trace, ("body", "trace", "candidates"))
     return idempotency.run(body, lambda session: accepted(jobs.create_pipeline(session, body)))

@@ -7,13 +7,14 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Response
 from fastapi.responses import StreamingResponse
 
-from schemas.base import Page
+from schemas.base import FieldError, Page
 from schemas.job import Job
-from schemas.trace import Trace, TraceCreate, TraceState, Verdict
+from schemas.trace import Trace, TraceConfig, TraceCreate, TraceState, Verdict
 from services.api.dependencies import ID_PATTERN, DatabaseDep, ObjectId, PageDep, StoresDep
-from services.api.errors import documented
+from services.api.errors import ApiProblem, documented
 from services.api.idempotency import IdempotencyDep, accepted
 from services.api.ranges import etag
+from services.api.routes.library import known_effects
 from storage import jobs, traces
 from storage.errors import Conflict
 
@@ -25,7 +26,22 @@ NPZ = "application/vnd.numpy.npz"
 @router.post("", status_code=202, response_model=Job, responses=documented(401, 403, 404, 409, 413, 422))
 def create_trace(body: TraceCreate, idempotency: IdempotencyDep) -> Response:
     """Trace a scene's residual to a named effect; the trace's id is in the job's `outputs`."""
+    require_known(body.config, ("body", "config", "candidates"))
     return idempotency.run(body, lambda session: accepted(jobs.create_trace(session, body)))
+
+
+def require_known(config: TraceConfig, place: tuple[str, ...]) -> None:
+    """Refuse candidates that the registry does not have. Raises ApiProblem, 422, that names each."""
+    known = {effect.name for effect in known_effects()}
+    unknown = [
+        FieldError(loc=[*place, index], msg=f"no effect {name!r}; GET /v1/effects lists them")
+        for index, name in enumerate(config.candidates)
+        if name not in known
+    ]
+    if unknown:
+        raise ApiProblem(
+            422, "invalid_request", "; ".join(fault.msg for fault in unknown[:3]), errors=unknown
+        )
 
 
 @router.get("", responses=documented(401, 403, 422))

@@ -82,6 +82,18 @@ def test_traces_are_refused_cancelled_and_done_once(client: httpx.Client, servic
     assert_problem(client.get("/v1/traces/trc_none"), 404, "not_found")
 
 
+def test_unknown_candidates_are_named(client: httpx.Client) -> None:
+    config = {"candidates": ["air_drag_linear", "phlogiston"]}
+    scene = scene_id(client)
+    problem = assert_problem(
+        client.post("/v1/traces", json={"scene_id": scene, "config": config}), 422, "invalid_request"
+    )
+    assert problem["errors"][0]["loc"] == ["body", "config", "candidates", 1]
+    assert "phlogiston" in problem["detail"]
+    body = {"scene_id": scene, "close_the_loop": True, "trace": config}
+    assert_problem(client.post("/v1/pipelines", json=body), 422, "invalid_request")
+
+
 def test_a_named_effect_is_compared_with_a_model_without_it(client: httpx.Client, service: Service) -> None:
     job = pipeline(client, "closed loop", close_the_loop=True)
     service.work()
