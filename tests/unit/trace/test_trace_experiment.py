@@ -10,13 +10,16 @@ import pytest
 from made_scene import box_body, made_scene
 
 from physworld.build import build_twin
+from physworld.calibrate import CalibrationConfig
 from physworld.calibrate.parameters import parameters_of
 from physworld.demonstrate.limits import limits_of
 from physworld.demonstrate.motion import broken_limit
 from physworld.effects.registry import effect
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
+from physworld.trace import TraceConfig, document, trace
 from physworld.trace.experiment import Experiment, ExperimentConfig, Rival, propose
 from physworld.trace.experiment_search import clock_of
+from physworld.trace.html import render
 from physworld.trace.probing import COORDINATES, motion_of, nudged, random_probe
 from physworld.trace.refit import Refit, refit
 from physworld.trace.rivals import reconciled, refit_of
@@ -197,3 +200,25 @@ def test_rivals_that_differ_in_what_the_recording_leaves_open_are_brought_togeth
     slope = 1.0
     assert reconciled([first, other], valley)[1] is other
     assert reconciled([first, other], None) == [first, other]
+
+
+@pytest.mark.slow
+def test_a_trace_of_an_equivalent_set_carries_the_answer_to_what_to_do_next() -> None:
+    scene = gentle_beam(train=(0, FRAMES - 6), test=(FRAMES - 6, FRAMES))
+    twin = build_twin(scene, 60).with_parameters(youngs_modulus_pa=YOUNGS_MODULUS_PA)
+    scene = recorded(scene, twin.with_effect(effect("actuation_lag", lag_s=1.0 / 30.0)), seed=2)
+    names = ("actuation_lag", "measurement_clock")
+    calibration = CalibrationConfig(particle_budget=60, damping="none")
+    few = replace(CONFIG, draws=5, refinements=0)
+    config = TraceConfig(calibration=calibration, candidates=names, experiment=few, bootstraps=100)
+    result = trace(scene, config, calibrated_twin=twin)
+    report = document(result)
+    assert report["verdict"] == "equivalent_set"
+    assert {e["name"] for e in report["effects"] + report["equivalent"]} == set(names)
+    assert all(0.0 <= row["absorbed"] <= 1.0 for row in report["candidates"])
+    assert report["split"] == {"train": [1, FRAMES - 6], "test": [FRAMES - 6, FRAMES]}
+    proposed = report["suggested_experiment"]
+    assert not proposed["separates"] and proposed["simulations"] > 0
+    assert proposed["recording_sigmas"] < 5.0 and "flash" in proposed["description"]
+    assert report["simulations"] > proposed["simulations"]
+    assert "No motion of the grips" in render(report, scene, result.before, result.after)
