@@ -68,7 +68,9 @@ def load_of(scene: Scene) -> Load | None:
         return Load(float(mass), np.linspace(ends[0], ends[-1], _LINE_POINTS if len(ends) > 1 else 1))
     if scene.body.box_min_m is None or scene.body.box_max_m is None:
         raise SceneUnsupported("body.tip_load without place_m needs body.box_min_m and body.box_max_m")
-    given = {"xyz".index(axis): float(value) for axis, value in _COORDINATE.findall(str(facts.get("where", "")))}
+    given = {
+        "xyz".index(axis): float(value) for axis, value in _COORDINATE.findall(str(facts.get("where", "")))
+    }
     if not given:
         raise SceneUnsupported(
             f"body.tip_load says no place: neither place_m nor an x, y or z in {facts.get('where')!r}"

@@ -42,7 +42,9 @@ def test_the_family_is_wrong_as_often_as_it_says() -> None:
     rng = np.random.default_rng(3)
     false = 0
     for _ in range(200):
-        noise = np.repeat(rng.normal(size=ROWS // 20), 20) + 0.3 * rng.normal(size=ROWS)  # neighbours are alike
+        noise = np.repeat(rng.normal(size=ROWS // 20), 20) + 0.3 * rng.normal(
+            size=ROWS
+        )  # neighbours are alike
         slow = [np.repeat(rng.normal(size=ROWS // 20), 20) for _ in range(8)]
         candidates = [response(str(k), column) for k, column in enumerate(slow)]
         found = scores(noise, np.zeros((ROWS, 0)), candidates, [], BLOCK_OF_ROW, 0.05, 200, 0)
