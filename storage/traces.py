@@ -18,6 +18,7 @@ TWIN = "twin.npz"
 TRACKS = "tracks.npz"
 REPORT = "report.json"
 PAGE = "report.html"
+DECLARED = "declared.npz"
 
 
 def get_trace(session: Session, trace_id: str) -> Trace:

@@ -119,5 +119,6 @@ def _cloud(site: Site, trace: Trace, record: SceneRecord) -> Cloud:
 
 
 def _best(trace: Trace) -> list[dict[str, Any]]:
-    """Candidates by their score, the best first."""
-    return sorted(trace.candidates, key=lambda item: -(item.get("score") or 0.0))
+    """Candidates by their score, the best first; a score below zero is rounding."""
+    floored = [{**item, "score": max(0.0, item.get("score") or 0.0)} for item in trace.candidates]
+    return sorted(floored, key=lambda item: -item["score"])

@@ -3,7 +3,8 @@
 Which effects were added, with their strengths and intervals, or why nothing was added; the held-out track error of
 the twin without and with them, and of the world models that learned from the one and from the other. "Before" of the
 twin is the fit's own, with the damping that it may have added; of the world model it is the version that learned from
-that twin with the same settings, where there is one.
+that twin with the same settings, where there is one. A trace also calibrates anew: ``twin.recalibrated_m`` is the error
+of the declared physics alone after that, so that nobody takes its part for the effect's.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from physworld.worldmodel.scene_view import view_scene
 from schemas.trace import Trace
 from storage import registry, traces
 from workers.stores import Stores
-from workers.tasks.inputs import scene_of, twin_of
+from workers.tasks.inputs import npz_arrays, scene_of, twin_of
 
 METRIC = "track_m"
 WORLD_MODEL = "world_model_finetuned"
@@ -59,10 +60,13 @@ def closed_loop(
     }
     if not added:
         return section
-    plain = _twin_errors(
-        scene_of(stores, payload["scene_id"]), twin_of(stores, payload["fit_id"]), architecture
-    )
+    scene = scene_of(stores, payload["scene_id"])
+    plain = _twin_errors(scene, twin_of(stores, payload["fit_id"]), architecture)
     section["twin"] = before_and_after(plain, _curve(metrics, "twin"))
+    declared = _declared_twin(stores, trace)
+    if declared is not None:
+        alone = mean_with_interval(_twin_errors(scene, declared, architecture))
+        section["twin"] |= {"recalibrated_m": alone.value, "recalibrated_ci95_m": list(alone.ci95)}
     before = None if baseline is None else _curve(baseline.metrics, WORLD_MODEL)
     section["world_model"] = before_and_after(before, _curve(metrics, WORLD_MODEL))
     section["baseline_version"] = None if baseline is None else baseline.version
@@ -100,6 +104,14 @@ def _curve(metrics: Mapping[str, Any], name: str) -> np.ndarray | None:
         return None
     curve = np.array([np.nan if value is None else value for value in curves[name]], dtype=float)
     return curve if np.isfinite(curve).any() else None
+
+
+def _declared_twin(stores: Stores, trace: Trace) -> Twin | None:
+    """The declared physics alone as the trace calibrated it."""
+    found = next((item for item in trace.artifacts if item.name == traces.DECLARED), None)
+    if found is None:
+        return None
+    return Twin.from_arrays(npz_arrays(stores.artifacts.read_bytes(found.sha256)), stores.settings.device)
 
 
 def _twin_errors(scene: Scene, twin: Twin, architecture: WorldModelConfig) -> np.ndarray:

@@ -2,8 +2,8 @@
 
 Files: ``report.json`` (:func:`physworld.trace.document`), ``tracks.npz`` (``times`` (T,) f8 [s], ``before`` and
 ``after`` (T, N, 3) f8 [m]: open loop from frame 0 without and with the effects, each calibrated on the training
-frames), ``report.html`` (one self-contained page), and, where the verdict is ``named``, ``twin.npz``: the twin that
-carries the effects (``Twin.to_arrays``).
+frames), ``report.html`` (one self-contained page), ``declared.npz``: the twin of the declared physics alone, calibrated
+anew (``Twin.to_arrays``), and, where the verdict is ``named``, ``twin.npz``: the twin that carries the effects.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from physworld.trace import document
 from physworld.trace.html import render
 from schemas.trace import NAMED
-from storage.traces import PAGE, REPORT, TRACKS, TWIN
+from storage.traces import DECLARED, PAGE, REPORT, TRACKS, TWIN
 from workers.tasks.inputs import npz_bytes
 
 if TYPE_CHECKING:
@@ -36,6 +36,7 @@ def trace_files(scene: Scene, result: TraceResult, report: dict[str, Any]) -> li
         (REPORT, JSON, json.dumps(report, indent=1, allow_nan=False).encode()),
         (TRACKS, NPZ, npz_bytes(tracks)),
         (PAGE, HTML, render(report, scene, result.before, result.after).encode()),
+        (DECLARED, NPZ, npz_bytes(result.declared.fitted.twin.to_arrays())),
     ]
     if report["verdict"] == NAMED:
         files.append((TWIN, NPZ, npz_bytes(result.verdict.model.fitted.twin.to_arrays())))

@@ -97,7 +97,11 @@ def _trace(runtime: Runtime, scene_id: str, fit_id: str, verdict: str) -> str:
     with runtime.database.session() as session:
         job = jobs.create_trace(session, TraceCreate(scene_id=scene_id, fit=FIT))
         row = session.get_one(TraceRow, job.outputs[0].id)
-        row.state, row.verdict, row.artifacts = "ready", verdict, [artifact.model_dump()]
+        alone = runtime.stores.artifacts.put_bytes(
+            npz_bytes(twin_of(runtime.stores, fit_id).to_arrays()), "declared.npz"
+        )
+        row.state, row.verdict = "ready", verdict
+        row.artifacts = [artifact.model_dump(), alone.model_dump()]
         effects = [{"name": "air_drag_linear", "parameters": {"rate_per_s": number}}]
         row.report = {
             "verdict": verdict,
@@ -131,6 +135,7 @@ def test_the_card_says_which_effect_and_the_errors_before_and_after(
         assert figures["gain_m"] == pytest.approx(figures["before_m"] - figures["after_m"])
         assert figures["gain_ci95_m"][0] <= figures["gain_m"] <= figures["gain_ci95_m"][1]
     assert section["twin"]["before_m"] != section["twin"]["after_m"]
+    assert section["twin"]["recalibrated_m"] == pytest.approx(section["twin"]["before_m"])
     assert {item["kind"] for item in card["lineage"]["inputs"]} == {"dataset", "scene", "fit", "trace"}
 
 

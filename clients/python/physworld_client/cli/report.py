@@ -139,10 +139,10 @@ def _print_closed_loop(section: Mapping[str, Any]) -> None:
         interval = (
             "" if gain is None else f", gain {_millimetres(gain[0])} to {_millimetres(gain[1])} mm (95 %)"
         )
-        before, after = _millimetres(figures["before_m"]), _millimetres(figures["after_m"])
-        stdout.print(
-            f"  {title}: held-out error {before} mm before, {after} mm after{interval}", soft_wrap=True
-        )
+        before, after = f"{_millimetres(figures['before_m'])} mm before", _millimetres(figures["after_m"])
+        if figures.get("recalibrated_m") is not None:
+            before += f", {_millimetres(figures['recalibrated_m'])} mm calibrated anew without the effect"
+        stdout.print(f"  {title}: held-out error {before}, {after} mm after{interval}", soft_wrap=True)
 
 
 def _table(metrics: Mapping[str, Any], key: str, version: ModelVersion) -> Mapping[str, Any]:
