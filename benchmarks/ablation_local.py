@@ -9,6 +9,7 @@ of the frames after them.
 
 from __future__ import annotations
 
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -34,7 +35,8 @@ FRAMES, FPS, NOISE_M = 60, 30.0, 3e-4
 TRUE_MODULUS_PA, SOFT_LOG, SOFT_AT, SOFT_WIDTH = 4e5, -1.2, 0.5, 0.18
 BUDGET, FINE_BUDGET = 400, 1300
 SIMULATIONS = 60
-LOCAL_ONLY = LocalConfig(deviation=1.0)
+LOCAL = LocalConfig()
+LOCAL_ONLY = replace(LOCAL, deviation=1.0)
 
 
 def measure(repeats: int, seed: int) -> Report:
@@ -55,6 +57,7 @@ def measure(repeats: int, seed: int) -> Report:
             case.pop("twin", None)
             case.pop("properties", None)
         figures[name] = found
+        print(f"{name}: {found}", file=sys.stderr, flush=True)  # an hour may pass before the table
         floor = f"{1e3 * noise_floor(scene.noise_sigma_m):.2f}" if scene.noise_sigma_m else "-"
         for kind, case in found.items():
             field_text = f"{case['field_rms_log']:.2f}" if "field_rms_log" in case else "-"
@@ -93,7 +96,7 @@ def ablation(scene: Scene) -> dict[str, dict[str, object]]:
     fitted = calibrate(scene, config)
     seconds = time.perf_counter() - started
     nothing = np.zeros((fitted.twin.lattice.fill.size, 2))
-    both = fit_fields(scene, fitted.twin)
+    both = fit_fields(scene, fitted.twin, LOCAL)
     alone_twin = prior_twin(scene, config)
     alone = fit_fields(scene, alone_twin, LOCAL_ONLY)
     return {

@@ -33,9 +33,10 @@ from physworld.twin import Twin
 
 _INDUCING = 300  # particles that the modes are computed from
 _FAILED = 1e3  # value of a run that blew up, in units of the homogeneous fit's error
+_WORTH = 0.9  # of the validation error is what a weaker prior may leave at most
 _PROBE = 0.02  # of a coefficient, for the first Hessian
 _FLAT = 1e-6  # gradient that ends a search
-_LEAST_FALL = 0.01  # relative fall of the objective in a step that ends a search
+_LEAST_FALL, _PATIENCE = 0.01, 3  # relative fall of the objective, over so many steps, that ends a search
 _LOOSE = 1e-4  # strength of the prior on the constants
 _FIELDS = ("stiffness", "density")
 
@@ -58,10 +59,10 @@ class LocalConfig:
     """
 
     fields: tuple[str, ...] = ("stiffness",)
-    modes: int = 8
+    modes: int = 6
     deviation: float = 0.5
-    length: float = 0.5
-    strengths: tuple[float, ...] = (0.01, 0.001, 0.0001)
+    length: float = 0.7
+    strengths: tuple[float, ...] = (0.1, 0.01, 0.001)
     validation: float = 0.3
     iterations: int = 20
     least_gain: float = 0.05
@@ -134,7 +135,7 @@ def fit_fields(
         validation[strength] = ratio
         if progress is not None:
             progress(f"prior strength {strength:g}: validation error {ratio:.3f} of the homogeneous fit's")
-        if best is None or ratio < validation[best]:
+        if best is None or ratio < _WORTH * validation[best]:  # a weaker prior has to be worth it
             best, best_z = strength, z
     kept = best is not None and validation[best] < 1.0 - config.least_gain
     final = np.zeros(search.size)
@@ -258,13 +259,12 @@ class _FieldSearch:
             total = value / scale + float(weight @ full**2)
             return total, (slope / scale + 2 * weight * full)[free]
 
-        last = [np.inf]
+        values: list[float] = []
 
         def watch(intermediate_result: OptimizeResult) -> None:
-            now = float(intermediate_result.fun)
-            if now > (1.0 - _LEAST_FALL) * last[0]:
+            values.append(float(intermediate_result.fun))
+            if len(values) > _PATIENCE and values[-1] > (1.0 - _LEAST_FALL) * values[-1 - _PATIENCE]:
                 raise StopIteration
-            last[0] = now
 
         curvature = self._curvature(z, end) / scale + 2 * np.diag(weight)
         inverse = np.linalg.inv(curvature[np.ix_(free, free)])
