@@ -1,10 +1,11 @@
 # make demo [SCENE=path]   the main job on a scene, from a fresh machine to the results table
-# make test                everything the tests need, then linters and tests
+# make test [JOBS=n]       everything the tests need, then linters and tests in n processes (2)
 # make bench               the figures of docs/benchmarks.md
 # make up                  the embedded service in the foreground
 SHELL := /bin/bash
 SCENE ?= sample/soft_beam
 DATA ?= .demo
+JOBS ?= 2
 BIN := .venv/bin
 export OMP_NUM_THREADS ?= 1
 
@@ -29,7 +30,7 @@ lint: dev
 	$(BIN)/lint-imports
 
 test: lint
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses=$(JOBS) --dist=loadfile
 
 bench:
 	@scripts/bootstrap.sh --bench
