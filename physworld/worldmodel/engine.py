@@ -1,23 +1,28 @@
-"""The fast rollout of one sequence on a CPU: prepares a model's weights once for the native kernel.
+"""The fast rollout on a CPU, of one sequence or of a batch of candidates: a model's weights, prepared once.
 
-It is the function of ``rollout.unroll`` for a batch of one, in single precision, several times faster: nothing is
-allocated and nothing returns to Python between steps.
+It is the function of ``rollout.unroll`` in single precision, several times faster: nothing is allocated and nothing
+returns to Python between steps. A candidate of a batch is rolled out exactly as it would be alone. The kernel releases
+the interpreter's lock, so threads share a batch.
 """
 
 from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from itertools import pairwise
+from types import ModuleType
 
 import numpy as np
 import torch
 
 from physworld.worldmodel.messages import warp_module
-from physworld.worldmodel.modal import softness
 from physworld.worldmodel.model import WorldModel
 
 REGISTER = 16
 
 
 class RolloutEngine:
-    """A model's weights, transposed and padded; call :meth:`run` as often as you like."""
+    """A model's weights, transposed and padded; call :meth:`run` and :meth:`run_batch` as often as you like."""
 
     def __init__(self, model: WorldModel) -> None:
         spec, config, norm = model.spec, model.config, model.norm
@@ -41,6 +46,7 @@ class RolloutEngine:
         change, velocity, length = (float(x) for x in (norm.change, norm.velocity, norm.length))
         self._scalars = np.array([1.0 / velocity, change, 1.0 / length], dtype=np.float32)
         self._sizes = {
+            "corrected": int(model.corrects_prior()),
             "first": config.history,
             "history": config.history,
             "objects": spec.object_count,
@@ -57,12 +63,43 @@ class RolloutEngine:
 
     def run(self, start: np.ndarray, driven: np.ndarray, phi: np.ndarray) -> np.ndarray:
         """All vertices (T, V, 3) float32 from object frames (h+1, n, 3), control vertices (T, C, 3), Φ (n, 2)."""
-        from physworld.worldmodel import engine_kernels as kernels
+        return self.run_batch(start, driven[None], phi)[0]
 
-        frames, sizes = driven.shape[0], self._sizes | {"frames": driven.shape[0]}
-        path = np.zeros((frames, self.vertices, 3), dtype=np.float32)
-        path[: self.history + 1, : self.objects] = start
-        path[:, self.objects :] = driven
+    def run_batch(
+        self, start: np.ndarray, driven: np.ndarray, phi: np.ndarray, *, threads: int = 1
+    ) -> np.ndarray:
+        """All vertices of every candidate, (B, T, V, 3) float32.
+
+        Args:
+            start: object frames (h+1, n, 3), or (B, h+1, n, 3) where candidates start differently.
+            driven: control vertices, (B, T, C, 3).
+            phi: log property ratios, (n, 2) or (B, n, 2).
+            threads: that share the candidates.
+        """
+        candidates, frames, n = driven.shape[0], driven.shape[1], self.objects
+        path = np.zeros((candidates, frames, self.vertices, 3), dtype=np.float32)
+        path[:, : self.history + 1, :n] = start
+        path[:, :, n:] = driven
+        shared = np.broadcast_to(np.asarray(phi, dtype=np.float64), (candidates, n, 2))
+        scaled = np.ascontiguousarray(shared / self._property_scale, dtype=np.float32)
+        soft = (shared[..., 0] - shared[..., 1]).mean(axis=1).astype(np.float32)
+        bounds = np.linspace(0, candidates, min(threads, candidates) + 1).astype(int)
+        parts = [slice(a, b) for a, b in pairwise(bounds) if b > a]
+        launches = [(path[part], scaled[part], soft[part]) for part in parts]
+        if len(launches) <= 1:
+            for launch in launches:
+                self._launch(*launch)
+            return path
+        warp_module().load_module(_kernels(), device="cpu")  # before threads could race to compile it
+        with ThreadPoolExecutor(len(launches)) as pool:
+            for done in [pool.submit(self._launch, *launch) for launch in launches]:
+                done.result()
+        return path
+
+    def _launch(self, path: np.ndarray, phi: np.ndarray, soft: np.ndarray) -> None:
+        """Fill in ``path`` (B, T, V, 3) in place; the arrays are contiguous float32."""
+        kernels, candidates, frames = _kernels(), path.shape[0], path.shape[1]
+        sizes = self._sizes | {"candidates": candidates, "frames": frames}
         rows, edges = self.vertices * self.hidden, sizes["edges"]
         scratch = dict.fromkeys(("state", "hear", "say", "placed", "heard", "sent", "sums", "inner"), rows)
         scratch |= {
@@ -75,13 +112,19 @@ class RolloutEngine:
             "ahead": 3 * self.vertices,
         }
         arrays = self._fixed | {name: np.zeros(count, dtype=np.float32) for name, count in scratch.items()}
-        arrays |= {"path": path, "phi": np.ascontiguousarray(phi / self._property_scale, dtype=np.float32)}
-        scalars = np.append(self._scalars, np.float32(softness(phi)))
+        arrays |= {"paths": path, "phis": phi, "softnesses": soft}
         table = np.array([arrays[name].ctypes.data for name in kernels.ARRAYS], dtype=np.int64)
         numbers = np.array([sizes[name] for name in kernels.SIZES], dtype=np.int32)
-        addresses = [numbers.ctypes.data, scalars.ctypes.data, table.ctypes.data]
+        addresses = [numbers.ctypes.data, self._scalars.ctypes.data, table.ctypes.data]
         warp_module().launch(kernels.rollout, dim=1, inputs=addresses, device="cpu", record_tape=False)
-        return path
+
+
+@cache
+def _kernels() -> ModuleType:
+    """The kernel's module, imported late: it imports Warp."""
+    from physworld.worldmodel import engine_kernels
+
+    return engine_kernels
 
 
 def _pack_weights(model: WorldModel, hidden: int) -> dict[str, np.ndarray]:

@@ -1,4 +1,7 @@
-"""The whole rollout of one sequence as one native function: no Python and no launch between steps.
+"""Whole rollouts of a batch of candidates as one native function: no Python and no launch between steps.
+
+Candidates run one after another: a network of this size keeps the arithmetic units busy by itself, and its scratch
+stays in the cache. Where the network adds nothing to the modal prior (``corrected`` is 0) only the prior is run.
 
 Rows of 16 floats are one vector register (two or four of them on older CPUs); every width is padded to a multiple
 of 16 with zeros, which a ReLU leaves zero. ``product`` multiplies four rows at a time, so that a weight is
@@ -12,13 +15,13 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 SIZES = (
-    "first", "frames", "history", "objects", "vertices", "edges", "layers", "hidden", "modes", "controls",
-    "inputs", "places_width", "grounded",
+    "candidates", "corrected", "first", "frames", "history", "objects", "vertices", "edges", "layers", "hidden",
+    "modes", "controls", "inputs", "places_width", "grounded",
 )  # fmt: skip
-SCALARS = ("per_velocity", "change", "per_length", "softness")
+SCALARS = ("per_velocity", "change", "per_length")
 ARRAYS = (
-    "path", "amplitudes", "offsets", "edge_sender", "edge_receiver", "edge_offset", "share",
-    "reference", "phi", "mean", "basis", "shape", "prior_weight", "prior_response",
+    "paths", "amplitudes", "offsets", "edge_sender", "edge_receiver", "edge_offset", "share",
+    "reference", "phis", "softnesses", "mean", "basis", "shape", "prior_weight", "prior_response",
     "encode_in", "encode_in_bias", "encode_out", "encode_out_bias",
     "receive", "receive_bias", "send", "position", "edge_bias", "edge_length",
     "update_in", "update_in_bias", "update_out", "update_out_bias",
@@ -47,6 +50,7 @@ _ROLLOUT = (
     + _unpack()
     + r"""
     const int H = hidden, N = objects, VN = vertices, C = controls, R = modes;
+    float* path = paths;
     auto positive = [](V x) -> V { return (V)((I)x & (x > 0.0f)); };
     // out (rows, width) = [out +] in (rows, depth) * weight (depth, width) [+ bias]
     auto product = [](float* out, const float* in, const float* weight, const float* bias, int rows, int depth,
@@ -100,112 +104,122 @@ _ROLLOUT = (
             amplitudes[(long long)t * R + m] = sum;
         }
     };
-    for (int t = first - history; t < first; ++t) project(t);
-    for (int t = first; t < frames - 1; ++t) {
-        const float* now = path + (long long)t * VN * 3;
-        float* next = path + (long long)(t + 1) * VN * 3;
-        // modal prior
-        project(t);
-        int f = 0;
-        for (int s = 0; s <= history; ++s)
-            for (int m = 0; m < R; ++m) regressors[f++] = amplitudes[(long long)(t - s) * R + m];
-        float centre[3], here[3], there[3];
-        centre_of(t, here);
-        centre_of(t + 1, there);
-        for (int s = -1; s <= history; ++s) {
-            centre_of(t - s, centre);
-            for (int c = 0; c < C; ++c)
-                for (int k = 0; k < 3; ++k)
-                    regressors[f++] = path[((long long)(t - s) * VN + N + c) * 3 + k] - centre[k] - shape[c * 3 + k];
-        }
-        for (int s = -1; s <= history; ++s) {
-            if (s == 0) continue;
-            centre_of(t - s, centre);
-            for (int k = 0; k < 3; ++k) regressors[f++] = centre[k] - here[k];
-        }
-        regressors[f++] = 1.0f;
-        for (int i = 0; i < N; ++i)
-            for (int k = 0; k < 3; ++k) ahead[i * 3 + k] = there[k] + mean[i * 3 + k];
-        for (int m = 0; m < R; ++m) {
-            float a = 0.0f;
-            for (int k = 0; k < f; ++k) a += prior_weight[(long long)m * f + k] * regressors[k];
-            const int lagged = (history + 1) * R;
-            const float* answer = prior_response + (long long)m * (lagged + 1);
-            for (int k = 0; k < lagged; ++k) a += softness * answer[k] * regressors[k];
-            a += softness * answer[lagged];
-            for (int i = 0; i < 3 * N; ++i) ahead[i] += a * basis[(long long)m * N * 3 + i];
-        }
-        for (int i = 3 * N; i < 3 * VN; ++i) ahead[i] = next[i];
-        // vertex features, places
-        for (int i = 0; i < VN; ++i) {
-            float* x = features + (long long)i * inputs;
-            float* p = places + (long long)i * places_width;
-            int at = 0;
-            for (int k = 0; k < 3; ++k) p[k] = now[i * 3 + k] - reference[i * 3 + k];
-            for (int s = 0; s < history; ++s)
-                for (int k = 0; k < 3; ++k) {
-                    const float* older = now - (long long)s * VN * 3 + i * 3 + k;
-                    const float move = older[0] - older[-(long long)VN * 3];
-                    p[3 + at] = move;
-                    x[at++] = move * per_velocity;
-                }
-            for (int k = 0; k < 3; ++k) x[at++] = (ahead[i * 3 + k] - now[i * 3 + k]) * per_velocity;
-            for (int k = 0; k < 2; ++k) x[at++] = i < N ? phi[i * 2 + k] : 0.0f;
-            x[at++] = i < N ? 1.0f : 0.0f;
-            x[at++] = i < N ? 0.0f : 1.0f;
-            if (grounded) {
-                const float height = now[i * 3 + 2] * per_length;
-                x[at++] = height < 0.0f ? 0.0f : (height > 1.0f ? 1.0f : height);
+    for (int b = 0; b < candidates; ++b) {
+        path = paths + (long long)b * frames * VN * 3;
+        const float* phi = phis + (long long)b * N * 2;
+        const float softness = softnesses[b];
+        for (int t = first - history; t < first; ++t) project(t);
+        for (int t = first; t < frames - 1; ++t) {
+            const float* now = path + (long long)t * VN * 3;
+            float* next = path + (long long)(t + 1) * VN * 3;
+            // modal prior
+            project(t);
+            int f = 0;
+            for (int s = 0; s <= history; ++s)
+                for (int m = 0; m < R; ++m) regressors[f++] = amplitudes[(long long)(t - s) * R + m];
+            float centre[3], here[3], there[3];
+            centre_of(t, here);
+            centre_of(t + 1, there);
+            for (int s = -1; s <= history; ++s) {
+                centre_of(t - s, centre);
+                for (int c = 0; c < C; ++c)
+                    for (int k = 0; k < 3; ++k)
+                        regressors[f++] =
+                            path[((long long)(t - s) * VN + N + c) * 3 + k] - centre[k] - shape[c * 3 + k];
             }
-        }
-        for (int e = 0; e < edges; ++e) {
-            float square = 0.0f;
-            for (int k = 0; k < 3; ++k) {
-                const float gap = places[(long long)edge_sender[e] * places_width + k]
-                    - places[(long long)edge_receiver[e] * places_width + k] + edge_offset[e * 3 + k];
-                square += gap * gap;
+            for (int s = -1; s <= history; ++s) {
+                if (s == 0) continue;
+                centre_of(t - s, centre);
+                for (int k = 0; k < 3; ++k) regressors[f++] = centre[k] - here[k];
             }
-            length[e] = __builtin_sqrtf(square);
-        }
-        product(inner, features, encode_in, encode_in_bias, VN, inputs, H, false);
-        rectify(inner, VN * H);
-        product(state, inner, encode_out, encode_out_bias, VN, H, H, false);
-        for (int l = 0; l < layers; ++l) {
-            const long long square = (long long)l * H * H;
-            product(hear, state, receive + square, receive_bias + l * H, VN, H, H, false);
-            product(say, state, send + square, nullptr, VN, H, H, false);
-            product(inner, state, update_in + 4 * square, update_in_bias + l * H, VN, H, H, false);
-            for (int kind = 0; kind < 3; ++kind) {
-                const float* W = edge_length + (l * 3 + kind) * H;
-                const float* S = edge_bias + (long long)l * edges * H;
-                product(placed, places, position + (long long)(l * 3 + kind) * places_width * H, nullptr, VN,
-                        places_width, H, false);
-                for (int c = 0; c < VN * H; c += 16) {
-                    *(V*)(heard + c) = *(V*)(hear + c) - *(V*)(placed + c);
-                    *(V*)(sent + c) = *(V*)(say + c) + *(V*)(placed + c);
-                }
-                for (int i = 0; i < VN; ++i) {
-                    const int row = kind * VN + i;
-                    for (int c = 0; c < H; c += 16) {
-                        const V p = *(const V*)(heard + (long long)i * H + c), w = *(const V*)(W + c);
-                        V sum = 0.0f;
-                        for (int e = offsets[row]; e < offsets[row + 1]; ++e)
-                            sum += positive(p + *(const V*)(sent + (long long)edge_sender[e] * H + c)
-                                            + *(const V*)(S + (long long)e * H + c) + length[e] * w);
-                        *(V*)(sums + (long long)i * H + c) = sum * share[row];
+            regressors[f++] = 1.0f;
+            for (int i = 0; i < N; ++i)
+                for (int k = 0; k < 3; ++k) ahead[i * 3 + k] = there[k] + mean[i * 3 + k];
+            for (int m = 0; m < R; ++m) {
+                float a = 0.0f;
+                for (int k = 0; k < f; ++k) a += prior_weight[(long long)m * f + k] * regressors[k];
+                const int lagged = (history + 1) * R;
+                const float* answer = prior_response + (long long)m * (lagged + 1);
+                for (int k = 0; k < lagged; ++k) a += softness * answer[k] * regressors[k];
+                a += softness * answer[lagged];
+                for (int i = 0; i < 3 * N; ++i) ahead[i] += a * basis[(long long)m * N * 3 + i];
+            }
+            for (int i = 3 * N; i < 3 * VN; ++i) ahead[i] = next[i];
+            if (!corrected) {
+                for (int i = 0; i < 3 * N; ++i) next[i] = ahead[i];
+                continue;
+            }
+            // vertex features, places
+            for (int i = 0; i < VN; ++i) {
+                float* x = features + (long long)i * inputs;
+                float* p = places + (long long)i * places_width;
+                int at = 0;
+                for (int k = 0; k < 3; ++k) p[k] = now[i * 3 + k] - reference[i * 3 + k];
+                for (int s = 0; s < history; ++s)
+                    for (int k = 0; k < 3; ++k) {
+                        const float* older = now - (long long)s * VN * 3 + i * 3 + k;
+                        const float move = older[0] - older[-(long long)VN * 3];
+                        p[3 + at] = move;
+                        x[at++] = move * per_velocity;
                     }
+                for (int k = 0; k < 3; ++k) x[at++] = (ahead[i * 3 + k] - now[i * 3 + k]) * per_velocity;
+                for (int k = 0; k < 2; ++k) x[at++] = i < N ? phi[i * 2 + k] : 0.0f;
+                x[at++] = i < N ? 1.0f : 0.0f;
+                x[at++] = i < N ? 0.0f : 1.0f;
+                if (grounded) {
+                    const float height = now[i * 3 + 2] * per_length;
+                    x[at++] = height < 0.0f ? 0.0f : (height > 1.0f ? 1.0f : height);
                 }
-                product(inner, sums, update_in + 4 * square + (1 + kind) * H * H, nullptr, VN, H, H, true);
             }
+            for (int e = 0; e < edges; ++e) {
+                float square = 0.0f;
+                for (int k = 0; k < 3; ++k) {
+                    const float gap = places[(long long)edge_sender[e] * places_width + k]
+                        - places[(long long)edge_receiver[e] * places_width + k] + edge_offset[e * 3 + k];
+                    square += gap * gap;
+                }
+                length[e] = __builtin_sqrtf(square);
+            }
+            product(inner, features, encode_in, encode_in_bias, VN, inputs, H, false);
             rectify(inner, VN * H);
-            product(state, inner, update_out + square, update_out_bias + l * H, VN, H, H, true);
+            product(state, inner, encode_out, encode_out_bias, VN, H, H, false);
+            for (int l = 0; l < layers; ++l) {
+                const long long square = (long long)l * H * H;
+                product(hear, state, receive + square, receive_bias + l * H, VN, H, H, false);
+                product(say, state, send + square, nullptr, VN, H, H, false);
+                product(inner, state, update_in + 4 * square, update_in_bias + l * H, VN, H, H, false);
+                for (int kind = 0; kind < 3; ++kind) {
+                    const float* W = edge_length + (l * 3 + kind) * H;
+                    const float* S = edge_bias + (long long)l * edges * H;
+                    product(placed, places, position + (long long)(l * 3 + kind) * places_width * H, nullptr, VN,
+                            places_width, H, false);
+                    for (int c = 0; c < VN * H; c += 16) {
+                        *(V*)(heard + c) = *(V*)(hear + c) - *(V*)(placed + c);
+                        *(V*)(sent + c) = *(V*)(say + c) + *(V*)(placed + c);
+                    }
+                    for (int i = 0; i < VN; ++i) {
+                        const int row = kind * VN + i;
+                        for (int c = 0; c < H; c += 16) {
+                            const V p = *(const V*)(heard + (long long)i * H + c), w = *(const V*)(W + c);
+                            V sum = 0.0f;
+                            for (int e = offsets[row]; e < offsets[row + 1]; ++e)
+                                sum += positive(p + *(const V*)(sent + (long long)edge_sender[e] * H + c)
+                                                + *(const V*)(S + (long long)e * H + c) + length[e] * w);
+                            *(V*)(sums + (long long)i * H + c) = sum * share[row];
+                        }
+                    }
+                    product(inner, sums, update_in + 4 * square + (1 + kind) * H * H, nullptr, VN, H, H, true);
+                }
+                rectify(inner, VN * H);
+                product(state, inner, update_out + square, update_out_bias + l * H, VN, H, H, true);
+            }
+            product(inner, state, decode_in, decode_in_bias, N, H, H, false);
+            rectify(inner, N * H);
+            product(correction, inner, decode_out, decode_out_bias, N, H, 16, false);
+            product(correction, features, skip, nullptr, N, inputs, 16, true);
+            for (int i = 0; i < N; ++i)
+                for (int k = 0; k < 3; ++k) next[i * 3 + k] = ahead[i * 3 + k] + change * correction[i * 16 + k];
         }
-        product(inner, state, decode_in, decode_in_bias, N, H, H, false);
-        rectify(inner, N * H);
-        product(correction, inner, decode_out, decode_out_bias, N, H, 16, false);
-        product(correction, features, skip, nullptr, N, inputs, 16, true);
-        for (int i = 0; i < N; ++i)
-            for (int k = 0; k < 3; ++k) next[i * 3 + k] = ahead[i * 3 + k] + change * correction[i * 16 + k];
     }
 """
 )

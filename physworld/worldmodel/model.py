@@ -207,6 +207,11 @@ class WorldModel(nn.Module):
         correction = self.forward(window, ahead, phi, constants)
         return torch.cat([ahead[:n] + self.norm.change * correction, control_next])
 
+    def corrects_prior(self) -> bool:
+        """Whether the network adds anything to the modal prior: not before the first step of training."""
+        ends = (self.skip.weight, self.decoder.out.weight, self.decoder.out.bias)
+        return any(bool(torch.any(weight != 0)) for weight in ends)
+
     def edge_constants(self) -> EdgeConstants:
         """What of the edge products depends on weights and graph only; valid until the weights change."""
         terms = [self._edge_terms(layer.weight) for layer in self.edge]

@@ -21,16 +21,18 @@ ground's height where there is a ground.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import torch
 
 from physworld.worldmodel.config import WorldModelConfig
+from physworld.worldmodel.engine import RolloutEngine
 from physworld.worldmodel.graph import GraphSpec
 from physworld.worldmodel.modal import ModalPrior
 from physworld.worldmodel.model import WorldModel
-from physworld.worldmodel.rollout import rollout
+from physworld.worldmodel.rollout import rollout, rollout_batch
 from physworld.worldmodel.skinning import Skin
 
 _OWN = ("rest.", "particle.", "control.", "phi", "start.", "skin.", "graph.")
@@ -63,6 +65,29 @@ class PublishedModel:
             self.start_history if history is None else history,
             controllers,
             self.phi if phi is None else phi,
+        )
+
+    @cached_property
+    def engine(self) -> RolloutEngine:
+        """The weights, prepared once for every rollout that follows."""
+        return RolloutEngine(self.model)
+
+    def rollout_batch(
+        self,
+        controllers: np.ndarray,
+        *,
+        history: np.ndarray | None = None,
+        phi: np.ndarray | None = None,
+        threads: int = 1,
+    ) -> np.ndarray:
+        """Object vertices (B, T, n, 3) [m] for candidates (B, T, K, 3) that share their first h+1 ticks."""
+        return rollout_batch(
+            self.engine,
+            self.spec,
+            self.start_history if history is None else history,
+            controllers,
+            self.phi if phi is None else phi,
+            threads=threads,
         )
 
     def to_tensors(self) -> dict[str, np.ndarray]:

@@ -2,7 +2,8 @@
 
 A rollout starts from h + 1 known frames of the object (from rest: the same frame h + 1 times, with the
 controllers still) and is driven by controllers on the model's clock. Positions are counted from the start's
-middle, in single precision. One sequence goes through the native engine, a batch through torch.
+middle, in single precision. What shares one start goes through the native engine, one sequence or a batch of
+candidates; episodes that each start elsewhere go through torch.
 """
 
 from __future__ import annotations
@@ -33,19 +34,40 @@ def rollout(
         controllers: all controllers at frames 0 … T-1 [m], (T, K, 3).
         phi: log property ratios, (n, 2).
     """
-    frames, n = model.config.history + 1, spec.object_count
+    return rollout_batch(RolloutEngine(model), spec, initial_history, controllers[None], phi)[0]
+
+
+def rollout_batch(
+    engine: RolloutEngine,
+    spec: GraphSpec,
+    initial_history: np.ndarray,
+    controllers: np.ndarray,
+    phi: np.ndarray,
+    *,
+    threads: int = 1,
+) -> np.ndarray:
+    """Object vertices of every candidate [m], (B, T, n, 3) float64.
+
+    Args:
+        engine: the model's engine; ``spec`` its graph.
+        initial_history: object vertices at frames 0 … h of the clock [m], (h+1, n, 3), for all candidates.
+        controllers: all controllers of every candidate at frames 0 … T-1 [m], (B, T, K, 3).
+        phi: log property ratios, (n, 2), or (B, n, 2) with one set a candidate.
+        threads: that share the candidates.
+    """
+    frames, n = engine.history + 1, spec.object_count
     expected = ((frames, n, 3), (n, 2))
-    if (initial_history.shape, phi.shape) != expected:
+    if (initial_history.shape, phi.shape[-2:]) != expected:
         raise GraphInvalid(f"history and phi of shapes {initial_history.shape}, {phi.shape}, not {expected}")
-    if controllers.shape[0] < frames or controllers.shape[1] <= int(spec.control_index.max(initial=0)):
+    if controllers.shape[1] < frames or controllers.shape[2] <= int(spec.control_index.max(initial=0)):
         raise GraphInvalid(
-            f"controllers of shape {controllers.shape} do not drive a history of {frames} frames"
+            f"controllers of shape {controllers.shape[1:]} do not drive a history of {frames} frames"
         )
     origin = graph_origin(spec, initial_history[-1])
-    predicted = RolloutEngine(model).run(
-        initial_history - origin, controllers[:, spec.control_index] - origin, phi
+    predicted = engine.run_batch(
+        initial_history - origin, controllers[:, :, spec.control_index] - origin, phi, threads=threads
     )
-    return predicted[:, :n].astype(np.float64) + origin
+    return predicted[:, :, :n].astype(np.float64) + origin
 
 
 def rollout_tracks(model: WorldModel, tracks: list[Track]) -> list[Tensor]:
