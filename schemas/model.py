@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
 from schemas.base import Artifact, Lineage, Request, Resource, Seed
+
+Tag = Annotated[str, Field(min_length=1, max_length=64)]
 
 
 class TrainingConfig(Request):
@@ -74,3 +76,60 @@ class AliasSet(Request):
     """Body of PUT /v1/models/{name}/aliases/{alias}."""
 
     version: int = Field(ge=1, lt=2**31)
+
+
+class VersionPatch(Request):
+    """Body of PATCH /v1/models/{name}/versions/{version}: the two fields that are not part of what was published."""
+
+    description: str | None = Field(default=None, max_length=10_000)
+    tags: list[Tag] | None = Field(default=None, max_length=50)
+
+
+class MeasuredError(Resource):
+    """A mean error [m] and its 95 % interval by blocks of frames; None where it is not known."""
+
+    value: float
+    ci95: tuple[float, float] | None = None
+
+
+class ComparedError(Resource):
+    """One predictor's error on the held-out frames in two versions.
+
+    ``gain``: mean of a − b over the frames that both versions score, paired; above zero: b is better. None where the
+    versions were not scored on the same frames of the same recording.
+    """
+
+    metric: str
+    predictor: str
+    a: MeasuredError | None = None
+    b: MeasuredError | None = None
+    gain: MeasuredError | None = None
+
+
+class Difference(Resource):
+    """A fact in which two versions differ: its place (``config.steps``) and both values, None where one lacks it."""
+
+    field: str
+    a: Any = None
+    b: Any = None
+
+
+class ErrorCurves(Resource):
+    """Track error [m] of every predictor against the time in the recording [s], None where nothing was seen."""
+
+    times_s: list[float] = Field(default_factory=list)
+    track_m: dict[str, list[float | None]] = Field(default_factory=dict)
+
+
+class ModelComparison(Resource):
+    """Two versions of a name side by side."""
+
+    name: str
+    a: int
+    b: int
+    same_recording: bool
+    errors: list[ComparedError] = Field(default_factory=list)
+    figures: list[Difference] = Field(default_factory=list)
+    curves_a: ErrorCurves = Field(default_factory=ErrorCurves)
+    curves_b: ErrorCurves = Field(default_factory=ErrorCurves)
+    differences: list[Difference] = Field(default_factory=list)

@@ -13,7 +13,7 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from schemas.base import Artifact, Lineage, Page
-from schemas.model import Model, ModelVersion, TrainingConfig
+from schemas.model import Model, ModelVersion, TrainingConfig, VersionPatch
 from storage.errors import Conflict, NotFound
 from storage.pages import page_of
 from storage.tables import (
@@ -106,6 +106,17 @@ def fail_version(session: Session, name: str, version: int, message: str) -> Non
     if row.state == "pending":
         row.state = "failed"
         row.message = message
+
+
+def patch_version(session: Session, name: str, version: int | str, patch: VersionPatch) -> ModelVersion:
+    """Change description and tags, which are no part of the signed files; what is None stays."""
+    row = version_row(session, name, resolve(session, name, version))
+    if patch.description is not None:
+        row.description = patch.description
+    if patch.tags is not None:
+        row.tags = list(dict.fromkeys(patch.tags))
+    session.flush()
+    return _version(row, _aliases_of(session, name, row.version))
 
 
 def get_model(session: Session, name: str) -> Model:

@@ -8,6 +8,8 @@ Embedded and distributed differ here and nowhere else::
     PHYSWORLD_BROKER_PREFIX  of every key in a broker that is shared    none
     PHYSWORLD_STORE_URL      file:///folder or s3://bucket/prefix      file://{data_dir}/store
     PHYSWORLD_DEVICE         of the simulations, cpu or cuda:0          cpu
+    PHYSWORLD_SIGNING_KEY    base64 of an Ed25519 key (32 bytes)        made in data_dir (``storage.signing``)
+    PHYSWORLD_SIGNING_KEY_FILE  a file that holds it                    none
 """
 
 from __future__ import annotations
@@ -45,6 +47,8 @@ class Settings(BaseSettings):
     max_attempts: int = Field(default=5, ge=1)
     republish_seconds: float = Field(default=60.0, gt=0)
     max_upload_bytes: int = Field(default=512 * 2**20, ge=1)
+    signing_key: SecretStr | None = None
+    signing_key_file: Path | None = None
     device: str = Field(default="cpu", pattern=r"^(cpu|cuda:\d+)$")
     log_level: Literal["debug", "info", "warning", "error"] = "info"
 

@@ -338,6 +338,16 @@ class AssessmentRow(Base):
     lineage: Mapped[Json]
 
 
+class SigningKeyRow(Base):
+    """A public key that signs manifests; the private one is never here."""
+
+    __tablename__ = "signing_keys"
+
+    key_id: Mapped[str] = mapped_column(primary_key=True)
+    public_key: Mapped[str]
+    created_at: Mapped[datetime]
+
+
 class ApiKeyRow(Base):
     """An API key: the SHA-256 of its token, never the token."""
 
@@ -364,3 +374,37 @@ class IdempotencyRow(Base):
     status: Mapped[int | None]
     headers: Mapped[Json | None] = mapped_column(JSON(none_as_null=True))
     body: Mapped[bytes | None] = mapped_column(LargeBinary)
+
+
+class RunRow(Base):
+    """A rollout or a plan made with a model version; ``figures`` is the answer beside its artifacts."""
+
+    __tablename__ = "model_runs"
+    __table_args__ = (
+        ForeignKeyConstraint(["model", "version"], ["model_versions.name", "model_versions.version"]),
+        Index(None, "kind", "created_at"),
+    )
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    kind: Mapped[str]
+    model: Mapped[str]
+    version: Mapped[int]
+    state: Mapped[str]
+    created_at: Mapped[datetime]
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
+    config: Mapped[Json]
+    figures: Mapped[Json]
+    lineage: Mapped[Json]
+    artifacts: Mapped[JsonList]
+
+
+class TicketRow(Base):
+    """A ticket that lets one connection in where no header can be sent: the SHA-256 of its text, never the text."""
+
+    __tablename__ = "tickets"
+    __table_args__ = (Index(None, "expires_at"),)
+
+    digest: Mapped[str] = mapped_column(primary_key=True)
+    key_id: Mapped[str]
+    subject: Mapped[str]
+    expires_at: Mapped[datetime]

@@ -24,6 +24,7 @@ from services.api.routes import (
     models,
     pipelines,
     scenes,
+    signing_keys,
     traces,
 )
 from services.api.security import Authentication, bearer
@@ -65,6 +66,7 @@ def create_api(settings: Settings, database: Database, stores: Stores) -> FastAP
         jobs,
         artifacts,
         library,
+        signing_keys,
         keys,
     ):
         versioned.include_router(module.router)

@@ -1,7 +1,7 @@
 """Starts the parts in their order, keeps them running, says when they serve, and ends them all.
 
-Order: folder locks → database at its newest revision → admin key → broker (waited for) → web, dispatcher,
-workers, trainer. A child that ends is started again with growing pauses; the broker comes back on its port
+Order: folder locks → database at its newest revision → admin key, signing key → broker (waited for) → web,
+dispatcher, workers, trainer. A child that ends is started again with growing pauses; the broker comes back on its port
 with its append-only file. The supervisor is one thread that sleeps between looks; its death by any signal
 ends every child (Linux: PR_SET_PDEATHSIG) and the next start carries on from the database.
 """
@@ -30,7 +30,7 @@ from services.embedded import logs
 from services.embedded.broker import Broker, choose_broker
 from services.embedded.child import Child, Program
 from services.embedded.folder import DataFolder, FolderLocks, write_private
-from storage import api_keys, leases
+from storage import api_keys, leases, signing
 from storage.database import open_database
 from storage.settings import Settings
 
@@ -172,6 +172,7 @@ class Supervisor:
             else:
                 _, token = api_keys.create_key(session, KEY_NAME, "admin")
                 write_private(self._folder.api_key, token + "\n")
+            signing.register(session, signing.open_signer(settings))
         database.dispose()
 
     def _listen(self) -> socket.socket:

@@ -9,7 +9,8 @@ everything open loop on the frames that were held out, and stores the version's 
 * ``prediction.npz``: ``times`` (T,) f8 [s], ``tracks`` and ``tracks_calibrated`` (T, N, 3) f4 [m] after and
   before fine-tuning, ``twin_tracks``; ``tick_times`` (S,) f8 and ``vertices`` (S, n, 3) f4 on the model's
   clock;
-* ``manifest.json``: sha256 and size of each of them; its digest is the version's.
+* ``manifest.json``: sha256 and size of each of them; its digest is the version's;
+* ``manifest.sig.json``: the installation's signature of the manifest (``storage.signing``).
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ import numpy as np
 import torch
 from safetensors.numpy import save as save_tensors
 
+from physworld.evaluate.blocks import mean_with_interval
 from physworld.evaluate.table import held_out_table
 from physworld.worldmodel import config as settings_of
 from physworld.worldmodel.clock import resample_smooth
@@ -39,8 +41,9 @@ from physworld.worldmodel.scene_view import SceneView, view_scene
 from physworld.worldmodel.training import TrainingResult, train
 from schemas.base import Artifact, Reference
 from schemas.model import TrainingConfig
+from schemas.signing import SIGNATURE_NAME
 from services.trainer.closed_loop import closed_loop
-from storage import resources
+from storage import resources, signing
 from workers.context import TaskContext
 from workers.lineage import lineage_of
 from workers.registry import HandlerResult
@@ -50,6 +53,7 @@ from workers.tasks.inputs import made_from, npz_bytes, scene_of, twin_of
 logger = logging.getLogger(__name__)
 
 CHECKPOINT = "training.pt"
+MANIFEST_NAME = "manifest.json"
 SPEED_REPEATS = 3
 
 
@@ -98,15 +102,16 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     lineage = lineage_of([dataset, *made_from(stores, payload)], payload["config"], {"training": config.seed})
     card = _card(payload, config, published, metrics, lineage)
     artifacts = _store(stores, payload, published, view, measured, card)
+    manifest = next(artifact for artifact in artifacts if artifact.name == MANIFEST_NAME)
     context.check()
     shutil.rmtree(_checkpoint_folder(stores.settings.data_dir, context.lease.job_id), ignore_errors=True)
     result = {
         "artifacts": [artifact.model_dump(mode="json") for artifact in artifacts],
-        "sha256": artifacts[-1].sha256,
+        "sha256": manifest.sha256,
         "metrics": metrics,
         "lineage": lineage,
     }
-    return HandlerResult(result, artifacts[-1].sha256)
+    return HandlerResult(result, manifest.sha256)
 
 
 def translate(
@@ -149,12 +154,13 @@ def measure(view: SceneView, published: PublishedModel) -> Measured:
     twin_tracks = resample_smooth(view.twin_tracks, view.times, frame_times)
     predictions = {"twin": twin_tracks, "world_model": tracks_calibrated, "world_model_finetuned": tracks}
     finite = {name: path for name, path in predictions.items() if np.isfinite(path).all()}
+    table = _with_intervals(held_out_table(view.scene, finite))
     return Measured(
         tracks=tracks,
         tracks_calibrated=tracks_calibrated,
         twin_tracks=twin_tracks,
         vertices=np.concatenate([np.repeat(view.vertices[:1], view.first, axis=0), rolled]),
-        table=_with_absent(held_out_table(view.scene, finite), sorted(set(predictions) - set(finite))),
+        table=_with_absent(table, sorted(set(predictions) - set(finite))),
         steps_per_second={
             "twin": view.twin_steps_per_second,
             "world_model": (len(rolled) - view.history - 1) / min(seconds),
@@ -171,6 +177,19 @@ def json_safe(value: Any) -> Any:
     if isinstance(value, np.generic):
         value = value.item()
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _with_intervals(table: dict[str, Any]) -> dict[str, Any]:
+    """The table with ``ci95``: metric to name to the 95 % interval of the mean [m], by blocks of frames."""
+    table["ci95"] = {
+        metric: {
+            name: list(mean_with_interval(np.array(curve, dtype=float)).ci95)
+            for name, curve in table["per_frame"][metric].items()
+            if any(value is not None for value in curve)
+        }
+        for metric in ("track_m", "chamfer_phystwin_m", "chamfer_l2_m")
+    }
+    return table
 
 
 def _with_absent(table: dict[str, Any], absent: list[str]) -> dict[str, Any]:
@@ -333,7 +352,7 @@ def _store(
     measured: Measured,
     card: dict[str, Any],
 ) -> list[Artifact]:
-    """The version's files, the manifest last."""
+    """The version's files, the manifest and its signature last."""
     put = stores.artifacts.put_bytes
     prediction = {
         "times": view.scene.times,
@@ -355,7 +374,14 @@ def _store(
         "files": {item.name: {"sha256": item.sha256, "size": item.size} for item in artifacts},
     }
     text = json.dumps(manifest, indent=1, sort_keys=True).encode()
-    return [*artifacts, put(text, "manifest.json", "application/json")]
+    signer = signing.open_signer(stores.settings)
+    with stores.database.session() as session:
+        signing.register(session, signer)
+    return [
+        *artifacts,
+        put(text, MANIFEST_NAME, "application/json"),
+        put(signer.sign(text), SIGNATURE_NAME, "application/json"),
+    ]
 
 
 def _checkpoint_folder(data_dir: Path, job_id: str) -> Path:

@@ -34,6 +34,7 @@ from physworld_client.errors import (
     RequestTimedOut,
     SceneInvalid,
     ServerError,
+    SignatureInvalid,
     WaitTimedOut,
 )
 
@@ -61,6 +62,7 @@ __all__ = [
     "RequestTimedOut",
     "SceneInvalid",
     "ServerError",
+    "SignatureInvalid",
     "WaitTimedOut",
     "__version__",
 ]

@@ -18,15 +18,17 @@ from physworld_client.errors import PhysWorldError, WaitTimedOut
 from physworld_client.manifest import artifacts_of, verify_folder
 from physworld_client.pages import AsyncListPage
 from physworld_client.partial import PartialFile
+from physworld_client.signatures import keys_by_id, remember
 from physworld_client.stream import HEARTBEAT_S, IDLE_LIMIT_S, EventDecoder, ends_job
 from physworld_client.waiting import Patience, job_id_of, require_success
 from schemas.base import Artifact
 from schemas.dataset import Dataset, DatasetConfig, Episode
 from schemas.fit import Fit, FitConfig
 from schemas.job import TERMINAL_STATES, Event, Job
-from schemas.model import Model, ModelVersion, TrainingConfig
+from schemas.model import Model, ModelComparison, ModelVersion, TrainingConfig
 from schemas.pipeline import PipelineCreate
 from schemas.scene import Scene
+from schemas.signing import SigningKey
 
 if TYPE_CHECKING:
     from physworld_client.async_client import AsyncClient
@@ -157,10 +159,48 @@ class AsyncModels(AsyncResource):
         """Moves an alias to a version."""
         return await self._client.send(calls.alias_set(name, alias, version))
 
-    async def download(self, name: str, folder: str | Path, version: int | str = LATEST) -> ModelVersion:
-        """Downloads every file of a version into ``folder`` and verifies them against the manifest.
+    async def delete_alias(self, name: str, alias: str) -> Model:
+        """Removes an alias; the version stays."""
+        return await self._client.send(calls.alias_delete(name, alias))
+
+    async def update(
+        self,
+        name: str,
+        version: int | str,
+        *,
+        description: str | None = None,
+        tags: tuple[str, ...] | None = None,
+    ) -> ModelVersion:
+        """Changes description and tags of a version; what is None stays. Its files never change."""
+        return await self._client.send(calls.version_patch(name, version, description, tags))
+
+    async def compare(self, name: str, a: int | str, b: int | str) -> ModelComparison:
+        """Two ready versions: errors with intervals and paired gains, curves, differences in how they were made."""
+        return await self._client.send(calls.versions_compare(name, a, b))
+
+    async def signing_keys(self) -> tuple[SigningKey, ...]:
+        """Every public key that signs, or once signed, this service's models."""
+        page = await self._client.send(calls.signing_keys())
+        return tuple(page.data)
+
+    async def download(
+        self,
+        name: str,
+        folder: str | Path,
+        version: int | str = LATEST,
+        *,
+        public_key: str | None = None,
+        allow_unsigned: bool = False,
+    ) -> ModelVersion:
+        """Downloads every file of a version into ``folder`` and verifies them: signature, manifest, digests.
+
+        Args:
+            public_key: the only key in base64 that may have signed; by default the service's own keys, which are
+                remembered on this machine (``physworld_client.signatures``).
+            allow_unsigned: take a version that was published before there were signatures.
 
         Raises:
+            SignatureInvalid: the manifest is not signed, or not by such a key.
             DigestMismatch: a file is not what the manifest promises.
             ModelUnreadable: the version is not ready or its artifacts are incomplete.
         """
@@ -168,7 +208,12 @@ class AsyncModels(AsyncResource):
         target = Path(folder)
         for artifact in artifacts_of(found):
             await self._client.artifacts.download(artifact.sha256, target / artifact.name)
-        verify_folder(target, found.sha256)
+        keys = None
+        if public_key is not None:
+            keys = keys_by_id([public_key])
+        elif not allow_unsigned:
+            keys = remember(await self.signing_keys(), self._client.base_url)
+        verify_folder(target, found.sha256, keys=keys)
         return found
 
 

@@ -18,9 +18,18 @@ from schemas.base import Page
 from schemas.dataset import Dataset, DatasetConfig, DatasetCreate, Episode
 from schemas.fit import Fit, FitConfig, FitCreate
 from schemas.job import Job
-from schemas.model import AliasSet, Model, ModelVersion, TrainingConfig, TrainingCreate
+from schemas.model import (
+    AliasSet,
+    Model,
+    ModelComparison,
+    ModelVersion,
+    TrainingConfig,
+    TrainingCreate,
+    VersionPatch,
+)
 from schemas.pipeline import PipelineCreate
 from schemas.scene import Scene
+from schemas.signing import SigningKey
 from schemas.trace import Trace, TraceConfig, TraceCreate
 
 Answer = TypeVar("Answer")
@@ -53,6 +62,8 @@ _TRACE = TypeAdapter(Trace)
 _DATASET = TypeAdapter(Dataset)
 _MODEL = TypeAdapter(Model)
 _VERSION = TypeAdapter(ModelVersion)
+_COMPARISON = TypeAdapter(ModelComparison)
+_SIGNING_KEYS = TypeAdapter(Page[SigningKey])
 _ASSESSMENT = TypeAdapter(Assessment)
 _JOB = TypeAdapter(Job)
 _SCENES = TypeAdapter(Page[Scene])
@@ -224,6 +235,29 @@ def alias_set(name: str, alias: str, version: int) -> Call[Model]:
     """PUT /v1/models/{name}/aliases/{alias}."""
     path = f"/v1/models/{_part(name)}/aliases/{_part(alias)}"
     return Call("PUT", path, _MODEL, body=AliasSet(version=version))
+
+
+def alias_delete(name: str, alias: str) -> Call[Model]:
+    """DELETE /v1/models/{name}/aliases/{alias}."""
+    return Call("DELETE", f"/v1/models/{_part(name)}/aliases/{_part(alias)}", _MODEL)
+
+
+def version_patch(
+    name: str, version: int | str, description: str | None, tags: tuple[str, ...] | None
+) -> Call[ModelVersion]:
+    """PATCH /v1/models/{name}/versions/{version}."""
+    body = VersionPatch(description=description, tags=None if tags is None else [*tags])
+    return Call("PATCH", f"/v1/models/{_part(name)}/versions/{_part(version)}", _VERSION, body=body)
+
+
+def versions_compare(name: str, a: int | str, b: int | str) -> Call[ModelComparison]:
+    """GET /v1/models/{name}/compare."""
+    return Call("GET", f"/v1/models/{_part(name)}/compare", _COMPARISON, query={"a": str(a), "b": str(b)})
+
+
+def signing_keys() -> Call[Page[SigningKey]]:
+    """GET /v1/signing-keys."""
+    return Call("GET", "/v1/signing-keys", _SIGNING_KEYS, query={"limit": 200})
 
 
 def pipeline_create(body: PipelineCreate) -> Call[Job]:

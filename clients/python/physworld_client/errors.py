@@ -20,6 +20,7 @@
     ├── DigestMismatch              bytes are not those that their SHA-256 promises; nothing was kept
     ├── BundleUnreadable            a local scene cannot be packed: the path, and what is wrong with it
     └── ModelUnreadable             a local model artifact is incomplete or of an unknown layout
+        └── SignatureInvalid        its manifest is not signed by a known key; nothing was loaded
 
 ``str(error)`` is one line that a person can act on. ``ApiError.problem.request_id`` finds the request in the
 service's log.
@@ -147,6 +148,10 @@ class BundleUnreadable(PhysWorldError):
 
 class ModelUnreadable(PhysWorldError):
     """A local model artifact is incomplete or of an unknown layout."""
+
+
+class SignatureInvalid(ModelUnreadable):
+    """A manifest is not signed by a known key, or is not the one that was signed."""
 
 
 _ERROR_OF_STATUS: dict[int, type[ApiError]] = {

@@ -1,17 +1,21 @@
 """The manifest of a published model: which files belong to it, with size and SHA-256 of each.
 
 ``manifest.json`` is ``{"name", "version", "files": {name: {"sha256", "size"}}}``; a version's ``sha256`` is
-the digest of this file. Nothing of a model is read before its files were verified.
+the digest of this file. ``manifest.sig.json`` signs it (``physworld_client.signatures``). Nothing of a model is read
+before its files and the signature were verified.
 """
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 
 from pydantic import BaseModel, ValidationError
 
 from physworld_client.errors import DigestMismatch, ModelUnreadable
 from physworld_client.partial import sha256_of
+from physworld_client.signatures import verify_signature
 from schemas.base import Artifact
 from schemas.model import ModelVersion
 
@@ -35,20 +39,29 @@ class Manifest(BaseModel):
     files: dict[str, ManifestFile]
 
 
-def verify_folder(folder: Path, sha256: str | None = None) -> Manifest:
-    """Checks every file of a model folder against its manifest, and the manifest against ``sha256``.
+def verify_folder(
+    folder: Path, sha256: str | None = None, *, keys: Mapping[str, str] | None = None
+) -> Manifest:
+    """Checks the signature of a model folder's manifest, the manifest against ``sha256``, every file against it.
+
+    Args:
+        keys: trusted public keys in base64 by key id; None leaves the signature unchecked.
 
     Raises:
+        SignatureInvalid: no key of ``keys`` signed this manifest.
         ModelUnreadable: the manifest or a file is missing, or a name leaves the folder.
         DigestMismatch: a file, or the manifest, is not what was published.
     """
     path = folder / MANIFEST_NAME
     if not path.is_file():
         raise ModelUnreadable(f"{folder} holds no {MANIFEST_NAME}: not a downloaded model")
-    if sha256 is not None and (found := sha256_of(path)) != sha256:
+    data = path.read_bytes()
+    if sha256 is not None and (found := hashlib.sha256(data).hexdigest()) != sha256:
         raise DigestMismatch(str(path), sha256, found)
+    if keys is not None:
+        verify_signature(folder, data, keys)
     try:
-        manifest = Manifest.model_validate_json(path.read_bytes())
+        manifest = Manifest.model_validate_json(data)
     except ValidationError as error:
         fault = error.errors()[0]
         place = ".".join(str(part) for part in fault["loc"])

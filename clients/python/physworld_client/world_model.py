@@ -4,7 +4,7 @@
     vertices = model.rollout(controllers)      # (T, n, 3) from (T, K, 3), model.dt_s apart
     points = model.track(vertices)             # (T, N, 3), the scene's measured points
 
-The files are checked against the manifest before anything of them is read. Needs numpy and safetensors. The
+Signature and digests are checked before anything of the files is read. Needs numpy, safetensors and cryptography. The
 tensors and their meaning: ``physworld.worldmodel.model`` and ``physworld.worldmodel.published``.
 """
 
@@ -23,6 +23,7 @@ from safetensors.numpy import load_file
 from physworld_client.errors import ModelUnreadable
 from physworld_client.manifest import CARD_NAME, WEIGHTS_NAME, verify_folder
 from physworld_client.network import PROPERTY_COUNT, Network
+from physworld_client.signatures import trusted_keys
 
 CARD_SCHEMA = 1
 
@@ -61,18 +62,29 @@ class WorldModel:
     _skin: tuple[np.ndarray, np.ndarray] | None
 
     @classmethod
-    def load(cls, folder: str | Path, *, sha256: str | None = None) -> WorldModel:
+    def load(
+        cls,
+        folder: str | Path,
+        *,
+        sha256: str | None = None,
+        public_key: str | None = None,
+        allow_unsigned: bool = False,
+    ) -> WorldModel:
         """Loads a folder written by ``client.models.download``.
 
         Args:
             sha256: the version's digest, when known from elsewhere; the folder must be exactly that version.
+            public_key: the only key in base64 that may have signed it; by default any known one
+                (``physworld_client.signatures``).
+            allow_unsigned: load without looking at the signature (a version published before there were any).
 
         Raises:
+            SignatureInvalid: the manifest is not signed, not by a trusted key, or was changed since.
             DigestMismatch: a file is not the published one.
             ModelUnreadable: a file is missing, or the artifact has a layout that this client does not know.
         """
         place = Path(folder)
-        manifest = verify_folder(place, sha256)
+        manifest = verify_folder(place, sha256, keys=trusted_keys(public_key, allow_unsigned))
         missing = [name for name in (WEIGHTS_NAME, CARD_NAME) if name not in manifest.files]
         if missing:
             raise ModelUnreadable(f"the manifest in {place} lists no {' and no '.join(missing)}")

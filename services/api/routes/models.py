@@ -1,24 +1,25 @@
-"""World models: train and publish a version, look versions up, move aliases."""
+"""World models: train and publish a version, look versions up, compare them, describe them, move aliases."""
 
 from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Path, Response
+from fastapi import APIRouter, Path, Query, Response
 
 from schemas.base import Page
 from schemas.job import Job
-from schemas.model import AliasSet, Model, ModelVersion, TrainingCreate
+from schemas.model import AliasSet, Model, ModelComparison, ModelVersion, TrainingCreate, VersionPatch
 from services.api.dependencies import DatabaseDep, ModelName, PageDep
 from services.api.errors import documented
 from services.api.idempotency import IdempotencyDep, accepted
 from storage import jobs, registry
+from storage.comparison import compare_versions
 
 router = APIRouter(prefix="/models", tags=["models"])
 
-Version = Annotated[
-    str, Path(pattern=r"^([1-9][0-9]{0,8}|[a-z][a-z0-9_-]{0,31})$", description="number, alias or `latest`")
-]
+VERSION = r"^([1-9][0-9]{0,8}|[a-z][a-z0-9_-]{0,31})$"
+Version = Annotated[str, Path(pattern=VERSION, description="number, alias or `latest`")]
+OneOfTwo = Annotated[str, Query(pattern=VERSION, description="number, alias or `latest`")]
 Alias = Annotated[str, Path(pattern=r"^[a-z][a-z0-9_-]{0,31}$")]
 
 
@@ -59,6 +60,23 @@ def get_version(name: ModelName, version: Version, database: DatabaseDep) -> Mod
     """A version by number, by alias, or the newest ready one as `latest`."""
     with database.reading() as session:
         return registry.get_version(session, name, version)
+
+
+@router.patch("/{name}/versions/{version}", responses=documented(401, 403, 404, 413, 422))
+def patch_version(
+    name: ModelName, version: Version, body: VersionPatch, database: DatabaseDep
+) -> ModelVersion:
+    """Change description and tags. The files of a ready version never change."""
+    with database.session() as session:
+        return registry.patch_version(session, name, version, body)
+
+
+@router.get("/{name}/compare", responses=documented(401, 403, 404, 409, 422))
+def compare(name: ModelName, a: OneOfTwo, b: OneOfTwo, database: DatabaseDep) -> ModelComparison:
+    """Two ready versions: errors with intervals and paired gains, curves, and what differs in how they were made."""
+    with database.reading() as session:
+        pair = registry.get_version(session, name, a), registry.get_version(session, name, b)
+    return compare_versions(*pair)
 
 
 @router.put("/{name}/aliases/{alias}", responses=documented(401, 403, 404, 409, 413, 422))

@@ -6,6 +6,7 @@ that the SDK sees every state of a job without simulations.
 
 from __future__ import annotations
 
+import base64
 import io
 import json
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from physworld_client import Client
 
 from schemas.base import Artifact, Problem
 from services.stores import Stores
-from storage import leases
+from storage import leases, signing
 from storage.database import Database
 from storage.tables import utc_now
 
@@ -142,7 +143,12 @@ class Service:
         files = [self._put("model.safetensors", f"{name} {version}".encode()), self._put("card.json", b"{}")]
         listed = {file.name: {"sha256": file.sha256, "size": file.size} for file in files}
         manifest = {"name": name, "version": version, "files": listed}
-        files.append(self._put("manifest.json", json.dumps(manifest).encode()))
+        text = json.dumps(manifest).encode()
+        files.append(self._put("manifest.json", text))
+        signer = signing.signer_of(base64.b64encode(bytes(range(32))).decode(), "the test")
+        with self.database.session() as session:
+            signing.register(session, signer)
+        files.append(self._put("manifest.sig.json", signer.sign(text)))
         held_out: dict[str, Any] = {metric: dict.fromkeys(ROWS, 0.001) for metric in METRICS}
         metrics = {
             "held_out": held_out,
@@ -150,7 +156,7 @@ class Service:
             "noise_floor_m": 0.0005,
         }
         artifacts = [file.model_dump() for file in files]
-        return {"artifacts": artifacts, "sha256": files[-1].sha256, "metrics": metrics}
+        return {"artifacts": artifacts, "sha256": files[-2].sha256, "metrics": metrics}
 
 
 def write_scene(folder: Path, name: str = "strip", *, seed: int = 0) -> Path:

@@ -56,7 +56,7 @@ def test_the_whole_chain_step_by_step(service: Service, client: Client, tmp_path
     version = client.models.download("strip", tmp_path / "model", "champion")
     assert (version.version, version.description, version.aliases) == (1, "first", ["champion"])
     names = {path.name for path in (tmp_path / "model").iterdir()}
-    assert names == {"model.safetensors", "card.json", "manifest.json"}
+    assert names == {"model.safetensors", "card.json", "manifest.json", "manifest.sig.json"}
     assert hashlib.sha256((tmp_path / "model" / "manifest.json").read_bytes()).hexdigest() == version.sha256
     assert client.models.version("strip") == version
     assert client.models.get("strip").latest_version == 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import dataclasses
 import hashlib
 import json
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from physworld_client.errors import DigestMismatch, ModelUnreadable
+from physworld_client.signatures import remember
 from physworld_client.world_model import WorldModel
 from safetensors.numpy import load_file, save_file
 
@@ -21,9 +23,19 @@ from physworld.worldmodel.graph import GraphSpec
 from physworld.worldmodel.modal import ModalPrior, regressor_count, rigid_prior
 from physworld.worldmodel.model import Normalisation
 from physworld.worldmodel.model import WorldModel as Network
+from schemas.signing import SigningKey
+from storage import signing
 
 FRAMES = 60
+SIGNER = signing.signer_of(base64.b64encode(bytes(range(32))).decode(), "the test")
 AGREEMENT_M = 1e-4  # single precision over 60 steps; the motion itself is of the order of 0.1 m
+
+
+@pytest.fixture(autouse=True)
+def known(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """This machine has met the service that signs here."""
+    monkeypatch.setenv("PHYSWORLD_KNOWN_KEYS", str(tmp_path_factory.mktemp("keys") / "known.json"))
+    remember([SigningKey(key_id=SIGNER.key_id, public_key=SIGNER.public_key)], "the test")
 
 
 def published(ground_height_m: float | None = None) -> PublishedModel:
@@ -94,6 +106,7 @@ def seal(folder: Path) -> str:
         files[name] = {"sha256": hashlib.sha256(data).hexdigest(), "size": len(data)}
     text = json.dumps({"name": "bar", "version": 4, "files": files})
     (folder / "manifest.json").write_text(text)
+    (folder / "manifest.sig.json").write_bytes(SIGNER.sign(text.encode()))
     return hashlib.sha256(text.encode()).hexdigest()
 
 

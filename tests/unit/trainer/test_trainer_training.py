@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import json
 from collections.abc import Iterator
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from safetensors.numpy import load
 from tiny_scene import register, tiny_scene
 
@@ -19,9 +21,10 @@ from schemas.dataset import DatasetConfig
 from schemas.fit import FitConfig
 from schemas.job import Job
 from schemas.model import ModelVersion, TrainingConfig, TrainingCreate
+from schemas.signing import ManifestSignature
 from services.trainer import training
 from services.trainer.training import json_safe, translate
-from storage import jobs, leases, registry, resources
+from storage import jobs, leases, registry, resources, signing
 from storage.database import open_database
 from storage.settings import Settings
 from storage.tables import ShardRow
@@ -94,7 +97,19 @@ def test_a_training_publishes_a_version_that_rolls_out(runtime: Runtime, dataset
     job, version = _train(runtime, dataset_id)
     assert (job.state, version.state) == ("succeeded", "ready"), job.error
     files = _files(runtime, version)
-    assert set(files) == {"model.safetensors", "card.json", "prediction.npz", "manifest.json"}
+    assert set(files) == {
+        "model.safetensors",
+        "card.json",
+        "prediction.npz",
+        "manifest.json",
+        "manifest.sig.json",
+    }
+    with runtime.database.reading() as session:
+        (key,) = signing.list_signing_keys(session).data
+    signature = ManifestSignature.model_validate_json(files["manifest.sig.json"])
+    assert signature.key_id == key.key_id
+    public = Ed25519PublicKey.from_public_bytes(base64.b64decode(key.public_key))
+    public.verify(base64.b64decode(signature.signature), files["manifest.json"])
     assert hashlib.sha256(files["manifest.json"]).hexdigest() == version.sha256
     manifest = json.loads(files["manifest.json"])
     assert (manifest["name"], manifest["version"]) == ("bar", 1)
@@ -118,6 +133,8 @@ def test_the_metrics_have_every_row_of_the_table(runtime: Runtime, dataset_id: s
         assert rows <= set(row)
         assert all(row[name] > 0.0 for name in rows)
     assert set(version.metrics["steps_per_second"]) == {"twin", "world_model"}
+    low, high = version.metrics["held_out"]["ci95"]["track_m"]["twin"]
+    assert low < version.metrics["held_out"]["track_m"]["twin"] < high
     assert version.metrics["episodes"] == 4
     assert version.metrics["validation"]["curve"][-1][0] == SMALL.steps
 

@@ -1,0 +1,32 @@
+"""Signatures of published models: Ed25519 over the bytes of a version's manifest."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Literal
+
+from pydantic import Field
+
+from schemas.base import Resource
+
+SIGNATURE_NAME = "manifest.sig.json"
+
+
+class SigningKey(Resource):
+    """A public key that signs, or signed, manifests of this service.
+
+    ``public_key``: base64 of its 32 bytes (RFC 8032); ``key_id``: the first 16 hexadecimal digits of their SHA-256.
+    """
+
+    key_id: str = Field(pattern=r"^[0-9a-f]{16}$")
+    algorithm: Literal["ed25519"] = "ed25519"
+    public_key: str
+    created_at: datetime | None = None
+
+
+class ManifestSignature(Resource):
+    """The content of ``manifest.sig.json``; ``signature``: base64 of 64 bytes over ``manifest.json`` as it is."""
+
+    algorithm: Literal["ed25519"] = "ed25519"
+    key_id: str = Field(pattern=r"^[0-9a-f]{16}$")
+    signature: str
