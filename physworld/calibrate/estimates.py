@@ -99,7 +99,10 @@ def held_at_priors(
             if np.isfinite(gain)
             else "not tried to its end"
         )
-        kept = "held at its prior" if values[name] else "not needed"
+        needless = (
+            not values[name] or name == "yield_stress_pa"
+        )  # nothing reaches the prior of a yield stress
+        kept = "not needed" if needless else "held at its prior"
         held[name] = Estimate(values[name], units[name], None, False, f"{kept}: {share}")
     for name in ("poissons_ratio", "ground_friction"):
         if name in values and name not in held:

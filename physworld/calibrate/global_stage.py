@@ -6,7 +6,8 @@
 3. Free optional parameters (drag, internal friction, Poisson's ratio, an undeclared ground's friction), the best one
    first. A screening by one run each skips those that cannot help to first order; of the others each must lower
    the training cost by more than 2 % (Poisson's ratio: 15 %). After one that removed half of it, start again from a
-   quarter and four times the stiffness: the first scan knew less. Drop again what the others made needless.
+   quarter and four times the stiffness: the first scan knew less. Drop again what the others made needless, also the
+   yield of a flow law, which is searched with the stiffness from the first scan on.
 4. Shift the tracked points inside the body by their mean residual (frame 0 is noisy too), clipped at 3 sigma.
 5. Gauss-Newton again on all that were kept; hold at its prior what the data turn out not to fix; intervals and
    correlations from the sensitivities at the optimum.
@@ -35,7 +36,7 @@ from physworld.calibrate.estimates import (
 from physworld.calibrate.journal import Journal
 from physworld.calibrate.least_squares import Solution
 from physworld.calibrate.losses import training_losses
-from physworld.calibrate.parameters import Parameter, parameters_of
+from physworld.calibrate.parameters import Parameter, flow_law, parameters_of
 from physworld.calibrate.search import Optimum, Progress, Search
 from physworld.materials.library import with_law
 from physworld.scene import Scene
@@ -62,6 +63,8 @@ class CalibrationConfig:
         damping: "auto" adds drag and internal friction where the data ask; "none" keeps the declared physics only.
         law: name of the elastic law (:mod:`physworld.materials.library`); None for the shape's usual one.
         formulation: "auto", "total_lagrangian" or "updated_lagrangian": see :mod:`physworld.mpm.choose`.
+        plasticity: name of the flow law (:mod:`physworld.materials.plastic`), whose yield is searched too; None for an
+            elastic body.
     """
 
     particle_budget: int = 2000
@@ -70,6 +73,7 @@ class CalibrationConfig:
     damping: Literal["auto", "none"] = "auto"
     law: str | None = None
     formulation: str = "auto"
+    plasticity: str | None = None
 
 
 @dataclass(frozen=True)
@@ -123,7 +127,7 @@ def calibrate(
         CalibrationError: no start gave a usable simulation.
         Cancelled: ``cancelled`` returned true.
         SceneUnsupported: the scene declares too little for a body.
-        ValueError: there is no such law for the body.
+        ValueError: there is no such law for the body, or no such flow law.
     """
     config = config or CalibrationConfig()
     started = time.perf_counter()
@@ -158,8 +162,14 @@ def calibrate(
 
 
 def prior_twin(scene: Scene, config: CalibrationConfig) -> Twin:
-    """The twin before its calibration, under the configured law."""
-    twin = build_twin(scene, config.particle_budget, config.device, formulation=config.formulation)
+    """The twin before its calibration, under the configured laws."""
+    twin = build_twin(
+        scene,
+        config.particle_budget,
+        config.device,
+        plasticity=None if config.plasticity is None else flow_law(config.plasticity),
+        formulation=config.formulation,
+    )
     return twin if config.law is None else replace(twin, law=with_law(twin.law, config.law))
 
 
@@ -175,7 +185,7 @@ def searched_parameters(scene: Scene, twin: Twin, config: CalibrationConfig) -> 
 
 def select(search: Search, parameters: list[Parameter]) -> tuple[list[Parameter], Optimum, dict[str, float]]:
     """Steps 1 to 3: the parameters to keep, their optimum, and what the others would have removed."""
-    kept = [p for p in parameters if p.stage == "stiffness"]
+    kept = [p for p in parameters if p.stage != "optional"]
     optimum = search.scan(kept)
     candidates = [p for p in parameters if p.stage == "optional"]
     rejected: dict[str, float] = {}
@@ -197,7 +207,7 @@ def select(search: Search, parameters: list[Parameter]) -> tuple[list[Parameter]
         candidates.remove(hopeful[best])
         if gains[hopeful[best].name] > _RESTART_GAIN:
             optimum = _restarted(search, kept, optimum)
-    for needless in [p for p in kept if p.stage == "optional"]:
+    for needless in [p for p in kept if p.stage != "stiffness"]:
         others = [k for k, p in enumerate(kept) if p is not needless]
         trial = search.solve([kept[k] for k in others], optimum.theta[others], 2)
         if trial.cost * (1.0 - needless.least_gain) <= optimum.cost:

@@ -4,8 +4,10 @@ Stiffness and friction are positive and span decades: they are searched in the l
 as it is. With gravity, ground and prescribed grips only ratios to the density show, so the density is never a
 parameter here: it stays as declared, or at its prior, and the report says so.
 
-A *stiffness* is always searched. The others are *optional*: air drag, internal friction, Poisson's ratio, and the
-friction of a ground that declares none; each is freed only if the data ask for it, and else stays at its prior.
+A *stiffness* is always searched, and with it where a flow law yields, if the body has one and the data show it: the
+prior of a yield stress is a value that nothing reaches. The others are *optional*: air drag, internal friction,
+Poisson's ratio, and the friction of a ground that declares none; each is freed only if the data ask for it, and else
+stays at its prior.
 """
 
 from __future__ import annotations
@@ -17,6 +19,14 @@ from typing import Literal
 import numpy as np
 
 from physworld.materials.laws import RodLaw, SheetLaw, SolidLaw
+from physworld.materials.plastic import (
+    PLASTICITIES,
+    DruckerPrager,
+    Identity,
+    Plasticity,
+    StVenantKirchhoff,
+    VonMises,
+)
 from physworld.twin import Twin
 
 _LOG_STEP = 0.02  # finite-difference step in the logarithm
@@ -24,6 +34,8 @@ _POISSON_BOUNDS, _POISSON_STEP = (0.0, 0.48), 0.02
 _LEAST_GAIN = 0.02  # share of the training cost that an optional parameter must remove
 _POISSON_GAIN = 0.15  # the same of Poisson's ratio, which absorbs a little of whatever else is missing
 _FRICTION_BOUNDS = (0.02, 3.0)
+_NEVER_PA = 1e12  # a yield stress that nothing reaches
+_SAND_RAD = 0.6  # friction angle of loose dry sand
 
 
 @dataclass(frozen=True)
@@ -36,7 +48,8 @@ class Parameter:
         low, high: bounds of the search.
         start: starts of the search, best first by prior knowledge; for an optional one the value that is tried first.
         apply: a twin with this value.
-        stage: "stiffness" parameters come first; "optional" ones are freed only if the data ask for them.
+        stage: "stiffness" parameters come first, with where a "flow" law yields; "optional" ones are freed only if the
+            data ask for them.
         scale: searched in the logarithm, or as it is.
         step: of finite differences, in the searched scale.
         prior: value of an optional parameter that is not freed.
@@ -49,7 +62,7 @@ class Parameter:
     high: float
     start: tuple[float, ...]
     apply: Callable[[Twin, float], Twin]
-    stage: Literal["stiffness", "optional"]
+    stage: Literal["stiffness", "flow", "optional"]
     step: float = _LOG_STEP
     scale: Literal["log", "linear"] = "log"
     prior: float = 0.0
@@ -91,7 +104,39 @@ def parameters_of(
             Parameter("ground_friction", "1", *_FRICTION_BOUNDS, (prior,), _set("ground_friction"), "optional",
                       0.05, prior=prior)
         )  # fmt: skip
-    return [*_stiffness(twin, separate_bending), *optional]
+    return [*_stiffness(twin, separate_bending), *_flow(twin), *optional]
+
+
+def flow_law(name: str) -> Plasticity:
+    """The flow law called ``name`` with prior numbers: one that yields nowhere, or loose dry sand.
+
+    Raises:
+        ValueError: there is no such flow law.
+    """
+    if name not in PLASTICITIES:
+        raise ValueError(f"no flow law {name!r}; there are {sorted(PLASTICITIES)}")
+    law = PLASTICITIES[name]
+    if law is VonMises or law is StVenantKirchhoff:
+        return law(yield_stress_pa=_NEVER_PA)
+    return law(friction_angle_rad=_SAND_RAD) if law is DruckerPrager else law()
+
+
+def _flow(twin: Twin) -> list[Parameter]:
+    """Where the twin's flow law yields. Hardening, flow viscosity and cohesion stay as they are."""
+    if isinstance(twin.plasticity, DruckerPrager):
+        angle = twin.plasticity.friction_angle_rad
+        return [
+            Parameter("friction_angle_rad", "rad", 0.05, 1.4, (angle, 0.35, 0.85), _set("friction_angle_rad"), "flow",
+                      0.03, "linear", angle)
+        ]  # fmt: skip
+    if twin.plasticity is None or isinstance(twin.plasticity, Identity):
+        return []
+    weight = twin.density * 9.81 * float(np.ptp(twin.body.start, axis=0).max())
+    starts = tuple(weight * factor for factor in (1.0, 0.2, 5.0, 25.0))
+    return [
+        Parameter("yield_stress_pa", "Pa", 1e-3 * weight, 1e4 * weight, starts, _set("yield_stress_pa"), "flow", 0.05,
+                  prior=_NEVER_PA)
+    ]  # fmt: skip
 
 
 def _stiffness(twin: Twin, separate_bending: bool) -> list[Parameter]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,6 @@ from physworld.calibrate.journal import Journal
 from physworld.calibrate.least_squares import Solution, finite_differences, gauss_newton
 from physworld.calibrate.parameters import Parameter
 from physworld.errors import CalibrationError, Cancelled, SimulationError
-from physworld.mpm.lattice import Lattice
 from physworld.scene import UNDEFORMED_AT_REST, Scene
 from physworld.twin import Twin
 
@@ -25,6 +25,7 @@ Progress = Callable[[int, int, str], None]
 _OFFSET_CLIP_SIGMAS = 3.0
 _FIRST_WINDOW = 0.33  # share of the training path that the first search sees
 _FIRST_WINDOW_FRAMES = 10
+_BESIDE = 0.1  # of a cell: how far beside a point its neighbours are followed
 _DISTINCT = 0.05  # starts that end closer than this in the logarithm are one
 
 
@@ -117,10 +118,13 @@ class Search:
         return residual
 
     def scan(self, parameters: list[Parameter]) -> Optimum:
-        """Multi-start over the first parameter's starts on the first window, then on all training frames."""
+        """Multi-start over the starts of the first parameter and of a flow law's, then on all training frames."""
         window = self.first_window()
-        rest = [p.searched(p.start[0]) for p in parameters[1:]]
-        starts = [np.array([parameters[0].searched(value), *rest]) for value in parameters[0].start]
+        tried = [p.start if k == 0 or p.stage == "flow" else p.start[:1] for k, p in enumerate(parameters)]
+        starts = [
+            np.array([p.searched(value) for p, value in zip(parameters, values, strict=True)])
+            for values in product(*tried)
+        ]
         costs = self._step(
             "scan",
             lambda: {"costs": [float(np.mean(self.residual(parameters, t, window) ** 2)) for t in starts]},
@@ -130,7 +134,7 @@ class Search:
         )
         if not usable:
             raise CalibrationError(
-                f"none of {len(costs)} starts of {parameters[0].name} from {parameters[0].start[0]:.3g} to "
+                f"none of {len(costs)} starts with {parameters[0].name} from {parameters[0].start[0]:.3g} to "
                 f"{parameters[0].start[-1]:.3g} {parameters[0].unit} gave a usable simulation"
             )
         early = [self.solve(parameters, np.array(theta), 3, window) for _, theta in usable[:3]]
@@ -225,7 +229,7 @@ class Search:
         """Mean residual of every point in the material's frame [m], (N, 3), clipped; None where it cannot be had."""
         if self.simulations + 2 + len(parameters) > self.limit:
             return None  # the search on the moved points needs a residual and a Jacobian of its own
-        twin, lattice = self.twin_at(parameters, theta), self.twin.lattice
+        twin = self.twin_at(parameters, theta)
         times, controls = self.scene.control_track()
         try:
             nodes = twin.simulate_nodes(
@@ -237,7 +241,7 @@ class Search:
         frames = slice(self.begin, self.end)
         mask = self.scene.visible[frames]
         error = np.where(mask[..., None], self.scene.points[frames] - twin.track_nodes(nodes)[frames], 0.0)
-        gradient = _deformation(lattice, twin.body.points, nodes[frames])
+        gradient = _deformation(twin, nodes)[frames]
         local = np.linalg.solve(gradient, error[..., None])[..., 0]
         seen = np.maximum(mask.sum(axis=0), 1)[:, None]
         limit = _OFFSET_CLIP_SIGMAS * sigma
@@ -263,14 +267,26 @@ class Search:
             raise Cancelled(f"calibration cancelled in run {self.simulations} at frame {done} of {total}")
 
 
-def _deformation(lattice: Lattice, points: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """Where material directions point, (T, N, 3, 3): columns of the deformation gradient; a sheet's normal last."""
-    frames = nodes.shape[0]
-    flat = nodes.transpose(1, 0, 2).reshape(nodes.shape[1], -1)
+def _deformation(twin: Twin, carriers: np.ndarray) -> np.ndarray:
+    """Where material directions point, (T, N, 3, 3): columns of the deformation gradient; a sheet's normal last.
+
+    Carriers that are particles have no shape functions that last: neighbours of a point are followed instead.
+    """
+    lattice, points = twin.lattice, twin.body.points
     columns = []
     for axis in range(lattice.dim):
-        slope = lattice.interpolation(points, tuple(int(a == axis) for a in range(lattice.dim)))
-        columns.append((slope @ flat).reshape(len(points), frames, 3).transpose(1, 0, 2))
+        if twin.formulation == "updated_lagrangian":
+            step = np.zeros(lattice.dim)
+            step[axis] = _BESIDE * lattice.spacing[axis]
+            ends = [
+                replace(twin, body=replace(twin.body, points=points + sign * step)).track_nodes(carriers)
+                for sign in (-1.0, 1.0)
+            ]
+            columns.append((ends[1] - ends[0]) / (2.0 * step[axis]))
+        else:
+            slope = lattice.interpolation(points, tuple(int(a == axis) for a in range(lattice.dim)))
+            flat = carriers.transpose(1, 0, 2).reshape(carriers.shape[1], -1)
+            columns.append((slope @ flat).reshape(len(points), len(carriers), 3).transpose(1, 0, 2))
     if lattice.dim == 2:
         normal = np.cross(*columns)
         columns.append(normal / np.linalg.norm(normal, axis=-1, keepdims=True))
