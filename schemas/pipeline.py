@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from schemas.base import Request, Resource
 from schemas.dataset import DatasetConfig
 from schemas.fit import FitConfig
 from schemas.model import TrainingConfig
-from schemas.trace import TraceConfig
+from schemas.trace import NO_OTHER_PHYSICS, TraceConfig
 
 
 class PipelineCreate(Request):
@@ -29,6 +29,12 @@ class PipelineCreate(Request):
     trace: TraceConfig = Field(default_factory=TraceConfig)
     dataset: DatasetConfig = Field(default_factory=DatasetConfig)
     training: TrainingConfig = Field(default_factory=TrainingConfig)
+
+    @model_validator(mode="after")
+    def _traceable(self) -> Self:
+        if self.close_the_loop and not self.fit.usual_physics:
+            raise ValueError(NO_OTHER_PHYSICS)
+        return self
 
 
 class ModelReference(Resource):

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, model_validator
 
 from schemas.base import Artifact, Lineage, Request, Resource, Seed
 from schemas.fit import FitConfig
@@ -32,6 +32,11 @@ class TraceConfig(Request):
     seed: Seed = 0
 
 
+NO_OTHER_PHYSICS = (
+    "a trace calibrates the usual elastic law: fit.law, fit.plasticity and fit.formulation must be left out"
+)
+
+
 class TraceCreate(Request):
     """Body of POST /v1/traces.
 
@@ -43,6 +48,12 @@ class TraceCreate(Request):
     fit_id: str | None = None
     fit: FitConfig = Field(default_factory=lambda: FitConfig(damping="none"))
     config: TraceConfig = Field(default_factory=TraceConfig)
+
+    @model_validator(mode="after")
+    def _usual_physics(self) -> Self:
+        if not self.fit.usual_physics:
+            raise ValueError(NO_OTHER_PHYSICS)
+        return self
 
 
 class Figure(Resource):

@@ -12,14 +12,10 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from dataclasses import asdict, replace
+from contextlib import nullcontext
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from physworld.calibrate import CalibrationConfig
-    from physworld.calibrate.law_choice import LawChoice
-    from physworld.scene import Scene
+from typing import Any
 
 SCHEMA_VERSION = 1
 
@@ -40,6 +36,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--particles", type=_count, default=None, help="particles of the twin, about")
     parser.add_argument("--simulations", type=_count, default=None, help="most simulations of the search")
     parser.add_argument("--law", default=None, help="elastic law by name, or auto: choose it by the data")
+    parser.add_argument("--plasticity", default=None, help="flow law by name; its yield is calibrated too")
     parser.add_argument("--formulation", default="auto", help="total_lagrangian, updated_lagrangian or auto")
     parser.add_argument(
         "--quick", action="store_true", help="leave out the runs on finer cells and time steps"
@@ -62,15 +59,18 @@ def _fit(given: argparse.Namespace) -> None:
     from physworld.calibrate.discretisation import converged_parameters
     from physworld.evaluate.numerics import measure_numerics
     from workers.commands.terminal import progress_bar, read_scene
+    from workers.law_choice import AUTO, chosen_laws
     from workers.tasks.fit_report import fit_files, fit_report, json_safe, parameter_json
 
     scene = read_scene(given.scene)
     numbers = {"particle_budget": given.particles, "max_simulations": given.simulations}
     config = CalibrationConfig(
-        **{name: value for name, value in numbers.items() if value is not None}, formulation=given.formulation
+        **{name: value for name, value in numbers.items() if value is not None},
+        formulation=given.formulation,
+        plasticity=given.plasticity,
     )
-    choice = _chosen_law(given.law, scene, config)
-    config = replace(config, law=choice.elastic if choice.decided_by != "default" else None)
+    with progress_bar(f"law {scene.name}") if given.law == AUTO else nullcontext() as shown:
+        config, choice = chosen_laws(given.law, scene, config, shown)
     with progress_bar(f"fit {scene.name}") as shown:
         fitted = calibrate(scene, config, progress=shown)
     report = fit_report(scene, fitted, choice)
@@ -91,23 +91,6 @@ def _fit(given: argparse.Namespace) -> None:
     if given.json is not None:
         given.json.parent.mkdir(parents=True, exist_ok=True)
         given.json.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n")
-
-
-def _chosen_law(asked: str | None, scene: Scene, config: CalibrationConfig) -> LawChoice:
-    """The law that was asked for, chosen where it is ``auto``; its record."""
-    from physworld.calibrate.global_stage import prior_twin
-    from physworld.calibrate.law_choice import LawChoice, choose_law
-    from workers.commands.terminal import progress_bar
-    from workers.law_endpoint import law_endpoint
-    from workers.motion_picture import motion_pictures
-
-    if asked == "auto":
-        with progress_bar(f"law {scene.name}") as shown:
-            return choose_law(scene, config, law_endpoint(), motion_pictures, progress=shown)
-    twin = prior_twin(scene, replace(config, law=asked))
-    if asked is None:
-        return LawChoice(twin.law.name)
-    return LawChoice(asked, decided_by="given", reason="named by the caller")
 
 
 def fit_document(scene_name: str, report: dict[str, Any]) -> dict[str, Any]:
@@ -136,7 +119,7 @@ def _print(document: dict[str, Any]) -> None:
     for name, error in sorted(held_out["track_m"].items(), key=lambda item: item[1] or 0.0):
         print(f"  {name:<20} {'-' if error is None else format(1e3 * error, '.4g')}")
     law, numerics = document["law"], document["numerics"]
-    print(f"law {law['elastic']}, decided by {law['decided_by']}: {law['reason']}")
+    print(f"laws {law['elastic']} and {law['plastic']}, decided by {law['decided_by']}: {law['reason']}")
     if numerics is not None:
         drag, cells = numerics["equivalent_drag_per_s"], numerics["finer_cells_m"]
         print(

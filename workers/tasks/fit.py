@@ -15,6 +15,7 @@ from typing import Any
 from physworld.calibrate import CalibrationConfig, Journal, calibrate
 from schemas.fit import FitConfig
 from workers.context import TaskContext
+from workers.law_choice import chosen_laws
 from workers.lineage import lineage_of
 from workers.registry import HandlerResult
 from workers.stores import Stores
@@ -38,12 +39,15 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
         max_simulations=config.max_simulations,
         device=stores.settings.device,
         damping=config.damping,
+        plasticity=config.plasticity,
+        formulation=config.formulation,
     )
     folder = Path(stores.settings.data_dir) / "checkpoints" / context.lease.job_id
     journal = stored_journal(folder / JOURNAL, payload)
+    calibration, law = chosen_laws(config.law, scene, calibration, progress, context.cancelled, journal)
     fitted = calibrate(scene, calibration, progress, context.cancelled, journal)
     context.check()
-    report = fit_report(scene, fitted)
+    report = fit_report(scene, fitted, law)
     artifacts = [
         stores.artifacts.put_bytes(content, name, MEDIA_TYPES[name])
         for name, content in fit_files(scene, fitted, report).items()

@@ -28,6 +28,9 @@ def fit(
     law: Annotated[
         str | None, typer.Option(help="Elastic law by name, or auto: choose it by the data.")
     ] = None,
+    plasticity: Annotated[
+        str | None, typer.Option(help="Flow law by name; its yield is calibrated too.")
+    ] = None,
     formulation: Annotated[
         str | None, typer.Option(help="total_lagrangian, updated_lagrangian or auto.")
     ] = None,
@@ -42,6 +45,7 @@ def fit(
         "--particles": particles,
         "--simulations": simulations,
         "--law": law,
+        "--plasticity": plasticity,
         "--formulation": formulation,
     }
     options = [text for name, value in given.items() if value is not None for text in (name, str(value))]

@@ -36,6 +36,13 @@ def run(
     vertices: Annotated[int | None, typer.Option(min=4, help="Vertices of the graph.")] = None,
     particles: Annotated[int | None, typer.Option(min=50, help="Particles of the twin, about.")] = None,
     simulations: Annotated[int | None, typer.Option(min=1, help="Most simulations of the fit.")] = None,
+    law: Annotated[str | None, typer.Option(help="Elastic law by name, or auto: choose it.")] = None,
+    plasticity: Annotated[
+        str | None, typer.Option(help="Flow law by name; its yield is calibrated too.")
+    ] = None,
+    formulation: Annotated[
+        str | None, typer.Option(help="total_lagrangian, updated_lagrangian or auto.")
+    ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of demonstration and training.")] = None,
     name: Annotated[str | None, typer.Option(help="Name of the model [the scene's name].")] = None,
     close_the_loop: Annotated[
@@ -54,12 +61,18 @@ def run(
     data: Data = None,
 ) -> None:
     """Fit, demonstrate, train, publish, download: from a recording to a world model."""
-    numbers = {"episodes": episodes, "hidden": hidden, "steps": steps, "vertices": vertices, "seed": seed}
-    numbers |= {"particle_budget": particles, "max_simulations": simulations}
+    settings: dict[str, object] = {
+        "episodes": episodes,
+        "hidden": hidden,
+        "steps": steps,
+        "vertices": vertices,
+    }
+    settings |= {"seed": seed, "particle_budget": particles, "max_simulations": simulations}
+    settings |= {"law": law, "plasticity": plasticity, "formulation": formulation}
     with _service(url, token, data, workers, keep_up) as (address, alive):
         with Client(address.url, address.token) as client:
             loop = {"close_the_loop": True, "compare": compare} if close_the_loop else {}
-            report, folder = _run(client, scene, name, numbers, loop, out, address.data, alive)
+            report, folder = _run(client, scene, name, settings, loop, out, address.data, alive)
     print_report(report)
     if json is not None:
         write_report(report, json)
@@ -103,7 +116,7 @@ def _run(
     client: Client,
     scene: Path,
     name: str | None,
-    numbers: dict[str, int | None],
+    settings: dict[str, object],
     loop: dict[str, bool],
     out: Path | None,
     data: Path | None,
@@ -119,7 +132,7 @@ def _run(
     )
     for warning in uploaded.warnings:
         stdout.print(f"warning: {warning}", markup=False, soft_wrap=True)
-    pipeline = client.pipelines.create(_pipeline(uploaded.id, name, numbers, loop))
+    pipeline = client.pipelines.create(_pipeline(uploaded.id, name, settings, loop))
     stdout.print(f"job: {pipeline.id}")
     try:
         pipeline, stages = follow(client, pipeline.id, alive, CLOSED_LOOP if loop else STAGES)
@@ -140,10 +153,10 @@ def _run(
 
 
 def _pipeline(
-    scene_id: str, name: str | None, numbers: dict[str, int | None], loop: dict[str, bool]
+    scene_id: str, name: str | None, settings: dict[str, object], loop: dict[str, bool]
 ) -> PipelineCreate:
     """The body of the request: only what was given; the service fills in its defaults."""
-    given = {key: value for key, value in numbers.items() if value is not None}
+    given = {key: value for key, value in settings.items() if value is not None}
     body: dict[str, object] = {"scene_id": scene_id, **loop}
     if name is not None:
         body["model_name"] = name

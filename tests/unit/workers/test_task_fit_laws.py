@@ -1,0 +1,83 @@
+"""Fits of the service under other laws: named ones, a chosen one, and a twin that flows demonstrates."""
+
+from __future__ import annotations
+
+from typing import get_args
+
+import pytest
+from pydantic import ValidationError
+from test_tasks import _drain, _make_dataset
+
+from physworld.calibrate import Journal
+from physworld.materials.library import ROD_LAWS, SHEET_LAWS, SOLID_LAWS
+from physworld.materials.plastic import PLASTICITIES
+from schemas.fit import ElasticLaw, Fit, FitConfig, FlowLaw
+from schemas.pipeline import PipelineCreate
+from schemas.trace import TraceCreate
+from storage import jobs, resources
+from workers.law_choice import AUTO, chosen_laws
+from workers.stores import Stores
+
+SMALL = {"particle_budget": 60, "max_simulations": 8, "damping": "none"}
+
+
+def fitted(runtime, scene_id: str, **laws: str) -> Fit:
+    with runtime.database.session() as session:
+        job = jobs.create_fit(session, scene_id, FitConfig.model_validate({**SMALL, **laws}))
+    _drain(runtime)
+    with runtime.database.reading() as session:
+        return resources.get_fit(session, job.outputs[0].id)
+
+
+def test_the_wire_names_every_law_of_the_library() -> None:
+    assert set(get_args(ElasticLaw)) == {AUTO, *SOLID_LAWS, *SHEET_LAWS, *ROD_LAWS}
+    assert set(get_args(FlowLaw)) == set(PLASTICITIES)
+
+
+def test_a_flowing_twin_is_fitted_and_demonstrates(runtime_with, stores: Stores, scene_id: str) -> None:
+    fit = fitted(runtime_with(), scene_id, plasticity="von_mises")
+    assert fit.state == "ready" and "yield_stress_pa" in fit.parameters
+    assert fit.metrics["formulation"]["name"] == "updated_lagrangian"
+    assert (fit.metrics["law"]["plastic"], fit.metrics["law"]["decided_by"]) == ("von_mises", "given")
+    job, dataset = _make_dataset(runtime_with(), fit, episodes=2, frames=6)
+    assert (job.state, dataset.state, dataset.statistics["episodes"]) == ("succeeded", "sealed", 2)
+
+
+def test_a_law_is_chosen_by_cross_validation_and_recorded(
+    runtime_with, scene_id: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("PHYSWORLD_LAW_URL", raising=False)
+    fit = fitted(runtime_with(), scene_id, law="auto")
+    assert fit.metrics["law"]["decided_by"] == "cross_validation"
+    assert set(fit.metrics["law"]["figures"]["held_out_rms_m"]) >= {"neo_hookean", "fixed_corotated"}
+
+
+def test_a_choice_that_an_earlier_attempt_made_is_kept() -> None:
+    from tiny_scene import tiny_scene
+
+    from physworld.calibrate import CalibrationConfig
+
+    made = {
+        "elastic": "hencky",
+        "plastic": "von_mises",
+        "decided_by": "model m",
+        "reason": "r",
+        "figures": {},
+    }
+    texts: list[str] = []
+    Journal("k", None, texts.append).step("law", lambda: made)
+    config, choice = chosen_laws(
+        AUTO, tiny_scene(), CalibrationConfig(particle_budget=60), journal=Journal("k", texts[-1])
+    )
+    assert (config.law, config.plasticity, choice.decided_by) == ("hencky", "von_mises", "model m")
+
+
+@pytest.mark.parametrize(
+    "fit", [{"law": "hencky"}, {"formulation": "updated_lagrangian"}, {"plasticity": "von_mises"}]
+)
+def test_a_trace_refuses_other_physics(fit: dict) -> None:
+    with pytest.raises(ValidationError, match=r"fit\.law, fit\.plasticity"):
+        TraceCreate.model_validate({"scene_id": "scn_x", "fit": fit})
+    with pytest.raises(ValidationError, match=r"fit\.law, fit\.plasticity"):
+        PipelineCreate.model_validate({"scene_id": "scn_x", "close_the_loop": True, "fit": fit})
+    PipelineCreate.model_validate({"scene_id": "scn_x", "fit": fit})
