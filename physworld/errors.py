@@ -6,7 +6,8 @@ PhysworldError
 │   ├── UnstableSimulation  a state is not finite, or an element inverted
 │   ├── CFLViolation        a forced time step exceeds the stable one
 │   ├── ParticlesLeftTheGrid  material left the stated workspace
-│   └── ContactFailed       a collider is too fast for its contact, or material came too deep into it
+│   ├── ContactFailed       a collider is too fast for its contact, or material came too deep into it
+│   └── EpisodeRejected     every try at a demonstration was rejected
 ├── UnknownEffect           no effect or strength of that name
 ├── EffectRefused           the effect makes no sense for this twin
 ├── BatchRefused            the episodes cannot be integrated side by side
@@ -47,6 +48,10 @@ class ParticlesLeftTheGrid(SimulationError):
 
 class ContactFailed(SimulationError):
     """A collider is too fast for its contact, or material came too deep into it."""
+
+
+class EpisodeRejected(SimulationError):
+    """Every try at a demonstration was rejected."""
 
 
 class UnknownEffect(PhysworldError):

@@ -1,7 +1,7 @@
 """Demonstrations: Bézier motions of the grips, part-aware property fields, episodes run by the twin."""
 
+from physworld.demonstrate.config import DemonstrationConfig, StrengthRange
 from physworld.demonstrate.episode import (
-    DemonstrationConfig,
     EpisodePlan,
     derived_seed,
     make_episode,
@@ -12,6 +12,7 @@ from physworld.demonstrate.episode import (
 __all__ = [
     "DemonstrationConfig",
     "EpisodePlan",
+    "StrengthRange",
     "derived_seed",
     "make_episode",
     "plan_episode",

@@ -6,22 +6,24 @@ and a replay at most as long as the training frames; its motion is known between
 (``control_times``), so that the twin is driven smoothly.
 
 Rejected are episodes that the twin cannot simulate, that are not finite, or whose material leaves the
-workspace: each raises a ``SimulationError`` with its numbers. ``make_episode`` plans anew with a derived seed
-and keeps the reasons.
+workspace: each raises a ``SimulationError`` with its numbers. ``make_episode`` plans anew with the seed of the
+next try and keeps the reasons; after the last try it raises ``EpisodeRejected``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from functools import lru_cache
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from physworld.demonstrate.limits import MotionLimits, limits_of, training_track
+from physworld.demonstrate.config import DemonstrationConfig
+from physworld.demonstrate.limits import MotionLimits, limits_of, pushers_of, training_track
 from physworld.demonstrate.motion import random_motion
-from physworld.demonstrate.perturbation import perturb_properties
+from physworld.demonstrate.paths import PathStyle
+from physworld.demonstrate.properties import Drawn, draw_properties
 from physworld.demonstrate.replay import (
     VARIANTS,
     WARP,
@@ -30,8 +32,13 @@ from physworld.demonstrate.replay import (
     playback_duration,
     replayed,
 )
-from physworld.errors import ParticlesLeftTheGrid, SceneUnsupported, SimulationError, UnstableSimulation
-from physworld.geometry.features import carry_features, part_features
+from physworld.errors import (
+    EpisodeRejected,
+    ParticlesLeftTheGrid,
+    SceneUnsupported,
+    SimulationError,
+    UnstableSimulation,
+)
 from physworld.scene import Scene
 from physworld.worldmodel.clock import model_dt
 
@@ -44,49 +51,13 @@ WORKSPACE_MARGIN = 1.5  # in object sizes, around the start state and the contro
 
 
 @dataclass(frozen=True)
-class DemonstrationConfig:
-    """How demonstrations are drawn.
-
-    Attributes:
-        frames: ticks of an episode; None: as many as the recording lasts, at most ``max_frames``.
-        max_frames: keeps long recordings affordable.
-        property_sigma: σ of log(E/E_fit).
-        density_ratio: σ of log(ρ/ρ_fit), in shares of ``property_sigma``.
-        length_scale: ℓ of the property field; 1 is the RMS feature distance of two particles.
-        feature_count, landmarks: size of the spectral embedding, and of the Nyström approximation.
-        replay_share: share of episodes that replay the recording's training frames, plain or varied.
-        control_substeps: control points per tick that the twin is driven with.
-        attempts: plans tried by ``make_episode`` before it gives up.
-    """
-
-    frames: int | None = None
-    max_frames: int = 150
-    property_sigma: float = 0.2
-    density_ratio: float = 0.5
-    length_scale: float = 1.0
-    feature_count: int = 8
-    landmarks: int = 96
-    replay_share: float = 0.2
-    control_substeps: int = 4
-    attempts: int = 4
-
-    def __post_init__(self) -> None:
-        if self.frames is not None and self.frames < 2:
-            raise ValueError(f"{self.frames} frames; an episode has at least 2")
-        if self.max_frames < 2 or self.control_substeps < 1 or self.attempts < 1:
-            raise ValueError(f"not usable: {asdict(self)}")
-        if not (0.0 <= self.replay_share <= 1.0 and self.property_sigma >= 0.0 and self.density_ratio >= 0.0):
-            raise ValueError(f"replay share {self.replay_share:g}, property sigma {self.property_sigma:g}")
-
-
-@dataclass(frozen=True)
 class EpisodePlan:
     """What an episode will do; T ticks, K control points, P particles.
 
     Attributes:
         times: ticks [s] from 0, (T,) float64.
         controllers: control points at the ticks [m], (T, K, 3) float64.
-        properties: log(E/E_fit) and log(ρ/ρ_fit), (P, 2) float64.
+        drawn: what the episode's twin differs in.
         motion: the pattern's name.
         seed: everything random follows from it.
         control_times, control_points: the same motion between the ticks, (S,) and (S, K, 3).
@@ -97,7 +68,7 @@ class EpisodePlan:
 
     times: np.ndarray
     controllers: np.ndarray
-    properties: np.ndarray
+    drawn: Drawn
     motion: str
     seed: int
     control_times: np.ndarray
@@ -105,6 +76,11 @@ class EpisodePlan:
     from_rest: bool
     scale: float
     size_m: float
+
+    @property
+    def properties(self) -> np.ndarray:
+        """log(E/E_fit) and log(ρ/ρ_fit), (P, 2) float64."""
+        return self.drawn.fields
 
     def attributes(self) -> dict[str, Any]:
         """What is recorded beside the arrays; JSON types only."""
@@ -117,18 +93,13 @@ class EpisodePlan:
             "dt_s": float(self.times[1] - self.times[0]),
             "peak_control_speed_m_s": float(speeds.max(initial=0.0)),
             "control_reach_m": float(np.abs(self.controllers - self.controllers[0]).max(initial=0.0)),
-            "log_modulus_std": float(self.properties[:, 0].std()),
-            "log_modulus_mean": float(self.properties[:, 0].mean()),
+            **self.drawn.attributes(),
         }
-
-    def rejection(self, error: SimulationError) -> dict[str, Any]:
-        """What is recorded of a plan that was not accepted; JSON types only."""
-        return {"seed": self.seed, "motion": self.motion, "reason": str(error)}
 
 
 def plan_episode(scene: Scene, twin: Twin, config: DemonstrationConfig, seed: int) -> EpisodePlan:
     """The episode that ``seed`` stands for."""
-    if not twin.controller_groups:
+    if not twin.controller_groups and not pushers_of(scene):
         raise SceneUnsupported(f"scene {scene.name!r} has no controllers: no motion can be demonstrated")
     choice, motion_generator, property_generator = (
         np.random.default_rng(stream) for stream in np.random.SeedSequence(seed).spawn(3)
@@ -144,20 +115,16 @@ def plan_episode(scene: Scene, twin: Twin, config: DemonstrationConfig, seed: in
         from_rest = True
         control_times = _control_times(duration, dt, config.control_substeps)
         first_pose = training_track(scene)[1][0]
-        drawn = random_motion(first_pose, limits, control_times, motion_generator)
-        motion, points, scale = drawn.pattern, drawn.points, drawn.scale
+        style = PathStyle(config.motion == "linear", config.curvature_limit, config.arc_tolerance)
+        moved = random_motion(
+            first_pose, limits, control_times, motion_generator, weights=config.patterns, style=style
+        )
+        motion, points, scale = moved.pattern, moved.points, moved.scale
     ticks = slice(None, None, config.control_substeps)
     return EpisodePlan(
         times=control_times[ticks],
         controllers=points[ticks],
-        properties=perturb_properties(
-            _features(scene, twin, config),
-            property_generator,
-            sigma_modulus=config.property_sigma,
-            sigma_density=config.property_sigma * config.density_ratio,
-            length_scale=config.length_scale,
-            landmarks=config.landmarks,
-        ),
+        drawn=draw_properties(scene, twin, config, property_generator),
         motion=motion,
         seed=seed,
         control_times=control_times,
@@ -170,7 +137,7 @@ def plan_episode(scene: Scene, twin: Twin, config: DemonstrationConfig, seed: in
 
 def run_episode(twin: Twin, plan: EpisodePlan, progress: Progress | None = None) -> dict[str, np.ndarray]:
     """Simulate a plan: times (T,) f8; f4: particles (T, P, 3), controllers (T, K, 3), properties (P, 2)."""
-    particles = twin.simulate(
+    particles = plan.drawn.twin(twin).simulate(
         plan.control_times,
         plan.control_points,
         plan.times,
@@ -195,17 +162,46 @@ def episode_arrays(plan: EpisodePlan, particles: np.ndarray) -> dict[str, np.nda
 def make_episode(
     scene: Scene, twin: Twin, config: DemonstrationConfig, seed: int, progress: Progress | None = None
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Arrays and attributes of an accepted episode; the rejected ones before it are in ``rejected``."""
+    """Arrays and attributes of an accepted episode; the rejected ones before it are in ``rejected``.
+
+    Raises:
+        EpisodeRejected: none of ``config.attempts`` tries was accepted; the message counts the reasons.
+    """
     rejected: list[dict[str, Any]] = []
-    while True:
-        tried = len(rejected)
-        plan = plan_episode(scene, twin, config, seed if tried == 0 else derived_seed(seed, tried))
+    while len(rejected) < config.attempts:
+        tried = try_seed(seed, len(rejected))
+        plan = None
         try:
-            return run_episode(twin, plan, progress), {**plan.attributes(), "rejected": rejected}
+            plan = plan_episode(scene, twin, config, tried)
+            return run_episode(twin, plan, progress), accepted_attributes(plan, rejected)
         except SimulationError as error:
-            rejected.append(plan.rejection(error))
-            if len(rejected) == config.attempts:
-                raise
+            rejected.append(rejection(tried, plan, error))
+    raise all_rejected(seed, rejected)
+
+
+def try_seed(seed: int, tries_before: int) -> int:
+    """The seed of the next try at the episode that ``seed`` stands for."""
+    return seed if tries_before == 0 else derived_seed(seed, tries_before)
+
+
+def accepted_attributes(plan: EpisodePlan, rejected: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """What is recorded of an accepted plan and of the tries before it; JSON types only."""
+    return {**plan.attributes(), "tries": len(rejected) + 1, "rejected": list(rejected)}
+
+
+def rejection(seed: int, plan: EpisodePlan | None, error: SimulationError) -> dict[str, Any]:
+    """What is recorded of a try that was not accepted; JSON types only. ``plan`` is None where it was not even made."""
+    motion = "" if plan is None else plan.motion
+    return {"seed": seed, "motion": motion, "kind": type(error).__name__, "reason": str(error)}
+
+
+def all_rejected(seed: int, rejected: Sequence[dict[str, Any]]) -> EpisodeRejected:
+    """The error of an episode without an accepted try."""
+    kinds = Counter(one["kind"] for one in rejected)
+    counted = ", ".join(f"{count} x {kind}" for kind, count in kinds.most_common())
+    return EpisodeRejected(
+        f"seed {seed}: all {len(rejected)} tries were rejected ({counted}); the last: {rejected[-1]['reason']}"
+    )
 
 
 def check_episode(particles: np.ndarray, plan: EpisodePlan) -> None:
@@ -266,30 +262,6 @@ def _replay(
         control_times = _control_times(min(duration_s, track_times[-1]), dt, substeps)
         return control_times, replayed(track_times, track, control_times)
     if motion == "replay_mirrored":
-        object_centre = twin.particles_start.mean(axis=0)
-        track, rate = mirrored(track, limits.grips, object_centre, _up(scene)), 1.0
+        track, rate = mirrored(track, limits.bodies, limits.object_centre_m, limits.up), 1.0
     control_times = _control_times(min(duration_s, playback_duration(track_times[-1], rate)), dt, substeps)
     return control_times, replayed(track_times, track, playback_clock(control_times, rate))
-
-
-def _up(scene: Scene) -> np.ndarray:
-    """The unit vector against gravity; z where there is none."""
-    strength = float(np.linalg.norm(scene.gravity_m_s2))
-    return -scene.gravity_m_s2 / strength if strength > 0.0 else np.array([0.0, 0.0, 1.0])
-
-
-def _features(scene: Scene, twin: Twin, config: DemonstrationConfig) -> np.ndarray:
-    """Supplied part features at the particles, or the spectral embedding of the rest shape."""
-    supplied = scene.part_features
-    if supplied is None:
-        return _embedding(np.ascontiguousarray(twin.particles_rest).tobytes(), config.feature_count)
-    if scene.rest_volume_points is not None and len(supplied) == len(scene.rest_volume_points):
-        return carry_features(scene.rest_volume_points, supplied, twin.particles_start)
-    seen = scene.visible[0]
-    return carry_features(scene.points[0][seen], supplied[seen], twin.particles_start)
-
-
-@lru_cache(maxsize=4)
-def _embedding(points: bytes, count: int) -> np.ndarray:
-    """``part_features`` of float64 points; the same for every episode of a twin, and a tenth of its cost."""
-    return part_features(np.frombuffer(points).reshape(-1, 3), count)

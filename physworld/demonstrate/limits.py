@@ -9,7 +9,8 @@ no motion tears the object.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -38,6 +39,8 @@ GRAPH_NEIGHBORS = 24
 JOINED_SHARE = 0.15  # grips with less material between them, in object sizes, are one body
 CLAMP_SHARE = 0.5  # the same for grips that kept their distance within STEADY_SHARE
 STEADY_SHARE = 0.1
+STRETCH = {1: 0.03, 2: 0.05, 3: 0.1}
+"""Largest extra strain of a stretch, by the body's dimension: ropes and sheets hardly give."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +55,10 @@ class MotionLimits:
         spread_min_m, spread_max_m: distances between grip centres, (G, G).
         floor_m: lowest height of a control point, or -inf.
         size_m: largest side of the rest shape's bounding box.
+        pushers: control points that carry colliders and grip nothing, one index array a collider.
+        object_centre_m: mean of the particles at the start, (3,).
+        up: unit vector against gravity, (3,).
+        stretch: how far a stretch may draw grips apart beyond ``spread_max_m``, as a share of it.
     """
 
     grips: tuple[np.ndarray, ...]
@@ -64,6 +71,15 @@ class MotionLimits:
     spread_max_m: np.ndarray
     floor_m: float
     size_m: float
+    pushers: tuple[np.ndarray, ...] = ()
+    object_centre_m: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    up: np.ndarray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    stretch: float = 0.0
+
+    @property
+    def bodies(self) -> tuple[np.ndarray, ...]:
+        """Everything that may move: grips, then pushers."""
+        return (*self.grips, *self.pushers)
 
 
 def limits_of(scene: Scene, twin: Twin) -> MotionLimits:
@@ -73,8 +89,10 @@ def limits_of(scene: Scene, twin: Twin) -> MotionLimits:
     times, track = training_track(scene)
     paths = material_paths(rest, start, track[0])
     grips = _joined_grips(twin.controller_groups, track, paths, size)
-    centres = np.stack([track[:, grip].mean(axis=1) for grip in grips], axis=1)
-    moves = centres - centres[0]
+    pushers = pushers_of(scene)
+    moves = np.concatenate([_centres(track, (body,)) for body in (*grips, *pushers)], axis=1)
+    moves = moves - moves[0]
+    centres = _centres(track, grips)
     distances = np.linalg.norm(centres[:, :, None] - centres[:, None, :], axis=-1)
     floor = _floor(scene, track, size)
     reach_min = np.minimum(moves.min(axis=(0, 1)), -REACH_FLOOR * size)
@@ -92,7 +110,24 @@ def limits_of(scene: Scene, twin: Twin) -> MotionLimits:
         spread_max_m=np.maximum(SLACK * distances.max(axis=0), material_between(grips, paths)),
         floor_m=floor,
         size_m=size,
+        pushers=pushers,
+        object_centre_m=start.mean(axis=0),
+        up=up_of(scene),
+        stretch=STRETCH[twin.lattice.dim],
     )
+
+
+def pushers_of(scene: Scene) -> tuple[np.ndarray, ...]:
+    """Controllers that carry a collider, an index array for each such collider."""
+    return tuple(
+        np.array(collider.controllers, dtype=np.int64) for collider in scene.colliders if collider.controllers
+    )
+
+
+def up_of(scene: Scene) -> np.ndarray:
+    """The unit vector against gravity, (3,); z where there is none."""
+    strength = float(np.linalg.norm(scene.gravity_m_s2))
+    return -scene.gravity_m_s2 / strength if strength > 0.0 else np.array([0.0, 0.0, 1.0])
 
 
 def training_track(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
@@ -110,6 +145,16 @@ def material_paths(rest: np.ndarray, start: np.ndarray, control_points: np.ndarr
     Particles ``rest`` and ``start`` (P, 3) are the same material; each of the ``control_points`` (K, 3)
     holds the particle of the start state that is nearest to it.
     """
+    parts = (np.ascontiguousarray(part, dtype=np.float64).tobytes() for part in (rest, start, control_points))
+    return _material_paths(*parts)
+
+
+@lru_cache(maxsize=4)
+def _material_paths(rest_bytes: bytes, start_bytes: bytes, control_bytes: bytes) -> np.ndarray:
+    """``material_paths`` of float64 points: the same for every episode of a twin, and most of its plan's cost."""
+    rest, start, control_points = (
+        np.frombuffer(part).reshape(-1, 3) for part in (rest_bytes, start_bytes, control_bytes)
+    )
     count = len(rest)
     distances, indices = cKDTree(rest).query(rest, k=min(GRAPH_NEIGHBORS, count - 1) + 1)
     rows = np.repeat(np.arange(count), indices.shape[1])
@@ -121,6 +166,8 @@ def material_paths(rest: np.ndarray, start: np.ndarray, control_points: np.ndarr
 
 def material_between(grips: Sequence[np.ndarray], paths: np.ndarray) -> np.ndarray:
     """Mean material path [m] between grips, (G, G), zero on the diagonal."""
+    if not grips:
+        return np.zeros((0, 0))
     means = [[float(paths[np.ix_(one, other)].mean()) for other in grips] for one in grips]
     return np.array(means) * (1.0 - np.eye(len(grips)))
 
@@ -133,13 +180,20 @@ def _joined_grips(
     Groups are joined when the material between them is short, or shorter than half the object while the
     recording never moved them against each other (a clamp seen by several markers).
     """
+    if not groups:
+        return ()
     material = material_between(groups, paths)
-    centres = np.stack([track[:, group].mean(axis=1) for group in groups], axis=1)
+    centres = _centres(track, groups)
     distances = np.linalg.norm(centres[:, :, None] - centres[:, None, :], axis=-1)
     steady = np.ptp(distances, axis=0) < STEADY_SHARE * distances[0]
     joined = (material < JOINED_SHARE * size) | (steady & (material < CLAMP_SHARE * size))
     count, labels = csgraph.connected_components(sparse.csr_matrix(joined), directed=False)
     return tuple(np.concatenate([groups[g] for g in np.flatnonzero(labels == c)]) for c in range(count))
+
+
+def _centres(track: np.ndarray, bodies: Sequence[np.ndarray]) -> np.ndarray:
+    """Centres of bodies of control points (S, K, 3), (S, G, 3)."""
+    return np.stack([track[:, body].mean(axis=1) for body in bodies], axis=1) if bodies else track[:, :0]
 
 
 def _turn(grips: Sequence[np.ndarray], track: np.ndarray) -> float:

@@ -1,21 +1,28 @@
 """Part-aware perturbation of physical properties: a Gaussian field over part features (paper, P3-Pert).
 
 S_ij = exp(-|F_i - F_j|² / 2ℓ²), Σ = σ²S, δ ~ N(0, Σ); the properties are multiplied by exp(δ), so that they
-stay positive. Σ of all P particles is never formed: with m landmarks spread over feature space by
-farthest-point sampling, C = S_{P,m} and W = S_{m,m} = UΛUᵀ, the Nyström approximation S ≈ C W⁻¹ Cᵀ has the
-factor C U Λ^{-1/2}, and δ = σ C U Λ^{-1/2} ξ with ξ ~ N(0, I). Its rows are scaled to unit length: each
-particle keeps its variance σ² exactly; what the landmarks do not resolve is a little more correlated.
+stay positive. Where a length scale in space is given too, S_ij has the further factor exp(-|x_i - x_j|² / 2ℓ_x²).
+Σ of all P particles is never formed: with m landmarks spread over feature space by farthest-point sampling,
+C = S_{P,m} and W = S_{m,m} = UΛUᵀ, the Nyström approximation S ≈ C W⁻¹ Cᵀ has the factor C U Λ^{-1/2}, and
+δ = σ C U Λ^{-1/2} ξ with ξ ~ N(0, I). Landmarks are doubled until they miss no more than a stated share of the
+variance anywhere. The factor's rows are scaled to unit length: each particle keeps its variance σ² exactly; what
+the landmarks do not resolve is a little more correlated.
 
-Samples are bounded by 3σ, smoothly: nothing changes below 2σ.
+Samples are bounded by 3σ and by a largest factor, smoothly: nothing changes in the inner two thirds. The baselines
+of the paper's ablation are one draw for the whole body (``uniform``) and one for each particle (``random``).
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-KEEP_SIGMAS = 2.0
+from physworld.errors import UnstableSimulation
+
+KEEP_SHARE = 2.0 / 3.0  # of the bound: up to there samples are left alone
 BOUND_SIGMAS = 3.0
 EIGENVALUE_FLOOR = 1e-9  # relative; directions below it carry no variance and would only amplify rounding
+MOST_LANDMARKS = 768
+JUMP_SIGMAS = 6.0
 
 
 def similarity(first: np.ndarray, second: np.ndarray, length_scale: float) -> np.ndarray:
@@ -24,67 +31,135 @@ def similarity(first: np.ndarray, second: np.ndarray, length_scale: float) -> np
     return np.exp(-np.maximum(squared, 0.0) / (2.0 * length_scale**2))
 
 
+def with_space(
+    features: np.ndarray, points: np.ndarray, length_scale: float, space_scale_m: float
+) -> np.ndarray:
+    """Features (P, F + 3) whose kernel at ``length_scale`` is that of features times that of ``points`` (P, 3) [m]."""
+    if not space_scale_m > 0.0:
+        raise ValueError(f"length scale in space {space_scale_m:g} m is not positive")
+    return np.concatenate([features, points * (length_scale / space_scale_m)], axis=1)
+
+
 class PropertyField:
     """The law N(0, S) over particles, ready to be sampled.
 
     Attributes:
         factor: (P, r) with factor @ factor.T ≈ S and a unit diagonal.
+        landmarks: how many were taken.
         unresolved: largest 1 - diag(C W⁻¹ Cᵀ): the share of variance that the landmarks miss somewhere.
     """
 
-    def __init__(self, features: np.ndarray, length_scale: float, landmarks: int = 96) -> None:
+    def __init__(
+        self, features: np.ndarray, length_scale: float, landmarks: int = 96, unresolved: float = 1.0
+    ) -> None:
         features = np.asarray(features, dtype=np.float64)
         if features.ndim != 2 or not np.isfinite(features).all():
             raise ValueError(f"features of shape {features.shape} must be finite and two-dimensional")
         if not length_scale > 0.0:
             raise ValueError(f"length scale {length_scale:g} is not positive")
-        chosen = farthest_points(features, landmarks)
-        between = similarity(features, features[chosen], length_scale)
-        values, vectors = np.linalg.eigh(between[chosen])
-        kept = values > EIGENVALUE_FLOOR * values[-1]
-        factor = between @ (vectors[:, kept] / np.sqrt(values[kept]))
-        norms = np.linalg.norm(factor, axis=1)
-        self.unresolved = float(1.0 - np.min(norms) ** 2)
-        # A particle far from every landmark has a row of nearly zero length; m ≥ the number of such islands
-        # in practice, and the floor keeps the division finite where it is not.
+        while True:
+            chosen = farthest_points(features, landmarks)
+            between = similarity(features, features[chosen], length_scale)
+            values, vectors = np.linalg.eigh(between[chosen])
+            kept = values > EIGENVALUE_FLOOR * values[-1]
+            factor = between @ (vectors[:, kept] / np.sqrt(values[kept]))
+            norms = np.linalg.norm(factor, axis=1)
+            self.unresolved = float(1.0 - np.min(norms) ** 2)
+            self.landmarks = len(chosen)
+            if self.unresolved <= unresolved or landmarks >= min(MOST_LANDMARKS, len(features)):
+                break
+            landmarks *= 2
+        # A particle far from every landmark has a row of nearly zero length; the floor keeps the division finite.
         self.factor = factor / np.maximum(norms, 1e-6)[:, None]
+        self._steps: tuple[np.ndarray, np.ndarray] | None = None
 
     def sample(self, generator: np.random.Generator) -> np.ndarray:
         """One draw of N(0, S), (P,)."""
         return self.factor @ generator.standard_normal(self.factor.shape[1])
 
+    def step_sizes(self, pairs: np.ndarray) -> np.ndarray:
+        """Standard deviation of δ_i - δ_j over σ for pairs (M, 2) of particles, (M,); kept for the same pairs."""
+        if self._steps is None or self._steps[0] is not pairs:
+            apart = np.linalg.norm(self.factor[pairs[:, 0]] - self.factor[pairs[:, 1]], axis=1)
+            self._steps = pairs, apart
+        return self._steps[1]
 
-def bounded(values: np.ndarray) -> np.ndarray:
-    """Standard-normal values within ±3: identity up to ±2, then a tanh that joins it with equal slope."""
-    over = np.maximum(np.abs(values) - KEEP_SIGMAS, 0.0)
-    span = BOUND_SIGMAS - KEEP_SIGMAS
-    return np.where(over > 0.0, np.sign(values) * (KEEP_SIGMAS + span * np.tanh(over / span)), values)
+
+def bounded(values: np.ndarray, most: float = BOUND_SIGMAS) -> np.ndarray:
+    """Values within ±``most``: identity up to two thirds of it, then a tanh that joins it with equal slope."""
+    keep = KEEP_SHARE * most
+    over = np.maximum(np.abs(values) - keep, 0.0)
+    span = most - keep
+    return np.where(over > 0.0, np.sign(values) * (keep + span * np.tanh(over / span)), values)
 
 
-def perturb_properties(
-    features: np.ndarray,
+def perturb(
+    kind: str,
+    sigma: float,
+    count: int,
+    field: PropertyField | None,
     generator: np.random.Generator,
-    *,
-    sigma_modulus: float,
-    sigma_density: float,
-    length_scale: float = 1.0,
-    landmarks: int = 96,
+    largest_factor: float = np.inf,
 ) -> np.ndarray:
-    """log(E/E_fit) and log(ρ/ρ_fit) per particle, (P, 2) float64; the two fields are independent.
+    """Log factors of one property, (P,) float64.
 
     Args:
-        features: part features (P, F) of unit RMS distance (``geometry.features``).
-        sigma_modulus, sigma_density: standard deviations in the log.
-        length_scale: ℓ in the same unit: 1 is the distance of two random particles.
+        kind: ``p3`` (needs a ``field``), ``uniform``, ``random``, ``none``.
+        sigma: standard deviation in the log, before the bound.
+        count: P.
+        largest_factor: bound of the factor and of its inverse.
     """
-    field = PropertyField(features, length_scale, landmarks)
-    return np.stack(
-        [
-            sigma_modulus * bounded(field.sample(generator)),
-            sigma_density * bounded(field.sample(generator)),
-        ],
-        axis=1,
-    )
+    if kind == "none" or sigma == 0.0:
+        return np.zeros(count)
+    if kind == "p3":
+        if field is None:
+            raise ValueError("a part-aware perturbation needs a field over part features")
+        normal = field.sample(generator)
+    elif kind == "uniform":
+        normal = np.full(count, generator.standard_normal())
+    elif kind == "random":
+        normal = generator.standard_normal(count)
+    else:
+        raise ValueError(f"unknown perturbation {kind!r}")
+    return bounded(sigma * normal, min(BOUND_SIGMAS * sigma, float(np.log(largest_factor))))
+
+
+def check_field(
+    values: np.ndarray,
+    sigma: float,
+    neighbours: np.ndarray,
+    field: PropertyField | None,
+    largest_factor: float = np.inf,
+) -> float:
+    """Refuse log factors (P,) that pass their bounds or jump; the root mean square step between neighbours, in σ.
+
+    A field over features has E|δ_i - δ_j|² = 2σ²(1 - S_ij). A step of more than six of these standard deviations
+    between ``neighbours`` (M, 2), pairs of particles side by side, does not belong to it.
+
+    Raises:
+        UnstableSimulation: with the numbers.
+    """
+    if not np.isfinite(values).all():
+        raise UnstableSimulation(
+            f"{int((~np.isfinite(values)).sum())} of {len(values)} properties are not finite"
+        )
+    most = min(BOUND_SIGMAS * sigma, float(np.log(largest_factor)))
+    if float(np.abs(values).max(initial=0.0)) > most * (1.0 + 1e-9):
+        raise UnstableSimulation(
+            f"a property is exp({np.abs(values).max():.4f}) times its fitted value, the bound is exp({most:.4f})"
+        )
+    if sigma == 0.0 or not len(neighbours):
+        return 0.0
+    steps = values[neighbours[:, 0]] - values[neighbours[:, 1]]
+    if field is not None:
+        allowed = JUMP_SIGMAS * sigma * field.step_sizes(neighbours) + 1e-9
+        if np.any(np.abs(steps) > allowed):
+            worst = int(np.argmax(np.abs(steps) - allowed))
+            raise UnstableSimulation(
+                f"particles {neighbours[worst].tolist()} side by side differ by {abs(steps[worst]):.4f} in the log "
+                f"of a property, {allowed[worst]:.4f} is the most that their features allow"
+            )
+    return float(np.sqrt(np.mean(steps**2)) / sigma)
 
 
 def farthest_points(features: np.ndarray, count: int) -> np.ndarray:

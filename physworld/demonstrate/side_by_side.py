@@ -12,15 +12,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from physworld.batch import Episode, simulate_batch
+from physworld.demonstrate.config import DemonstrationConfig
 from physworld.demonstrate.episode import (
-    DemonstrationConfig,
     EpisodePlan,
     Progress,
-    derived_seed,
+    accepted_attributes,
+    all_rejected,
     episode_arrays,
     plan_episode,
+    rejection,
+    try_seed,
 )
-from physworld.errors import SimulationError
+from physworld.errors import BatchRefused, SimulationError
 from physworld.scene import Scene
 
 if TYPE_CHECKING:
@@ -39,28 +42,35 @@ def make_episodes(
     """Arrays and attributes of an accepted episode for each seed, or the error of its last attempt.
 
     Raises:
-        BatchRefused: the twin cannot be simulated side by side.
+        BatchRefused: the twin cannot be simulated side by side, or its effects differ from episode to episode.
     """
+    if config.strengths:
+        raise BatchRefused(f"{len(config.strengths)} strengths of effects that each episode draws for itself")
     made: list[Made | SimulationError | None] = [None] * len(seeds)
     rejected: list[list[dict[str, Any]]] = [[] for _ in seeds]
     waiting = list(range(len(seeds)))
     while waiting:
-        plans = {}
+        plans: dict[int, EpisodePlan] = {}
+        refused: dict[int, tuple[EpisodePlan | None, SimulationError]] = {}
         for place in waiting:
-            tried = len(rejected[place])
-            seed = seeds[place] if tried == 0 else derived_seed(seeds[place], tried)
-            plans[place] = plan_episode(scene, twin, config, seed)
-        waiting = []
+            try:
+                plans[place] = plan_episode(scene, twin, config, try_seed(seeds[place], len(rejected[place])))
+            except SimulationError as error:
+                refused[place] = None, error
         for together in _starting_together(twin, plans):
             for place, result in _simulated(twin, {k: plans[k] for k in together}, progress).items():
-                if not isinstance(result, SimulationError):
-                    made[place] = (result, {**plans[place].attributes(), "rejected": rejected[place]})
-                    continue
-                rejected[place].append(plans[place].rejection(result))
-                if len(rejected[place]) == config.attempts:
-                    made[place] = result
+                if isinstance(result, SimulationError):
+                    refused[place] = plans[place], result
                 else:
-                    waiting.append(place)
+                    made[place] = result, accepted_attributes(plans[place], rejected[place])
+        waiting = []
+        for place, (plan, error) in sorted(refused.items()):
+            tried = try_seed(seeds[place], len(rejected[place]))
+            rejected[place].append(rejection(tried, plan, error))
+            if len(rejected[place]) == config.attempts:
+                made[place] = all_rejected(seeds[place], rejected[place])
+            else:
+                waiting.append(place)
     return [one for one in made if one is not None]
 
 
@@ -77,7 +87,12 @@ def _simulated(
     """Arrays of the plans, or why they cannot be trusted."""
     episodes = [
         Episode(
-            plan.control_times, plan.control_points, plan.times, plan.properties, from_rest=plan.from_rest
+            plan.control_times,
+            plan.control_points,
+            plan.times,
+            plan.properties,
+            plan.drawn.parameters,
+            plan.from_rest,
         )
         for plan in plans.values()
     ]

@@ -83,6 +83,17 @@ class SpeedProfile:
         return rise, fall
 
 
+@dataclass(frozen=True)
+class ConstantSpeed:
+    """Uniform motion without ramps: what VMP-Gen is compared with (paper, ablation of the motion pattern)."""
+
+    duration_s: float
+
+    def progress(self, t: np.ndarray) -> np.ndarray:
+        """Share of the way, t/D in [0, 1]."""
+        return np.clip(np.asarray(t, dtype=np.float64) / self.duration_s, 0.0, 1.0)
+
+
 def profile_for(
     distance_m: float,
     peak_speed_m_s: float,

@@ -20,7 +20,8 @@ import numpy as np
 
 from physworld.demonstrate.bezier import ArcLength, bent
 from physworld.demonstrate.limits import MotionLimits
-from physworld.demonstrate.motion import GripPath, Segment, broken_limit, largest_share, rigid_points
+from physworld.demonstrate.motion import broken_limit, largest_share, rigid_points
+from physworld.demonstrate.paths import GripPath, Segment
 from physworld.demonstrate.speed_profile import profile_for
 
 COORDINATES = {"hold": 0, "lift": 4, "carry": 12, "shake": 5, "turn": 5}

@@ -17,7 +17,13 @@ from physworld.demonstrate import (
     run_episode,
 )
 from physworld.demonstrate.episode import check_episode, episode_frames
-from physworld.errors import ParticlesLeftTheGrid, SceneUnsupported, SimulationError, UnstableSimulation
+from physworld.errors import (
+    EpisodeRejected,
+    ParticlesLeftTheGrid,
+    SceneUnsupported,
+    SimulationError,
+    UnstableSimulation,
+)
 
 CONFIG = DemonstrationConfig(frames=12)
 
@@ -126,6 +132,7 @@ def test_an_episode_that_cannot_be_simulated_is_replaced_and_the_reasons_are_kep
                 continue
             if attributes["rejected"]:
                 first = attributes["rejected"][0]
+                assert first["kind"] and attributes["tries"] == len(attributes["rejected"]) + 1
                 assert first["seed"] == seed and any(c.isdigit() for c in first["reason"])
                 assert attributes["seed"] == derived_seed(seed, len(attributes["rejected"]))
                 assert np.isfinite(arrays["particles"]).all()
@@ -135,7 +142,7 @@ def test_an_episode_that_cannot_be_simulated_is_replaced_and_the_reasons_are_kep
 
 def test_after_the_last_attempt_the_reason_is_raised(block, block_twin):
     jelly = block_twin.with_parameters(youngs_modulus_pa=100.0)
-    with pytest.raises(SimulationError, match=r"t = \d"):
+    with pytest.raises(EpisodeRejected, match=r"all 2 tries were rejected \(2 x .*frame \d"):
         make_episode(block, jelly, DemonstrationConfig(frames=40, attempts=2), 0)
 
 

@@ -8,13 +8,9 @@ import numpy as np
 import pytest
 
 from physworld.demonstrate.limits import limits_of
-from physworld.demonstrate.motion import (
-    broken_limit,
-    patterns_for,
-    random_motion,
-    random_path,
-    rigid_points,
-)
+from physworld.demonstrate.motion import broken_limit, random_motion, rigid_points
+from physworld.demonstrate.paths import random_path
+from physworld.demonstrate.patterns import patterns_for
 
 TIMES = np.arange(0.0, 4.0, 1.0 / 240.0)
 SEEDS = range(6)
@@ -25,7 +21,7 @@ def limits(block, block_twin):
     return limits_of(block, block_twin)
 
 
-@pytest.mark.parametrize("pattern", ["single", "together", "bimanual"])
+@pytest.mark.parametrize("pattern", ["single", "lift", "push", "twist", "together", "bimanual"])
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_motion_keeps_every_limit_and_starts_at_rest_at_the_first_pose(block, limits, pattern, seed):
     first = block.controllers[0]
@@ -81,7 +77,7 @@ def test_hold_one_holds_one_of_three(block, block_twin):
     three[:, 6, 0] += 0.02 * np.sin(block.times)  # it moves against the others: a grip of its own
     limits = limits_of(replace(block, controllers=three), replace(block_twin, controller_groups=groups))
     assert len(limits.grips) == 3
-    assert patterns_for(3)[-1] == "hold_one"
+    assert patterns_for(limits, three[0])[-1] == "hold_one"
     points = random_motion(three[0], limits, TIMES, np.random.default_rng(1), "hold_one").points
     still = [np.abs(points[:, grip] - three[0, grip]).max() < 1e-12 for grip in limits.grips]
     assert sum(still) == 1
@@ -94,10 +90,6 @@ def test_the_same_seed_gives_the_same_motion_and_another_seed_another(block, lim
     )
     np.testing.assert_array_equal(one, two)
     assert np.abs(one - other).max() > 0.005
-
-
-def test_one_grip_has_one_pattern():
-    assert patterns_for(1) == ("single",)
 
 
 def test_motions_near_the_ground_stay_above_it(held_block, block_twin):
