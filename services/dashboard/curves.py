@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from schemas.model import ModelComparison
+
 if TYPE_CHECKING:
     from physworld.scene import Scene
 
@@ -58,6 +60,27 @@ def chart(
             for name, values in errors.items()
         ],
     }
+
+
+def comparison_chart(found: ModelComparison) -> dict[str, object]:
+    """Curves of two versions over the times of the first; what only the scene decides (baselines) is drawn once."""
+    times = np.array(found.curves_a.times_s, dtype=float)
+    errors: dict[str, np.ndarray] = {}
+    drawn = chart(times, errors, split=None)
+    series = []
+    for number, curves, roles in (
+        (found.a, found.curves_a, {"twin": "rigid", "world_model_finetuned": "other"}),
+        (found.b, found.curves_b, {"twin": "predicted", "world_model_finetuned": "model"}),
+    ):
+        for name, values in curves.track_m.items():
+            if name not in roles or len(values) != len(curves.times_s) or len(values) < 2:
+                continue
+            given = np.array([math.nan if value is None else value for value in values], dtype=float)
+            label = f"{LABELS[name][0]}, version {number}"
+            placed = onto(np.array(curves.times_s, dtype=float), given, times)
+            one = chart(times, {name: placed}, split=None)["series"]
+            series += [{**item, "label": label, "role": roles[name]} for item in one]  # type: ignore[attr-defined]
+    return {**drawn, "series": series}
 
 
 def given_curves(metrics: Mapping[str, Any]) -> tuple[np.ndarray, dict[str, np.ndarray]] | None:

@@ -8,18 +8,22 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import HTMLResponse, JSONResponse, Response
 
-from schemas.model import Model, ModelVersion
+from schemas.model import Model, ModelComparison, ModelVersion
 from services.dashboard.clouds import Cloud, Layer, measured_layers, resampled, scene_cloud, thinned
-from services.dashboard.curves import chart, given_curves
+from services.dashboard.curves import chart, comparison_chart, given_curves
 from services.dashboard.pages_scenes import PREDICTION, layer_response, recording_of
 from services.dashboard.site import BASE, Site
 from services.dashboard.tables import held_out_of
 from storage import registry, resources
+from storage.comparison import compare_versions
 from storage.errors import NotFound
 
 PAGE_SIZE = 50
 
+CHOICES = 200
+
 Cursor = Annotated[str | None, Query(max_length=512)]
+Chosen = Annotated[str | None, Query(max_length=64)]
 
 
 @dataclass(frozen=True)
@@ -59,8 +63,33 @@ def router(site: Site) -> APIRouter:
             next_cursor=page.next_cursor,
         )
 
+    @routes.get("/models/{name}/compare")
+    def compare_page(request: Request, name: str, a: Chosen = None, b: Chosen = None) -> HTMLResponse:
+        with site.database.reading() as session:
+            model = registry.get_model(session, name)
+            ready = registry.list_versions(session, name, limit=CHOICES, state="ready").data
+        numbers = [str(version.version) for version in ready]
+        choices = [*sorted(model.aliases), *numbers]
+        first = a or (numbers[1] if len(numbers) > 1 else next(iter(numbers), None))
+        second = b or next(iter(numbers), None)
+        found = None if first is None or second is None else _compared(site, name, first, second)
+        return site.page(
+            request,
+            "compare.html",
+            model=model,
+            choices=choices,
+            a=first,
+            b=second,
+            found=found,
+            has_curve=found is not None and len(found.curves_a.times_s) > 1,
+        )
+
+    @routes.get("/models/{name}/compare/curve")
+    def compare_curve(name: str, a: str, b: str) -> Response:
+        return JSONResponse(comparison_chart(_compared(site, name, a, b)))
+
     @routes.get("/models/{name}/{number}")
-    def version_page(request: Request, name: str, number: int) -> HTMLResponse:
+    def version_page(request: Request, name: str, number: str) -> HTMLResponse:
         version = _version(site, name, number)
         return site.page(
             request,
@@ -71,25 +100,31 @@ def router(site: Site) -> APIRouter:
         )
 
     @routes.get("/models/{name}/{number}/curve")
-    def curve(name: str, number: int) -> Response:
+    def curve(name: str, number: str) -> Response:
         given = given_curves(_version(site, name, number).metrics)
         if given is None:
             raise NotFound("curve of model version", f"{name}:{number}")
         return JSONResponse(chart(*given, split=None))
 
     @routes.get("/models/{name}/{number}/cloud")
-    def cloud(name: str, number: int) -> Response:
+    def cloud(name: str, number: str) -> Response:
         url = f"{BASE}/models/{name}/{number}/cloud"
         return JSONResponse(_cloud(site, _version(site, name, number)).describe(url))
 
     @routes.get("/models/{name}/{number}/cloud/{layer}")
-    def cloud_layer(name: str, number: int, layer: str) -> Response:
+    def cloud_layer(name: str, number: str, layer: str) -> Response:
         return layer_response(_cloud(site, _version(site, name, number)), layer)
 
     return routes
 
 
-def _version(site: Site, name: str, number: int) -> ModelVersion:
+def _compared(site: Site, name: str, a: str, b: str) -> ModelComparison:
+    with site.database.reading() as session:
+        pair = registry.get_version(session, name, a), registry.get_version(session, name, b)
+    return compare_versions(*pair)
+
+
+def _version(site: Site, name: str, number: str) -> ModelVersion:
     with site.database.reading() as session:
         return registry.get_version(session, name, number)
 

@@ -15,7 +15,7 @@ from typing import NoReturn
 
 import typer
 
-from physworld_client.cli import effects, fit, lists, loop, run, trace, up
+from physworld_client.cli import effects, fit, lists, loop, registry, run, trace, up
 from physworld_client.cli.output import stderr
 from physworld_client.errors import PhysWorldError
 
@@ -36,7 +36,7 @@ app.add_typer(lists.scenes, name="scenes")
 app.add_typer(lists.fits, name="fits")
 app.add_typer(loop.traces, name="traces")
 app.add_typer(lists.datasets, name="datasets")
-app.add_typer(lists.models, name="models")
+app.add_typer(registry.models, name="models")
 app.add_typer(lists.jobs, name="jobs")
 
 
