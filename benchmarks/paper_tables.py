@@ -1,0 +1,319 @@
+"""``python -m benchmarks.paper_tables --json FILE``: the paper's tables as relations, with their spread over seeds.
+
+On scenes with known truth, made by engines that are not ours, and on a real recording:
+
+* the world model against the twin that taught it, and against the same network trained on the recording alone;
+* with and without fine-tuning of Φ;
+* VMP-Gen against uniform linear motion; P3-Pert against none, uniform and random perturbation of the properties;
+* steps per second of the world model and of the twin;
+* motions of a kind that the training did not see (``benchmarks.unseen_motion``).
+
+Every row stands beside the do-nothing baselines of its scene. Each cell (scene, condition, seed) is kept in
+``--cells`` as soon as it is done: a run that was ended goes on where it stopped, and a report says how many cells
+it has. ``--minutes`` ends a run before the next cell. Networks, episodes and optimiser steps are those of
+``benchmarks.paper_models``, smaller than the service's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from benchmarks import unseen_motion
+from benchmarks.harness import Report, write_json, write_section
+from benchmarks.paper_models import (
+    EPISODES,
+    METRICS,
+    ORIGIN,
+    SCENES,
+    Case,
+    case_of,
+    demonstrations,
+    learn,
+    recording_alone,
+    scene_of,
+    score,
+    settings,
+)
+from physworld.demonstrate import DemonstrationConfig
+
+SEEDS = (0, 1, 2)
+CELLS = Path(".bench") / "paper_tables"
+CONDITIONS = {
+    "full": DemonstrationConfig(),
+    "linear": DemonstrationConfig(motion="linear"),
+    "none": DemonstrationConfig(perturbation="none"),
+    "uniform": DemonstrationConfig(perturbation="uniform"),
+    "random": DemonstrationConfig(perturbation="random"),
+}
+ALONE = "recording_alone"
+BASELINES = ("static", "rigid_follow", "constant_velocity")
+LABELS = {
+    "static": "static",
+    "rigid_follow": "rigid follow",
+    "constant_velocity": "constant velocity",
+    "twin": "twin",
+    "recording_alone": "GNN on the recording alone",
+    "world_model": "world model, no fine-tuning",
+    "world_model_finetuned": "world model, fine-tuned",
+    "linear": "… linear motion instead of VMP-Gen",
+    "none": "… no perturbation instead of P3-Pert",
+    "uniform": "… uniform perturbation",
+    "random": "… random perturbation",
+}
+
+
+@dataclass(frozen=True)
+class Relation:
+    """An inequality of the paper: ``better`` errs less than ``worse``; ``paper``: the ratio of its headline table."""
+
+    key: str
+    better: str
+    worse: str
+    paper: str
+
+
+RELATIONS = (
+    Relation("finetuned_against_twin", "world_model_finetuned", "twin", "0.91 (CD), 1.0 (track)"),
+    Relation("finetuned_against_recording_alone", "world_model_finetuned", ALONE, "1/3 to 1/5"),
+    Relation("fine_tuning", "world_model_finetuned", "world_model", "0.84"),
+    Relation("vmp_against_linear", "world_model_finetuned", "linear", "below 1"),
+    Relation("p3_against_none", "world_model_finetuned", "none", "below 1"),
+    Relation("p3_against_uniform", "world_model_finetuned", "uniform", "below 1"),
+    Relation("p3_against_random", "world_model_finetuned", "random", "below 1"),
+)
+
+
+def main() -> int:
+    """Run what is missing, report what there is."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.paper_tables", description=__doc__)
+    parser.add_argument("--json", type=Path, default=None, help="write all figures there")
+    parser.add_argument("--docs", type=Path, default=None, help="Markdown file whose section is replaced")
+    parser.add_argument("--cells", type=Path, default=CELLS, help="folder of finished cells")
+    parser.add_argument("--minutes", type=float, default=None, help="begin no cell after that long")
+    parser.add_argument("--scenes", nargs="*", choices=sorted(SCENES), default=list(SCENES))
+    given = parser.parse_args()
+    wp.config.quiet = True
+    torch.set_num_threads(1)
+    cells = Cells(given.cells, given.minutes)
+    scenes = [name for name in given.scenes if scene_of(name) is not None]
+    for name in sorted(set(given.scenes) - set(scenes)):
+        print(f"{name}: left out, {SCENES[name]} is not on this machine", file=sys.stderr)
+    planned = list(plan(scenes))
+    for key, work in planned:
+        cells.fill(key, work)
+    held = {key: cells.get(key) for key, _ in planned}
+    report = summarise(scenes, held)
+    print(report.markdown())
+    if given.json is not None:
+        write_json(report, given.json)
+    if given.docs is not None:
+        write_section(report, given.docs)
+    return 0
+
+
+class Cells:
+    """Finished cells as JSON files; one of other settings counts as absent."""
+
+    def __init__(self, folder: Path, minutes: float | None) -> None:
+        digest = hashlib.sha256(json.dumps(settings(), sort_keys=True).encode()).hexdigest()[:12]
+        self.folder = folder / digest
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self._until = None if minutes is None else time.monotonic() + 60.0 * minutes
+        self._cases: dict[str, Case] = {}
+
+    def get(self, key: str) -> dict[str, Any] | None:
+        """A finished cell's figures."""
+        path = self._path(key)
+        return json.loads(path.read_text()) if path.exists() else None
+
+    def fill(self, key: str, work: Callable[[Case], dict[str, Any]]) -> None:
+        """Do the cell's work unless it is done or the time is up."""
+        if self._path(key).exists() or (self._until is not None and time.monotonic() > self._until):
+            return
+        begun = time.perf_counter()
+        figures = work(self._case(key.split("/")[0])) | {"seconds": time.perf_counter() - begun}
+        partial = self._path(key).with_suffix(".part")
+        partial.write_text(json.dumps(figures))
+        partial.replace(self._path(key))
+        print(f"{key}: {figures['seconds']:.0f} s", file=sys.stderr, flush=True)
+
+    def _case(self, name: str) -> Case:
+        if name not in self._cases:
+            case = case_of(name, self.folder)
+            assert case is not None, "plan() leaves out scenes that are not here"
+            self._cases[name] = case
+        return self._cases[name]
+
+    def _path(self, key: str) -> Path:
+        return self.folder / f"{key.replace('/', '-')}.json"
+
+
+def plan(scenes: list[str]) -> Iterator[tuple[str, Callable[[Case], dict[str, Any]]]]:
+    """Every cell, a whole seed of all scenes before the next one."""
+    for seed in SEEDS:
+        for name in scenes:
+            for condition in CONDITIONS:
+                yield f"{name}/{condition}/{seed}", lambda case, c=condition, s=seed: conditioned(case, c, s)
+            yield f"{name}/{ALONE}/{seed}", lambda case, s=seed: recording_alone(case, s)
+        if "soft_beam" in scenes:
+            for kind in unseen_motion.KINDS:
+                yield (
+                    f"soft_beam/unseen_{kind}/{seed}",
+                    lambda case, k=kind, s=seed: unseen_motion.cell(case, k, s),
+                )
+
+
+def conditioned(case: Case, condition: str, seed: int) -> dict[str, Any]:
+    """A model of the condition's demonstrations, scored on the recording's held-out frames."""
+    begun = time.perf_counter()
+    episodes, rejected = demonstrations(case, CONDITIONS[condition], EPISODES, seed)
+    simulated = time.perf_counter()
+    trained = learn(case.view.spec, episodes, seed)
+    return {
+        **score(case, trained),
+        "rejected": rejected,
+        "demonstration_s": simulated - begun,
+        "training_s": time.perf_counter() - simulated,
+    }
+
+
+def summarise(scenes: list[str], held: dict[str, dict[str, Any] | None]) -> Report:
+    """Errors over seeds by scene and prediction, and the relations."""
+    done = sum(cell is not None for cell in held.values())
+    errors = {name: errors_by_prediction(name, held) for name in scenes}
+    relations = {relation.key: hold(relation, errors) for relation in RELATIONS}
+    speeds = {name: speed(name, held) for name in scenes}
+    rows = []
+    for name in scenes:
+        for prediction, by_metric in errors[name].items():
+            if not any(by_metric.values()):
+                continue
+            cells = [in_millimetres(by_metric[metric]) for metric in METRICS]
+            rows.append([f"{name} ({ORIGIN[name]})", LABELS[prediction], *cells])
+    notes = [f"{done} of {len(held)} cells are done; mean ± standard deviation over the seeds that are."]
+    notes += [in_words(relation, relations[relation.key]) for relation in RELATIONS]
+    notes += [
+        f"{name}: world model {found['world_model']:.0f}, twin {found['twin']:.0f} steps/s ({found['ratio']:.0f} x)."
+        for name, found in speeds.items()
+        if found is not None
+    ]
+    unseen = {
+        kind: unseen_motion.pooled([held.get(f"soft_beam/unseen_{kind}/{seed}") for seed in SEEDS])
+        for kind in unseen_motion.KINDS
+    }
+    notes += [unseen_motion.in_words(kind, found) for kind, found in unseen.items() if found is not None]
+    return Report(
+        name="paper_tables",
+        title="The paper's tables as relations",
+        figures={
+            "cells": {
+                "done": done,
+                "planned": len(held),
+                "missing": [key for key in held if held[key] is None],
+            },
+            "errors": errors,
+            "relations": relations,
+            "steps_per_second": speeds,
+            "unseen_motion": unseen,
+            "settings": settings(),
+        },
+        header=["scene", "prediction", "track, mm", "Chamfer PhysTwin, mm", "Chamfer L2, mm"],
+        rows=rows,
+        notes=notes,
+    )
+
+
+def errors_by_prediction(name: str, held: dict[str, dict[str, Any] | None]) -> dict[str, Any]:
+    """Prediction → metric → {seed: error [m]}; conditions other than full are fine-tuned models."""
+    found: dict[str, dict[str, dict[str, float]]] = {
+        label: {metric: {} for metric in METRICS} for label in LABELS
+    }
+    for seed in SEEDS:
+        for condition in (*CONDITIONS, ALONE):
+            cell = held.get(f"{name}/{condition}/{seed}")
+            if cell is None:
+                continue
+            sources = {condition: "world_model_finetuned"}
+            if condition == "full":
+                sources = {key: key for key in (*BASELINES, "twin", "world_model", "world_model_finetuned")}
+            elif condition == ALONE:
+                sources = {ALONE: ALONE}
+            for label, source in sources.items():
+                for metric in METRICS:
+                    error = cell[metric].get(source)
+                    if error is not None:
+                        found[label][metric][str(seed)] = error
+    return found
+
+
+def hold(relation: Relation, errors: dict[str, Any]) -> dict[str, Any]:
+    """Ratios better/worse of the track error by scene and seed, and in how many the relation holds."""
+    ratios = {}
+    for name, by_prediction in errors.items():
+        better, worse = (by_prediction[side]["track_m"] for side in (relation.better, relation.worse))
+        own = {seed: better[seed] / worse[seed] for seed in better if seed in worse}
+        if own:
+            logs = np.log(list(own.values()))
+            ratios[name] = {
+                "by_seed": own,
+                "mean": float(np.exp(logs.mean())),
+                "holds": bool((logs < 0.0).all()),
+            }
+    every = [ratio for found in ratios.values() for ratio in found["by_seed"].values()]
+    return {
+        "by_scene": ratios,
+        "pairs": len(every),
+        "holds_in": sum(ratio < 1.0 for ratio in every),
+        "mean_ratio": float(np.exp(np.mean(np.log(every)))) if every else None,
+        "paper": relation.paper,
+    }
+
+
+def in_words(relation: Relation, found: dict[str, Any]) -> str:
+    """One line: the ratio here, the paper's, where it holds."""
+    left, right = LABELS[relation.better], LABELS[relation.worse].removeprefix("… ")
+    if not found["pairs"]:
+        return f"{left} / {right}: not measured yet."
+    scenes = ", ".join(f"{name} {entry['mean']:.2f}" for name, entry in found["by_scene"].items())
+    return (
+        f"{left} / {right}: track error ratio {found['mean_ratio']:.2f} ({scenes}); below 1 in {found['holds_in']} of "
+        f"{found['pairs']} pairs of scene and seed; the paper: {relation.paper}."
+    )
+
+
+def speed(name: str, held: dict[str, dict[str, Any] | None]) -> dict[str, float] | None:
+    """Medians over the scene's cells; None without one."""
+    found = [
+        cell["steps_per_second"]
+        for key, cell in held.items()
+        if cell is not None and key.startswith(f"{name}/") and "steps_per_second" in cell
+    ]
+    if not found:
+        return None
+    medians = {side: float(np.median([cell[side] for cell in found])) for side in ("world_model", "twin")}
+    return medians | {"ratio": medians["world_model"] / medians["twin"]}
+
+
+def in_millimetres(by_seed: dict[str, float]) -> str:
+    """``1.76 ± 0.12``."""
+    values = 1e3 * np.array(list(by_seed.values()))
+    if not len(values):
+        return "–"
+    spread = f" ± {values.std(ddof=1):.2g}" if len(values) > 1 and np.ptp(values) > 0 else ""
+    return f"{values.mean():.3g}{spread}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
