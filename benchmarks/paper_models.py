@@ -49,9 +49,12 @@ METRICS = ("track_m", "chamfer_phystwin_m", "chamfer_l2_m")
 
 SMALL = WorldModelConfig(hidden=32, message_passing_steps=5, vertices=60)
 TRAINING = TrainingConfig(
-    steps=80, batch_size=4, look_ahead=12, learning_rate=2e-3, validation_every=20, checkpoint_every=10_000
-)
-    steps=100, batch_size=4, look_ahead=16, validation_every=25, checkpoint_every=10_000
+    steps=80,
+    batch_size=4,
+    look_ahead=12,
+    learning_rate=2e-3,
+    validation_every=20,
+    checkpoint_every=10_000,
 )
 TUNING = FineTuneConfig(steps=40)
 EPISODES = 60
