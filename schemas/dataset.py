@@ -3,20 +3,57 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from schemas.base import Artifact, Lineage, Request, Resource, Seed
 
+Pattern = Literal["single", "lift", "push", "stretch", "twist", "together", "bimanual", "hold_one"]
+Property = Literal["stiffness", "density", "friction"]
+
 
 class DatasetConfig(Request):
-    """How many episodes, and how strongly the calibrated properties are perturbed (log-space sigma)."""
+    """How many episodes, how they move, and what their twins differ in.
+
+    ``motion``: ``vmp`` (curved paths at three-phase speed) or ``linear`` (straight lines at constant speed);
+    ``patterns``: weights of the patterns, none given: all that make sense for the scene, alike; ``replay_share`` of
+    the episodes replay the recording's training frames. ``perturbation``: ``p3`` (a Gaussian field over part
+    features), ``uniform`` (one factor for the whole body), ``random`` (each particle on its own) or ``none``, of the
+    ``properties`` named, with ``property_sigma`` the standard deviation of the log of the stiffness; a kernel of
+    features alone, or of space too (``space_scale``, in object sizes). ``effects``: whether strengths that a trace
+    found are drawn within their intervals. An episode that is rejected is drawn anew, at most ``tries`` times.
+    """
 
     episodes: int = Field(default=100, ge=1, le=20_000)
     frames: int | None = Field(default=None, ge=2, le=5000)
+    motion: Literal["vmp", "linear"] = "vmp"
+    patterns: dict[Pattern, Annotated[float, Field(ge=0.0, le=1e6)]] | None = None
+    replay_share: float = Field(default=0.2, ge=0.0, le=1.0)
+    curvature_limit: float = Field(default=6.0, gt=0.0, le=100.0)
+    perturbation: Literal["p3", "uniform", "random", "none"] = "p3"
+    properties: list[Property] = Field(default=["stiffness", "density"], max_length=3)
     property_sigma: float = Field(default=0.2, ge=0.0, le=2.0)
+    length_scale: float = Field(default=1.0, gt=0.0, le=100.0)
+    space_scale: float | None = Field(default=None, gt=0.0, le=100.0)
+    features: Literal["auto", "supplied", "geometric"] = "auto"
+    effects: Literal["perturbed", "as_found"] = "perturbed"
+    tries: int = Field(default=8, ge=1, le=100)
     seed: Seed = 0
+
+    @field_validator("patterns")
+    @classmethod
+    def _some_pattern(cls, patterns: dict[Pattern, float] | None) -> dict[Pattern, float] | None:
+        if patterns is not None and not sum(patterns.values()) > 0.0:
+            raise ValueError("at least one pattern needs a positive weight")
+        return patterns
+
+    @field_validator("properties")
+    @classmethod
+    def _each_once(cls, properties: list[Property]) -> list[Property]:
+        if len(set(properties)) < len(properties):
+            raise ValueError("names a property twice")
+        return properties
 
 
 class DatasetCreate(Request):

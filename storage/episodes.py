@@ -119,12 +119,16 @@ class EpisodeStore:
         attributes = header.get("attributes")
         return arrays, dict(attributes) if isinstance(attributes, dict) else {}
 
-    def verify(self, path: str, digest: str) -> None:
-        """Raise EpisodeCorrupt unless the episode decodes and has this digest."""
+    def verified(self, path: str, digest: str) -> tuple[Arrays, dict[str, Any]]:
+        """What :meth:`read` gives of a committed episode. Raises EpisodeCorrupt, also where it is gone."""
         try:
-            self.read(path, digest)
+            return self.read(path, digest)
         except NotFound as error:
             raise EpisodeCorrupt(f"{path} was committed and is gone") from error
+
+    def verify(self, path: str, digest: str) -> None:
+        """Raise EpisodeCorrupt unless the episode decodes and has this digest."""
+        self.verified(path, digest)
 
     def write_manifest(self, dataset_id: str, episodes: Iterable[Episode]) -> Artifact:
         """Store the manifest of a dataset; its SHA-256 is the digest of the dataset."""

@@ -7,7 +7,6 @@
     ├── Cancelled            the job was cancelled: stop, the shard ends as cancelled
     ├── UnknownShardKind     this worker has no handler for the kind
     ├── NotEnoughDisk        the estimate of what a dataset writes exceeds what is free
-    ├── EpisodeRejected      every sub-seed of an episode gave an unstable simulation
     └── DatasetIncomplete    at sealing, an episode is missing, twice there, or its digest differs
 """
 
@@ -42,12 +41,6 @@ class NotEnoughDisk(WorkerError):
     """Checked before the first episode, not found out at the last."""
 
     code = "budget_exceeded"
-
-
-class EpisodeRejected(WorkerError):
-    """No sub-seed gave a stable simulation; the message lists each reason."""
-
-    code = "episode_rejected"
 
 
 class DatasetIncomplete(WorkerError):

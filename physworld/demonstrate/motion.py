@@ -92,7 +92,7 @@ def random_motion(
         style: ``uniform`` gives the baseline instead of a pattern.
 
     Raises:
-        ValueError: the weights leave no pattern that makes sense for the scene.
+        SceneUnsupported: the weights leave no pattern that makes sense for the scene.
     """
     duration = float(times[-1])
     if style.uniform:

@@ -21,6 +21,7 @@ import numpy as np
 
 from physworld.demonstrate.limits import MotionLimits
 from physworld.demonstrate.paths import Stroke
+from physworld.errors import SceneUnsupported
 
 PATTERNS = ("single", "lift", "push", "stretch", "twist", "together", "bimanual", "hold_one")
 SHORTEST_STROKE = 0.3  # of the room along a directed stroke
@@ -49,11 +50,11 @@ def weighted(names: tuple[str, ...], weights: Mapping[str, float] | None) -> np.
     """Chances of the patterns ``names``, (n,); None: all alike.
 
     Raises:
-        ValueError: no weight is left for them; the message names the patterns that would do.
+        SceneUnsupported: no weight is left for them; the message names the patterns that would do.
     """
     given = np.array([1.0 if weights is None else float(weights.get(name, 0.0)) for name in names])
     if not given.sum() > 0.0:
-        raise ValueError(
+        raise SceneUnsupported(
             f"the mix {dict(weights or {})} leaves no pattern; this scene allows {', '.join(names)}"
         )
     return given / given.sum()

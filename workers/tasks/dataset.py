@@ -2,8 +2,9 @@
 
 An episode is written under the epoch of its lease and exists once its shard is committed: whatever a killed
 or overtaken worker wrote belongs to nobody and is removed at sealing. Its seed follows from the dataset's
-and its index alone, so a second attempt makes the same episode. The seal reads every episode again and
-compares digests.
+and its index alone, so a second attempt makes the same episode; an episode that is rejected (unstable, out of the
+workspace) is drawn anew from the seed of its next try, and its reasons are kept. The seal reads every episode again,
+compares digests, and writes the card of what they cover (:mod:`workers.tasks.dataset_card`).
 
 On a GPU the first shard of a block simulates the whole block side by side, and the process keeps the rest for the
 shards that follow; whoever makes an episode, its block is the same.
@@ -14,27 +15,36 @@ from __future__ import annotations
 import shutil
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
-from physworld.demonstrate import DemonstrationConfig, derived_seed, make_episode
+from physworld.demonstrate import (
+    DemonstrationConfig,
+    StrengthRange,
+    derived_seed,
+    make_episode,
+    plan_episode,
+)
+from physworld.demonstrate.coverage import Coverage
 from physworld.demonstrate.episode import episode_frames
 from physworld.demonstrate.side_by_side import make_episodes
 from physworld.errors import SimulationError
 from physworld.scene import Scene
 from physworld.twin import Twin
 from schemas.dataset import DatasetConfig, Episode
-from storage import resources
+from schemas.trace import FoundEffect
+from storage import resources, traces
 from workers.context import TaskContext
 from workers.errors import DatasetIncomplete, NotEnoughDisk
 from workers.lineage import lineage_of
 from workers.registry import HandlerResult
 from workers.stores import Stores
+from workers.tasks.dataset_card import store_card
 from workers.tasks.inputs import made_from, scene_of, twin_of
 
-ATTEMPTS = 5
 FLOAT_BYTES = 4
 STORE_OVERHEAD = 1.05
 WIDTHS = {"cpu": 1, "cuda": 16}
@@ -49,7 +59,10 @@ def plan(context: TaskContext, stores: Stores) -> HandlerResult:
     config = DatasetConfig.model_validate(payload["config"])
     scene = scene_of(stores, payload["scene_id"])
     twin = twin_of(stores, payload["fit_id"], payload.get("trace_id"))
-    frames = episode_frames(scene, _demonstration(config))
+    demonstration = demonstration_of(config, _strengths(stores, payload.get("trace_id"), config))
+    frames = episode_frames(scene, demonstration)
+    with suppress(SimulationError):  # what the settings and the scene refuse is said before the first episode
+        plan_episode(scene, twin, demonstration, derived_seed(config.seed % 2**63, 0))
     particles, controllers = len(twin.particles_rest), scene.controllers.shape[1]
     per_frame = 3 * FLOAT_BYTES * (particles + controllers) + 8
     need = round(STORE_OVERHEAD * config.episodes * (frames * per_frame + 2 * FLOAT_BYTES * particles))
@@ -72,7 +85,10 @@ def episode(context: TaskContext, stores: Stores) -> HandlerResult:
         context.check()
 
     started = time.perf_counter()
-    arrays, attributes = _made(stores, payload["dataset_id"], scene, twin, config, index, progress)
+    demonstration = demonstration_of(config, _strengths(stores, payload.get("trace_id"), config))
+    arrays, attributes = _made(
+        stores, payload["dataset_id"], scene, twin, config, demonstration, index, progress
+    )
     simulated = time.perf_counter()
     context.check()
     attributes |= {"index": index, "scene_id": payload["scene_id"], "fit_id": payload["fit_id"]}
@@ -107,18 +123,20 @@ def seal(context: TaskContext, stores: Stores) -> HandlerResult:
         raise DatasetIncomplete(
             f"dataset {dataset_id} holds {len(indices)} episodes of {config.episodes}; missing {missing[:20]}"
         )
+    coverage = Coverage(len(episodes))
     for done, committed in enumerate(episodes):
         context.check()
         context.progress(done, len(episodes), "episodes", "verifying")
-        stores.episodes.verify(committed.path, committed.digest)
+        coverage.add(*stores.episodes.verified(committed.path, committed.digest))
     manifest = stores.episodes.write_manifest(dataset_id, episodes)
     context.check()
     stores.episodes.remove_orphans(dataset_id, [committed.path for committed in episodes])
     inputs = made_from(stores, payload)
+    card, pictures = store_card(stores, dataset_id, manifest.sha256, config, coverage)
     result = {
         "digest": manifest.sha256,
-        "statistics": _statistics(episodes),
-        "artifacts": [manifest.model_dump(mode="json")],
+        "statistics": _statistics(episodes, card),
+        "artifacts": [artifact.model_dump(mode="json") for artifact in (manifest, *pictures)],
         "lineage": lineage_of(inputs, payload["config"], {"dataset": config.seed}),
     }
     return HandlerResult(result, manifest.sha256)
@@ -130,13 +148,14 @@ def _made(
     scene: Scene,
     twin: Twin,
     config: DatasetConfig,
+    demonstration: DemonstrationConfig,
     index: int,
     progress: Callable[[int, int], None],
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Arrays and attributes of episode ``index``, alone or as one of its block."""
-    demonstration, seed = _demonstration(config), config.seed % 2**63
+    seed = config.seed % 2**63
     width = WIDTHS[twin.device.partition(":")[0]]
-    if width == 1 or twin.formulation != "total_lagrangian":
+    if width == 1 or twin.formulation != "total_lagrangian" or demonstration.strengths:
         return make_episode(scene, twin, demonstration, derived_seed(seed, index), progress)
     first = index - index % width
     seeds = [derived_seed(seed, other) for other in range(first, min(first + width, config.episodes))]
@@ -150,8 +169,49 @@ def _made(
     return arrays, dict(attributes)
 
 
-def _demonstration(config: DatasetConfig) -> DemonstrationConfig:
-    return DemonstrationConfig(frames=config.frames, property_sigma=config.property_sigma, attempts=ATTEMPTS)
+def demonstration_of(config: DatasetConfig, strengths: tuple[StrengthRange, ...] = ()) -> DemonstrationConfig:
+    """The wire's settings as the library's."""
+    return DemonstrationConfig(
+        frames=config.frames,
+        motion=config.motion,
+        patterns=None if config.patterns is None else dict(config.patterns),
+        replay_share=config.replay_share,
+        curvature_limit=config.curvature_limit,
+        perturbation=config.perturbation,
+        properties=tuple(config.properties),
+        property_sigma=config.property_sigma,
+        length_scale=config.length_scale,
+        space_scale=config.space_scale,
+        features=config.features,
+        strengths=strengths,
+        attempts=config.tries,
+    )
+
+
+def _strengths(stores: Stores, trace_id: str | None, config: DatasetConfig) -> tuple[StrengthRange, ...]:
+    """Intervals of the strengths that the trace found; none where they are to stay as found."""
+    if trace_id is None or config.effects == "as_found":
+        return ()
+    return stores.cached(("strengths", trace_id), lambda: _read_strengths(stores, trace_id))
+
+
+def _read_strengths(stores: Stores, trace_id: str) -> tuple[StrengthRange, ...]:
+    with stores.database.reading() as session:
+        trace = traces.get_trace(session, trace_id)
+    return strength_ranges(trace.effects) if traces.adds_effects(trace) else ()
+
+
+def strength_ranges(effects: Sequence[FoundEffect]) -> tuple[StrengthRange, ...]:
+    """Those strengths of effects that have a value and an interval; an estimate outside of it widens it."""
+    found = []
+    for known in effects:
+        for name, figure in known.parameters.items():
+            low, high = figure.ci95 or (None, None)
+            if figure.value is None or low is None or high is None:
+                continue
+            ends = (min(low, figure.value), max(high, figure.value))
+            found.append(StrengthRange(known.name, name, figure.value, *ends))
+    return tuple(found)
 
 
 def _check_disk(stores: Stores, need: int, what: str) -> None:
@@ -167,7 +227,7 @@ def _check_disk(stores: Stores, need: int, what: str) -> None:
         )
 
 
-def _statistics(episodes: list[Episode]) -> dict[str, Any]:
+def _statistics(episodes: list[Episode], card: dict[str, Any]) -> dict[str, Any]:
     frames = np.array([episode.frames for episode in episodes])
     return {
         "episodes": len(episodes),
@@ -176,4 +236,6 @@ def _statistics(episodes: list[Episode]) -> dict[str, Any]:
         "particles": episodes[0].particles,
         "motions": dict(sorted(Counter(episode.motion for episode in episodes).items())),
         "repeated_attempts": sum(episode.attempt > 1 for episode in episodes),
+        "rejected_tries": card["rejections"]["count"],
+        "workspace_occupancy": round(card["workspace"]["occupancy"], 4),
     }

@@ -15,6 +15,7 @@ from physworld.demonstrate.limits import limits_of
 from physworld.demonstrate.motion import LINEAR, broken_limit, random_motion
 from physworld.demonstrate.paths import PathStyle
 from physworld.demonstrate.patterns import axis_of, check_weights, patterns_for, weighted
+from physworld.errors import SceneUnsupported
 from physworld.geometry.rigid import rigid_motion
 from physworld.scene import DeclaredCollider
 
@@ -152,7 +153,7 @@ def test_weights_that_are_no_mix_are_refused(limits, block):
         check_weights({"lift": 0.0})
     with pytest.raises(ValueError, match="not negative"):
         DemonstrationConfig(patterns={"lift": -1.0})
-    with pytest.raises(ValueError, match="leaves no pattern; this scene allows single"):
+    with pytest.raises(SceneUnsupported, match="leaves no pattern; this scene allows single"):
         weighted(patterns_for(limits, block.controllers[0]), {"hold_one": 1.0})
 
 

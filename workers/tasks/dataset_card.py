@@ -1,0 +1,42 @@
+"""The card of a dataset: what its episodes cover and what was rejected, as ``card.json`` with ``coverage.svg|png``."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from physworld.demonstrate.coverage import Coverage
+from schemas.base import Artifact
+from schemas.dataset import DatasetConfig
+from workers.coverage_picture import coverage_pictures
+from workers.stores import Stores
+from workers.tasks.fit_report import json_safe
+
+CARD, SVG, PNG = "card.json", "coverage.svg", "coverage.png"
+
+
+def card_of(dataset_id: str, digest: str, config: DatasetConfig, coverage: Coverage) -> dict[str, Any]:
+    """The card as plain JSON."""
+    return {
+        "schema_version": 1,
+        "dataset_id": dataset_id,
+        "digest": digest,
+        "config": config.model_dump(mode="json"),
+        **json_safe(coverage.summary()),
+        "pictures": [SVG, PNG],
+    }
+
+
+def store_card(
+    stores: Stores, dataset_id: str, digest: str, config: DatasetConfig, coverage: Coverage
+) -> tuple[dict[str, Any], list[Artifact]]:
+    """The card, and the artifacts of it and its pictures."""
+    card = card_of(dataset_id, digest, config, coverage)
+    svg, png = coverage_pictures(coverage)
+    text = json.dumps(card, indent=1, allow_nan=False).encode()
+    artifacts = [
+        stores.artifacts.put_bytes(text, CARD, "application/json"),
+        stores.artifacts.put_bytes(svg, SVG, "image/svg+xml"),
+        stores.artifacts.put_bytes(png, PNG, "image/png"),
+    ]
+    return card, artifacts
