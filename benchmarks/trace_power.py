@@ -34,7 +34,9 @@ from physworld.errors import PhysworldError
 from physworld.trace import TraceResult, document, trace
 
 NULLS = 36
-METHOD = tuple(f"physworld/{room}" for room in ("trace", "calibrate", "effects", "mpm"))
+METHOD = tuple(
+    f"physworld/{room}" for room in ("trace", "calibrate", "effects", "mpm", "geometry", "evaluate")
+)
 _EVERY = 2  # injections between two recordings without an effect
 _OFF = 1.3  # stiffness that a trace starts from, over the true one
 _STIFFNESS = ("youngs_modulus_pa", "membrane_n_m", "bending_n_m", "bending_n_m2")

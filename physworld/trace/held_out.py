@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,21 +43,56 @@ def measure(
     seed: int,
 ) -> HeldOut:
     """Measure two predictions (T, N, 3) on the held-out frames."""
-    window = slice(*split.test)
-    squares = [_per_frame(scene, tracks, window) for tracks in (before, after)]
+    return measure_all([Unseen(scene, split, before, after)], sigma, resamples, seed)
+
+
+@dataclass(frozen=True)
+class Unseen:
+    """Held-out frames of one recording, with the predictions before and after, (T, N, 3) [m]."""
+
+    scene: Scene
+    split: Split
+    before: np.ndarray
+    after: np.ndarray
+
+    @property
+    def window(self) -> slice:
+        """Its frames."""
+        return slice(*self.split.test)
+
+    def squares(self, tracks: np.ndarray) -> np.ndarray:
+        """Sum of squared coordinate errors and their number in every frame, (F, 2)."""
+        return _per_frame(self.scene, tracks, self.window)
+
+    def chamfer(self, tracks: np.ndarray) -> float:
+        """Mean over its frames [m]."""
+        return chamfer_l2(
+            tracks[self.window], self.scene.points[self.window], self.scene.visible[self.window]
+        )
+
+
+def measure_all(parts: Sequence[Unseen], sigma: float | None, resamples: int, seed: int) -> HeldOut:
+    """Measure predictions on the held-out frames of several recordings together, every coordinate alike."""
+    squares = [
+        np.concatenate([part.squares(tracks) for part, tracks in zip(parts, kind, strict=True)])
+        for kind in ([p.before for p in parts], [p.after for p in parts])
+    ]
     low_high = _intervals(*squares, resamples, seed)
     was, now = (_root(square) for square in squares)
     above = was - (sigma or 0.0)
-    measured, visible = scene.points[window], scene.visible[window]
+    frames = [part.split.test[1] - part.split.test[0] for part in parts]
     return HeldOut(
         noise_floor=sigma,
         before=was,
         after=now,
         after_ci95=low_high[0],
         gain_ci95=low_high[1],
-        chamfer_before=chamfer_l2(before[window], measured, visible),
-        chamfer_after=chamfer_l2(after[window], measured, visible),
-        baselines={n: _root(_per_frame(scene, f(scene), window)) for n, f in _BASELINES.items()},
+        chamfer_before=float(np.average([part.chamfer(part.before) for part in parts], weights=frames)),
+        chamfer_after=float(np.average([part.chamfer(part.after) for part in parts], weights=frames)),
+        baselines={
+            name: _root(np.concatenate([part.squares(predict(part.scene)) for part in parts]))
+            for name, predict in _BASELINES.items()
+        },
         explained_fraction=(was - now) / above if sigma and above > 0 else None,
     )
 

@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from physworld.effects.registry import EFFECTS
-from physworld.trace.held_out import METRIC
+from physworld.trace.held_out import METRIC, HeldOut
 from physworld.trace.result import Named, Number, TraceResult
 
 SCHEMA_VERSION = 1
@@ -15,7 +15,6 @@ _SHOWN = 10  # best scores of a step
 
 def document(result: TraceResult) -> dict[str, Any]:
     """The answer under stable keys; JSON types only, numbers that are not finite as null."""
-    out = result.held_out
     ranked = result.path[0].scores if result.path else None
     selected = set(result.verdict.model.names) if result.effects else set()
     best: dict[str, dict[str, Any]] = {}
@@ -73,18 +72,11 @@ def document(result: TraceResult) -> dict[str, Any]:
             "numerics": result.numerics,
             "second_resolution": {" + ".join(names): values for names, values in result.finer.items()},
         },
-        "held_out": {
-            "metric": METRIC,
-            "noise_floor": out.noise_floor,
-            "before": out.before,
-            "after": out.after,
-            "after_ci95": list(out.after_ci95),
-            "gain_ci95": list(out.gain_ci95),
-            "chamfer_before": out.chamfer_before,
-            "chamfer_after": out.chamfer_after,
-            "baselines": out.baselines,
-            "explained_fraction": out.explained_fraction,
-        },
+        "held_out": _errors(result.held_out),
+        "recordings": [
+            {"scene": r.scene, "role": r.role, "frames": list(r.frames), **_errors(r.held_out)}
+            for r in result.recordings
+        ],
         "calibrated": {name: _number(number) for name, number in result.calibrated.items()},
         "unexplained": {"rms_m": result.remainder_m, "description": result.remainder},
         "suggested_experiment": None if result.experiment is None else result.experiment.document(),
@@ -93,6 +85,21 @@ def document(result: TraceResult) -> dict[str, Any]:
         "simulations": result.simulations,
     }
     return _finite(found)
+
+
+def _errors(out: HeldOut) -> dict[str, Any]:
+    return {
+        "metric": METRIC,
+        "noise_floor": out.noise_floor,
+        "before": out.before,
+        "after": out.after,
+        "after_ci95": list(out.after_ci95),
+        "gain_ci95": list(out.gain_ci95),
+        "chamfer_before": out.chamfer_before,
+        "chamfer_after": out.chamfer_after,
+        "baselines": out.baselines,
+        "explained_fraction": out.explained_fraction,
+    }
 
 
 def _effect(effect: Named) -> dict[str, Any]:

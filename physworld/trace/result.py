@@ -43,6 +43,18 @@ class Step:
 
 
 @dataclass(frozen=True)
+class Outcome:
+    """One recording of several: its role (fitted, held_out), scored frames, open-loop tracks (T, N, 3) [m], errors."""
+
+    scene: str
+    role: str
+    frames: tuple[int, int]
+    before: np.ndarray
+    after: np.ndarray
+    held_out: HeldOut
+
+
+@dataclass(frozen=True)
 class TraceResult:
     """See :mod:`physworld.trace.run`.
 
@@ -57,12 +69,13 @@ class TraceResult:
         candidates, refused: what was tried, and why the rest was not.
         numerics: root mean squared change of the training prediction by each numerical direction, over the noise.
         finer: values at the second resolution by the unknowns' names, for each model that was refitted there.
-        before, after: open-loop tracks, (T, N, 3) [m].
-        held_out: errors on the held-out frames.
+        before, after: open-loop tracks of the first recording, (T, N, 3) [m].
+        held_out: errors on the recordings that are held out, if there are any; else on the held-out frames.
         remainder_m, remainder: what is left on the training frames beyond the noise, and in words.
         experiment: what would tell an equivalent set apart, or None.
         simulations, seconds: cost.
         notes: what a reader has to know.
+        recordings: every recording of its own, those that are held out last.
     """
 
     scene: str
@@ -87,3 +100,4 @@ class TraceResult:
     seconds: float
     experiment: Experiment | None = None
     notes: tuple[str, ...] = field(default_factory=tuple)
+    recordings: tuple[Outcome, ...] = ()

@@ -11,7 +11,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -25,11 +25,19 @@ from physworld.trace.config import TraceConfig
 from physworld.trace.confirm import Confirmation, Model, best_variants
 from physworld.trace.describe import describe
 from physworld.trace.experiment import Experiment, propose, rival_of
-from physworld.trace.held_out import measure
+from physworld.trace.held_out import HeldOut, Unseen, measure, measure_all
 from physworld.trace.intervals import calibrated, named, numbers
 from physworld.trace.noise import noise_sigma
+from physworld.trace.recordings import (
+    FITTED,
+    HELD_OUT,
+    JointSimulations,
+    Recording,
+    Recordings,
+    side_by_side,
+)
 from physworld.trace.refit import refit
-from physworld.trace.result import Step, TraceResult
+from physworld.trace.result import Outcome, Step, TraceResult
 from physworld.trace.score import Scores, orthonormal, project, scores
 from physworld.trace.sensitivity import (
     Response,
@@ -39,20 +47,16 @@ from physworld.trace.sensitivity import (
     refinement_of,
 )
 from physworld.trace.simulations import (
-    Drive,
     Job,
     Memory,
     Progress,
     Runner,
-    Simulations,
     in_turn,
-    nodes_of,
     stable_step_s,
 )
-from physworld.trace.split import Split, freeze
 from physworld.trace.unknowns import Unknown, bending_factor, clamp_reach, of_parameter
 from physworld.trace.verdict import NOTHING, UNEXPLAINED, Verdict, accounts, decide, helps, simplest
-from physworld.trace.whitening import Whitener, moved, responses, whitener
+from physworld.trace.whitening import Whitener, whitener
 from physworld.twin import Twin
 
 _POISSON_SPREAD = 0.08  # of what is known of a soft solid's Poisson's ratio beforehand
@@ -63,9 +67,10 @@ _AGREEMENT = 0.25  # share by which a strength may move with the resolution
 
 
 def trace(
-    scene: Scene,
+    scene: Scene | Sequence[Scene],
     config: TraceConfig | None = None,
     *,
+    held_out: Sequence[Scene] = (),
     runner: Runner = in_turn,
     memory: Memory | None = None,
     journal: Journal | None = None,
@@ -73,11 +78,13 @@ def trace(
     progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> TraceResult:
-    """Trace a recording.
+    """Trace a recording, or several of one object.
 
     Args:
-        scene: the recording.
+        scene: the recording; or several, which share material and effects. The first one is calibrated alone first,
+            and its tracks are those of the result.
         config: settings; None for the defaults.
+        held_out: recordings of the same object that only the report sees.
         runner: where simulations run.
         memory: simulations that were run before; with the same memory a trace that was cut off goes on.
         journal: of the calibration, likewise.
@@ -88,19 +95,27 @@ def trace(
     Raises:
         CalibrationError: no start gave a usable simulation.
         Cancelled: ``cancelled`` returned true.
-        SceneUnsupported: the scene declares too little for a body.
+        SceneUnsupported: the scene declares too little for a body; or the recordings are of different kinds.
     """
     config = config or TraceConfig()
     begun = time.perf_counter()
-    split = freeze(scene, config.blocks, config.shortest_block)
-    seen = replace(scene, train=split.train, test=split.test)
+    scenes = [scene] if isinstance(scene, Scene) else list(scene)
+    recordings = Recordings(scenes, held_out, config.blocks, config.shortest_block)
     calibrated_runs = 0
     if calibrated_twin is None:
-        fitted = calibrate(seen, config.calibration, progress, cancelled, journal)
+        fitted = calibrate(recordings.lead.scene, config.calibration, progress, cancelled, journal)
         calibrated_twin, calibrated_runs = fitted.twin, fitted.simulations
-    drive = Drive(*scene.control_track(), scene.times)
-    simulations = Simulations(drive, runner, memory, progress, cancelled)
-    work = _Trace(seen, split, config, simulations, calibrated_twin)
+    simulations = JointSimulations(
+        recordings,
+        calibrated_twin,
+        config.calibration.particle_budget,
+        config.refinement,
+        runner,
+        memory,
+        progress,
+        cancelled,
+    )
+    work = _Trace(recordings, config, simulations, calibrated_twin)
     result = work.run()
     return replace(
         result, simulations=simulations.count + calibrated_runs, seconds=time.perf_counter() - begun
@@ -111,10 +126,12 @@ class _Trace:
     """State of one trace."""
 
     def __init__(
-        self, scene: Scene, split: Split, config: TraceConfig, simulations: Simulations, twin: Twin
+        self, recordings: Recordings, config: TraceConfig, simulations: JointSimulations, twin: Twin
     ) -> None:
-        self.scene, self.split, self.config, self.simulations = scene, split, config, simulations
-        self.frames = split.train[1]
+        self.recordings, self.lead = recordings, recordings.lead.scene
+        self.scene, self.split = recordings.scene, recordings.split
+        self.config, self.simulations = config, simulations
+        self.frames = self.split.train[1]
         self.twin = twin
         self.notes: list[str] = []
 
@@ -122,17 +139,15 @@ class _Trace:
         config, simulations = self.config, self.simulations
         simulations.stage = "declared physics"
         simulations.least_step_s = stable_step_s(self.twin, simulations.drive) / _SLOWEST
-        job = Job(self.twin, self.frames)
-        nodes = nodes_of(job, simulations.drive)
-        tracks = self.twin.observe(nodes, simulations.drive.times[: self.frames])
+        tracks, answers = simulations.first_look(Job(self.twin, self.frames))
         sigma = noise_sigma(self.scene, self.split, tracks)
         if sigma is None:
             self.notes.append("no noise is declared and none can be estimated: no claim")
         scale = sigma or float(np.sqrt(np.mean((tracks - self.scene.points[: self.frames]) ** 2))) or 1e-3
-        white = whitener(self.scene, self.split, scale, responses(self.twin, nodes))
+        white = whitener(self.scene, self.split, scale, answers)
         simulations.stage = "numerics"
         directions, finer = numerical_directions(
-            simulations, self.scene, self.twin, tracks, config.calibration.particle_budget, config.refinement
+            simulations, self.lead, self.twin, tracks, config.calibration.particle_budget, config.refinement
         )
         block_of_row = self.split.block_of(white.frame_of_row)
         declared = self._declared(white, block_of_row)
@@ -168,7 +183,7 @@ class _Trace:
         models = (verdict.model, *verdict.equivalent)
         left = max(model.fitted.misfit for model in models)
         return propose(
-            self.scene,
+            self.lead,
             [rival_of(model) for model in models],
             white.sigma,
             discrepancy=float(np.sqrt(max(left**2 - 1.0, 0.0))),
@@ -197,7 +212,7 @@ class _Trace:
         return Model((), fitted, cross_validated(fitted, block_of_row))
 
     def _calibrated_unknowns(self, twin: Twin) -> list[Unknown]:
-        body, ground = self.scene.body, self.scene.ground
+        body, ground = self.lead.body, self.lead.ground
         known = parameters_of(
             twin,
             separate_bending=body.thickness_m is None and body.size_m is None,
@@ -283,16 +298,18 @@ class _Trace:
     ) -> TraceResult:
         config, simulations = self.config, self.simulations
         simulations.stage = "held-out frames"
-        before, after = (self._prediction(model, white) for model in (declared, verdict.model))
+        outcomes = self._outcomes(declared, verdict.model, white, sigma)
         estimates = [
             numbers(m.fitted, block_of_row, finer.get(m.names, {}), config.bootstraps, config.seed)
             for m in (verdict.model, *verdict.equivalent)
         ]
         claimed = verdict.name not in (NOTHING, UNEXPLAINED)
-        held_out = measure(self.scene, self.split, before, after, sigma, config.bootstraps, config.seed)
+        unseen = [o for o in outcomes if o.role == HELD_OUT]
+        held_out = self._errors(unseen or [o for o in outcomes if o.role == FITTED], sigma)
+        after = side_by_side([o.after for o in outcomes if o.role == FITTED], self.scene.frame_count)
         remainder_m, remainder = describe(self.scene, after, self.split.train, white.sigma)
         return TraceResult(
-            scene=self.scene.name,
+            scene=self.lead.name,
             verdict=verdict,
             effects=named(verdict.model, estimates[0]) if claimed else (),
             equivalent=tuple(named(m, e) for m, e in zip(verdict.equivalent, estimates[1:], strict=True)),
@@ -305,27 +322,63 @@ class _Trace:
             refused=refused,
             numerics=numerics,
             finer=finer,
-            before=before,
-            after=after,
+            before=outcomes[0].before,
+            after=outcomes[0].after,
             held_out=held_out,
             remainder_m=remainder_m,
             remainder=remainder,
             simulations=0,
             seconds=0.0,
             notes=tuple(self.notes),
+            recordings=tuple(outcomes),
         )
 
-    def _prediction(self, model: Model, white: Whitener) -> np.ndarray:
-        """Open loop over all frames, (T, N, 3), with the points' own places from the training frames."""
-        twin = moved(model.fitted.twin, white.place_errors(model.fitted.tracks))
-        tracks = self.simulations.run([Job(twin, self.scene.frame_count)])[0]
-        if tracks is not None:
-            return tracks
-        self.notes.append(
-            "the run over the held-out frames cannot be trusted: the last training frame is kept"
-        )
-        last = model.fitted.tracks
-        return np.concatenate([last, np.repeat(last[-1:], self.scene.frame_count - len(last), axis=0)])
+    def _outcomes(self, declared: Model, model: Model, white: Whitener, sigma: float | None) -> list[Outcome]:
+        """Open-loop predictions of every recording before and after, and their errors on frames that were not used."""
+        every = [*self.recordings.fitted, *self.recordings.held_out]
+        before, after = (self._predictions(m, white, every) for m in (declared, model))
+        found = []
+        for recording, was, now in zip(every, before, after, strict=True):
+            noise = recording.scene.noise_sigma_m or sigma
+            errors = measure(
+                recording.scene, recording.split, was, now, noise, self.config.bootstraps, self.config.seed
+            )
+            found.append(
+                Outcome(recording.scene.name, recording.role, recording.split.test, was, now, errors)
+            )
+        return found
+
+    def _errors(self, outcomes: list[Outcome], sigma: float | None) -> HeldOut:
+        """Those of several recordings together."""
+        if len(outcomes) == 1:
+            return outcomes[0].held_out
+        parts = [
+            Unseen(recording.scene, recording.split, outcome.before, outcome.after)
+            for recording, outcome in zip(self._recordings_of(outcomes), outcomes, strict=True)
+        ]
+        return measure_all(parts, sigma, self.config.bootstraps, self.config.seed)
+
+    def _recordings_of(self, outcomes: list[Outcome]) -> tuple[Recording, ...]:
+        return self.recordings.held_out if outcomes[0].role == HELD_OUT else self.recordings.fitted
+
+    def _predictions(self, model: Model, white: Whitener, recordings: list[Recording]) -> list[np.ndarray]:
+        """Open loop over all frames, [(T, N, 3)], with the points' own places from the training frames."""
+        places = white.place_errors(model.fitted.tracks)
+        found = []
+        for recording, tracks in zip(
+            recordings, self.simulations.predictions(model.fitted.twin, places), strict=True
+        ):
+            if tracks is None:
+                self.notes.append(
+                    f"{recording.scene.name}: the run over the frames that were not used cannot be trusted; the last "
+                    "training frame, or without one the first frame, is kept"
+                )
+                known = model.fitted.tracks[: recording.split.train[1], recording.points]
+                if recording.role == HELD_OUT:
+                    known = recording.scene.points[:1]
+                tracks = side_by_side([known], recording.scene.frame_count)
+            found.append(tracks)
+        return found
 
 
 def _agrees(model: Model, finer: dict[str, float], member: Candidate) -> bool:

@@ -202,18 +202,23 @@ class Simulations:
     ) -> None:
         self.drive, self.count = drive, 0
         self._runner, self._memory = runner, memory or Memory()
-        self._progress, self._cancelled, self._digest = progress, cancelled, drive.digest()
+        self._progress, self._cancelled = progress, cancelled
         self.stage, self.least_step_s = "", 0.0
 
     def run(self, jobs: Sequence[Job]) -> list[np.ndarray | None]:
         """Tracks of every job. Raises Cancelled."""
-        keys = [job.fingerprint(self._digest) for job in jobs]
+        return self.under(self.drive, jobs)
+
+    def under(self, drive: Drive, jobs: Sequence[Job]) -> list[np.ndarray | None]:
+        """Tracks of every job under this drive. Raises Cancelled."""
+        digest = drive.digest()
+        keys = [job.fingerprint(digest) for job in jobs]
         known = [self._memory.get(key) for key in keys]
         missing = [k for k, (found, _) in enumerate(known) if not found]
         tracks = [found for _, found in known]
         self.count += len(jobs) - len(missing)
         waiting = [replace(jobs[k], least_step_s=self.least_step_s) for k in missing]
-        fresh = self._runner(waiting, self.drive, self._poll) if missing else iter(())
+        fresh = self._runner(waiting, drive, self._poll) if missing else iter(())
         for k, made in zip(missing, fresh, strict=True):
             self._memory.put(keys[k], made)
             tracks[k] = made
