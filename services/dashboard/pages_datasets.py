@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+import json
+from typing import Annotated, Any
 
 import numpy as np
 from fastapi import APIRouter, Query, Request
@@ -13,8 +14,13 @@ from services.dashboard.clouds import Cloud, Layer, thinned
 from services.dashboard.pages_scenes import layer_response
 from services.dashboard.site import BASE, Site
 from storage import overview, resources
+from storage.errors import NotFound
 
 PAGE_SIZE = 50
+COVERAGE = "coverage.svg"
+CARD = "card.json"
+SHOWN_REJECTIONS = 12
+PICTURE_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 DONE_STATES = frozenset({"sealed", "failed"})
 
 Cursor = Annotated[str | None, Query(max_length=512)]
@@ -49,6 +55,7 @@ def router(site: Site) -> APIRouter:
             chosen = episodes.data[0] if episodes.data else None
             if episode is not None:
                 chosen = resources.get_episode(session, dataset_id, episode)
+        files = {artifact.name: artifact.sha256 for artifact in dataset.artifacts}
         return site.page(
             request,
             "dataset.html",
@@ -56,9 +63,21 @@ def router(site: Site) -> APIRouter:
             scene=scene,
             chosen=chosen,
             episodes=episodes.data,
+            files=files,
+            rejections=_rejections(site, files),
             cursor=cursor,
             next_cursor=episodes.next_cursor,
         )
+
+    @routes.get("/datasets/{dataset_id}/coverage.svg")
+    def coverage(dataset_id: str) -> Response:
+        with site.database.reading() as session:
+            dataset = resources.get_dataset(session, dataset_id)
+        digest = next((known.sha256 for known in dataset.artifacts if known.name == COVERAGE), None)
+        if digest is None:
+            raise NotFound("picture", f"{COVERAGE} of {dataset_id}")
+        headers = {"Content-Security-Policy": PICTURE_POLICY, "Cache-Control": "private, max-age=86400"}
+        return Response(site.artifacts.read_bytes(digest), headers=headers, media_type="image/svg+xml")
 
     @routes.get("/live/datasets/{dataset_id}")
     async def live_page(request: Request, dataset_id: str) -> Response:
@@ -79,6 +98,14 @@ def router(site: Site) -> APIRouter:
         return layer_response(_cloud(site, dataset_id, index), layer)
 
     return routes
+
+
+def _rejections(site: Site, files: dict[str, str]) -> dict[str, Any] | None:
+    """What the card says of rejected tries, the first few of them; None without a card."""
+    if CARD not in files:
+        return None
+    found: dict[str, Any] = json.loads(site.artifacts.read_bytes(files[CARD]))["rejections"]
+    return {**found, "first": found["first"][:SHOWN_REJECTIONS]}
 
 
 def _cloud(site: Site, dataset_id: str, index: int) -> Cloud:

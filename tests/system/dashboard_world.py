@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from physworld.demonstrate.coverage import Coverage
 from physworld.scene import Body, Scene
 from schemas.base import Artifact, Problem
 from schemas.dataset import DatasetConfig
@@ -27,6 +28,7 @@ from storage.database import Database, open_database
 from storage.scene_bundle import canonical_archive
 from storage.settings import Settings
 from storage.tables import utc_now
+from workers.tasks.dataset_card import store_card
 
 FRAMES, POINTS, PARTICLES = 90, 24, 300
 FIRST_HELD_OUT = 63
@@ -174,10 +176,32 @@ def _finish_pipeline(world: World, recording: Scene) -> str:
     with world.database.reading() as session:
         episodes = resources.all_episodes(session, world.dataset_id)
     manifest = world.stores.episodes.write_manifest(world.dataset_id, episodes)
-    seal = {"digest": manifest.sha256, "statistics": {"seconds": 12.5}, "artifacts": [manifest.model_dump()]}
+    files = [manifest, *_card(world, manifest.sha256)]
+    seal = {
+        "digest": manifest.sha256,
+        "statistics": {"seconds": 12.5},
+        "artifacts": [artifact.model_dump() for artifact in files],
+    }
     complete(world, lease, seal, manifest.sha256)
     complete(world, claim(world, pipeline.id), _training_result(world, recording))
     return pipeline.id
+
+
+def _card(world: World, digest: str) -> list[Artifact]:
+    """The dataset's card with its pictures; one try of the second episode was rejected."""
+    coverage = Coverage(EPISODES)
+    for line, arrays, _ in world.stores.episodes.iterate(digest):
+        refused = {
+            "seed": 77,
+            "motion": "twist",
+            "kind": "UnstableSimulation",
+            "reason": "t = 0.31 s: <b>not</b> finite",
+        }
+        tried = [refused] if line.index == 1 else []
+        coverage.add(arrays, {"motion": line.motion, "index": line.index, "rejected": tried})
+    return store_card(
+        world.stores.artifacts, world.dataset_id, digest, DatasetConfig(episodes=EPISODES), coverage
+    )[1]
 
 
 def _fit_result(world: World, recording: Scene) -> dict[str, Any]:

@@ -7,6 +7,7 @@ every request: at the end of each test there are none of the former two, and no 
 from __future__ import annotations
 
 import hashlib
+import json
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -273,12 +274,32 @@ def test_the_error_curve_and_the_parameters_of_the_twin_are_there(visit: Visit, 
 def test_a_dataset_shows_its_episodes_and_one_of_them_in_3d(visit: Visit, world: World) -> None:
     visit.open(f"/datasets/{world.dataset_id}")
     visit.points_shown()
-    expect(visit.page.locator("tbody tr")).to_have_count(EPISODES)
+    expect(visit.page.locator("tbody tr:has(a)")).to_have_count(EPISODES)
     visit.page.locator("tbody a").last.click()
     visit.points_shown()
     expect(visit.page.locator("figure canvas")).to_have_attribute(
         "aria-label", "Particles of episode 2 in 3D"
     )
+
+
+def test_a_dataset_shows_what_it_covers_and_what_was_rejected(
+    visit: Visit, world: World, tmp_path: Path
+) -> None:
+    visit.open(f"/datasets/{world.dataset_id}")
+    picture = visit.page.locator("#coverage img")
+    expect(picture).to_be_visible()
+    assert picture.evaluate("image => image.decode().then(() => image.naturalWidth)") > 400
+    panel = visit.page.locator("#coverage")
+    expect(panel).to_contain_text("1 tries were rejected (1 UnstableSimulation)")
+    expect(panel.locator("tbody tr")).to_contain_text("t = 0.31 s: <b>not</b> finite")
+    with visit.page.expect_download() as download:
+        panel.get_by_role("link", name="card.json").click()
+    download.value.save_as(tmp_path / "card.json")
+    card = json.loads((tmp_path / "card.json").read_text())
+    assert card["episodes"] == EPISODES and card["rejections"]["by_motion"]["twist"] == {
+        "rejected": 1,
+        "tries": 1,
+    }
 
 
 def test_a_model_shows_its_card_and_gives_its_files(visit: Visit, world: World, tmp_path: Path) -> None:

@@ -132,7 +132,7 @@ def seal(context: TaskContext, stores: Stores) -> HandlerResult:
     context.check()
     stores.episodes.remove_orphans(dataset_id, [committed.path for committed in episodes])
     inputs = made_from(stores, payload)
-    card, pictures = store_card(stores, dataset_id, manifest.sha256, config, coverage)
+    card, pictures = store_card(stores.artifacts, dataset_id, manifest.sha256, config, coverage)
     result = {
         "digest": manifest.sha256,
         "statistics": _statistics(episodes, card),

@@ -8,8 +8,8 @@ from typing import Any
 from physworld.demonstrate.coverage import Coverage
 from schemas.base import Artifact
 from schemas.dataset import DatasetConfig
+from storage.artifacts import ArtifactStore
 from workers.coverage_picture import coverage_pictures
-from workers.stores import Stores
 from workers.tasks.fit_report import json_safe
 
 CARD, SVG, PNG = "card.json", "coverage.svg", "coverage.png"
@@ -28,15 +28,15 @@ def card_of(dataset_id: str, digest: str, config: DatasetConfig, coverage: Cover
 
 
 def store_card(
-    stores: Stores, dataset_id: str, digest: str, config: DatasetConfig, coverage: Coverage
+    store: ArtifactStore, dataset_id: str, digest: str, config: DatasetConfig, coverage: Coverage
 ) -> tuple[dict[str, Any], list[Artifact]]:
     """The card, and the artifacts of it and its pictures."""
     card = card_of(dataset_id, digest, config, coverage)
     svg, png = coverage_pictures(coverage)
     text = json.dumps(card, indent=1, allow_nan=False).encode()
     artifacts = [
-        stores.artifacts.put_bytes(text, CARD, "application/json"),
-        stores.artifacts.put_bytes(svg, SVG, "image/svg+xml"),
-        stores.artifacts.put_bytes(png, PNG, "image/png"),
+        store.put_bytes(text, CARD, "application/json"),
+        store.put_bytes(svg, SVG, "image/svg+xml"),
+        store.put_bytes(png, PNG, "image/png"),
     ]
     return card, artifacts
