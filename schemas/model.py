@@ -27,6 +27,9 @@ class TrainingConfig(Request):
     batch_size: int = Field(default=6, ge=1, le=256)
     learning_rate: float = Field(default=1e-3, gt=0, le=1)
     fine_tune_steps: int = Field(default=60, ge=0, le=10_000)
+    formats: list[Literal["torch_export", "onnx"]] = Field(
+        default_factory=lambda: ["torch_export", "onnx"], max_length=2
+    )
     seed: Seed = 0
 
 

@@ -7,6 +7,7 @@ its training job, so the trainer starts as soon as there is something to learn f
 from __future__ import annotations
 
 from schemas.queues import TRAINING
+from storage import signing
 from storage.settings import Settings
 from workers.app import run_worker
 from workers.registry import register
@@ -19,6 +20,7 @@ HANDLERS = {
 
 def serve(settings: Settings, name: str) -> int:
     """Serve the training queue until told to stop; returns the exit code."""
+    signing.open_signer(settings)  # a key that cannot be read ends the trainer now, not after the training
     for kind, handler in HANDLERS.items():
         register(kind, handler)
     return run_worker(settings, TRAINING, name)

@@ -5,6 +5,7 @@ carries on from the last one), fine-tunes the properties on the recording's trai
 everything open loop on the frames that were held out, and stores the version's files:
 
 * ``model.safetensors``: see ``physworld.worldmodel.model`` and ``.published``;
+* ``step.pt2``, ``step.onnx``: one step as a program (``physworld.worldmodel.export``);
 * ``card.json``: lineage, architecture, metrics, seeds, versions, intended use, limits;
 * ``prediction.npz``: ``times`` (T,) f8 [s], ``tracks`` and ``tracks_calibrated`` (T, N, 3) f4 [m] after and
   before fine-tuning, ``twin_tracks``; ``tick_times`` (S,) f8 and ``vertices`` (S, n, 3) f4 on the model's
@@ -32,6 +33,7 @@ from safetensors.numpy import save as save_tensors
 from physworld.evaluate.blocks import mean_with_interval
 from physworld.evaluate.table import held_out_table
 from physworld.worldmodel import config as settings_of
+from physworld.worldmodel import export
 from physworld.worldmodel.clock import resample_smooth
 from physworld.worldmodel.dataset import Track, read_track
 from physworld.worldmodel.errors import CheckpointMismatch, TrainingCancelled
@@ -54,6 +56,7 @@ logger = logging.getLogger(__name__)
 
 CHECKPOINT = "training.pt"
 MANIFEST_NAME = "manifest.json"
+PROGRAMS = {"torch_export": ("step.pt2", export.torch_program), "onnx": ("step.onnx", export.onnx_program)}
 SPEED_REPEATS = 3
 
 
@@ -363,8 +366,13 @@ def _store(
         "vertices": measured.vertices.astype(np.float32),
     }
     facts = {"format": "physworld-world-model", "name": payload["name"], "version": str(payload["version"])}
+    programs = [
+        put(PROGRAMS[name][1](published.model), PROGRAMS[name][0], "application/octet-stream")
+        for name in dict.fromkeys(card["training"]["formats"])
+    ]
     artifacts = [
         put(save_tensors(published.to_tensors(), facts), "model.safetensors", "application/octet-stream"),
+        *programs,
         put(json.dumps(card, indent=1, allow_nan=False).encode(), "card.json", "application/json"),
         put(npz_bytes(prediction), "prediction.npz", "application/x-npz"),
     ]

@@ -26,6 +26,7 @@ SECRETS = (
     "S3_ACCESS_KEY_ID",
     "S3_SECRET_ACCESS_KEY",
     "PHYSWORLD_ADMIN_TOKEN",
+    "PHYSWORLD_SIGNING_KEY",
 )
 ONE_SHOT = {"migrate"}
 OURS = {"migrate", "api", "dispatcher", "worker", "trainer"}
@@ -67,7 +68,7 @@ def test_compose_accepts_the_file_and_refuses_it_without_secrets(repository: Pat
 def test_every_secret_is_required_and_has_no_default(text: str) -> None:
     required = set()
     for name, operator, _ in SUBSTITUTION.findall(text):
-        if name in SECRETS or re.search(r"PASSWORD|SECRET|TOKEN|ACCESS_KEY", name):
+        if name in SECRETS or re.search(r"PASSWORD|SECRET|TOKEN|ACCESS_KEY|SIGNING_KEY", name):
             assert operator == ":?", f"${{{name}}} can be empty or has a default"
             required.add(name)
     assert required == set(SECRETS)

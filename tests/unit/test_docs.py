@@ -27,7 +27,7 @@ LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 HEADING = re.compile(r"^#+ +(.+)$", re.MULTILINE)
 COMMAND = re.compile(r"^ *(physworld [^\n]*)$", re.MULTILINE)
 INLINE_COMMAND = re.compile(r"`(physworld [^`]*)`")
-ADDRESS = re.compile(r"`(GET|POST|PUT|DELETE) (/[^`]*)`")
+ADDRESS = re.compile(r"`(GET|POST|PUT|PATCH|DELETE) (/[^`]*)`")
 
 
 def anchors(text: str) -> set[str]:

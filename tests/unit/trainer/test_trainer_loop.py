@@ -34,6 +34,7 @@ FIT = FitConfig(particle_budget=60, max_simulations=4)
 SMALL = TrainingConfig(
     hidden=16, message_passing_steps=2, history=2, look_ahead=2, vertices=20, steps=16, batch_size=2,
     fine_tune_steps=5,
+    formats=[],
 )  # fmt: skip
 
 

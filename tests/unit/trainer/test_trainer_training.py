@@ -43,6 +43,7 @@ SMALL = TrainingConfig(
     steps=16,
     batch_size=2,
     fine_tune_steps=5,
+    formats=[],
 )
 
 

@@ -1,0 +1,191 @@
+"""One step of the world model as a program without our code: ``torch.export`` and ONNX.
+
+    next = step(window, control_next, phi, senders, receivers, kinds, rest_relative)
+
+    window         (h+1, V, 3)  x^{t-h} … x^t [m], object vertices first; z from the ground where there is one
+    control_next   (C, 3)       control vertices at t + 1 [m]
+    phi            (n, 2)       log property ratios of the object vertices
+    senders, receivers, kinds   (E,) int64: who is heard, by whom, and the kind of the edge (0 near, 1 coarse, 2 grip)
+    rest_relative  (E, 3)       undeformed x_sender − x_receiver of each edge [m]
+    next           (V, 3)       all vertices at t + 1 [m]
+
+float32 but for the indices. V, C, n and h are the model's; the number of edges E is free, so that another graph over
+the same vertices (an edge that tore, a contact) can be given at each step; ``edge_list`` is the model's own. The
+equations are those of ``physworld.worldmodel.model``, written edge by edge: the split form keeps its constants per
+graph and would freeze E.
+"""
+
+from __future__ import annotations
+
+import io
+import logging
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from physworld.worldmodel.graph import EDGE_KINDS, GraphSpec
+from physworld.worldmodel.model import WorldModel
+
+INPUTS = ("window", "control_next", "phi", "senders", "receivers", "kinds", "rest_relative")
+OUTPUT = "next"
+ONNX_OPSET = 18
+
+
+class StepProgram(nn.Module):
+    """The step in plain torch; see the module's text for inputs and output."""
+
+    def __init__(self, model: WorldModel) -> None:
+        super().__init__()
+        spec = model.spec
+        self.objects, self.vertices = spec.object_count, spec.vertex_count
+        self.grounded = spec.ground_height_m is not None
+        # Modules by names that are no Python keywords (``encoder.in`` is): the exporters write code with them.
+        self.encoder, self.decoder = nn.Sequential(*model.encoder), nn.Sequential(*model.decoder)
+        self.receive, self.send, self.edge = model.receive, model.send, model.edge
+        self.update_in, self.update_out, self.skip = model.update_in, model.update_out, model.skip
+        self.norm, self.prior = model.norm, model.prior
+
+    def forward(
+        self,
+        window: Tensor,
+        control_next: Tensor,
+        phi: Tensor,
+        senders: Tensor,
+        receivers: Tensor,
+        kinds: Tensor,
+        rest_relative: Tensor,
+    ) -> Tensor:
+        """Positions (V, 3) at t + 1."""
+        n, count = self.objects, self.vertices
+        prior = self.prior(window[:, :, None], control_next[:, None], phi[:, None])[:, 0]
+        ahead = torch.cat([prior, control_next])
+        features = self._vertex_features(window, ahead, phi)
+        of_kind = nn.functional.one_hot(kinds, EDGE_KINDS).to(window.dtype)
+        edges = self._edge_features(window, senders, receivers, kinds, rest_relative)
+        by_kind = (of_kind[:, :, None] * edges[:, None, :]).flatten(1)
+        ends = kinds * count + receivers
+        degree = window.new_zeros(EDGE_KINDS * count).scatter_add(0, ends, torch.ones_like(edges[:, 0]))
+        state = self.encoder(features)
+        for layer in range(len(self.receive)):
+            weight = self.edge[layer].weight.transpose(1, 2).flatten(0, 1)
+            heard, sent = self.receive[layer](state), self.send[layer](state)
+            messages = torch.relu(
+                heard.index_select(0, receivers) + sent.index_select(0, senders) + by_kind @ weight
+            )
+            total = torch.zeros_like(state).repeat(EDGE_KINDS, 1)
+            total = total.scatter_add(0, ends[:, None].expand_as(messages), messages)
+            means = (total / degree.clamp(min=1.0)[:, None]).unflatten(0, (EDGE_KINDS, count))
+            inner = self.update_in[layer](torch.cat([state, *means.unbind(0)], dim=-1))
+            state = state + self.update_out[layer](torch.relu(inner))
+        correction = self.decoder(state[:n]) + self.skip(features[:n])
+        return torch.cat([prior + self.norm.change * correction, control_next])
+
+    def _vertex_features(self, window: Tensor, ahead: Tensor, phi: Tensor) -> Tensor:
+        """f_i, (V, 3h + 7 or 3h + 8)."""
+        controls = self.vertices - self.objects
+        moves = (window[1:] - window[:-1]).flip(0) / self.norm.velocity
+        of_object = torch.cat([window.new_ones(self.objects, 1), window.new_zeros(controls, 1)])
+        properties = torch.cat([phi / self.norm.properties, phi.new_zeros(controls, phi.shape[1])])
+        parts = [
+            *moves.unbind(0),
+            (ahead - window[-1]) / self.norm.velocity,
+            properties,
+            of_object,
+            1.0 - of_object,
+        ]
+        if self.grounded:
+            parts.append(torch.clamp(window[-1, :, 2:] / self.norm.length, 0.0, 1.0))
+        return torch.cat(parts, dim=-1)
+
+    def _edge_features(
+        self, window: Tensor, senders: Tensor, receivers: Tensor, kinds: Tensor, rest: Tensor
+    ) -> Tensor:
+        """e_ij, (E, 3h + 8)."""
+        norm = self.norm
+        relative = window.index_select(1, senders) - window.index_select(1, receivers)
+        strain, drift, stretch = (
+            scale.index_select(0, kinds)[:, None] for scale in (norm.strain, norm.relative, norm.stretch)
+        )
+        moves = (relative[1:] - relative[:-1]).flip(0) / drift
+        length = torch.linalg.vector_norm(relative[-1], dim=-1, keepdim=True)
+        rest_length = torch.linalg.vector_norm(rest, dim=-1, keepdim=True)
+        return torch.cat(
+            [
+                relative[-1] / norm.length,
+                (relative[-1] - rest) / strain,
+                *moves.unbind(0),
+                rest_length / norm.length,
+                (length - rest_length) / stretch,
+            ],
+            dim=-1,
+        )
+
+
+def edge_list(spec: GraphSpec) -> dict[str, np.ndarray]:
+    """The model's own edges as the program takes them."""
+    receivers, slots = np.nonzero(spec.neighbours < spec.vertex_count)
+    return {
+        "senders": spec.neighbours[receivers, slots].astype(np.int64),
+        "receivers": receivers.astype(np.int64),
+        "kinds": spec.edge_kind[receivers, slots].astype(np.int64),
+        "rest_relative": spec.rest_relative[receivers, slots].astype(np.float32),
+    }
+
+
+def example_inputs(model: WorldModel) -> dict[str, np.ndarray]:
+    """Inputs of the program at rest."""
+    spec, frames = model.spec, model.config.history + 1
+    rest = model._reference.numpy(force=True)
+    return {
+        "window": np.repeat(rest[None], frames, axis=0).astype(np.float32),
+        "control_next": rest[spec.object_count :].astype(np.float32),
+        "phi": np.zeros((spec.object_count, model.norm.properties.shape[0]), dtype=np.float32),
+        **edge_list(spec),
+    }
+
+
+def torch_program(model: WorldModel) -> bytes:
+    """A ``.pt2`` file: ``torch.export.load(file).module()(*inputs)``."""
+    buffer = io.BytesIO()
+    torch.export.save(_exported(model), buffer)
+    return buffer.getvalue()
+
+
+def onnx_program(model: WorldModel) -> bytes:
+    """An ONNX file with the inputs ``INPUTS`` and the output ``next``. Needs onnx and onnxscript."""
+    with _quiet():
+        program = torch.onnx.export(
+            _exported(model),
+            input_names=list(INPUTS),
+            output_names=[OUTPUT],
+            opset_version=ONNX_OPSET,
+            dynamo=True,
+            verbose=False,
+        )
+    return program.model_proto.SerializeToString()
+
+
+def _exported(model: WorldModel) -> torch.export.ExportedProgram:
+    inputs = tuple(torch.as_tensor(values) for values in example_inputs(model).values())
+    edges = torch.export.Dim("edges", min=1)
+    shapes = dict.fromkeys(INPUTS[:3]) | {name: {0: edges} for name in INPUTS[3:]}
+    with torch.no_grad():
+        return torch.export.export(StepProgram(model).eval(), inputs, dynamic_shapes=shapes, strict=False)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """The exporter warns of its own internals and logs what it did."""
+    log = logging.getLogger("torch.onnx")
+    level = log.level
+    log.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        log.setLevel(level)
