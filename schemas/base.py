@@ -8,7 +8,7 @@ from typing import Annotated, Any, Generic, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-ObjectKind = Literal["scene", "fit", "trace", "dataset", "model", "assessment", "artifact"]
+ObjectKind = Literal["scene", "fit", "trace", "dataset", "model", "assessment", "rollout", "plan", "artifact"]
 _UNSTORABLE = re.compile("[\0\ud800-\udfff]")
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 

@@ -10,6 +10,8 @@ PREFIXES = {
     "trace": "trc",
     "dataset": "dst",
     "assessment": "ass",
+    "rollout": "rol",
+    "plan": "pln",
     "job": "job",
     "shard": "shd",
     "key": "key",

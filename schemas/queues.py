@@ -4,6 +4,7 @@ from __future__ import annotations
 
 SIMULATION = "sim"
 TRAINING = "train"
+INFERENCE = "infer"
 TASK_NAME = "physworld.run_shard"
 
 QUEUE_OF_SHARD = {
@@ -15,4 +16,6 @@ QUEUE_OF_SHARD = {
     "dataset_seal": SIMULATION,
     "training": TRAINING,
     "assessment": TRAINING,
+    "rollout": INFERENCE,
+    "plan": INFERENCE,
 }

@@ -9,6 +9,8 @@
                stage 2  one `dataset_seal` shard
     training   stage 0  one `training` shard
     assessment stage 0  one `assessment` shard, whose result may open a trace
+    rollout    stage 0  one `rollout` shard
+    plan       stage 0  one `plan` shard
     pipeline   child jobs, each opened by the success of the one before (``storage.chain``)
 
 Everything here runs in the transaction that changes the shard, under the lock of the job and, before it, of
@@ -29,7 +31,7 @@ from schemas.base import Problem, Reference
 from schemas.dataset import Episode
 from schemas.fit import FitConfig
 from schemas.job import TERMINAL_STATES, Progress
-from storage import helpers, registry, resources, traces
+from storage import helpers, registry, resources, runs, traces
 from storage.chain import open_next, share_done
 from storage.errors import Conflict, NotFound
 from storage.events import append_event
@@ -45,6 +47,7 @@ from storage.results import (
     EpisodeResult,
     FitResult,
     PlanResult,
+    RunResult,
     SealResult,
     ShardResult,
     SimulationResult,
@@ -54,7 +57,7 @@ from storage.results import (
 from storage.tables import FitRow, JobRow, ShardRow
 
 # Alone in their stage: their own progress is the job's.
-LONG_SHARDS = frozenset({"fit", "trace", "training", "assessment"})
+LONG_SHARDS = frozenset({"fit", "trace", "training", "assessment", "rollout", "plan"})
 
 
 def lock_job(session: Session, job_id: str) -> JobRow:
@@ -171,6 +174,8 @@ def _apply(session: Session, job: JobRow, shard: ShardRow, result: ShardResult) 
         _set_output(job, Reference(kind="trace", id=trace_id, digest=digest))
     elif isinstance(result, AssessmentResult):
         _apply_assessment(session, job, payload["assessment_id"], result)
+    elif isinstance(result, RunResult):
+        _apply_run(session, job, payload["run_id"], result)
     elif isinstance(result, PlanResult):
         resources.start_writing(session, payload["dataset_id"])
     elif isinstance(result, EpisodeResult):
@@ -212,6 +217,13 @@ def _apply_assessment(session: Session, job: JobRow, assessment_id: str, result:
     row.trace_id = opened.outputs[0]["id"]
     job.outputs = [*job.outputs, *opened.outputs]
     append_event(session, job.id, "log", {"message": "trace queued", "child": opened.id, "kind": "trace"})
+
+
+def _apply_run(session: Session, job: JobRow, run_id: str, result: RunResult) -> None:
+    """Keep the figures and files of a rollout or a plan."""
+    kind: runs.RunKind = "plan" if job.kind == "plan" else "rollout"
+    runs.mark_run_ready(session, kind, run_id, result.figures, result.artifacts, result.lineage)
+    _set_output(job, Reference(kind=kind, id=run_id, digest=runs.run_digest(result.artifacts, kind)))
 
 
 def _start_next_stage(session: Session, job: JobRow, shard: ShardRow, result: ShardResult) -> bool:
@@ -282,6 +294,8 @@ def _fail_output(session: Session, job: JobRow, message: str) -> None:
         traces.fail_trace(session, output)
     elif job.kind == "assessment":
         traces.fail_assessment(session, output)
+    elif job.kind == "rollout" or job.kind == "plan":
+        runs.fail_run(session, "plan" if job.kind == "plan" else "rollout", output)
     elif job.kind == "dataset":
         resources.fail_dataset(session, output)
     else:

@@ -5,14 +5,16 @@ States: queued -> running -> succeeded | failed, and queued | running -> cancell
 
 from __future__ import annotations
 
+from typing import Any
+
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from schemas.assessment import AssessmentCreate
-from schemas.base import Page
+from schemas.base import Artifact, Page
 from schemas.dataset import DatasetConfig
 from schemas.fit import FitConfig
-from schemas.job import Job
+from schemas.job import Job, Progress
 from schemas.model import TrainingCreate
 from schemas.pipeline import PipelineCreate
 from schemas.trace import TraceCreate
@@ -27,7 +29,9 @@ from storage.opening import (
     open_trace,
     open_training,
 )
+from storage.opening_runs import open_run
 from storage.pages import page_of
+from storage.runs import RunKind
 from storage.tables import JobRow, columns_of, utc_now
 
 __all__ = [
@@ -37,6 +41,7 @@ __all__ = [
     "create_dataset",
     "create_fit",
     "create_pipeline",
+    "create_run",
     "create_trace",
     "create_training",
     "events_after",
@@ -74,6 +79,19 @@ def create_training(session: Session, request: TrainingCreate, parent: JobRow | 
 def create_pipeline(session: Session, request: PipelineCreate) -> Job:
     """Open fit, dataset and training as one job. Raises NotFound."""
     return _job(session, open_pipeline(session, request))
+
+
+def create_run(
+    session: Session,
+    kind: RunKind,
+    name: str,
+    version: int,
+    config: dict[str, Any],
+    request: Artifact,
+    progress: Progress,
+) -> Job:
+    """Open a rollout or a plan with a model version. Raises NotFound, or Conflict when it is not ready."""
+    return _job(session, open_run(session, kind, name, version, config, request, progress))
 
 
 def get_job(session: Session, job_id: str) -> Job:

@@ -45,7 +45,7 @@ def open_fit(session: Session, scene_id: str, config: FitConfig, parent: JobRow 
     """A fit of a scene. Raises NotFound."""
     scene = _scene(session, scene_id)
     fit_id = new_id("fit")
-    job = _open_job(
+    job = open_job(
         session,
         "fit",
         parent=parent,
@@ -63,7 +63,7 @@ def open_fit(session: Session, scene_id: str, config: FitConfig, parent: JobRow 
         config=job.config,
         parameters={},
         metrics={},
-        lineage=_lineage(job),
+        lineage=pending_lineage(job),
         artifacts=[],
     )
     session.add(row)
@@ -89,7 +89,7 @@ def open_trace(
         inputs.append(Reference(kind="fit", id=fit_id, digest=fit_digest(known)))
     trace_id = new_id("trace")
     settings = {"fit": fit.model_dump(mode="json"), "trace": config.model_dump(mode="json")}
-    job = _open_job(
+    job = open_job(
         session,
         "trace",
         parent=parent,
@@ -108,7 +108,7 @@ def open_trace(
         config=settings["trace"],
         fit=settings["fit"],
         report={},
-        lineage=_lineage(job),
+        lineage=pending_lineage(job),
         artifacts=[],
     )
     session.add(row)
@@ -138,7 +138,7 @@ def open_dataset(
             raise Conflict(f"trace {trace_id} is of scene {trace.scene_id}, fit {fit_id} of {fit.scene_id}")
         inputs.append(Reference(kind="trace", id=trace_id, digest=trace_digest(trace)))
     dataset_id = new_id("dataset")
-    job = _open_job(
+    job = open_job(
         session,
         "dataset",
         parent=parent,
@@ -157,7 +157,7 @@ def open_dataset(
         job_id=job.id,
         config=job.config,
         statistics={},
-        lineage=_lineage(job),
+        lineage=pending_lineage(job),
         artifacts=[],
     )
     session.add(row)
@@ -179,7 +179,7 @@ def open_training(session: Session, request: TrainingCreate, parent: JobRow | No
         raise NotFound("dataset", request.dataset_id)
     if dataset.state != "sealed":
         raise Conflict(f"dataset {dataset.id} is {dataset.state}; training needs a sealed dataset")
-    job = _open_job(
+    job = open_job(
         session,
         "training",
         parent=parent,
@@ -201,7 +201,7 @@ def open_training(session: Session, request: TrainingCreate, parent: JobRow | No
         description=request.description,
         tags=request.tags,
     )
-    version.lineage = _lineage(job)
+    version.lineage = pending_lineage(job)
     job.outputs = _plain([Reference(kind="model", id=reference_id(version.name, version.version))])
     payload = {
         "name": version.name,
@@ -224,7 +224,7 @@ def open_assessment(session: Session, name: str, version: int, request: Assessme
         raise Conflict(f"version {version} of {name} is {model.state}; an assessment needs a ready version")
     scene = _scene(session, request.scene_id)
     assessment_id = new_id("assessment")
-    job = _open_job(
+    job = open_job(
         session,
         "assessment",
         parent=None,
@@ -246,7 +246,7 @@ def open_assessment(session: Session, name: str, version: int, request: Assessme
         job_id=job.id,
         config=job.config,
         figures={},
-        lineage=_lineage(job),
+        lineage=pending_lineage(job),
     )
     session.add(row)
     payload = {
@@ -266,7 +266,7 @@ def open_pipeline(session: Session, request: PipelineCreate) -> JobRow:
     """The whole chain; its first child, the fit, is opened with it. Raises NotFound."""
     scene = _scene(session, request.scene_id)
     name = request.model_name or model_name_of(scene.name)
-    job = _open_job(
+    job = open_job(
         session,
         "pipeline",
         parent=None,
@@ -308,7 +308,7 @@ def model_name_of(scene_name: str) -> str:
     return plain[:NAME_LENGTH] or "model"
 
 
-def _open_job(
+def open_job(
     session: Session,
     kind: JobKind,
     *,
@@ -318,6 +318,7 @@ def _open_job(
     config: dict[str, Any],
     progress: Progress,
 ) -> JobRow:
+    """A queued job without shards yet, and its first event."""
     job = JobRow(
         id=new_id("job"),
         kind=kind,
@@ -354,7 +355,8 @@ def _scene(session: Session, scene_id: str) -> SceneRow:
     return scene
 
 
-def _lineage(job: JobRow) -> dict[str, Any]:
+def pending_lineage(job: JobRow) -> dict[str, Any]:
+    """The lineage of what a job will bring forth, before it has."""
     return Lineage(inputs=[Reference.model_validate(item) for item in job.inputs], job_id=job.id).model_dump(
         mode="json"
     )

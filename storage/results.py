@@ -83,6 +83,13 @@ class TrainingResult(ShardResult):
     metrics: dict[str, Any] = Field(default_factory=dict)
 
 
+class RunResult(ShardResult):
+    """Of a ``rollout`` or ``plan`` shard: what it says beside its files."""
+
+    figures: dict[str, Any]
+    artifacts: list[Artifact] = Field(min_length=1)
+
+
 class AssessmentResult(ShardResult):
     """Of an ``assessment`` shard."""
 
@@ -106,6 +113,8 @@ RESULT_OF_SHARD: dict[str, type[ShardResult]] = {
     "dataset_seal": SealResult,
     "training": TrainingResult,
     "assessment": AssessmentResult,
+    "rollout": RunResult,
+    "plan": RunResult,
 }
 
 

@@ -22,7 +22,7 @@ from typing import Any
 from celery import Celery, signals
 from kombu import Exchange, Queue
 
-from schemas.queues import SIMULATION, TASK_NAME, TRAINING
+from schemas.queues import INFERENCE, SIMULATION, TASK_NAME, TRAINING
 from storage.settings import Settings
 
 HARD_LIMIT_S = 12 * 3600
@@ -50,7 +50,7 @@ def create_app(settings: Settings) -> Celery:
         task_create_missing_queues=False,
         task_default_queue=SIMULATION,
         task_ignore_result=True,
-        task_queues=[Queue(name, EXCHANGE, routing_key=name) for name in (SIMULATION, TRAINING)],
+        task_queues=[Queue(name, EXCHANGE, routing_key=name) for name in (SIMULATION, TRAINING, INFERENCE)],
         task_reject_on_worker_lost=True,
         task_serializer="json",
         task_soft_time_limit=SOFT_LIMIT_S,

@@ -28,7 +28,7 @@ from celery import Celery
 from kombu.exceptions import OperationalError as BrokerError
 
 from schemas.job import TERMINAL_STATES
-from schemas.queues import SIMULATION, TASK_NAME, TRAINING
+from schemas.queues import INFERENCE, SIMULATION, TASK_NAME, TRAINING
 from storage import idempotency, leases
 from storage.database import Database, open_database
 from storage.errors import DatabaseUnavailable, StoreError
@@ -58,8 +58,8 @@ class Dispatcher:
         self._database = database
         self._app = app
         self._connection = app.connection_for_write()
-        self._depth = dict.fromkeys((SIMULATION, TRAINING), 0)
-        self._empty_looks = dict.fromkeys((SIMULATION, TRAINING), 0)
+        self._depth = dict.fromkeys((SIMULATION, TRAINING, INFERENCE), 0)
+        self._empty_looks = dict.fromkeys((SIMULATION, TRAINING, INFERENCE), 0)
         self._sweep_due = 0.0
         self._forget_due = 0.0
 

@@ -5,7 +5,8 @@ WorldModelError
 ├── DatasetUnusable      episodes too short, at another clock, or not numbers
 ├── TrainingDiverged     the loss or the gradient stopped being a number (``step`` says when)
 ├── TrainingCancelled    the caller's ``cancelled`` said so
-└── CheckpointMismatch   a checkpoint of other settings or other data
+├── CheckpointMismatch   a checkpoint of other settings or other data
+└── ControlsInvalid      control paths that cannot drive this model (``field`` says which part of them)
 """
 
 from __future__ import annotations
@@ -42,3 +43,11 @@ class TrainingCancelled(WorldModelError):
 
 class CheckpointMismatch(WorldModelError):
     """The checkpoint belongs to other settings or other data."""
+
+
+class ControlsInvalid(WorldModelError):
+    """``field`` of a request for a rollout does not fit the model."""
+
+    def __init__(self, message: str, field: str) -> None:
+        super().__init__(message)
+        self.field = field

@@ -99,7 +99,7 @@ def job_links(job: Job) -> Job:
         if output.kind == "model":
             name, _, version = output.id.rpartition(":")
             links["model"] = f"/v1/models/{name}/versions/{version}"
-        elif output.kind in {"fit", "trace", "dataset", "assessment"}:
+        elif output.kind in {"fit", "trace", "dataset", "assessment", "rollout", "plan"}:
             links[output.kind] = f"/v1/{output.kind}s/{output.id}"
     return job.model_copy(update={"links": links})
 

@@ -5,15 +5,17 @@ from __future__ import annotations
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from schemas.rollout import MAX_REQUEST_BYTES
 from services.api.errors import ApiProblem, answer
 
 JSON_LIMIT_BYTES = 1024 * 1024
 MULTIPART_OVERHEAD_BYTES = 64 * 1024
 UPLOAD_PATHS = frozenset({"/v1/scenes"})
+ARRAY_PATHS = frozenset({"/v1/rollouts"})
 
 
 class BodyLimit:
-    """ASGI middleware; uploads are bounded by the settings, every other body by 1 MiB."""
+    """ASGI middleware; uploads are bounded by the settings, rollouts by 32 MiB, every other body by 1 MiB."""
 
     def __init__(self, app: ASGIApp, max_upload_bytes: int) -> None:
         self.app = app
@@ -26,6 +28,8 @@ class BodyLimit:
             return
         if scope["path"] in UPLOAD_PATHS:
             allowed, limit = self.max_upload_bytes + MULTIPART_OVERHEAD_BYTES, self.max_upload_bytes
+        elif scope["path"] in ARRAY_PATHS:
+            allowed = limit = MAX_REQUEST_BYTES
         else:
             allowed = limit = JSON_LIMIT_BYTES
         declared = Headers(scope=scope).get("Content-Length", "0")

@@ -27,11 +27,16 @@ def main(arguments: list[str] | None = None) -> int:
         "--port", type=int, default=0, help="web port on 127.0.0.1; 0: last one, or a free one"
     )
     parser.add_argument("--no-trainer", action="store_true", help="do not start the trainer")
+    parser.add_argument(
+        "--no-inference", action="store_true", help="do not start rollouts, plans, live sessions"
+    )
     given = parser.parse_args(arguments)
     if given.workers < 0:
         parser.error(f"--workers {given.workers} is negative")
     root = given.data if given.data is not None else Settings().data_dir
-    options = Options(root, given.workers, given.port, trainer=not given.no_trainer)
+    options = Options(
+        root, given.workers, given.port, trainer=not given.no_trainer, inference=not given.no_inference
+    )
     try:
         Supervisor(options, _say).run()
     except AlreadyRunning as error:

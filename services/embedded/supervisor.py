@@ -1,8 +1,8 @@
 """Starts the parts in their order, keeps them running, says when they serve, and ends them all.
 
 Order: folder locks → database at its newest revision → admin key, signing key → broker (waited for) → web,
-dispatcher, workers, trainer. A child that ends is started again with growing pauses; the broker comes back on its port
-with its append-only file. The supervisor is one thread that sleeps between looks; its death by any signal
+dispatcher, workers, trainer, inference. A child that ends is started again with growing pauses; the broker comes back
+on its port with its append-only file. The supervisor is one thread that sleeps between looks; its death by any signal
 ends every child (Linux: PR_SET_PDEATHSIG) and the next start carries on from the database.
 """
 
@@ -54,12 +54,14 @@ class Options:
         workers: simulation worker processes.
         port: of the web process; 0 takes the last one, or any that is free.
         trainer: whether to run the trainer.
+        inference: whether to run the inference service and its worker.
     """
 
     root: Path
     workers: int = 2
     port: int = 0
     trainer: bool = True
+    inference: bool = True
 
 
 class StartFailed(Exception):
@@ -89,9 +91,9 @@ class Supervisor:
         try:
             locks.wait_until_alone(EARLIER_RUN_WITHIN_S)
             locks.hold_family()
-            with self._listen() as listening:
+            with self._listen() as listening, _any_port() as inference:
                 try:
-                    self._start(locks.family_descriptor, listening)
+                    self._start(locks.family_descriptor, listening, inference)
                     self._watch()
                 finally:
                     self._end()
@@ -100,12 +102,14 @@ class Supervisor:
         finally:
             locks.close()
 
-    def _start(self, family: int, listening: socket.socket) -> None:
+    def _start(self, family: int, listening: socket.socket, inference: socket.socket) -> None:
         environment = {**os.environ, "PHYSWORLD_DATA_DIR": str(self._folder.root), "PYTHONUNBUFFERED": "1"}
         broker = choose_broker(self._folder, environment)
         environment["PHYSWORLD_BROKER_URL"] = broker.url
         if not broker.command:  # somebody else's: others may use it for the same
             environment.setdefault("PHYSWORLD_BROKER_PREFIX", f"physworld-{self._folder.digest}:")
+        if self._options.inference:
+            environment["PHYSWORLD_INFERENCE_URL"] = f"http://127.0.0.1:{inference.getsockname()[1]}"
         settings = Settings(data_dir=self._folder.root, broker_url=SecretStr(broker.url))
         settings.check()
         self._prepare_database(settings)
@@ -113,7 +117,7 @@ class Supervisor:
         if broker.command:
             self._add(Program("broker", broker.command, environment), family)
         self._wait_for_broker(broker)
-        for program in self._programs(environment, listening):
+        for program in self._programs(environment, listening, inference):
             self._add(program, family)
         self._write_state(ready=False)
         self._wait_until_ready()
@@ -124,7 +128,9 @@ class Supervisor:
         self._say(f"  API key    {self._folder.api_key}")
         self._say(f"  data       {self._folder.root}")
 
-    def _programs(self, environment: dict[str, str], listening: socket.socket) -> list[Program]:
+    def _programs(
+        self, environment: dict[str, str], listening: socket.socket, inference: socket.socket
+    ) -> list[Program]:
         python = (sys.executable, "-m")
         programs = [
             Program(
@@ -142,6 +148,12 @@ class Supervisor:
         if self._options.trainer:
             train = (*python, "services.trainer", "--name", "trainer")
             programs.append(self._python_program("trainer", train, environment, signal.SIGQUIT))
+        if self._options.inference:
+            module = (*python, "services.inference")
+            answer = (*module, "serve", "--fd", str(inference.fileno()))
+            programs.append(Program("inference", answer, environment, descriptors=(inference.fileno(),)))
+            work = (*module, "work", "--name", "planner")
+            programs.append(self._python_program("planner", work, environment, signal.SIGQUIT))
         return programs
 
     def _python_program(
@@ -270,6 +282,14 @@ class Supervisor:
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self._stop.set()
+
+
+def _any_port() -> socket.socket:
+    """A socket that listens on a free loopback port."""
+    listening = socket.socket()
+    listening.bind(("127.0.0.1", 0))
+    listening.listen(128)
+    return listening
 
 
 class Stopped(Exception):

@@ -50,6 +50,8 @@ def test_start_look_start_again_and_ctrl_c(tmp_path: Path) -> None:
             "worker-1",
             "worker-2",
             "trainer",
+            "inference",
+            "planner",
         }
         key_file = Path(state["api_key_file"])
         assert stat.S_IMODE(key_file.stat().st_mode) == 0o600

@@ -8,7 +8,7 @@ import sys
 import pytest
 from pydantic import SecretStr
 
-from schemas.queues import SIMULATION, TASK_NAME, TRAINING
+from schemas.queues import INFERENCE, SIMULATION, TASK_NAME, TRAINING
 from storage.settings import Settings
 from workers import registry
 from workers.app import HARD_LIMIT_S, create_app
@@ -39,6 +39,7 @@ def test_each_queue_has_a_route_of_its_own(settings: Settings) -> None:
     assert {(queue.name, queue.routing_key) for queue in queues} == {
         (SIMULATION, SIMULATION),
         (TRAINING, TRAINING),
+        (INFERENCE, INFERENCE),
     }
 
 

@@ -1,0 +1,69 @@
+"""What the grips may do: speed, acceleration, workspace, distances; and the nearest motion that keeps to it.
+
+Motions are translations: velocities of G grips over T ticks, (…, T, G, 3) [m/s]; a grip's displacement at tick t is the
+sum of its velocities up to t, times dt. Turning a grip is left to whoever drives it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+SPREAD_PASSES = 2
+
+
+@dataclass(frozen=True)
+class GripLimits:
+    """Limits of every grip.
+
+    Attributes:
+        speed_m_s, acceleration_m_s2: largest.
+        box_min_m, box_max_m: of a grip's displacement from where the plan starts, (G, 3).
+        spread_max_m: largest distance between grip centres, (G, G), infinite where none.
+        centres_m: of the grips where the plan starts, (G, 3).
+    """
+
+    speed_m_s: float
+    acceleration_m_s2: float
+    box_min_m: np.ndarray
+    box_max_m: np.ndarray
+    spread_max_m: np.ndarray
+    centres_m: np.ndarray
+
+    def kept(self, velocities: np.ndarray, dt_s: float) -> np.ndarray:
+        """Velocities (…, T, G, 3) cut to the limits, tick by tick: acceleration, speed, workspace, spread.
+
+        Where a grip meets the end of its workspace it stops there within the tick: the workspace comes before the
+        acceleration.
+        """
+        out = np.empty_like(velocities)
+        place = np.zeros(velocities.shape[:-3] + velocities.shape[-2:])
+        before = np.zeros_like(place)
+        for t in range(velocities.shape[-3]):
+            change = _shortened(velocities[..., t, :, :] - before, self.acceleration_m_s2 * dt_s)
+            wanted = place + dt_s * _shortened(before + change, self.speed_m_s)
+            wanted = self._apart(np.clip(wanted, self.box_min_m, self.box_max_m))
+            wanted = np.clip(wanted, self.box_min_m, self.box_max_m)
+            out[..., t, :, :] = before = (wanted - place) / dt_s
+            place = wanted
+        return out
+
+    def _apart(self, place: np.ndarray) -> np.ndarray:
+        """Displacements (…, G, 3) with no two grips farther from each other than the material between them is long."""
+        count = place.shape[-2]
+        for _ in range(SPREAD_PASSES if count > 1 else 0):
+            for i in range(count):
+                for j in range(i + 1, count):
+                    gap = self.centres_m[j] + place[..., j, :] - self.centres_m[i] - place[..., i, :]
+                    length = np.linalg.norm(gap, axis=-1, keepdims=True)
+                    excess = np.maximum(length - self.spread_max_m[i, j], 0.0) / np.maximum(length, 1e-12)
+                    place = place.copy()
+                    place[..., i, :] += 0.5 * excess * gap
+                    place[..., j, :] -= 0.5 * excess * gap
+        return place
+
+
+def _shortened(vectors: np.ndarray, longest: float) -> np.ndarray:
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors * np.minimum(1.0, longest / np.maximum(length, 1e-300))

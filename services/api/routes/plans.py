@@ -1,0 +1,70 @@
+"""Plans: motions of the grips that bring the object to a goal, checked in the twin."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Response
+
+from schemas.arrays import EncodedArray
+from schemas.base import Page
+from schemas.job import Job, Progress
+from schemas.plan import Plan, PlanCreate, ShapeGoal
+from services.api.dependencies import DatabaseDep, ObjectId, PageDep, StoresDep
+from services.api.errors import documented
+from services.api.idempotency import IdempotencyDep, accepted
+from services.api.routes.rollouts import invalid, read_array, ready_version
+from storage import jobs, registry, resources, runs
+
+router = APIRouter(prefix="/plans", tags=["plans"])
+
+MOST_SHAPE_POINTS = 20_000
+
+
+@router.post("", status_code=202, response_model=Job, responses=documented(401, 403, 404, 409, 413, 422))
+def create_plan(
+    body: PlanCreate, idempotency: IdempotencyDep, database: DatabaseDep, stores: StoresDep
+) -> Response:
+    """Search a motion that brings the object to the goal; the plan's id is in the job's `outputs`."""
+    with database.reading() as session:
+        version = ready_version(registry.get_version(session, body.model, body.version))
+        points = resources.get_scene(session, str(version.scene_id)).points
+    asked = _checked(body, points).model_copy(update={"version": version.version})
+    request = stores.artifacts.put_bytes(asked.model_dump_json().encode(), runs.REQUEST, "application/json")
+    config = asked.model_dump(mode="json", exclude={"goal"}) | {"goal": body.goal.kind}
+    progress = Progress(total=body.config.iterations, unit="iterations")
+    return idempotency.run(
+        body,
+        lambda session: accepted(
+            jobs.create_run(session, "plan", body.model, version.version, config, request, progress)
+        ),
+    )
+
+
+@router.get("", responses=documented(401, 403, 422))
+def list_plans(
+    database: DatabaseDep, page: PageDep, model: Annotated[str | None, Query(max_length=64)] = None
+) -> Page[Plan]:
+    """Plans, newest first."""
+    with database.reading() as session:
+        return runs.list_plans(session, limit=page.limit, cursor=page.cursor, model=model)
+
+
+@router.get("/{plan_id}", responses=documented(401, 403, 404, 422))
+def get_plan(plan_id: ObjectId, database: DatabaseDep) -> Plan:
+    """A plan; control path, predicted and executed paths are the artifact `plan.npz`."""
+    with database.reading() as session:
+        return runs.get_plan(session, plan_id)
+
+
+def _checked(body: PlanCreate, points: int) -> PlanCreate:
+    """The request with its goal's array checked. Raises ApiProblem, 422."""
+    if isinstance(body.goal, ShapeGoal):
+        shape = read_array(body.goal.shape, "goal.shape", (2,))
+        if shape.shape[1] != 3 or len(shape) > MOST_SHAPE_POINTS:
+            raise invalid("goal.shape", f"goal.shape is {shape.shape}, not (M <= {MOST_SHAPE_POINTS}, 3)")
+        return body.model_copy(update={"goal": ShapeGoal(shape=EncodedArray.of(shape))})
+    beyond = [index for index in body.goal.index if index >= points]
+    if beyond:
+        raise invalid("goal.index", f"goal.index holds {beyond[:5]}; the scene has {points} points")
+    return body

@@ -1,0 +1,143 @@
+"""Rollouts: what a published model predicts for control paths, at once or as a job."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import numpy as np
+from fastapi import APIRouter, Query, Response
+
+from schemas.arrays import ArrayInput, EncodedArray, array_of
+from schemas.base import FieldError, Page
+from schemas.job import Progress
+from schemas.model import ModelVersion
+from schemas.rollout import (
+    MAX_CANDIDATES,
+    MAX_STEPS,
+    MAX_TICKS,
+    SYNC_STEPS,
+    SYNC_VALUES,
+    Rollout,
+    RolloutCreate,
+)
+from services.api.dependencies import DatabaseDep, ObjectId, PageDep, PrincipalDep, SettingsDep, StoresDep
+from services.api.errors import ApiProblem, documented
+from services.api.idempotency import IdempotencyDep, accepted, answer_of
+from services.api.inference import roll_out
+from storage import jobs, registry, resources, runs
+
+router = APIRouter(prefix="/rollouts", tags=["rollouts"])
+
+NOMINAL_RATE_HZ = 30.0
+_ANSWERS: dict[int | str, dict[str, Any]] = {
+    202: {"description": "Too large to be answered at once: a job; its output is the rollout"},
+    **documented(401, 403, 404, 409, 413, 422, 503),
+}
+
+
+@router.post("", response_model=Rollout, responses=_ANSWERS)
+def create_rollout(
+    body: RolloutCreate,
+    idempotency: IdempotencyDep,
+    database: DatabaseDep,
+    stores: StoresDep,
+    settings: SettingsDep,
+    principal: PrincipalDep,
+) -> Response:
+    """Predict a batch of control paths: 200 with the arrays for a small one, 202 with a job for a large one."""
+    with database.reading() as session:
+        version = ready_version(registry.get_version(session, body.model, body.version))
+        scene = resources.get_scene(session, str(version.scene_id))
+    shape = _shape(body, scene.controllers)
+    asked = _encoded(body).model_copy(update={"version": version.version})
+    ticks = shape[1] if body.times is None else max(1, round(body.times[-1] * NOMINAL_RATE_HZ))
+    places = sum(
+        {"points": scene.points, "vertices": version.config.vertices}[part] for part in set(body.returns)
+    )
+    small = shape[0] * ticks <= SYNC_STEPS and 3 * shape[0] * -(-ticks // body.every) * places <= SYNC_VALUES
+    if small and body.mode == "auto" and settings.inference_url:
+        found = roll_out(settings.inference_url, database, principal.id, asked)
+        return idempotency.run(body, lambda session: answer_of(200, found))
+    request = stores.artifacts.put_bytes(asked.model_dump_json().encode(), runs.REQUEST, "application/json")
+    config = asked.model_dump(mode="json", exclude={"controllers", "phi", "times"}) | {"shape": list(shape)}
+    progress = Progress(total=shape[0] * ticks, unit="steps")
+    return idempotency.run(
+        body,
+        lambda session: accepted(
+            jobs.create_run(session, "rollout", body.model, version.version, config, request, progress)
+        ),
+    )
+
+
+@router.get("", responses=documented(401, 403, 422))
+def list_rollouts(
+    database: DatabaseDep, page: PageDep, model: Annotated[str | None, Query(max_length=64)] = None
+) -> Page[Rollout]:
+    """Rollouts that were jobs, newest first."""
+    with database.reading() as session:
+        return runs.list_rollouts(session, limit=page.limit, cursor=page.cursor, model=model)
+
+
+@router.get("/{rollout_id}", responses=documented(401, 403, 404, 422))
+def get_rollout(rollout_id: ObjectId, database: DatabaseDep) -> Rollout:
+    """A rollout that was a job; its arrays are the artifact `rollout.npz`."""
+    with database.reading() as session:
+        return runs.get_rollout(session, rollout_id)
+
+
+def ready_version(version: ModelVersion) -> ModelVersion:
+    """The version, if it can predict. Raises ApiProblem, 409."""
+    if version.state != "ready" or version.scene_id is None:
+        raise ApiProblem(
+            409,
+            "conflict",
+            f"version {version.version} of {version.name} is {version.state}; it cannot predict",
+        )
+    return version
+
+
+def invalid(field: str, message: str) -> ApiProblem:
+    """422 that names the field."""
+    return ApiProblem(422, "invalid_request", message, errors=[FieldError(loc=["body", field], msg=message)])
+
+
+def read_array(value: ArrayInput, field: str, dimensions: tuple[int, ...]) -> np.ndarray:
+    """The values, finite. Raises ApiProblem, 422, with the place and the numbers."""
+    try:
+        return array_of(value, field, dimensions)
+    except ValueError as error:
+        raise invalid(field, str(error)) from error
+
+
+def _shape(body: RolloutCreate, controllers: int) -> tuple[int, int]:
+    """(B, T) of the control paths, after everything that needs no model was checked."""
+    values = read_array(body.controllers, "controllers", (3, 4))
+    shape = values.shape if values.ndim == 4 else (1, *values.shape)
+    if shape[2:] != (controllers, 3):
+        raise invalid(
+            "controllers",
+            f"controllers of shape {values.shape}, not (B, T, {controllers}, 3): the scene has {controllers} of them",
+        )
+    if (
+        shape[0] > MAX_CANDIDATES
+        or shape[0] * shape[1] > MAX_STEPS
+        or (body.times is None and shape[1] > MAX_TICKS)
+    ):
+        raise invalid(
+            "controllers",
+            f"{shape[0]} candidates of {shape[1]} ticks; at most {MAX_CANDIDATES} candidates, {MAX_TICKS} ticks and "
+            f"{MAX_STEPS} in all",
+        )
+    if body.times is not None and (
+        not body.times or not np.isfinite(body.times).all() or len(body.times) != shape[1]
+    ):
+        raise invalid("times", f"{len(body.times)} times, which must be finite, for {shape[1]} places")
+    return shape[0], shape[1]
+
+
+def _encoded(body: RolloutCreate) -> RolloutCreate:
+    """The same with its arrays in single precision."""
+    arrays = {"controllers": EncodedArray.of(read_array(body.controllers, "controllers", (3, 4)))}
+    if body.phi is not None:
+        arrays["phi"] = EncodedArray.of(read_array(body.phi, "phi", (2, 3)))
+    return body.model_copy(update=arrays)

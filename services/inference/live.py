@@ -1,0 +1,153 @@
+"""Live sessions over WebSocket: control velocities in, frames of points out at the model's clock or faster.
+
+``/live?model=NAME&version=N&ticket=…&frames=2``: first a JSON text ``{"type": "ready", …}``, then binary frames
+(``session``), ``frames`` of them a tick, interpolated. The client sends binary control messages, and as JSON text
+``{"type": "reset"}``. Velocities last ``HOLD_S``: a client that falls silent stops its grips.
+
+The model is stepped in a thread, never on the event loop. A slow reader gets fewer frames, the newest each time:
+nothing queues up. A session ends after ``IDLE_S`` without a message (4408), at a message that cannot be read (1007),
+when the client does not take a frame within ``SEND_S`` (4409); a process holds ``MOST_SESSIONS`` of them (1013).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+
+import numpy as np
+import structlog
+from starlette.concurrency import run_in_threadpool
+from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
+
+from services.inference.models import Models
+from services.inference.session import Control, ControlRefused, LiveSession
+from storage import tickets
+from storage.database import Database
+from storage.errors import StorageError
+
+MOST_SESSIONS, THREADS = 4, 2
+IDLE_S, SEND_S, HOLD_S = 120.0, 10.0, 0.3
+MOST_FRAMES = 4
+UNREADABLE, TRY_LATER, POLICY, IDLE, TOO_SLOW = 1007, 1013, 1008, 4408, 4409
+
+log = structlog.get_logger("physworld.live")
+
+
+class LiveSessions:
+    """The sessions of one process."""
+
+    def __init__(
+        self, database: Database, models: Models, *, idle_s: float = IDLE_S, most: int = MOST_SESSIONS
+    ) -> None:
+        self._database, self._models = database, models
+        self._idle_s, self._most, self._open = idle_s, most, 0
+        self._pool = ThreadPoolExecutor(THREADS, thread_name_prefix="live")
+
+    async def serve(self, socket: WebSocket) -> None:
+        """Serve one connection until it ends."""
+        query = socket.query_params
+        model, version, ticket = (query.get(name, "") for name in ("model", "version", "ticket"))
+        frames = min(max(int(query["frames"]), 1), MOST_FRAMES) if query.get("frames", "").isdecimal() else 1
+        await socket.accept()
+        if await run_in_threadpool(self._key_of, ticket, f"live:{model}:{version}") is None:
+            await socket.close(POLICY, "the ticket is unknown, over or for something else")
+            return
+        if self._open >= self._most:
+            await socket.close(TRY_LATER, f"{self._open} sessions are open, the most of this process")
+            return
+        self._open += 1
+        try:
+            _, published = await run_in_threadpool(self._models.get, model, version)
+            session = await run_in_threadpool(LiveSession, published)
+            await _Connection(socket, session, self._pool, frames, self._idle_s).run()
+        except StorageError as error:
+            await socket.close(POLICY, str(error)[:120])
+        except WebSocketDisconnect:
+            pass
+        finally:
+            self._open -= 1
+
+    def _key_of(self, ticket: str, subject: str) -> object | None:
+        with self._database.session() as session:
+            return tickets.redeem(session, ticket, subject)
+
+
+class _Connection:
+    """A session with its connection: one task reads, one steps, one sends the newest frame."""
+
+    def __init__(
+        self, socket: WebSocket, session: LiveSession, pool: ThreadPoolExecutor, frames: int, idle_s: float
+    ) -> None:
+        self._socket, self._session, self._pool = socket, session, pool
+        self._frames, self._idle_s = frames, idle_s
+        self._control: Control | None = None
+        self._heard_at = self._steered_at = asyncio.get_running_loop().time()
+        self._reset = False
+        self._newest: bytes | None = None
+        self._fresh = asyncio.Event()
+
+    async def run(self) -> None:
+        """Until the client leaves, falls silent, sends nonsense or stops reading."""
+        await self._socket.send_text(json.dumps({"type": "ready", **self._session.describe()}))
+        tasks = [asyncio.create_task(work) for work in (self._read(), self._step(), self._send())]
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        code, reason = next(iter(done)).result()
+        if code and self._socket.application_state is WebSocketState.CONNECTED:
+            with suppress(RuntimeError):  # the client may have gone meanwhile
+                await self._socket.close(code, reason)
+
+    async def _read(self) -> tuple[int, str]:
+        clock = asyncio.get_running_loop().time
+        while True:
+            message = await self._socket.receive()
+            if message["type"] == "websocket.disconnect":
+                return 0, ""
+            self._heard_at = clock()
+            try:
+                if message.get("bytes") is not None:
+                    self._control, self._steered_at = self._session.read(message["bytes"]), clock()
+                elif json.loads(message["text"]).get("type") == "reset":
+                    self._reset = True
+            except (ControlRefused, ValueError, AttributeError, RecursionError) as error:
+                return UNREADABLE, str(error)[:120]
+
+    async def _step(self) -> tuple[int, str]:
+        loop = asyncio.get_running_loop()
+        still = np.zeros((len(self._session.describe()["controllers"]), 3))
+        due = loop.time()
+        while True:
+            if loop.time() - self._heard_at > self._idle_s:
+                return IDLE, f"no message for {self._idle_s:g} s"
+            control = self._control
+            moving = control is not None and loop.time() - self._steered_at < HOLD_S
+            velocity = control.velocity if control is not None and moving else still
+            if self._reset:
+                self._reset = False
+                self._session.reset()
+            await loop.run_in_executor(self._pool, self._session.tick, velocity)
+            for part in range(1, self._frames + 1):
+                self._newest = self._session.frame(part / self._frames, control.number if control else 0)
+                self._fresh.set()
+                due += self._session.dt_s / self._frames
+                await asyncio.sleep(max(0.0, due - loop.time()))
+            if loop.time() - due > 0.5:  # too slow for real time: go on from now
+                due = loop.time()
+
+    async def _send(self) -> tuple[int, str]:
+        while True:
+            await self._fresh.wait()
+            self._fresh.clear()
+            frame, self._newest = self._newest, None
+            if frame is None:
+                continue
+            try:
+                await asyncio.wait_for(self._socket.send_bytes(frame), SEND_S)
+            except TimeoutError:
+                return TOO_SLOW, f"a frame was not taken within {SEND_S:g} s"
+            except (WebSocketDisconnect, RuntimeError):
+                return 0, ""

@@ -1,0 +1,53 @@
+"""Published models, loaded once and kept while they are used: the least recently used one goes first."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections import OrderedDict
+
+from safetensors.numpy import load as load_tensors
+
+from physworld.worldmodel.published import PublishedModel
+from schemas.model import ModelVersion
+from storage import registry
+from storage.artifacts import ArtifactStore
+from storage.database import Database
+from storage.errors import Conflict, NotFound
+
+KEPT_MODELS = 4
+
+
+class Models:
+    """Versions by their manifest's digest; safe between threads."""
+
+    def __init__(self, database: Database, artifacts: ArtifactStore, kept: int = KEPT_MODELS) -> None:
+        self._database, self._artifacts, self._most = database, artifacts, kept
+        self._kept: OrderedDict[str, PublishedModel] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, name: str, version: int | str) -> tuple[ModelVersion, PublishedModel]:
+        """The version and its network. Raises NotFound, Conflict when it is not ready, ArtifactCorrupt."""
+        with self._database.reading() as session:
+            found = registry.get_version(session, name, version)
+        if found.state != "ready" or found.sha256 is None:
+            raise Conflict(
+                f"version {found.version} of {name} is {found.state}; a rollout needs a ready version"
+            )
+        with self._lock:  # one at a time: two loads of one model would take twice its memory
+            model = self._kept.get(found.sha256)
+            if model is None:
+                model = self._kept[found.sha256] = self._load(found)
+                while len(self._kept) > self._most:
+                    self._kept.popitem(last=False)
+            self._kept.move_to_end(found.sha256)
+        return found, model
+
+    def _load(self, version: ModelVersion) -> PublishedModel:
+        files = {item.name: item.sha256 for item in version.artifacts}
+        for name in ("card.json", "model.safetensors"):
+            if name not in files:
+                raise NotFound("artifact", f"{name} of {version.name}:{version.version}")
+        card = json.loads(self._artifacts.read_bytes(files["card.json"]))
+        tensors = load_tensors(self._artifacts.read_bytes(files["model.safetensors"]))
+        return PublishedModel.from_tensors(tensors, card["architecture"])

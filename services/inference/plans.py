@@ -1,0 +1,125 @@
+"""From a request for a plan to its figures and arrays: search with the model, check in the twin.
+
+Arrays of ``plan.npz``, T ticks of the plan after the h + 1 of the model's history:
+    times (T,) f8            [s] from the first tick of the history
+    controllers (h+1+T, K, 3) f8   all control points [m]; what POST /v1/rollouts takes
+    displacements (T, G, 3) f8     of the grips [m]
+    predicted (T, N, 3) f4   measured points, the model's [m]
+    executed (T, N, 3) f4    the same in the twin [m]
+    motionless (T, N, 3) f4  in the twin when the grips do not move [m]
+    cost_history (I+1,) f8   best cost after each iteration [m], the first that of no motion
+    goal_index (M,) i8, goal_places (M, 3) f8; or goal_shape (M, 3) f8
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from physworld.planning.goals import Goal, GoalPoints, GoalShape
+from physworld.planning.mppi import Found, MppiConfig, search
+from physworld.planning.task import PlanningTask
+from physworld.worldmodel.published import PublishedModel
+from schemas.arrays import array_of
+from schemas.plan import PlanCreate, PlanLimits, PointGoal
+from workers.context import TaskContext
+from workers.stores import Stores
+from workers.tasks.inputs import scene_of, twin_of
+
+
+def make(
+    context: TaskContext, stores: Stores, request: PlanCreate, model: PublishedModel
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Search, execute, measure. Raises Cancelled, ValueError for limits that leave the start out."""
+    payload = context.lease.payload
+    scene = scene_of(stores, payload["scene_id"])
+    twin = twin_of(stores, payload["fit_id"], payload.get("trace_id"))
+    task = _limited(PlanningTask.of(model, twin, scene), request.limits)
+    goal, goal_arrays = goal_of(request)
+    asked = request.config
+    config = MppiConfig(
+        horizon=asked.horizon, samples=asked.samples, iterations=asked.iterations, settle=asked.settle
+    )
+
+    def progress(done: int, total: int, cost: float) -> None:
+        context.progress(done, total, "iterations", f"cost {1e3 * cost:.3g} mm")
+
+    found = search(
+        task.predict,
+        goal,
+        task.limits,
+        task.dt_s,
+        config,
+        np.random.default_rng(asked.seed),
+        progress=progress,
+        cancelled=context.cancelled,
+    )
+    context.progress(config.iterations, config.iterations, "iterations", "executing the plan in the twin")
+    executed = task.execute(found.displacements)
+    context.check()
+    motionless = task.execute(np.zeros_like(found.displacements))
+    arrays = {
+        "times": task.dt_s * (np.arange(config.horizon) + len(model.start_history)),
+        "controllers": task.controllers(found.displacements),
+        "displacements": found.displacements,
+        "predicted": found.points.astype(np.float32),
+        "executed": executed.astype(np.float32),
+        "motionless": motionless.astype(np.float32),
+        "cost_history": np.array(found.costs),
+        **goal_arrays,
+    }
+    return _figures(task, goal, config, found, executed, motionless) | {"goal": request.goal.kind}, arrays
+
+
+def goal_of(request: PlanCreate) -> tuple[Goal, dict[str, np.ndarray]]:
+    """The library's goal, and its arrays by name."""
+    if isinstance(request.goal, PointGoal):
+        index, places = np.array(request.goal.index), np.array(request.goal.places)
+        return GoalPoints(index, places), {"goal_index": index, "goal_places": places}
+    shape = array_of(request.goal.shape, "goal.shape", (2,))
+    return GoalShape(shape), {"goal_shape": shape}
+
+
+def _limited(task: PlanningTask, limits: PlanLimits) -> PlanningTask:
+    def corner(place: tuple[float, float, float] | None) -> np.ndarray | None:
+        return None if place is None else np.array(place)
+
+    return task.with_limits(
+        limits.speed_m_s,
+        limits.acceleration_m_s2,
+        corner(limits.workspace_min_m),
+        corner(limits.workspace_max_m),
+    )
+
+
+def _figures(
+    task: PlanningTask,
+    goal: Goal,
+    config: MppiConfig,
+    found: Found,
+    executed: np.ndarray,
+    motionless: np.ndarray,
+) -> dict[str, Any]:
+    ending = slice(-config.settling, None)
+    gap = np.linalg.norm(found.points - executed, axis=-1)
+    speeds = np.linalg.norm(np.diff(found.displacements, axis=0, prepend=0.0), axis=-1) / task.dt_s
+    limits = task.limits
+    return {
+        "dt_s": task.dt_s,
+        "history": len(task.model.start_history) - 1,
+        "predicted_error_m": found.distance_m,
+        "executed_error_m": float(goal.distance(executed[ending]).mean()),
+        "motionless_error_m": float(goal.distance(motionless[ending]).mean()),
+        "model_against_twin_m": float(gap.mean()),
+        "model_against_twin_end_m": float(gap[ending].mean()),
+        "cost_history": list(found.costs),
+        "limits": {
+            "speed_m_s": limits.speed_m_s,
+            "acceleration_m_s2": limits.acceleration_m_s2,
+            "workspace_min_m": limits.box_min_m.tolist(),
+            "workspace_max_m": limits.box_max_m.tolist(),
+        },
+        "peak_speed_m_s": float(speeds.max()),
+        "samples": found.samples,
+    }

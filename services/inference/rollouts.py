@@ -1,0 +1,184 @@
+"""From a request for a rollout to its arrays: checks against the model, clock, start, properties, the engine.
+
+The same code answers at once (``app``) and as a job (``jobs``).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from physworld.worldmodel.controls import on_clock, peak_speed
+from physworld.worldmodel.errors import ControlsInvalid, WorldModelError
+from physworld.worldmodel.published import PublishedModel
+from schemas.arrays import ArrayInput, array_of
+from schemas.rollout import MAX_CANDIDATES, MAX_STEPS, MAX_TICKS, MAX_VALUES, RolloutCreate
+
+CLOCK_TOLERANCE = 1e-3
+CHUNK_STEPS = 2000  # between two looks at whether the job was cancelled
+FARTHEST_M = 1000.0
+
+
+class RolloutDiverged(WorldModelError):
+    """The prediction left the numbers, or the room."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A request on the model's clock.
+
+    Attributes:
+        controllers: (B, T, K, 3) [m], the first h + 1 ticks the history's.
+        history: object vertices at these ticks [m], (h+1, n, 3).
+        phi: log property ratios, (n, 2) or (B, n, 2).
+        shown: ticks that are returned.
+        times: of those, from the first tick that was asked for [s].
+    """
+
+    controllers: np.ndarray
+    history: np.ndarray
+    phi: np.ndarray
+    shown: np.ndarray
+    times: np.ndarray
+
+    @property
+    def steps(self) -> int:
+        """Steps of the model, over all candidates."""
+        return self.controllers.shape[0] * (self.controllers.shape[1] - len(self.history))
+
+
+def prepare(request: RolloutCreate, model: PublishedModel) -> Prepared:
+    """Check a request against its model. Raises ControlsInvalid with the field and the numbers."""
+    spec, frames = model.spec, len(model.start_history)
+    if request.dt_s is not None and abs(request.dt_s / spec.dt_s - 1.0) > CLOCK_TOLERANCE:
+        raise ControlsInvalid(
+            f"dt_s is {request.dt_s:.6g} s, the model's time step {spec.dt_s:.6g} s; give times instead, and the "
+            "controllers are interpolated",
+            "dt_s",
+        )
+    driven = _read(request.controllers, "controllers", (3, 4))
+    driven = driven[None] if driven.ndim == 3 else driven
+    count = model.start_controllers.shape[1]
+    if driven.shape[2:] != (count, 3):
+        raise ControlsInvalid(
+            f"controllers of shape {driven.shape}, not (B, T, {count}, 3): the scene has {count} controllers",
+            "controllers",
+        )
+    if len(driven) > MAX_CANDIDATES:
+        raise ControlsInvalid(f"{len(driven)} candidates; {MAX_CANDIDATES} are the most", "controllers")
+    if np.abs(driven).max() > FARTHEST_M:
+        raise ControlsInvalid(
+            f"a controller is {np.abs(driven).max():.4g} m from the origin; {FARTHEST_M:g} m is the farthest",
+            "controllers",
+        )
+    driven = on_clock(
+        driven, None if request.times is None else np.array(request.times), spec.dt_s, MAX_TICKS
+    )
+    lead = 0
+    history = model.start_history
+    if request.start == "rest":
+        lead = frames - 1
+        history = np.repeat(history[:1], frames, axis=0)
+        driven = np.concatenate([np.repeat(driven[:, :1], lead, axis=1), driven], axis=1)
+    ticks = driven.shape[1]
+    if ticks <= frames:
+        raise ControlsInvalid(
+            f"controllers at {ticks} ticks of {spec.dt_s:.4g} s; the model's history alone has {frames}",
+            "controllers",
+        )
+    if ticks > MAX_TICKS or ticks * len(driven) > MAX_STEPS:
+        raise ControlsInvalid(
+            f"{len(driven)} candidates of {ticks} ticks; at most {MAX_TICKS} ticks and {MAX_STEPS} in all",
+            "controllers",
+        )
+    shown = np.arange(lead, ticks)[:: request.every]
+    values = len(driven) * len(shown) * 3 * _places(request, model)
+    if values > MAX_VALUES:
+        raise ControlsInvalid(
+            f"the answer would hold {values} numbers; {MAX_VALUES} are the most: return fewer ticks (every)",
+            "every",
+        )
+    return Prepared(driven, history, _phi(request, model, len(driven)), shown, (shown - lead) * spec.dt_s)
+
+
+def run(
+    request: RolloutCreate,
+    model: PublishedModel,
+    prepared: Prepared,
+    *,
+    threads: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[dict[str, np.ndarray], float]:
+    """``points`` (B, S, N, 3) and ``vertices`` (B, S, n, 3) float32 as asked for, and the seconds it took.
+
+    ``progress(steps done, steps in all)`` may raise to stop. Raises RolloutDiverged.
+    """
+    started = time.perf_counter()
+    driven = prepared.controllers
+    found: dict[str, list[np.ndarray]] = {part: [] for part in request.returns}
+    per_candidate = driven.shape[1] - len(prepared.history)
+    chunk = max(threads, CHUNK_STEPS // per_candidate)
+    for first in range(0, len(driven), chunk):
+        taken = slice(first, first + chunk)
+        phi = prepared.phi[taken] if prepared.phi.ndim == 3 else prepared.phi
+        vertices = model.rollout_batch(driven[taken], history=prepared.history, phi=phi, threads=threads)
+        _check(vertices, first, model.spec.dt_s)
+        vertices = vertices[:, prepared.shown]
+        for part in request.returns:
+            moved = vertices if part == "vertices" else model.skin.apply(vertices)
+            found[part].append(moved.astype(np.float32))
+        if progress is not None:
+            progress(min(first + chunk, len(driven)) * per_candidate, len(driven) * per_candidate)
+    arrays = {part: np.concatenate(pieces) for part, pieces in found.items()}
+    return arrays, time.perf_counter() - started
+
+
+def facts(request: RolloutCreate, model: PublishedModel, prepared: Prepared) -> dict[str, object]:
+    """What an answer says beside its arrays; JSON types."""
+    return {
+        "dt_s": model.spec.dt_s,
+        "history": model.model.config.history,
+        "candidates": len(prepared.controllers),
+        "ticks": prepared.controllers.shape[1],
+        "times": prepared.times.tolist(),
+        "speed_m_s": peak_speed(prepared.controllers, model.spec.dt_s),
+    }
+
+
+def _read(value: ArrayInput, field: str, dimensions: tuple[int, ...]) -> np.ndarray:
+    try:
+        return array_of(value, field, dimensions)
+    except ValueError as error:
+        raise ControlsInvalid(str(error), field) from error
+
+
+def _places(request: RolloutCreate, model: PublishedModel) -> int:
+    counts = {"points": len(model.skin.index), "vertices": model.spec.object_count}
+    return sum(counts[part] for part in set(request.returns))
+
+
+def _phi(request: RolloutCreate, model: PublishedModel, candidates: int) -> np.ndarray:
+    """(n, 2) or (B, n, 2), the factors added in the logarithm."""
+    phi, n = model.phi, model.spec.object_count
+    if request.phi is not None:
+        phi = _read(request.phi, "phi", (2, 3))
+        if phi.shape not in ((n, 2), (candidates, n, 2)):
+            raise ControlsInvalid(f"phi of shape {phi.shape}, not ({n}, 2) or ({candidates}, {n}, 2)", "phi")
+        if np.abs(phi).max() > 10.0:
+            raise ControlsInvalid(
+                f"phi reaches {np.abs(phi).max():.4g}; logarithms beyond 10 mean nothing", "phi"
+            )
+    return phi + np.log([request.stiffness_factor, request.density_factor])
+
+
+def _check(vertices: np.ndarray, first: int, dt_s: float) -> None:
+    broken = ~(np.abs(vertices) < 10 * FARTHEST_M).all(axis=(2, 3))
+    if broken.any():
+        candidate, tick = np.argwhere(broken)[0]
+        raise RolloutDiverged(
+            f"candidate {first + candidate} left the numbers at {tick * dt_s:.3g} s: the controls ask more than the "
+            "model has learned"
+        )

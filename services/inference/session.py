@@ -1,0 +1,112 @@
+"""One live session without its connection: limits on the controls, ticks, the frames that are sent.
+
+A frame is little-endian: uint32 tick, uint32 number of the last control message, float32 time [s], uint32 flags
+(1: the prediction had left the numbers and was set back), then float32 points (N, 3) and controllers (K, 3) [m].
+A control message is uint32 its number, then float32 velocities [m/s], (G, 3) for the grips or (K, 3).
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from physworld.worldmodel.controls import grip_groups
+from physworld.worldmodel.live import LiveRollout
+from physworld.worldmodel.published import PublishedModel
+
+HEAD = struct.Struct("<IIfI")
+SET_BACK = 1
+SPEED_PER_SIZE, REACH_PER_SIZE = 4.0, 1.5
+"""Largest speed [1/s] and distance of a grip from its start, in sizes of the body."""
+
+
+class ControlRefused(ValueError):
+    """A control message that cannot be meant."""
+
+
+@dataclass(frozen=True)
+class Control:
+    """``number`` of the message and velocities of all controllers [m/s], (K, 3)."""
+
+    number: int
+    velocity: np.ndarray
+
+
+class LiveSession:
+    """A model's body under the controls of one client."""
+
+    def __init__(self, model: PublishedModel, stiffness_factor: float = 1.0) -> None:
+        self.dt_s = model.spec.dt_s
+        self._skin = model.skin
+        start = model.start_controllers[-1]
+        self.groups = grip_groups(model.spec, start)
+        size = float(np.ptp(model.spec.rest_vertices, axis=0).max())
+        self.speed_m_s, self.reach_m = SPEED_PER_SIZE * size, REACH_PER_SIZE * size
+        self._start, self._flags = start, 0
+        phi = model.phi + np.array([np.log(stiffness_factor), 0.0])
+        self._rollout = LiveRollout(model, phi=phi)
+        self._before = self._now = self._points()
+
+    def describe(self) -> dict[str, Any]:
+        """What the client must know before the first frame; JSON types."""
+        return {
+            "dt_s": self.dt_s,
+            "points": len(self._now),
+            "controllers": self._start.tolist(),
+            "grips": [group.tolist() for group in self.groups],
+            "speed_m_s": self.speed_m_s,
+            "reach_m": self.reach_m,
+            "start": self._now.astype(np.float32).tolist(),
+        }
+
+    def read(self, message: bytes) -> Control:
+        """A control message, its speeds cut to the limit. Raises ControlRefused."""
+        grips, count = len(self.groups), len(self._start)
+        rows = (len(message) - 4) // 12
+        if len(message) != 4 + 12 * rows or rows not in (grips, count):
+            raise ControlRefused(
+                f"a control message of {len(message)} bytes; it has {4 + 12 * grips} (grips) or {4 + 12 * count}"
+            )
+        velocity = np.frombuffer(message, dtype="<f4", offset=4).reshape(rows, 3).astype(np.float64)
+        if not np.isfinite(velocity).all():
+            raise ControlRefused("a velocity is not a finite number")
+        if rows != count:
+            spread = np.zeros((count, 3))
+            for group, one in zip(self.groups, velocity, strict=True):
+                spread[group] = one
+            velocity = spread
+        speed = np.linalg.norm(velocity, axis=1, keepdims=True)
+        velocity = velocity * np.minimum(1.0, self.speed_m_s / np.maximum(speed, 1e-12))
+        return Control(struct.unpack_from("<I", message)[0], velocity)
+
+    def reset(self) -> None:
+        """Back to the start."""
+        self._rollout.reset()
+        self._before = self._now = self._points()
+
+    def tick(self, velocity: np.ndarray) -> None:
+        """One step of the model under velocities (K, 3) [m/s]; a prediction that left the numbers is set back."""
+        wanted = self._rollout.controllers + self.dt_s * velocity
+        offset = wanted - self._start
+        for group in self.groups:  # a grip stays rigid where it meets the end of its reach
+            middle = offset[group].mean(axis=0)
+            offset[group] += np.clip(middle, -self.reach_m, self.reach_m) - middle
+        self._rollout.step(self._start + offset)
+        self._before, self._now = self._now, self._points()
+        if not (np.abs(self._now) < 1e3).all():
+            self.reset()
+            self._flags = SET_BACK
+
+    def frame(self, share: float, number: int) -> bytes:
+        """The frame between the last two ticks: ``share`` 1 is the newest."""
+        points = (1.0 - share) * self._before + share * self._now
+        head = HEAD.pack(self._rollout.tick, number, self._rollout.tick * self.dt_s, self._flags)
+        self._flags = 0
+        body = np.concatenate([points, self._rollout.controllers]).astype("<f4")
+        return head + body.tobytes()
+
+    def _points(self) -> np.ndarray:
+        return self._skin.apply(self._rollout.vertices)

@@ -1,0 +1,101 @@
+"""Rollouts and plans: what a model version was asked, and what it answered."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, TypeVar
+
+from pydantic import BaseModel
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from schemas.base import Artifact, Lineage, Page
+from schemas.plan import Plan
+from schemas.rollout import Rollout
+from storage.errors import Conflict, NotFound
+from storage.pages import page_of
+from storage.tables import RunRow, columns_of
+
+RunKind = Literal["rollout", "plan"]
+Wire = TypeVar("Wire", Rollout, Plan)
+REQUEST = "request.json"
+RESULT = {"rollout": "rollout.npz", "plan": "plan.npz"}
+
+
+def get_rollout(session: Session, rollout_id: str) -> Rollout:
+    """The rollout, or NotFound."""
+    return _wire(Rollout, run_row(session, "rollout", rollout_id))
+
+
+def get_plan(session: Session, plan_id: str) -> Plan:
+    """The plan, or NotFound."""
+    return _wire(Plan, run_row(session, "plan", plan_id))
+
+
+def list_rollouts(
+    session: Session, *, limit: int = 50, cursor: str | None = None, model: str | None = None
+) -> Page[Rollout]:
+    """Rollouts that were jobs, newest first."""
+    return _page(session, "rollout", Rollout, limit, cursor, model)
+
+
+def list_plans(
+    session: Session, *, limit: int = 50, cursor: str | None = None, model: str | None = None
+) -> Page[Plan]:
+    """Plans, newest first."""
+    return _page(session, "plan", Plan, limit, cursor, model)
+
+
+def mark_run_ready(
+    session: Session,
+    kind: RunKind,
+    run_id: str,
+    figures: dict[str, Any],
+    artifacts: list[Artifact],
+    lineage: Lineage,
+) -> None:
+    """Fill in a pending run. Raises Conflict when it is not pending."""
+    row = run_row(session, kind, run_id)
+    if row.state != "pending":
+        raise Conflict(f"{kind} {run_id} is {row.state}; only a pending one can become ready")
+    row.state = "ready"
+    row.figures = figures
+    row.artifacts = [*row.artifacts, *(artifact.model_dump(mode="json") for artifact in artifacts)]
+    row.lineage = lineage.model_dump(mode="json")
+    session.flush()
+
+
+def fail_run(session: Session, kind: RunKind, run_id: str) -> None:
+    """Mark a pending run failed; a ready one stays as it is."""
+    row = run_row(session, kind, run_id)
+    if row.state == "pending":
+        row.state = "failed"
+
+
+def run_digest(artifacts: list[Artifact], kind: RunKind) -> str | None:
+    """The digest by which others refer to a run: that of its arrays."""
+    return next((item.sha256 for item in artifacts if item.name == RESULT[kind]), None)
+
+
+def run_row(session: Session, kind: RunKind, run_id: str) -> RunRow:
+    """The row, or NotFound."""
+    row = session.get(RunRow, run_id)
+    if row is None or row.kind != kind:
+        raise NotFound(kind, run_id)
+    return row
+
+
+def _page(
+    session: Session, kind: RunKind, wire: type[Wire], limit: int, cursor: str | None, model: str | None
+) -> Page[Wire]:
+    statement = select(RunRow).where(RunRow.kind == kind)
+    if model is not None:
+        statement = statement.where(RunRow.model == model)
+    keys = (RunRow.created_at, RunRow.id)
+    return page_of(session, statement, keys, lambda row: _wire(wire, row), limit=limit, cursor=cursor)
+
+
+def _wire(wire: type[Wire], row: RunRow) -> Wire:
+    columns = columns_of(row)
+    answer: BaseModel = wire.model_validate({**columns.pop("figures"), **columns})
+    assert isinstance(answer, wire)
+    return answer

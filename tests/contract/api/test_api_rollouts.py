@@ -1,0 +1,220 @@
+"""Rollouts over the API with a real model behind it: small ones at once, large ones as jobs, and what is refused."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from inference_serving import Served, serve_inference
+from published_tiny import tiny_model
+
+from schemas.arrays import EncodedArray
+from schemas.rollout import SYNC_STEPS
+from storage import leases
+from storage.tables import utc_now
+from workers.execute import Runtime, run_shard
+from workers.registry import register
+
+SINGLE_PRECISION_M = 2e-6
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    with serve_inference(tmp_path_factory.mktemp("data")) as served:
+        yield served
+
+
+def paths(candidates: int = 3, ticks: int = 16) -> np.ndarray:
+    """Control paths (B, T, 4, 3) that begin as the recording does and then drift apart."""
+    model = tiny_model()[2]
+    past = model.start_controllers
+    path = np.repeat(past[-1:], ticks, axis=0)
+    path[: len(past)] = past
+    drift = np.linspace(0.0, 0.02, ticks - len(past))[:, None, None] * np.array([0.0, 1.0, 1.0])
+    batch = np.repeat(path[None], candidates, axis=0)
+    batch[:, len(past) :] += np.linspace(-1.0, 1.0, candidates)[:, None, None, None] * drift
+    return batch
+
+
+def body(served: Served, controllers: np.ndarray, **more: object) -> dict[str, object]:
+    encoded = EncodedArray.of(controllers).model_dump()
+    return {"model": served.model, "controllers": encoded, **more}
+
+
+def _work(served: Served) -> None:
+    register("rollout", "services.inference.jobs:rollout")
+    runtime = Runtime(served.settings, served.database, served.stores, "test")
+    while True:
+        with served.database.session() as session:
+            waiting = leases.publishable(session, utc_now())
+            leases.mark_published(session, waiting, utc_now())
+        if not waiting:
+            return
+        for publication in waiting:
+            assert run_shard(runtime, publication.shard_id) == "done"
+
+
+def test_a_small_rollout_is_answered_at_once_with_what_the_model_predicts(served: Served) -> None:
+    model, controllers = tiny_model()[2], paths()
+    expected = model.rollout_batch(controllers.astype(np.float32).astype(float))
+    with served.client() as client:
+        answer = client.post(
+            "/v1/rollouts", json=body(served, controllers, returns=["points", "vertices"], every=2)
+        )
+    assert answer.status_code == 200, answer.text
+    found = answer.json()
+    assert (found["candidates"], found["ticks"], found["history"]) == (3, 16, 2)
+    assert found["times"] == pytest.approx(np.arange(0, 16, 2) * model.spec.dt_s)
+    vertices = EncodedArray.model_validate(found["vertices"]).numpy()
+    points = EncodedArray.model_validate(found["points"]).numpy()
+    assert vertices == pytest.approx(expected[:, ::2], abs=SINGLE_PRECISION_M)
+    assert points == pytest.approx(model.skin.apply(expected[:, ::2]), abs=SINGLE_PRECISION_M)
+    assert np.abs(points[0, -1] - points[2, -1]).max() > 5e-3
+
+
+def test_nested_lists_and_one_candidate_do_as_well(served: Served) -> None:
+    controllers = paths(1)[0]
+    with served.client() as client:
+        listed = client.post(
+            "/v1/rollouts", json={"model": served.model, "controllers": controllers.tolist()}
+        )
+        encoded = client.post("/v1/rollouts", json=body(served, controllers))
+    assert listed.status_code == 200, listed.text
+    assert listed.json()["points"] == encoded.json()["points"]
+
+
+def test_controls_on_another_clock_are_interpolated(served: Served) -> None:
+    model, controllers = tiny_model()[2], paths(1)[0]
+    times = np.arange(len(controllers)) * model.spec.dt_s
+    fine_times = np.linspace(0.0, times[-1], 3 * len(times) - 2)
+    fine = np.stack(
+        [np.interp(fine_times, times, column) for column in controllers.reshape(len(times), -1).T], axis=1
+    ).reshape(-1, *controllers.shape[1:])
+    with served.client() as client:
+        coarse = client.post("/v1/rollouts", json=body(served, controllers)).json()
+        answer = client.post("/v1/rollouts", json=body(served, fine, times=fine_times.tolist()))
+    assert answer.status_code == 200, answer.text
+    found = EncodedArray.model_validate(answer.json()["points"]).numpy()
+    assert found == pytest.approx(EncodedArray.model_validate(coarse["points"]).numpy(), abs=1e-5)
+
+
+def test_from_rest_the_first_tick_is_the_first_that_is_asked_for(served: Served) -> None:
+    start = tiny_model()[2].start_controllers[:1]
+    with served.client() as client:
+        still = client.post("/v1/rollouts", json=body(served, np.repeat(start, 8, axis=0), start="rest"))
+    assert still.status_code == 200, still.text
+    assert EncodedArray.model_validate(still.json()["points"]).shape[:2] == [1, 8]
+
+
+def test_a_stiffer_body_answers_otherwise(served: Served) -> None:
+    with served.client() as client:
+        plain = client.post("/v1/rollouts", json=body(served, paths())).json()
+        stiff = client.post("/v1/rollouts", json=body(served, paths(), stiffness_factor=3.0)).json()
+    gap = np.abs(
+        EncodedArray.model_validate(plain["points"]).numpy()
+        - EncodedArray.model_validate(stiff["points"]).numpy()
+    )
+    assert gap.max() > 1e-5
+
+
+def test_a_large_rollout_is_a_job_whose_artifact_is_the_same_prediction(served: Served) -> None:
+    count = SYNC_STEPS // 16 + 2
+    controllers = paths(count)
+    with served.client() as client:
+        answer = client.post("/v1/rollouts", json=body(served, controllers))
+        assert answer.status_code == 202, answer.text
+        job = answer.json()
+        assert answer.headers["Location"] == f"/v1/jobs/{job['id']}"
+        pending = client.get(job["links"]["rollout"]).json()
+        assert pending["state"] == "pending"
+        _work(served)
+        found = client.get(job["links"]["rollout"]).json()
+        assert found["state"] == "ready"
+        assert found["candidates"] == count
+        file = next(item for item in found["artifacts"] if item["name"] == "rollout.npz")
+        data = client.get(f"/v1/artifacts/{file['sha256']}").content
+        assert found["id"] in {item["id"] for item in client.get("/v1/rollouts").json()["data"]}
+        assert client.get(f"/v1/jobs/{job['id']}").json()["outputs"][0]["digest"] == file["sha256"]
+    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+        points = arrays["points"]
+    model = tiny_model()[2]
+    expected = model.skin.apply(model.rollout_batch(controllers[:2].astype(np.float32).astype(float)))
+    assert points[:2] == pytest.approx(expected, abs=SINGLE_PRECISION_M)
+
+
+def test_the_same_key_gives_the_same_answer_and_another_body_is_refused(served: Served) -> None:
+    with served.client() as client:
+        headers = {"Idempotency-Key": "rollout-1"}
+        first = client.post("/v1/rollouts", json=body(served, paths()), headers=headers)
+        again = client.post("/v1/rollouts", json=body(served, paths()), headers=headers)
+        other = client.post("/v1/rollouts", json=body(served, paths(2)), headers=headers)
+    assert first.status_code == again.status_code == 200
+    assert again.headers["Idempotent-Replayed"] == "true"
+    assert first.content == again.content
+    assert other.status_code == 422
+
+
+@pytest.mark.parametrize(
+    ("spoil", "field", "words"),
+    [
+        (
+            lambda c: {"controllers": EncodedArray.of(np.where(c > 0.004, np.nan, c)).model_dump()},
+            "controllers",
+            "finite",
+        ),
+        (lambda c: {"controllers": EncodedArray.of(c[:, :, :3]).model_dump()}, "controllers", "4 of them"),
+        (
+            lambda c: {"controllers": EncodedArray.of(c[:, :3]).model_dump()},
+            "controllers",
+            "history alone has 3",
+        ),
+        (
+            lambda c: {"controllers": EncodedArray.of(np.repeat(c[:1], 200, 1)).model_dump()},
+            "controllers",
+            "3000",
+        ),
+        (lambda c: {"controllers": {"shape": [2, 2, 4, 3], "data": "AAAA"}}, "controllers", "3 bytes"),
+        (lambda c: {"controllers": [[1.0], [1.0, 2.0]]}, "controllers", "regular"),
+        (lambda c: {"controllers": []}, "controllers", "axes"),
+        (lambda c: {"dt_s": 0.01}, "dt_s", "0.0333333"),
+        (lambda c: {"times": [0.0, 0.1]}, "times", "2 times"),
+        (lambda c: {"times": [0.5 + 0.1 * i for i in range(16)]}, "times", "start at 0"),
+        (lambda c: {"phi": [[0.0, 0.0]]}, "phi", "(20, 2)"),
+        (lambda c: {"stiffness_factor": 1e9}, "stiffness_factor", "100"),
+    ],
+)
+def test_what_cannot_be_rolled_out_is_refused_with_the_field_and_the_numbers(
+    served: Served, spoil: object, field: str, words: str
+) -> None:
+    controllers = paths()
+    with served.client() as client:
+        answer = client.post("/v1/rollouts", json={**body(served, controllers), **spoil(controllers)})
+    assert answer.status_code == 422, answer.text
+    assert answer.headers["Content-Type"] == "application/problem+json"
+    problem = answer.json()
+    assert any(field in fault["loc"] for fault in problem["errors"]), problem
+    assert words in answer.text
+
+
+def test_unknown_models_and_readers_are_refused(served: Served) -> None:
+    from storage import api_keys
+
+    with served.database.session() as session:
+        _, reader = api_keys.create_key(session, "reader", "read")
+    with served.client() as client:
+        assert (
+            client.post("/v1/rollouts", json={**body(served, paths()), "model": "nobody"}).status_code == 404
+        )
+        assert client.post("/v1/rollouts", json={**body(served, paths()), "version": 9}).status_code == 404
+    with served.client(reader) as client:
+        assert client.post("/v1/rollouts", json=body(served, paths())).status_code == 403
+
+
+def test_the_inference_service_answers_nobody_without_a_ticket(served: Served) -> None:
+    import httpx
+
+    asked = {**body(served, paths()), "version": served.version}
+    bare = httpx.post(f"{served.inference_url}/rollouts", json=asked, trust_env=False)
+    assert bare.status_code == 401

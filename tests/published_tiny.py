@@ -1,0 +1,85 @@
+"""A published world model of the tiny scene, made without the service: twin, a few episodes, some training steps."""
+
+from __future__ import annotations
+
+import io
+import json
+from functools import cache
+
+import numpy as np
+from safetensors.numpy import save as save_tensors
+from tiny_scene import register, tiny_scene
+
+from physworld.build import build_twin
+from physworld.demonstrate import DemonstrationConfig, derived_seed, make_episode
+from physworld.scene import Scene
+from physworld.twin import Twin
+from physworld.worldmodel.config import TrainingConfig, WorldModelConfig
+from physworld.worldmodel.dataset import read_track
+from physworld.worldmodel.published import PublishedModel
+from physworld.worldmodel.scene_view import view_scene
+from physworld.worldmodel.training import train
+from schemas.base import Lineage
+from schemas.fit import FitConfig
+from schemas.model import TrainingConfig as WireConfig
+from storage import jobs, leases, registry
+from storage.artifacts import ArtifactStore
+from storage.database import Database
+from storage.tables import utc_now
+
+NAME = "tiny-bar"
+FRAMES, EPISODES = 24, 6
+SMALL = WorldModelConfig(hidden=16, message_passing_steps=2, history=2, vertices=20, neighbours=5, modes=6)
+
+
+@cache
+def tiny_model() -> tuple[Scene, Twin, PublishedModel]:
+    """The scene, its twin with prior parameters, and a model that learned from the twin."""
+    scene = tiny_scene(FRAMES)
+    twin = build_twin(scene, 60).with_parameters(youngs_modulus_pa=3e4)
+    view = view_scene(scene, twin, SMALL)
+    settings = DemonstrationConfig(frames=FRAMES)
+    episodes = [make_episode(scene, twin, settings, derived_seed(0, index))[0] for index in range(EPISODES)]
+    tracks = [read_track(view.spec, arrays, SMALL.history) for arrays in episodes]
+    trained = train(tracks, view.spec, SMALL, TrainingConfig(steps=12, batch_size=2, look_ahead=2))
+    phi = np.zeros((view.spec.object_count, 2))
+    return scene, twin, view.published(trained.model, phi, phi)
+
+
+def publish_tiny(database: Database, artifacts: ArtifactStore) -> tuple[str, int]:
+    """Register scene, fit and model; the model's name and version."""
+    scene, twin, model = tiny_model()
+    scene_id = register(scene, database, artifacts)
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, **twin.to_arrays())
+    file = artifacts.put_bytes(buffer.getvalue(), "twin.npz")
+    with database.session() as session:
+        job = jobs.create_fit(session, scene_id, FitConfig())
+    with database.session() as session:
+        waiting = next(p for p in leases.publishable(session, utc_now()) if p.kind == "fit")
+        leases.mark_published(session, [waiting], utc_now())
+        lease = leases.claim(session, waiting.shard_id, "test", utc_now(), 30.0)
+        assert lease is not None
+        result = {"parameters": {}, "metrics": {}, "artifacts": [file.model_dump()]}
+        assert leases.complete(session, lease, result, None)
+    card = json.dumps({"architecture": model.facts()}).encode()
+    files = [
+        artifacts.put_bytes(save_tensors(model.to_tensors(), {}), "model.safetensors"),
+        artifacts.put_bytes(card, "card.json", "application/json"),
+    ]
+    config = WireConfig(hidden=16, message_passing_steps=2, history=2, vertices=20)
+    with database.session() as session:
+        row = registry.allot_version(
+            session, NAME, config=config, scene_id=scene_id, fit_id=job.outputs[0].id
+        )
+        manifest = artifacts.put_bytes(f"{NAME} {row.version}".encode(), "manifest.json")
+        registry.publish(
+            session,
+            NAME,
+            row.version,
+            artifacts=[*files, manifest],
+            sha256=manifest.sha256,
+            metrics={},
+            lineage=Lineage(),
+        )
+        return NAME, row.version
