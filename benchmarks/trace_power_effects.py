@@ -30,7 +30,7 @@ _DIRECTIONS: dict[str, dict[str, float]] = {
     "mass_field": {"bump": 1.0},
     "gravity_tilt": {"tilt_x_rad": 0.8, "tilt_y_rad": -0.6},
     "buoyancy": {"density_ratio": 1.0, "added_mass_ratio": 0.5},
-    "wind": {"push_x_m_s2": 2.4, "push_y_m_s2": 3.2, "rate_per_s": 1.0},  # 4 m/s, whatever the scale
+    "wind": {"push_x_m_s2": 0.3, "push_y_m_s2": 0.4, "rate_per_s": 1.0},  # 0.5 m/s, whatever the scale
     "viscoelastic_maxwell": {"shear_modulus_pa": 1.0, "share": 1.0},
     "clamp_offset": {"angle_x_rad": 0.5, "angle_y_rad": 0.7, "angle_z_rad": 0.5},
     "region_force": {"force_x_n": 0.3, "force_y_n": 0.8, "force_z_n": 0.5},

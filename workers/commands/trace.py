@@ -1,5 +1,9 @@
 """``python -m workers.commands.trace SCENE --out report.json``: trace a recording's residual to a named effect.
 
+Several recordings of one object are fitted together (``trace A B``); those after ``--held-out`` are only predicted, for
+the report. The tracks and the page are those of the first recording; with several, the tracks of the k-th (those that
+are held out last) lie beside them as ``before_k`` and ``after_k``, k from 0.
+
 The report is :func:`physworld.trace.document`; ``--predictions FILE`` keeps the open-loop tracks before and after,
 ``--html FILE`` shows all of it as one self-contained page.
 Simulations run in two processes unless ``--processes`` says otherwise; ``--resume DIR`` keeps every simulation there,
@@ -31,7 +35,16 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="physworld trace", description="Trace what a calibrated twin leaves to an effect that it lacks."
     )
-    parser.add_argument("scene", type=Path, help="folder, archive, final_data.pkl or C3D file")
+    parser.add_argument(
+        "scenes",
+        metavar="SCENE",
+        type=Path,
+        nargs="+",
+        help="folder, archive, final_data.pkl or C3D file; several: recordings of one object",
+    )
+    parser.add_argument(
+        "--held-out", type=Path, nargs="+", default=[], metavar="SCENE", help="recordings for the report only"
+    )
     parser.add_argument("--out", type=Path, default=None, help="write the report to this file")
     parser.add_argument("--predictions", type=Path, default=None, help="npz with the tracks before and after")
     parser.add_argument("--html", type=Path, default=None, help="write the report as a page to this file")
@@ -60,7 +73,9 @@ def _trace(given: argparse.Namespace) -> None:
     from physworld.trace.simulations import in_turn
     from workers.commands.terminal import progress_bar, read_scene
 
-    scene = read_scene(given.scene)
+    scenes = [read_scene(path) for path in given.scenes]
+    held_out = [read_scene(path) for path in given.held_out]
+    scene = scenes[0]
     config = TraceConfig()
     if given.particles is not None:
         config = TraceConfig(calibration=CalibrationConfig(particle_budget=given.particles, damping="none"))
@@ -72,13 +87,24 @@ def _trace(given: argparse.Namespace) -> None:
         journal = Journal(key, stored.read_text() if stored.exists() else None, stored.write_text)
     pool = Workers(given.processes) if given.processes > 1 else nullcontext(in_turn)
     with progress_bar(f"trace {scene.name}") as shown, pool as runner:
-        result = trace(scene, config, runner=runner, memory=memory, journal=journal, progress=shown)
+        result = trace(
+            scenes,
+            config,
+            held_out=held_out,
+            runner=runner,
+            memory=memory,
+            journal=journal,
+            progress=shown,
+        )
     report = document(result)
     _print(report)
     if given.predictions is not None:
         given.predictions.parent.mkdir(parents=True, exist_ok=True)
         with given.predictions.open("wb") as file:
-            np.savez(file, before=result.before, after=result.after)
+            several = result.recordings if len(result.recordings) > 1 else ()
+            tracks = {f"before_{k}": known.before for k, known in enumerate(several)}
+            tracks |= {f"after_{k}": known.after for k, known in enumerate(several)}
+            np.savez(file, before=result.before, after=result.after, **tracks)
     if given.html is not None:
         given.html.parent.mkdir(parents=True, exist_ok=True)
         given.html.write_text(render(report, scene, result.before, result.after), encoding="utf-8")
@@ -103,6 +129,11 @@ def _print(report: dict[str, Any]) -> None:
         f"held-out error [mm]: before {1e3 * held_out['before']:.4g}, after {1e3 * held_out['after']:.4g}"
         + ("" if floor is None else f", noise {1e3 * floor:.4g}")
     )
+    for known in report["recordings"] if len(report["recordings"]) > 1 else ():
+        print(
+            f"  {known['scene']:<20} {known['role']:<9} frames {known['frames'][0]} to {known['frames'][1]}: "
+            f"before {1e3 * known['before']:.4g}, after {1e3 * known['after']:.4g}"
+        )
     print(f"remains: {report['unexplained']['description']}")
     if report["suggested_experiment"] is not None:
         print(f"next: {report['suggested_experiment']['description']}")

@@ -15,7 +15,7 @@ from typing import NoReturn
 
 import typer
 
-from physworld_client.cli import effects, fit, lists, loop, registry, run, trace, up
+from physworld_client.cli import effects, export, fit, lists, loop, registry, run, trace, up
 from physworld_client.cli.output import stderr
 from physworld_client.errors import PhysWorldError
 
@@ -30,11 +30,12 @@ app = typer.Typer(
 app.command("up")(up.up)
 app.command("run")(run.run)
 app.command("fit")(fit.fit)
-app.command("trace")(trace.trace)
+app.command("trace", cls=trace.ManyHeldOut)(trace.trace)
 app.add_typer(effects.effects, name="effects")
 app.add_typer(lists.scenes, name="scenes")
 app.add_typer(lists.fits, name="fits")
 app.add_typer(loop.traces, name="traces")
+lists.datasets.command("export")(export.export)
 app.add_typer(lists.datasets, name="datasets")
 app.add_typer(registry.models, name="models")
 app.add_typer(lists.jobs, name="jobs")

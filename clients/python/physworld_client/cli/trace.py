@@ -1,19 +1,50 @@
-"""``physworld trace SCENE``: trace the residual of a calibrated twin to a named effect, without the service."""
+"""``physworld trace SCENE``: trace the residual of a calibrated twin to a named effect, without the service.
+
+``physworld trace A B --held-out C D``: several recordings of one object, and some that only the report sees.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 from physworld_client.cli.fit import become
 
 MODULE = "workers.commands.trace"
+HELD_OUT = "--held-out"
+
+
+class ManyHeldOut(TyperCommand):
+    """A command whose ``--held-out`` takes all that follows it, up to the next option."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Repeat the option before every value that follows it, which is how it is declared."""
+        spread, taking = [], False
+        for k, text in enumerate(args):
+            if text == HELD_OUT and (k + 1 == len(args) or args[k + 1].startswith("-")):
+                raise typer.BadParameter(f"{HELD_OUT} needs a recording after it")
+            if text.startswith("-"):
+                taking = text == HELD_OUT
+                spread += [] if taking else [text]
+            else:
+                spread += [HELD_OUT, text] if taking else [text]
+        return super().parse_args(ctx, spread)
 
 
 def trace(
-    scene: Annotated[Path, typer.Argument(help="Folder, archive, final_data.pkl or C3D file.")],
+    scenes: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SCENE...",
+            help="Folder, archive, final_data.pkl or C3D file; several are recordings of one object.",
+        ),
+    ],
+    held_out: Annotated[
+        list[Path] | None, typer.Option(metavar="SCENE...", help="Recordings that only the report sees.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Write the report to this file.")] = None,
     predictions: Annotated[
         Path | None, typer.Option(help="Write the tracks before and after to this npz.")
@@ -35,4 +66,6 @@ def trace(
         "--resume": resume,
     }
     options = [text for name, value in given.items() if value is not None for text in (name, str(value))]
-    become(MODULE, [*options, "--", str(scene)])
+    if held_out:
+        options += [HELD_OUT, *map(str, held_out)]
+    become(MODULE, [*options, "--", *map(str, scenes)])
