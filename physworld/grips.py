@@ -9,10 +9,10 @@ from physworld.scene import Grip
 
 
 def gripped_nodes(body: ReferenceBody, controllers: np.ndarray, grip: Grip | None) -> np.ndarray:
-    """Every node that gripped material touches: all nodes of cells most of whose particles are in the grip."""
+    """Every node that gripped material touches: all nodes of cells most of whose material is in the grip."""
     lattice = body.lattice
     particles = lattice.interpolation(lattice.particle_coordinates) @ body.start
-    slack = 1e-6
+    slack, tie = 1e-6, 1e-9
     declared = grip is not None and grip.region_min_m is not None
     if declared and lattice.dim == 3 and np.any(grip.region_max_m <= grip.region_min_m):
         return _bonded_nodes(body, grip)
@@ -26,9 +26,11 @@ def gripped_nodes(body: ReferenceBody, controllers: np.ndarray, grip: Grip | Non
         low, high = nearest.min(axis=0) - reach, nearest.max(axis=0) + reach
         coordinates = lattice.particle_coordinates
         inside = np.all((coordinates >= low) & (coordinates <= high), axis=1)
-    solid = lattice.fill > 0
-    share = (inside.reshape(solid.shape) & solid).sum(axis=1) / np.maximum(solid.sum(axis=1), 1)
-    most = share > 0.5 if declared else share >= 0.5
+    material = lattice.fill.sum(axis=1)
+    share = (inside.reshape(lattice.fill.shape) * lattice.fill).sum(axis=1) / np.where(
+        material > 0, material, 1.0
+    )
+    most = share > 0.5 + tie if declared else share >= 0.5 - tie
     cells = most if np.any(most) else share > 0
     if not np.any(cells):
         cells = np.zeros(len(lattice.cells), dtype=bool)

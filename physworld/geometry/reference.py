@@ -6,9 +6,10 @@
 - *Solid* (everything else): reference coordinates are the world's at the start; a declared box, points that fill
   the body, or points that bound it.
 
-Cell faces lie on the faces of boxes. At a declared grip they lie 1/(2 sqrt 3) of a cell inside it: prescribing every
-node of the gripped cells also fixes the slope at their face, which a solid's clamp does not, and so acts that much
-beyond it. With this the clamp is second order in the cell size (``docs/verification.md``).
+Cell faces lie on the faces of boxes and where declared grips end (:mod:`physworld.geometry.alignment`).
+At a solid's grip they lie 1/(2 sqrt 3) of a cell inside it: prescribing every node of the gripped cells also fixes the
+slope at their face, which a solid's clamp does not, and so acts that much beyond it. With this the clamp is second
+order in the cell size (``docs/verification.md``).
 """
 
 from __future__ import annotations
@@ -19,9 +20,11 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from physworld.errors import SceneUnsupported
+from physworld.geometry.alignment import cells_along, faces_along
 from physworld.geometry.curves import fit_nodes
 from physworld.geometry.declared import grips_of, load_of
 from physworld.geometry.filling import filled_body, inside_surface_points
+from physworld.geometry.sheet_cells import grips_in_plane, sheet_lattice
 from physworld.mpm.lattice import Lattice, lattice_from_cells
 from physworld.scene import AS_MEASURED, Scene
 
@@ -33,7 +36,6 @@ _BOX_KINDS = ("beam", "block")
 _FLAT = 0.08  # a sheet's points lie within this share of its width of their plane (root mean square)
 _TIGHTER = 0.97  # a sheet is turned in its plane if that shrinks its bounding rectangle below this share
 _CLAMP_REACH = 0.5 / np.sqrt(3.0)  # cells by which a held layer of splines acts beyond its face
-_THINNEST_GRIP = 0.25  # cells of gripped material that must stay behind a face that was moved into the grip
 _THIN = 1e-4  # points whose extent falls below this share of their largest one span a dimension less
 _BOX_FILL = 0.93  # a cloud that fills this share of its bounding box is a box, whatever its kind
 
@@ -195,26 +197,11 @@ def _require_volume(cloud: np.ndarray, kind: str) -> None:
 def _solid_lattice(scene: Scene, low: np.ndarray, high: np.ndarray, test, budget: int) -> Lattice:
     size = np.maximum(high - low, 1e-9)
     cell = float((8 * np.prod(size) / budget) ** (1 / 3))
-    spacing = size / np.maximum(1, np.round(size / cell))
-    origin = low.copy()
-    for grip in grips_of(scene):
-        if grip.region_min_m is None or grip.region_max_m is None:
-            continue
-        cover = (np.minimum(grip.region_max_m, high) - np.maximum(grip.region_min_m, low)) / size
-        axis = int(np.argmin(cover))
-        if cover[axis] >= 0.9:
-            continue
-        at_low = grip.region_min_m[axis] - low[axis] < high[axis] - grip.region_max_m[axis]
-        face = grip.region_max_m[axis] if at_low else grip.region_min_m[axis]
-        free = high[axis] - face if at_low else face - low[axis]
-        depth = face - low[axis] if at_low else high[axis] - face
-        face_only = depth == 0.0  # bonded at its end: no material has to stay behind
-        reach = _CLAMP_REACH if face_only or depth > (_CLAMP_REACH + _THINNEST_GRIP) * cell else 0.0
-        spacing[axis] = free / (max(1, round(free / cell + reach)) - reach)
-        face -= (1 if at_low else -1) * reach * spacing[axis]
-        behind = np.ceil((face - low[axis]) / spacing[axis] - 1e-6)
-        origin[axis] = face - behind * spacing[axis]
-        break
+    grips = grips_of(scene)
+    along = [
+        cells_along(low[a], high[a], cell, faces_along(a, low, high, grips), _CLAMP_REACH) for a in range(3)
+    ]
+    origin, spacing = np.array(along).T
     counts = np.ceil((high - origin) / spacing - 1e-6).astype(int)
     cells = np.stack(np.meshgrid(*[np.arange(c) for c in counts], indexing="ij"), axis=-1).reshape(-1, 3)
     fill = _box_fill(cells, origin, spacing, low, high)
@@ -384,9 +371,7 @@ def _sheet(scene: Scene, refinement: float) -> ReferenceBody | None:
         material = ((points - origin) @ axes.T)[:, :2]
         flat_map = (origin, axes)
     cell = max(float(size.max()) / (refinement * _SHEET_CELLS), 1e-4)
-    counts = np.maximum(3, np.round(size / cell)).astype(int)
-    cells = np.stack(np.meshgrid(*[np.arange(c) for c in counts], indexing="ij"), axis=-1).reshape(-1, 2)
-    lattice = lattice_from_cells(np.zeros(2), size / counts, cells, np.ones((len(cells), 4)))
+    lattice = sheet_lattice(size, cell, grips_in_plane(scene, flat_map))
     rest = np.zeros((len(lattice.nodes), 3))
     rest[:, :2] = lattice.node_coordinates
     if flat_map is not None:
