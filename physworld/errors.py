@@ -88,3 +88,7 @@ class Cancelled(PhysworldError):
 
 class TrainingDiverged(PhysworldError):
     """A loss or a weight is not finite."""
+
+
+class GaussiansUnreadable(PhysworldError):
+    """A splat is not of the layout that it must have, or holds numbers that are none."""

@@ -74,7 +74,7 @@ install_chromium() {
     fi
 }
 
-EXTRAS=api,sim,train
+EXTRAS=api,sim,train,video
 case "${1:-}" in
     "") ;;
     --dev) EXTRAS=$EXTRAS,dev ;;
@@ -99,6 +99,6 @@ rm -f "$STAMP"
 install "setuptools==$SETUPTOOLS"
 install_torch
 say "installing PhysWorld [$EXTRAS] and its client"
-install --no-build-isolation --editable ".[$EXTRAS]" --editable clients/python
+install --no-build-isolation --editable ".[$EXTRAS]" --editable "clients/python[export]"
 printf '%s %s\n' "$WANTED" "$EXTRAS" >"$STAMP"
 say "done: $VENV"

@@ -1,0 +1,44 @@
+"""``physworld video MOTION.npz``: draw a motion as a film, in this process as ``physworld fit`` does."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from physworld_client.cli.fit import become
+
+MODULE = "workers.commands.video"
+
+
+def video(
+    motion: Annotated[Path, typer.Argument(help="npz with vertices, particles or tracks, and times.")],
+    out: Annotated[Path, typer.Option(help="The film, MP4.")],
+    gaussians: Annotated[Path | None, typer.Option(help="Splat of the object at rest, PLY.")] = None,
+    camera: Annotated[Path | None, typer.Option(help="Camera, JSON.")] = None,
+    size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHT without a camera [640x480].")] = None,
+    azimuth: Annotated[float | None, typer.Option(help="View without a camera [degrees].")] = None,
+    elevation: Annotated[float | None, typer.Option(help="View without a camera [degrees].")] = None,
+    frames: Annotated[Path | None, typer.Option(help="Folder for the frames as PNG.")] = None,
+    against: Annotated[Path | None, typer.Option(help="Frames to compare with: folder or npz.")] = None,
+    lpips: Annotated[Path | None, typer.Option(help="torch.export program of LPIPS.")] = None,
+    json: Annotated[Path | None, typer.Option(help="Write the scores to this file.")] = None,
+    device: Annotated[str | None, typer.Option(help="cpu or cuda.")] = None,
+) -> None:
+    """Draw a motion with the Gaussians that it carries; needs no service."""
+    given = {
+        "--out": out,
+        "--gaussians": gaussians,
+        "--camera": camera,
+        "--size": size,
+        "--azimuth": azimuth,
+        "--elevation": elevation,
+        "--frames": frames,
+        "--against": against,
+        "--lpips": lpips,
+        "--json": json,
+        "--device": device,
+    }
+    options = [f"{name}={value}" for name, value in given.items() if value is not None]
+    become(MODULE, [*options, "--", str(motion)])

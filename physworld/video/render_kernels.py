@@ -1,0 +1,56 @@
+"""Warp kernel of the renderer: one thread a pixel, front to back over the Gaussians of its tile."""
+
+from __future__ import annotations
+
+import warp as wp
+
+TILE = 16
+_LEAST_ALPHA = 1.0 / 255.0
+_MOST_ALPHA = 0.99
+_LEAST_LEFT = 1e-4
+
+
+@wp.kernel
+def blend(
+    width: int,
+    tiles_across: int,
+    starts: wp.array(dtype=wp.int32),
+    order: wp.array(dtype=wp.int32),
+    centres: wp.array(dtype=wp.vec2f),
+    conics: wp.array(dtype=wp.vec3f),
+    opacities: wp.array(dtype=wp.float32),
+    colours: wp.array(dtype=wp.vec3f),
+    depths: wp.array(dtype=wp.float32),
+    background: wp.vec3f,
+    picture: wp.array(dtype=wp.vec3f),
+    alpha: wp.array(dtype=wp.float32),
+    depth: wp.array(dtype=wp.float32),
+):
+    pixel = wp.tid()
+    row = pixel // width
+    column = pixel - row * width
+    tile = (row // wp.static(TILE)) * tiles_across + column // wp.static(TILE)
+    x = float(column) + 0.5
+    y = float(row) + 0.5
+    left = wp.float32(1.0)
+    seen = wp.vec3f(0.0, 0.0, 0.0)
+    far = wp.float32(0.0)
+    for k in range(starts[tile], starts[tile + 1]):
+        g = order[k]
+        centre = centres[g]
+        conic = conics[g]
+        dx = x - centre[0]
+        dy = y - centre[1]
+        power = -0.5 * (conic[0] * dx * dx + conic[2] * dy * dy) - conic[1] * dx * dy
+        if power <= 0.0:
+            a = wp.min(wp.static(_MOST_ALPHA), opacities[g] * wp.exp(power))
+            if a >= wp.static(_LEAST_ALPHA):
+                after = left * (1.0 - a)
+                if after < wp.static(_LEAST_LEFT):
+                    break
+                seen += left * a * colours[g]
+                far += left * a * depths[g]
+                left = after
+    picture[pixel] = seen + left * background
+    alpha[pixel] = 1.0 - left
+    depth[pixel] = far

@@ -1,0 +1,198 @@
+"""``python -m workers.commands.video MOTION.npz --out film.mp4``: draw a motion as a film, and score it against frames.
+
+MOTION.npz holds ``vertices``, ``particles`` or ``tracks`` (T, n, 3) [m] with ``times`` (T,) [s] or ``dt_s``: what
+``physworld rollout``, ``physworld fit --out`` and ``physworld trace --predictions`` write. ``rest`` (n, 3) is the state
+in which the splat shows the object; without it, the first frame is. Without a splat the points themselves are drawn.
+
+``--against`` takes a folder of pictures in the order of their names, or an npz with ``frames`` (T, H, W, 3) and, for
+the IoU, ``masks`` (T, H, W). ``--camera`` is JSON: ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy`` [px] and
+``world_to_camera`` (4 x 4), the convention of OpenCV.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+_MOTIONS = ("vertices", "particles", "tracks", "points", "after")
+_SHOWN = 3000  # points of a motion that are drawn where there is no splat
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Parse the command line, draw, write."""
+    given = _parser().parse_args(arguments)
+    from workers.commands.terminal import guarded
+
+    return guarded(lambda: _film(given))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="physworld video", description="Draw a motion as a film.")
+    parser.add_argument("motion", type=Path, help="npz with vertices, particles or tracks, and times")
+    parser.add_argument("--out", type=Path, required=True, help="the film, MP4")
+    parser.add_argument("--gaussians", type=Path, default=None, help="splat of the object at rest, PLY")
+    parser.add_argument("--camera", type=Path, default=None, help="camera, JSON")
+    parser.add_argument("--size", default="640x480", help="of the film without a camera [px]")
+    parser.add_argument("--azimuth", type=float, default=-60.0, help="of the view without a camera [degrees]")
+    parser.add_argument(
+        "--elevation", type=float, default=20.0, help="of the view without a camera [degrees]"
+    )
+    parser.add_argument("--frames", type=Path, default=None, help="folder for the frames as PNG")
+    parser.add_argument("--against", type=Path, default=None, help="frames to compare with: folder or npz")
+    parser.add_argument("--lpips", type=Path, default=None, help="torch.export program of LPIPS")
+    parser.add_argument("--json", type=Path, default=None, help="write the scores to this file")
+    parser.add_argument("--device", default="cpu", help="cpu or cuda")
+    return parser
+
+
+def _film(given: argparse.Namespace) -> None:
+    import warp as wp
+
+    wp.config.quiet = True
+    from PIL import Image
+
+    from physworld.video import (
+        GaussianCarrier,
+        Renderer,
+        encode_mp4,
+        frames_per_second,
+        from_ply,
+        gaussians_at_points,
+    )
+    from workers.commands.terminal import progress_bar
+
+    moved, rest, times = _motion(given.motion)
+    camera = _camera(given, moved)
+    if given.gaussians is not None:
+        splat = from_ply(given.gaussians.read_bytes())
+    else:
+        splat = gaussians_at_points(rest[:: max(1, len(rest) // _SHOWN)])
+    carrier, renderer = GaussianCarrier(splat, rest), Renderer(camera, device=given.device)
+    pictures, coverage = [], []
+    with progress_bar(f"video {given.motion.name}") as shown:
+        for number, vertices in enumerate(moved):
+            picture = renderer.render(*carrier.at(vertices))
+            pictures.append(np.round(picture.rgb * 255.0).astype(np.uint8))
+            coverage.append(picture.alpha.astype(np.float16))
+            shown(number + 1, len(moved), f"{len(splat)} Gaussians, {camera.width} x {camera.height} px")
+    scores = _scores(given, np.stack(pictures), np.stack(coverage))
+    given.out.parent.mkdir(parents=True, exist_ok=True)
+    given.out.write_bytes(encode_mp4(pictures, frames_per_second(times)))
+    if given.frames is not None:
+        given.frames.mkdir(parents=True, exist_ok=True)
+        for number, pixels in enumerate(pictures):
+            Image.fromarray(pixels).save(given.frames / f"{number:05d}.png")
+    print(f"{len(pictures)} frames, {len(splat)} Gaussians: {given.out}")
+    for name, value in (scores or {}).items():
+        print(f"{name:<8} {value if isinstance(value, str | None) else format(value, '.4g')}")
+    if given.json is not None:
+        given.json.write_text(json.dumps({"frames": len(pictures), "scores": scores}, indent=2) + "\n")
+
+
+def _motion(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Moved points (T, n, 3), the same at rest (n, 3), and times (T,). Raises ValueError with what is wrong."""
+    arrays = _arrays(path)
+    name = next((key for key in _MOTIONS if key in arrays), None)
+    if name is None:
+        raise ValueError(f"{path} holds {sorted(arrays)}, but none of {', '.join(_MOTIONS)}")
+    moved = np.asarray(arrays[name], dtype=np.float64)
+    if moved.ndim != 3 or moved.shape[2] != 3 or moved.shape[0] < 2 or moved.shape[1] < 2:
+        raise ValueError(
+            f"{name} in {path} must be of shape (T, n, 3) with T and n from 2 on, got {moved.shape}"
+        )
+    if not np.isfinite(moved).all():
+        raise ValueError(f"{name} in {path} holds {np.sum(~np.isfinite(moved))} numbers that are not finite")
+    if "times" in arrays:
+        times = np.asarray(arrays["times"], dtype=np.float64)
+    elif "dt_s" in arrays:
+        times = float(arrays["dt_s"]) * np.arange(len(moved))
+    else:
+        raise ValueError(f"{path} says neither times nor dt_s: how fast is the film?")
+    if times.shape != (len(moved),):
+        raise ValueError(f"{path} has {times.size} times for {len(moved)} frames")
+    rest = np.asarray(arrays.get("rest", moved[0]), dtype=np.float64)
+    return moved, rest, times
+
+
+def _camera(given: argparse.Namespace, moved: np.ndarray) -> Any:
+    from physworld.video import Camera, orbit_view
+
+    if given.camera is not None:
+        try:
+            facts = json.loads(given.camera.read_text())
+            return Camera(
+                int(facts["width"]), int(facts["height"]),
+                *(float(facts[key]) for key in ("fx", "fy", "cx", "cy")),
+                np.asarray(facts["world_to_camera"], dtype=np.float64),
+            )  # fmt: skip
+        except (KeyError, TypeError, json.JSONDecodeError) as error:
+            raise ValueError(f"{given.camera} is no camera: {error!r}") from error
+    width, times, height = given.size.partition("x")
+    if not (times and width.isdigit() and height.isdigit()):
+        raise ValueError(f"--size must be WIDTHxHEIGHT in pixels, got {given.size!r}")
+    return orbit_view(moved.reshape(-1, 3), given.azimuth, given.elevation, int(width), int(height))
+
+
+def _scores(given: argparse.Namespace, pictures: np.ndarray, coverage: np.ndarray) -> dict[str, Any] | None:
+    from PIL import Image
+
+    from physworld.video import compare_frames
+
+    if given.against is None:
+        return None
+    masks = None
+    if given.against.is_dir():
+        files = sorted(f for f in given.against.iterdir() if f.suffix.lower() in (".png", ".jpg", ".jpeg"))
+        if len(files) != len(pictures):
+            raise ValueError(
+                f"{given.against} holds {len(files)} pictures, the film has {len(pictures)} frames"
+            )
+        frames = np.stack([np.asarray(Image.open(file).convert("RGB")) for file in files])
+    else:
+        arrays = _arrays(given.against)
+        if "frames" not in arrays:
+            raise ValueError(f"{given.against} holds {sorted(arrays)}, but no frames")
+        frames, masks = arrays["frames"], arrays.get("masks")
+    found = compare_frames(
+        pictures,
+        frames,
+        None if masks is None else coverage,
+        masks,
+        None if given.lpips is None else _lpips(given.lpips),
+    )
+    psnr = found.psnr_db if np.isfinite(found.psnr_db) else None
+    return {"psnr_db": psnr, "ssim": found.ssim, "iou": found.iou, "lpips": found.lpips}
+
+
+def _lpips(path: Path) -> Callable[[np.ndarray, np.ndarray], float]:
+    """A torch.export program of two pictures (1, 3, H, W) in [-1, 1]."""
+    import torch
+
+    network = torch.export.load(path).module()
+
+    def distance(one: np.ndarray, other: np.ndarray) -> float:
+        pair = [torch.from_numpy(2.0 * x - 1.0).float().permute(2, 0, 1)[None] for x in (one, other)]
+        with torch.no_grad():
+            return float(network(*pair))
+
+    return distance
+
+
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    try:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except (zipfile.BadZipFile, EOFError, KeyError, AttributeError) as error:
+        raise ValueError(f"{path} is no npz archive: {error}") from error
+
+
+if __name__ == "__main__":
+    sys.exit(main())
