@@ -233,8 +233,9 @@ def page(rows: list[dict[str, Any]]) -> Report:
         rows=table,
         notes=[
             "Errors in mm, root mean square per axis, open loop, on recordings or frames that no step has seen. "
-            "After: with what the verdict names. Would be: with the model that predicts left-out training blocks best, whether "
-            "or not it may be named; no claim. Best baseline: the best of static, rigid follow and constant velocity.",
+            "After: with what the verdict names. Would be: with the model that predicts left-out training blocks best, "
+            "whether or not it may be named; no claim. Best baseline: the best of static, rigid follow and constant "
+            "velocity.",
             *notes,
         ],
     )  # fmt: skip
