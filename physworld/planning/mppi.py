@@ -8,8 +8,9 @@ out in one batch, and moves u to their average under
 
 (the paper's update without its control cost γ; effort is part of S_k). ε is coloured noise, power 1/f^β over the ticks
 (Pinneri et al. 2020, "Sample-efficient cross-entropy method for real-time planning", section 3.1): white noise on
-velocities hardly moves a grip. λ is a share of the spread of the better half of the costs, so that it needs no scale;
-the noise shrinks by a factor each iteration. The best motion seen is kept among the samples, and is the answer.
+velocities hardly moves a grip. λ is a share of the spread of the better half of the costs, so that it needs no scale.
+The noise's size follows the weighted spread of the samples, for each grip and axis (as in Bhardwaj et al. 2021,
+"STORM", section 3.2). The best motion seen is kept among the samples, and is the answer.
 
     S = mean over the settling ticks of distance(goal) + a share of its mean over all ticks + effort
 """
@@ -38,7 +39,8 @@ class MppiConfig:
         samples: K, motions in an iteration.
         iterations: of them.
         noise_share: standard deviation of ε at the start, in units of the speed limit.
-        noise_decay: factor on it each iteration.
+        noise_memory: share of its old variance that each iteration keeps.
+        noise_floor: least of it, in units of its start.
         colour: β of its spectrum.
         temperature: λ in units of the spread of the better half of the costs.
         settle: share of the horizon, its last ticks, over which the goal counts.
@@ -52,9 +54,10 @@ class MppiConfig:
     samples: int = 512
     iterations: int = 10
     noise_share: float = 0.4
-    noise_decay: float = 0.85
-    colour: float = 2.0
-    temperature: float = 0.2
+    noise_memory: float = 0.3
+    noise_floor: float = 0.02
+    colour: float = 2.5
+    temperature: float = 0.3
     settle: float = 0.2
     path_share: float = 0.05
     effort_share: float = 0.02
@@ -120,7 +123,8 @@ def search(
     still = float(_ending(goal.distance(points), config)[0])
     best_cost = float(_costs(points, best[None], goal, limits, dt_s, config, still)[0])
     costs, best_points, drawn = [best_cost], points[0], 1
-    sigma = config.noise_share * limits.speed_m_s
+    widest = config.noise_share * limits.speed_m_s
+    sigma = np.full((grips, 3), widest)
     for iteration in range(config.iterations):
         noise = sigma * coloured_noise(generator, (config.samples, config.horizon, grips, 3), config.colour)
         noise[0] = 0.0
@@ -140,8 +144,10 @@ def search(
                 best_cost, best, best_points = float(part[winner]), some[winner].copy(), points[winner].copy()
         drawn += config.samples
         weights = _weights(cost, config.temperature)
+        spread = np.einsum("k,ktgx->gx", weights, (tried - mean) ** 2) / config.horizon
+        sigma = np.sqrt(config.noise_memory * sigma**2 + (1.0 - config.noise_memory) * spread)
+        sigma = np.maximum(sigma, config.noise_floor * widest)
         mean = limits.kept(np.einsum("k,ktgx->tgx", weights, tried), dt_s)
-        sigma *= config.noise_decay
         costs.append(best_cost)
         if progress is not None:
             progress(iteration + 1, config.iterations, best_cost)

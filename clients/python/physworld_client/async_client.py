@@ -10,6 +10,7 @@ import httpx
 
 from physworld_client import transport as wire
 from physworld_client.async_loop import AsyncAssessments, AsyncTraces
+from physworld_client.async_predict import AsyncPlans, AsyncRollouts
 from physworld_client.async_resources import (
     AsyncArtifacts,
     AsyncDatasets,
@@ -45,6 +46,8 @@ class AsyncClient:
         self.datasets = AsyncDatasets(self)
         self.models = AsyncModels(self)
         self.assessments = AsyncAssessments(self)
+        self.rollouts = AsyncRollouts(self)
+        self.plans = AsyncPlans(self)
         self.jobs = AsyncJobs(self)
         self.pipelines = AsyncPipelines(self)
         self.artifacts = AsyncArtifacts(self)

@@ -10,7 +10,17 @@ from email.utils import format_datetime
 
 import httpx
 import pytest
-from physworld_client import AsyncClient, Client, async_loop, async_resources, errors, loop, resources
+from physworld_client import (
+    AsyncClient,
+    Client,
+    async_loop,
+    async_predict,
+    async_resources,
+    errors,
+    loop,
+    predict,
+    resources,
+)
 from physworld_client.errors import PhysWorldError, SceneInvalid, error_from_response
 from physworld_client.stream import EventDecoder, ends_job
 from physworld_client.transport import RETRY_LIMIT_S, Retry, client_options, is_loopback, retry_after_s
@@ -160,4 +170,5 @@ def test_the_asynchronous_resources_have_the_same_names_and_arguments() -> None:
 
     assert public(resources) == public(async_resources)
     assert public(loop) == public(async_loop)
+    assert public(predict) == public(async_predict)
     assert list(inspect.signature(Client).parameters) == list(inspect.signature(AsyncClient).parameters)

@@ -15,7 +15,7 @@ from typing import NoReturn
 
 import typer
 
-from physworld_client.cli import effects, export, fit, lists, loop, registry, run, trace, up
+from physworld_client.cli import effects, export, fit, lists, loop, predict, registry, run, trace, up
 from physworld_client.cli.output import stderr
 from physworld_client.errors import PhysWorldError
 
@@ -31,6 +31,8 @@ app.command("up")(up.up)
 app.command("run")(run.run)
 app.command("fit")(fit.fit)
 app.command("trace", cls=trace.ManyHeldOut)(trace.trace)
+app.command("rollout")(predict.rollout)
+app.command("plan")(predict.plan)
 app.add_typer(effects.effects, name="effects")
 app.add_typer(lists.scenes, name="scenes")
 app.add_typer(lists.fits, name="fits")

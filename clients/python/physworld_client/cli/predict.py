@@ -1,0 +1,165 @@
+"""``physworld rollout MODEL`` and ``physworld plan MODEL``: use a published model of a running service."""
+
+from __future__ import annotations
+
+import json as jsonlib
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from physworld_client.arrays import arrays_of
+from physworld_client.cli import service
+from physworld_client.cli.options import Data, Json, Token, Url
+from physworld_client.cli.output import print_json, stderr, stdout
+from physworld_client.errors import PhysWorldError
+from physworld_client.resources import LATEST
+from schemas.plan import Plan, PlanConfig, PlanLimits
+from schemas.rollout import Part
+
+Version = Annotated[str, typer.Option(help="Number, alias or latest.")]
+
+
+def rollout(
+    model: Annotated[str, typer.Argument(help="Name of a published model.")],
+    controllers: Annotated[
+        Path,
+        typer.Option(help="npz with controllers, (B, T, K, 3) or (T, K, 3) [m], and perhaps times (T,) [s]."),
+    ],
+    out: Annotated[Path, typer.Option(help="Write times, points and what else is asked for to this npz.")],
+    version: Version = LATEST,
+    rest: Annotated[bool, typer.Option(help="Begin at rest, not as the recording did.")] = False,
+    vertices: Annotated[bool, typer.Option(help="Also the vertices of the graph.")] = False,
+    every: Annotated[int, typer.Option(min=1, help="Return each so many-th tick.")] = 1,
+    stiffness: Annotated[float, typer.Option(help="Factor on the stiffness.")] = 1.0,
+    timeout: Annotated[float | None, typer.Option(min=0, help="Seconds to wait for a job.")] = None,
+    json: Json = False,
+    url: Url = None,
+    token: Token = None,
+    data: Data = None,
+) -> None:
+    """Predict what the object does under given motions of its control points."""
+    arrays = _controllers(controllers)
+    returns: list[Part] = ["points", "vertices"] if vertices else ["points"]
+    with service.connect(url, token, data) as client:
+        found = client.rollouts.create(
+            model,
+            arrays["controllers"],
+            _version(version),
+            times=arrays.get("times"),
+            start="rest" if rest else "recording",
+            stiffness_factor=stiffness,
+            returns=returns,
+            every=every,
+            timeout=timeout,
+        )
+    parts = {"points": found.points, "vertices": found.vertices}
+    _write(out, {"times": found.times, **{name: part for name, part in parts.items() if part is not None}})
+    if json:
+        print_json(found.rollout.model_copy(update={"points": None, "vertices": None}))
+        return
+    answer = found.rollout
+    stdout.print(
+        f"{model} version {answer.version}: {answer.candidates} x {answer.ticks} ticks of {answer.dt_s:.4g} s in "
+        f"{answer.seconds or 0.0:.2f} s, controls up to {answer.speed_m_s:.3g} m/s, written to {out}",
+        markup=False,
+        soft_wrap=True,
+    )
+
+
+def plan(
+    model: Annotated[str, typer.Argument(help="Name of a published model.")],
+    goal: Annotated[
+        Path,
+        typer.Option(help="npz: index (M,) and places (M, 3) [m] of measured points, or shape (M, 3) [m]."),
+    ],
+    out: Annotated[Path, typer.Option(help="Write the control path and the predicted paths to this npz.")],
+    version: Version = LATEST,
+    horizon: Annotated[int, typer.Option(min=2, help="Ticks of the motion.")] = 60,
+    samples: Annotated[int, typer.Option(min=8, help="Motions tried in an iteration.")] = 512,
+    iterations: Annotated[int, typer.Option(min=1, help="Of the search.")] = 10,
+    speed: Annotated[
+        float | None, typer.Option(min=0, help="Fastest grip [m/s]; default the recording's.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    timeout: Annotated[float | None, typer.Option(min=0, help="Seconds to wait; default for ever.")] = None,
+    json: Json = False,
+    url: Url = None,
+    token: Token = None,
+    data: Data = None,
+) -> None:
+    """Find a motion of the grips that brings the object to a goal, and check it in the twin."""
+    arrays = _npz(goal)
+    points = None
+    if "index" in arrays and "places" in arrays:
+        pairs = zip(arrays["index"].tolist(), arrays["places"].tolist(), strict=True)
+        points = {int(index): place for index, place in pairs}
+    elif "shape" not in arrays:
+        raise PhysWorldError(f"{goal} holds {sorted(arrays)}; a goal is index and places, or shape")
+    config = PlanConfig(horizon=horizon, samples=samples, iterations=iterations, seed=seed)
+    with service.connect(url, token, data) as client:
+        job = client.plans.create(
+            model,
+            _version(version),
+            points=points,
+            shape=None if points is not None else arrays["shape"],
+            limits=PlanLimits(speed_m_s=speed),
+            config=config,
+        )
+        stderr.print(f"job {job.id}", markup=False)
+        client.jobs.wait(job, timeout)
+        found = client.plans.result(job.outputs[0].id)
+    _write(out, found.arrays)
+    if json:
+        print_json(found.plan)
+    else:
+        _print_plan(found.plan, out)
+
+
+def _print_plan(plan: Plan, out: Path) -> None:
+    def mm(metres: float | None) -> str:
+        return "?" if metres is None else f"{1e3 * metres:.3g}"
+
+    stdout.print(
+        f"{plan.id}: {plan.samples} motions tried, written to {out}\n"
+        f"error to the goal [mm]: predicted {mm(plan.predicted_error_m)}, executed in the twin "
+        f"{mm(plan.executed_error_m)}, without motion {mm(plan.motionless_error_m)}\n"
+        f"model against twin on the way [mm]: {mm(plan.model_against_twin_m)}",
+        markup=False,
+        soft_wrap=True,
+    )
+
+
+def _controllers(path: Path) -> dict[str, np.ndarray]:
+    """From an npz, or from the ``suggested_experiment`` of a trace's report (JSON)."""
+    if path.suffix == ".json":
+        report: dict[str, Any] = jsonlib.loads(path.read_text())
+        experiment = report.get("suggested_experiment", report)
+        if not experiment or not experiment.get("controllers"):
+            raise PhysWorldError(f"{path} suggests no experiment with a motion")
+        return {
+            "controllers": np.array(experiment["controllers"], dtype=float),
+            "times": np.array(experiment["times_s"], dtype=float),
+        }
+    arrays = _npz(path)
+    if "controllers" not in arrays:
+        raise PhysWorldError(f"{path} holds {sorted(arrays)}, no controllers")
+    return arrays
+
+
+def _npz(path: Path) -> dict[str, np.ndarray]:
+    try:
+        return arrays_of(path.read_bytes())
+    except OSError as error:
+        raise PhysWorldError(f"{path} cannot be read: {error}") from error
+
+
+def _write(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("wb") as file:
+        np.savez(file, allow_pickle=False, **arrays)
+
+
+def _version(text: str) -> int | str:
+    return int(text) if text.isdecimal() else text

@@ -1,0 +1,130 @@
+"""Using published models, synchronous: rollouts and plans.
+
+``async_predict`` holds the same classes with the same names and arguments, awaited; a test compares them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from physworld_client import predictions
+from physworld_client.pages import ListPage
+from physworld_client.predictions import Planned, Predicted
+from physworld_client.resources import LATEST, Resource
+from schemas.job import Job
+from schemas.plan import Plan, PlanConfig, PlanLimits
+from schemas.rollout import Part, Rollout, Start
+
+
+class Rollouts(Resource):
+    """What published models predict."""
+
+    def create(
+        self,
+        model: str,
+        controllers: np.ndarray,
+        version: int | str = LATEST,
+        *,
+        times: np.ndarray | None = None,
+        dt_s: float | None = None,
+        start: Start = "recording",
+        phi: np.ndarray | None = None,
+        stiffness_factor: float = 1.0,
+        density_factor: float = 1.0,
+        returns: Sequence[Part] = ("points",),
+        every: int = 1,
+        as_job: bool = False,
+        timeout: float | None = None,
+    ) -> Predicted:
+        """Predicts control paths and returns the arrays; a large batch is a job, which is waited for.
+
+        Args:
+            controllers: all control points [m], (B, T, K, 3) or (T, K, 3); with ``start`` "recording" the first
+                h + 1 ticks belong to the model's history.
+            times: of the T places [s], from 0, where they are not at ticks of the model's clock.
+            dt_s: the time step that the paths were made for; the service refuses another than the model's.
+            start: "recording", or "rest": the body lies still where the recording begins.
+            phi: log property ratios, (n, 2) or (B, n, 2); by default the fine-tuned ones.
+            stiffness_factor, density_factor: on top of them.
+            returns: "points" (measured points), "vertices" (the graph's).
+            every: return each so many-th tick.
+            as_job: queue it, however small.
+            timeout: seconds to wait for a job.
+        """
+        answer = self._client.send(
+            predictions.rollout_create(
+                model,
+                controllers,
+                version,
+                times,
+                dt_s,
+                start,
+                phi,
+                stiffness_factor,
+                density_factor,
+                returns,
+                every,
+                as_job,
+            )
+        )
+        if isinstance(answer, Rollout):
+            return predictions.predicted(answer)
+        return self.result(self._client.jobs.wait(answer, timeout).outputs[0].id)
+
+    def get(self, rollout_id: str) -> Rollout:
+        """A rollout that was a job."""
+        return self._client.send(predictions.rollout_get(rollout_id))
+
+    def result(self, rollout_id: str) -> Predicted:
+        """The arrays of a rollout that was a job."""
+        rollout = self.get(rollout_id)
+        artifact, call = predictions.file_of(rollout.artifacts, "rollout.npz", rollout_id)
+        return predictions.predicted(rollout, predictions.checked_arrays(artifact, self._client.send(call)))
+
+    def list(
+        self, *, limit: int | None = None, cursor: str | None = None, model: str | None = None
+    ) -> ListPage[Rollout]:
+        """Rollouts that were jobs, newest first."""
+        return self._page(lambda at: predictions.rollout_list(limit=limit, cursor=at, model=model), cursor)
+
+
+class Plans(Resource):
+    """Motions of the grips that bring the object to a goal."""
+
+    def create(
+        self,
+        model: str,
+        version: int | str = LATEST,
+        *,
+        points: dict[int, Sequence[float]] | None = None,
+        shape: np.ndarray | None = None,
+        limits: PlanLimits | None = None,
+        config: PlanConfig | None = None,
+    ) -> Job:
+        """Starts a plan; its job's output is the plan.
+
+        Args:
+            points: places [m] for measured points, by their number.
+            shape: or a cloud of points [m], (M, 3), for the whole body.
+            limits: of speed, acceleration, workspace; by default the recording's.
+            config: horizon, samples, iterations, seed.
+        """
+        return self._client.send(predictions.plan_create(model, version, points, shape, limits, config))
+
+    def get(self, plan_id: str) -> Plan:
+        """One plan: errors of the prediction and of its execution in the twin."""
+        return self._client.send(predictions.plan_get(plan_id))
+
+    def result(self, plan_id: str) -> Planned:
+        """A plan with its arrays: control path, predicted and executed paths."""
+        plan = self.get(plan_id)
+        artifact, call = predictions.file_of(plan.artifacts, "plan.npz", plan_id)
+        return Planned(plan, predictions.checked_arrays(artifact, self._client.send(call)))
+
+    def list(
+        self, *, limit: int | None = None, cursor: str | None = None, model: str | None = None
+    ) -> ListPage[Plan]:
+        """Plans, newest first."""
+        return self._page(lambda at: predictions.plan_list(limit=limit, cursor=at, model=model), cursor)
