@@ -15,7 +15,9 @@ Tag = Annotated[str, Field(min_length=1, max_length=64)]
 class TrainingConfig(Request):
     """Settings of the graph network (paper, section GNN-Based World Models) and of its training.
 
-    The defaults are meant for some minutes on one core; look-ahead grows to its value during training.
+    The defaults are meant for some minutes on one core. ``patience``: validations without a better one after which the
+    training ends (0: never). ``start_share`` below 1: the training may begin once that share of the dataset's episodes is
+    committed, and takes the others in as it goes (``physworld.worldmodel.training``).
     """
 
     hidden: int = Field(default=64, ge=8, le=1024)
@@ -26,6 +28,8 @@ class TrainingConfig(Request):
     steps: int = Field(default=240, ge=1, le=1_000_000)
     batch_size: int = Field(default=6, ge=1, le=256)
     learning_rate: float = Field(default=1e-3, gt=0, le=1)
+    patience: int = Field(default=8, ge=0, le=1000)
+    start_share: float = Field(default=1.0, gt=0, le=1)
     fine_tune_steps: int = Field(default=60, ge=0, le=10_000)
     formats: list[Literal["torch_export", "onnx"]] = Field(
         default_factory=lambda: ["torch_export", "onnx"], max_length=2

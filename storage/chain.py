@@ -7,6 +7,8 @@
     fit -> trace -> dataset -> training -> dataset -> training           ... an effect named: first on the fit's own
                                                                          twin, for comparison, then with the effect
 
+A training whose ``start_share`` is below 1 is opened as soon as its dataset is planned, and runs beside it.
+
 The comparison is left out when it was not asked for (``compare``) or when a ready version of the same name on an equal
 twin with the same settings is there already.
 """
@@ -17,7 +19,7 @@ from collections.abc import Sequence
 
 from sqlalchemy.orm import Session
 
-from schemas.job import Progress
+from schemas.job import TERMINAL_STATES, Progress
 from schemas.model import TrainingCreate
 from schemas.pipeline import PipelineCreate
 from storage.opening import open_dataset, open_trace, open_training
@@ -29,7 +31,9 @@ _SHARES = {"fit": 0.35, "trace": 0.6, "dataset": 0.35, "training": 0.30}  # of a
 
 
 def open_next(session: Session, parent: JobRow, children: Sequence[JobRow]) -> bool:
-    """Open what follows the last child, which has succeeded; False when nothing does."""
+    """Open what follows the last child, when all have succeeded; False when nothing does."""
+    if any(job.state not in TERMINAL_STATES for job in children):
+        return True  # a training runs beside its dataset; the end of the later one decides
     request = PipelineCreate.model_validate(parent.config)
     outputs = {job.kind: str(job.outputs[0]["id"]) for job in children}
     last = children[-1]
@@ -50,6 +54,15 @@ def open_next(session: Session, parent: JobRow, children: Sequence[JobRow]) -> b
         trace_id = None if trace is None or own else trace.id
         open_dataset(session, outputs["fit"], request.dataset, trace_id, parent=parent)
     return True
+
+
+def dataset_planned(session: Session, parent: JobRow, dataset_id: str) -> None:
+    """Open the training beside the dataset whose episodes are about to be made, where it need not wait for them."""
+    request = PipelineCreate.model_validate(parent.config)
+    if request.training.start_share < 1.0:
+        name = request.model_name or ""
+        training = TrainingCreate(name=name, dataset_id=dataset_id, config=request.training)
+        open_training(session, training, parent=parent)
 
 
 def share_done(parent: JobRow, children: Sequence[JobRow]) -> float:

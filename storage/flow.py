@@ -32,7 +32,7 @@ from schemas.dataset import Episode
 from schemas.fit import FitConfig
 from schemas.job import TERMINAL_STATES, Progress
 from storage import helpers, registry, resources, runs, traces
-from storage.chain import open_next, share_done
+from storage.chain import dataset_planned, open_next, share_done
 from storage.errors import Conflict, NotFound
 from storage.events import append_event
 from storage.opening import (
@@ -234,6 +234,9 @@ def _start_next_stage(session: Session, job: JobRow, shard: ShardRow, result: Sh
         payloads = [{**shard.payload, "index": index, "plan": plan} for index in range(result.episodes)]
         add_shards(session, job, "episode", payloads)
         report_progress(session, job, Progress(done=0, total=result.episodes, unit="episodes"))
+        parent = _parent(session, job)
+        if parent is not None:
+            dataset_planned(session, parent, shard.payload["dataset_id"])
         return True
     if isinstance(result, EpisodeResult):
         job.stage += 1
@@ -246,7 +249,7 @@ def _start_next_stage(session: Session, job: JobRow, shard: ShardRow, result: Sh
 def _child_succeeded(session: Session, child: JobRow, now: datetime) -> None:
     """Open the pipeline's next child, or finish the pipeline."""
     parent = _parent(session, child)
-    if parent is None:
+    if parent is None or parent.state in TERMINAL_STATES:  # what ran beside this child has failed
         return
     parent.heartbeat_at = now
     parent.outputs = [*parent.outputs, *child.outputs]

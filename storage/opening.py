@@ -173,12 +173,21 @@ def open_dataset(
 
 
 def open_training(session: Session, request: TrainingCreate, parent: JobRow | None = None) -> JobRow:
-    """The next version of a model. Raises NotFound, or Conflict when the dataset is not sealed."""
+    """The next version of a model. Raises NotFound, or Conflict when the dataset is not sealed.
+
+    With a ``start_share`` below 1 it may still be in the making: the training waits for what it needs.
+    """
     dataset = session.get(DatasetRow, request.dataset_id)
     if dataset is None:
         raise NotFound("dataset", request.dataset_id)
-    if dataset.state != "sealed":
-        raise Conflict(f"dataset {dataset.id} is {dataset.state}; training needs a sealed dataset")
+    streams = request.config.start_share < 1.0
+    if dataset.state != "sealed" and not (streams and dataset.state in {"pending", "writing"}):
+        needed = (
+            "one that is sealed or in the making"
+            if streams
+            else "a sealed dataset (or a start_share below 1)"
+        )
+        raise Conflict(f"dataset {dataset.id} is {dataset.state}; training needs {needed}")
     job = open_job(
         session,
         "training",

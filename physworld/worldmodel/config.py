@@ -58,6 +58,8 @@ class TrainingConfig:
         average_decay: decay of the running average of the weights that is validated and published.
         validation_fraction: share of the episodes held out whole.
         validation_every: steps between open-loop validations.
+        patience: validations in a row without a better one after which the training ends early; 0: never.
+        start_share: share of the episodes that the training begins with; 1: it has all of them from the start.
         checkpoint_every: steps between checkpoints.
         threads: torch threads.
         seed: of initial weights, batches and noise.
@@ -74,9 +76,17 @@ class TrainingConfig:
     average_decay: float = 0.99
     validation_fraction: float = 0.1
     validation_every: int = 250
+    patience: int = 0
+    start_share: float = 1.0
     checkpoint_every: int = 250
     threads: int = 1
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.patience < 0 or not 0.0 < self.start_share <= 1.0:
+            raise ValueError(
+                f"patience {self.patience}, start share {self.start_share:g} (above 0, at most 1)"
+            )
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,14 @@ errors that a rollout makes; Φ carries noise too, so that it can be fine-tuned 
 alone from the same frame: a sub-sequence counts by the share of the prior's error that is left, so that the few in
 which small errors grow fast do not drown the others. With a τ of a few frames the network learns corrections that do
 not last: τ is long from the first step. A running average of the weights is what is validated (open-loop
-rollouts of whole held-out episodes) and returned; the best one wins. The same seed, data and settings give
-the same weights, and so does a run that was interrupted and resumed from a checkpoint.
+rollouts of whole held-out episodes) and returned; the best one wins; ``patience`` validations without a better one end
+the training. The same seed, data and settings give the same weights, and so does a run that was interrupted and resumed
+from a checkpoint.
+
+**While episodes still arrive** (``start_share`` below 1): the first share of the episodes by index is enough to begin.
+Validation episodes, scales and modal prior come from it and stay. The others join in the order of their index at steps
+that the settings alone decide, spread over the first ``JOIN_SHARE`` of the training, which waits for one that is not
+there yet: the weights do not depend on when an episode arrived.
 """
 
 from __future__ import annotations
@@ -37,11 +43,16 @@ from physworld.worldmodel.model import Normalisation, PriorStep, WorldModel
 from physworld.worldmodel.rollout import rollout_tracks
 
 WARM_UP_SHARE = 0.1
+JOIN_SHARE = 0.5
+JOIN_BATCHES = 10
 
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """The best averaged model; ``validation`` holds (step, open-loop error [m]); ``losses`` (step, loss)."""
+    """The best averaged model; ``validation`` holds (step, open-loop error [m]); ``losses`` (step, loss).
+
+    ``steps``: taken, fewer than asked for where the patience ended; ``episodes``: trained or validated on.
+    """
 
     model: WorldModel
     validation: list[tuple[int, float]]
@@ -50,6 +61,8 @@ class TrainingResult:
     best_error_m: float
     prior_error_m: float
     static_error_m: float
+    steps: int
+    episodes: int
 
 
 @dataclass
@@ -74,6 +87,8 @@ def train(
     config: WorldModelConfig,
     training: TrainingConfig,
     *,
+    total: int | None = None,
+    later: Callable[[int], Track] | None = None,
     checkpoint: bytes | None = None,
     save_checkpoint: Callable[[bytes], None] | None = None,
     progress: Callable[[int, int, float], None] | None = None,
@@ -82,6 +97,9 @@ def train(
     """Train on ``tracks``; see the module's docstring.
 
     Args:
+        tracks: every episode, or the first :func:`first_episodes` of ``total`` when the others come ``later``.
+        total: how many episodes there will be; by default those of ``tracks``.
+        later: gives an episode by its index, when it is there; raises TrainingCancelled while it waits.
         checkpoint: bytes that an earlier, interrupted run gave to ``save_checkpoint``.
         save_checkpoint: called every ``checkpoint_every`` steps.
         progress: called after each step with (step, steps, loss).
@@ -90,7 +108,12 @@ def train(
     if not tracks:
         raise DatasetUnusable("no episode to train on")
     torch.set_num_threads(training.threads)
-    fitting, held_out = split_tracks(tracks, training.validation_fraction, training.seed)
+    total = len(tracks) if total is None else total
+    first = first_episodes(total, training.start_share)
+    if len(tracks) < (total if later is None else first):
+        raise DatasetUnusable(f"{len(tracks)} of {total} episodes are here; the training begins with {first}")
+    later = later or tracks.__getitem__
+    fitting, held_out = split_tracks(list(tracks[:first]), training.validation_fraction, training.seed)
     n, h = spec.object_count, config.history
     positions, phis = [track.positions.numpy() for track in fitting], [track.phi.numpy() for track in fitting]
     prior = fit_prior(positions, phis, n, h, config.modes)
@@ -101,13 +124,18 @@ def train(
     identity = _identity(config, training, scales)
     if checkpoint is not None:
         _restore(run, checkpoint, identity)
-    sampler = WindowSampler(fitting)
     if run.step == 0:
         _validate(run, held_out)
-    longest = max(sampler.lengths) - config.history - 1
-    while run.step < training.steps:
+    joined = first
+    sampler = WindowSampler(fitting)
+    while run.step < training.steps and not _out_of_patience(run, training):
         if cancelled is not None and cancelled():
             raise TrainingCancelled(run.step)
+        present = episodes_at(run.step, first, total, training.steps)
+        if present > joined:
+            fitting += [later(index) for index in range(joined, present)]
+            sampler, joined = WindowSampler(fitting), present
+        longest = max(sampler.lengths) - config.history - 1
         loss = _train_step(run, sampler, training, min(training.look_ahead, longest))
         run.step += 1
         if run.step % training.validation_every == 0 or run.step == training.steps:
@@ -126,7 +154,20 @@ def train(
         best_error_m=run.best_error_m,
         prior_error_m=run.validation[0][1],
         static_error_m=_mean_error([_static(track, config.history) for track in held_out], held_out, spec),
+        steps=run.step,
+        episodes=joined,
     )
+
+
+def first_episodes(total: int, start_share: float) -> int:
+    """How many of ``total`` episodes a training begins with: at least two, where there are two."""
+    return max(math.ceil(start_share * total - 1e-9), min(2, total))
+
+
+def episodes_at(step: int, first: int, total: int, steps: int) -> int:
+    """How many episodes take part from ``step`` of ``steps`` on; they join in ``JOIN_BATCHES`` batches."""
+    share = min(1.0, step / max(1.0, JOIN_SHARE * steps))
+    return first + math.floor((total - first) * math.floor(share * JOIN_BATCHES) / JOIN_BATCHES)
 
 
 def open_loop_error(model: WorldModel, tracks: list[Track]) -> float:
@@ -210,6 +251,12 @@ def _validate(run: _Run, held_out: list[Track]) -> None:
     if error < run.best_error_m or not run.best_weights:
         run.best_error_m, run.best_step = error, run.step
         run.best_weights = {name: value.clone() for name, value in run.average.state_dict().items()}
+
+
+def _out_of_patience(run: _Run, training: TrainingConfig) -> bool:
+    """Whether the last ``patience`` validations brought nothing better."""
+    since = sum(step > run.best_step for step, _ in run.validation)
+    return 0 < training.patience <= since
 
 
 def _mean_error(predicted: list[Tensor], tracks: list[Track], spec: GraphSpec) -> float:

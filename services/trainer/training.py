@@ -1,8 +1,9 @@
-"""The ``training`` shard: from a sealed dataset to a published world model.
+"""The ``training`` shard: from a dataset to a published world model.
 
-Reads the episodes through the manifest, trains with a checkpoint every few hundred steps (a killed trainer
-carries on from the last one), fine-tunes the properties on the recording's training frames, measures
-everything open loop on the frames that were held out, and stores the version's files:
+Reads the episodes (``services.trainer.episodes``), trains with a checkpoint every few hundred steps, kept in the
+scratch store (a killed trainer, or another one in its place, carries on from the last one), fine-tunes the properties
+on the recording's training frames, measures everything open loop on the frames that were held out, and stores the
+version's files:
 
 * ``model.safetensors``: see ``physworld.worldmodel.model`` and ``.published``;
 * ``step.pt2``, ``step.onnx``: one step as a program (``physworld.worldmodel.export``);
@@ -20,10 +21,8 @@ import json
 import logging
 import math
 import os
-import shutil
 import time
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,17 +34,17 @@ from physworld.evaluate.table import held_out_table
 from physworld.worldmodel import config as settings_of
 from physworld.worldmodel import export
 from physworld.worldmodel.clock import resample_smooth
-from physworld.worldmodel.dataset import Track, read_track
 from physworld.worldmodel.errors import CheckpointMismatch, TrainingCancelled
 from physworld.worldmodel.finetune import FineTuneResult, fine_tune
 from physworld.worldmodel.published import PublishedModel
 from physworld.worldmodel.scene_view import SceneView, view_scene
-from physworld.worldmodel.training import TrainingResult, train
-from schemas.base import Artifact, Reference
+from physworld.worldmodel.training import TrainingResult, first_episodes, train
+from schemas.base import Artifact
 from schemas.model import TrainingConfig
 from schemas.signing import SIGNATURE_NAME
 from services.trainer.closed_loop import closed_loop
-from storage import resources, signing
+from services.trainer.episodes import Episodes
+from storage import signing
 from workers.context import TaskContext
 from workers.lineage import lineage_of
 from workers.registry import HandlerResult
@@ -81,10 +80,9 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     twin = twin_of(stores, payload["fit_id"], payload.get("trace_id"))
     context.progress(0, config.steps, "steps", "reading the dataset")
     view = view_scene(scene, twin, architecture)
-    dataset = _dataset_reference(stores, payload["dataset_id"])
-    tracks = _read_tracks(context, stores, dataset, view, architecture.history)
+    episodes = Episodes(context, stores, payload["dataset_id"], view.spec, architecture.history)
     started = time.perf_counter()
-    trained = _train(context, stores.settings.data_dir, tracks, view, architecture, training)
+    trained = _train(context, stores, episodes, view, architecture, training)
     training_s = time.perf_counter() - started
     context.progress(config.steps, config.steps, "steps", "fine-tuning on the recording")
     phi = np.zeros((view.spec.object_count, 2))
@@ -100,14 +98,15 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     published = view.published(trained.model, tuned.phi, phi)
     measured = measure(view, published)
     seconds = {"training": training_s, "fine_tuning": tuning_s}
-    metrics = json_safe(_metrics(view, trained, tuned, measured, seconds, len(tracks)))
+    metrics = json_safe(_metrics(view, trained, tuned, measured, seconds))
     metrics["closed_loop"] = json_safe(closed_loop(stores, payload, metrics, architecture))
+    dataset = episodes.sealed()
     lineage = lineage_of([dataset, *made_from(stores, payload)], payload["config"], {"training": config.seed})
     card = _card(payload, config, published, metrics, lineage)
     artifacts = _store(stores, payload, published, view, measured, card)
     manifest = next(artifact for artifact in artifacts if artifact.name == MANIFEST_NAME)
     context.check()
-    shutil.rmtree(_checkpoint_folder(stores.settings.data_dir, context.lease.job_id), ignore_errors=True)
+    stores.scratch.remove(context.lease.job_id)
     result = {
         "artifacts": [artifact.model_dump(mode="json") for artifact in artifacts],
         "sha256": manifest.sha256,
@@ -135,6 +134,8 @@ def translate(
             look_ahead=config.look_ahead,
             learning_rate=config.learning_rate,
             validation_every=interval,
+            patience=config.patience,
+            start_share=config.start_share,
             checkpoint_every=interval,
             threads=int(os.environ.get("PHYSWORLD_TRAINER_THREADS", "1")),
             seed=config.seed,
@@ -203,44 +204,21 @@ def _with_absent(table: dict[str, Any], absent: list[str]) -> dict[str, Any]:
     return table
 
 
-def _dataset_reference(stores: Stores, dataset_id: str) -> Reference:
-    with stores.database.reading() as session:
-        return Reference(
-            kind="dataset", id=dataset_id, digest=resources.get_dataset(session, dataset_id).digest
-        )
-
-
-def _read_tracks(
-    context: TaskContext, stores: Stores, dataset: Reference, view: SceneView, history: int
-) -> list[Track]:
-    """Every episode of the sealed dataset, checked against its manifest, at the graph's vertices."""
-    if dataset.digest is None:
-        raise ValueError(f"dataset {dataset.id} has no digest: it is not sealed")
-    tracks = []
-    for _, arrays, _ in stores.episodes.iterate(dataset.digest):
-        context.check()
-        tracks.append(read_track(view.spec, arrays, history))
-    return tracks
-
-
 def _train(
     context: TaskContext,
-    data_dir: Path,
-    tracks: list[Track],
+    stores: Stores,
+    episodes: Episodes,
     view: SceneView,
     architecture: settings_of.WorldModelConfig,
     training: settings_of.TrainingConfig,
 ) -> TrainingResult:
     """Train, from the checkpoint of an earlier attempt where there is one."""
-    path = _checkpoint_folder(data_dir, context.lease.job_id) / CHECKPOINT
-
-    def save(data: bytes) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_suffix(f".{os.getpid()}")
-        partial.write_bytes(data)
-        partial.replace(path)
+    job_id = context.lease.job_id
+    first = first_episodes(episodes.total, training.start_share)
+    tracks = [episodes.track(index) for index in range(first)]
 
     def progress(step: int, steps: int, loss: float) -> None:
+        episodes.reached = (step, steps)
         context.progress(step, steps, "steps", f"loss {loss:.4g}")
 
     def attempt(checkpoint: bytes | None) -> TrainingResult:
@@ -249,16 +227,18 @@ def _train(
             view.spec,
             architecture,
             training,
+            total=episodes.total,
+            later=episodes.track,
             checkpoint=checkpoint,
-            save_checkpoint=save,
+            save_checkpoint=lambda data: stores.scratch.put(job_id, CHECKPOINT, data),
             progress=progress,
             cancelled=context.cancelled,
         )
 
     try:
-        return _stopping(context, lambda: attempt(path.read_bytes() if path.exists() else None))
+        return _stopping(context, lambda: attempt(stores.scratch.get(job_id, CHECKPOINT)))
     except CheckpointMismatch as mismatch:
-        logger.warning("job %s starts anew: %s", context.lease.job_id, mismatch)
+        logger.warning("job %s starts anew: %s", job_id, mismatch)
         return _stopping(context, lambda: attempt(None))
 
 
@@ -277,19 +257,19 @@ def _metrics(
     tuned: FineTuneResult,
     measured: Measured,
     seconds: dict[str, float],
-    episodes: int,
 ) -> dict[str, Any]:
     return {
         "held_out": measured.table,
         "steps_per_second": measured.steps_per_second,
         "noise_floor_m": measured.table["noise_floor_m"],
         "seconds": seconds,
-        "episodes": episodes,
+        "episodes": trained.episodes,
         "validation": {
             "open_loop_m": trained.best_error_m,
             "static_m": trained.static_error_m,
             "prior_m": trained.prior_error_m,
             "best_step": trained.best_step,
+            "steps": trained.steps,
             "curve": trained.validation,
             "training_loss": trained.losses,
         },
@@ -390,7 +370,3 @@ def _store(
         put(text, MANIFEST_NAME, "application/json"),
         put(signer.sign(text), SIGNATURE_NAME, "application/json"),
     ]
-
-
-def _checkpoint_folder(data_dir: Path, job_id: str) -> Path:
-    return Path(data_dir) / "checkpoints" / job_id

@@ -5,7 +5,9 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -123,7 +125,7 @@ def test_a_training_publishes_a_version_that_rolls_out(runtime: Runtime, dataset
     with runtime.database.reading() as session:
         digest = resources.get_dataset(session, dataset_id).digest
     assert {item["kind"]: item["digest"] for item in card["lineage"]["inputs"]}["dataset"] == digest
-    assert not (runtime.settings.data_dir / "checkpoints" / job.id).exists()
+    assert not runtime.stores.scratch.has(job.id, training.CHECKPOINT)
 
 
 def test_the_metrics_have_every_row_of_the_table(runtime: Runtime, dataset_id: str) -> None:
@@ -207,3 +209,60 @@ def test_a_rollout_that_left_the_numbers_is_published_as_absent(monkeypatch: pyt
     measured = training.measure(view, view.published(model, phi, phi))
     assert measured.table["track_m"]["world_model"] is None
     assert measured.table["track_m"]["twin"] is not None
+
+
+def test_a_training_begins_while_its_dataset_is_being_written(runtime: Runtime) -> None:
+    """It learns from what is there, waits for the rest and the seal, and ends with the weights of a late start."""
+    scene_id = register(tiny_scene(FRAMES), runtime.database, runtime.stores.artifacts)
+    with runtime.database.session() as session:
+        fit = jobs.create_fit(session, scene_id, FitConfig(particle_budget=60, max_simulations=4))
+    _drain(runtime)
+    streamed = SMALL.model_copy(update={"start_share": 0.5})
+    with runtime.database.session() as session:
+        made = jobs.create_dataset(session, fit.outputs[0].id, DatasetConfig(episodes=6))
+        request = TrainingCreate(name="bar", dataset_id=made.outputs[0].id, config=streamed)
+        job = jobs.create_training(session, request)
+    with runtime.database.reading() as session:
+        waiting = leases.publishable(session, datetime.now(UTC))
+    (training_shard,) = [item.shard_id for item in waiting if item.kind == "training"]
+    with ThreadPoolExecutor(1) as pool:
+        outcome = pool.submit(run_shard, runtime, training_shard)
+        _write_episodes(runtime, 3)
+        progress = _until(runtime, job, lambda found: found.progress.done > 0)
+        assert not outcome.done()
+        with runtime.database.reading() as session:
+            assert resources.get_dataset(session, made.outputs[0].id).episodes_done == 3
+        assert progress.progress.done <= SMALL.steps * 0.5
+        _drain(runtime)
+        assert outcome.result(60) == "done"
+    with runtime.database.session() as session:
+        jobs.create_training(session, request)
+    _drain(runtime)
+    with runtime.database.reading() as session:
+        late, early = registry.list_versions(session, "bar").data
+        digest = resources.get_dataset(session, made.outputs[0].id).digest
+    assert early.metrics["episodes"] == late.metrics["episodes"] == 6
+    assert {item.kind: item.digest for item in early.lineage.inputs}["dataset"] == digest
+    weights = [load(_files(runtime, version)["model.safetensors"]) for version in (early, late)]
+    assert all(np.array_equal(weights[0][name], weights[1][name]) for name in weights[0])
+
+
+def _write_episodes(runtime: Runtime, count: int) -> None:
+    """The plan, and the first so many episodes."""
+    for kind, shards in (("dataset_plan", 1), ("episode", count)):
+        for _ in range(shards):
+            with runtime.database.reading() as session:
+                waiting = leases.publishable(session, datetime.now(UTC))
+            first = next(item.shard_id for item in waiting if item.kind == kind)
+            assert run_shard(runtime, first) == "done"
+
+
+def _until(runtime: Runtime, job: Job, reached: Callable[[Job], bool]) -> Job:
+    deadline = time.monotonic() + 60.0
+    while time.monotonic() < deadline:
+        with runtime.database.reading() as session:
+            found = jobs.get_job(session, job.id)
+        if reached(found):
+            return found
+        time.sleep(0.05)
+    raise AssertionError(f"job {job.id} is {found.state} at {found.progress}")

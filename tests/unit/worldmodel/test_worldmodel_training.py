@@ -130,3 +130,83 @@ def test_a_rollout_starts_as_told_and_moves_with_the_world(
     shift = np.array([3.0, -2.0, 1.0])
     moved = rollout(model, spec, start + shift, controllers + shift, phi)
     assert moved - shift == pytest.approx(path, abs=1e-5)
+
+
+def test_a_training_that_stops_improving_ends_with_its_best_weights(tracks: list[Track]) -> None:
+    """A rate of zero: nothing is better than the first validation."""
+    hopeless = dataclasses.replace(SHORT, steps=200, learning_rate=0.0, validation_every=4, patience=3)
+    result = train(tracks, graph(), SMALL, hopeless)
+    assert (result.steps, result.best_step) == (12, 0)
+    assert [step for step, _ in result.validation] == [0, 4, 8, 12]
+    assert result.best_error_m == result.prior_error_m
+    patient = train(tracks, graph(), SMALL, dataclasses.replace(hopeless, steps=24, patience=0))
+    assert patient.steps == 24
+
+
+def test_patience_survives_a_kill(tracks: list[Track]) -> None:
+    settings = dataclasses.replace(SHORT, steps=60, learning_rate=0.0, patience=2, checkpoint_every=4)
+    saved: list[bytes] = []
+    whole = train(tracks, graph(), SMALL, settings, save_checkpoint=saved.append)
+    for checkpoint in saved:
+        resumed = train(tracks, graph(), SMALL, settings, checkpoint=checkpoint)
+        assert (resumed.steps, resumed.validation) == (whole.steps, whole.validation)
+        assert torch.equal(_weights(whole.model), _weights(resumed.model))
+
+
+STREAMED = dataclasses.replace(SHORT, steps=20, start_share=0.5)
+
+
+def test_episodes_that_arrive_late_change_nothing(tracks: list[Track]) -> None:
+    """The order in which they are asked for is that of their index, and early arrival is no advantage."""
+    whole = train(tracks, graph(), SMALL, STREAMED)
+    asked: list[int] = []
+    steps: list[int] = []
+
+    def later(index: int) -> Track:
+        asked.append(index)
+        return tracks[index]
+
+    streamed = train(
+        tracks[:8],
+        graph(),
+        SMALL,
+        STREAMED,
+        total=len(tracks),
+        later=later,
+        progress=lambda step, steps_, loss: steps.append(len(asked)),
+    )
+    assert torch.equal(_weights(whole.model), _weights(streamed.model))
+    assert whole.validation == streamed.validation
+    assert asked == list(range(8, 16))
+    assert steps[0] == 0 and 0 < steps[5] < 8 and steps[10] == 8, "some join at once or never"
+    assert streamed.episodes == 16
+
+
+def test_a_streamed_training_resumes_with_the_same_weights(tracks: list[Track]) -> None:
+    saved: list[bytes] = []
+    whole = train(tracks, graph(), SMALL, STREAMED, save_checkpoint=saved.append)
+    for checkpoint in saved[:2]:
+        resumed = train(
+            tracks[:8],
+            graph(),
+            SMALL,
+            STREAMED,
+            total=len(tracks),
+            later=tracks.__getitem__,
+            checkpoint=checkpoint,
+        )
+        assert torch.equal(_weights(whole.model), _weights(resumed.model))
+
+
+def test_the_validation_episodes_are_fixed_by_the_first_share(tracks: list[Track]) -> None:
+    """What comes later is never validated on, so the errors of two steps are of the same episodes."""
+    half = train(tracks[:8], graph(), SMALL, dataclasses.replace(SHORT, steps=4))
+    streamed = train(tracks, graph(), SMALL, dataclasses.replace(STREAMED, steps=4))
+    assert half.validation[0] == streamed.validation[0]
+
+
+def test_too_few_episodes_to_begin_with_are_refused(tracks: list[Track]) -> None:
+    with pytest.raises(DatasetUnusable, match="3 of 16 episodes are here; the training begins with 8"):
+        train(tracks[:3], graph(), SMALL, STREAMED, total=16, later=tracks.__getitem__)
+    with pytest.raises(ValueError, match="start share 0"):
+        dataclasses.replace(SHORT, start_share=0.0)

@@ -1,0 +1,77 @@
+"""The episodes of a dataset as a training asks for them: by index, waiting for those that are still being made.
+
+A training whose ``start_share`` is below 1 may begin while its dataset is being written. What is committed stays what
+it is, so an episode may be read as soon as its row is there, checked against the digest in it. At the end the dataset
+has to be sealed: a version names the digest of the data it learned from.
+"""
+
+from __future__ import annotations
+
+import time
+
+from physworld.worldmodel.dataset import Track, read_track
+from physworld.worldmodel.graph import GraphSpec
+from schemas.base import Reference
+from schemas.dataset import Dataset, Episode
+from storage import resources
+from storage.errors import NotFound
+from workers.context import TaskContext
+from workers.errors import DatasetIncomplete
+from workers.stores import Stores
+
+POLL_S = 0.5
+
+
+class Episodes:
+    """Episodes of one dataset at the graph's vertices.
+
+    Attributes:
+        total: how many there are, or will be.
+        reached: steps taken and to take, for the progress while it waits.
+    """
+
+    def __init__(
+        self, context: TaskContext, stores: Stores, dataset_id: str, spec: GraphSpec, history: int
+    ) -> None:
+        self._context, self._stores, self._dataset_id = context, stores, dataset_id
+        self._spec, self._history = spec, history
+        self.total = self._dataset().config.episodes
+        self.reached = (0, 1)
+
+    def track(self, index: int) -> Track:
+        """Episode ``index`` once it is there. Raises Cancelled, LeaseLost, DatasetIncomplete or EpisodeCorrupt."""
+        while (episode := self._committed(index)) is None:
+            if self._dataset().state in {"failed", "sealed"}:
+                raise DatasetIncomplete(
+                    f"dataset {self._dataset_id} ended without episode {index} of {self.total}"
+                )
+            self._wait(f"waiting for episode {index} of {self.total}")
+        self._context.check()
+        arrays, _ = self._stores.episodes.verified(episode.path, episode.digest)
+        return read_track(self._spec, arrays, self._history)
+
+    def sealed(self) -> Reference:
+        """The dataset with its digest, once it is sealed. Raises Cancelled, LeaseLost or DatasetIncomplete."""
+        while (dataset := self._dataset()).digest is None:
+            if dataset.state == "failed":
+                raise DatasetIncomplete(
+                    f"dataset {self._dataset_id} failed: there is nothing to name as its origin"
+                )
+            self._wait("waiting for the dataset's seal")
+        return Reference(kind="dataset", id=dataset.id, digest=dataset.digest)
+
+    def _wait(self, message: str) -> None:
+        self._context.check()
+        self._context.progress(*self.reached, "steps", message)
+        time.sleep(POLL_S)
+
+    def _dataset(self) -> Dataset:
+        with self._stores.database.reading() as session:
+            return resources.get_dataset(session, self._dataset_id)
+
+    def _committed(self, index: int) -> Episode | None:
+        with self._stores.database.reading() as session:
+            try:
+                return resources.get_episode(session, self._dataset_id, index)
+            except NotFound:
+                return None
