@@ -15,6 +15,7 @@ from physworld_client import calls, transport
 from physworld_client.arrays import arrays_of
 from physworld_client.bundle import open_bundle
 from physworld_client.errors import PhysWorldError, WaitTimedOut
+from physworld_client.export import Format, open_export
 from physworld_client.manifest import artifacts_of, verify_folder
 from physworld_client.pages import AsyncListPage
 from physworld_client.partial import PartialFile
@@ -120,6 +121,38 @@ class AsyncDatasets(AsyncResource):
             NotFound: no such episode is committed.
         """
         return arrays_of(await self._client.send(calls.dataset_episode(dataset_id, index)))
+
+    async def export(
+        self,
+        dataset_id: str,
+        folder: str | Path,
+        *,
+        format: Format = "npz",
+        episodes: int | None = None,
+        points: int | None = None,
+        on_progress: Callable[[int, int], None] | None = None,
+    ) -> Path:
+        """Writes the episodes of a sealed dataset for other tools: see :mod:`physworld_client.export`.
+
+        Args:
+            folder: a new or empty folder.
+            format: ``npz``, ``ply`` or ``lerobot`` (v3, needs the extra ``export``).
+            episodes: only the first so many.
+            points: at most so many particles a frame; None: all, of ``lerobot`` 256.
+            on_progress: called with (episodes written, episodes in all).
+
+        Raises:
+            ExportRefused: the dataset is not sealed, the folder holds something, a package is missing.
+        """
+        dataset = await self.get(dataset_id)
+        writer = open_export(format, folder, dataset, points)
+        count = dataset.episodes_done if episodes is None else min(episodes, dataset.episodes_done)
+        for index in range(count):
+            writer.add(index, await self.episode(dataset_id, index))
+            if on_progress is not None:
+                on_progress(index + 1, count)
+        writer.finish()
+        return Path(folder)
 
 
 class AsyncModels(AsyncResource):

@@ -18,6 +18,7 @@
     ├── JobCancelled                a job waited for was cancelled; ``.job``
     ├── WaitTimedOut                the job goes on, the caller's patience ended; ``.job``
     ├── DigestMismatch              bytes are not those that their SHA-256 promises; nothing was kept
+    ├── ExportRefused               episodes cannot be written in that form or to that place: what, and why
     ├── BundleUnreadable            a local scene cannot be packed: the path, and what is wrong with it
     └── ModelUnreadable             a local model artifact is incomplete or of an unknown layout
         └── SignatureInvalid        its manifest is not signed by a known key; nothing was loaded
@@ -140,6 +141,10 @@ class DigestMismatch(PhysWorldError):
         self.expected = expected
         self.found = found
         super().__init__(f"{what}: SHA-256 is {found}, expected {expected}")
+
+
+class ExportRefused(PhysWorldError):
+    """Episodes cannot be written in that form or to that place."""
 
 
 class BundleUnreadable(PhysWorldError):

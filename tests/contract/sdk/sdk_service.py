@@ -106,6 +106,8 @@ class Service:
             arrays = {
                 "times": np.arange(10) / 30.0,
                 "particles": np.full((10, 20, 3), lease.index, np.float32),
+                "controllers": np.zeros((10, 2, 3), np.float32),
+                "properties": np.zeros((20, 2), np.float32),
             }
             dataset = lease.payload["dataset_id"]
             path, digest = self.stores.episodes.write(

@@ -174,6 +174,14 @@ def test_lists_show_and_download(service: Service, tmp_path: Path) -> None:
         (("models", "download", "listed"), "listed-1/model.safetensors"),
         (("fits", "download", fit["id"], "-o", "files"), "files/twin.npz"),
         (("datasets", "download", dataset["id"], "--episodes", "-o", "all"), "all/episode-00000.npz"),
+        (
+            ("datasets", "export", dataset["id"], "-f", "lerobot", "--episodes", "2", "-o", "robot"),
+            "robot/meta/info.json",
+        ),
+        (
+            ("datasets", "export", dataset["id"], "-f", "ply", "--episodes", "2"),
+            f"{dataset['id']}-ply/episode-00000/frame-00000.ply",
+        ),
         (("models", "alias", "listed", "champion", "1"), ""),
         (("models", "download", "listed", "--version", "champion", "-o", "again"), "again/card.json"),
     ):

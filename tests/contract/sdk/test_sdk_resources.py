@@ -135,6 +135,13 @@ def test_the_asynchronous_client_does_the_same(service: Service, tmp_path: Path)
             done = await waiting
             assert seen[-1] == "succeeded"
             assert [event.type async for event in client.jobs.events(done.id)][-1] == "state"
+            [dataset] = (await client.datasets.list(limit=1)).data
+            seen_episodes: list[tuple[int, int]] = []
+            await client.datasets.export(
+                dataset.id, tmp_path / "episodes", on_progress=lambda *at: seen_episodes.append(at)
+            )
+            assert seen_episodes == [(1, 2), (2, 2)]
+            assert len(list((tmp_path / "episodes").glob("episode-*.npz"))) == 2
             version = await client.models.download("async", tmp_path / "out")
             assert version.name == "async"
             pages = await client.jobs.list(limit=2)

@@ -15,6 +15,7 @@ import typer
 from pydantic import BaseModel
 
 from physworld_client.cli import service
+from physworld_client.cli.export import export
 from physworld_client.cli.options import Data, Json, Limit, Token, Url
 from physworld_client.cli.output import ago, print_fields, print_json, print_table, stdout
 from physworld_client.client import Client
@@ -34,6 +35,7 @@ PAGE = 100
 scenes = typer.Typer(help="Measured scenes.", no_args_is_help=True)
 fits = typer.Typer(help="Calibrated twins.", no_args_is_help=True)
 datasets = typer.Typer(help="Datasets of demonstration episodes.", no_args_is_help=True)
+datasets.command("export")(export)
 models = typer.Typer(help="Published world models.", no_args_is_help=True)
 jobs = typer.Typer(help="Jobs.", no_args_is_help=True)
 
