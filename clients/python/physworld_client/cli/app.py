@@ -15,7 +15,7 @@ from typing import NoReturn
 
 import typer
 
-from physworld_client.cli import effects, export, fit, lists, loop, predict, registry, run, trace, up
+from physworld_client.cli import effects, export, fit, lists, loop, predict, registry, run, trace, up, video
 from physworld_client.cli.output import stderr
 from physworld_client.errors import PhysWorldError
 
@@ -33,6 +33,7 @@ app.command("fit")(fit.fit)
 app.command("trace", cls=trace.ManyHeldOut)(trace.trace)
 app.command("rollout")(predict.rollout)
 app.command("plan")(predict.plan)
+app.command("video")(video.video)
 app.add_typer(effects.effects, name="effects")
 app.add_typer(lists.scenes, name="scenes")
 app.add_typer(lists.fits, name="fits")
