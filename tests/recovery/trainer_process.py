@@ -1,0 +1,44 @@
+"""A trainer as a process of its own: ``python trainer_process.py DATA_DIR`` works until no training waits.
+
+What a process that was killed here before left behind is taken back first, as the supervisor does at its start.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+
+from storage import leases
+from storage.database import open_database
+from storage.settings import Settings
+from workers.execute import Runtime, run_shard
+from workers.owner import process_owner
+from workers.registry import register
+from workers.stores import Stores
+
+PATIENCE_S = 20.0
+
+
+def main(data_dir: Path) -> int:
+    """0 when every training is done; 1 when one failed or waits for too long."""
+    settings = Settings(data_dir=data_dir, lease_seconds=20.0)
+    database = open_database(settings)
+    register("training", "services.trainer.training:run")
+    runtime = Runtime(settings, database, Stores(settings, database), process_owner())
+    for take_back in (leases.recover, leases.reap):
+        with database.session() as session:
+            take_back(session, datetime.now(UTC))
+    until = time.monotonic() + PATIENCE_S
+    while time.monotonic() < until:
+        with database.reading() as session:
+            waiting = leases.publishable(session, datetime.now(UTC))
+        for publication in waiting:
+            return 0 if run_shard(runtime, publication.shard_id) == "done" else 1
+        time.sleep(0.1)
+    return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(Path(sys.argv[1])))
