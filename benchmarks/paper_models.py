@@ -37,12 +37,12 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 SHARED = REPOSITORY.parent / "shared" / "data"
 SCENES = {
     "soft_beam": REPOSITORY / "sample" / "soft_beam",
-    "d07": SHARED / "undeclared" / "d07",
+    "d02": SHARED / "undeclared" / "d02",
     "rope_b_shake": SHARED / "real" / "rope_b_shake",
 }
 ORIGIN = {
     "soft_beam": "MuJoCo, known truth",
-    "d07": "independent engine, known truth",
+    "d02": "independent engine, known truth",
     "rope_b_shake": "real recording",
 }
 METRICS = ("track_m", "chamfer_phystwin_m", "chamfer_l2_m")
