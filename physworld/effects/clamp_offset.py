@@ -59,7 +59,10 @@ class ClampOffset(Effect):
         held = held_count(twin)
         if held == 0:
             return f"{held} nodes are held: no clamp"
-        free = int((~_held_cells(twin)).sum())
+        clamped = _held_cells(twin)
+        if not clamped.any():
+            return f"{held} nodes are held but no cell by half: the clamp has no face"
+        free = int((~clamped).sum())
         return f"{free} cells are free: no room for a longer clamp" if free == 0 else None
 
     def problem(self, problem: Problem, twin: Twin) -> Problem:
@@ -94,11 +97,15 @@ class ClampOffset(Effect):
 
 
 def _held_cells(twin: Twin) -> np.ndarray:
-    """Cells all of whose nodes are held, (C,) bool."""
+    """Cells all of whose nodes are held, (C,) bool; where a clamp ends within the first cell, those that are half held.
+
+    A clamp that is known by a few points near the body's face holds the nodes about them and no cell whole.
+    """
     held = np.zeros(len(twin.lattice.nodes), dtype=bool)
     for nodes in twin.held_nodes:
         held[nodes] = True
-    return held[twin.lattice.cell_nodes].all(axis=1)
+    share = held[twin.lattice.cell_nodes].mean(axis=1)
+    return share == 1.0 if np.any(share == 1.0) else share >= 0.5
 
 
 def _gaps(twin: Twin) -> tuple[np.ndarray, float]:

@@ -207,6 +207,25 @@ def test_a_clamp_that_reaches_a_cell_farther_holds_that_cell(name: str) -> None:
     assert twin.lattice.node_coordinates[added, 0].max() == pytest.approx(before + reach)
 
 
+@pytest.mark.parametrize("name", ["solid", "sheet", "rope"])
+def test_a_clamp_that_ends_within_the_first_cell_has_a_face_too(name: str) -> None:
+    twin = TWINS[name]
+    nodes = twin.lattice.node_coordinates[:, 0]
+    planes = np.unique(np.round(nodes, 9))[:2]  # of the three that a cell has
+    thin = np.flatnonzero(np.isin(np.round(nodes, 9), planes))
+    loosely = replace(twin, held_nodes=(thin,), controller_groups=twin.controller_groups[:1])
+    assert not np.isin(twin.lattice.cell_nodes, thin).all(axis=1).any()
+    reach = float(twin.lattice.spacing[0])
+    longer = effect("clamp_offset", reach_m=1.01 * reach).grips(loosely)
+    assert len(longer.held_nodes[0]) > len(thin)
+    times = np.linspace(0.0, 0.1, 3)
+    softer = loosely.with_effect(effect("clamp_offset", reach_m=-0.5 * reach))
+    assert not np.allclose(moved(softer, times)[-1], moved(loosely, times)[-1], atol=1e-7)
+    alone = replace(twin, held_nodes=(thin[:1],), controller_groups=twin.controller_groups[:1])
+    if name != "rope":
+        assert "no face" in (effect("clamp_offset").refuses(alone) or "")
+
+
 def test_a_turned_clamp_turns_what_it_holds() -> None:
     twin = TWINS["solid"]
     turned = twin.with_effect(effect("clamp_offset", angle_y_rad=0.1))
