@@ -19,6 +19,7 @@ from physworld.worldmodel.messages import warp_module
 from physworld.worldmodel.model import WorldModel
 
 REGISTER = 16
+GAP_FLOOR_M = 1e-7  # rounding: the reference places of object vertices are their rest places
 
 
 class RolloutEngine:
@@ -57,7 +58,7 @@ class RolloutEngine:
             "modes": prior.basis.shape[0],
             "controls": spec.control_count,
             "inputs": model.skip.in_features,
-            "places_width": 3 * (config.history + 1),
+            "places_width": 3 * (config.history + 2),
             "grounded": int(spec.ground_height_m is not None),
         }
 
@@ -128,7 +129,12 @@ def _kernels() -> ModuleType:
 
 
 def _pack_weights(model: WorldModel, hidden: int) -> dict[str, np.ndarray]:
-    """Every weight as (…, in, out), widths padded to ``hidden``; layers stacked."""
+    """Every weight as (…, in, out), widths padded to ``hidden``; layers stacked.
+
+    What is constant of an edge's first product, (E, H) a layer, is too much to read every step. Its part that is linear
+    in reference places is a difference of vertex quantities, as the moving part is, and joins ``position``; what
+    remains is |r_rest| times one row, and for edges whose reference is not their rest (grips) three rows more.
+    """
     with torch.inference_mode():
         constants = model.edge_constants()
     own, wide = model.config.hidden, hidden
@@ -142,9 +148,23 @@ def _pack_weights(model: WorldModel, hidden: int) -> dict[str, np.ndarray]:
 
     encoder_in, encoder_out = getattr(model.encoder, "in"), model.encoder.out
     decoder_in, decoder_out = getattr(model.decoder, "in"), model.decoder.out
-    inputs, edges = encoder_in.in_features, model.spec.edge_count
-    positions = [_padded(part, part.shape[0], wide) for layer in constants.position for part in layer]
+    inputs = encoder_in.in_features
+    kinds, norm, h = [layer.weight.transpose(1, 2) for layer in model.edge], model.norm, model.config.history
+    near = [part[:3] / norm.length for layer in kinds for part in layer]
+    strain = [part[3:6] / norm.strain[kind] for layer in kinds for kind, part in enumerate(layer)]
+    rest = [
+        (part[6 + 3 * h] / norm.length - part[7 + 3 * h] / norm.stretch[kind])[None]
+        for layer in kinds
+        for kind, part in enumerate(layer)
+    ]
+    moving = [part for layer in constants.position for part in layer]
+    positions = [
+        _padded(torch.cat([own, anchor]), len(own) + 3, wide)
+        for own, anchor in zip(moving, near, strict=True)
+    ]
     lengths = [_padded(part[None], 1, wide) for layer in constants.length for part in layer]
+    gap = model._constants[:, 3:6]
+    gaps = [float(part.abs().max()) if len(part) else 0.0 for part in gap.split(model._edges_by_kind)]
     return {
         "encode_in": _padded(encoder_in.weight.T, inputs, wide),
         "encode_in_bias": _padded(encoder_in.bias[None], 1, wide),
@@ -154,8 +174,12 @@ def _pack_weights(model: WorldModel, hidden: int) -> dict[str, np.ndarray]:
         "receive_bias": biases(model.receive),
         "send": stack(model.send),
         "position": np.stack(positions),
-        "edge_bias": np.stack([_padded(layer, edges, wide) for layer in constants.bias]),
-        "edge_length": np.stack(lengths),
+        "edge_rest": _floats(model._constants[:, 6]),
+        "edge_gap": _floats(gap),
+        "gapped": np.array([size > GAP_FLOOR_M for size in gaps], dtype=np.int32),
+        "length_weight": np.stack(lengths),
+        "rest_weight": np.stack([_padded(part, 1, wide) for part in rest]),
+        "gap_weight": np.stack([_padded(part, 3, wide) for part in strain]),
         "update_in": stack(model.update_in, 4),
         "update_in_bias": biases(model.update_in),
         "update_out": stack(model.update_out),

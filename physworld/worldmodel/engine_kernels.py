@@ -5,7 +5,8 @@ stays in the cache. Where the network adds nothing to the modal prior (``correct
 
 Rows of 16 floats are one vector register (two or four of them on older CPUs); every width is padded to a multiple
 of 16 with zeros, which a ReLU leaves zero. ``product`` multiplies four rows at a time, so that a weight is
-read once for four vertices. Equations: ``physworld.worldmodel.model``. CPU only.
+read once for four vertices; products are fused with sums by hand, since Warp's compiler does not contract them.
+Equations: ``physworld.worldmodel.model``. CPU only.
 """
 
 from __future__ import annotations
@@ -23,13 +24,14 @@ ARRAYS = (
     "paths", "amplitudes", "offsets", "edge_sender", "edge_receiver", "edge_offset", "share",
     "reference", "phis", "softnesses", "mean", "basis", "shape", "prior_weight", "prior_response",
     "encode_in", "encode_in_bias", "encode_out", "encode_out_bias",
-    "receive", "receive_bias", "send", "position", "edge_bias", "edge_length",
+    "receive", "receive_bias", "send", "position", "edge_rest", "edge_gap", "gapped",
+    "length_weight", "rest_weight", "gap_weight",
     "update_in", "update_in_bias", "update_out", "update_out_bias",
     "decode_in", "decode_in_bias", "decode_out", "decode_out_bias", "skip",
     "features", "places", "state", "hear", "say", "placed", "heard", "sent", "sums", "inner", "correction",
     "length", "regressors", "ahead",
 )  # fmt: skip
-INTEGER_ARRAYS = frozenset({"offsets", "edge_sender", "edge_receiver"})
+INTEGER_ARRAYS = frozenset({"offsets", "edge_sender", "edge_receiver", "gapped"})
 
 
 def _unpack() -> str:
@@ -52,8 +54,9 @@ _ROLLOUT = (
     const int H = hidden, N = objects, VN = vertices, C = controls, R = modes;
     float* path = paths;
     auto positive = [](V x) -> V { return (V)((I)x & (x > 0.0f)); };
+    auto fused = [](float a, V b, V c) -> V { return __builtin_elementwise_fma((V)a, b, c); };
     // out (rows, width) = [out +] in (rows, depth) * weight (depth, width) [+ bias]
-    auto product = [](float* out, const float* in, const float* weight, const float* bias, int rows, int depth,
+    auto product = [&](float* out, const float* in, const float* weight, const float* bias, int rows, int depth,
                       int width, bool add) {
         for (int c = 0; c < width; c += 32) {
             const bool two = c + 16 < width;
@@ -76,8 +79,10 @@ _ROLLOUT = (
                 for (int k = 0; k < depth; ++k) {
                     const V w = *(const V*)(weight + (long long)k * width + c);
                     const V u = *(const V*)(weight + (long long)k * width + d);
-                    p0 += x0[k] * w; p1 += x1[k] * w; p2 += x2[k] * w; p3 += x3[k] * w;
-                    q0 += x0[k] * u; q1 += x1[k] * u; q2 += x2[k] * u; q3 += x3[k] * u;
+                    p0 = fused(x0[k], w, p0); p1 = fused(x1[k], w, p1);
+                    p2 = fused(x2[k], w, p2); p3 = fused(x3[k], w, p3);
+                    q0 = fused(x0[k], u, q0); q1 = fused(x1[k], u, q1);
+                    q2 = fused(x2[k], u, q2); q3 = fused(x3[k], u, q3);
                 }
                 *(V*)(y3 + c) = p3; *(V*)(y2 + c) = p2; *(V*)(y1 + c) = p1; *(V*)(y0 + c) = p0;
                 *(V*)(y3 + d) = q3; *(V*)(y2 + d) = q2; *(V*)(y1 + d) = q1; *(V*)(y0 + d) = q0;
@@ -154,7 +159,10 @@ _ROLLOUT = (
                 float* x = features + (long long)i * inputs;
                 float* p = places + (long long)i * places_width;
                 int at = 0;
-                for (int k = 0; k < 3; ++k) p[k] = now[i * 3 + k] - reference[i * 3 + k];
+                for (int k = 0; k < 3; ++k) {
+                    p[k] = now[i * 3 + k] - reference[i * 3 + k];
+                    p[places_width - 3 + k] = reference[i * 3 + k];
+                }
                 for (int s = 0; s < history; ++s)
                     for (int k = 0; k < 3; ++k) {
                         const float* older = now - (long long)s * VN * 3 + i * 3 + k;
@@ -189,22 +197,36 @@ _ROLLOUT = (
                 product(say, state, send + square, nullptr, VN, H, H, false);
                 product(inner, state, update_in + 4 * square, update_in_bias + l * H, VN, H, H, false);
                 for (int kind = 0; kind < 3; ++kind) {
-                    const float* W = edge_length + (l * 3 + kind) * H;
-                    const float* S = edge_bias + (long long)l * edges * H;
-                    product(placed, places, position + (long long)(l * 3 + kind) * places_width * H, nullptr, VN,
+                    const int row_of_kind = l * 3 + kind;
+                    product(placed, places, position + (long long)row_of_kind * places_width * H, nullptr, VN,
                             places_width, H, false);
                     for (int c = 0; c < VN * H; c += 16) {
                         *(V*)(heard + c) = *(V*)(hear + c) - *(V*)(placed + c);
                         *(V*)(sent + c) = *(V*)(say + c) + *(V*)(placed + c);
                     }
                     for (int i = 0; i < VN; ++i) {
-                        const int row = kind * VN + i;
+                        const int row = kind * VN + i, from = offsets[row], to = offsets[row + 1];
                         for (int c = 0; c < H; c += 16) {
-                            const V p = *(const V*)(heard + (long long)i * H + c), w = *(const V*)(W + c);
+                            const V p = *(const V*)(heard + (long long)i * H + c);
+                            const V w = *(const V*)(length_weight + row_of_kind * H + c);
+                            const V u = *(const V*)(rest_weight + row_of_kind * H + c);
                             V sum = 0.0f;
-                            for (int e = offsets[row]; e < offsets[row + 1]; ++e)
-                                sum += positive(p + *(const V*)(sent + (long long)edge_sender[e] * H + c)
-                                                + *(const V*)(S + (long long)e * H + c) + length[e] * w);
+                            if (gapped[kind]) {
+                                const float* G = gap_weight + (long long)row_of_kind * 3 * H + c;
+                                const V g0 = *(const V*)G, g1 = *(const V*)(G + H), g2 = *(const V*)(G + 2 * H);
+                                for (int e = from; e < to; ++e) {
+                                    V m = p + *(const V*)(sent + (long long)edge_sender[e] * H + c);
+                                    m = fused(length[e], w, fused(edge_rest[e], u, m));
+                                    m = fused(edge_gap[3 * e], g0, m);
+                                    m = fused(edge_gap[3 * e + 1], g1, fused(edge_gap[3 * e + 2], g2, m));
+                                    sum += positive(m);
+                                }
+                            } else {
+                                for (int e = from; e < to; ++e) {
+                                    const V m = p + *(const V*)(sent + (long long)edge_sender[e] * H + c);
+                                    sum += positive(fused(length[e], w, fused(edge_rest[e], u, m)));
+                                }
+                            }
                             *(V*)(sums + (long long)i * H + c) = sum * share[row];
                         }
                     }
