@@ -25,7 +25,7 @@ CLOCK_TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class Track:
-    """One episode seen by the graph: ``positions`` (T, V, 3) float32 from ``graph_origin``, ``phi`` (n, 2)."""
+    """One episode seen by the graph: ``positions`` (T, V, 3) float32 from ``graph_origin``, ``phi`` (n, 2 + m)."""
 
     positions: Tensor
     phi: Tensor
@@ -49,8 +49,13 @@ def graph_origin(spec: GraphSpec, vertices: np.ndarray) -> np.ndarray:
     return origin
 
 
-def read_track(spec: GraphSpec, arrays: dict[str, np.ndarray], history: int) -> Track:
-    """The graph's vertices of an episode. Raises DatasetUnusable with the numbers."""
+def read_track(
+    spec: GraphSpec, arrays: dict[str, np.ndarray], history: int, strengths: np.ndarray | None = None
+) -> Track:
+    """The graph's vertices of an episode, with ``strengths`` (m,) of effects as further columns of Φ.
+
+    Raises DatasetUnusable with the numbers.
+    """
     times, particles, controllers = arrays["times"], arrays["particles"], arrays["controllers"]
     frames = len(times)
     if frames < history + 2:
@@ -66,6 +71,8 @@ def read_track(spec: GraphSpec, arrays: dict[str, np.ndarray], history: int) -> 
         [particles[:, spec.particle_index], controllers[:, spec.control_index]], axis=1, dtype=np.float64
     )
     phi = np.asarray(arrays["properties"], dtype=np.float64)[spec.particle_index]
+    if strengths is not None:
+        phi = np.concatenate([phi, np.broadcast_to(strengths, (len(phi), len(strengths)))], axis=1)
     if not (np.isfinite(vertices).all() and np.isfinite(phi).all()):
         raise DatasetUnusable("an episode holds values that are not finite")
     vertices -= graph_origin(spec, vertices[0, : spec.object_count])

@@ -7,9 +7,11 @@ the skinned tracked points with the visible measured ones:
     loss = MSE / s² + chamfer_weight · Chamfer / s + smoothness_weight · ‖(Φ - Φ_start) / σ_properties‖²
 
 where s is the root-mean-square excursion of the measured points and Chamfer goes from the measured points
-to the nearest predicted ones. The states are refreshed by a new rollout each time the inner validation is
-made. That one, the open-loop error on the last share of the *training* frames, decides when to stop and
-whether the result is kept at all: a Φ that does not beat the calibrated one there is thrown away.
+to the nearest predicted ones. Strengths of effects that the model takes (``WorldModel.strength_count``) are optimised
+with Φ, one number each for the whole body, and kept within their intervals. The states are refreshed by a new rollout
+each time the inner validation is made. That one, the open-loop error on the last share of the *training* frames,
+decides when to stop and whether the result is kept at all: a Φ that does not beat the calibrated one there is thrown
+away.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ from physworld.worldmodel.config import FineTuneConfig
 from physworld.worldmodel.dataset import graph_origin
 from physworld.worldmodel.engine import RolloutEngine
 from physworld.worldmodel.errors import TrainingCancelled
-from physworld.worldmodel.model import WorldModel
+from physworld.worldmodel.model import PROPERTY_COUNT, WorldModel
 from physworld.worldmodel.skinning import Skin
 
 CHECK_EVERY = 5
@@ -53,9 +55,10 @@ class Recording:
 
 @dataclass(frozen=True)
 class FineTuneResult:
-    """``phi`` (n, 2); the inner validation error [m] before and after; whether the new Φ was kept."""
+    """``phi`` (n, 2), ``strengths`` (m,); the inner validation error [m] before and after; whether they were kept."""
 
     phi: np.ndarray
+    strengths: np.ndarray
     error_before_m: float
     error_after_m: float
     kept: bool
@@ -69,15 +72,23 @@ def fine_tune(
     skin: Skin,
     config: FineTuneConfig,
     *,
+    bounds: np.ndarray | None = None,
     progress: Callable[[int, int, float], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> FineTuneResult:
-    """Optimise ``phi`` (n, 2) on the recording's training frames; see the module's docstring."""
+    """Optimise ``phi`` (n, 2), and strengths from 0 on, on the recording's training frames; see the module's docstring.
+
+    Args:
+        bounds: smallest and largest value of each strength in the model's units, (m, 2).
+    """
+    limits = np.zeros((0, 2)) if bounds is None else np.asarray(bounds, dtype=float)
+    if limits.shape != (model.strength_count, 2):
+        raise ValueError(f"bounds {limits.shape}, the model takes {model.strength_count} strengths")
     trainable = [parameter for parameter in model.parameters() if parameter.requires_grad]
     for parameter in trainable:
         parameter.requires_grad_(False)
     try:
-        return _optimise(_Task(model, recording, skin, config), phi, progress, cancelled)
+        return _optimise(_Task(model, recording, skin, config), phi, limits, progress, cancelled)
     finally:
         for parameter in trainable:
             parameter.requires_grad_(True)
@@ -86,38 +97,49 @@ def fine_tune(
 def _optimise(
     task: _Task,
     phi: np.ndarray,
+    limits: np.ndarray,
     progress: Callable[[int, int, float], None] | None,
     cancelled: Callable[[], bool] | None,
 ) -> FineTuneResult:
-    """Adam on Φ until the inner validation stops improving."""
+    """Adam on Φ and the strengths until the inner validation stops improving."""
     model, config = task.model, task.config
+    scale = model.norm.properties
     start = torch.as_tensor(phi, dtype=torch.float32)
+    start = torch.cat([start, start.new_zeros(len(start), len(limits))], dim=1)
+    low, high = (torch.as_tensor(side, dtype=torch.float32) / scale[PROPERTY_COUNT:] for side in limits.T)
     path = task.rollout(start)
     before = best = task.validation_error(path)
     best_phi, best_step, step = start, 0, 0
-    change = torch.zeros_like(start, requires_grad=True)
-    optimiser = torch.optim.Adam([change], lr=config.learning_rate)
+    local = torch.zeros_like(start[:, :PROPERTY_COUNT], requires_grad=True)
+    shared = torch.zeros(len(limits), requires_grad=True)
+    optimiser = torch.optim.Adam([local, shared], lr=config.learning_rate)
     while step < config.steps and task.segments:
         if cancelled is not None and cancelled():
             raise TrainingCancelled(step)
         optimiser.zero_grad()
-        loss = task.loss(path, start + change * model.norm.properties)
+        change = torch.cat([local, shared.expand(len(start), -1)], dim=1)
+        loss = task.loss(path, start + change * scale)
         loss = loss + config.smoothness_weight * change.square().sum(dim=1).mean()
         loss.backward()
-        torch.nn.utils.clip_grad_norm_([change], 1.0)
+        torch.nn.utils.clip_grad_norm_([local, shared], 1.0)
         optimiser.step()
+        with torch.no_grad():
+            shared.clamp_(low, high)
         step += 1
         if progress is not None:
             progress(step, config.steps, loss.item())
         if step % CHECK_EVERY == 0 or step == config.steps:
-            candidate = (start + change * model.norm.properties).detach()
+            change = torch.cat([local, shared.expand(len(start), -1)], dim=1)
+            candidate = (start + change * scale).detach()
             path = task.rollout(candidate)
             error = task.validation_error(path)
             if error < best:
                 best, best_phi, best_step = error, candidate, step
             elif step - best_step >= PATIENCE_CHECKS * CHECK_EVERY:
                 break
-    return FineTuneResult(best_phi.double().numpy(), before, best, best_step > 0, step)
+    found = best_phi.double().numpy()
+    strengths = found[0, PROPERTY_COUNT:].copy()
+    return FineTuneResult(found[:, :PROPERTY_COUNT].copy(), strengths, before, best, best_step > 0, step)
 
 
 class _Task:
@@ -140,7 +162,7 @@ class _Task:
         self.fitting = max(1, round((1.0 - config.validation_fraction) * len(self.left)))
         self.segments = self._segments(int(self.left[self.fitting - 1]))
         self.constants = model.edge_constants()
-        self.engine = RolloutEngine(model)
+        self.engine = None if model.strength_count else RolloutEngine(model)
 
     def _segments(self, last: int) -> list[int]:
         """First ticks of the segments: evenly over the fitting part, all of one length."""
@@ -153,7 +175,9 @@ class _Task:
 
     def rollout(self, phi: Tensor) -> Tensor:
         """Open loop over the training frames, (T, V, 3)."""
-        return torch.from_numpy(self.engine.run(self.start, self.driven.numpy()[:, :, 0], phi.numpy()))
+        engine = self.engine or RolloutEngine(self.model.at_strengths(phi[0, PROPERTY_COUNT:]))
+        own = phi[:, :PROPERTY_COUNT].numpy()
+        return torch.from_numpy(engine.run(self.start, self.driven.numpy()[:, :, 0], own))
 
     def validation_error(self, path: Tensor) -> float:
         """Mean distance [m] of visible points in the frames that the fit does not see; infinite if not a

@@ -58,6 +58,13 @@ where s = t+1 takes c^{t+1}.
     F = (h+1) R + (h+2) 3C + (h+1) 3 + 1, prior.response (R, (h+1) R + 1);
     graph.neighbours (V, D) int64, V where the slot is empty; graph.edge_kind (V, D) int64;
     graph.rest_relative (V, D, 3).
+
+**Strengths.** Where episodes differ in the strengths of effects as well, Φ has m more columns while the network learns
+and is fine-tuned: each strength's distance from its estimate in half-widths of its interval, the same at every object
+vertex. A published version stands at fixed strengths: what they add to the first layers is constant over the object's
+vertices and goes into the weight of its kind (:meth:`WorldModel.at_strengths`), so that all of the above stays as it
+is.
+
 What a published version adds for its scene is told in ``physworld.worldmodel.published``.
 
 **Split.** The first edge product of [h_i, h_j, e_ij] is taken apart: h_i and h_j are multiplied once per
@@ -69,6 +76,7 @@ and |r^t|. The product of the messages with update_in follows the sum. The funct
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -93,7 +101,7 @@ class Normalisation:
         relative: of relative displacements per step along edges, by edge kind.
         strain: of r - r_rest along edges, by edge kind.
         stretch: of |r| - |r_rest| along edges, by edge kind.
-        properties: of Φ, (2,).
+        properties: of Φ, (2,), or (2 + m,) with m strengths of effects.
     """
 
     velocity: float = 1.0
@@ -101,7 +109,7 @@ class Normalisation:
     relative: tuple[float, float, float] = (1.0, 1.0, 1.0)
     strain: tuple[float, float, float] = (1.0, 1.0, 1.0)
     stretch: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    properties: tuple[float, float] = (1.0, 1.0)
+    properties: tuple[float, ...] = (1.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -128,7 +136,9 @@ class WorldModel(nn.Module):
         self.config = config
         self.spec = spec
         hidden, h, layers = config.hidden, config.history, config.message_passing_steps
-        vertex_features = 3 * h + 5 + PROPERTY_COUNT + (spec.ground_height_m is not None)
+        normalisation = normalisation or Normalisation()
+        self.strength_count = len(normalisation.properties) - PROPERTY_COUNT
+        vertex_features = 3 * h + 5 + len(normalisation.properties) + (spec.ground_height_m is not None)
         self.encoder = _two_layers(vertex_features, hidden, hidden)
         self.receive = nn.ModuleList(nn.Linear(hidden, hidden) for _ in range(layers))
         self.send = nn.ModuleList(nn.Linear(hidden, hidden, bias=False) for _ in range(layers))
@@ -140,7 +150,7 @@ class WorldModel(nn.Module):
         for start in (self.skip.weight, self.decoder.out.weight, self.decoder.out.bias):
             nn.init.zeros_(start)  # an untrained network leaves the prior as it is
         self._set_graph(spec)
-        self.norm = _Scales(normalisation or Normalisation(), spec)
+        self.norm = _Scales(normalisation, spec)
         reference = _reference_positions(spec)
         n = spec.object_count
         self.prior = PriorStep(prior or rigid_prior(reference[:n], reference[n:], h), h)
@@ -212,6 +222,21 @@ class WorldModel(nn.Module):
         ends = (self.skip.weight, self.decoder.out.weight, self.decoder.out.bias)
         return any(bool(torch.any(weight != 0)) for weight in ends)
 
+    def at_strengths(self, strengths: Tensor) -> WorldModel:
+        """The same function at fixed ``strengths`` (m,), as a model of the two properties alone."""
+        if strengths.shape != (self.strength_count,):
+            raise ValueError(f"strengths {tuple(strengths.shape)}, the model has {self.strength_count}")
+        if not self.strength_count:
+            return self
+        fixed = copy.deepcopy(self)
+        first = 3 * self.config.history + 3 + PROPERTY_COUNT
+        scaled = strengths / self.norm.properties[PROPERTY_COUNT:]
+        fixed.encoder.add_module("in", _at_inputs(getattr(self.encoder, "in"), first, scaled))
+        fixed.skip = _at_inputs(self.skip, first, scaled)
+        fixed.norm.properties = self.norm.properties[:PROPERTY_COUNT].clone()
+        fixed.strength_count = 0
+        return fixed
+
     def edge_constants(self) -> EdgeConstants:
         """What of the edge products depends on weights and graph only; valid until the weights change."""
         terms = [self._edge_terms(layer.weight) for layer in self.edge]
@@ -236,7 +261,7 @@ class WorldModel(nn.Module):
         new = window.new_zeros
         own = moves.permute(1, 2, 0, 3).flatten(2) / self.norm.velocity
         act = (ahead - window[-1]) / self.norm.velocity
-        properties = torch.cat([phi / self.norm.properties, new(control, batch, PROPERTY_COUNT)])
+        properties = torch.cat([phi / self.norm.properties, new(control, batch, phi.shape[-1])])
         kind = new(n + control, batch, 2)
         kind[:n, :, 0] = 1.0
         kind[n:, :, 1] = 1.0
@@ -309,6 +334,19 @@ class _Scales(nn.Module):
         values["length"] = (spec.edge_radius_m,)
         for name, value in values.items():
             self.register_buffer(name, torch.tensor(value, dtype=torch.float32))
+
+
+def _at_inputs(layer: nn.Linear, first: int, values: Tensor) -> nn.Linear:
+    """The layer with the inputs ``first`` … at ``values``; the input after them, 1 for the object, takes their part."""
+    last = first + len(values)
+    weight = torch.cat([layer.weight[:, :first], layer.weight[:, last:]], dim=1)
+    fixed = nn.Linear(weight.shape[1], layer.out_features, bias=layer.bias is not None)
+    with torch.no_grad():
+        fixed.weight.copy_(weight)
+        fixed.weight[:, first] += layer.weight[:, first:last] @ values
+        if layer.bias is not None:
+            fixed.bias.copy_(layer.bias)
+    return fixed
 
 
 def _single(values: np.ndarray) -> Tensor:

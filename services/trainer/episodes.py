@@ -8,7 +8,11 @@ has to be sealed: a version names the digest of the data it learned from.
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 
+import numpy as np
+
+from physworld.demonstrate.config import StrengthRange
 from physworld.worldmodel.dataset import Track, read_track
 from physworld.worldmodel.graph import GraphSpec
 from schemas.base import Reference
@@ -22,20 +26,35 @@ from workers.stores import Stores
 POLL_S = 0.5
 
 
+def half(one: StrengthRange) -> float:
+    """Half the width of a strength's interval."""
+    return 0.5 * (one.high - one.low)
+
+
 class Episodes:
     """Episodes of one dataset at the graph's vertices.
 
     Attributes:
         total: how many there are, or will be.
+        strengths: of the trace's effects that the episodes differ in, with their intervals.
         reached: steps taken and to take, for the progress while it waits.
     """
 
     def __init__(
-        self, context: TaskContext, stores: Stores, dataset_id: str, spec: GraphSpec, history: int
+        self,
+        context: TaskContext,
+        stores: Stores,
+        dataset_id: str,
+        spec: GraphSpec,
+        history: int,
+        strengths: Sequence[StrengthRange] = (),
     ) -> None:
         self._context, self._stores, self._dataset_id = context, stores, dataset_id
         self._spec, self._history = spec, history
-        self.total = self._dataset().config.episodes
+        dataset = self._dataset()
+        self.total = dataset.config.episodes
+        perturbed = dataset.config.effects != "as_found"
+        self.strengths = tuple(one for one in strengths if perturbed and one.low < one.high)
         self.reached = (0, 1)
 
     def track(self, index: int) -> Track:
@@ -47,8 +66,18 @@ class Episodes:
                 )
             self._wait(f"waiting for episode {index} of {self.total}")
         self._context.check()
-        arrays, _ = self._stores.episodes.verified(episode.path, episode.digest)
-        return read_track(self._spec, arrays, self._history)
+        arrays, attributes = self._stores.episodes.verified(episode.path, episode.digest)
+        drawn = attributes.get("effect_strengths", {})
+        own = [
+            (drawn.get(f"{one.effect}.{one.name}", one.value) - one.value) / half(one)
+            for one in self.strengths
+        ]
+        return read_track(self._spec, arrays, self._history, np.array(own))
+
+    def bounds(self) -> np.ndarray:
+        """Ends of the strengths' intervals as distances from the estimates in half-widths, (m, 2)."""
+        ends = [[(end - one.value) / half(one) for end in (one.low, one.high)] for one in self.strengths]
+        return np.array(ends).reshape(-1, 2)
 
     def sealed(self) -> Reference:
         """The dataset with its digest, once it is sealed. Raises Cancelled, LeaseLost or DatasetIncomplete."""

@@ -22,6 +22,7 @@ import logging
 import math
 import os
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -29,6 +30,7 @@ import numpy as np
 import torch
 from safetensors.numpy import save as save_tensors
 
+from physworld.demonstrate.config import StrengthRange
 from physworld.evaluate.blocks import mean_with_interval
 from physworld.evaluate.table import held_out_table
 from physworld.worldmodel import config as settings_of
@@ -43,12 +45,13 @@ from schemas.base import Artifact
 from schemas.model import TrainingConfig
 from schemas.signing import SIGNATURE_NAME
 from services.trainer.closed_loop import closed_loop
-from services.trainer.episodes import Episodes
-from storage import signing
+from services.trainer.episodes import Episodes, half
+from storage import signing, traces
 from workers.context import TaskContext
 from workers.lineage import lineage_of
 from workers.registry import HandlerResult
 from workers.stores import Stores
+from workers.tasks.dataset import strength_ranges
 from workers.tasks.inputs import made_from, npz_bytes, scene_of, twin_of
 
 logger = logging.getLogger(__name__)
@@ -80,7 +83,8 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     twin = twin_of(stores, payload["fit_id"], payload.get("trace_id"))
     context.progress(0, config.steps, "steps", "reading the dataset")
     view = view_scene(scene, twin, architecture)
-    episodes = Episodes(context, stores, payload["dataset_id"], view.spec, architecture.history)
+    strengths = _strengths(stores, payload)
+    episodes = Episodes(context, stores, payload["dataset_id"], view.spec, architecture.history, strengths)
     started = time.perf_counter()
     trained = _train(context, stores, episodes, view, architecture, training)
     training_s = time.perf_counter() - started
@@ -90,15 +94,24 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     tuned = _stopping(
         context,
         lambda: fine_tune(
-            trained.model, phi, view.recording(), view.skin, tuning, cancelled=context.cancelled
+            trained.model,
+            phi,
+            view.recording(),
+            view.skin,
+            tuning,
+            bounds=episodes.bounds(),
+            cancelled=context.cancelled,
         ),
     )
     tuning_s = time.perf_counter() - started
     context.progress(config.steps, config.steps, "steps", "measuring on the held-out frames")
-    published = view.published(trained.model, tuned.phi, phi)
-    measured = measure(view, published)
+    found = torch.as_tensor(tuned.strengths, dtype=torch.float32)
+    published = view.published(trained.model.at_strengths(found), tuned.phi, phi)
+    before = view.published(trained.model.at_strengths(torch.zeros_like(found)), phi, phi)
+    measured = measure(view, published, before)
     seconds = {"training": training_s, "fine_tuning": tuning_s}
     metrics = json_safe(_metrics(view, trained, tuned, measured, seconds))
+    metrics["fine_tuning"]["strengths"] = json_safe(_tuned_strengths(episodes.strengths, tuned.strengths))
     metrics["closed_loop"] = json_safe(closed_loop(stores, payload, metrics, architecture))
     dataset = episodes.sealed()
     lineage = lineage_of([dataset, *made_from(stores, payload)], payload["config"], {"training": config.seed})
@@ -144,15 +157,15 @@ def translate(
     )
 
 
-def measure(view: SceneView, published: PublishedModel) -> Measured:
-    """Open-loop predictions over the whole recording, and what they cost."""
+def measure(view: SceneView, published: PublishedModel, before: PublishedModel | None = None) -> Measured:
+    """Open-loop predictions over the whole recording, and what they cost; ``before``: without fine-tuned strengths."""
     controllers = view.controllers[view.first :]
     seconds = []
     for _ in range(SPEED_REPEATS):
         started = time.perf_counter()
         rolled = published.rollout(controllers)
         seconds.append(time.perf_counter() - started)
-    calibrated = published.rollout(controllers, phi=published.phi_calibrated)
+    calibrated = (before or published).rollout(controllers, phi=published.phi_calibrated)
     frame_times = view.scene.times - view.scene.times[0]
     tracks, tracks_calibrated = view.tracks_of(rolled), view.tracks_of(calibrated)
     twin_tracks = resample_smooth(view.twin_tracks, view.times, frame_times)
@@ -202,6 +215,27 @@ def _with_absent(table: dict[str, Any], absent: list[str]) -> dict[str, Any]:
         for metric in ("track_m", "track_phystwin_m", "chamfer_phystwin_m", "chamfer_l2_m"):
             table[metric][name] = None
     return table
+
+
+def _strengths(stores: Stores, payload: dict[str, Any]) -> tuple[StrengthRange, ...]:
+    """Strengths that the dataset's trace found, with their intervals."""
+    if payload.get("trace_id") is None:
+        return ()
+    with stores.database.reading() as session:
+        trace = traces.get_trace(session, payload["trace_id"])
+    return strength_ranges(trace.effects) if traces.adds_effects(trace) else ()
+
+
+def _tuned_strengths(ranges: Sequence[StrengthRange], found: np.ndarray) -> dict[str, Any]:
+    """Strengths of effects at which the version stands, beside what the trace said."""
+    return {
+        f"{one.effect}.{one.name}": {
+            "calibrated": one.value,
+            "ci95": [one.low, one.high],
+            "tuned": one.value + half(one) * float(value),
+        }
+        for one, value in zip(ranges, found, strict=True)
+    }
 
 
 def _train(

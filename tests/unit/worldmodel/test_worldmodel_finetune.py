@@ -10,10 +10,11 @@ import torch
 from held_bar import SMALL, graph
 
 from physworld.worldmodel.config import FineTuneConfig, TrainingConfig
-from physworld.worldmodel.dataset import Track
+from physworld.worldmodel.dataset import Track, read_track
 from physworld.worldmodel.finetune import Recording, fine_tune
+from physworld.worldmodel.model import WorldModel
 from physworld.worldmodel.published import PublishedModel
-from physworld.worldmodel.rollout import rollout
+from physworld.worldmodel.rollout import rollout, unroll
 from physworld.worldmodel.skinning import affine_skin
 from physworld.worldmodel.training import train
 
@@ -109,3 +110,64 @@ def test_published_tensors_hold_everything(
     history = episodes[2]["particles"][: SMALL.history + 1, published.spec.particle_index].astype(np.float64)
     direct = rollout(published.model, published.spec, history, controllers, published.phi)
     assert again.rollout(controllers, history=history) == pytest.approx(direct, abs=1e-6)
+
+
+@pytest.fixture(scope="module")
+def with_strength(episodes: list[dict[str, np.ndarray]]) -> WorldModel:
+    """The bar whose stiffness comes as the strength of an effect, in units of 0.5, and not as a property."""
+    spec = graph()
+    seen = [
+        read_track(
+            spec,
+            arrays | {"properties": np.zeros_like(arrays["properties"])},
+            SMALL.history,
+            np.array([arrays["properties"][0, 0] / 0.5, 0.0]),
+        )
+        for arrays in episodes
+    ]
+    return train(seen, spec, SMALL, dataclasses.replace(TRAINING, steps=100)).model
+
+
+def test_a_model_at_fixed_strengths_is_the_same_function(
+    with_strength: WorldModel, episodes: list[dict[str, np.ndarray]]
+) -> None:
+    spec, frames = with_strength.spec, SMALL.history + 1
+    track = read_track(spec, episodes[3], SMALL.history, np.array([0.8, -0.3]))
+    batch = track.positions[:, :, None]
+    whole = unroll(
+        with_strength, batch[:frames, : spec.object_count], batch[:, spec.object_count :], track.phi[:, None]
+    )
+    fixed = with_strength.at_strengths(torch.tensor([0.8, -0.3]))
+    plain = unroll(
+        fixed, batch[:frames, : spec.object_count], batch[:, spec.object_count :], track.phi[:, None, :2]
+    )
+    assert torch.allclose(whole, plain, atol=2e-5)
+    other = with_strength.at_strengths(torch.tensor([-0.8, -0.3]))
+    moved = unroll(
+        other, batch[:frames, : spec.object_count], batch[:, spec.object_count :], track.phi[:, None, :2]
+    )
+    assert float((moved - plain).abs().max()) > 1e-4, "the strength does nothing"
+    assert with_strength.strength_count == 2 and fixed.strength_count == 0
+
+
+def test_a_strength_moves_towards_the_recording_and_stays_in_its_interval(
+    with_strength: WorldModel, published: PublishedModel, episodes: list[dict[str, np.ndarray]]
+) -> None:
+    controllers = episodes[1]["controllers"].astype(np.float64)
+    zero = np.zeros((published.spec.object_count, 2))
+    truth = dataclasses.replace(
+        published, model=with_strength.at_strengths(torch.tensor([1.0, 0.0])), phi=zero
+    )
+    recording = _recording(truth, controllers, zero)
+    tuning = dataclasses.replace(TUNING, steps=30, learning_rate=0.2)
+    wide = fine_tune(
+        with_strength, zero, recording, published.skin, tuning, bounds=np.array([[-2.0, 2.0], [-2.0, 2.0]])
+    )
+    assert wide.kept and wide.error_after_m < 0.8 * wide.error_before_m
+    assert 0.2 < wide.strengths[0] <= 2.0
+    narrow = fine_tune(
+        with_strength, zero, recording, published.skin, tuning, bounds=np.array([[-0.1, 0.1], [0.0, 0.0]])
+    )
+    assert narrow.strengths[0] == pytest.approx(0.1) and narrow.strengths[1] == 0.0
+    with pytest.raises(ValueError, match="takes 2 strengths"):
+        fine_tune(with_strength, zero, recording, published.skin, tuning)
