@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -72,9 +72,15 @@ class Case:
 
 
 def settings() -> dict[str, Any]:
-    """Everything that a cell's figures depend on beside its own key; a change makes cells anew."""
+    """What a cell's figures depend on beside its own key and the defaults; a change makes cells anew."""
     parts = {"model": SMALL, "training": TRAINING, "tuning": TUNING, "fit": FIT}
-    return {name: repr(part) for name, part in parts.items()} | {"episodes": EPISODES}
+    chosen = {
+        f"{name}.{item.name}": getattr(part, item.name)
+        for name, part in parts.items()
+        for item in fields(part)
+        if getattr(part, item.name) != item.default
+    }
+    return {"episodes": EPISODES} | chosen
 
 
 def scene_of(name: str) -> Scene | None:

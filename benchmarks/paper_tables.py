@@ -163,16 +163,16 @@ class Cells:
 def plan(scenes: list[str]) -> Iterator[tuple[str, Callable[[Case], dict[str, Any]]]]:
     """Every cell, a whole seed of all scenes before the next one."""
     for seed in SEEDS:
-        for name in scenes:
-            for condition in CONDITIONS:
-                yield f"{name}/{condition}/{seed}", lambda case, c=condition, s=seed: conditioned(case, c, s)
-            yield f"{name}/{ALONE}/{seed}", lambda case, s=seed: recording_alone(case, s)
         if "soft_beam" in scenes:
             for kind in unseen_motion.KINDS:
                 yield (
                     f"soft_beam/unseen_{kind}/{seed}",
                     lambda case, k=kind, s=seed: unseen_motion.cell(case, k, s),
                 )
+        for name in scenes:
+            for condition in CONDITIONS:
+                yield f"{name}/{condition}/{seed}", lambda case, c=condition, s=seed: conditioned(case, c, s)
+            yield f"{name}/{ALONE}/{seed}", lambda case, s=seed: recording_alone(case, s)
 
 
 def conditioned(case: Case, condition: str, seed: int) -> dict[str, Any]:
