@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -78,6 +79,11 @@ class Episodes:
         """Ends of the strengths' intervals as distances from the estimates in half-widths, (m, 2)."""
         ends = [[(end - one.value) / half(one) for end in (one.low, one.high)] for one in self.strengths]
         return np.array(ends).reshape(-1, 2)
+
+    def description(self) -> dict[str, Any]:
+        """What the dataset says of itself: kinds of motion, lengths, settings; the limits of what was learned."""
+        dataset = self._dataset()
+        return {"statistics": dataset.statistics, "config": dataset.config.model_dump(mode="json")}
 
     def sealed(self) -> Reference:
         """The dataset with its digest, once it is sealed. Raises Cancelled, LeaseLost or DatasetIncomplete."""

@@ -115,7 +115,7 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     metrics["closed_loop"] = json_safe(closed_loop(stores, payload, metrics, architecture))
     dataset = episodes.sealed()
     lineage = lineage_of([dataset, *made_from(stores, payload)], payload["config"], {"training": config.seed})
-    card = _card(payload, config, published, metrics, lineage)
+    card = _card(payload, config, published, metrics, lineage) | {"trained_on": episodes.description()}
     artifacts = _store(stores, payload, published, view, measured, card)
     manifest = next(artifact for artifact in artifacts if artifact.name == MANIFEST_NAME)
     context.check()

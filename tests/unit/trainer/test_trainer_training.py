@@ -125,6 +125,9 @@ def test_a_training_publishes_a_version_that_rolls_out(runtime: Runtime, dataset
     with runtime.database.reading() as session:
         digest = resources.get_dataset(session, dataset_id).digest
     assert {item["kind"]: item["digest"] for item in card["lineage"]["inputs"]}["dataset"] == digest
+    assert card["trained_on"]["statistics"]["episodes"] == 4 and card["trained_on"]["statistics"]["motions"]
+    assert card["intended_use"] and card["limits"]
+    assert set(card["metrics"]["held_out"]["per_frame"]["track_m"]) >= {"twin", "world_model", "static"}
     assert not runtime.stores.scratch.has(job.id, training.CHECKPOINT)
 
 
