@@ -32,6 +32,8 @@ class TraceConfig(Request):
     seed: Seed = 0
 
 
+MOST_RECORDINGS = 8
+
 NO_OTHER_PHYSICS = (
     "a trace calibrates the usual elastic law: fit.law, fit.plasticity and fit.formulation must be left out"
 )
@@ -42,9 +44,14 @@ class TraceCreate(Request):
 
     A trace calibrates the declared physics itself, with ``fit``'s budgets and never with damping. ``fit_id`` names a
     ready fit of the scene: its twin is taken instead where it holds no damping.
+
+    ``scene_ids`` are further recordings of the same object, fitted together with ``scene_id``;
+    ``held_out_scene_ids`` are recordings that only the report sees.
     """
 
     scene_id: str
+    scene_ids: list[str] = Field(default_factory=list, max_length=MOST_RECORDINGS)
+    held_out_scene_ids: list[str] = Field(default_factory=list, max_length=MOST_RECORDINGS)
     fit_id: str | None = None
     fit: FitConfig = Field(default_factory=lambda: FitConfig(damping="none"))
     config: TraceConfig = Field(default_factory=TraceConfig)
@@ -53,6 +60,16 @@ class TraceCreate(Request):
     def _usual_physics(self) -> Self:
         if not self.fit.usual_physics:
             raise ValueError(NO_OTHER_PHYSICS)
+        return self
+
+    @model_validator(mode="after")
+    def _each_once(self) -> Self:
+        every = [self.scene_id, *self.scene_ids, *self.held_out_scene_ids]
+        twice = sorted({known for known in every if every.count(known) > 1})
+        if twice:
+            raise ValueError(
+                f"a recording is fitted or held out, once: {', '.join(twice)} came more than once"
+            )
         return self
 
 
@@ -78,14 +95,16 @@ class FoundEffect(Resource):
 class Trace(Resource):
     """A trace. Once ready it holds every key of its ``report.json``, also those that are not named here.
 
-    ``held_out`` are errors on frames that nothing before the report has seen; ``twin.npz`` is among the artifacts where
-    the verdict is ``named``.
+    ``held_out`` are errors on frames that nothing before the report has seen, of the recordings that are held out if
+    there are any; ``recordings`` has those of each. ``twin.npz`` is among the artifacts where the verdict is ``named``.
     """
 
     model_config = ConfigDict(extra="allow")
 
     id: str
     scene_id: str
+    scene_ids: list[str] = Field(default_factory=list)
+    held_out_scene_ids: list[str] = Field(default_factory=list)
     fit_id: str | None = None
     state: TraceState
     created_at: datetime
@@ -100,6 +119,7 @@ class Trace(Resource):
     equivalent: list[FoundEffect] = Field(default_factory=list)
     candidates: list[dict[str, Any]] = Field(default_factory=list)
     held_out: dict[str, Any] | None = None
+    recordings: list[dict[str, Any]] = Field(default_factory=list)
     calibrated: dict[str, Figure] = Field(default_factory=dict)
     unexplained: dict[str, Any] | None = None
     suggested_experiment: dict[str, Any] | None = None

@@ -57,7 +57,15 @@ def create_fit(session: Session, scene_id: str, config: FitConfig, parent: JobRo
 
 def create_trace(session: Session, request: TraceCreate) -> Job:
     """Open a trace. Raises NotFound, or Conflict when the fit is not ready or of another scene."""
-    opened = open_trace(session, request.scene_id, request.fit, request.config, request.fit_id)
+    opened = open_trace(
+        session,
+        request.scene_id,
+        request.fit,
+        request.config,
+        request.fit_id,
+        scene_ids=request.scene_ids,
+        held_out_scene_ids=request.held_out_scene_ids,
+    )
     return _job(session, opened)
 
 

@@ -7,7 +7,7 @@ cannot be seen by anybody.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from sqlalchemy.orm import Session
@@ -78,10 +78,17 @@ def open_trace(
     config: TraceConfig,
     fit_id: str | None = None,
     parent: JobRow | None = None,
+    scene_ids: Sequence[str] = (),
+    held_out_scene_ids: Sequence[str] = (),
 ) -> JobRow:
-    """A trace of a scene, from a ready fit of it or its own. Raises NotFound, or Conflict when the fit does not do."""
-    scene = _scene(session, scene_id)
-    inputs = [Reference(kind="scene", id=scene_id, digest=scene.digest)]
+    """A trace of a scene, from a ready fit of it or its own. Raises NotFound, or Conflict when the fit does not do.
+
+    ``scene_ids`` are fitted with the scene, ``held_out_scene_ids`` only reported on.
+    """
+    inputs = [
+        Reference(kind="scene", id=known, digest=_scene(session, known).digest)
+        for known in (scene_id, *scene_ids, *held_out_scene_ids)
+    ]
     if fit_id is not None:
         known = _ready_fit(session, fit_id, "a trace")
         if known.scene_id != scene_id:
@@ -89,6 +96,7 @@ def open_trace(
         inputs.append(Reference(kind="fit", id=fit_id, digest=fit_digest(known)))
     trace_id = new_id("trace")
     settings = {"fit": fit.model_dump(mode="json"), "trace": config.model_dump(mode="json")}
+    others = {"scene_ids": list(scene_ids), "held_out_scene_ids": list(held_out_scene_ids)}
     job = open_job(
         session,
         "trace",
@@ -107,12 +115,12 @@ def open_trace(
         job_id=job.id,
         config=settings["trace"],
         fit=settings["fit"],
-        report={},
+        report=others,
         lineage=pending_lineage(job),
         artifacts=[],
     )
     session.add(row)
-    payload = {"trace_id": trace_id, "scene_id": scene_id, "fit_id": fit_id, **settings}
+    payload = {"trace_id": trace_id, "scene_id": scene_id, "fit_id": fit_id, **others, **settings}
     add_shards(session, job, "trace", [payload])
     return job
 

@@ -209,7 +209,7 @@ class FitRow(Base):
 
 
 class TraceRow(Base):
-    """A residual traced to an effect; ``report`` is the whole answer."""
+    """A residual traced to an effect; ``report`` is the whole answer, beginning with the other recordings asked for."""
 
     __tablename__ = "traces"
     __table_args__ = (Index(None, "created_at"),)

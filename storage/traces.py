@@ -61,7 +61,7 @@ def mark_trace_ready(
         raise Conflict(f"trace {trace_id} is {row.state}; only a pending trace can become ready")
     row.state = "ready"
     row.verdict = verdict
-    row.report = report
+    row.report = {**row.report, **report}  # a pending one holds the other recordings
     row.artifacts = [artifact.model_dump(mode="json") for artifact in artifacts]
     row.lineage = lineage.model_dump(mode="json")
     session.flush()

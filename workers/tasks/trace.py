@@ -59,6 +59,7 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     """Trace, report, store."""
     payload = context.lease.payload
     scene = scene_of(stores, payload["scene_id"])
+    others = [*payload.get("scene_ids", ()), *payload.get("held_out_scene_ids", ())]
     with stores.database.session() as session:
         helpers.call_off(session, context.lease.job_id)  # those of an attempt that was lost
     try:
@@ -72,7 +73,7 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
         stores.artifacts.put_bytes(content, name, media_type)
         for name, media_type, content in trace_files(scene, result, report)
     ]
-    inputs: list[Reference] = [scene_reference(stores, payload["scene_id"])]
+    inputs: list[Reference] = [scene_reference(stores, known) for known in (payload["scene_id"], *others)]
     if payload["fit_id"] is not None:
         inputs.append(fit_reference(stores, payload["fit_id"]))
     settings = {"fit": payload["fit"], "trace": payload["trace"]}
@@ -189,8 +190,9 @@ def _traced(context: TaskContext, stores: Stores, scene: Scene) -> Any:
     fit = FitConfig.model_validate(payload["fit"])
     shown = _Progress(context, fit.max_simulations)
     return trace(
-        scene,
+        [scene, *(scene_of(stores, known) for known in payload.get("scene_ids", ()))],
         translate(fit, WireConfig.model_validate(payload["trace"]), stores.settings.device),
+        held_out=[scene_of(stores, known) for known in payload.get("held_out_scene_ids", ())],
         runner=SharedRunner(context, stores),
         memory=SharedMemory(stores, context.lease.job_id),
         journal=_journal(stores, context.lease.job_id, payload),

@@ -1,9 +1,10 @@
 """What a trace leaves behind on the service: the report and its files.
 
 Files: ``report.json`` (:func:`physworld.trace.document`), ``tracks.npz`` (``times`` (T,) f8 [s], ``before`` and
-``after`` (T, N, 3) f8 [m]: open loop from frame 0 without and with the effects, each calibrated on the training
-frames), ``report.html`` (one self-contained page), ``declared.npz``: the twin of the declared physics alone, calibrated
-anew (``Twin.to_arrays``), and, where the verdict is ``named``, ``twin.npz``: the twin that carries the effects.
+``after`` (T, N, 3) f8 [m]: open loop from frame 0 without and with the effects, each calibrated on the training frames;
+of several recordings those of the first, and ``before_k``, ``after_k`` of each), ``report.html`` (one self-contained
+page), ``declared.npz``: the twin of the declared physics alone, calibrated anew (``Twin.to_arrays``), and, where the
+verdict is ``named``, ``twin.npz``: the twin that carries the effects.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ def trace_report(result: TraceResult) -> dict[str, Any]:
 def trace_files(scene: Scene, result: TraceResult, report: dict[str, Any]) -> list[tuple[str, str, bytes]]:
     """Name, media type and content of every file, the report first."""
     tracks = {"times": scene.times, "before": result.before, "after": result.after}
+    for k, known in enumerate(result.recordings if len(result.recordings) > 1 else ()):
+        tracks |= {f"before_{k}": known.before, f"after_{k}": known.after}
     files = [
         (REPORT, JSON, json.dumps(report, indent=1, allow_nan=False).encode()),
         (TRACKS, NPZ, npz_bytes(tracks)),

@@ -5,7 +5,7 @@ The synchronous and the asynchronous client send the same calls, so that an endp
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 from urllib.parse import quote
@@ -120,10 +120,21 @@ def fit_list(*, limit: int | None, cursor: str | None, state: str | None = None)
 
 
 def trace_create(
-    scene_id: str, config: TraceConfig | None, fit: FitConfig | None, fit_id: str | None
+    scene_id: str,
+    config: TraceConfig | None,
+    fit: FitConfig | None,
+    fit_id: str | None,
+    scene_ids: Sequence[str] = (),
+    held_out_scene_ids: Sequence[str] = (),
 ) -> Call[Job]:
     """POST /v1/traces."""
-    body = TraceCreate(scene_id=scene_id, fit_id=fit_id, config=config or TraceConfig())
+    body = TraceCreate(
+        scene_id=scene_id,
+        scene_ids=list(scene_ids),
+        held_out_scene_ids=list(held_out_scene_ids),
+        fit_id=fit_id,
+        config=config or TraceConfig(),
+    )
     return Call(
         "POST", "/v1/traces", _JOB, body=body if fit is None else body.model_copy(update={"fit": fit})
     )

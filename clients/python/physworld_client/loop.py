@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from physworld_client import calls
@@ -27,9 +29,17 @@ class Traces(Resource):
         *,
         fit: FitConfig | None = None,
         fit_id: str | None = None,
+        scene_ids: Sequence[str] = (),
+        held_out_scene_ids: Sequence[str] = (),
     ) -> Job:
-        """Starts a trace; its job's output is the trace."""
-        return self._client.send(calls.trace_create(scene_id, config, fit, fit_id))
+        """Starts a trace; its job's output is the trace.
+
+        ``scene_ids`` are further recordings of the object, fitted together with the scene; ``held_out_scene_ids`` are
+        recordings that only the report sees.
+        """
+        return self._client.send(
+            calls.trace_create(scene_id, config, fit, fit_id, scene_ids, held_out_scene_ids)
+        )
 
     def get(self, trace_id: str) -> Trace:
         """One trace: the verdict and every figure of its report."""

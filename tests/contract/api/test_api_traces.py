@@ -61,6 +61,24 @@ def test_a_trace_is_accepted_and_answers_with_its_report(client: httpx.Client, s
             np.testing.assert_array_equal(arrays[name], array)
 
 
+def test_a_trace_of_several_recordings_says_which_are_fitted_and_which_held_out(
+    client: httpx.Client, service: Service
+) -> None:
+    first, second, unseen = (scene_id(client, f"strip {k}") for k in "abc")
+    body = {"scene_id": first, "scene_ids": [second], "held_out_scene_ids": [unseen]}
+    job, trace_id = made(client, "/v1/traces", body, "trace")
+    assert [item["id"] for item in job["inputs"]] == [first, second, unseen]
+    for _ in range(2):
+        trace = client.get(f"/v1/traces/{trace_id}").json()
+        assert {key: trace[key] for key in body} == body
+        service.work()
+    assert trace["state"] == "ready"
+    twice = client.post("/v1/traces", json={**body, "held_out_scene_ids": [first]})
+    assert_problem(twice, 422, "invalid_request")
+    assert first in twice.text
+    assert_problem(client.post("/v1/traces", json={**body, "scene_ids": ["scn_none"]}), 404, "not_found")
+
+
 def test_traces_are_refused_cancelled_and_done_once(client: httpx.Client, service: Service) -> None:
     scene = scene_id(client)
     assert_problem(client.post("/v1/traces", json={"scene_id": "scn_none"}), 404, "not_found")

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
+from tiny_scene import register, tiny_scene
 
 from physworld.trace import Memory
 from physworld.twin import Twin
@@ -70,6 +72,28 @@ def test_a_trace_reports_shares_its_simulations_and_tidies_up(
     assert len(helped) > 3 and {shard.state for shard in helped} == {"DONE"}
     assert trace.simulations is not None and trace.simulations >= len(helped)
     assert stores.scratch.jobs() == []
+
+
+def test_a_trace_of_several_recordings_reports_on_each(
+    runtime_with: Callable[..., Runtime], stores: Stores, scene_id: str
+) -> None:
+    others = [register(replace(tiny_scene(), name=name), stores.database, stores.artifacts) for name in "bc"]
+    with stores.database.session() as session:
+        request = TraceCreate(
+            scene_id=scene_id, scene_ids=others[:1], held_out_scene_ids=others[1:], fit=FIT, config=SMALL
+        )
+        job = jobs.create_trace(session, request)
+    (driver,) = _waiting(stores)
+    assert run_shard(runtime_with(), driver) == "done"
+    trace = _trace(stores, job)
+    assert [(r["scene"], r["role"]) for r in trace.recordings] == [
+        ("tiny bar", "fitted"), ("b", "fitted"), ("c", "held_out"),
+    ]  # fmt: skip
+    assert trace.scene_ids == others[:1] and trace.held_out_scene_ids == others[1:]
+    assert trace.held_out is not None and trace.held_out["before"] == trace.recordings[2]["before"]
+    assert [item.id for item in trace.lineage.inputs] == [scene_id, *others]
+    data = stores.artifacts.read_bytes(named(trace.artifacts, "tracks.npz", trace.id).sha256)
+    assert {"before", "before_0", "after_1", "after_2"} <= set(npz_arrays(data))
 
 
 def test_a_killed_trace_goes_on_without_repeating_simulations(

@@ -38,6 +38,13 @@ def traces_add(
     fit: Annotated[str | None, typer.Option(help="A ready fit whose twin to begin with.")] = None,
     particles: Annotated[int | None, typer.Option(min=50, help="Particles of the twin, about.")] = None,
     candidate: Annotated[list[str] | None, typer.Option(help="Try this effect only; repeatable.")] = None,
+    also: Annotated[
+        list[str] | None,
+        typer.Option("--with", help="Another recording of the object, fitted with it; repeatable."),
+    ] = None,
+    held_out: Annotated[
+        list[str] | None, typer.Option(help="A recording that only the report sees; repeatable.")
+    ] = None,
     json: Json = False,
     url: Url = None,
     token: Token = None,
@@ -47,7 +54,14 @@ def traces_add(
     config = TraceConfig(candidates=candidate or [])
     settings = None if particles is None else FitConfig(particle_budget=particles, damping="none")
     with service.connect(url, token, data) as client:
-        job = client.traces.create(scene_id, config, fit=settings, fit_id=fit)
+        job = client.traces.create(
+            scene_id,
+            config,
+            fit=settings,
+            fit_id=fit,
+            scene_ids=also or (),
+            held_out_scene_ids=held_out or (),
+        )
     if json:
         print_json(job)
     else:
