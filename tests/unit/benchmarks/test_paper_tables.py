@@ -1,0 +1,111 @@
+"""The paper's tables: cells that are kept, relations over scenes and seeds, a report of what is there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks import paper_tables, unseen_motion
+from benchmarks.paper_tables import (
+    ALONE,
+    CONDITIONS,
+    RELATIONS,
+    SEEDS,
+    Cells,
+    Relation,
+    hold,
+    plan,
+    summarise,
+)
+
+
+def cell(model: float, tuned: float, twin: float = 0.002) -> dict[str, Any]:
+    errors = {"static": 0.1, "rigid_follow": 0.02, "constant_velocity": 0.5, "twin": twin}
+    errors |= {"world_model": model, "world_model_finetuned": tuned}
+    speeds = {"steps_per_second": {"world_model": 800.0, "twin": 20.0}}
+    return {metric: dict(errors) for metric in paper_tables.METRICS} | speeds
+
+
+def held(scenes: list[str]) -> dict[str, dict[str, Any] | None]:
+    """Everything of the first two seeds; the third one is not done."""
+    found: dict[str, dict[str, Any] | None] = {key: None for key, _ in plan(scenes)}
+    worse = {"full": 1.0, "linear": 2.0, "none": 1.0 / 1.1, "uniform": 1.2, "random": 1.4}
+    for scene in scenes:
+        for seed in SEEDS[:2]:
+            for condition, factor in worse.items():
+                found[f"{scene}/{condition}/{seed}"] = cell(
+                    0.005 * factor, 0.004 * factor * (1.0 + 0.1 * seed)
+                )
+            found[f"{scene}/{ALONE}/{seed}"] = {metric: {ALONE: 0.016} for metric in paper_tables.METRICS}
+    return found
+
+
+def test_every_relation_of_the_paper_is_planned_for_every_scene_and_seed() -> None:
+    keys = [key for key, _ in plan(["soft_beam", "d02"])]
+    assert len(keys) == len(set(keys)) == len(SEEDS) * (2 * (len(CONDITIONS) + 1) + len(unseen_motion.KINDS))
+    first = [key for key in keys if key.endswith("/0")]
+    assert keys[: len(first)] == first, "a whole seed comes before the next one"
+
+
+def test_a_relation_is_judged_pair_by_pair() -> None:
+    report = summarise(["soft_beam"], held(["soft_beam"]))
+    relations = report.figures["relations"]
+    assert relations["vmp_against_linear"]["mean_ratio"] == pytest.approx(0.5)
+    assert (relations["vmp_against_linear"]["holds_in"], relations["vmp_against_linear"]["pairs"]) == (2, 2)
+    assert relations["p3_against_none"]["mean_ratio"] == pytest.approx(1.1)
+    assert relations["p3_against_none"]["holds_in"] == 0
+    assert not relations["p3_against_none"]["by_scene"]["soft_beam"]["holds"]
+    assert relations["finetuned_against_twin"]["by_scene"]["soft_beam"]["by_seed"]["0"] == pytest.approx(2.0)
+    assert report.figures["cells"]["done"] == 12
+    assert f"12 of {len(held(['soft_beam']))} cells are done" in report.markdown()
+    assert report.figures["steps_per_second"]["soft_beam"]["ratio"] == pytest.approx(40.0)
+
+
+def test_a_report_without_a_cell_says_that_nothing_was_measured() -> None:
+    report = summarise(["soft_beam"], {key: None for key, _ in plan(["soft_beam"])})
+    assert report.rows == []
+    assert report.markdown().count("not measured yet") == len(RELATIONS)
+    empty = hold(Relation("x", "twin", "static", ""), report.figures["errors"])
+    assert empty["pairs"] == 0 and empty["mean_ratio"] is None
+
+
+def test_a_finished_cell_is_not_done_again_and_no_cell_begins_after_the_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Cells, "_case", lambda self, name: name)
+    cells = Cells(tmp_path, None)
+    done: list[str] = []
+
+    def work(case: Any) -> dict[str, Any]:
+        done.append(case)
+        return {"error": 0.5}
+
+    cells.fill("soft_beam/full/0", work)
+    Cells(tmp_path, None).fill("soft_beam/full/0", work)
+    assert done == ["soft_beam"]
+    assert Cells(tmp_path, None).get("soft_beam/full/0")["error"] == 0.5  # type: ignore[index]
+    late = Cells(tmp_path, 0.0)
+    late.fill("d02/full/0", work)
+    assert late.get("d02/full/0") is None and done == ["soft_beam"]
+    monkeypatch.setattr(paper_tables, "settings", lambda: {"episodes": 1})
+    assert Cells(tmp_path, None).get("soft_beam/full/0") is None, "cells of other settings do not count"
+
+
+def test_unseen_motions_are_pooled_over_seeds() -> None:
+    def one(error: float) -> dict[str, Any]:
+        figures = {"mean_m": error, "largest_m": 3 * error, "at_frame_m": {"10": error, "100": 2 * error}}
+        return {
+            "size_m": 0.2,
+            "unseen": figures,
+            "seen": figures,
+            "baselines": dict.fromkeys(("static", "rigid_follow"), figures),
+        }
+
+    found = unseen_motion.pooled([one(0.001), None, one(0.003)])
+    assert found is not None and found["seeds"] == 2
+    assert found["unseen"]["mean_m"]["mean"] == pytest.approx(0.002)
+    assert found["unseen"]["at_frame_m"]["100"] == pytest.approx(0.004)
+    assert "trained without it 2.00" in unseen_motion.in_words("twist", found)
+    assert unseen_motion.pooled([None]) is None
