@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
-
-from services.trainer.app import serve
-from storage.settings import get_settings
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -16,6 +14,11 @@ def main(arguments: list[str] | None = None) -> int:
         "--name", default="trainer", help="name of this trainer on its host (default: trainer)"
     )
     options = parser.parse_args(arguments)
+    # Before NumPy is there: its threads spin beside torch's, and beside the workers on the same host.
+    os.environ.setdefault("OMP_NUM_THREADS", os.environ.get("PHYSWORLD_TRAINER_THREADS", "1"))
+    from services.trainer.app import serve
+    from storage.settings import get_settings
+
     settings = get_settings()
     settings.check()
     return serve(settings, options.name)
