@@ -37,7 +37,6 @@ NULLS = 36
 METHOD = tuple(
     f"physworld/{room}" for room in ("trace", "calibrate", "effects", "mpm", "geometry", "evaluate")
 )
-_EVERY = 2  # injections between two recordings without an effect
 _OFF = 1.3  # stiffness that a trace starts from, over the true one
 _STIFFNESS = ("youngs_modulus_pa", "membrane_n_m", "bending_n_m", "bending_n_m2")
 
@@ -70,12 +69,7 @@ def tasks(nulls: int) -> list[Task]:
         for body in (*bodies, GROUND_ONLY)
         if body != GROUND_ONLY or _needs_ground(name)
     ]
-    mixed: list[Task] = []
-    for k, task in enumerate(injected):
-        if k % _EVERY == 0 and k // _EVERY < len(without):
-            mixed.append(without[k // _EVERY])
-        mixed.append(task)
-    return mixed + without[-(-len(injected) // _EVERY) :]
+    return without + injected
 
 
 def _needs_ground(name: str) -> bool:
