@@ -115,15 +115,25 @@ def remember(keys: Iterable[SigningKey], origin: str) -> dict[str, str]:
         if key.key_id not in known:
             held[key.key_id] = {"public_key": key.public_key, "origin": origin}
     if held.keys() != known.keys():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_name(f"{path.name}.{os.getpid()}")
-        try:
-            part.write_text(json.dumps(held, indent=1) + "\n")
-            part.replace(path)
-        finally:
-            with suppress(FileNotFoundError):
-                part.unlink()
+        _write(path, json.dumps(held, indent=1) + "\n")
     return {key_id: entry["public_key"] for key_id, entry in held.items()}
+
+
+def _write(path: Path, text: str) -> None:
+    """Replace the file in one step."""
+    part = path.with_name(f"{path.name}.{os.getpid()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_text(text)
+        part.replace(path)
+    except OSError as error:
+        raise ModelUnreadable(
+            f"the service's keys cannot be remembered in {path} ({error}): set PHYSWORLD_KNOWN_KEYS to a place "
+            "that can be written, or give public_key"
+        ) from error
+    finally:
+        with suppress(OSError):
+            part.unlink()
 
 
 def known_keys_file() -> Path:

@@ -115,6 +115,13 @@ def test_keys_are_remembered_once_and_never_overwritten(keys_file: Path) -> None
     assert remember([wire(THEIRS)], "https://theirs").keys() == {OURS.key_id, THEIRS.key_id}
 
 
+def test_a_place_that_cannot_be_written_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("PHYSWORLD_KNOWN_KEYS", str(tmp_path / "file" / "known.json"))
+    with pytest.raises(ModelUnreadable, match=r"cannot be remembered in .*set PHYSWORLD_KNOWN_KEYS"):
+        remember([wire(OURS)], "https://ours")
+
+
 def test_a_damaged_file_of_keys_is_named(keys_file: Path) -> None:
     keys_file.parent.mkdir()
     keys_file.write_text('{"0": 3}')
