@@ -69,6 +69,8 @@ class BodyForm(Form):
     mass_kg: Positive | None = None
     segment_rest_lengths_m: list[Positive] | None = None
     topology: Topology | None = None
+    self_contact: bool | None = None
+    topology_change: bool | None = None
 
 
 class GroundForm(Form):

@@ -58,6 +58,7 @@ def test_a_sound_scene_has_neither_fault_nor_warning() -> None:
 
 
 FAULTS: list[tuple[str, Break, str, str]] = [
+    ("a word for a flag", set_body(self_contact="no"), "self_contact", "boolean"),
     (
         "millimetres",
         scale("points", "controllers", "rest_volume_points", by=1000.0),
