@@ -11,9 +11,11 @@ import time
 from pathlib import Path
 
 import numpy as np
+import onnxruntime
 import psutil
 import pytest
 from physworld_client.world_model import WorldModel
+from safetensors.numpy import load_file
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
@@ -21,6 +23,7 @@ COMMAND = Path(sys.executable).with_name("physworld")
 SMALL = ("--episodes", "3", "--simulations", "6", "--steps", "20", "--vertices", "30", "--hidden", "16")
 ROWS = {"static", "rigid_follow", "constant_velocity", "twin", "world_model", "world_model_finetuned"}
 ENDED_WITHIN_S = 30.0
+STEP_AGREEMENT_M = 1e-5
 
 
 def command(scene: Path, data: Path, *options: str) -> list[str]:
@@ -44,6 +47,29 @@ def processes_of(data: Path) -> list[str]:
         except (psutil.NoSuchProcess, psutil.AccessDenied, psutil.ZombieProcess):
             continue
     return found
+
+
+def one_step(step: onnxruntime.InferenceSession, folder: Path, model: WorldModel) -> np.ndarray:
+    """Object vertices one tick after the start [m], the grips standing still, by the ONNX program."""
+    tensors = load_file(folder / "model.safetensors")
+    neighbours = tensors["graph.neighbours"]
+    receivers, slots = np.nonzero(neighbours < len(neighbours))
+    origin = model.start_history[-1].mean(axis=0)
+    if model.ground_height_m is not None:
+        origin[2] = model.ground_height_m
+    controls = model.start_controllers[:, model.control_index] - origin
+    window = np.concatenate([model.start_history - origin, controls], axis=1).astype(np.float32)
+    inputs = {
+        "window": window,
+        "control_next": window[-1, len(model.rest_vertices) :],
+        "phi": model.phi.astype(np.float32),
+        "senders": neighbours[receivers, slots],
+        "receivers": receivers,
+        "kinds": tensors["graph.edge_kind"][receivers, slots],
+        "rest_relative": tensors["graph.rest_relative"][receivers, slots],
+    }
+    (following,) = step.run(None, inputs)
+    return following[: len(model.rest_vertices)] + origin
 
 
 def test_from_a_recording_to_a_world_model(repository: Path, tmp_path: Path) -> None:
@@ -71,6 +97,9 @@ def test_from_a_recording_to_a_world_model(repository: Path, tmp_path: Path) -> 
     vertices = model.rollout(np.concatenate([model.start_controllers, controllers]))
     assert vertices.shape == (10 + model.history + 1, len(model.rest_vertices), 3)
     assert np.isfinite(model.track(vertices)).all()
+    folder = data / "models" / "soft_beam-1"
+    step = onnxruntime.InferenceSession(folder / "step.onnx", providers=["CPUExecutionProvider"])
+    assert np.abs(one_step(step, folder, model) - vertices[model.history + 1]).max() < STEP_AGREEMENT_M
     assert processes_of(data) == [], "the service ends with the command that started it"
 
 
