@@ -52,6 +52,14 @@ def cross_validated(fitted: Refit, block_of_row: np.ndarray) -> CrossValidation:
     return CrossValidation(np.array(errors), np.array(sizes))
 
 
+def seen_through(residual: np.ndarray, basis: np.ndarray, block_of_row: np.ndarray) -> CrossValidation:
+    """Mean squared error of every block once the directions ``basis`` (M, k), orthonormal, are taken out."""
+    left = (residual - basis @ (basis.T @ residual)) ** 2
+    sizes = np.bincount(block_of_row)
+    there = sizes > 0
+    return CrossValidation((np.bincount(block_of_row, left)[there] / sizes[there]), sizes[there])
+
+
 def difference(worse: CrossValidation, better: CrossValidation) -> tuple[float, float]:
     """Mean of the blocks' differences of squared error, and its standard error."""
     gap = worse.errors - better.errors

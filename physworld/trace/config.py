@@ -9,7 +9,7 @@ from physworld.trace.experiment_search import ExperimentConfig
 
 
 def _declared() -> CalibrationConfig:
-    return CalibrationConfig(damping="none")
+    return CalibrationConfig(particle_budget=1000, damping="none")
 
 
 @dataclass(frozen=True)
@@ -17,7 +17,8 @@ class TraceConfig:
     """Settings.
 
     Attributes:
-        calibration: of the declared physics only.
+        calibration: of the declared physics only; on coarser cells than a fit's, for a trace simulates a lot, and finer
+            ones are asked in the end.
         family_wise_level: probability of naming an effect where residuals are without one.
         resamples: sign patterns of the max statistic.
         blocks: time blocks of the training frames, at most; never shorter than ``shortest_block`` frames.
@@ -51,10 +52,10 @@ class TraceConfig:
     acceptable: float = 2.0
     most_of_it: float = 0.7
     alike: float = 0.95
-    confirmed: int = 6
+    confirmed: int = 8
     iterations: int = 5
     effects_at_most: int = 2
-    refinement: float = 1.25
+    refinement: float = 1.4
     bootstraps: int = 1000
     seed: int = 0
     candidates: tuple[str, ...] = ()

@@ -14,13 +14,21 @@ import numpy as np
 from physworld.trace.candidates import Candidate
 from physworld.trace.comparison import CrossValidation, cross_validated, difference
 from physworld.trace.refit import Refit, refit
-from physworld.trace.score import Score, project
-from physworld.trace.simulations import Simulations
-from physworld.trace.unknowns import Unknown
+from physworld.trace.score import Score, orthonormal, project
+from physworld.trace.simulations import Job, Simulations
+from physworld.trace.unknowns import CLAMP, Unknown, at
 from physworld.trace.whitening import Whitener
 
-_MEANINGFUL = 2.0  # standard errors by which a model must predict better than a simpler one
+REACH = f"{CLAMP}.reach_m"
+MEANINGFUL = 2.0  # standard errors by which a model must predict better than a simpler one
 _STARTS, _GLANCE = 3, 2  # variants of an effect that are tried, and iterations after which the best goes on
+_WORSE = 3.0  # a search is left that is this many times as far from the noise as the best so far
+_HALF = 0.5  # and has not removed this share of what the model without the effect leaves
+_ELSEWHERE = tuple(0.12 * k for k in range(-4, 5))  # logarithms of the stiffness: a scan through the optimum
+_FURTHER = (3.0, 9.0)  # times the linear estimate of a strength, which is low where motion is out of phase
+_AROUND = (-0.48, -0.24, 0.24, 0.48)  # logarithms of the stiffness where a strength without shapes starts too
+_HELD = (-2.0, 2.0)  # places of the clamp's reach, in its steps
+_TRIED = 2  # starts elsewhere that are followed
 _NUDGE = 0.1  # of a probe: where a search starts if the linear estimate says none, so that shapes can show
 
 
@@ -52,7 +60,7 @@ class Model:
 def beats(better: Model, worse: Model) -> bool:
     """Whether left-out blocks are predicted better by more than chance."""
     gain, spread = difference(worse.validated, better.validated)
-    return gain > _MEANINGFUL * spread
+    return gain > MEANINGFUL * spread
 
 
 @dataclass
@@ -65,26 +73,84 @@ class Confirmation:
     frames: int
     iterations: int
 
-    def model(self, base: Model, variants: list[Score], columns: dict[str, np.ndarray]) -> Model | None:
+    def model(
+        self, base: Model, variants: list[Score], columns: dict[str, np.ndarray], best: Model | None = None
+    ) -> Model | None:
         """``base`` with one effect more, everything refitted; None where no run was usable.
 
         Args:
             variants: scores of the effect's variants against the base's residual, the ones to start from.
             columns: whitened sensitivities at zero of every variant, by label, (M, k).
+            best: of the models that were refitted before; what is far worse after a few steps is left.
         """
-        brief = self.iterations if len(variants) == 1 else _GLANCE
-        starts = [self._with_gates(base, score, columns[score.candidate.label], brief) for score in variants]
+        alone = len(variants) == 1 and not variants[0].candidate.shapes
+        hopeless = np.inf if best is None else _hopeless(base, best)
+        starts = [
+            self._with_gates(base, score, columns[score.candidate.label], alone, hopeless)
+            for score in variants
+        ]
         usable = [(s.candidate, f) for s, f in zip(variants, starts, strict=True) if f is not None]
         if not usable:
             return None
         candidate, found = min(usable, key=lambda pair: pair[1].misfit)
         unknowns = [*found.unknowns, *candidate.shape_unknowns()]
-        if candidate.shapes or len(variants) > 1:
-            again = refit(self.simulations, self.whitener, found.twin, unknowns, self.frames, self.iterations)
+        if not alone:
+            again = refit(
+                self.simulations,
+                self.whitener,
+                found.twin,
+                unknowns,
+                self.frames,
+                self.iterations,
+                None,
+                hopeless,
+            )
             found = again or found
         return Model((*base.members, candidate), found, cross_validated(found, self.block_of_row))
 
-    def _with_gates(self, base: Model, score: Score, columns: np.ndarray, iterations: int) -> Refit | None:
+    def elsewhere(self, model: Model) -> Model:
+        """The model refitted from other stiffnesses and clamps, if that is better; else itself.
+
+        What the declared physics made of the recording need not lie in the valley where the effect fits: a stiffness
+        may be a period off, and a clamp's reach is not smooth. Other valleys show as minima of a scan of the stiffness;
+        other reaches are tried with what they ask of the other unknowns.
+        """
+        fitted = model.fitted
+        first = np.eye(len(fitted.theta))[0]
+        scan = [fitted.theta + shift * first for shift in _ELSEWHERE]
+        reaches = _other_reaches(fitted)
+        costs = self._costs(fitted, [*scan, *reaches])
+        line = np.array(costs[: len(scan)])
+        middle = len(scan) // 2
+        line[middle] = float(np.sum(fitted.residual**2))
+        padded = np.concatenate([[np.inf], line, [np.inf]])
+        valleys = (line < padded[:-2]) & (line < padded[2:]) & (np.arange(len(line)) != middle)
+        starts = [(line[k], scan[k]) for k in np.flatnonzero(valleys)]
+        starts += list(zip(costs[len(scan) :], reaches, strict=True))
+        best = model
+        for _, place in sorted(((c, p) for c, p in starts if np.isfinite(c)), key=lambda pair: pair[0])[
+            :_TRIED
+        ]:
+            unknowns = [u.starting(t) for u, t in zip(fitted.unknowns, place, strict=True)]
+            twin = at(fitted.twin, unknowns, np.array([u.start for u in unknowns]))
+            hopeless = float(np.sum(best.fitted.residual**2))
+            other = refit(
+                self.simulations, self.whitener, twin, unknowns, self.frames, self.iterations, None, hopeless
+            )
+            if other is not None and other.misfit < best.fitted.misfit:
+                best = Model(model.members, other, cross_validated(other, self.block_of_row))
+        return best
+
+    def _costs(self, fitted: Refit, places: list[np.ndarray]) -> list[float]:
+        """Squared residuals at places (p,); infinite where a run cannot be trusted."""
+        low, high = _bounds(fitted)
+        twins = [at(fitted.twin, fitted.unknowns, np.clip(place, low, high)) for place in places]
+        runs = self.simulations.run([Job(twin, self.frames) for twin in twins])
+        return [np.inf if t is None else float(np.sum(self.whitener.residual(t) ** 2)) for t in runs]
+
+    def _with_gates(
+        self, base: Model, score: Score, columns: np.ndarray, alone: bool, hopeless: float
+    ) -> Refit | None:
         """The refit of a variant whose shape stays as it is."""
         candidate = score.candidate
         gates = candidate.unknowns()
@@ -98,9 +164,64 @@ class Confirmation:
         half = np.concatenate([0.5 * (linear + own[: len(known)]), 0.5 * strengths])
         unknowns = [u.starting(t) for u, t in zip([*known, *gates], start, strict=True)]
         prepared = candidate.prepared(base.fitted.twin)
+        if alone:
+            first = np.eye(len(start))[0]
+            far = start.copy()
+            far[len(known) :] *= _FURTHER[0]
+            places = [own, half, *(np.r_[linear, factor * strengths] for factor in _FURTHER)]
+            places += [far + shift * first for shift in _AROUND]
+            if len(gates) > 1:
+                places += [np.r_[linear, one] for one in _one_by_one(base.fitted, columns, gates)]
+            return refit(
+                self.simulations, self.whitener, prepared, unknowns, self.frames, self.iterations, places
+            )
         return refit(
-            self.simulations, self.whitener, prepared, unknowns, self.frames, iterations, [own, half]
-        )
+            self.simulations, self.whitener, prepared, unknowns, self.frames, _GLANCE, [own, half], hopeless,
+            brief=True,
+        )  # fmt: skip
+
+
+def _one_by_one(fitted: Refit, columns: np.ndarray, gates: list[Unknown]) -> list[np.ndarray]:
+    """Linear estimates, (k,), with one gate open at a time: what two gates share may have gone to the wrong one."""
+    basis = orthonormal(fitted.free_jacobian)
+    free, left = project(basis, columns), project(basis, fitted.residual)
+    found = []
+    for k, gate in enumerate(gates):
+        size = float(free[:, k] @ free[:, k])
+        one = np.zeros(len(gates))
+        one[k] = np.clip(float(free[:, k] @ left) / size, gate.low, gate.high) if size > 0 else 0.0
+        if one[k] != 0.0:
+            found.append(one)
+    return found
+
+
+def _hopeless(base: Model, best: Model) -> float:
+    """Squared residual above which a rival of ``best`` is not searched any further."""
+    noise = float(len(best.fitted.residual))
+    left = max(best.fitted.misfit**2 - 1.0, 0.0) * noise
+    before = max(base.fitted.misfit**2 - 1.0, 0.0) * noise
+    return noise + max(_WORSE * left, _HALF * before)
+
+
+def _other_reaches(fitted: Refit) -> list[np.ndarray]:
+    """Places (p,) with another reach of the clamp, the other unknowns where they then fit best to first order."""
+    names = [unknown.name for unknown in fitted.unknowns]
+    if REACH not in names:
+        return []
+    k = names.index(REACH)
+    others = np.delete(np.arange(len(names)), k)
+    answer = np.linalg.lstsq(fitted.jacobian[:, others], fitted.jacobian[:, k], rcond=1e-6)[0]
+    found = []
+    for reach in _HELD:
+        place, change = fitted.theta.copy(), reach - fitted.theta[k]
+        place[k] = reach
+        place[others] -= answer * change
+        found.append(place)
+    return found
+
+
+def _bounds(fitted: Refit) -> tuple[np.ndarray, np.ndarray]:
+    return np.array([u.low for u in fitted.unknowns]), np.array([u.high for u in fitted.unknowns])
 
 
 def _linear(fitted: Refit, strengths: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -123,8 +244,9 @@ def best_variants(
 ) -> list[list[Score]]:
     """The best variants of every effect whose variants together score at least ``least``, ``count`` effects at most.
 
-    One variant where the effect has no shapes to free, else the best three: a linear score does not tell which of them
-    leads to the right shape.
+    Effects come in turn from two orders, by their best variant alone and by all variants together: many columns explain
+    much of anything, and one alone may have the wrong shape. One variant where the effect has no shapes to free, else
+    the best three: a linear score does not tell which of them leads to the right shape.
     """
     found: dict[str, list[Score]] = {}
     for score in ranked:
@@ -133,7 +255,10 @@ def best_variants(
         wanted = score.family >= least and score.share > 0.0 and score.candidate.effect not in besides
         if wanted and len(own) < most:
             own.append(score)
-    return sorted((own for own in found.values() if own), key=lambda own: -own[0].family)[:count]
+    alone = [own for own in found.values() if own]  # in the order of their best variants
+    together = sorted(alone, key=lambda own: -own[0].family)
+    taken = {own[0].candidate.effect: own for pair in zip(alone, together, strict=True) for own in pair}
+    return list(taken.values())[:count]
 
 
 def explained_direction(model: Model, base: Model, basis: np.ndarray) -> np.ndarray:

@@ -20,6 +20,7 @@ from physworld.twin import Twin
 _SCALES = (1.0, 0.3)  # of a Gauss-Newton step, tried together
 _TOLERANCE = 2e-3  # relative fall of the cost that ends the search
 _BOUND = 1e-6
+_PATIENCE = 2  # iterations before a search is judged hopeless
 
 
 @dataclass(frozen=True)
@@ -69,13 +70,18 @@ def refit(
     frames: int,
     iterations: int,
     starts: list[np.ndarray] | None = None,
+    hopeless: float = np.inf,
+    brief: bool = False,
     jacobian: np.ndarray | None = None,
 ) -> Refit | None:
     """Minimise the whitened misfit and the priors over the unknowns, from the best of the starts.
 
     Args:
         starts: places (p,) to try first, beside the unknowns' own.
-        jacobian: sensitivities at the unknowns' own start, if they are known, (M, p): the first step is free.
+        hopeless: squared residual (sum) above which the search is left after two iterations: what it is compared with
+            does far better.
+        brief: leave the Jacobian one step behind the optimum.
+        jacobian: sensitivities to use throughout, (M, p): another resolution's, which hardly differ, save most runs.
 
     Returns:
         The optimum; None where no start gave a usable run.
@@ -87,13 +93,14 @@ def refit(
     if best is None:
         return None
     theta, tracks, residual, cost = best
-    usable = jacobian is not None and np.array_equal(theta, own)
-    slope = jacobian if usable and jacobian is not None else None
-    damping = 1e-3
-    for _ in range(iterations):
+    slope, known, damping = jacobian, jacobian, 1e-3
+    for number in range(iterations):
+        if number >= _PATIENCE and cost > hopeless:
+            break
         if slope is None:
             here = [u.starting(t) for u, t in zip(unknowns, theta, strict=True)]
             slope, _ = sensitivities(simulations, whitener, twin, tracks, here, frames)
+            known = slope
         step = _step(unknowns, theta, residual, slope, damping, low, high)
         trials = [np.clip(theta + scale * step, low, high) for scale in _SCALES]
         found = _best_of(simulations, whitener, twin, unknowns, trials, frames)
@@ -107,7 +114,9 @@ def refit(
         damping = max(damping / 10.0, 1e-6)
         if gain < _TOLERANCE:
             break
-        slope = None
+        slope = jacobian
+    if slope is None and known is not None and (brief or cost > hopeless):
+        slope = known
     if slope is None:
         here = [u.starting(t) for u, t in zip(unknowns, theta, strict=True)]
         slope, _ = sensitivities(simulations, whitener, twin, tracks, here, frames)

@@ -12,18 +12,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from physworld.trace.comparison import alikeness, difference
+from physworld.trace.comparison import alikeness, difference, seen_through
 from physworld.trace.config import TraceConfig
-from physworld.trace.confirm import Model, beats, explained_direction
+from physworld.trace.confirm import MEANINGFUL, Model, beats, explained_direction
 
 NAMED, EQUIVALENT, DATA, NUMERICAL = "named", "equivalent_set", "data_issue", "numerical_issue"
 UNEXPLAINED, NOTHING = "unexplained", "nothing_to_explain"
 FASTEST_WIND_M_S = 20.0
 _DISCREPANCY = 0.05
+_NOISE_KNOWN = 0.05  # share to which the variance of the noise is known
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,9 @@ def decide(
     resolved: float,
     config: TraceConfig,
     tried: int,
+    solver: np.ndarray,
+    block_of_row: np.ndarray,
+    chance: Callable[[Model], bool] = lambda model: False,
 ) -> Verdict:
     """The verdict.
 
@@ -61,9 +66,12 @@ def decide(
         agreement: for models that were refitted at a second resolution (by their names), whether it agreed.
         resolved: misfit of the declared physics once what other cells and time steps change is taken out.
         tried: number of candidate effects.
+        solver: orthonormal directions of what other cells and time steps change, (M, k).
+        block_of_row: block of every row, (M,).
+        chance: whether the best score under random signs reaches a model's.
     """
     before = declared.fitted.misfit
-    real = [model for model in models if helps(model, declared, config)]
+    real = claimable(declared, models, config, solver, block_of_row, chance)
     if not real:
         if before <= config.near_floor:
             reason = f"misfit {before:.2f} of the noise, and none of {tried} effects explains more"
@@ -108,6 +116,38 @@ def helps(model: Model, declared: Model, config: TraceConfig) -> bool:
     return beats(model, declared) and share >= config.material_share
 
 
+def claimable(
+    declared: Model,
+    models: list[Model],
+    config: TraceConfig,
+    solver: np.ndarray,
+    block_of_row: np.ndarray,
+    chance: Callable[[Model], bool],
+) -> list[Model]:
+    """Models that help, also where the solver's own directions are taken out of what they explain.
+
+    Where the declared physics is near the noise already, nothing says that there is anything to explain but the score:
+    there it has to be beyond chance.
+    """
+    quiet = declared.fitted.misfit <= config.near_floor
+    return [
+        model
+        for model in models
+        if helps(model, declared, config)
+        and survives(model, declared, solver, block_of_row, config)
+        and not (quiet and chance(model))
+    ]
+
+
+def survives(
+    model: Model, declared: Model, solver: np.ndarray, block_of_row: np.ndarray, config: TraceConfig
+) -> bool:
+    """Whether what a model explains is more than what other cells and time steps would change."""
+    before, after = (seen_through(m.fitted.residual, solver, block_of_row) for m in (declared, model))
+    gain, spread = difference(before, after)
+    return gain > MEANINGFUL * spread and gain >= config.material_share * before.mean
+
+
 def implausible(model: Model) -> str | None:
     """Why nobody would believe a model's numbers; None where one may.
 
@@ -143,19 +183,23 @@ def simplest(models: list[Model], declared: Model) -> Model:
 def as_good(model: Model, best: Model, declared: Model) -> bool:
     """Whether a model's errors on left-out blocks are within one standard error of the best model's.
 
-    A model of the body's numerics is never exact, and one more number absorbs some of that: a difference below
-    ``_DISCREPANCY`` of what the best model explains does not count either.
+    A model of the body's numerics is never exact, and one more number absorbs some of that: a difference below both
+    ``_DISCREPANCY`` of what the best model explains and what it leaves above the noise does not count either.
     """
     gap, spread = difference(model.validated, best.validated)
     explained = max(declared.validated.mean - best.validated.mean, 0.0)
-    return gap <= max(spread, _DISCREPANCY * explained)
+    remainder = max(best.validated.mean - 1.0, 0.0) + _NOISE_KNOWN
+    return gap <= max(spread, min(_DISCREPANCY * explained, remainder))
 
 
 def indistinguishable(model: Model, best: Model, basis: np.ndarray, declared: Model, alike: float) -> bool:
-    """Whether another model that is no less simple does as well, and by explaining the same."""
+    """Whether another model that is no less simple does as well, and by explaining the same.
+
+    As well: within one standard error, or within half of what the better one leaves above the noise, which may as well
+    lie between the two as elsewhere.
+    """
     if len(model.members) != len(best.members) or len(model.fitted.unknowns) > len(best.fitted.unknowns):
         return False
     same = alikeness(explained_direction(model, declared, basis), explained_direction(best, declared, basis))
-    return same > alike and difference(model.validated, best.validated)[0] <= max(
-        difference(model.validated, best.validated)[1], 0.0
-    )
+    gap, spread = difference(model.validated, best.validated)
+    return same > alike and gap <= max(spread, 0.5 * max(best.fitted.misfit**2 - 1.0, 0.0))

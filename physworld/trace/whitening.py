@@ -44,6 +44,7 @@ class Whitener:
         sigma: [m].
         first: first of the training frames.
         places: one a tracked point.
+        common: what all points share of an uncertain start: basis (M, k) and shrink (k,), after the places; or None.
     """
 
     measured: np.ndarray
@@ -53,6 +54,7 @@ class Whitener:
     sigma: float
     first: int
     places: tuple[Place, ...]
+    common: tuple[np.ndarray, np.ndarray] | None = None
 
     def residual(self, tracks: np.ndarray) -> np.ndarray:
         """Whitened measured minus predicted, (M,), of tracks (frames, N, 3) from frame 0."""
@@ -84,7 +86,19 @@ class Whitener:
         for place in self.places:
             block = out[place.rows].reshape(-1)
             out[place.rows] = (block - place.basis @ (place.shrink * (place.basis.T @ block))).reshape(-1, 3)
-        return out.reshape(-1)
+        flat = out.reshape(-1)
+        if self.common is None:
+            return flat
+        basis, shrink = self.common
+        return flat - basis @ (shrink * (basis.T @ flat))
+
+    def knowing(self, differences: list[np.ndarray]) -> Whitener:
+        """With changes of the prediction, (frames, N, 3) each, that are as likely as not: one deviation each."""
+        if not differences:
+            return self
+        factors = np.stack([self.change(difference) for difference in differences], axis=1)
+        u, s, _ = np.linalg.svd(factors, full_matrices=False)
+        return replace(self, common=(u, 1.0 - 1.0 / np.sqrt(1.0 + s**2)))
 
 
 def whitener(scene: Scene, split: Split, sigma: float, responses: np.ndarray) -> Whitener:

@@ -99,7 +99,7 @@ def test_a_trace_that_was_cut_off_goes_on_from_its_memory(tmp_path: Path) -> Non
     def stop() -> bool:
         nonlocal calls
         calls += 1
-        return calls > 900
+        return calls > 300
 
     memory = Memory(tmp_path)
     config = replace(CONFIG, candidates=("air_drag_linear", "measurement_scale"))

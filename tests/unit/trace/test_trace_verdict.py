@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import SimpleNamespace
 
 import numpy as np
@@ -35,10 +36,16 @@ def model(residual: np.ndarray, *effects: str, kind: str = "force", unknowns: in
 
 
 def answer(
-    models: list[Model], declared: np.ndarray, agree: bool = True, resolved: float = 9.0
+    models: list[Model],
+    declared: np.ndarray,
+    agree: bool = True,
+    resolved: float = 9.0,
+    solver: np.ndarray | None = None,
+    chance: Callable[[Model], bool] = lambda model: False,
 ) -> tuple[str, tuple[str, ...]]:
     agreement = {m.names: agree for m in models}
-    found = decide(model(declared), models, np.zeros((ROWS, 0)), agreement, resolved, CONFIG, 20)
+    facts = (np.zeros((ROWS, 0)) if solver is None else solver, BLOCK_OF_ROW, chance)
+    found = decide(model(declared), models, np.zeros((ROWS, 0)), agreement, resolved, CONFIG, 20, *facts)
     return found.name, found.model.names
 
 
@@ -88,3 +95,17 @@ def test_two_effects_are_named_only_where_one_leaves_too_much() -> None:
     both = model(NOISE, "drag", "viscosity", unknowns=2)
     assert answer([model(NOISE + 2 * OTHER, "drag"), both], before) == ("named", ("drag", "viscosity"))
     assert answer([model(NOISE + 0.1 * OTHER, "drag"), both], before) == ("named", ("drag",))
+
+
+def test_what_other_cells_would_change_is_no_effect() -> None:
+    along = (DRAG / np.linalg.norm(DRAG))[:, None]
+    assert answer([model(NOISE, "drag")], NOISE + DRAG, solver=along)[0] == "unexplained"
+    across = (OTHER / np.linalg.norm(OTHER))[:, None]
+    assert answer([model(NOISE, "drag")], NOISE + DRAG, solver=across)[0] == "named"
+
+
+def test_near_the_noise_a_score_that_chance_reaches_is_nothing() -> None:
+    before = NOISE + 0.5 * DRAG
+    assert answer([model(NOISE, "drag")], before) == ("named", ("drag",))
+    assert answer([model(NOISE, "drag")], before, chance=lambda m: True) == ("nothing_to_explain", ())
+    assert answer([model(NOISE, "drag")], NOISE + 2 * DRAG, chance=lambda m: True) == ("named", ("drag",))
