@@ -15,12 +15,13 @@ anything. A kill at any instant leaves the shard RUNNING until its lease ends, n
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from typing import Any, Literal, cast
 
-from sqlalchemy import CursorResult, func, or_, select, update
+from sqlalchemy import CursorResult, case, func, or_, select, update
 from sqlalchemy.orm import Session
 
 from schemas.base import Problem
@@ -216,20 +217,26 @@ def publishable(
     A message too many is harmless: its ``claim`` finds nothing to take.
     """
     stale = now - timedelta(seconds=republish_seconds)
+    fresh = func.sum(case((ShardRow.published_at > stale, 1), else_=0))
+    queued, announced = Counter[str](), Counter[str]()
+    counts = (
+        select(ShardRow.kind, func.count(), fresh).where(ShardRow.state == QUEUED).group_by(ShardRow.kind)
+    )
+    for kind, count, told in session.execute(counts):
+        if kind in QUEUE_OF_SHARD:
+            queued[QUEUE_OF_SHARD[kind]] += count
+            announced[QUEUE_OF_SHARD[kind]] += int(told)
     found: list[Publication] = []
-    for queue in sorted(set(QUEUE_OF_SHARD.values())):
-        kinds = [kind for kind, name in QUEUE_OF_SHARD.items() if name == queue]
-        queued = (ShardRow.state == QUEUED, ShardRow.kind.in_(kinds))
-        announced = session.scalar(
-            select(func.count()).select_from(ShardRow).where(*queued, ShardRow.published_at > stale)
-        )
-        room = min(limit, window - (announced or 0))
-        if room <= 0:
+    for queue in sorted(queued):
+        room = min(limit, window - announced[queue])
+        if room <= 0 or queued[queue] == announced[queue]:
             continue
+        kinds = [kind for kind, name in QUEUE_OF_SHARD.items() if name == queue]
         rows = session.execute(
             select(ShardRow.id, ShardRow.kind, ShardRow.epoch)
             .where(
-                *queued,
+                ShardRow.state == QUEUED,
+                ShardRow.kind.in_(kinds),
                 or_(ShardRow.published_at.is_(None), ShardRow.published_at <= stale),
                 or_(ShardRow.not_before.is_(None), ShardRow.not_before <= now),
             )
