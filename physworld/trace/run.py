@@ -20,9 +20,9 @@ from physworld.calibrate import Journal, calibrate
 from physworld.calibrate.parameters import parameters_of
 from physworld.scene import Scene
 from physworld.trace.candidates import Candidate, candidates
-from physworld.trace.comparison import cross_validated, difference
+from physworld.trace.comparison import cross_validated
 from physworld.trace.config import TraceConfig
-from physworld.trace.confirm import MEANINGFUL, Confirmation, Model, best_variants
+from physworld.trace.confirm import Model
 from physworld.trace.describe import describe
 from physworld.trace.experiment import Experiment, propose, rival_of
 from physworld.trace.held_out import HeldOut, Unseen, measure, measure_all
@@ -36,15 +36,14 @@ from physworld.trace.recordings import (
     Recordings,
     side_by_side,
 )
-from physworld.trace.refit import Refit, refit
-from physworld.trace.result import Number, Outcome, Step, TraceResult
-from physworld.trace.score import Score, Scores, orthonormal, project, scores
+from physworld.trace.refit import refit
+from physworld.trace.result import Outcome, Step, TraceResult
+from physworld.trace.score import orthonormal, project
+from physworld.trace.second_resolution import SecondResolution
+from physworld.trace.selection import Selection, by_chance
 from physworld.trace.sensitivity import (
-    Response,
     candidate_responses,
-    decoys,
     numerical_directions,
-    refinement_of,
 )
 from physworld.trace.simulations import (
     Job,
@@ -55,16 +54,13 @@ from physworld.trace.simulations import (
     stable_step_s,
 )
 from physworld.trace.start_pose import turned_starts
-from physworld.trace.unknowns import Unknown, bending_factor, clamp_reach, of_parameter, with_strengths
+from physworld.trace.unknowns import Unknown, bending_factor, clamp_reach, of_parameter
 from physworld.trace.verdict import (
     NOTHING,
     UNEXPLAINED,
     Verdict,
-    accounts,
     claimable,
     decide,
-    helps,
-    simplest,
 )
 from physworld.trace.whitening import Whitener, whitener
 from physworld.twin import Twin
@@ -73,11 +69,6 @@ _POISSON_SPREAD = 0.08  # of what is known of a soft solid's Poisson's ratio bef
 _OTHER_STIFFNESSES = tuple(0.12 * k for k in (-6, -5, -4, -3, -2, -1, 1, 2, 3, 4, 5, 6))
 """Logarithms: a phase that has slipped by a period is a local minimum, so others are looked at before a descent."""
 _SLOWEST = 8.0  # times the cost of the declared physics that a run may take: explicit friction is dear
-_AGREEMENT = 0.25  # share by which what an effect does may move with the resolution
-_AT_LEAST = 0.5  # share of a strength that finer cells must leave, however wide its interval
-_FINER_STEPS = 3  # of the refit on finer cells, with the sensitivities of the coarser
-_OUTDONE = 0.5  # share of what a complete model's effect explains that a rival must explain to be refitted
-_LEADING = 2  # models that are refitted from elsewhere
 
 
 def trace(
@@ -178,11 +169,12 @@ class _Trace:
         )
         usable = [response for response in found if not response.failed]
         refused |= {r.candidate.label: "its simulation cannot be trusted" for r in found if r.failed}
-        path = self._select(declared, usable, white, block_of_row)
+        setting = (simulations, white, block_of_row, self.frames, config)
+        path = Selection(*setting).path(declared, usable)
         models = [model for step in path for model in step.tried]
-        facts = (solver, block_of_row, lambda model: _by_chance(model, path[0].scores))
+        facts = (solver, block_of_row, lambda model: by_chance(model, path[0].scores))
         real = claimable(declared, models, config, *facts)
-        finer_values, agreement = self._second_resolution(declared, real, white, block_of_row, finer)
+        finer_values, agreement = SecondResolution(*setting, finer).check(declared, real)
         tried = len({c.effect for c in chosen})
         verdict = decide(declared, models, basis, agreement, resolved, config, tried, *facts)
         if sigma is None and verdict.name not in (NOTHING, UNEXPLAINED):
@@ -241,152 +233,12 @@ class _Trace:
         found = [of_parameter(p, twin, spread.get(p.name)) for p in known]
         return [*found, *(unknown for unknown in (bending, reach) if unknown is not None)]
 
-    def _select(
-        self, declared: Model, usable: list[Response], white: Whitener, block_of_row: np.ndarray
-    ) -> tuple[Step, ...]:
-        """Forward selection."""
-        config, path, base = self.config, [], declared
-        confirmation = Confirmation(self.simulations, white, block_of_row, self.frames, config.iterations)
-        columns = {response.candidate.label: response.columns for response in usable}
-        for number in range(config.effects_at_most):
-            ranked = self._scores(base, usable, white, block_of_row)
-            least = max(config.material_share, ranked.threshold if number else 0.0)
-            hopeful = best_variants(ranked.ranked, least, config.confirmed, base.names)
-            if (
-                declared.fitted.misfit <= config.near_floor
-            ):  # nothing but a score beyond chance calls for an effect
-                hopeful = [variants for variants in hopeful if variants[0].share >= ranked.threshold]
-            tried = []
-            for variants in hopeful:
-                self.simulations.stage = f"refit with {variants[0].candidate.effect}"
-                best = min(tried, key=lambda m: m.fitted.misfit, default=None)
-                if best is not None and self._outdone(base, best, variants[0], ranked):
-                    continue
-                model = confirmation.model(base, variants, columns, best)
-                if model is not None:
-                    tried.append(model)
-            tried = self._again(confirmation, base, tried, ranked)
-            good = [m for m in tried if helps(m, base, config)]
-            kept = simplest(good, base) if good else None
-            path.append(Step(base, ranked, tuple(tried), kept))
-            if kept is None or kept.fitted.misfit <= config.near_floor:
-                break
-            base = kept
-        return tuple(path)
-
-    def _outdone(self, base: Model, best: Model, score: Score, ranked: Scores) -> bool:
-        """Whether a model is complete of which an effect explains too little to first order, in whatever shape."""
-        if best.fitted.misfit > self.config.near_floor:
-            return False
-        own = max(s.family for s in ranked.ranked if s.candidate.effect == best.names[-1])
-        return score.family < _OUTDONE * own
-
-    def _again(
-        self, confirmation: Confirmation, base: Model, tried: list[Model], ranked: Scores
-    ) -> list[Model]:
-        """Models that leave too much, refitted from elsewhere: the best, and simpler ones that scored like them."""
-        self.simulations.stage = "refit from elsewhere"
-        floor, ordered = self.config.near_floor, sorted(tried, key=lambda m: m.fitted.misfit)
-        if not ordered:
-            return tried
-        share = {s.candidate.effect: s.share for s in reversed(ranked.ranked)}
-        best = ordered[0]
-        simpler = [
-            m
-            for m in ordered[1:]
-            if len(m.fitted.unknowns) < len(best.fitted.unknowns)
-            and share[m.names[-1]] >= _OUTDONE * share[best.names[-1]]
-        ]
-        leading = ordered[:_LEADING] if best.fitted.misfit > floor else []
-        worth = [
-            m
-            for m in [*leading, *simpler[:_LEADING]]
-            if m.fitted.misfit > floor and helps(m, base, self.config)
-        ]
-        found = {id(m): m for m in tried}
-        for m in worth:
-            if found[id(m)] is m:
-                found[id(m)] = confirmation.elsewhere(m)
-        return [found[id(m)] for m in tried]
-
-    def _scores(
-        self, base: Model, usable: list[Response], white: Whitener, block_of_row: np.ndarray
-    ) -> Scores:
-        config = self.config
-        rest = [r for r in usable if r.candidate.effect not in base.names]
-        shape = (len(white.visible), white.visible.shape[1])
-        fakes = decoys(rest, white, shape, config.decoys, config.seed)
-        return scores(
-            base.fitted.residual, base.fitted.free_jacobian, rest, fakes, block_of_row,
-            config.family_wise_level, config.resamples, config.seed,
-        )  # fmt: skip
-
-    def _second_resolution(
-        self, declared: Model, real: list[Model], white: Whitener, block_of_row: np.ndarray, finer: Twin
-    ) -> tuple[dict[tuple[str, ...], dict[str, float]], dict[tuple[str, ...], bool]]:
-        """Values and agreement of the best model on finer cells."""
-        values: dict[tuple[str, ...], dict[str, float]] = {}
-        agreement: dict[tuple[str, ...], bool] = {}
-        if not real or not accounts(simplest(real, declared), declared, self.config):
-            return values, agreement
-        best = simplest(real, declared)
-        self.simulations.stage = "second resolution"
-        twin = refinement_of(best.fitted.twin, finer)
-        found = refit(
-            self.simulations, white, twin, best.fitted.unknowns, self.frames, _FINER_STEPS,
-            jacobian=best.fitted.jacobian,
-        )  # fmt: skip
-        if found is None:
-            agreement[best.names] = False
-            return values, agreement
-        names = [u.name for u in found.unknowns]
-        values[best.names] = {name: found.value(name) for name in names}
-        intervals = numbers(best.fitted, block_of_row, {}, self.config.bootstraps, self.config.seed)
-        agreement[best.names] = self._still_helps(declared, found, finer, white, block_of_row) and all(
-            self._alike(best.fitted, found, member, white)
-            or _within(best.fitted, values[best.names], intervals, member)
-            for member in best.members
-        )
-        return values, agreement
-
-    def _still_helps(
-        self, declared: Model, fine: Refit, finer: Twin, white: Whitener, block_of_row: np.ndarray
-    ) -> bool:
-        """Whether the effect predicts better on finer cells too, beside the declared physics refitted there."""
-        twin = refinement_of(declared.fitted.twin, finer)
-        plain = refit(
-            self.simulations, white, twin, declared.fitted.unknowns, self.frames, _FINER_STEPS,
-            jacobian=declared.fitted.jacobian,
-        )  # fmt: skip
-        if plain is None:
-            return False
-        before, after = (cross_validated(fitted, block_of_row) for fitted in (plain, fine))
-        gain, spread = difference(before, after)
-        return gain > MEANINGFUL * spread and gain >= self.config.material_share * before.mean
-
     def _turns(self, tracks: np.ndarray, sigma: float) -> list[np.ndarray]:
         """What the uncertain pose of the start does to the prediction, (frames, N, 3) each."""
         if len(self.recordings.fitted) > 1:
             return []
         jobs = [Job(turned, self.frames) for turned in turned_starts(self.lead, self.twin, sigma)]
         return [found - tracks for found in self.simulations.run(jobs) if found is not None]
-
-    def _alike(self, coarse: Refit, fine: Refit, member: Candidate, white: Whitener) -> bool:
-        """Whether an effect does the same to the prediction at both resolutions, whatever its numbers.
-
-        Two numbers of one effect may make up for each other (a tether's stiffness and its anchor); what they do
-        together is what the data see.
-        """
-        silent = {gate.name: 0.0 for gate in member.gates}
-        changes = []
-        for fitted in (coarse, fine):
-            without = with_strengths(fitted.twin, member.effect, silent)
-            tracks = self.simulations.run([Job(without, self.frames)])[0]
-            if tracks is None:
-                return False
-            changes.append(white.change(fitted.tracks - tracks))
-        moved_by = float(np.linalg.norm(changes[1] - changes[0]))
-        return moved_by <= _AGREEMENT * float(np.linalg.norm(changes[0]))
 
     def _result(
         self,
@@ -484,21 +336,3 @@ class _Trace:
                 tracks = side_by_side([known], recording.scene.frame_count)
             found.append(tracks)
         return found
-
-
-def _by_chance(model: Model, scores: Scores) -> bool:
-    """Whether random signs reach the score of every effect of a model, in its best variant."""
-    own = [s.share for s in scores.ranked if s.candidate.effect in model.names]
-    return max(own, default=0.0) < scores.threshold
-
-
-def _within(coarse: Refit, finer: dict[str, float], intervals: dict[str, Number], member: Candidate) -> bool:
-    """Whether finer cells leave an effect's strengths within their intervals, and most of each."""
-    for gate in member.gates:
-        name = f"{member.effect}.{gate.name}"
-        before, after, interval = coarse.value(name), finer[name], intervals[name].ci95
-        if interval is None or abs(after - before) > 0.5 * (interval[1] - interval[0]):
-            return False
-        if after * before < _AT_LEAST * before**2:
-            return False
-    return True

@@ -1,0 +1,109 @@
+"""The winner on finer cells: its effect has to help there too, and to do the same.
+
+Sensitivities hardly change with the cells, so those of the coarser ones serve the refit: a few fine simulations do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from physworld.trace.candidates import Candidate
+from physworld.trace.comparison import cross_validated, difference
+from physworld.trace.config import TraceConfig
+from physworld.trace.confirm import MEANINGFUL, Model
+from physworld.trace.intervals import numbers
+from physworld.trace.refit import Refit, refit
+from physworld.trace.result import Number
+from physworld.trace.sensitivity import refinement_of
+from physworld.trace.simulations import Job, Simulations
+from physworld.trace.unknowns import with_strengths
+from physworld.trace.verdict import accounts, simplest
+from physworld.trace.whitening import Whitener
+from physworld.twin import Twin
+
+Values = dict[tuple[str, ...], dict[str, float]]
+_AGREEMENT = 0.25  # share by which what an effect does may move with the resolution
+_AT_LEAST = 0.5  # share of a strength that finer cells must leave, however wide its interval
+_FINER_STEPS = 3  # of the refit on finer cells
+
+
+@dataclass(frozen=True)
+class SecondResolution:
+    """The check of one trace: as :class:`physworld.trace.selection.Selection`, and the twin on finer cells."""
+
+    simulations: Simulations
+    white: Whitener
+    block_of_row: np.ndarray
+    frames: int
+    config: TraceConfig
+    finer: Twin
+
+    def check(self, declared: Model, real: list[Model]) -> tuple[Values, dict[tuple[str, ...], bool]]:
+        """Values of the best of the models that may be claimed, on the finer cells, and whether they agree."""
+        values: Values = {}
+        agreement: dict[tuple[str, ...], bool] = {}
+        if not real or not accounts(simplest(real, declared), declared, self.config):
+            return values, agreement
+        best = simplest(real, declared)
+        self.simulations.stage = "second resolution"
+        twin = refinement_of(best.fitted.twin, self.finer)
+        found = refit(
+            self.simulations, self.white, twin, best.fitted.unknowns, self.frames, _FINER_STEPS,
+            jacobian=best.fitted.jacobian,
+        )  # fmt: skip
+        if found is None:
+            agreement[best.names] = False
+            return values, agreement
+        names = [u.name for u in found.unknowns]
+        values[best.names] = {name: found.value(name) for name in names}
+        intervals = numbers(best.fitted, self.block_of_row, {}, self.config.bootstraps, self.config.seed)
+        agreement[best.names] = self._still_helps(declared, found) and all(
+            self._alike(best.fitted, found, member)
+            or _within(best.fitted, values[best.names], intervals, member)
+            for member in best.members
+        )
+        return values, agreement
+
+    def _still_helps(self, declared: Model, fine: Refit) -> bool:
+        """Whether the effect predicts better on finer cells too, beside the declared physics refitted there."""
+        twin = refinement_of(declared.fitted.twin, self.finer)
+        plain = refit(
+            self.simulations, self.white, twin, declared.fitted.unknowns, self.frames, _FINER_STEPS,
+            jacobian=declared.fitted.jacobian,
+        )  # fmt: skip
+        if plain is None:
+            return False
+        before, after = (cross_validated(fitted, self.block_of_row) for fitted in (plain, fine))
+        gain, spread = difference(before, after)
+        return gain > MEANINGFUL * spread and gain >= self.config.material_share * before.mean
+
+    def _alike(self, coarse: Refit, fine: Refit, member: Candidate) -> bool:
+        """Whether an effect does the same to the prediction at both resolutions, whatever its numbers.
+
+        Two numbers of one effect may make up for each other (a tether's stiffness and its anchor); what they do
+        together is what the data see.
+        """
+        silent = {gate.name: 0.0 for gate in member.gates}
+        changes = []
+        for fitted in (coarse, fine):
+            without = with_strengths(fitted.twin, member.effect, silent)
+            tracks = self.simulations.run([Job(without, self.frames)])[0]
+            if tracks is None:
+                return False
+            changes.append(self.white.change(fitted.tracks - tracks))
+        moved_by = float(np.linalg.norm(changes[1] - changes[0]))
+        return moved_by <= _AGREEMENT * float(np.linalg.norm(changes[0]))
+
+
+def _within(coarse: Refit, finer: dict[str, float], intervals: dict[str, Number], member: Candidate) -> bool:
+    """Whether finer cells leave an effect's strengths within their intervals, and most of each."""
+    for gate in member.gates:
+        name = f"{member.effect}.{gate.name}"
+        before, after, interval = coarse.value(name), finer[name], intervals[name].ci95
+        if interval is None or abs(after - before) > 0.5 * (interval[1] - interval[0]):
+            return False
+        if after * before < _AT_LEAST * before**2:
+            return False
+    return True

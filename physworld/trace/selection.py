@@ -1,0 +1,112 @@
+"""Forward selection: score, refit the best, keep the simplest that helps, and go on where it leaves too much."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from physworld.trace.config import TraceConfig
+from physworld.trace.confirm import Confirmation, Model, best_variants
+from physworld.trace.result import Step
+from physworld.trace.score import Score, Scores, scores
+from physworld.trace.sensitivity import Response, decoys
+from physworld.trace.simulations import Simulations
+from physworld.trace.verdict import helps, simplest
+from physworld.trace.whitening import Whitener
+
+_OUTDONE = 0.5  # share of what a complete model's effect explains that a rival must explain to be refitted
+_LEADING = 2  # models that are refitted from elsewhere
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The selection of one trace: its simulations, whitener, block of every row (M,), training frames, settings."""
+
+    simulations: Simulations
+    white: Whitener
+    block_of_row: np.ndarray
+    frames: int
+    config: TraceConfig
+
+    def path(self, declared: Model, usable: list[Response]) -> tuple[Step, ...]:
+        """The steps from the declared physics; ``usable``: what every candidate does to the prediction."""
+        config, path, base = self.config, [], declared
+        confirmation = Confirmation(
+            self.simulations, self.white, self.block_of_row, self.frames, config.iterations
+        )
+        columns = {response.candidate.label: response.columns for response in usable}
+        for number in range(config.effects_at_most):
+            ranked = self._scores(base, usable)
+            least = max(config.material_share, ranked.threshold if number else 0.0)
+            hopeful = best_variants(ranked.ranked, least, config.confirmed, base.names)
+            if declared.fitted.misfit <= config.near_floor:  # only a score beyond chance calls for an effect
+                hopeful = [variants for variants in hopeful if variants[0].share >= ranked.threshold]
+            tried = []
+            for variants in hopeful:
+                self.simulations.stage = f"refit with {variants[0].candidate.effect}"
+                best = min(tried, key=lambda m: m.fitted.misfit, default=None)
+                if best is not None and self._outdone(base, best, variants[0], ranked):
+                    continue
+                model = confirmation.model(base, variants, columns, best)
+                if model is not None:
+                    tried.append(model)
+            tried = self._again(confirmation, base, tried, ranked)
+            good = [m for m in tried if helps(m, base, config)]
+            kept = simplest(good, base) if good else None
+            path.append(Step(base, ranked, tuple(tried), kept))
+            if kept is None or kept.fitted.misfit <= config.near_floor:
+                break
+            base = kept
+        return tuple(path)
+
+    def _outdone(self, base: Model, best: Model, score: Score, ranked: Scores) -> bool:
+        """Whether a model is complete of which an effect explains too little to first order, in whatever shape."""
+        if best.fitted.misfit > self.config.near_floor:
+            return False
+        own = max(s.family for s in ranked.ranked if s.candidate.effect == best.names[-1])
+        return score.family < _OUTDONE * own
+
+    def _again(
+        self, confirmation: Confirmation, base: Model, tried: list[Model], ranked: Scores
+    ) -> list[Model]:
+        """Models that leave too much, refitted from elsewhere: the best, and simpler ones that scored like them."""
+        self.simulations.stage = "refit from elsewhere"
+        floor, ordered = self.config.near_floor, sorted(tried, key=lambda m: m.fitted.misfit)
+        if not ordered:
+            return tried
+        share = {s.candidate.effect: s.share for s in reversed(ranked.ranked)}
+        best = ordered[0]
+        simpler = [
+            m
+            for m in ordered[1:]
+            if len(m.fitted.unknowns) < len(best.fitted.unknowns)
+            and share[m.names[-1]] >= _OUTDONE * share[best.names[-1]]
+        ]
+        leading = ordered[:_LEADING] if best.fitted.misfit > floor else []
+        worth = [
+            m
+            for m in [*leading, *simpler[:_LEADING]]
+            if m.fitted.misfit > floor and helps(m, base, self.config)
+        ]
+        found = {id(m): m for m in tried}
+        for m in worth:
+            if found[id(m)] is m:
+                found[id(m)] = confirmation.elsewhere(m)
+        return [found[id(m)] for m in tried]
+
+    def _scores(self, base: Model, usable: list[Response]) -> Scores:
+        config, white = self.config, self.white
+        rest = [r for r in usable if r.candidate.effect not in base.names]
+        shape = (len(white.visible), white.visible.shape[1])
+        fakes = decoys(rest, white, shape, config.decoys, config.seed)
+        return scores(
+            base.fitted.residual, base.fitted.free_jacobian, rest, fakes, self.block_of_row,
+            config.family_wise_level, config.resamples, config.seed,
+        )  # fmt: skip
+
+
+def by_chance(model: Model, scores: Scores) -> bool:
+    """Whether random signs reach the score of every effect of a model, in its best variant."""
+    own = [s.share for s in scores.ranked if s.candidate.effect in model.names]
+    return max(own, default=0.0) < scores.threshold
