@@ -10,8 +10,9 @@ from physworld.trace.config import TraceConfig
 from physworld.trace.confirm import Confirmation, Model, best_variants
 from physworld.trace.result import Step
 from physworld.trace.score import Score, Scores, scores
-from physworld.trace.sensitivity import Response, decoys
+from physworld.trace.sensitivity import Response, candidate_responses, decoys
 from physworld.trace.simulations import Simulations
+from physworld.trace.valleys import FAR, with_valleys
 from physworld.trace.verdict import helps, simplest
 from physworld.trace.whitening import Whitener
 
@@ -51,6 +52,9 @@ class Selection:
                 model = confirmation.model(base, variants, columns, best)
                 if model is not None:
                     tried.append(model)
+            if number == 0:
+                self.simulations.stage = "refit from other valleys"
+                tried = with_valleys(confirmation, base, ranked, columns, tried)
             tried = self._again(confirmation, base, tried, ranked)
             good = [m for m in tried if helps(m, base, config)]
             kept = simplest(good, base) if good else None
@@ -58,7 +62,19 @@ class Selection:
             if kept is None or kept.fitted.misfit <= config.near_floor:
                 break
             base = kept
+            if declared.fitted.misfit > FAR:  # what the candidates did there says little of what they do here
+                usable = self._afresh(base, usable)
+                columns = {response.candidate.label: response.columns for response in usable}
         return tuple(path)
+
+    def _afresh(self, base: Model, usable: list[Response]) -> list[Response]:
+        """What the candidates do to another model's prediction."""
+        self.simulations.stage = "sensitivities"
+        chosen = [r.candidate for r in usable if r.candidate.effect not in base.names]
+        found = candidate_responses(
+            self.simulations, self.white, base.fitted.twin, base.fitted.tracks, chosen, self.frames
+        )
+        return [response for response in found if not response.failed]
 
     def _outdone(self, base: Model, best: Model, score: Score, ranked: Scores) -> bool:
         """Whether a model is complete of which an effect explains too little to first order, in whatever shape."""

@@ -1,0 +1,123 @@
+"""Other valleys: where a dissipative effect fits with another stiffness than the one that does best without it.
+
+Linear scores ask what an effect does near the optimum of the declared physics. Where the misfit is many times the noise
+that optimum may be a compromise far from the truth: a body that rings down is fitted without damping by one so stiff
+that it hardly rings, and there damping does nothing. So the effects that take energy are tried at other stiffnesses as
+well, with strengths over their range, by simulation. What does much better there is refitted from there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from physworld.trace.candidates import Candidate
+from physworld.trace.confirm import Confirmation, Model
+from physworld.trace.refit import Refit
+from physworld.trace.score import Scores
+from physworld.trace.sensitivity import sensitivities
+from physworld.trace.simulations import Job, Simulations
+from physworld.trace.unknowns import at
+from physworld.trace.whitening import Whitener
+
+FAR = 3.0  # misfit over the noise from which on a linear score is not relied on alone
+DISSIPATIVE = (
+    "air_drag_linear", "air_drag_quadratic", "viscosity_kelvin_voigt", "viscoelastic_maxwell"
+)  # fmt: skip
+_SHIFTS = (-1.0, -0.8, -0.6, -0.4, -0.2, 0.0, 0.25, 0.5)  # of the stiffness, logarithms
+_SHARES = (0.01, 0.1, 0.5)  # of a strength's upper bound
+_BETTER = 0.7  # share of the squared residual that a valley may leave
+
+
+@dataclass(frozen=True)
+class Valley:
+    """A place from which an effect is worth a refit: the calibrated unknowns there, and the effect's strengths (k,)."""
+
+    candidate: Candidate
+    start: Refit
+    strengths: np.ndarray
+    cost: float
+
+
+def with_valleys(
+    confirmation: Confirmation,
+    base: Model,
+    ranked: Scores,
+    columns: dict[str, np.ndarray],
+    tried: list[Model],
+) -> list[Model]:
+    """The models that were refitted; one from another valley in the place of its like where it is better.
+
+    Args:
+        base: the declared physics.
+        ranked: all scores against it.
+        columns: whitened sensitivities of every variant, by label, (M, k).
+        tried: models with one effect.
+    """
+    scores = {score.candidate.label: score for score in ranked.ranked}
+    chosen = [score.candidate for score in ranked.ranked]
+    best = {model.names: model for model in tried}
+    frames = confirmation.frames
+    for valley in valleys(confirmation.simulations, confirmation.whitener, base.fitted, chosen, frames):
+        score = replace(scores[valley.candidate.label], strengths=valley.strengths)
+        model = confirmation.model(replace(base, fitted=valley.start), [score], columns)
+        if model is None:
+            continue
+        known = best.get(model.names)
+        if known is None or model.fitted.misfit < known.fitted.misfit:
+            best[model.names] = model
+    return list(best.values())
+
+
+def valleys(
+    simulations: Simulations, whitener: Whitener, fitted: Refit, chosen: Sequence[Candidate], frames: int
+) -> list[Valley]:
+    """The best valley of every dissipative effect that leaves at most 70 % of the squared residual, best first.
+
+    Args:
+        fitted: the optimum without the effects; its first unknown is the stiffness.
+        chosen: candidates, in the variants that are tried.
+    """
+    if fitted.misfit <= FAR:
+        return []
+    known = [c for c in chosen if c.effect in DISSIPATIVE and len(c.gates) == 1]
+    low, high = (np.array([getattr(u, end) for u in fitted.unknowns]) for end in ("low", "high"))
+    places = [np.clip(fitted.theta + shift * np.eye(len(low))[0], low, high) for shift in _SHIFTS]
+    tries, jobs = [], []
+    for candidate in known:
+        prepared, gate = candidate.prepared(fitted.twin), candidate.unknowns()[0]
+        for place in places:
+            there = at(prepared, fitted.unknowns, place)
+            for share in _SHARES:
+                strength = share * gate.high
+                tries.append((candidate, place, strength))
+                jobs.append(Job(gate.apply(there, strength), frames))
+    best: dict[str, tuple[float, Candidate, np.ndarray, float]] = {}
+    for (candidate, place, strength), tracks in zip(tries, simulations.run(jobs), strict=True):
+        if tracks is None:
+            continue
+        cost = float(np.sum(whitener.residual(tracks) ** 2))
+        if cost < best.get(candidate.effect, (np.inf,))[0]:
+            best[candidate.effect] = (cost, candidate, place, strength)
+    limit = _BETTER * float(np.sum(fitted.residual**2))
+    found = []
+    for cost, candidate, place, strength in sorted(best.values(), key=lambda one: one[0]):
+        start = _moved(simulations, whitener, fitted, place, frames) if cost <= limit else None
+        if start is not None:
+            found.append(Valley(candidate, start, np.array([strength]), cost))
+    return found
+
+
+def _moved(
+    simulations: Simulations, whitener: Whitener, fitted: Refit, place: np.ndarray, frames: int
+) -> Refit | None:
+    """The declared physics at another place (p,), which is no optimum; None where it cannot be simulated."""
+    unknowns = [u.starting(t) for u, t in zip(fitted.unknowns, place, strict=True)]
+    twin = at(fitted.twin, unknowns, place)
+    tracks = simulations.run([Job(twin, frames)])[0]
+    if tracks is None:
+        return None
+    slope, _ = sensitivities(simulations, whitener, twin, tracks, unknowns, frames)
+    return Refit(unknowns, twin, place, tracks, whitener.residual(tracks), slope)

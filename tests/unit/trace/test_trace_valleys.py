@@ -1,0 +1,66 @@
+"""Valleys: damping is found from a stiffness where a linear score does not see it; near the noise nothing is tried."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_scene import box_body, made_scene
+
+from physworld.build import build_twin
+from physworld.calibrate.parameters import parameters_of
+from physworld.effects.registry import effect
+from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
+from physworld.trace.candidates import candidates
+from physworld.trace.recordings import JointSimulations, Recordings
+from physworld.trace.refit import Refit
+from physworld.trace.sensitivity import sensitivities
+from physworld.trace.simulations import Job
+from physworld.trace.unknowns import of_parameter
+from physworld.trace.valleys import FAR, valleys
+from physworld.trace.whitening import whitener
+
+BUDGET, TRUE_PA, STIFF_PA, RATE_PER_S, SIGMA = 60, 5e4, 1.2e5, 8.0, 5e-4
+
+
+def sagging() -> Scene:
+    """A bar that starts level, and sags and rings under its weight."""
+    low, high = np.array([0.0, -0.015, -0.015]), np.array([0.16, 0.015, 0.015])
+    grip = np.array([[0.0, y, z] for y in (-0.01, 0.01) for z in (-0.01, 0.01)])
+    points = [[x, y, 0.015] for x in np.linspace(0.06, 0.16, 3) for y in (-0.015, 0.015)]
+    scene = made_scene(
+        points, "beam", grip, 20, body=box_body(low, high, density_kg_m3=500.0),
+        initial_state=UNDEFORMED_AT_REST, grips=(Grip((0, 1, 2, 3), low, np.array([0.03, 0.015, 0.015])),),
+    )  # fmt: skip
+    twin = build_twin(scene, BUDGET).with_parameters(youngs_modulus_pa=TRUE_PA)
+    twin = twin.with_effect(effect("air_drag_linear", rate_per_s=RATE_PER_S))
+    tracks = twin.observe(twin.simulate_nodes(*scene.control_track(), scene.times), scene.times)
+    noise = np.random.default_rng(0).normal(scale=SIGMA, size=tracks.shape)
+    return replace(scene, points=tracks + noise, noise_sigma_m=SIGMA)
+
+
+@pytest.mark.parametrize("far", [True, False])
+def test_damping_is_found_at_another_stiffness_where_the_misfit_is_far_from_the_noise(far: bool) -> None:
+    scene = sagging() if far else replace(sagging(), noise_sigma_m=0.1)
+    recordings = Recordings([scene], (), 12, 3)
+    twin = build_twin(scene, BUDGET).with_parameters(youngs_modulus_pa=STIFF_PA)
+    simulations = JointSimulations(recordings, twin, BUDGET, 1.25)
+    frames = recordings.split.train[1]
+    tracks, answers = simulations.first_look(Job(twin, frames))
+    white = whitener(recordings.scene, recordings.split, scene.noise_sigma_m or 0.0, answers)
+    known = parameters_of(twin, separate_bending=False, damping=False)
+    stiffness = [of_parameter(p, twin, None) for p in known if p.name == "youngs_modulus_pa"]
+    slope, _ = sensitivities(simulations, white, twin, tracks, stiffness, frames)
+    fitted = Refit(stiffness, twin, np.array([stiffness[0].start]), tracks, white.residual(tracks), slope)
+    assert (fitted.misfit > FAR) == far
+    before = simulations.count
+    chosen, _ = candidates(twin, ("air_drag_linear", "gravity_tilt"))
+    found = valleys(simulations, white, fitted, chosen, frames)
+    if not far:
+        assert found == [] and simulations.count == before
+        return
+    assert [valley.candidate.effect for valley in found] == ["air_drag_linear"]
+    assert found[0].start.value("youngs_modulus_pa") == pytest.approx(TRUE_PA, rel=0.25)
+    assert found[0].cost < 0.2 * float(np.sum(fitted.residual**2))
+    assert found[0].start.jacobian.shape == (len(fitted.residual), 1)
