@@ -7,7 +7,8 @@ import pytest
 
 from physworld.effects.base import Strength
 from physworld.trace.candidates import Candidate
-from physworld.trace.score import scores
+from physworld.trace.confirm import best_variants
+from physworld.trace.score import Score, scores
 from physworld.trace.sensitivity import Response
 
 BLOCKS, ROWS = 10, 400
@@ -29,6 +30,23 @@ def test_only_what_calibration_cannot_do_scores() -> None:
     assert first.candidate.effect == "drag" and first.share > 0.98 and first.share > found.threshold
     assert first.strengths == pytest.approx([2.0], abs=0.05)
     assert all(score.share < 0.05 for score in found.ranked[1:]) and max(found.decoys) < 0.05
+
+
+def test_effects_are_refitted_in_turn_by_their_best_variant_and_by_all_together() -> None:
+    shape = Strength("shape", "1", -1.0, 1.0, 0.1)
+
+    def score(name: str, share: float, family: float, variant: str = "") -> Score:
+        gate = Strength("s", "1", 0.0, 10.0, 1.0)
+        shapes = (shape,) if variant else ()
+        candidate = Candidate(name, variant, (gate,), {"shape": 0.0} if variant else {}, shapes)
+        return Score(candidate, share, np.ones(1), np.ones(1), 0.0, family)
+
+    ranked = [score("drag", 0.5, 0.5), score("lag", 0.3, 0.3), score("field", 0.2, 0.6, "slope"),
+              score("field", 0.1, 0.6, "bump"), score("weak", 0.01, 0.01)]  # fmt: skip
+    found = best_variants(ranked, 0.03, 8)
+    assert [own[0].candidate.effect for own in found] == ["drag", "field", "lag"]
+    assert [len(own) for own in found] == [1, 2, 1]
+    assert [own[0].candidate.effect for own in best_variants(ranked, 0.03, 2)] == ["drag", "field"]
 
 
 def test_a_strength_of_one_sign_does_not_explain_the_other() -> None:

@@ -42,6 +42,20 @@ def test_whitened_products_are_those_of_the_inverse_covariance(parts: tuple) -> 
     assert white.change(tracks) @ got == pytest.approx(expected, rel=1e-9)
 
 
+def test_what_all_points_share_joins_the_covariance(parts: tuple) -> None:
+    scene, split, _, tracks = parts
+    rng = np.random.default_rng(2)
+    shared = [rng.normal(scale=SIGMA, size=tracks.shape) for _ in range(2)]
+    white = whitener(scene, split, SIGMA, np.zeros((FRAMES, POINTS, 3, 3)))
+    assert white.knowing([]) is white
+    seen = scene.visible[slice(*split.train)]
+    common = np.stack([change[slice(*split.train)][seen].reshape(-1) for change in shared], axis=1)
+    covariance = SIGMA**2 * np.eye(len(common)) + common @ common.T
+    error = (scene.points - tracks)[slice(*split.train)][seen].reshape(-1)
+    got = white.knowing(shared).residual(tracks)
+    assert got @ got == pytest.approx(error @ np.linalg.solve(covariance, error), rel=1e-9)
+
+
 def test_the_place_of_a_point_is_found_and_clipped(parts: tuple) -> None:
     scene, split, _, _ = parts
     eye = np.broadcast_to(np.eye(3), (FRAMES, POINTS, 3, 3))
