@@ -21,6 +21,7 @@ from services.api.routes import (
     jobs,
     keys,
     library,
+    live,
     models,
     pipelines,
     plans,
@@ -66,6 +67,7 @@ def create_api(settings: Settings, database: Database, stores: Stores) -> FastAP
         assessments,
         rollouts,
         plans,
+        live,
         pipelines,
         jobs,
         artifacts,
@@ -75,6 +77,7 @@ def create_api(settings: Settings, database: Database, stores: Stores) -> FastAP
     ):
         versioned.include_router(module.router)
     app.include_router(versioned)
+    app.include_router(live.sockets, prefix=PREFIX)
     app.include_router(health.router)
     errors.install(app)
     describe(app)

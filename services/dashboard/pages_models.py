@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Annotated
+from urllib.parse import urlencode
 
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import HTMLResponse, JSONResponse, Response
 
 from schemas.model import Model, ModelComparison, ModelVersion
+from services.dashboard.access import require_same_origin
 from services.dashboard.clouds import Cloud, Layer, measured_layers, resampled, scene_cloud, thinned
 from services.dashboard.curves import chart, comparison_chart, given_curves
 from services.dashboard.pages_scenes import PREDICTION, layer_response, recording_of
 from services.dashboard.site import BASE, Site
 from services.dashboard.tables import held_out_of
-from storage import registry, resources
+from storage import registry, resources, tickets
+from storage.api_keys import ApiKey
 from storage.comparison import compare_versions
 from storage.errors import NotFound
 
@@ -99,6 +102,18 @@ def router(site: Site) -> APIRouter:
             has_cloud=version.scene_id is not None and site.arrays(version.artifacts, PREDICTION) is not None,
         )
 
+    @routes.get("/models/{name}/{number}/playground")
+    def playground(request: Request, name: str, number: str) -> HTMLResponse:
+        return site.page(request, "playground.html", version=_version(site, name, number))
+
+    @routes.post("/models/{name}/{number}/live", dependencies=[Depends(require_same_origin)])
+    def live_ticket(request: Request, name: str, number: str) -> Response:
+        viewer: ApiKey = request.state.viewer
+        version = _version(site, name, number).version
+        with site.database.session() as session:
+            ticket, _ = tickets.issue(session, viewer.id, f"session:{name}:{version}")
+        return JSONResponse({"path": f"/v1/live?{urlencode(_session(name, version, ticket))}"})
+
     @routes.get("/models/{name}/{number}/curve")
     def curve(name: str, number: str) -> Response:
         given = given_curves(_version(site, name, number).metrics)
@@ -124,7 +139,12 @@ def _compared(site: Site, name: str, a: str, b: str) -> ModelComparison:
     return compare_versions(*pair)
 
 
-def _version(site: Site, name: str, number: str) -> ModelVersion:
+def _session(name: str, number: int, ticket: str) -> dict[str, str | int]:
+    """The query of a live session: two frames a tick, interpolated, of the graph's vertices."""
+    return {"model": name, "version": number, "ticket": ticket, "frames": 2, "part": "vertices"}
+
+
+def _version(site: Site, name: str, number: int | str) -> ModelVersion:
     with site.database.reading() as session:
         return registry.get_version(session, name, number)
 

@@ -1,8 +1,9 @@
 """Live sessions over WebSocket: control velocities in, frames of points out at the model's clock or faster.
 
-``/live?model=NAME&version=N&ticket=…&frames=2``: first a JSON text ``{"type": "ready", …}``, then binary frames
-(``session``), ``frames`` of them a tick, interpolated. The client sends binary control messages, and as JSON text
-``{"type": "reset"}``. Velocities last ``HOLD_S``: a client that falls silent stops its grips.
+``/live?model=NAME&version=N&ticket=…&frames=2&part=points``: first a JSON text ``{"type": "ready", …}``, then binary
+frames (``session``), ``frames`` of them a tick, interpolated; ``part=vertices`` for the graph's vertices. The client
+sends binary control messages, and as JSON text ``{"type": "reset"}``. Velocities last ``HOLD_S``: a client that falls
+silent stops its grips.
 
 The model is stepped in a thread, never on the event loop. A slow reader gets fewer frames, the newest each time:
 nothing queues up. A session ends after ``IDLE_S`` without a message (4408), at a message that cannot be read (1007),
@@ -60,7 +61,8 @@ class LiveSessions:
         self._open += 1
         try:
             _, published = await run_in_threadpool(self._models.get, model, version)
-            session = await run_in_threadpool(LiveSession, published)
+            vertices = query.get("part") == "vertices"
+            session = await run_in_threadpool(LiveSession, published, vertices=vertices)
             await _Connection(socket, session, self._pool, frames, self._idle_s).run()
         except StorageError as error:
             await socket.close(POLICY, str(error)[:120])
@@ -146,7 +148,8 @@ class _Connection:
             if frame is None:
                 continue
             try:
-                await asyncio.wait_for(self._socket.send_bytes(frame), SEND_S)
+                async with asyncio.timeout(SEND_S):  # wait_for may swallow the cancellation (cpython 86296)
+                    await self._socket.send_bytes(frame)
             except TimeoutError:
                 return TOO_SLOW, f"a frame was not taken within {SEND_S:g} s"
             except (WebSocketDisconnect, RuntimeError):

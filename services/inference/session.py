@@ -38,16 +38,16 @@ class Control:
 class LiveSession:
     """A model's body under the controls of one client."""
 
-    def __init__(self, model: PublishedModel, stiffness_factor: float = 1.0) -> None:
+    def __init__(self, model: PublishedModel, *, vertices: bool = False) -> None:
+        """``vertices``: frames hold the graph's object vertices in the place of the measured points."""
         self.dt_s = model.spec.dt_s
-        self._skin = model.skin
+        self._skin = None if vertices else model.skin
         start = model.start_controllers[-1]
         self.groups = grip_groups(model.spec, start)
         size = float(np.ptp(model.spec.rest_vertices, axis=0).max())
         self.speed_m_s, self.reach_m = SPEED_PER_SIZE * size, REACH_PER_SIZE * size
         self._start, self._flags = start, 0
-        phi = model.phi + np.array([np.log(stiffness_factor), 0.0])
-        self._rollout = LiveRollout(model, phi=phi)
+        self._rollout = LiveRollout(model)
         self._before = self._now = self._points()
 
     def describe(self) -> dict[str, Any]:
@@ -109,4 +109,5 @@ class LiveSession:
         return head + body.tobytes()
 
     def _points(self) -> np.ndarray:
-        return self._skin.apply(self._rollout.vertices)
+        vertices = self._rollout.vertices
+        return vertices if self._skin is None else self._skin.apply(vertices)

@@ -17,7 +17,7 @@ rmSync(OUT, { recursive: true, force: true });
 mkdirSync(`${OUT}/licences`, { recursive: true });
 
 await build({
-  entryPoints: ["src/app.js", "src/cloud.js", "src/curve.js", "src/style.css"],
+  entryPoints: ["src/app.js", "src/cloud.js", "src/curve.js", "src/playground.js", "src/style.css"],
   outdir: OUT,
   bundle: true,
   minify: true,

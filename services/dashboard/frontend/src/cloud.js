@@ -10,25 +10,7 @@ import {
 } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import { colour, onSchemeChange } from "./palette.js";
-
-const VERTEX = `
-  uniform float size; uniform float scale;
-  void main() {
-    vec4 view = modelViewMatrix * vec4(position, 1.0);
-    gl_Position = projectionMatrix * view;
-    gl_PointSize = clamp(size * scale / -view.z, 2.0, 40.0);
-  }`;
-const FRAGMENT = `
-  uniform vec3 tint; uniform float opacity;
-  void main() {
-    vec2 p = gl_PointCoord * 2.0 - 1.0;
-    float r = dot(p, p);
-    float edge = 1.0 - smoothstep(1.0 - min(0.5, 2.0 * fwidth(r)), 1.0, r);
-    if (edge <= 0.0) discard;
-    float light = 0.62 + 0.38 * sqrt(1.0 - r) - 0.18 * (p.x + p.y) * 0.5;
-    gl_FragColor = vec4(tint * light, opacity * edge);
-    #include <colorspace_fragment>
-  }`;
+import { FRAGMENT, VERTEX, grid, segments } from "./points.js";
 
 /** One set of moving points with its own colour, size and switch. */
 class Layer {
@@ -145,27 +127,6 @@ function bounds(layers, box) {
   return low.x <= high.x ? [low, high] : [new Vector3(-0.5, -0.5, 0), new Vector3(0.5, 0.5, 1)];
 }
 
-/** A round number of metres near a tenth of the extent: 1, 2 or 5 times a power of ten. */
-function gridStep(extent) {
-  const rough = extent / 8;
-  const power = 10 ** Math.floor(Math.log10(rough));
-  return [1, 2, 5, 10].map((factor) => factor * power).find((step) => step >= rough);
-}
-
-function grid(low, high, floor) {
-  const extent = Math.max(high.x - low.x, high.y - low.y, (high.z - low.z) * 0.6, 0.01) * 1.1;
-  const step = gridStep(extent);
-  const half = Math.ceil(extent / 2 / step) * step;
-  const centre = [low.x + high.x, low.y + high.y].map((sum) => Math.round(sum / 2 / step) * step);
-  const z = floor ?? low.z - 0.02 * extent;
-  const corners = [];
-  for (let offset = -half; offset <= half + step / 2; offset += step) {
-    corners.push(centre[0] + offset, centre[1] - half, z, centre[0] + offset, centre[1] + half, z);
-    corners.push(centre[0] - half, centre[1] + offset, z, centre[0] + half, centre[1] + offset, z);
-  }
-  return [segments(corners), step];
-}
-
 /** The edges of the box between two corners. */
 function wireframe([low, high]) {
   const corner = (index) => [0, 1, 2].map((axis) => (index & (1 << axis) ? high : low)[axis]);
@@ -174,12 +135,6 @@ function wireframe([low, high]) {
     for (const bit of [1, 2, 4]) if (!(index & bit)) ends.push(...corner(index), ...corner(index | bit));
   }
   return segments(ends);
-}
-
-function segments(ends) {
-  const geometry = new BufferGeometry();
-  geometry.setAttribute("position", new BufferAttribute(new Float32Array(ends), 3));
-  return new LineSegments(geometry, new LineBasicMaterial());
 }
 
 class Player {

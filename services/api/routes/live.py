@@ -1,0 +1,152 @@
+"""Live sessions: a ticket over HTTP, then a WebSocket that is handed through to the inference service.
+
+A program may connect with its key in the header instead of a ticket. Nothing is computed here: frames pass as they
+come, and a client that reads slowly slows the inner connection, whose sender then leaves frames out.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import suppress
+from typing import Any
+from urllib.parse import urlencode
+
+import structlog
+from fastapi import APIRouter, WebSocket
+from starlette.concurrency import run_in_threadpool
+from starlette.websockets import WebSocketState
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed, WebSocketException
+
+from schemas.live import LiveTicket, LiveTicketCreate
+from services.api.dependencies import DatabaseDep, PrincipalDep, SettingsDep
+from services.api.errors import documented
+from services.api.inference import unavailable
+from services.api.routes.rollouts import ready_version
+from storage import api_keys, registry, tickets
+from storage.api_keys import ApiKey
+from storage.database import Database
+from storage.errors import StorageError
+from storage.settings import Settings
+
+router = APIRouter(prefix="/live", tags=["live"])
+sockets = APIRouter()
+
+MESSAGE_BYTES = 64 * 1024
+POLICY, UNAVAILABLE, TOO_BIG = 1008, 1013, 1009
+OPEN_S = 60.0  # the inference service loads torch at its first session
+PASSED_CODES = frozenset({1000, 1001, 1007, 1008, 1013, *range(4000, 5000)})
+
+log = structlog.get_logger("physworld.live")
+
+
+@router.post("/tickets", status_code=201, responses=documented(401, 403, 404, 409, 413, 422, 503))
+def create_ticket(
+    body: LiveTicketCreate, database: DatabaseDep, settings: SettingsDep, principal: PrincipalDep
+) -> LiveTicket:
+    """A ticket for one live session, good for one connection within a minute."""
+    return issue(database, settings, principal.id, body.model, body.version)
+
+
+def issue(database: Database, settings: Settings, key_id: str, model: str, version: int | str) -> LiveTicket:
+    """The ticket and the address that takes it. Raises NotFound, or ApiProblem: 409, 503."""
+    if not settings.inference_url:
+        raise unavailable("no inference service belongs to this installation")
+    with database.session() as session:
+        found = ready_version(registry.get_version(session, model, version))
+        ticket, until = tickets.issue(session, key_id, _subject(model, found.version))
+    query = urlencode({"model": model, "version": found.version, "ticket": ticket})
+    return LiveTicket(
+        ticket=ticket, model=model, version=found.version, expires_at=until, path=f"/v1/live?{query}"
+    )
+
+
+@sockets.websocket("/live")
+async def live(socket: WebSocket) -> None:
+    """A live session of a model version; ``schemas.live`` and docs/rollouts.md tell the messages."""
+    settings: Settings = socket.app.state.settings
+    database: Database = socket.app.state.database
+    query = socket.query_params
+    model, version = query.get("model", ""), query.get("version", "")
+    header, ticket = socket.headers.get("Authorization", ""), query.get("ticket", "")
+    await socket.accept()
+    if not settings.inference_url:
+        await socket.close(UNAVAILABLE, "no inference service belongs to this installation")
+        return
+    try:
+        entry = await run_in_threadpool(_enter, database, model, version, ticket, header)
+    except StorageError as error:
+        await socket.close(POLICY, str(error)[:120])
+        return
+    if entry is None:
+        await socket.close(POLICY, "a ticket of POST /v1/live/tickets, or a key that may write, is needed")
+        return
+    inner_query = {**entry, "frames": query.get("frames", "1")[:2], "part": query.get("part", "points")[:10]}
+    address = f"{settings.inference_url.replace('http', 'ws', 1)}/live?{urlencode(inner_query)}"
+    try:
+        async with connect(
+            address, compression=None, proxy=None, open_timeout=OPEN_S, max_queue=2, max_size=2**22
+        ) as inner:
+            await _relay(socket, inner)
+    except (OSError, TimeoutError, WebSocketException) as error:
+        log.warning("live_session_not_opened", error=str(error))
+        with suppress(RuntimeError):
+            await socket.close(UNAVAILABLE, "the inference service does not answer")
+
+
+def _subject(model: str, version: int) -> str:
+    return f"session:{model}:{version}"
+
+
+def _enter(database: Database, model: str, version: str, ticket: str, header: str) -> dict[str, Any] | None:
+    """The inner connection's query for whoever may open a session, else None. Raises NotFound."""
+    with database.session() as session:
+        number = registry.get_version(session, model, version).version if ticket or header else 0
+        key: ApiKey | None = None
+        if ticket:
+            key = tickets.redeem(session, ticket, _subject(model, number))
+        elif header.lower().startswith("bearer "):
+            key = api_keys.verify(session, header[7:].strip())
+            key = key if key is not None and key.allows("write") else None
+        if key is None:
+            return None
+        inner, _ = tickets.issue(session, key.id, f"live:{model}:{number}")
+    return {"model": model, "version": number, "ticket": inner}
+
+
+async def _relay(socket: WebSocket, inner: ClientConnection) -> None:
+    """Hand messages through until one side ends, then end the other with the same words."""
+
+    async def up() -> tuple[int, str]:
+        while True:
+            message = await socket.receive()
+            if message["type"] == "websocket.disconnect":
+                return 0, ""
+            data: bytes | str = message.get("bytes") or message.get("text") or b""
+            if len(data) > MESSAGE_BYTES:
+                return TOO_BIG, f"a message of {len(data)} bytes; {MESSAGE_BYTES} are the most"
+            await inner.send(data)
+
+    async def down() -> tuple[int, str]:
+        while True:
+            message = await inner.recv()
+            await (socket.send_bytes(message) if isinstance(message, bytes) else socket.send_text(message))
+
+    tasks = [asyncio.create_task(work()) for work in (up, down)]
+    done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+    first = next(iter(done))
+    error = first.exception()
+    if error is None:
+        code, reason = first.result()
+    elif isinstance(error, ConnectionClosed):
+        closed = error.rcvd
+        known = closed is not None and closed.code in PASSED_CODES
+        code, reason = (closed.code, closed.reason) if closed is not None and known else (UNAVAILABLE, "")
+    else:
+        code, reason = 0, ""
+    if code and socket.application_state is WebSocketState.CONNECTED:
+        with suppress(RuntimeError):
+            await socket.close(code, reason)

@@ -1,0 +1,51 @@
+// What the 3D views share: round points, the ground's grid, line segments.
+
+import { BufferAttribute, BufferGeometry, LineBasicMaterial, LineSegments } from "three";
+
+export const VERTEX = `
+  uniform float size; uniform float scale;
+  void main() {
+    vec4 view = modelViewMatrix * vec4(position, 1.0);
+    gl_Position = projectionMatrix * view;
+    gl_PointSize = clamp(size * scale / -view.z, 2.0, 40.0);
+  }`;
+export const FRAGMENT = `
+  uniform vec3 tint; uniform float opacity;
+  void main() {
+    vec2 p = gl_PointCoord * 2.0 - 1.0;
+    float r = dot(p, p);
+    float edge = 1.0 - smoothstep(1.0 - min(0.5, 2.0 * fwidth(r)), 1.0, r);
+    if (edge <= 0.0) discard;
+    float light = 0.62 + 0.38 * sqrt(1.0 - r) - 0.18 * (p.x + p.y) * 0.5;
+    gl_FragColor = vec4(tint * light, opacity * edge);
+    #include <colorspace_fragment>
+  }`;
+
+/** A round number of metres near a tenth of the extent: 1, 2 or 5 times a power of ten. */
+function gridStep(extent) {
+  const rough = extent / 8;
+  const power = 10 ** Math.floor(Math.log10(rough));
+  return [1, 2, 5, 10].map((factor) => factor * power).find((step) => step >= rough);
+}
+
+/** Lines on the floor under a box, and the distance between them [m]. */
+export function grid(low, high, floor) {
+  const extent = Math.max(high.x - low.x, high.y - low.y, (high.z - low.z) * 0.6, 0.01) * 1.1;
+  const step = gridStep(extent);
+  const half = Math.ceil(extent / 2 / step) * step;
+  const centre = [low.x + high.x, low.y + high.y].map((sum) => Math.round(sum / 2 / step) * step);
+  const z = floor ?? low.z - 0.02 * extent;
+  const corners = [];
+  for (let offset = -half; offset <= half + step / 2; offset += step) {
+    corners.push(centre[0] + offset, centre[1] - half, z, centre[0] + offset, centre[1] + half, z);
+    corners.push(centre[0] - half, centre[1] + offset, z, centre[0] + half, centre[1] + offset, z);
+  }
+  return [segments(corners), step];
+}
+
+/** Lines between pairs of points, x, y, z each. */
+export function segments(ends) {
+  const geometry = new BufferGeometry();
+  geometry.setAttribute("position", new BufferAttribute(new Float32Array(ends), 3));
+  return new LineSegments(geometry, new LineBasicMaterial());
+}

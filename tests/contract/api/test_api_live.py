@@ -1,0 +1,214 @@
+"""Live sessions through the API: who gets in, what comes back, what ends a session."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import struct
+import time
+from collections.abc import Awaitable, Callable, Iterator
+from urllib.parse import urlencode
+
+import numpy as np
+import pytest
+from inference_serving import Served, serve_inference
+from published_tiny import tiny_model
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed
+
+from services.inference import live
+from services.inference.session import HEAD
+from storage import api_keys
+
+WITHIN_S = 20.0
+SINGLE_PRECISION_M = 2e-6
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    with serve_inference(tmp_path_factory.mktemp("data")) as served:
+        yield served
+
+
+def path_of(served: Served) -> str:
+    with served.client() as client:
+        answer = client.post("/v1/live/tickets", json={"model": served.model})
+    assert answer.status_code == 201, answer.text
+    return answer.json()["path"]
+
+
+def address(served: Served, path: str) -> str:
+    return served.url.replace("http", "ws", 1) + path
+
+
+def run(served: Served, work: Callable[[ClientConnection, dict], Awaitable[None]], frames: int = 1) -> None:
+    """Open a session with a ticket and do ``work`` with it and the first message."""
+
+    async def session() -> None:
+        where = address(served, f"{path_of(served)}&frames={frames}")
+        async with connect(where, proxy=None) as socket:
+            await asyncio.wait_for(work(socket, json.loads(await socket.recv())), WITHIN_S)
+
+    asyncio.run(session())
+
+
+def frame(message: bytes | str, ready: dict) -> tuple[tuple, np.ndarray, np.ndarray]:
+    assert isinstance(message, bytes)
+    places = np.frombuffer(message, "<f4", offset=HEAD.size).reshape(-1, 3)
+    assert len(places) == ready["points"] + len(ready["controllers"])
+    return HEAD.unpack_from(message), places[: ready["points"]], places[ready["points"] :]
+
+
+def control(number: int, velocity: list[float], rows: int = 1) -> bytes:
+    return struct.pack("<I", number) + np.tile(np.array(velocity, "<f4"), (rows, 1)).tobytes()
+
+
+def test_points_follow_the_controls_as_a_rollout_would(served: Served) -> None:
+    model = tiny_model()[2]
+
+    async def work(socket: ClientConnection, ready: dict) -> None:
+        assert ready["type"] == "ready"
+        assert ready["grips"] == [[0, 1, 2, 3]]
+        path, number = [], 0
+        while len(path) < 20:
+            number += 1
+            await socket.send(control(number, [0.0, 0.1, 0.0]))
+            head, points, controllers = frame(await socket.recv(), ready)
+            path.append((head[0], points, controllers))
+        ticks = [tick for tick, _, _ in path]
+        assert ticks == list(range(ticks[0], ticks[0] + 20))  # none was left out
+        driven = np.concatenate([model.start_controllers, [c.astype(float) for _, _, c in path]])
+        assert driven[-1, 0, 1] - driven[2, 0, 1] > 0.03
+        if ticks[0] == 1:  # from the session's first tick on it is a rollout under what the grips did
+            expected = model.skin.apply(model.rollout(driven)[3:])
+            assert np.array([points for _, points, _ in path]) == pytest.approx(expected, abs=2e-5)
+
+    run(served, work)
+
+
+def test_frames_come_at_the_models_clock_or_faster(served: Served) -> None:
+    async def work(socket: ClientConnection, ready: dict) -> None:
+        await socket.recv()
+        started, count = time.monotonic(), 0
+        while time.monotonic() - started < 2.0:
+            await socket.recv()
+            count += 1
+        assert 30.0 <= count / 2.0 <= 75.0  # two a tick of 1/30 s
+
+    run(served, work, frames=2)
+
+
+def test_the_vertices_of_the_graph_can_be_had_instead(served: Served) -> None:
+    async def session() -> None:
+        async with connect(address(served, f"{path_of(served)}&part=vertices"), proxy=None) as socket:
+            ready = json.loads(await socket.recv())
+            assert ready["points"] == 20
+            _, points, _ = frame(await socket.recv(), ready)
+            assert np.isfinite(points).all()
+
+    asyncio.run(session())
+
+
+def test_speed_and_reach_are_cut_and_silence_stops_the_grips(served: Served) -> None:
+    async def work(socket: ClientConnection, ready: dict) -> None:
+        start = np.array(ready["controllers"])
+        far, number, before = 0.0, 0, start
+        for _ in range(60):
+            number += 1
+            await socket.send(control(number, [0.0, 0.0, 50.0], rows=4))
+            _, _, controllers = frame(await socket.recv(), ready)
+            assert np.abs(controllers - before).max() <= ready["speed_m_s"] * ready["dt_s"] * 2.5 + 1e-5
+            before, far = controllers, float((controllers - start)[:, 2].max())
+        assert far == pytest.approx(ready["reach_m"], abs=1e-5)
+        await socket.send(control(number + 1, [0.0, 0.0, -0.1]))
+        until = time.monotonic() + live.HOLD_S + 0.4
+        while time.monotonic() < until:
+            _, _, held = frame(await socket.recv(), ready)
+        _, _, later = frame(await socket.recv(), ready)
+        assert np.array_equal(held, later)
+        await socket.send(json.dumps({"type": "reset"}))
+        for _ in range(10):
+            _, _, again = frame(await socket.recv(), ready)
+        assert again == pytest.approx(start, abs=1e-6)
+
+    run(served, work)
+
+
+@pytest.mark.parametrize(
+    ("message", "words"),
+    [
+        (b"\x01\x00\x00\x00abc", "bytes"),
+        (control(1, [0.0, float("nan"), 0.0]), "finite"),
+        ("no json", "Expecting"),
+        ("[" * 60_000, ""),
+        ("[]", "get"),
+        (b"x" * 100_000, "bytes"),
+    ],
+)
+def test_a_message_that_cannot_be_meant_ends_the_session(served: Served, message: bytes, words: str) -> None:
+    async def work(socket: ClientConnection, ready: dict) -> None:
+        await socket.send(message)
+        with pytest.raises(ConnectionClosed) as ended:
+            while True:
+                await socket.recv()
+        assert ended.value.rcvd is not None
+        assert ended.value.rcvd.code in {1007, 1009}
+        assert words in ended.value.rcvd.reason
+
+    run(served, work)
+
+
+def test_a_ticket_is_good_once_and_for_its_model_only(served: Served) -> None:
+    path = path_of(served)
+
+    async def refused(where: str, headers: dict[str, str] | None = None) -> int:
+        async with connect(address(served, where), proxy=None, additional_headers=headers) as socket:
+            try:
+                text = await socket.recv()
+                return json.loads(text)["points"]
+            except ConnectionClosed as ended:
+                assert ended.rcvd is not None
+                return ended.rcvd.code
+
+    plain = f"/v1/live?{urlencode({'model': served.model, 'version': served.version})}"
+    with served.database.session() as session:
+        _, reader = api_keys.create_key(session, "reader", "read")
+    assert asyncio.run(refused(path)) == 4
+    assert asyncio.run(refused(path)) == 1008
+    assert asyncio.run(refused(path_of(served).replace("version=1", "version=7"))) == 1008
+    assert asyncio.run(refused(plain)) == 1008
+    assert asyncio.run(refused(plain, {"Authorization": f"Bearer {served.token}"})) == 4
+    assert asyncio.run(refused(plain, {"Authorization": f"Bearer {reader}"})) == 1008
+    assert asyncio.run(refused("/v1/live?model=nobody&version=1&ticket=x")) == 1008
+    with served.client(reader) as client:
+        assert client.post("/v1/live/tickets", json={"model": served.model}).status_code == 403
+
+
+def test_sessions_are_limited_and_a_place_is_free_again_when_one_ends(served: Served) -> None:
+    async def work() -> None:
+        sockets: list[ClientConnection] = []
+        while len(sockets) < live.MOST_SESSIONS:  # those of the tests before end in their own time
+            socket = await connect(address(served, path_of(served)), proxy=None)
+            try:
+                await socket.recv()
+            except ConnectionClosed:
+                await asyncio.sleep(0.1)
+                continue
+            sockets.append(socket)
+        async with connect(address(served, path_of(served)), proxy=None) as one_more:
+            with pytest.raises(ConnectionClosed) as ended:
+                await one_more.recv()
+            assert ended.value.rcvd is not None
+            assert ended.value.rcvd.code == 1013
+        for socket in sockets:
+            await socket.close()
+        for _ in range(100):
+            async with connect(address(served, path_of(served)), proxy=None) as again:
+                try:
+                    assert json.loads(await again.recv())["type"] == "ready"
+                    return
+                except ConnectionClosed:
+                    await asyncio.sleep(0.05)
+        raise AssertionError("no place became free")
+
+    asyncio.run(asyncio.wait_for(work(), 60.0))
