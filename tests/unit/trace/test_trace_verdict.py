@@ -77,6 +77,7 @@ def test_effects_that_do_the_same_are_a_set_and_faults_of_the_data_are_called_so
 
 def test_a_strength_that_moves_with_the_resolution_is_numerical() -> None:
     assert answer([model(NOISE, "drag")], NOISE + 2 * DRAG, agree=False)[0] == "numerical_issue"
+    assert answer([model(NOISE, "drag")], NOISE + 0.5 * DRAG, agree=False)[0] == "nothing_to_explain"
 
 
 def test_a_misfit_that_other_cells_explain_is_numerical() -> None:
