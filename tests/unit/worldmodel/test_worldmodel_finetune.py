@@ -125,7 +125,7 @@ def with_strength(episodes: list[dict[str, np.ndarray]]) -> WorldModel:
         )
         for arrays in episodes
     ]
-    return train(seen, spec, SMALL, dataclasses.replace(TRAINING, steps=100)).model
+    return train(seen, spec, SMALL, dataclasses.replace(TRAINING, steps=60)).model
 
 
 def test_a_model_at_fixed_strengths_is_the_same_function(
