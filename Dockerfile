@@ -2,6 +2,7 @@
 #   api      web process, migration: neither torch nor warp
 #   worker   dispatcher, simulation workers: warp
 #   trainer  training workers: warp and torch
+#   inference  rollouts, plans and live sessions: warp and torch
 # Dependencies are installed before the source is copied, so that a change of code rebuilds one small layer.
 # Build arguments: PIP_INDEX_URL and PIP_EXTRA_INDEX_URL where packages come from another index (the pinned CPU
 # build of torch lies on its project's own index).
@@ -55,3 +56,15 @@ COPY services/__init__.py services/
 COPY services/trainer/ services/trainer/
 USER 10001:10001
 CMD ["python", "-m", "services.trainer"]
+
+FROM base AS inference
+RUN python requirements.py api sim train > requirements.txt && pip install -r requirements.txt -c constraints.txt
+COPY schemas/ schemas/
+COPY storage/ storage/
+COPY physworld/ physworld/
+COPY workers/ workers/
+COPY services/__init__.py services/
+COPY services/inference/ services/inference/
+USER 10001:10001
+EXPOSE 8100
+CMD ["python", "-m", "services.inference", "serve", "--host", "0.0.0.0"]

@@ -29,7 +29,7 @@ SECRETS = (
     "PHYSWORLD_SIGNING_KEY",
 )
 ONE_SHOT = {"migrate"}
-OURS = {"migrate", "api", "dispatcher", "worker", "trainer"}
+OURS = {"migrate", "api", "dispatcher", "worker", "trainer", "inference", "planner"}
 PINNED = re.compile(r"^[a-z0-9./-]+:v?\d+\.\d+(\.\d+)?([.-][a-z0-9.-]+)?$")
 SUBSTITUTION = re.compile(r"(?<!\$)\$\{([A-Z0-9_]+)(:?[-?+])?([^}]*)\}")
 
@@ -165,6 +165,7 @@ def test_named_volumes_are_declared(text: str) -> None:
         ("api", "services.web services.api.migrate", "torch warp celery kombu workers benchmarks"),
         ("worker", "workers.__main__ workers.dispatcher workers.app", "torch warp services benchmarks"),
         ("trainer", "services.trainer.__main__ workers.app", "torch warp fastapi benchmarks"),
+        ("inference", "services.inference.__main__ services.inference.lazy workers.app", "torch warp benchmarks"),
     ],
 )
 def test_an_image_holds_what_its_process_imports(
