@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field
 
 from schemas.base import Artifact, Lineage, Request, Resource, Seed
 
+Format = Literal["torch_export", "onnx"]
+FORMATS: tuple[Format, ...] = get_args(Format)
 Tag = Annotated[str, Field(min_length=1, max_length=64)]
 
 
 class TrainingConfig(Request):
     """Settings of the graph network (paper, section GNN-Based World Models) and of its training.
 
-    The defaults are meant for some minutes on one core. ``patience``: validations without a better one after which the
-    training ends (0: never). ``start_share`` below 1: the training may begin once that share of the dataset's episodes is
-    committed, and takes the others in as it goes (``physworld.worldmodel.training``).
+    The defaults are meant for some minutes on one core. ``patience``: validations without a better one after which
+    the training ends (0: never). ``start_share`` below 1: the training may begin once that share of the dataset's
+    episodes is committed, and takes the others in as it goes (``physworld.worldmodel.training``).
     """
 
     hidden: int = Field(default=64, ge=8, le=1024)
@@ -31,9 +33,7 @@ class TrainingConfig(Request):
     patience: int = Field(default=8, ge=0, le=1000)
     start_share: float = Field(default=1.0, gt=0, le=1)
     fine_tune_steps: int = Field(default=60, ge=0, le=10_000)
-    formats: list[Literal["torch_export", "onnx"]] = Field(
-        default_factory=lambda: ["torch_export", "onnx"], max_length=2
-    )
+    formats: list[Format] = Field(default_factory=lambda: [*FORMATS], max_length=2)
     seed: Seed = 0
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 from urllib.parse import urlencode
 
 from fastapi import APIRouter, Depends, Query, Request
@@ -24,6 +25,7 @@ from storage.errors import NotFound
 PAGE_SIZE = 50
 
 CHOICES = 200
+CARD = "card.json"
 
 Cursor = Annotated[str | None, Query(max_length=512)]
 Chosen = Annotated[str | None, Query(max_length=64)]
@@ -98,6 +100,7 @@ def router(site: Site) -> APIRouter:
             request,
             "version.html",
             version=version,
+            card=_card(site, version),
             has_curve=given_curves(version.metrics) is not None,
             has_cloud=version.scene_id is not None and site.arrays(version.artifacts, PREDICTION) is not None,
         )
@@ -147,6 +150,18 @@ def _session(name: str, number: int, ticket: str) -> dict[str, str | int]:
 def _version(site: Site, name: str, number: int | str) -> ModelVersion:
     with site.database.reading() as session:
         return registry.get_version(session, name, number)
+
+
+def _card(site: Site, version: ModelVersion) -> dict[str, Any]:
+    """The version's card; empty where there is none that can be read."""
+    found = next((item for item in version.artifacts if item.name == CARD), None)
+    if found is None:
+        return {}
+    try:
+        card = json.loads(site.artifacts.read_bytes(found.sha256))
+    except ValueError:
+        return {}
+    return card if isinstance(card, dict) else {}
 
 
 def _cloud(site: Site, version: ModelVersion) -> Cloud:

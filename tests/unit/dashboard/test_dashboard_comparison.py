@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,6 +20,13 @@ from storage import registry
 from storage.database import open_database
 from storage.settings import Settings
 
+CARD = {
+    "intended_use": "Predict <this> object.",
+    "limits": "Turns are extrapolated.",
+    "trained_on": {"statistics": {"motions": {"lift": 7, "hold_one": 3}}},
+}
+STRENGTHS = {"air_drag_linear.rate_per_s": {"calibrated": 1.9, "ci95": [1.6, 2.2], "tuned": 2.05}}
+
 
 @pytest.fixture
 def client(tmp_path: Path) -> Iterator[httpx.Client]:
@@ -26,6 +34,7 @@ def client(tmp_path: Path) -> Iterator[httpx.Client]:
     settings = Settings(data_dir=tmp_path)
     database = open_database(settings)
     database.upgrade()
+    stores = Stores(settings)
     with database.session() as session:
         for name, error_m in (("beam", 0.004), ("beam", 0.0031), ("lonely", 0.001)):
             curves = {name: [error_m, error_m, None] for name in ("twin", "world_model_finetuned", "static")}
@@ -39,14 +48,14 @@ def client(tmp_path: Path) -> Iterator[httpx.Client]:
                 session,
                 name,
                 row.version,
-                artifacts=[],
+                artifacts=[stores.artifacts.put_bytes(json.dumps(CARD).encode(), "card.json")],
                 sha256="e" * 64,
-                metrics={"held_out": table},
+                metrics={"held_out": table, "fine_tuning": {"strengths": STRENGTHS}},
                 lineage=Lineage(),
             )
         registry.set_alias(session, "beam", "champion", 2)
     app = FastAPI()
-    mount(app, settings, database, Stores(settings))
+    mount(app, settings, database, stores)
     with serve(app) as origin, browser_at(origin) as browser:
         login(browser, database)
         yield browser
@@ -75,3 +84,14 @@ def test_without_a_choice_the_two_newest_are_taken(client: httpx.Client) -> None
 
 def test_a_page_of_a_version_answers_to_its_alias(client: httpx.Client) -> None:
     assert "version 2" in client.get("/dashboard/models/beam/champion").text
+
+
+def test_the_page_of_a_version_says_what_it_is_for_and_where_it_ends(client: httpx.Client) -> None:
+    page = client.get("/dashboard/models/beam/2").text
+    for text in (
+        "Predict &lt;this&gt; object.",
+        "Turns are extrapolated.",
+        "7 lift, 3 hold one",
+        "stands at 2.05",
+    ):
+        assert text in page, text
