@@ -64,7 +64,7 @@ class TraceResult:
         effects, equivalent: what is added, and what would do as well.
         calibrated: the calibrated parameters of the model with the effects.
         declared: the declared physics, refitted.
-        split, sigma: frozen split; noise [m], or None where it is unknown.
+        split, sigma: frozen split of the first recording; noise [m], or None where it is unknown.
         path: steps of the selection.
         candidates, refused: what was tried, and why the rest was not.
         numerics: root mean squared change of the training prediction by each numerical direction, over the noise.

@@ -44,6 +44,7 @@ from physworld.trace.selection import Selection, by_chance
 from physworld.trace.sensitivity import (
     candidate_responses,
     numerical_directions,
+    refinement_of,
 )
 from physworld.trace.simulations import (
     Job,
@@ -68,6 +69,7 @@ from physworld.twin import Twin
 _POISSON_SPREAD = 0.08  # of what is known of a soft solid's Poisson's ratio beforehand
 _OTHER_STIFFNESSES = tuple(0.12 * k for k in (-6, -5, -4, -3, -2, -1, 1, 2, 3, 4, 5, 6))
 """Logarithms: a phase that has slipped by a period is a local minimum, so others are looked at before a descent."""
+_NEAR = (-0.12, 0.12)  # on finer cells, where the coarser ones have looked farther
 _SLOWEST = 8.0  # times the cost of the declared physics that a run may take: explicit friction is dear
 
 
@@ -142,24 +144,35 @@ class _Trace:
 
     def run(self) -> TraceResult:
         config, simulations = self.config, self.simulations
-        simulations.stage = "declared physics"
-        simulations.least_step_s = stable_step_s(self.twin, simulations.drive) / _SLOWEST
-        tracks, answers = simulations.first_look(Job(self.twin, self.frames))
-        sigma = noise_sigma(self.scene, self.split, tracks)
+        level = 1.0
+        while True:
+            simulations.stage = "declared physics"
+            simulations.least_step_s = stable_step_s(self.twin, simulations.drive) / _SLOWEST
+            tracks, answers = simulations.first_look(Job(self.twin, self.frames))
+            sigma = noise_sigma(self.scene, self.split, tracks)
+            scale = sigma or float(np.sqrt(np.mean((tracks - self.scene.points[: self.frames]) ** 2))) or 1e-3
+            white = whitener(self.scene, self.split, scale, answers)
+            white = white.knowing(self._turns(tracks, scale))
+            simulations.stage = "numerics"
+            budget = config.calibration.particle_budget
+            directions, finer = numerical_directions(
+                simulations, self.lead, self.twin, tracks, budget, config.refinement, level
+            )
+            block_of_row = self.split.block_of(white.frame_of_row)
+            declared = self._declared(white, block_of_row, _OTHER_STIFFNESSES if level == 1.0 else _NEAR)
+            basis = orthonormal(declared.fitted.free_jacobian)
+            shifts = [project(basis, white.change(direction)) for direction in directions.values()]
+            numerics = {
+                n: float(np.sqrt(np.mean(shift**2))) for n, shift in zip(directions, shifts, strict=True)
+            }
+            if not self._too_coarse(numerics, finer):
+                break
+            level *= config.refinement
+            self.twin = refinement_of(declared.fitted.twin, finer)
         if sigma is None:
             self.notes.append("no noise is declared and none can be estimated: no claim")
-        scale = sigma or float(np.sqrt(np.mean((tracks - self.scene.points[: self.frames]) ** 2))) or 1e-3
-        white = whitener(self.scene, self.split, scale, answers)
-        white = white.knowing(self._turns(tracks, scale))
-        simulations.stage = "numerics"
-        directions, finer = numerical_directions(
-            simulations, self.lead, self.twin, tracks, config.calibration.particle_budget, config.refinement
-        )
-        block_of_row = self.split.block_of(white.frame_of_row)
-        declared = self._declared(white, block_of_row)
-        basis = orthonormal(declared.fitted.free_jacobian)
-        shifts = [project(basis, white.change(direction)) for direction in directions.values()]
-        numerics = {n: float(np.sqrt(np.mean(shift**2))) for n, shift in zip(directions, shifts, strict=True)}
+        if level > 1.0:
+            self.notes.append(f"cells {level:.3g} times smaller than asked for: coarser ones change too much")
         solver = orthonormal(np.stack(shifts, axis=1)) if shifts else basis[:, :0]
         resolved = float(np.sqrt(np.mean(project(solver, project(basis, declared.fitted.residual)) ** 2)))
         chosen, refused = candidates(declared.fitted.twin, config.candidates)
@@ -206,12 +219,21 @@ class _Trace:
         tracks = self.simulations.run([Job(twin, self.frames)])[0]
         return float("inf") if tracks is None else float(np.sum(white.residual(tracks) ** 2))
 
-    def _declared(self, white: Whitener, block_of_row: np.ndarray) -> Model:
+    def _too_coarse(self, numerics: dict[str, float], finer: Twin) -> bool:
+        """Whether finer cells change what counts, and can be afforded."""
+        if len(self.recordings.fitted) > 1 or self.recordings.held_out:
+            return False  # their other twins stay on the cells that were asked for
+        drive = self.simulations.drive
+        steps = float(drive.times[self.frames - 1] - drive.times[0]) / stable_step_s(finer, drive)
+        cost = finer.lattice.fill.size * steps
+        return numerics.get("finer cells", 0.0) > self.config.resolved and cost <= self.config.affordable
+
+    def _declared(self, white: Whitener, block_of_row: np.ndarray, shifts: tuple[float, ...]) -> Model:
         """The declared physics under the trace's own misfit."""
         self.simulations.stage = "declared physics"
         unknowns = self._calibrated_unknowns(self.twin)
         own = np.array([u.start for u in unknowns])
-        starts = [own + shift * np.eye(len(own))[0] for shift in _OTHER_STIFFNESSES]
+        starts = [own + shift * np.eye(len(own))[0] for shift in shifts]
         fitted = refit(
             self.simulations, white, self.twin, unknowns, self.frames, self.config.iterations, starts
         )
@@ -272,7 +294,7 @@ class _Trace:
             equivalent=tuple(named(m, e) for m, e in zip(verdict.equivalent, estimates[1:], strict=True)),
             calibrated=calibrated(estimates[0]),
             declared=declared,
-            split=self.split,
+            split=self.recordings.lead.split,
             sigma=sigma,
             path=path,
             candidates=chosen,

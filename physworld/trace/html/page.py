@@ -41,6 +41,7 @@ def render(report: dict[str, Any], scene: Scene, before: np.ndarray, after: np.n
     sections = [
         _head(report, found),
         _effects(report),
+        _recordings(report),
         _section(
             "Before and after",
             "Open loop from frame 0: each prediction sees the grips' motion and nothing of the points after the first "
@@ -97,7 +98,7 @@ def _head(report: dict[str, Any], found: Residuals) -> Html:
         _fact(
             "Held-out error",
             _arrow(words.millimetres(out.get("before")), words.millimetres(out.get("after")), changed),
-            _after_interval(out) if changed else f"on {len(found.times) - found.split} frames",
+            _after_interval(out) if changed else _where(report, len(found.times) - found.split),
         ),
         _fact("Noise floor", words.millimetres(out.get("noise_floor")), "of one coordinate of one point"),
         _fact(
@@ -119,6 +120,30 @@ def _head(report: dict[str, Any], found: Residuals) -> Html:
         tag("p", _sentence(str(report.get("reason", ""))), class_="quiet lead"),
         tag("div", *facts, class_="facts"),
     )  # fmt: skip
+
+
+def _where(report: dict[str, Any], frames: int) -> str:
+    unseen = sum(known.get("role") == "held_out" for known in report.get("recordings", ()))
+    return f"on {unseen} recordings that are held out" if unseen else f"on {frames} frames"
+
+
+def _recordings(report: dict[str, Any]) -> Html | None:
+    """Errors of each recording, where there are several."""
+    every = report.get("recordings", [])
+    if len(every) < 2:
+        return None
+    rows = []
+    for known in every:
+        first, end = known.get("frames", (0, 0))
+        role = "only measured" if known.get("role") == "held_out" else "fitted"
+        numbers = [words.millimetres(known.get(key)) for key in ("before", "after", "noise_floor")]
+        cells = [known.get("scene", ""), role, f"{first} to {end - 1}", *numbers]
+        rows.append(tag("tr", [tag("td", cell) for cell in cells]))
+    note = (
+        "Material and effects are the same for all. Errors are on frames not used. Pictures show the first."
+    )
+    head = ("recording", "", "frames", "before", "after", "noise")
+    return _section("Recordings", note, _table(head, rows))
 
 
 def _fact(name: str, value: str, note: str) -> Html:

@@ -52,6 +52,15 @@ def recording() -> tuple[Scene, np.ndarray, np.ndarray]:
     return scene, truth + drift, truth + 0.1 * drift
 
 
+def test_of_several_recordings_each_has_its_errors() -> None:
+    scene, before, after = recording()
+    known = {"frames": [1, 20], "before": 0.004, "after": 0.002, "noise_floor": 0.001}
+    every = [{"scene": "first", "role": "fitted", **known}, {"scene": HOSTILE, "role": "held_out", **known}]
+    page = render(report(recordings=every), scene, before, after)
+    assert "Recordings" in page and "only measured" in page and "1 to 19" in page and HOSTILE not in page
+    assert "only measured" not in render(report(recordings=every[:1]), scene, before, after)
+
+
 def report(**given: Any) -> dict[str, Any]:
     """A report with everything in it."""
     rate = {"value": 1.48, "unit": "1/s", "ci95": [1.3, 1.6]}
