@@ -65,11 +65,15 @@ def tasks(nulls: int) -> list[Task]:
     injected = [
         Task(body, name, level, 0)
         for level in (middle, high, low)
+        for body in (*_cheapest_first(bodies), GROUND_ONLY)
         for name in EFFECTS
-        for body in (*bodies, GROUND_ONLY)
         if body != GROUND_ONLY or _needs_ground(name)
     ]
     return without + injected
+
+
+def _cheapest_first(bodies: list[str]) -> list[str]:
+    return sorted(bodies, key=["rope", "beam", "sheet"].index)
 
 
 def _needs_ground(name: str) -> bool:
