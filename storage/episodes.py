@@ -16,7 +16,8 @@ import asyncio
 import hashlib
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Coroutine, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 
@@ -96,7 +97,7 @@ class EpisodeStore:
         header = {"format": FORMAT, "arrays": sorted(plain), "attributes": dict(attributes)}
         try:
             with writing(f"episode {path}", size, self._settings):
-                asyncio.run(_write_group(self._zarr(path), header, plain))
+                _finish(_write_group(self._zarr(path), header, plain))
         except StoreError:
             self._remove_quietly(path)
             raise
@@ -213,6 +214,17 @@ def _plain(name: str, array: NDArray[Any]) -> NDArray[Any]:
             f"array {name} is {array.dtype} with shape {array.shape}; numbers with axes are kept"
         )
     return np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
+
+
+def _finish(work: Coroutine[Any, Any, None]) -> None:
+    """Run ``work`` to its end on a loop of its own, in another thread where this one has a loop that runs."""
+    try:
+        asyncio.get_running_loop()
+    except RuntimeError:
+        asyncio.run(work)
+        return
+    with ThreadPoolExecutor(max_workers=1) as thread:
+        thread.submit(asyncio.run, work).result()
 
 
 async def _write_group(

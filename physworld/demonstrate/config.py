@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from types import MappingProxyType
 
 import numpy as np
 
@@ -116,7 +115,7 @@ class DemonstrationConfig:
             )
         if self.patterns is not None:
             check_weights(self.patterns)
-            object.__setattr__(self, "patterns", MappingProxyType(dict(self.patterns)))
+            object.__setattr__(self, "patterns", dict(self.patterns))
 
     def sigma_of(self, name: str) -> float:
         """σ of the log of one of ``PROPERTIES``; 0 where it is not perturbed."""

@@ -290,7 +290,7 @@ def test_a_dataset_shows_what_it_covers_and_what_was_rejected(
     expect(picture).to_be_visible()
     assert picture.evaluate("image => image.decode().then(() => image.naturalWidth)") > 400
     panel = visit.page.locator("#coverage")
-    expect(panel).to_contain_text("1 tries were rejected (1 UnstableSimulation)")
+    expect(panel).to_contain_text("1 try was rejected (1 UnstableSimulation)")
     expect(panel.locator("tbody tr")).to_contain_text("t = 0.31 s: <b>not</b> finite")
     with visit.page.expect_download() as download:
         panel.get_by_role("link", name="card.json").click()

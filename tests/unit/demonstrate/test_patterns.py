@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import pickle
 from collections import Counter
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -144,6 +145,12 @@ def test_the_mix_follows_its_weights(block, block_twin):
     motions = Counter(plan_episode(block, block_twin, config, seed).motion for seed in range(80))
     assert set(motions) == {"lift", "twist"}
     assert 46 <= motions["lift"] <= 74  # 60 expected, standard deviation 3.9
+
+
+def test_settings_survive_the_way_to_another_process():
+    config = DemonstrationConfig(patterns={"lift": 1.0})
+    assert pickle.loads(pickle.dumps(config)) == config
+    assert asdict(config)["patterns"] == {"lift": 1.0}
 
 
 def test_weights_that_are_no_mix_are_refused(limits, block):

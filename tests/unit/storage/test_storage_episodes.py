@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import resource
 import signal
 import subprocess
@@ -108,6 +109,14 @@ def test_a_truncated_shard_is_noticed(local: EpisodeStore, tmp_path: Path, kept:
     shard.write_bytes(data[: int(kept * len(data))])
     with pytest.raises(EpisodeCorrupt):
         local.verify(path, digest)
+
+
+def test_an_episode_is_written_where_an_event_loop_runs(local: EpisodeStore) -> None:
+    async def write() -> tuple[str, str]:
+        return local.write(DATASET, 0, 1, episode(), {})
+
+    path, digest = asyncio.run(write())
+    local.verify(path, digest)
 
 
 @given(
