@@ -85,14 +85,24 @@ def candidate_responses(
 
 
 def numerical_directions(
-    simulations: Simulations, scene: Scene, twin: Twin, base: np.ndarray, budget: int, refinement: float
+    simulations: Simulations,
+    scene: Scene,
+    twin: Twin,
+    base: np.ndarray,
+    budget: int,
+    refinement: float,
+    level: float = 1.0,
 ) -> tuple[dict[str, np.ndarray], Twin]:
-    """Changes of the prediction (frames, N, 3) that are the solver's own, by name; and the twin on finer cells."""
+    """Changes of the prediction (frames, N, 3) that are the solver's own, by name; and the twin on finer cells.
+
+    Args:
+        level: cells of ``twin`` are this many times smaller than the budget says.
+    """
     frames = len(base)
-    finer = refined(scene, twin, budget, refinement)
+    finer = refined(scene, twin, budget, level * refinement)
     variants = {
         "finer cells": Job(finer, frames),
-        "coarser cells": Job(refined(scene, twin, budget, 1.0 / refinement), frames),
+        "coarser cells": Job(refined(scene, twin, budget, level / refinement), frames),
         "half the time step": Job(twin, frames, 0.5),
     }
     found = zip(variants, simulations.run(list(variants.values())), strict=True)

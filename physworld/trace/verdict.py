@@ -89,7 +89,9 @@ def decide(
         reason = f"{what} fits best among {tried} effects but leaves too much to be named: {figures}"
         return Verdict(UNEXPLAINED, declared, (), reason)
     if agreement.get(best.names) is False and before <= config.near_floor:
-        reason = f"misfit {before:.2f} of the noise, and what {what} seems to explain moves with the resolution"
+        reason = (
+            f"misfit {before:.2f} of the noise, and what {what} seems to explain moves with the resolution"
+        )
         return Verdict(NOTHING, declared, (), reason)
     if agreement.get(best.names) is False:
         reason = f"the strength of {what} moves with the resolution: {figures}"
