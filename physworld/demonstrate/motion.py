@@ -88,7 +88,7 @@ def random_motion(
     Control points in no body stay where they are.
 
     Args:
-        pattern: which one; None: drawn by the ``weights`` of the patterns, all alike if None.
+        pattern: which one; None: drawn by the ``weights`` of the patterns, or the default ones.
         style: ``uniform`` gives the baseline instead of a pattern.
 
     Raises:

@@ -24,6 +24,11 @@ from physworld.demonstrate.paths import Stroke
 from physworld.errors import SceneUnsupported
 
 PATTERNS = ("single", "lift", "push", "stretch", "twist", "together", "bimanual", "hold_one")
+DEFAULT_WEIGHTS = {
+    **dict.fromkeys(("single", "together", "bimanual", "hold_one"), 4.0),
+    **dict.fromkeys(("lift", "push", "stretch", "twist"), 1.0),
+}
+"""Motions in any direction, as the paper's, four times as often as each directed one."""
 SHORTEST_STROKE = 0.3  # of the room along a directed stroke
 SIDEWAYS = 0.12  # spread of a directed stroke's end, as a share of the reach
 TWIST_RAD = 1.2
@@ -47,16 +52,15 @@ def patterns_for(limits: MotionLimits, first_pose: np.ndarray) -> tuple[str, ...
 
 
 def weighted(names: tuple[str, ...], weights: Mapping[str, float] | None) -> np.ndarray:
-    """Chances of the patterns ``names``, (n,); None: all alike.
+    """Chances of the patterns ``names``, (n,), by ``weights`` or ``DEFAULT_WEIGHTS``.
 
     Raises:
         SceneUnsupported: no weight is left for them; the message names the patterns that would do.
     """
-    given = np.array([1.0 if weights is None else float(weights.get(name, 0.0)) for name in names])
+    mix = DEFAULT_WEIGHTS if weights is None else weights
+    given = np.array([float(mix.get(name, 0.0)) for name in names])
     if not given.sum() > 0.0:
-        raise SceneUnsupported(
-            f"the mix {dict(weights or {})} leaves no pattern; this scene allows {', '.join(names)}"
-        )
+        raise SceneUnsupported(f"the mix {dict(mix)} leaves no pattern; this scene allows {', '.join(names)}")
     return given / given.sum()
 
 

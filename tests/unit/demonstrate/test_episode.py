@@ -142,7 +142,7 @@ def test_an_episode_that_cannot_be_simulated_is_replaced_and_the_reasons_are_kep
 
 def test_after_the_last_attempt_the_reason_is_raised(block, block_twin):
     jelly = block_twin.with_parameters(youngs_modulus_pa=100.0)
-    with pytest.raises(EpisodeRejected, match=r"all 2 tries were rejected \(2 x .*frame \d"):
+    with pytest.raises(EpisodeRejected, match=r"all 2 tries were rejected \(\d x .*frame \d"):
         make_episode(block, jelly, DemonstrationConfig(frames=40, attempts=2), 0)
 
 
