@@ -16,7 +16,7 @@ from services.dashboard import live
 from services.dashboard.access import require_same_origin, require_writer
 from services.dashboard.site import BASE, Site
 from services.dashboard.text import figure
-from storage import jobs, overview
+from storage import jobs, overview, runs
 
 PAGE_SIZE = 20
 EVENTS_SHOWN = 100
@@ -146,4 +146,11 @@ def _link(session: Session, reference: Reference) -> tuple[str, str]:
     if reference.kind == "scene":
         name = overview.scene_names(session, [reference.id]).get(reference.id, reference.id)
         return f"/scenes/{reference.id}", f"scene {name}"
-    return f"/{reference.kind}s/{reference.id}", f"{reference.kind} …{reference.id[-6:]}"
+    label = f"{reference.kind} …{reference.id[-6:]}"
+    if (
+        reference.kind == "rollout" or reference.kind == "plan"
+    ):  # no page of their own: their arrays, once they are there
+        job = runs.run_row(session, reference.kind, reference.id).job_id
+        name = f"{reference.id}.npz"
+        return (f"/artifacts/{reference.digest}?name={name}" if reference.digest else f"/jobs/{job}"), label
+    return f"/{reference.kind}s/{reference.id}", label

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import html
+import io
 import json
+import re
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+import httpx
 import numpy as np
 import pytest
 from inference_serving import Served, serve_inference
@@ -85,6 +89,21 @@ def test_a_large_batch_is_waited_for_and_is_the_same(served: Served, client: Cli
     alone = client.rollouts.create(served.model, batch[0])
     assert found.points[-1] == pytest.approx(alone.points[0], abs=SINGLE_PRECISION_M)
     assert client.rollouts.list(model=served.model).data[0].id == found.rollout.id
+
+
+def test_the_dashboard_shows_the_job_and_gives_its_arrays(served: Served, client: Client) -> None:
+    found = client.rollouts.create(served.model, paths(1), as_job=True, timeout=120)
+    with httpx.Client(base_url=served.url, follow_redirects=True, trust_env=False) as browser:
+        origin = {"Origin": served.url}
+        browser.post("/dashboard/login", data={"key": served.token, "next": "/dashboard/"}, headers=origin)
+        page = browser.get(f"/dashboard/jobs/{found.rollout.job_id}", headers={"Accept": "text/html"}).text
+        link = re.search(r'href="(/dashboard/artifacts/[^"]+)"', page)
+        assert link is not None
+        data = browser.get(html.unescape(link.group(1))).content
+        playground = browser.get(f"/dashboard/models/{served.model}/1/playground").text
+    with np.load(io.BytesIO(data)) as arrays:
+        assert np.array_equal(arrays["points"], found.points)
+    assert "data-playground" in playground
 
 
 def test_the_asynchronous_client_predicts_the_same(served: Served, client: Client) -> None:
