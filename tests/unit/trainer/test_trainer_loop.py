@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 import pytest
+from safetensors.numpy import load
 from tiny_scene import register, tiny_scene
 
 from physworld.effects.registry import effect
@@ -29,6 +30,7 @@ from workers.registry import register as register_handler
 from workers.stores import Stores
 from workers.tasks.inputs import named, npz_bytes, twin_of
 
+WEIGHTS = "model.safetensors"
 FRAMES = 48
 FIT = FitConfig(particle_budget=60, max_simulations=4)
 SMALL = TrainingConfig(
@@ -129,6 +131,12 @@ def test_the_card_says_which_effect_and_the_errors_before_and_after(
     assert section["effects_added"][0]["parameters"]["rate_per_s"]["ci95"] == [1.5, 2.5]
     assert "air_drag_linear (rate_per_s 2 1/s, 95 % 1.5 to 2.5)" in section["statement"]
     assert section["baseline_version"] == plain.version
+    strength = card["metrics"]["fine_tuning"]["strengths"]["air_drag_linear.rate_per_s"]
+    assert (strength["calibrated"], strength["ci95"]) == (2.0, [1.5, 2.5])
+    assert 1.5 <= strength["tuned"] <= 2.5
+    assert plain.metrics["fine_tuning"]["strengths"] == {}
+    weights = load(runtime.stores.artifacts.read_bytes(named(version.artifacts, WEIGHTS, "bar").sha256))
+    assert weights["norm.properties"].shape == (2,), "a published version takes no strengths"
     for name, row in (("twin", "twin"), ("world_model", "world_model_finetuned")):
         figures = section[name]
         assert figures["after_m"] == pytest.approx(version.metrics["held_out"]["track_m"][row])
