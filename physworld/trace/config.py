@@ -37,7 +37,7 @@ class TraceConfig:
         refinement: cells of the second resolution are this many times smaller.
         resolved: root mean squared change by finer cells, over the noise, beside what re-tuning can do, up to which a
             twin's cells are fine enough; else a trace of one recording goes on with the finer ones.
-        affordable: particles times time steps of a run on finer cells (50 ns each) up to which it does.
+        affordable: particles times time steps of a run on finer cells (50 ns each) up to which it does; 0: never.
         bootstraps: resamples of the intervals.
         seed: everything random follows from it.
         candidates: names of the registry to try; empty for all.
@@ -60,7 +60,7 @@ class TraceConfig:
     effects_at_most: int = 2
     refinement: float = 1.4
     resolved: float = 0.3
-    affordable: float = 1.5e7
+    affordable: float = 0.0
     bootstraps: int = 1000
     seed: int = 0
     candidates: tuple[str, ...] = ()
