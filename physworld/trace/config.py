@@ -52,7 +52,7 @@ class TraceConfig:
     decoys: int = 20
     material_share: float = 0.03
     near_floor: float = 1.2
-    acceptable: float = 2.0
+    acceptable: float = 1.5
     most_of_it: float = 0.7
     alike: float = 0.95
     confirmed: int = 8
