@@ -80,9 +80,8 @@ def in_words(kind: str, found: dict[str, Any]) -> str:
         ("static", "static"),
     ):
         mean, largest = found[name]["mean_m"], found[name]["largest_m"]
-        parts.append(
-            f"{label} {1e3 * mean['mean']:.2f} ± {1e3 * mean['std']:.2g} (at most {1e3 * largest['mean']:.3g})"
-        )
+        spread = f" ± {1e3 * mean['std']:.2g}" if found["seeds"] > 1 else ""
+        parts.append(f"{label} {1e3 * mean['mean']:.2f}{spread} (at most {1e3 * largest['mean']:.3g})")
     return f"Motion `{kind}`, {HORIZON} frames, distance from the twin in mm: {'; '.join(parts)}."
 
 
