@@ -151,7 +151,9 @@ def main() -> int:
     """Trace and score; 0 where every scene gave an answer."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.trace", description=__doc__)
     parser.add_argument("--set", type=Path, required=True, help="folder of scenes with their truth")
-    parser.add_argument("--json", type=Path, default=None)
+    parser.add_argument(
+        "--json", type=Path, default=None, help="figures; with --only, those of other scenes in it stay"
+    )
     parser.add_argument("--only", nargs="*", default=[], help="names of scenes; none: all")
     parser.add_argument("--resume", type=Path, default=None, help="folder that remembers simulations")
     parser.add_argument("--processes", type=int, default=2)
@@ -172,6 +174,12 @@ def main() -> int:
             row["wall_s"] = time.perf_counter() - begun
             rows.append(row)
             print(json.dumps(row), flush=True)
+    if given.only and given.json is not None and given.json.exists():
+        known = json.loads(given.json.read_text())
+        traced_now = {row["scene"] for row in rows} | set(failed)
+        rows += [row for row in known["scenes"] if row["scene"] not in traced_now]
+        failed += [name for name in known["failed"] if name not in traced_now]
+        rows.sort(key=lambda row: row["scene"])
     found = summary(rows)
     print(json.dumps(found, indent=2))
     if given.json is not None:
