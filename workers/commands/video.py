@@ -1,8 +1,9 @@
 """``python -m workers.commands.video MOTION.npz --out film.mp4``: draw a motion as a film, and score it against frames.
 
-MOTION.npz holds ``vertices``, ``particles`` or ``tracks`` (T, n, 3) [m] with ``times`` (T,) [s] or ``dt_s``: what
-``physworld rollout``, ``physworld fit --out`` and ``physworld trace --predictions`` write. ``rest`` (n, 3) is the state
-in which the splat shows the object; without it, the first frame is. Without a splat the points themselves are drawn.
+MOTION.npz holds ``vertices``, ``particles``, ``tracks`` or ``points``, (T, n, 3) [m] or a batch of them (B, T, n, 3), with
+``times`` (T,) [s] or ``dt_s``: what ``physworld rollout``, ``physworld fit --out`` and ``physworld trace --predictions``
+write. ``rest`` (n, 3) is the state in which the splat shows the object; without it, the first frame is. Without a splat
+the points themselves are drawn.
 
 ``--against`` takes a folder of pictures in the order of their names, or an npz with ``frames`` (T, H, W, 3) and, for
 the IoU, ``masks`` (T, H, W). ``--camera`` is JSON: ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy`` [px] and
@@ -38,6 +39,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="physworld video", description="Draw a motion as a film.")
     parser.add_argument("motion", type=Path, help="npz with vertices, particles or tracks, and times")
     parser.add_argument("--out", type=Path, required=True, help="the film, MP4")
+    parser.add_argument("--number", type=int, default=0, help="which motion of a batch")
     parser.add_argument("--gaussians", type=Path, default=None, help="splat of the object at rest, PLY")
     parser.add_argument("--camera", type=Path, default=None, help="camera, JSON")
     parser.add_argument("--size", default="640x480", help="of the film without a camera [px]")
@@ -69,7 +71,7 @@ def _film(given: argparse.Namespace) -> None:
     )
     from workers.commands.terminal import progress_bar
 
-    moved, rest, times = _motion(given.motion)
+    moved, rest, times = _motion(given.motion, given.number)
     camera = _camera(given, moved)
     if given.gaussians is not None:
         splat = from_ply(given.gaussians.read_bytes())
@@ -97,13 +99,17 @@ def _film(given: argparse.Namespace) -> None:
         given.json.write_text(json.dumps({"frames": len(pictures), "scores": scores}, indent=2) + "\n")
 
 
-def _motion(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _motion(path: Path, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Moved points (T, n, 3), the same at rest (n, 3), and times (T,). Raises ValueError with what is wrong."""
     arrays = _arrays(path)
     name = next((key for key in _MOTIONS if key in arrays), None)
     if name is None:
         raise ValueError(f"{path} holds {sorted(arrays)}, but none of {', '.join(_MOTIONS)}")
     moved = np.asarray(arrays[name], dtype=np.float64)
+    if moved.ndim == 4:  # a batch of rollouts
+        if not 0 <= number < len(moved):
+            raise ValueError(f"{name} in {path} holds {len(moved)} motions; there is no number {number}")
+        moved = moved[number]
     if moved.ndim != 3 or moved.shape[2] != 3 or moved.shape[0] < 2 or moved.shape[1] < 2:
         raise ValueError(
             f"{name} in {path} must be of shape (T, n, 3) with T and n from 2 on, got {moved.shape}"

@@ -63,6 +63,23 @@ def test_a_film_its_frames_and_equal_scores(motion: Path, tmp_path: Path) -> Non
     assert found == {"psnr_db": None, "ssim": pytest.approx(1.0), "iou": None, "lpips": "not measured"}
 
 
+def test_one_motion_of_a_batch(motion: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arrays = np.load(motion)
+    batch = tmp_path / "batch.npz"
+    still = np.repeat(arrays["vertices"][:1], FRAMES, axis=0)
+    np.savez(batch, points=np.stack([still, arrays["vertices"]]), times=arrays["times"])
+    folder = tmp_path / "still"
+    given = [str(batch), "--out", str(tmp_path / "a.mp4"), "--size", "64x48", "--frames", str(folder)]
+    assert video.main(given) == 0
+    pictures = [np.asarray(Image.open(file)) for file in sorted(folder.iterdir())]
+    assert all(np.array_equal(picture, pictures[0]) for picture in pictures)
+    assert video.main([*given, "--number", "1"]) == 0
+    pictures = [np.asarray(Image.open(file)) for file in sorted(folder.iterdir())]
+    assert not np.array_equal(pictures[-1], pictures[0])
+    assert video.main([*given, "--number", "2"]) == 2
+    assert "holds 2 motions; there is no number 2" in capsys.readouterr().err
+
+
 def test_a_splat_a_camera_masks_and_a_network(motion: Path, tmp_path: Path) -> None:
     moved = np.load(motion)["vertices"]
     splat, camera, frames = tmp_path / "s.ply", tmp_path / "c.json", tmp_path / "f.npz"

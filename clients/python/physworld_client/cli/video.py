@@ -15,6 +15,7 @@ MODULE = "workers.commands.video"
 def video(
     motion: Annotated[Path, typer.Argument(help="npz with vertices, particles or tracks, and times.")],
     out: Annotated[Path, typer.Option(help="The film, MP4.")],
+    number: Annotated[int | None, typer.Option(help="Which motion of a batch [0].")] = None,
     gaussians: Annotated[Path | None, typer.Option(help="Splat of the object at rest, PLY.")] = None,
     camera: Annotated[Path | None, typer.Option(help="Camera, JSON.")] = None,
     size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHT without a camera [640x480].")] = None,
@@ -29,6 +30,7 @@ def video(
     """Draw a motion with the Gaussians that it carries; needs no service."""
     given = {
         "--out": out,
+        "--number": number,
         "--gaussians": gaussians,
         "--camera": camera,
         "--size": size,
