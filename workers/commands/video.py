@@ -1,9 +1,9 @@
 """``python -m workers.commands.video MOTION.npz --out film.mp4``: draw a motion as a film, and score it against frames.
 
-MOTION.npz holds ``vertices``, ``particles``, ``tracks`` or ``points``, (T, n, 3) [m] or a batch of them (B, T, n, 3), with
-``times`` (T,) [s] or ``dt_s``: what ``physworld rollout``, ``physworld fit --out`` and ``physworld trace --predictions``
-write. ``rest`` (n, 3) is the state in which the splat shows the object; without it, the first frame is. Without a splat
-the points themselves are drawn.
+MOTION.npz holds ``vertices``, ``particles``, ``tracks`` or ``points``, (T, n, 3) [m] or a batch of them, with ``times``
+(T,) [s] or ``dt_s``: what ``physworld rollout``, ``physworld fit --out`` and ``physworld trace --predictions`` write.
+``rest`` (n, 3) is the state in which the splat shows the object; without it, the first frame is. Without a splat the
+points themselves are drawn.
 
 ``--against`` takes a folder of pictures in the order of their names, or an npz with ``frames`` (T, H, W, 3) and, for
 the IoU, ``masks`` (T, H, W). ``--camera`` is JSON: ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy`` [px] and
