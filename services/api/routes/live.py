@@ -12,7 +12,7 @@ from typing import Any
 from urllib.parse import urlencode
 
 import structlog
-from fastapi import APIRouter, WebSocket
+from fastapi import APIRouter, Response, WebSocket
 from starlette.concurrency import run_in_threadpool
 from starlette.websockets import WebSocketState
 from websockets.asyncio.client import ClientConnection, connect
@@ -21,12 +21,14 @@ from websockets.exceptions import ConnectionClosed, WebSocketException
 from schemas.live import LiveTicket, LiveTicketCreate
 from services.api.dependencies import DatabaseDep, PrincipalDep, SettingsDep
 from services.api.errors import documented
+from services.api.idempotency import IdempotencyDep, answer_of
 from services.api.inference import unavailable
 from services.api.routes.rollouts import ready_version
 from storage import api_keys, registry, tickets
 from storage.api_keys import ApiKey
 from storage.database import Database
 from storage.errors import StorageError
+from storage.idempotency import Answer
 from storage.settings import Settings
 
 router = APIRouter(prefix="/live", tags=["live"])
@@ -40,20 +42,30 @@ PASSED_CODES = frozenset({1000, 1001, 1007, 1008, 1013, *range(4000, 5000)})
 log = structlog.get_logger("physworld.live")
 
 
-@router.post("/tickets", status_code=201, responses=documented(401, 403, 404, 409, 413, 422, 503))
+@router.post(
+    "/tickets",
+    status_code=201,
+    response_model=LiveTicket,
+    responses=documented(401, 403, 404, 409, 413, 422, 503),
+)
 def create_ticket(
-    body: LiveTicketCreate, database: DatabaseDep, settings: SettingsDep, principal: PrincipalDep
-) -> LiveTicket:
-    """A ticket for one live session, good for one connection within a minute."""
-    return issue(database, settings, principal.id, body.model, body.version)
+    body: LiveTicketCreate,
+    idempotency: IdempotencyDep,
+    database: DatabaseDep,
+    settings: SettingsDep,
+    principal: PrincipalDep,
+) -> Response:
+    """A ticket for one live session, good for one connection within a minute. A replay holds no ticket."""
+    made = issue(database, settings, principal.id, body.model, body.version)
+    return idempotency.run(body, lambda session: answer_of(201, made), stored=_without_ticket)
 
 
 def issue(database: Database, settings: Settings, key_id: str, model: str, version: int | str) -> LiveTicket:
     """The ticket and the address that takes it. Raises NotFound, or ApiProblem: 409, 503."""
-    if not settings.inference_url:
-        raise unavailable("no inference service belongs to this installation")
     with database.session() as session:
         found = ready_version(registry.get_version(session, model, version))
+        if not settings.inference_url:
+            raise unavailable("no inference service belongs to this installation")
         ticket, until = tickets.issue(session, key_id, _subject(model, found.version))
     query = urlencode({"model": model, "version": found.version, "ticket": ticket})
     return LiveTicket(
@@ -92,6 +104,11 @@ async def live(socket: WebSocket) -> None:
         log.warning("live_session_not_opened", error=str(error))
         with suppress(RuntimeError):
             await socket.close(UNAVAILABLE, "the inference service does not answer")
+
+
+def _without_ticket(answer: Answer) -> Answer:
+    made = LiveTicket.model_validate_json(answer.body)
+    return answer_of(answer.status, made.model_copy(update={"ticket": "", "path": ""}), answer.headers)
 
 
 def _subject(model: str, version: int) -> str:
