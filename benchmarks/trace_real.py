@@ -234,8 +234,8 @@ def page(rows: list[dict[str, Any]]) -> Report:
         notes=[
             "Errors in mm, root mean square per axis, open loop, on recordings or frames that no step has seen. "
             "After: with what the verdict names. Would be: with the model that predicts left-out training blocks best, "
-            "whether or not it may be named, without what training frames say of the points' places; no claim. Best baseline: the best of static, rigid follow and constant "
-            "velocity.",
+            "whether or not it may be named, without what training frames say of the points' places; no claim. Best "
+            "baseline: the best of static, rigid follow and constant velocity.",
             *notes,
             *_not_run(rows),
         ],
