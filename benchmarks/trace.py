@@ -187,11 +187,12 @@ def main() -> int:
             json.dumps({"scenes": rows, "summary": found, "failed": failed}, indent=2) + "\n"
         )
     if given.docs is not None:
-        write_section(_report(rows, found), given.docs)
+        there = {row["scene"] for row in rows}
+        write_section(_report(rows, found, [s.name for s in scenes if s.name not in there]), given.docs)
     return 1 if failed else 0
 
 
-def _report(rows: list[dict[str, Any]], found: dict[str, Any]) -> Report:
+def _report(rows: list[dict[str, Any]], found: dict[str, Any], missing: list[str]) -> Report:
     header = ("scene", "acts", "verdict", "named (or)", "strength", "before", "after", "noise", "removed",
               "sims", "seconds")  # fmt: skip
     table = []
@@ -218,6 +219,7 @@ def _report(rows: list[dict[str, Any]], found: dict[str, Any]) -> Report:
         f"{found['clear_right']} of {found['clear']} clear effects right, {found['false_names']} named where none "
         f"acts, {found['wrong_names']} wrong names; {found['strength_within_25_percent']} of {found['strengths']} "
         "strengths within 25 %. Errors in mm, root mean square per axis; strength is found over true.",
+        f"Not traced in this version: {', '.join(missing) or 'none'}.",
     )
     return Report(
         name="trace", title="Undeclared effects", figures={"scenes": rows, **found}, header=header,
