@@ -16,6 +16,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import os
+import tempfile
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -90,15 +91,15 @@ def list_signing_keys(session: Session, *, limit: int = 50, cursor: str | None =
 def _make(path: Path) -> None:
     """Write a new key, readable by its owner only; of two that start at once the first one's stays."""
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}")
-    descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+    # A name of its own for every thread: the link shares the file with it. mkstemp's mode is 0600.
+    descriptor, part = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     with os.fdopen(descriptor, "wb") as file:
         file.write(base64.b64encode(os.urandom(KEY_BYTES)) + b"\n")
         file.flush()
         os.fsync(file.fileno())
     with suppress(FileExistsError):
         os.link(part, path)
-    part.unlink()
+    Path(part).unlink()
 
 
 def _read(path: Path) -> str:

@@ -165,7 +165,11 @@ def test_named_volumes_are_declared(text: str) -> None:
         ("api", "services.web services.api.migrate", "torch warp celery kombu workers benchmarks"),
         ("worker", "workers.__main__ workers.dispatcher workers.app", "torch warp services benchmarks"),
         ("trainer", "services.trainer.__main__ workers.app", "torch warp fastapi benchmarks"),
-        ("inference", "services.inference.__main__ services.inference.lazy workers.app", "torch warp benchmarks"),
+        (
+            "inference",
+            "services.inference.__main__ services.inference.lazy workers.app",
+            "torch warp benchmarks",
+        ),
     ],
 )
 def test_an_image_holds_what_its_process_imports(

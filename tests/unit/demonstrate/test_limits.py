@@ -19,7 +19,7 @@ from physworld.demonstrate.limits import (
 def test_a_still_recording_still_allows_motion(held_block, block_twin):
     limits = limits_of(held_block(moving=False), block_twin)
     size = limits.size_m
-    assert size == pytest.approx(0.2, rel=0.1)
+    assert 0.2 <= size < 0.23  # cells end at the grips, and so a little beyond the block
     np.testing.assert_allclose(limits.reach_max_m, REACH_FLOOR * size)
     np.testing.assert_allclose(limits.reach_min_m, -REACH_FLOOR * size)
     assert limits.speed_m_s == pytest.approx(SPEED_FLOOR * size)

@@ -23,6 +23,7 @@ from storage.tables import Base, JobRow, SceneRow, utc_now
 if TYPE_CHECKING:
     from conftest import Work
 
+NEWEST = "0004"
 SPAWN = multiprocessing.get_context("spawn")
 
 
@@ -42,7 +43,7 @@ def test_an_upgrade_twice_is_one(database: Database) -> None:
     revision = database.revision()
     database.upgrade()
     database.check()
-    assert database.revision() == revision == "0002"
+    assert database.revision() == revision == NEWEST
 
 
 def test_processes_that_upgrade_at_once_do_not_collide(tmp_path: Path) -> None:
@@ -58,7 +59,7 @@ def test_processes_that_upgrade_at_once_do_not_collide(tmp_path: Path) -> None:
 def test_a_database_without_tables_is_not_ready(tmp_path: Path) -> None:
     database = Database(f"sqlite:///{tmp_path / 'empty.db'}")
     assert database.revision() is None
-    with pytest.raises(DatabaseUnavailable, match="has revision None, this code needs 0002"):
+    with pytest.raises(DatabaseUnavailable, match=f"has revision None, this code needs {NEWEST}"):
         database.check()
     database.dispose()
 

@@ -46,6 +46,11 @@ def cloud() -> bytes:
     return buffer.getvalue()
 
 
+ENORMOUS = (
+    b"ply\nformat binary_little_endian 1.0\nelement vertex 900000000000\nproperty float x\nend_header\n"
+)
+
+
 @pytest.mark.parametrize(
     ("content", "said"),
     [
@@ -56,7 +61,7 @@ def cloud() -> bytes:
         (broken(x=np.array([0, np.nan, 1, np.inf])), "2 of 4 Gaussians"),
         (broken(rot_0=0.0, rot_1=0.0, rot_2=0.0, rot_3=0.0), "4 rotations of length 0"),
         (broken(scale_0=50.0), "to 50"),
-        (b"ply\nformat binary_little_endian 1.0\nelement vertex 900000000000\nproperty float x\nend_header\n", "PLY|900"),
+        (ENORMOUS, "PLY|900"),
     ],
 )  # fmt: skip
 def test_what_is_no_splat_is_refused_with_its_numbers(content: bytes, said: str) -> None:
