@@ -46,7 +46,7 @@ class DemonstrationConfig:
         frames: ticks of an episode; None: as many as the recording lasts, at most ``max_frames``.
         max_frames: keeps long recordings affordable.
         motion: ``vmp``: Bézier paths at three-phase speed (VMP-Gen); ``linear``: straight lines at constant speed.
-        patterns: weights of the patterns of ``physworld.demonstrate.patterns``; None: ``DEFAULT_WEIGHTS``.
+        patterns: weights of the patterns of ``physworld.demonstrate.patterns``; None: the free ones alike.
         replay_share: share of episodes that replay the recording's training frames, plain or varied.
         curvature_limit: largest curvature of a path times its chord (6: no turn tighter than a sixth of the chord).
         arc_tolerance: relative accuracy of the arc-length parameterisation.
