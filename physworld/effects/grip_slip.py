@@ -17,26 +17,12 @@ import warp as wp
 
 from physworld.effects.base import Effect, Strength
 from physworld.effects.places import gravity_size, held_count
+from physworld.mpm.node_kernels import on_path
 from physworld.mpm.terms import BoundTerm
 from physworld.mpm.total_lagrangian import HeldNodes, Problem, nodal_mass
 
 if TYPE_CHECKING:
     from physworld.twin import Twin
-
-
-@wp.func
-def on_path(
-    path_x: wp.array2d(dtype=wp.float64), path_v: wp.array2d(dtype=wp.float64), frame: int, k: int,
-    s: wp.float64, span: wp.float64,
-):  # fmt: skip
-    """Cubic Hermite between two frames at the share ``s`` of their interval ``span`` [s]."""
-    s2 = s * s
-    s3 = s2 * s
-    h01 = wp.float64(3.0) * s2 - wp.float64(2.0) * s3
-    start = path_x[frame, k]
-    goal = start + h01 * (path_x[frame + 1, k] - start)
-    goal += span * (s3 - wp.float64(2.0) * s2 + s) * path_v[frame, k]
-    return goal + span * (s3 - s2) * path_v[frame + 1, k]
 
 
 @wp.kernel

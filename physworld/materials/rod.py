@@ -2,8 +2,8 @@
 
     W = EA/2 (|x'| - 1)^2 + B/2 |k|^2       k = x' x x'' / |x'|^3       B = EI
 
-The rod is isotropic about its axis. Twist is not carried: it would need an angle at every node beside the position, and
-it decouples from an isotropic rod whose ends are not twisted (Bergou et al. 2008).
+The rod is isotropic about its axis. Its twist decouples from the centre line but for the two ends of a piece that is
+held at both (Bergou et al. 2008): there GJ = ``torsion_ratio`` EI counts, as :mod:`physworld.mpm.twist` has it.
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ class RodLaw:
         bending_n_m2: B = EI, bending stiffness [N m^2].
         relaxation_s: Kelvin-Voigt time tau of bending.
         density_kg_m: mass per length.
+        torsion_ratio: GJ / EI, torsional over bending stiffness: 1 / (1 + nu) of a round section, the default that of
+            nu = 0.3. It counts where grips hold the section at two places; 0: no twist is carried.
     """
 
     name: ClassVar[str] = "rod"
@@ -31,6 +33,12 @@ class RodLaw:
     bending_n_m2: float
     relaxation_s: float = 0.0
     density_kg_m: float = 0.05
+    torsion_ratio: float = 1.0 / 1.3
+
+    @property
+    def torsion_n_m2(self) -> float:
+        """GJ, torsional stiffness [N m^2]."""
+        return self.torsion_ratio * self.bending_n_m2
 
     @property
     def wave_speed_m_s(self) -> float:

@@ -1,10 +1,11 @@
 """The reverse pass of terms: d(w . f) / dx and / dv of whatever a bound term adds to the forces.
 
-Three kinds of terms are told apart:
+Terms of two kinds are taken back here, twist by :mod:`physworld.mpm.adjoint_twist`:
 
 * a term of plain Warp kernels: its launches are recorded once on a tape, and Warp's own adjoint kernels are launched;
-* a :class:`physworld.mpm.stress.BoundStress`: native code, by :mod:`physworld.mpm.adjoint_stress_kernels`;
-* growing stiffness, which multiplies the forces that are there: what came before it sees a multiplied w.
+* a :class:`physworld.mpm.stress.BoundStress`: native code, by :mod:`physworld.mpm.adjoint_stress_kernels`.
+
+Growing stiffness multiplies the forces that are there: what came before it sees a multiplied w.
 
 Memory that a term carries from substep to substep (``BoundTerm.memory``) is kept row by row in the forward pass and put
 back here; its derivatives run backwards beside those of the state.
@@ -97,17 +98,6 @@ class TermAdjoint(Protocol):
 def memories_of(term: BoundTerm, rows: int) -> list[Memory]:
     """One for each array that the term remembers."""
     return [Memory(array, rows) for array in getattr(term, "memory", ())]
-
-
-def adjoint_of(term: BoundTerm, problem: Problem, now: Reverse, memories: list[Memory]) -> TermAdjoint:
-    """The reverse pass of a bound term whose ``begin`` has been called.
-
-    Raises:
-        NotDifferentiable: one of its kernels was compiled without a backward pass.
-    """
-    if isinstance(term, BoundStress):
-        return StressAdjoint(term, problem, memories)
-    return RecordedAdjoint(term, problem.nodal_mass(), now, memories)
 
 
 class RecordedAdjoint:

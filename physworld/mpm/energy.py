@@ -4,8 +4,9 @@
            + work of the grips + work of terms - taken by drag - taken by internal friction
 
 Works are summed substep by substep inside the run by a meter that is the last of the problem's terms; stored energies
-come from the laws' energy densities at the frames. With no friction the remainder ``lost`` is the integrator's own: a
-leapfrog step conserves energy up to a bounded oscillation of second order in dt.
+come from the laws' energy densities at the frames. A rope's twist is stored energy too, and its grips work by turning
+its ends: that is summed from moment and turns, not from the energy. With no friction the remainder ``lost`` is the
+integrator's own: a leapfrog step conserves energy up to a bounded oscillation of second order in dt.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from physworld.materials.sheet import sheet_strains
 from physworld.mpm.energy_kernels import keep_forces, sum_works
 from physworld.mpm.forces import InternalForces
 from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian
+from physworld.mpm.twist import Twist, TwistMeter
 
 _AFTER_S = 1e-4  # the meter reads a frame when the next one starts: one more, this short, follows the last
 
@@ -34,8 +36,8 @@ class EnergyLedger:
         times: frames [s].
         kinetic: sum of m v^2 / 2 over the nodes.
         gravitational: - sum of m g . x, zero at the first frame.
-        elastic: stored by the law.
-        grip_work: done by the prescribed nodes on the rest.
+        elastic: stored by the law, twist included.
+        grip_work: done by the prescribed nodes on the rest, and by turning a rope's ends.
         term_work: done by contacts and effects on the body (negative where they take energy).
         drag: taken by linear air drag.
         internal_friction: taken by the law's own friction.
@@ -108,6 +110,7 @@ def run_with_ledger(
     )
     nodes = solver.run(x, v, longer, after, progress)[:-1]
     work, velocity = meter.read()
+    turning, twisted = meter.read_twist()
     velocity[:, held.nodes] = held.velocities
     mass = solver.mass
     kinetic = 0.5 * np.einsum("n,tni->tn", mass, velocity**2)
@@ -118,16 +121,16 @@ def run_with_ledger(
         times=np.asarray(times, dtype=float),
         kinetic=kinetic.sum(axis=1),
         gravitational=height.sum(axis=1),
-        elastic=elastic_energy(problem, nodes),
-        grip_work=(of_grips - of_grips[0]).sum(axis=1) - work[:, 2, held.nodes].sum(axis=1),
-        term_work=(work[:, 2] - work[:, 1]).sum(axis=1),
-        drag=work[:, 3, free].sum(axis=1),
+        elastic=elastic_energy(problem, nodes) + twisted,
+        grip_work=(of_grips - of_grips[0]).sum(axis=1) - work[:, 2, held.nodes].sum(axis=1) + turning,
+        term_work=(work[:, 2] - work[:, 1] - work[:, 3]).sum(axis=1),
+        drag=work[:, 4, free].sum(axis=1),
         internal_friction=(work[:, 0] - work[:, 1]).sum(axis=1),
     )
 
 
 def elastic_energy(problem: Problem, nodes: np.ndarray) -> np.ndarray:
-    """Energy stored by the law [J], (T,), at nodal positions (T, n, 3) [m]."""
+    """Energy stored by the law but for twist [J], (T,), at nodal positions (T, n, 3) [m]."""
     lattice, law = problem.lattice, problem.law
     measure = lattice.particle_measures
     if problem.stiffness_factor is not None:
@@ -208,8 +211,11 @@ class _Meter:
             wp.float64(problem.drag_per_s),
         ]
         self._internal, self._elastic = zeros(3 * n), zeros(3 * n)
-        self._state = [self._elastic, zeros(3 * n), zeros((3, 3 * n)), zeros(n), zeros((4, n))]
-        self._outputs = [zeros((self._frames + 1, 4, n)), zeros((self._frames + 1, 3 * n))]
+        self._twist = zeros(3 * n)
+        self._state = [self._elastic, self._twist, zeros(3 * n), zeros((4, 3 * n)), zeros(n), zeros((5, n))]
+        self._outputs = [zeros((self._frames + 1, 5, n)), zeros((self._frames + 1, 3 * n))]
+        twists = [term.bind(problem) for term in problem.terms if isinstance(term, Twist)]
+        self._twists = [(twist, TwistMeter(twist, self._frames + 1)) for twist in twists]
         return self._internal
 
     def bind(self, problem: Problem) -> _Meter:
@@ -223,6 +229,9 @@ class _Meter:
 
     def launch(self, x: wp.array, v: wp.array, clock: wp.array, counter: wp.array, force: wp.array) -> None:
         self._elastic_law.launch(x, clock, self._elastic)
+        for twist, turning in self._twists:
+            twist.launch(x, v, clock, counter, self._twist)
+            turning.add(counter)
         wp.launch(
             sum_works,
             dim=len(x) // 3,
@@ -232,9 +241,15 @@ class _Meter:
         )
 
     def read(self) -> tuple[np.ndarray, np.ndarray]:
-        """Works (T, 4, n) [J] and velocities (T, n, 3) [m/s] at the frames."""
+        """Works (T, 5, n) [J] and velocities (T, n, 3) [m/s] at the frames."""
         work, velocity = (array.numpy()[: self._frames] for array in self._outputs)
         return work.copy(), velocity.reshape(self._frames, -1, 3).copy()
+
+    def read_twist(self) -> tuple[np.ndarray, np.ndarray]:
+        """Work of grips that turn a rope's ends and energy of its twist at the frames [J], (T,) each."""
+        found = [turning.read() for _, turning in self._twists]
+        work, energy = (sum((f[k] for f in found), np.zeros(self._frames + 1)) for k in range(2))
+        return work[: self._frames], energy[: self._frames]
 
 
 def without_friction(law: Law) -> Law:

@@ -3,7 +3,7 @@
 Works are taken by the trapezoidal rule along the path of a node, (f_n + f_(n+1))/2 . (x_(n+1) - x_n): the sum that a
 symplectic step conserves to second order in dt. The velocity of a step is the node's displacement over dt.
 
-Legend: column of a sum: 0 elastic, 1 internal (elastic and internal friction), 2 all forces, 3 drag.
+Legend: column of a sum: 0 elastic, 1 internal (elastic and internal friction), 2 all forces, 3 twist, 4 drag.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ def sum_works(
     total: wp.array(dtype=wp.float64),
     # in, out
     elastic: wp.array(dtype=wp.float64),
+    twist: wp.array(dtype=wp.float64),
     last_x: wp.array(dtype=wp.float64),
     last_force: wp.array2d(dtype=wp.float64),
     last_dt: wp.array(dtype=wp.float64),
@@ -54,23 +55,24 @@ def sum_works(
     half = wp.float64(0.5) * last_dt[node]
     if first:
         half = wp.float64(0.5) * clock[2]
-        for column in range(4):
+        for column in range(5):
             work[column, node] = wp.float64(0.0)
     for axis in range(3):
         i = 3 * node + axis
         moved = x[i] - last_x[i]
         if first:
             moved = wp.float64(0.0)
-        works = wp.vec3d(elastic[i], internal[i], total[i])
-        for column in range(3):
+        works = wp.vec4d(elastic[i], internal[i], total[i], twist[i])
+        for column in range(4):
             work[column, node] += wp.float64(0.5) * (works[column] + last_force[column, i]) * moved
             last_force[column, i] = works[column]
-        work[3, node] += mass[node] * drag * v[i] * moved
+        work[4, node] += mass[node] * drag * v[i] * moved
         if frame:
             v_out[counter[0], i] = v[i] + half * (total[i] / mass[node] + gravity[axis] - drag * v[i])
         last_x[i] = x[i]
         elastic[i] = wp.float64(0.0)
+        twist[i] = wp.float64(0.0)
     if frame:
-        for column in range(4):
+        for column in range(5):
             work_out[counter[0], column, node] = work[column, node]
     last_dt[node] = clock[2]

@@ -20,8 +20,9 @@ import warp as wp
 
 from physworld.errors import NotDifferentiable
 from physworld.materials.laws import Law, SheetLaw, SolidLaw
-from physworld.mpm.adjoint import Gradient, RecordedRun
+from physworld.mpm.adjoint import RecordedRun
 from physworld.mpm.adjoint_pairs import ForcePair, ForceSide
+from physworld.mpm.adjoint_reverse import Gradient
 from physworld.mpm.forces import InternalForces
 from physworld.mpm.stress import BoundStress
 from physworld.mpm.terms import BoundTerm
@@ -117,7 +118,7 @@ class _Comparison:
                 np.zeros(len(g.law)) if s.stiffness_factor is None else np.log(s.stiffness_factor)
                 for s in (p, q)
             ]
-            total += float(g.log_stiffness @ (factors[0] - factors[1]))
+            total += float((g.log_stiffness - g.twist) @ (factors[0] - factors[1]))  # twist is launched
         for place, numbers, fields in self._stresses:
             bars = g.stresses[place]
             assert bars is not None

@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from physworld.geometry.rigid import least_rotation
-from physworld.mpm.adjoint import MEMORY_MB, Adjoint, Gradient
+from physworld.mpm.adjoint import MEMORY_MB, Adjoint
+from physworld.mpm.adjoint_reverse import Gradient
 from physworld.mpm.gradient import Direction, gradients
 from physworld.twin import Twin
 

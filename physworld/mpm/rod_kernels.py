@@ -2,10 +2,10 @@
 
     W = EA / 2 (|x'| - 1)^2 + B / 2 |k|^2     k = x' x x'' / |x'|^3     B = EI
 
-The rod is isotropic and its ends do not twist it, so twist decouples and is not carried (Bergou et al. 2008, the
-twist-free case). Internal friction is of Kelvin-Voigt kind with the time tau, on the corotational rate of bending, so
-that a rigid turn dissipates nothing. One cell a thread, its 2 particles are the lanes. The pieces of the text are
-written over a type S and shared with the tangent (:mod:`physworld.mpm.thin_tangent_kernels`).
+The rod is isotropic, so its twist decouples but for the ends that grips hold (:mod:`physworld.mpm.twist`). Internal
+friction is of Kelvin-Voigt kind with the time tau, on the corotational rate of bending, so that a rigid turn dissipates
+nothing. One cell a thread, its 2 particles are the lanes. The pieces of the text are written over a type S and shared
+with the tangent (:mod:`physworld.mpm.thin_tangent_kernels`).
 
 Legend: t = x', c = x'' at a particle; St, Sc the forces on them; EA, B stiffnesses times the particle's length.
 """

@@ -10,7 +10,8 @@ import pytest
 from bodies import GRAVITY, RodLaw, SheetLaw, SolidLaw, clamped_lattice, rest_nodes
 
 from physworld.errors import UnstableSimulation
-from physworld.mpm.adjoint import Adjoint, Gradient, RecordedRun
+from physworld.mpm.adjoint import Adjoint, RecordedRun
+from physworld.mpm.adjoint_reverse import Gradient
 from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian
 
 SHAPES = ("solid", "solid with friction", "sheet", "sheet with friction", "rod", "rod with friction")
