@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from physworld.colliders import carried, twin_colliders
+from physworld.errors import SceneUnsupported
 from physworld.geometry.declared import grips_of
 from physworld.geometry.reference import ReferenceBody, reference_body
 from physworld.geometry.rigid import rigid_groups
-from physworld.grips import gripped_nodes
+from physworld.grips import gripped_nodes, why_no_turn
 from physworld.materials.laws import Law, RodLaw, SheetLaw, SolidLaw
 from physworld.materials.plastic import Plasticity
 from physworld.mpm.choose import choose_formulation
@@ -64,6 +65,8 @@ def build_twin(
         nodes = np.setdiff1d(gripped_nodes(body, controls[0, group], region), taken)
         held.append(nodes)
         taken = np.concatenate([taken, nodes])
+    turning, notes = _turning(scene, body, controls[0], groups, held)
+    body = replace(body, notes=(*body.notes, *notes))
     friction = scene.ground.friction if scene.ground is not None else None
     return Twin(
         body=body,
@@ -76,11 +79,34 @@ def build_twin(
         held_nodes=tuple(held),
         controllers_start=controls[0],
         release_s=_release_time(scene),
+        turning=turning,
         colliders=twin_colliders(scene, body.half_thickness_m, PRIOR_FRICTION),
         plasticity=plasticity,
         formulation=choice.formulation,
         device=device,
     )
+
+
+def _turning(
+    scene: Scene,
+    body: ReferenceBody,
+    first: np.ndarray,
+    groups: tuple[np.ndarray, ...],
+    held: list[np.ndarray],
+) -> tuple[tuple[int, ...], tuple[str, ...]]:
+    """Grips of a rope between which it carries twist, and a note on every other one; of one grip alone nothing."""
+    if body.lattice.dim != 1 or sum(len(nodes) > 0 for nodes in held) < 2:
+        return (), ()
+    reasons = {
+        number: why_no_turn(body, nodes, first[group], scene.noise_sigma_m)
+        for number, (group, nodes) in enumerate(zip(groups, held, strict=True))
+        if len(nodes)
+    }
+    turning = tuple(number for number, reason in reasons.items() if reason is None)
+    notes = [f"grip {number} prescribes no twist: {reason}" for number, reason in reasons.items() if reason]
+    if len(turning) > 1:
+        notes.append(f"twist is carried between grips {', '.join(map(str, turning))}")
+    return turning, tuple(notes)
 
 
 def _prior_law(scene: Scene, body: ReferenceBody) -> Law:
@@ -99,7 +125,20 @@ def _prior_law(scene: Scene, body: ReferenceBody) -> Law:
     if lattice.dim == 2:
         membrane = modulus * section / (1 - 0.3**2)
         return SheetLaw(membrane, membrane * section**2 / 12, density_kg_m2=density)
-    return RodLaw(stretching_n=density * 40.0**2, bending_n_m2=density * 1e-2, density_kg_m=density)
+    prior = RodLaw(stretching_n=density * 40.0**2, bending_n_m2=density * 1e-2, density_kg_m=density)
+    return replace(prior, torsion_ratio=_torsion_ratio(scene, prior.torsion_ratio))
+
+
+def _torsion_ratio(scene: Scene, prior: float) -> float:
+    """GJ / EI as ``body.torsion_ratio`` declares it, else ``prior``."""
+    declared = (scene.declared.get("body") or {}).get("torsion_ratio")
+    if declared is None:
+        return prior
+    if isinstance(declared, bool) or not isinstance(declared, int | float) or not 0 <= declared < np.inf:
+        raise SceneUnsupported(
+            f"body.torsion_ratio is {declared!r}; it is GJ / EI of a rope, 0 or more (0: no twist)"
+        )
+    return float(declared)
 
 
 def _release_time(scene: Scene) -> float:

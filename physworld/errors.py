@@ -6,6 +6,7 @@ PhysworldError
 │   ├── UnstableSimulation  a state is not finite, or an element inverted
 │   ├── CFLViolation        a forced time step exceeds the stable one
 │   ├── ParticlesLeftTheGrid  material left the stated workspace
+│   ├── TwistLost           a rope folded, or a grip turned so far in a frame that its turns cannot be counted
 │   ├── ContactFailed       a collider is too fast for its contact, or material came too deep into it
 │   └── EpisodeRejected     every try at a demonstration was rejected
 ├── UnknownEffect           no effect or strength of that name
@@ -48,6 +49,10 @@ class ParticlesLeftTheGrid(SimulationError):
 
 class ContactFailed(SimulationError):
     """A collider is too fast for its contact, or material came too deep into it."""
+
+
+class TwistLost(SimulationError):
+    """A rope folded, or a grip turned so far in a frame, that its turns cannot be counted."""
 
 
 class EpisodeRejected(SimulationError):

@@ -1,11 +1,29 @@
-"""Which nodes a grip holds: every node that the gripped material touches."""
+"""Grips: which nodes they hold (every node that the gripped material touches), how they move them, how they twist.
+
+A grip of a rope prescribes how the section turns about the axis only where its control points fix a pose: three or
+more, not on a line, and far enough from the rope's axis for a turn to stand out of their noise.
+"""
 
 from __future__ import annotations
+
+from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from physworld.geometry.reference import ReferenceBody
+from physworld.geometry.rigid import rigid_motion
+from physworld.materials.rod import RodLaw
+from physworld.mpm.terms import Term
+from physworld.mpm.total_lagrangian import HeldNodes
+from physworld.mpm.twist import Twist, span_between
 from physworld.scene import Grip
+
+if TYPE_CHECKING:
+    from physworld.twin import Twin
+
+_OFF_LINE = 0.05  # second extent of control points over the first, below which they count as a line
+_LEVER_SIGMAS = 10.0  # of the tracking noise that control points must stand off the rope's axis
 
 
 def gripped_nodes(body: ReferenceBody, controllers: np.ndarray, grip: Grip | None) -> np.ndarray:
@@ -36,6 +54,69 @@ def gripped_nodes(body: ReferenceBody, controllers: np.ndarray, grip: Grip | Non
         cells = np.zeros(len(lattice.cells), dtype=bool)
         cells[np.unique(_nearest(particles, controllers) // lattice.fill.shape[1])] = True
     return np.unique(lattice.cell_nodes[cells])
+
+
+def held_paths(twin: Twin, times: np.ndarray, controls: np.ndarray) -> HeldNodes:
+    """Paths of the held nodes at ``times`` (T,) [s] under control points (T, K, 3) [m]: rigid with their group."""
+    numbers, paths = [np.empty(0, dtype=int)], [np.empty((len(times), 0, 3))]
+    for group, nodes in zip(twin.controller_groups, twin.held_nodes, strict=True):
+        rotation, shift = rigid_motion(twin.controllers_start[group], controls[:, group])
+        numbers.append(nodes)
+        paths.append(np.einsum("tij,nj->tni", rotation, twin.body.start[nodes]) + shift[:, None])
+    positions = np.concatenate(paths, axis=1)
+    velocities = np.gradient(positions, times, axis=0, edge_order=2 if len(times) > 2 else 1)
+    return HeldNodes(np.concatenate(numbers), positions, velocities)
+
+
+def why_no_turn(
+    body: ReferenceBody, nodes: np.ndarray, points: np.ndarray, noise_sigma_m: float | None
+) -> str | None:
+    """Why a grip's control points (k, 3) at the start do not show how a rope's section turns; None if they do."""
+    if len(points) < 3:
+        return f"{len(points)} control points fix no turn about the axis, 3 are needed"
+    local = points - points.mean(axis=0)
+    extents = np.linalg.svd(local, compute_uv=False)
+    if extents[1] < _OFF_LINE * extents[0]:
+        return f"its {len(points)} control points lie on a line, within {extents[1] / max(extents[0], 1e-12):.1%} of it"
+    low, high = _extent(body, nodes)
+    axis = np.squeeze(body.lattice.interpolation(np.array([[0.5 * (low + high)]]), (1,)) @ body.start)
+    axis /= np.linalg.norm(axis)
+    lever = float(np.sqrt(np.mean(np.sum(np.cross(local, axis) ** 2, axis=1))))
+    least = _LEVER_SIGMAS * (noise_sigma_m or 0.0)
+    if lever < least:
+        return (
+            f"its points stand {lever:.2g} m off the axis, {_LEVER_SIGMAS:g} sigma of noise are {least:.2g} m"
+        )
+    return None
+
+
+def twist_between_grips(twin: Twin, times: np.ndarray, controls: np.ndarray) -> tuple[Term, ...]:
+    """Twist of a rope's spans between the grips that show a turn, at ``times`` (T,) under ``controls`` (T, K, 3)."""
+    turning = [g for g in twin.turning if len(twin.held_nodes[g])]
+    if len(turning) < 2 or not isinstance(twin.law, RodLaw) or twin.law.torsion_n_m2 == 0:
+        return ()
+    extents = {g: _extent(twin.body, twin.held_nodes[g]) for g in turning}
+    turning.sort(key=lambda g: sum(extents[g]))
+    spans = []
+    for low, high in pairwise(turning):
+        groups = [twin.controller_groups[g] for g in (low, high)]
+        turns = np.stack([rigid_motion(twin.controllers_start[g], controls[:, g])[0] for g in groups])
+        ends = extents[low][1], extents[high][0]
+        spans.append(span_between(twin.lattice, twin.body.start, ends, turns, times))
+    found = tuple(span for span in spans if span is not None)
+    return (Twist(found),) if found else ()
+
+
+def _extent(body: ReferenceBody, nodes: np.ndarray) -> tuple[float, float]:
+    """Arc lengths [m] between which a rope's held ``nodes`` fix it: whole cells, else the middle of the nodes."""
+    lattice = body.lattice
+    whole = np.isin(lattice.cell_nodes, nodes).all(axis=1)
+    if not np.any(whole):
+        middle = float(lattice.node_coordinates[nodes, 0].mean())
+        return middle, middle
+    cells = lattice.cells[whole, 0]
+    low, high = lattice.origin[0] + np.array([cells.min(), cells.max() + 1]) * lattice.spacing[0]
+    return float(low), float(high)
 
 
 def _bonded_nodes(body: ReferenceBody, grip: Grip) -> np.ndarray:

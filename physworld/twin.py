@@ -9,7 +9,6 @@ total Lagrangian form, the particles in the updated one (:mod:`physworld.mpm.cho
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
@@ -19,23 +18,24 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.sparse.linalg import splu
 
-from physworld.colliders import TwinCollider, from_parts, to_parts
+from physworld.colliders import TwinCollider
 from physworld.effects.base import Effect
-from physworld.effects.registry import effect, in_order
+from physworld.effects.registry import in_order
 from physworld.errors import EffectRefused
 from physworld.geometry.reference import ReferenceBody
-from physworld.geometry.rigid import least_rotation, rigid_motion
+from physworld.geometry.rigid import least_rotation
+from physworld.grips import held_paths, twist_between_grips
 from physworld.integration import Integration, solver_knots
 from physworld.materials.laws import Law
-from physworld.materials.library import law_class
-from physworld.materials.plastic import PLASTICITIES, Plasticity
+from physworld.materials.plastic import Plasticity
 from physworld.mpm.choose import FormulationName
 from physworld.mpm.contact import GroundContact, ground, touching
 from physworld.mpm.following import follow
 from physworld.mpm.lattice import Lattice
 from physworld.mpm.terms import Term
-from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian
+from physworld.mpm.total_lagrangian import Problem, TotalLagrangian
 from physworld.mpm.updated_lagrangian import UpdatedLagrangian
+from physworld.twin_arrays import arrays_of, parts_of
 
 Progress = Callable[[int, int], None]
 
@@ -56,6 +56,8 @@ class Twin:
         held_nodes: nodes that each grip holds, one array a group.
         controllers_start: controllers at the first frame [m], (K, 3).
         release_s: the body is held at its start until then (somebody let go of it).
+        turning: numbers of the groups whose control points show how a rope's section turns about its axis; between
+            two of them the rope carries twist (:mod:`physworld.mpm.twist`).
         effects: what acts beside the declared physics.
         colliders: rigid bodies that push, still, on their own track or carried by controllers.
         plasticity: flow law, or None; updated Lagrangian only.
@@ -73,6 +75,7 @@ class Twin:
     held_nodes: tuple[np.ndarray, ...]
     controllers_start: np.ndarray
     release_s: float = 0.0
+    turning: tuple[int, ...] = ()
     effects: tuple[Effect, ...] = ()
     colliders: tuple[TwinCollider, ...] = ()
     plasticity: Plasticity | None = None
@@ -248,7 +251,8 @@ class Twin:
         gripped = self
         for known in active:
             gripped = known.grips(gripped)
-        held = gripped._held(knots, controls)
+        held = held_paths(gripped, knots, controls)
+        problem = replace(problem, terms=(*problem.terms, *twist_between_grips(gripped, knots, controls)))
         for known in active:
             problem, held = known.attach(problem, held, self)
         return Integration(problem, velocity, held, knots, frame_index)
@@ -305,69 +309,12 @@ class Twin:
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Everything as plain arrays, fit for an npz without pickle; :meth:`from_arrays` is the inverse."""
-        lattice, body = self.lattice, self.body
-        collider_facts, collider_arrays = to_parts(self.colliders)
-        facts = {
-            "law": self.law.name,
-            "law_parameters": asdict(self.law),
-            "air_drag_per_s": self.air_drag_per_s,
-            "ground_height_m": self.ground_height_m,
-            "ground_friction": self.ground_friction,
-            "release_s": self.release_s,
-            "thickness_m": body.thickness_m,
-            "notes": list(body.notes),
-            "groups": [g.tolist() for g in self.controller_groups],
-            "held": [h.tolist() for h in self.held_nodes],
-            "effects": [{"name": known.name, "strengths": known.values} for known in self.effects],
-            "colliders": collider_facts,
-            "formulation": self.formulation,
-            "plasticity": None
-            if self.plasticity is None
-            else {"name": self.plasticity.name, "parameters": asdict(self.plasticity)},
-        }
-        return {
-            "facts": np.array(json.dumps(facts)),
-            "gravity": np.asarray(self.gravity_m_s2, dtype=float),
-            "controllers_start": self.controllers_start,
-            **{f"lattice_{f.name}": getattr(lattice, f.name) for f in fields(lattice)},
-            **{
-                f"body_{k}": getattr(body, k)
-                for k in ("rest", "start", "start_velocity", "points", "offsets")
-            },
-            **({} if body.added_mass is None else {"body_added_mass": body.added_mass}),
-            **collider_arrays,
-        }
+        return arrays_of(self)
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray], device: str = "cpu") -> Twin:
         """The twin that :meth:`to_arrays` took apart, to be simulated on ``device``."""
-        facts = json.loads(str(arrays["facts"]))
-        flow = facts.get("plasticity")
-        lattice = Lattice(**{f.name: arrays[f"lattice_{f.name}"] for f in fields(Lattice)})
-        body = ReferenceBody(
-            lattice=lattice,
-            thickness_m=facts["thickness_m"],
-            notes=tuple(facts["notes"]),
-            added_mass=arrays.get("body_added_mass"),
-            **{k: arrays[f"body_{k}"] for k in ("rest", "start", "start_velocity", "points", "offsets")},
-        )
-        return cls(
-            body=body,
-            law=law_class(facts["law"], lattice.dim)(**facts["law_parameters"]),
-            gravity_m_s2=arrays["gravity"],
-            air_drag_per_s=facts["air_drag_per_s"],
-            ground_height_m=facts["ground_height_m"],
-            ground_friction=facts["ground_friction"],
-            controller_groups=tuple(np.array(g, dtype=int) for g in facts["groups"]),
-            held_nodes=tuple(np.array(h, dtype=int) for h in facts["held"]),
-            controllers_start=arrays["controllers_start"],
-            release_s=facts["release_s"],
-            effects=tuple(effect(e["name"], **e["strengths"]) for e in facts.get("effects", ())),
-            colliders=from_parts(facts.get("colliders", []), arrays, body.half_thickness_m),
-            plasticity=None if flow is None else PLASTICITIES[flow["name"]](**flow["parameters"]),
-            formulation=facts.get("formulation", "total_lagrangian"),
-            device=device,
-        )
+        return cls(**parts_of(arrays), device=device)
 
     @property
     def contacts(self) -> tuple[Term, ...]:
@@ -393,16 +340,6 @@ class Twin:
                 )
             )
         return terms
-
-    def _held(self, times: np.ndarray, controls: np.ndarray) -> HeldNodes:
-        numbers, paths = [np.empty(0, dtype=int)], [np.empty((len(times), 0, 3))]
-        for group, nodes in zip(self.controller_groups, self.held_nodes, strict=True):
-            rotation, shift = rigid_motion(self.controllers_start[group], controls[:, group])
-            numbers.append(nodes)
-            paths.append(np.einsum("tij,nj->tni", rotation, self.body.start[nodes]) + shift[:, None])
-        positions = np.concatenate(paths, axis=1)
-        velocities = np.gradient(positions, times, axis=0, edge_order=2 if len(times) > 2 else 1)
-        return HeldNodes(np.concatenate(numbers), positions, velocities)
 
 
 def _apply(matrix: Any, nodes: np.ndarray) -> np.ndarray:

@@ -6,8 +6,8 @@ parameter here: it stays as declared, or at its prior, and the report says so.
 
 A *stiffness* is always searched, and with it where a flow law yields, if the body has one and the data show it: the
 prior of a yield stress is a value that nothing reaches. The others are *optional*: air drag, internal friction,
-Poisson's ratio, and the friction of a ground that declares none; each is freed only if the data ask for it, and else
-stays at its prior.
+Poisson's ratio, the friction of a ground that declares none, and the torsion of a rope that two grips twist; each is
+freed only if the data ask for it, and else stays at its prior.
 """
 
 from __future__ import annotations
@@ -97,6 +97,11 @@ def parameters_of(
         optional.append(
             Parameter("poissons_ratio", "1", *_POISSON_BOUNDS, (prior,), apply, "optional", _POISSON_STEP, "linear",
                       prior, _POISSON_GAIN)
+        )  # fmt: skip
+    if isinstance(law, RodLaw) and len(twin.turning) > 1 and law.torsion_ratio > 0:
+        optional.append(
+            Parameter("torsion_ratio", "1", 0.02, 10.0, (law.torsion_ratio,), _set("torsion_ratio"), "optional", 0.1,
+                      prior=law.torsion_ratio)
         )  # fmt: skip
     if ground_friction and "ground_friction" in twin.parameters:
         prior = twin.parameters["ground_friction"]

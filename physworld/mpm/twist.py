@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from physworld.errors import UnstableSimulation
+from physworld.errors import TwistLost
 from physworld.materials.rod import RodLaw
 from physworld.mpm.lattice import Lattice
 from physworld.mpm.terms import BoundTerm
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from physworld.mpm.total_lagrangian import Problem
 
 _FOLD = 0.02  # 1 + cosine of the angle between neighbouring tangents below which a turn is lost: 168 degrees
+_MOST_TURN_RAD = 0.75 * np.pi  # of a grip between two frames: beyond pi the sense of a turn cannot be told
 _MOST_BEND_RAD = 4 * np.pi  # of a span, for the time step
 
 
@@ -128,6 +129,7 @@ class BoundTwist(BoundTerm):
             row[span.particles] = measure[span.particles] / measure[span.particles].sum()
         cell, lane = np.divmod(particles, lattice.fill.shape[1])
         nodes, slopes = lattice.cell_nodes[cell], (lattice.table((1,)) / lattice.spacing[0]).T[lane]
+        self._turns = np.stack([prescribed_turns(span) for span in spans])
         self.frequency_rad_s = _fastest(problem.nodal_mass(), nodes, slopes, spans, compliance)
 
         def array(values: np.ndarray, dtype: type = wp.float64) -> wp.array:
@@ -155,16 +157,30 @@ class BoundTwist(BoundTerm):
         """Twisting moment of every span in the last substep [N m], (S,)."""
         return self.state.moment.numpy().copy()
 
+    def begin(self, times: np.ndarray) -> None:
+        """A run starts.
+
+        Raises:
+            TwistLost: a grip turns too far from one frame to the next.
+        """
+        steps = np.abs(np.diff(self._turns, axis=2))
+        if steps.max(initial=0.0) > _MOST_TURN_RAD:
+            frame = int(np.argmax(steps.max(axis=(0, 1))))
+            raise TwistLost(
+                f"a grip turns the rope's end by {steps.max():.2f} rad between frames {frame} and {frame + 1}; beyond "
+                f"{_MOST_TURN_RAD:.2f} rad the sense of a turn cannot be told (sample the controllers faster)"
+            )
+
     def check(self, time_s: float) -> None:
         """After a frame.
 
         Raises:
-            UnstableSimulation: the rope folded back on itself between two particles, where turns are lost.
+            TwistLost: the rope folded back on itself between two particles, where turns are lost.
         """
         narrow = float(self.state.narrow.numpy().min())
         if not narrow >= _FOLD:
             angle = np.degrees(np.arccos(np.clip(narrow - 1.0, -1.0, 1.0)))
-            raise UnstableSimulation(
+            raise TwistLost(
                 f"the rope folded by {angle:.0f} degrees between two neighbouring particles before t = {time_s:.4f} s; "
                 f"twist cannot be followed beyond {np.degrees(np.arccos(_FOLD - 1.0)):.0f} degrees (take finer cells)"
             )
@@ -253,17 +269,18 @@ def _fastest(
     per_mass = float((np.abs(rows.T @ rows).sum(axis=1) / mass).max())
     worst = 0.0
     for span, soft in zip(spans, compliance, strict=True):
-        turned = np.abs(prescribed_turn(span)).max() + 2 * np.pi
+        low, high = prescribed_turns(span)
+        turned = np.abs(high - low).max() + 2 * np.pi
         worst = max(worst, turned / soft + _MOST_BEND_RAD**2 / (len(span.particles) * soft))
     return float(np.sqrt(per_mass * worst))
 
 
-def prescribed_turn(span: Span) -> np.ndarray:
-    """Angle by which the high grip turned about its tangent more than the low one, at the frames [rad], (T,)."""
+def prescribed_turns(span: Span) -> np.ndarray:
+    """Angles by which the grips turned about their tangents since the first frame [rad], low end then high, (2, T)."""
     turned = np.zeros((2, len(span.frames)))
     for end in range(2):
         for frame in range(1, len(span.frames)):
             (t, m), (u, goal) = span.frames[frame - 1, end], span.frames[frame, end]
             m = carried(m, np.array([t, u])) if t @ u > -1.0 + 1e-9 else m
             turned[end, frame] = np.arctan2(np.cross(m, goal) @ u, m @ goal)
-    return np.cumsum(turned[1] - turned[0])
+    return np.cumsum(turned, axis=1)

@@ -41,12 +41,13 @@ _MATERIALS = [
     Material(
         name="elastic_rod",
         title="Rope or rod, straight at rest",
-        energy="W(x', k) = EA/2 (|x'| - 1)^2 + B/2 |k|^2",
+        energy="W(x', k, Theta) = EA/2 (|x'| - 1)^2 + B/2 |k|^2 + GJ/2 (Theta/L)^2",
         parameters={
             "stretching_n": "N",
             "bending_n_m2": "N m^2",
             "relaxation_s": "s",
             "density_kg_m": "kg/m",
+            "torsion_ratio": "1",
         },
     ),
 ]

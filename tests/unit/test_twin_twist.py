@@ -1,0 +1,139 @@
+"""Which ropes carry twist, what they keep of it, and that all others are the same to the bit."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_scene import made_scene
+from scipy.spatial.transform import Rotation
+
+from physworld.build import build_twin
+from physworld.calibrate.parameters import parameters_of
+from physworld.errors import SceneUnsupported
+from physworld.mpm.gradient_twin import TwinRun, parameter
+from physworld.mpm.total_lagrangian import TotalLagrangian
+from physworld.mpm.twist import BoundTwist, Twist
+from physworld.scene import UNDEFORMED_AT_REST, Body, Scene
+from physworld.twin import Twin
+
+LENGTH, ARM = 0.4, 0.02
+CROSS = np.array([[0, ARM, 0], [0, -ARM, 0], [0, 0, ARM], [0, 0, -ARM]])
+LINE = np.array([[-0.01, 0, 0], [0.0, 0, 0], [0.01, 0, 0]])
+FRAMES = 16
+
+
+def rope(first: np.ndarray = CROSS, last: np.ndarray = CROSS, turns: float = 1.5, **body: object) -> Scene:
+    """A straight rope whose last hand turns about it; hands are points (k, 3) about the ends."""
+    s = np.linspace(0, LENGTH, 9)
+    points = np.stack([s, 0 * s, 0 * s], axis=1)
+    scene = made_scene(points, "rope", np.zeros((len(first) + len(last), 3)), FRAMES,
+                       initial_state=UNDEFORMED_AT_REST, body=Body(length_m=LENGTH, radius_m=0.004),
+                       gravity_m_s2=np.zeros(3), noise_sigma_m=2e-4, declared={"body": body})  # fmt: skip
+    angle = 2 * np.pi * turns * np.linspace(0, 1, FRAMES)
+    spin = Rotation.from_rotvec(angle[:, None] * np.array([1.0, 0, 0])).as_matrix()
+    far = np.array([LENGTH, 0.0, 0.0])
+    hands = [np.repeat(first[None], FRAMES, axis=0), np.einsum("tij,kj->tki", spin, last) + far]
+    return replace(scene, controllers=np.concatenate(hands, axis=1))
+
+
+def terms(twin: Twin, scene: Scene) -> tuple[object, ...]:
+    return twin.integration(*scene.control_track(), scene.times).problem.terms
+
+
+def test_a_rope_between_two_hands_is_twisted_by_their_turn() -> None:
+    scene = rope()
+    twin = build_twin(scene)
+    assert twin.turning == (0, 1)
+    assert "twist is carried between grips 0, 1" in twin.body.notes
+    run = twin.integration(*scene.control_track(), scene.times)
+    solver = TotalLagrangian(run.problem)
+    solver.run(twin.body.start, run.velocity, run.held, run.knots)
+    (bound,) = solver.terms
+    assert isinstance(bound, BoundTwist)
+    assert bound.angles_rad[0] == pytest.approx(3 * np.pi, rel=5e-3)  # at the last substep's start
+    held = twin.lattice.cells[:, 0]
+    whole = [np.isin(twin.lattice.cell_nodes, nodes).all(axis=1) for nodes in twin.held_nodes]
+    free = (held[whole[1]].min() - held[whole[0]].max() - 1) * twin.lattice.spacing[0]
+    expected = twin.law.torsion_ratio * twin.law.bending_n_m2 * bound.angles_rad[0] / free
+    assert bound.moments_n_m[0] == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("last", "why"),
+    [
+        (LINE, "3 control points lie on a line"),
+        (CROSS[:2], "2 control points fix no turn"),
+        (np.array([[0.0, 0.0, 0.0]]), "1 control points fix no turn"),
+        (0.05 * CROSS, "10 sigma of noise"),
+    ],
+)
+def test_a_hand_that_shows_no_turn_prescribes_none_and_says_so(last: np.ndarray, why: str) -> None:
+    twin = build_twin(rope(last=last))
+    assert any(note.startswith("grip 1 prescribes no twist") and why in note for note in twin.body.notes)
+    assert len(twin.turning) < 2
+
+
+def test_a_rope_with_a_free_end_or_a_hand_without_turn_is_the_same_to_the_bit() -> None:
+    scene = rope(last=LINE)
+    twin = build_twin(scene)
+    assert not any(isinstance(term, Twist) for term in terms(twin, scene))
+    track = scene.control_track()
+    first = twin.simulate_nodes(*track, scene.times)
+    other = twin.with_parameters(torsion_ratio=0.0).simulate_nodes(*track, scene.times)
+    assert np.array_equal(first, other)
+    one_hand = replace(scene, controllers=scene.controllers[:, :4])
+    assert terms(build_twin(one_hand), one_hand) == ()
+
+
+def test_what_a_twin_knows_of_twist_survives_storage_and_older_twins_carry_none() -> None:
+    scene = rope(torsion_ratio=0.4)
+    twin = build_twin(scene)
+    assert twin.parameters["torsion_ratio"] == 0.4
+    arrays = twin.with_parameters(torsion_ratio=0.5).to_arrays()
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    buffer.seek(0)
+    back = Twin.from_arrays(dict(np.load(buffer)))
+    assert back.law.torsion_ratio == 0.5
+    assert back.turning == (0, 1)
+    assert isinstance(terms(back, scene)[0], Twist)
+    facts = json.loads(str(arrays["facts"]))
+    del facts["turning"], facts["law_parameters"]["torsion_ratio"]
+    older = Twin.from_arrays({**arrays, "facts": np.array(json.dumps(facts))})
+    assert terms(older, scene) == ()
+
+
+def test_torsion_is_freed_only_where_it_counts() -> None:
+    names = [[p.name for p in parameters_of(build_twin(s), False)] for s in (rope(), rope(last=LINE))]
+    assert "torsion_ratio" in names[0]
+    assert "torsion_ratio" not in names[1]
+
+
+@pytest.mark.parametrize("value", [-1.0, "stiff", True])
+def test_a_torsion_that_is_no_ratio_is_refused(value: object) -> None:
+    with pytest.raises(SceneUnsupported, match="torsion_ratio"):
+        build_twin(rope(torsion_ratio=value))
+
+
+def test_a_gradient_by_the_torsion_is_that_of_whole_runs() -> None:
+    scene = rope(turns=1.9)
+    twin = build_twin(scene).with_parameters(bending_n_m2=2e-3)
+    twin = replace(twin, gravity_m_s2=np.array([0.0, 0.0, -9.81]))
+    track = scene.control_track()
+    step = 0.9 * TwinRun(twin, *track, scene.times).time_step_s
+    run = TwinRun(twin, *track, scene.times, time_step_s=step)
+    weights = np.random.default_rng(0).normal(size=run.tracks.shape)
+    _, found = run.gradient(weights, {"torsion": parameter(twin, "torsion_ratio")})
+    h, value = 1e-3, twin.law.torsion_ratio
+    ends = [
+        TwinRun(
+            twin.with_parameters(torsion_ratio=value + s * h), *track, scene.times, time_step_s=step
+        ).tracks
+        for s in (1, -1)
+    ]
+    expected = np.sum(weights * (ends[0] - ends[1])) / (2 * h)
+    assert found["torsion"] == pytest.approx(expected, rel=1e-3)
