@@ -30,7 +30,7 @@ class GridBox:
 
     Attributes:
         device_box: first cell (3), nodes (3), rim, as the kernels read it.
-        nodes, columns: how many nodes and vertical columns the allocated arrays hold.
+        nodes: how many nodes the allocated arrays hold.
     """
 
     def __init__(self, lattice: GridLattice, device: str) -> None:
@@ -38,7 +38,6 @@ class GridBox:
         self._device = device
         self.device_box = wp.zeros(7, dtype=wp.int32, device=device)
         self.nodes = 0
-        self.columns = 0
         self.counts = np.zeros(3, dtype=int)
 
     def enclose(self, x: np.ndarray, rim: int, time: float) -> bool:
@@ -66,9 +65,8 @@ class GridBox:
             )
         self.counts = counts.astype(int)
         self.device_box.assign(np.concatenate([first, counts, [rim]]).astype(np.int32))
-        nodes, columns = int(np.prod(self.counts)), int(np.prod(self.counts[:2]))
-        if nodes <= self.nodes and columns <= self.columns:
+        nodes = int(np.prod(self.counts))
+        if nodes <= self.nodes:
             return False
         self.nodes = int(_GROWTH * nodes) if self.nodes else nodes
-        self.columns = int(_GROWTH * columns) if self.columns else columns
         return True

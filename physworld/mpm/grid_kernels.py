@@ -1,14 +1,9 @@
-"""Device side of the grid of updated Lagrangian MPM: forces on nodes, grips, ground; gripped particles.
+"""Device side of the grid of updated Lagrangian MPM: forces on nodes, grips; gripped particles.
 
-    v_i = p_i / m_i + dt (g - c v_i)      then grips prescribe, then the ground stops and rubs
+    v_i = p_i / m_i + dt (g - c v_i)      then grips prescribe; contacts follow (:mod:`physworld.mpm.grid_contact`)
 
 A node belongs to a grip where at least an eighth of its mass is gripped: half a cell beyond the grip's face it has a
 sixth, so a clamp on a cell face prescribes the nodes that it does in the total Lagrangian form.
-
-The ground acts on nodes at and below its height. A column of nodes knows the gap under its lowest particle's lower
-face, and a node may approach by no more than that gap in a substep: bodies come to rest on the ground, not a cell
-above it as they do where the nodes' own approach counts. What the ground takes from the normal velocity bounds what
-it takes from the tangential one (Coulomb).
 
 Legend: clock = (frame interval [s], 1/dt [1/s], dt [s]); counter = (frame, substep, substeps of this frame); box =
 first cell (3), nodes (3), rim.
@@ -19,7 +14,6 @@ from __future__ import annotations
 import warp as wp
 
 GRIPPED_SHARE = 0.125
-_FAR = 1.0e30
 
 
 @wp.kernel(enable_backward=False)
@@ -27,15 +21,9 @@ def advance_grid(
     # model
     gravity: wp.vec3f,
     drag: float,
-    ground: int,
-    friction: float,
-    height: wp.float64,
-    origin_z: wp.float64,
-    dx_z: wp.float64,
     gripped: int,
     clock: wp.array(dtype=wp.float64),
     box: wp.array(dtype=wp.int32),
-    gap: wp.array(dtype=wp.float32),
     # in, cleared
     momentum: wp.array(dtype=wp.vec4f),
     impulse: wp.array(dtype=wp.vec4f),
@@ -45,7 +33,10 @@ def advance_grid(
     velocity_old: wp.array(dtype=wp.vec4f),
     split: int,
 ):
-    """Velocity [m/s] of one node at the end of the substep; ``velocity_old`` without forces, where ``split``."""
+    """Velocity [m/s] of one node at the end of the substep, before contacts, and its inverse mass [1/kg].
+
+    ``velocity_old`` is the one without forces, where ``split``. A gripped node has the inverse mass 0.
+    """
     node = wp.tid()
     if node >= box[3] * box[4] * box[5]:
         return
@@ -63,74 +54,15 @@ def advance_grid(
         impulse[node] = wp.vec4f()
         velocity_old[node] = wp.vec4f(before[0], before[1], before[2], m)
     v += dt * (gravity - drag * before)
+    mobility = 1.0 / m
     if gripped != 0:
         h = grip[node]
         if h[3] > 0.0:
             grip[node] = wp.vec4f()
             if h[3] >= GRIPPED_SHARE * m:
                 v = wp.vec3f(h[0], h[1], h[2]) / h[3]
-    if ground != 0:
-        column = node // box[5]
-        level = node - column * box[5] + box[2]
-        z = origin_z + (wp.float64(level) + wp.float64(0.5)) * dx_z
-        if z <= height:
-            least = -wp.max(gap[column], 0.0) / dt
-            if v[2] < least:
-                stopped = least - v[2]
-                sliding = wp.sqrt(v[0] * v[0] + v[1] * v[1]) + 1.0e-20
-                rubbed = wp.min(friction * stopped, sliding) / sliding
-                v = wp.vec3f(v[0] - rubbed * v[0], v[1] - rubbed * v[1], least)
-    velocity[node] = wp.vec4f(v[0], v[1], v[2], m)
-
-
-@wp.kernel(enable_backward=False)
-def clear_gaps(box: wp.array(dtype=wp.int32), gap: wp.array(dtype=wp.float32)):
-    """Forget the gaps of the last substep."""
-    column = wp.tid()
-    if column < box[3] * box[4]:
-        gap[column] = _FAR
-
-
-@wp.kernel(enable_backward=False)
-def measure_gaps(
-    # model
-    origin: wp.vec3d,
-    inv_dx: wp.vec3d,
-    height: wp.float64,
-    friction: float,
-    half_size: wp.float64,
-    reach: wp.float64,
-    box: wp.array(dtype=wp.int32),
-    # in, out
-    x: wp.array(dtype=wp.float64),
-    v: wp.array(dtype=wp.float32),
-    # out
-    gap: wp.array(dtype=wp.float32),
-):
-    """Lower the gap [m] of the 3 x 3 columns that a particle within ``reach`` of the ground touches.
-
-    A particle whose middle passed the ground, as one of a thin layer of grains may, is put back onto it, with the
-    friction of what stops it.
-    """
-    p = wp.tid()
-    low = x[3 * p + 2] - height
-    if low < wp.float64(0.0):
-        low = wp.float64(0.0)
-        x[3 * p + 2] = height
-        stopped = wp.max(-v[3 * p + 2], 0.0)
-        sliding = wp.sqrt(v[3 * p] * v[3 * p] + v[3 * p + 1] * v[3 * p + 1]) + 1.0e-20
-        kept = 1.0 - wp.min(friction * stopped, sliding) / sliding
-        v[3 * p] = kept * v[3 * p]
-        v[3 * p + 1] = kept * v[3 * p + 1]
-        v[3 * p + 2] = v[3 * p + 2] + stopped
-    if low < reach:
-        i = int(wp.floor((x[3 * p] - origin[0]) * inv_dx[0])) - 1 - box[0]
-        j = int(wp.floor((x[3 * p + 1] - origin[1]) * inv_dx[1])) - 1 - box[1]
-        if i >= 0 and j >= 0 and i + 2 < box[3] and j + 2 < box[4]:
-            value = wp.float32(low - half_size)
-            for a in range(3):
-                for b in range(3):
-                    wp.atomic_min(gap, (i + a) * box[4] + j + b, value)
+                mobility = 0.0
+    velocity[node] = wp.vec4f(v[0], v[1], v[2], mobility)
 
 
 @wp.kernel(enable_backward=False)

@@ -19,7 +19,7 @@ def compiled(module: object, folder: Path) -> bool:
     return bool(list(folder.glob("*.ptx")))
 
 
-@pytest.mark.parametrize("name", ["transfer_kernels", "grid_kernels"])
+@pytest.mark.parametrize("name", ["transfer_kernels", "grid_kernels", "grid_contact_kernels", "particle_kernels"])
 def test_the_transfers_compile_for_cuda(name: str, tmp_path: Path) -> None:
     wp.init()
     assert compiled(import_module(f"physworld.mpm.{name}"), tmp_path)

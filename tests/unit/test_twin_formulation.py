@@ -94,7 +94,7 @@ def test_grains_that_nobody_holds_are_tracked_into_their_heap() -> None:
 
 def test_effects_on_nodes_are_refused_by_name_and_others_act() -> None:
     twin = stiff(build_twin(tiny_scene(), BUDGET, formulation="updated_lagrangian"))
-    with pytest.raises(SceneUnsupported, match="no other term on nodes"):
+    with pytest.raises(SceneUnsupported, match="QuadraticDrag acts on the nodes"):
         observed(twin.with_effect(effect("air_drag_quadratic", coefficient_per_m=3.0)))
     heavy = observed(twin.with_effect(effect("air_drag_linear", rate_per_s=20.0)))
     assert np.abs(heavy - observed(twin)).max() > 1e-4
