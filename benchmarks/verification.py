@@ -3,7 +3,8 @@
     python -m benchmarks.verification [--json FILE] [--quick] [--docs FILE] [--picture FILE] [NAME ...]
 
 Prints one row a case: what is measured, against what, the resolutions, the error at each, the order of convergence.
-``--quick`` takes the coarsest resolutions only; ``--docs`` writes the table between its markers of a Markdown file,
+``--quick`` takes the coarsest resolutions only; ``--docs`` writes the table between its markers of a Markdown file, in
+which the rows of cases that were not named stay,
 ``--picture`` draws it. Ends with status 1 where a case misses its limit or its least order.
 """
 
@@ -12,17 +13,25 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import warp as wp
 
-from benchmarks import verification_effects, verification_peers, verification_solids, verification_thin
+from benchmarks import (
+    verification_effects,
+    verification_peers,
+    verification_solids,
+    verification_thin,
+    verification_twist,
+)
 from benchmarks.harness import Report, write_json, write_section
 from benchmarks.verification_cases import Case, Outcome, run_case
 
 CASES: tuple[Case, ...] = (
     *verification_solids.CASES,
     *verification_thin.CASES,
+    *verification_twist.CASES,
     *verification_effects.CASES,
     *verification_peers.CASES,
 )
@@ -92,6 +101,18 @@ def _row(outcome: Outcome) -> list[str]:
     return [title, case.theory, case.refined, steps, ", ".join(f"{e:+.1e}" for e in outcome.errors), order]
 
 
+def _with_rows_of(docs: Path, report: Report) -> Report:
+    """The report with the rows that a document has of cases which did not run, in the order of the cases."""
+    rows = {str(row[0]).removesuffix(" **missed**"): row for row in report.rows}
+    known = {}
+    for line in docs.read_text().splitlines() if docs.exists() else ():
+        cells = [cell.strip() for cell in line.strip("| ").split(" | ")]
+        known[cells[0].removesuffix(" **missed**")] = cells
+    titles = [case.title for case in CASES]
+    kept = [rows.get(title, known.get(title)) for title in titles]
+    return replace(report, rows=[row for row in kept if row is not None])
+
+
 def draw(outcomes: list[Outcome], path: Path) -> None:
     """Errors over step size, log and log; left what the clamp's place changes, right the rest that converges."""
     import matplotlib
@@ -150,7 +171,7 @@ def main() -> int:
     if given.json is not None:
         write_json(report, given.json)
     if given.docs is not None:
-        write_section(report, given.docs)
+        write_section(_with_rows_of(given.docs, report), given.docs)
     if given.picture is not None:
         draw(outcomes, given.picture)
     return 0 if report.figures["passed"] else 1

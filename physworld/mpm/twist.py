@@ -4,9 +4,9 @@
 
 Theta is the angle from the material frame that the first grip prescribes, carried along the centre line without twist
 (the Bishop frame), to the frame that the second prescribes. Twist waves run so much faster than bending ones that the
-material frame is in equilibrium at all times (Bergou et al. 2008, section 5.1): then its moment is the same all along
-an isotropic, naturally straight rod, and nothing but the two ends and the centre line's shape (its holonomy) sets it.
-The twist of a span is not a state: it has no mass and adds no mode. A free end carries none.
+material frame is in equilibrium at all times (the quasi-static frame of Bergou et al. 2008): then its moment is the
+same all along an isotropic, naturally straight rod, and nothing but the two ends and the centre line's shape (its
+holonomy) sets it. The twist of a span is not a state: it has no mass and adds no mode. A free end carries none.
 
 Angles are followed from substep to substep, so turns add up beyond 2 pi. They start within half a turn.
 Not carried: internal friction of twist, an unround section, a rest shape with twist in it.

@@ -4,7 +4,7 @@ Along the unit tangents t_0 (of the grip), t_1 ... t_M (of the particles), t_(M+
 carried from each to the next by the rotation of least angle. The twist angle is from the first grip's director, so
 carried, to the second's, about t_(M+1). With kb = 2 t x u / (1 + t . u) of neighbours t and u its variation is
 
-    d Theta / dt_i = (kb_(i-1, i) + kb_(i, i+1)) / 2        (Bergou et al. 2008, section 6 and appendix)
+    d Theta / dt_i = (kb_(i-1, i) + kb_(i, i+1)) / 2        (Bergou et al. 2008)
 
 Legend: a span's paths are (tangent, director) of its low end, then of its high end; along = unit tangents;
 inverse = 1 / |x'|; narrow = 1 + cosine of the largest angle between neighbours; clock, counter as everywhere.
