@@ -61,6 +61,9 @@ def measure(repeats: int, seed: int) -> Report:
         rows.append(
             [f"... the worst: {worst.removeprefix(shape + ' ')}", f"{effects[worst]:.1e}", f"{GOAL:.0e}"]
         )
+    for shape in ("solid", "sheet", "rope"):
+        name = f"{shape} on the ground: log friction"
+        rows.append([name, f"{errors[name]:.1e}", f"{FRICTION_GOAL:.0e}"])
     rows.append(["friction of the ground", f"{errors['friction of the ground']:.1e}", f"{FRICTION_GOAL:.0e}"])
     return Report(
         name="gradients",
@@ -120,6 +123,8 @@ def agreement(seed: int) -> dict[str, float]:
                     errors[f"{shape} {name} {known.name}"] = _strength(
                         twin, scene, name, known.name, value, step, seed
                     )
+    for shape, scene in _scenes().items():
+        errors[f"{shape} on the ground: log friction"] = _friction_field(build_twin(scene, 300), scene, seed)
     scene = _scenes()["solid"]
     errors["friction of the ground"] = _strength(
         build_twin(scene, 300), scene, "ground_friction", "change", 0.1, 2e-3, seed
@@ -148,6 +153,35 @@ def _fields(shape: str, twin: Twin, scene: Scene, seed: int) -> dict[str, float]
             worst = max(worst, abs(along_log @ along - expected) / max(abs(expected), 0.3 * cancelled))
         found[f"{shape} {name}"] = float(worst)
     return found
+
+
+def _friction_field(twin: Twin, scene: Scene, seed: int) -> float:
+    """Error of the gradient by the ground's friction of a body that slides on it, on an uneven field."""
+    low = float(twin.body.start[:, 2].min() if twin.lattice.dim < 3 else twin.particles_start[:, 2].min())
+    twin = replace(
+        twin,
+        ground_height_m=low - 1e-3,
+        ground_friction=0.4,
+        held_nodes=tuple(h[:0] for h in twin.held_nodes),
+    )
+    velocity = np.zeros_like(twin.body.start)
+    velocity[:, :2] = [0.3, 0.5]
+    twin = replace(twin, body=replace(twin.body, start_velocity=velocity))
+    count, step = twin.lattice.fill.size, 1e-3 if twin.lattice.dim < 3 else 1e-2
+    field, dt = 0.5 * np.linspace(-1.0, 1.0, count), 0.5 * _step()
+    track = scene.control_track()
+    properties = np.stack([0 * field, 0 * field, field], axis=1)
+    run = TwinRun(twin, *track, scene.times, properties=properties, time_step_s=dt)
+    weights = 1.0 + np.random.default_rng(seed).normal(size=run.tracks.shape)
+    gradient, _ = run.gradient(weights)
+    worst = 0.0
+    for along in (np.ones(count), np.linspace(0.0, 1.0, count)):
+        change = properties * 0
+        change[:, 2] = step * along
+        ends = [_loss(twin, scene, weights, dt, properties + sign * change) for sign in (1, -1)]
+        expected = (ends[0] - ends[1]) / (2 * step)
+        worst = max(worst, abs(gradient.log_friction @ along - expected) / abs(expected))
+    return float(worst)
 
 
 def _strength(twin: Twin, scene: Scene, name: str, which: str, value: float, step: float, seed: int) -> float:

@@ -21,7 +21,7 @@ from scipy.sparse.linalg import splu
 from physworld.colliders import TwinCollider
 from physworld.effects.base import Effect
 from physworld.effects.registry import in_order
-from physworld.errors import EffectRefused
+from physworld.errors import EffectRefused, SceneUnsupported
 from physworld.geometry.reference import ReferenceBody
 from physworld.geometry.rigid import least_rotation
 from physworld.grips import held_paths, twist_between_grips
@@ -189,7 +189,7 @@ class Twin:
         Args:
             control_times, control_points: (Tc,) [s] and (Tc, K, 3) [m]; first time is the start.
             frame_times: (T,) [s], the first one is the start.
-            properties: log factors of stiffness and density, (P, 2), or None.
+            properties: log factors of stiffness and density, (P, 2), and of the ground's friction, (P, 3), or None.
             progress: called with (knots done, knots in all); may raise to stop.
             from_rest: start with zero velocity and release at once.
 
@@ -241,6 +241,7 @@ class Twin:
             drag_per_s=self.air_drag_per_s,
             stiffness_factor=None if properties is None else np.exp(properties[:, 0]),
             density_factor=None if properties is None else np.exp(properties[:, 1]),
+            friction_factor=self._friction_factor(properties),
             added_mass=self.body.added_mass,
             terms=(*self.contacts, *self._pushes(control_times, control_points)),
             device=self.device,
@@ -328,6 +329,16 @@ class Twin:
                 self.lattice, self.body.start, plane, self.release_s, self.body.half_thickness_m
             )
         return (GroundContact(self.lattice, self.law, self.ground_height_m, self.ground_friction, offsets),)
+
+    def _friction_factor(self, properties: np.ndarray | None) -> np.ndarray | None:
+        if properties is None or properties.shape[1] < 3:
+            return None
+        if self.ground_height_m is None or self.formulation == "updated_lagrangian":
+            raise SceneUnsupported(
+                f"a field of the ground's friction over {len(properties)} particles needs a ground and the total "
+                f"Lagrangian form; here the ground is at {self.ground_height_m} and the form {self.formulation}"
+            )
+        return np.exp(properties[:, 2])
 
     def _pushes(self, times: np.ndarray, points: np.ndarray) -> list[Term]:
         """Contacts with the colliders under a control track."""

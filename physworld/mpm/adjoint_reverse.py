@@ -24,6 +24,7 @@ from physworld.mpm.adjoint_kernels import (
 from physworld.mpm.adjoint_pairs import ForcePair
 from physworld.mpm.adjoint_terms import Memory, RecordedAdjoint, Reverse, StressAdjoint, TermAdjoint
 from physworld.mpm.adjoint_twist import TwistAdjoint
+from physworld.mpm.ground import BoundGround
 from physworld.mpm.stress import BoundStress
 from physworld.mpm.tangent import InternalTangent
 from physworld.mpm.terms import BoundTerm
@@ -43,6 +44,7 @@ class Gradient:
     Attributes:
         log_stiffness, log_density: by the logarithms of the particles' fields, (P,).
         twist: the share of twist in ``log_stiffness``, (P,): its sum is by the torsional stiffness' logarithm.
+        log_friction: by the logarithms of the factors of the ground's friction, (P,); None in a run without that field.
         law: by the logarithm of every number of the law at every particle, (P, columns).
         columns: names of those numbers (:attr:`InternalTangent.parameters`).
         mass: by the nodal masses [1/kg], (n,).
@@ -58,6 +60,7 @@ class Gradient:
     log_stiffness: np.ndarray
     log_density: np.ndarray
     twist: np.ndarray
+    log_friction: np.ndarray | None
     law: np.ndarray
     columns: tuple[str, ...]
     mass: np.ndarray
@@ -231,6 +234,7 @@ class ReversePass:
         return Gradient(
             log_stiffness=stiffness + twisted,
             twist=twisted,
+            log_friction=self._by_log_friction(),
             log_density=_by_log_density(problem, mass),
             law=law,
             columns=columns,
@@ -244,6 +248,14 @@ class ReversePass:
             stresses=stresses,
             works=tuple(pair.work for pair in self._pairs),
         )
+
+    def _by_log_friction(self) -> np.ndarray | None:
+        found = None
+        for bound, term in zip(self._solver.terms, self._terms, strict=False):
+            if isinstance(bound, BoundGround) and isinstance(term, RecordedAdjoint):
+                share = bound.by_log_factor(term.differentiated_bar.numpy())
+                found = share if found is None else found + share
+        return found
 
 
 def _by_log_density(problem: Problem, mass_bar: np.ndarray) -> np.ndarray:

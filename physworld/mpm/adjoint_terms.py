@@ -101,13 +101,21 @@ def memories_of(term: BoundTerm, rows: int) -> list[Memory]:
 
 
 class RecordedAdjoint:
-    """A term of plain Warp kernels."""
+    """A term of plain Warp kernels.
+
+    Attributes:
+        differentiated_bar: derivatives by the term's array of that name, as flat numbers; None where it has none.
+    """
 
     def __init__(self, term: BoundTerm, mass: np.ndarray, now: Reverse, memories: list[Memory]) -> None:
         self._term, self._memories = term, memories
         self._scratch = wp.zeros_like(now.force_bar)
         self._launches = launches_of(term, now, self._scratch)
         known = {now.x.ptr: now.x_bar, now.v.ptr: now.v_bar, self._scratch.ptr: now.force_bar}
+        asked = getattr(term, "differentiated", None)
+        self.differentiated_bar = None if asked is None else wp.zeros_like(asked)
+        if asked is not None:
+            known[asked.ptr] = self.differentiated_bar
         self._new_bars = [wp.zeros_like(memory.bar) for memory in memories]
         by_pointer = {memory.now.ptr: bar for memory, bar in zip(memories, self._new_bars, strict=True)}
         self._bars = []

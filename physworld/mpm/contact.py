@@ -24,6 +24,7 @@ from physworld.materials.laws import Law, SolidLaw
 from physworld.mpm.bspline import GAUSS_POINTS
 from physworld.mpm.colliders import BoundCollider, Collider, ContactSurface
 from physworld.mpm.colliders_path import RigidPath
+from physworld.mpm.ground import BoundGround
 from physworld.mpm.lattice import Lattice
 
 if TYPE_CHECKING:
@@ -44,9 +45,12 @@ class GroundContact:
     offsets: np.ndarray | float = 0.0
 
     def bind(self, problem: Problem) -> BoundCollider:
-        """Device arrays for one problem."""
+        """Device arrays for one problem; its friction may be a field."""
         plane = ground(self.height_m, self.friction)
-        return BoundCollider(plane, contact_surface(self.lattice, self.law, self.offsets), problem)
+        surface = contact_surface(self.lattice, self.law, self.offsets)
+        if problem.friction_factor is None:
+            return BoundCollider(plane, surface, problem)
+        return BoundGround(plane, self.height_m, surface, problem)
 
 
 def ground(height_m: float, friction: float) -> Collider:

@@ -51,6 +51,7 @@ class Problem:
         gravity_m_s2: (3,).
         drag_per_s: linear drag rate c of every node [1/s].
         stiffness_factor, density_factor: fields over the particles, (P,), or None for 1.
+        friction_factor: of the ground under them, likewise.
         added_mass: lumped masses that hang from the nodes [kg], (n,), or None.
         terms: what else acts on the nodes, contacts and effects, in the order of their launches.
     """
@@ -64,6 +65,7 @@ class Problem:
     density_factor: np.ndarray | None = None
     added_mass: np.ndarray | None = None
     terms: tuple[Term, ...] = ()
+    friction_factor: np.ndarray | None = None
     device: str = field(default="cpu")
 
     def nodal_mass(self) -> np.ndarray:
