@@ -17,8 +17,11 @@ import warp as wp
 from physworld.effects.base import Effect, Strength
 from physworld.effects.ground_friction import no_ground
 from physworld.effects.places import body_size, gravity_size
+from physworld.errors import SceneUnsupported
+from physworld.mpm.bspline import GAUSS_POINTS
 from physworld.mpm.contact import GroundContact, surface_points
 from physworld.mpm.node_kernels import weighted_sum
+from physworld.mpm.particle_terms import ParticleBody
 from physworld.mpm.terms import BoundTerm
 from physworld.mpm.total_lagrangian import Problem
 
@@ -74,6 +77,29 @@ class AdhesionTerm:
             wp.float64(self.traction_pa), wp.float64(self.reach_m),
         ]  # fmt: skip
         return BoundAdhesion(len(points), inputs, device)
+
+    def on_particles(self, body: ParticleBody) -> BoundAdhesion:
+        """Device arrays for particles in the place of the surface's points: those that come so near are the lowest.
+
+        Raises:
+            SceneUnsupported: the reach goes to the layer of particles above the lowest.
+        """
+        lattice, device, count = body.problem.lattice, body.problem.device, len(body.solid)
+        dx, dy, dz = lattice.spacing
+        if self.reach_m > 0.5 * dz:
+            raise SceneUnsupported(
+                f"{Adhesion.name} reaches {self.reach_m:.3g} m; in the updated Lagrangian form it may reach the lowest "
+                f"particles only, {0.5 * dz:.3g} m"
+            )
+        inputs = [
+            wp.array(np.arange(count + 1), dtype=wp.int32, device=device),
+            wp.array(np.arange(count), dtype=wp.int32, device=device),
+            wp.array(np.ones(count), dtype=wp.float64, device=device),
+            wp.array(np.full(count, 0.25 * dx * dy), dtype=wp.float64, device=device),
+            wp.array(np.full(count, self.ground.height_m + GAUSS_POINTS[0] * dz), dtype=wp.float64, device=device),
+            wp.float64(self.traction_pa), wp.float64(self.reach_m),
+        ]  # fmt: skip
+        return BoundAdhesion(count, inputs, device)
 
 
 @dataclass(frozen=True)

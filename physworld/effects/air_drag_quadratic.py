@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from physworld.effects.base import Effect, Strength
+from physworld.mpm.particle_terms import ParticleBody
 from physworld.mpm.terms import BoundTerm
 from physworld.mpm.total_lagrangian import Problem
 
@@ -48,10 +49,15 @@ class QuadraticDrag:
         mass = wp.array(problem.nodal_mass(), dtype=wp.float64, device=problem.device)
         return BoundQuadraticDrag(mass, self.coefficient_per_m)
 
+    def on_particles(self, body: ParticleBody) -> BoundQuadraticDrag:
+        """Device arrays for particles in the place of nodes."""
+        mass = wp.array(body.mass, dtype=wp.float64, device=body.problem.device)
+        return BoundQuadraticDrag(mass, self.coefficient_per_m)
+
 
 @dataclass(frozen=True)
 class BoundQuadraticDrag(BoundTerm):
-    """Nodal masses on the device. k |v| is far below the rates that limit a time step."""
+    """Masses of nodes or particles on the device. k |v| is far below the rates that limit a time step."""
 
     mass: wp.array
     coefficient_per_m: float

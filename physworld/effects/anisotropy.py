@@ -85,4 +85,6 @@ class Anisotropy(Effect):
             f = np.array([np.cos(self.azimuth_rad), np.sin(self.azimuth_rad)])
             pairs = (f[0] * f[0], f[1] * f[1], f[0] * f[1])
             numbers = (self.ratio * law.membrane_n_m, self.ratio * law.bending_n_m, *pairs)
-        return replace(problem, terms=(*problem.terms, StressTerm(_MODELS[twin.lattice.dim], numbers)))
+        return replace(
+            problem, terms=(*problem.terms, StressTerm(_MODELS[twin.lattice.dim], numbers, name=self.name))
+        )

@@ -18,6 +18,8 @@ import warp as wp
 from physworld.effects.base import Effect, Strength
 from physworld.effects.places import gravity_size, held_count
 from physworld.mpm.node_kernels import on_path
+from physworld.mpm.particle_grips import particle_grips
+from physworld.mpm.particle_terms import ParticleBody
 from physworld.mpm.terms import BoundTerm
 from physworld.mpm.total_lagrangian import HeldNodes, Problem, nodal_mass
 
@@ -65,16 +67,26 @@ class GripSprings:
 
     def bind(self, problem: Problem) -> BoundGripSprings:
         """Device arrays."""
-        device, frames = problem.device, len(self.held.positions)
-        mass = problem.nodal_mass()[self.held.nodes]
+        return self._bound(problem, problem.nodal_mass(), self.held)
+
+    def on_particles(self, body: ParticleBody) -> BoundGripSprings:
+        """Device arrays for the gripped particles in the place of held nodes."""
+        held, lattice = self.held, body.problem.lattice
+        grips = particle_grips(lattice, body.solid, held.nodes, held.positions, held.velocities)
+        gripped = HeldNodes(grips.particles, grips.positions, grips.velocities)
+        return self._bound(body.problem, body.mass, gripped)
+
+    def _bound(self, problem: Problem, masses: np.ndarray, held: HeldNodes) -> BoundGripSprings:
+        device, frames = problem.device, len(held.positions)
+        mass = masses[held.nodes]
         frequency = float(np.sqrt(self.stiffness_n_m / mass.sum()))
         rate = 2 * self.damping_ratio * frequency
         inputs = [
-            wp.array(self.held.nodes, dtype=wp.int32, device=device),
+            wp.array(held.nodes, dtype=wp.int32, device=device),
             wp.array(mass * frequency**2, dtype=wp.float64, device=device),
             wp.array(mass * rate, dtype=wp.float64, device=device),
-            wp.array(self.held.positions.reshape(frames, -1), dtype=wp.float64, device=device),
-            wp.array(self.held.velocities.reshape(frames, -1), dtype=wp.float64, device=device),
+            wp.array(held.positions.reshape(frames, -1), dtype=wp.float64, device=device),
+            wp.array(held.velocities.reshape(frames, -1), dtype=wp.float64, device=device),
         ]
         return BoundGripSprings(inputs, device, frequency, rate)
 

@@ -33,7 +33,15 @@ def free_end(twin: Twin) -> np.ndarray:
 
 
 def region_weights(twin: Twin, centre: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes (k,) and weights (k,), summing to 1, of the centroid of the material within ``radius`` [m] of ``centre``.
+    """Nodes (k,) and weights (k,), summing to 1, of the centroid of the material that :func:`region_shares` names."""
+    rows = twin.lattice.interpolation(twin.lattice.particle_coordinates)
+    weights = np.asarray(rows.T @ region_shares(twin, centre, radius))
+    nodes = np.nonzero(weights)[0]
+    return nodes, weights[nodes]
+
+
+def region_shares(twin: Twin, centre: np.ndarray, radius: float) -> np.ndarray:
+    """Shares of the particles, (P,), summing to 1, in the centroid of the material within ``radius`` [m] of ``centre``.
 
     Places are those of the start; where nothing lies so near, the nearest particle is the region.
     """
@@ -42,11 +50,7 @@ def region_weights(twin: Twin, centre: np.ndarray, radius: float) -> tuple[np.nd
     inside = (gap <= radius) & (mass > 0)
     if not inside.any():
         inside = np.arange(len(gap)) == int(np.argmin(np.where(mass > 0, gap, np.inf)))
-    share = np.where(inside, mass, 0.0) / mass[inside].sum()
-    rows = twin.lattice.interpolation(twin.lattice.particle_coordinates)
-    weights = np.asarray(rows.T @ share)
-    nodes = np.nonzero(weights)[0]
-    return nodes, weights[nodes]
+    return np.where(inside, mass, 0.0) / mass[inside].sum()
 
 
 def unit_coordinates(lattice: Lattice) -> np.ndarray:

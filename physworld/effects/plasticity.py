@@ -170,5 +170,5 @@ class Plasticity(Effect):
                 return problem
             stiffness = law.bending_n_m if twin.lattice.dim == 2 else law.bending_n_m2
             numbers = (stiffness, 1.0 / self.yield_radius_m, h, getattr(law, "poissons_ratio", 0.0))
-        term = StressTerm(_MODELS[twin.lattice.dim], numbers, frequency_rad_s=0.0)
+        term = StressTerm(_MODELS[twin.lattice.dim], numbers, frequency_rad_s=0.0, name=self.name)
         return replace(problem, terms=(*problem.terms, term))

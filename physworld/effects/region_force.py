@@ -14,7 +14,8 @@ import numpy as np
 import warp as wp
 
 from physworld.effects.base import Effect, Strength
-from physworld.effects.places import body_size, free_end, gravity_size, region_weights
+from physworld.effects.places import body_size, free_end, gravity_size, region_shares, region_weights
+from physworld.mpm.particle_terms import ParticleBody
 from physworld.mpm.terms import BoundTerm
 from physworld.mpm.total_lagrangian import Problem
 
@@ -40,10 +41,11 @@ def push_nodes(
 
 @dataclass(frozen=True)
 class RegionForceTerm:
-    """Term of :class:`RegionForce`: nodes (k,) and their forces (k, 3) [N]."""
+    """Term of :class:`RegionForce`: nodes (k,) and their forces (k, 3) [N]; forces on particles (P, 3) [N]."""
 
     nodes: np.ndarray
     push: np.ndarray
+    particle_push: np.ndarray
 
     def bind(self, problem: Problem) -> BoundRegionForce:
         """Device arrays."""
@@ -51,6 +53,15 @@ class RegionForceTerm:
         return BoundRegionForce(
             wp.array(self.nodes, dtype=wp.int32, device=device),
             wp.array(self.push, dtype=wp.vec3d, device=device),
+        )
+
+    def on_particles(self, body: ParticleBody) -> BoundRegionForce:
+        """Device arrays for particles in the place of nodes."""
+        device, push = body.problem.device, self.particle_push[body.solid]
+        pushed = np.flatnonzero(push.any(axis=1))
+        return BoundRegionForce(
+            wp.array(pushed, dtype=wp.int32, device=device),
+            wp.array(push[pushed], dtype=wp.vec3d, device=device),
         )
 
 
@@ -107,5 +118,7 @@ class RegionForce(Effect):
         )
         radius = _RADIUS * body_size(twin) if self.radius_m is None else self.radius_m
         nodes, weights = region_weights(twin, centre, radius)
-        push = np.outer(weights, [self.force_x_n, self.force_y_n, self.force_z_n])
-        return replace(problem, terms=(*problem.terms, RegionForceTerm(nodes, push)))
+        force = [self.force_x_n, self.force_y_n, self.force_z_n]
+        particle_push = np.outer(region_shares(twin, centre, radius), force)
+        term = RegionForceTerm(nodes, np.outer(weights, force), particle_push)
+        return replace(problem, terms=(*problem.terms, term))

@@ -115,4 +115,4 @@ def _bending(problem: Problem, twin: Twin, bend: tuple[float, float]) -> StressT
     mu, lam = law.lame
     stress = np.repeat((-lam * strain)[None], 3, axis=0)
     stress[along] -= 2 * mu * strain
-    return StressTerm(_MODELS[3], (), stress, frequency_rad_s=0.0)
+    return StressTerm(_MODELS[3], (), stress, frequency_rad_s=0.0, name=RestShape.name)

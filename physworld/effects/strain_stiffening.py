@@ -75,5 +75,5 @@ class StrainStiffening(Effect):
         }[lattice.dim]()
         share = np.sqrt(3.0 * s) * _DESIGN_STRAIN  # of the law's own fastest frequency
         frequency = float(share * 2.0 * np.sqrt(lattice.dim) * law.wave_speed_m_s / lattice.spacing.min())
-        term = StressTerm(_MODELS[lattice.dim], numbers, frequency_rad_s=frequency)
+        term = StressTerm(_MODELS[lattice.dim], numbers, frequency_rad_s=frequency, name=self.name)
         return replace(problem, terms=(*problem.terms, term))

@@ -15,8 +15,9 @@ import numpy as np
 import warp as wp
 
 from physworld.effects.base import Effect, Strength
-from physworld.effects.places import body_size, free_end, gravity_size, region_weights
+from physworld.effects.places import body_size, free_end, gravity_size, region_shares, region_weights
 from physworld.mpm.node_kernels import weighted_sum
+from physworld.mpm.particle_terms import ParticleBody
 from physworld.mpm.terms import BoundTerm
 from physworld.mpm.total_lagrangian import Problem
 
@@ -50,20 +51,30 @@ def pull_of_tether(
 
 @dataclass(frozen=True)
 class TetherTerm:
-    """Term of :class:`Tether`: region (k,), (k,), anchor (3,) [m]."""
+    """Term of :class:`Tether`: region (k,), (k,), the particles' shares in it (P,), anchor (3,) [m]."""
 
     nodes: np.ndarray
     weights: np.ndarray
+    shares: np.ndarray
     anchor: np.ndarray
     stiffness_n_m: float
     rest_length_m: float
 
     def bind(self, problem: Problem) -> BoundTether:
         """Device arrays."""
+        return self._bound(problem, self.nodes, self.weights)
+
+    def on_particles(self, body: ParticleBody) -> BoundTether:
+        """Device arrays for particles in the place of nodes; the mass that moves at once is still that of the nodes."""
+        shares = self.shares[body.solid]
+        region = np.flatnonzero(shares)
+        return self._bound(body.problem, region, shares[region])
+
+    def _bound(self, problem: Problem, numbers: np.ndarray, weights: np.ndarray) -> BoundTether:
         device = problem.device
         inputs = [
-            wp.array(self.nodes, dtype=wp.int32, device=device),
-            wp.array(self.weights, dtype=wp.float64, device=device),
+            wp.array(numbers, dtype=wp.int32, device=device),
+            wp.array(weights, dtype=wp.float64, device=device),
             wp.vec3d(*self.anchor), wp.float64(self.stiffness_n_m), wp.float64(self.rest_length_m),
         ]  # fmt: skip
         inverse_mass = float(np.sum(self.weights**2 / problem.nodal_mass()[self.nodes]))
@@ -131,5 +142,6 @@ class Tether(Effect):
         anchor, attach = self.places(twin)
         radius = _RADIUS * body_size(twin) if self.radius_m is None else self.radius_m
         nodes, weights = region_weights(twin, attach, radius)
-        term = TetherTerm(nodes, weights, anchor, self.stiffness_n_m, self.rest_length_m)
+        shares = region_shares(twin, attach, radius)
+        term = TetherTerm(nodes, weights, shares, anchor, self.stiffness_n_m, self.rest_length_m)
         return replace(problem, terms=(*problem.terms, term))

@@ -15,6 +15,8 @@ import warp as wp
 
 from physworld.effects.base import Effect, Strength
 from physworld.errors import CFLViolation
+from physworld.mpm.particle_stress_kernels import grow_stress
+from physworld.mpm.particle_terms import BoundParticleStress, ParticleBody
 from physworld.mpm.terms import BoundTerm
 from physworld.mpm.total_lagrangian import Problem
 
@@ -50,6 +52,10 @@ class GrowingStiffness:
         """Room for the times comes with the run."""
         return BoundGrowth(self.rate_per_s, problem.device)
 
+    def on_particles(self, body: ParticleBody) -> BoundStressGrowth:
+        """The same on particles' stresses."""
+        return BoundStressGrowth(self.rate_per_s, body.problem.device)
+
 
 @dataclass
 class BoundGrowth(BoundTerm):
@@ -62,18 +68,39 @@ class BoundGrowth(BoundTerm):
 
     def begin(self, times: np.ndarray) -> None:
         """Take the times. Raises CFLViolation where the stiffness would outgrow the time step's margin."""
-        growth = float(np.exp(self.rate_per_s * np.array([times[0], times[-1]])).max())
-        if growth > _MOST:
-            raise CFLViolation(
-                f"the stiffness grows {growth:.3g} times by a rate of {self.rate_per_s:.3g} 1/s until "
-                f"{times[-1]:.3g} s; the time step's margin covers {_MOST:g}"
-            )
-        self.times = wp.array(times, dtype=wp.float64, device=self.device)
+        self.times = wp.array(_within_margin(times, self.rate_per_s), dtype=wp.float64, device=self.device)
 
     def launch(self, x: wp.array, v: wp.array, clock: wp.array, counter: wp.array, force: wp.array) -> None:
         """Multiply the forces that are there."""
         inputs = [self.times, wp.float64(self.rate_per_s), clock, counter]
         wp.launch(scale_forces, dim=len(force), inputs=inputs, outputs=[force], device=self.device)
+
+
+class BoundStressGrowth(BoundParticleStress):
+    """The rate on particles: each stress is multiplied in the substep that uses it."""
+
+    def __init__(self, rate_per_s: float, device: str) -> None:
+        self._rate, self._device = rate_per_s, device
+        self._times = wp.zeros(1, dtype=wp.float64, device=device)
+
+    def begin(self, times: np.ndarray) -> None:
+        """Take the times. Raises CFLViolation where the stiffness would outgrow the time step's margin."""
+        self._times = wp.array(_within_margin(times, self._rate), dtype=wp.float64, device=self._device)
+
+    def launch(self, F: wp.array, stress: wp.array, clock: wp.array, counter: wp.array) -> None:
+        """Multiply the stresses that are there."""
+        inputs = [self._times, wp.float64(self._rate), clock, counter]
+        wp.launch(grow_stress, dim=len(stress), inputs=inputs, outputs=[stress], device=self._device)
+
+
+def _within_margin(times: np.ndarray, rate_per_s: float) -> np.ndarray:
+    growth = float(np.exp(rate_per_s * np.array([times[0], times[-1]])).max())
+    if growth > _MOST:
+        raise CFLViolation(
+            f"the stiffness grows {growth:.3g} times by a rate of {rate_per_s:.3g} 1/s until {times[-1]:.3g} s; the "
+            f"time step's margin covers {_MOST:g}"
+        )
+    return times
 
 
 @dataclass(frozen=True)

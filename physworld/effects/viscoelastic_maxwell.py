@@ -100,4 +100,6 @@ class ViscoelasticMaxwell(Effect):
             2: lambda: (g * law.membrane_n_m, g * law.bending_n_m, tau, law.poissons_ratio),
             1: lambda: (g * law.stretching_n, g * law.bending_n_m2, tau),
         }[twin.lattice.dim]()
-        return replace(problem, terms=(*problem.terms, StressTerm(_MODELS[twin.lattice.dim], numbers)))
+        return replace(
+            problem, terms=(*problem.terms, StressTerm(_MODELS[twin.lattice.dim], numbers, name=self.name))
+        )

@@ -31,15 +31,17 @@ class GridContact:
     Args:
         collider: what pushes.
         lattice: the grid.
-        count: how many particles there are.
         lenient: particles that start inside touch where they are and further in.
+        friction: factors of the collider's friction, a particle (P,).
         device: Warp device.
     """
 
     def __init__(
-        self, collider: Collider, lattice: GridLattice, count: int, lenient: bool, device: str
+        self, collider: Collider, lattice: GridLattice, friction: np.ndarray, lenient: bool, device: str
     ) -> None:
+        count = len(friction)
         self.collider, self._lattice, self._count, self._device = collider, lattice, count, device
+        self._friction = wp.array(collider.friction * friction, dtype=wp.float32, device=device)
         self._lenient = lenient
         self._cell = float(lattice.spacing.min())
         self._half = GAUSS_POINTS[0] * lattice.spacing
@@ -124,7 +126,7 @@ class GridContact:
         grid = [wp.vec3d(*self._lattice.origin), wp.vec3d(*(1.0 / self._lattice.spacing)), box]
         wp.launch(
             press, self._count,
-            inputs=[self.collider.friction, relaxation, int(again), *grid, x, self._near, self._contact, self._drive],
+            inputs=[self._friction, relaxation, int(again), *grid, x, self._near, self._contact, self._drive],
             outputs=[self._impulse, velocity, self._totals], device=self._device,
         )  # fmt: skip
 

@@ -148,7 +148,7 @@ def find_near(
 @wp.kernel(enable_backward=False)
 def press(
     # model
-    friction: float,
+    friction: wp.array(dtype=wp.float32),
     relaxation: float,
     again: int,
     origin: wp.vec3d,
@@ -191,8 +191,9 @@ def press(
         along -= mass * slide
     normal = wp.max(normal, 0.0)
     size = wp.length(along)
-    if size > friction * normal:
-        along *= friction * normal / size
+    most = friction[p] * normal
+    if size > most:
+        along *= most / size
     wanted = normal * n + along
     impulse[p] = wanted
     change = wanted - given

@@ -89,10 +89,12 @@ class ParticleTerms:
         for term in problem.terms:
             if isinstance(term, GroundContact):
                 plane = ground(term.height_m, term.friction)
-                contacts.append(GridContact(plane, lattice, count, False, self._device))
+                factor = problem.friction_factor
+                friction = np.ones(count) if factor is None else factor[body.solid]
+                contacts.append(GridContact(plane, lattice, friction, False, self._device))
                 self.ground_height_m = term.height_m
             elif isinstance(term, ColliderContact):
-                contacts.append(GridContact(term.collider, lattice, count, True, self._device))
+                contacts.append(GridContact(term.collider, lattice, np.ones(count), True, self._device))
             else:
                 bound.append(_on_particles(term, body))
         self.contacts = tuple(contacts)

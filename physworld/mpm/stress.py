@@ -8,6 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from physworld.errors import SceneUnsupported
+from physworld.mpm.particle_stress_kernels import particle_model
+from physworld.mpm.particle_terms import BoundParticleStress, ParticleBody
 from physworld.mpm.stability import fastest_frequency
 from physworld.mpm.stress_kernels import StressModel
 from physworld.mpm.terms import BoundTerm
@@ -28,12 +31,32 @@ class StressTerm:
         fields: what FIELD(1), FIELD(2), … read, (k, P), or None.
         frequency_rad_s: what it adds to the fastest mode; None: found by power iteration about the rest state, with
             memory empty (a model that softens gives 0 there).
+        name: of the effect, for messages.
     """
 
     model: StressModel
     parameters: tuple[float, ...]
     fields: np.ndarray | None = None
     frequency_rad_s: float | None = None
+    name: str = "a stress beside the law's"
+
+    def on_particles(self, body: ParticleBody) -> BoundModel:
+        """The model on particles.
+
+        Raises:
+            SceneUnsupported: the body flows, and its particles do not know their whole deformation.
+        """
+        problem = body.problem
+        if body.flows:
+            raise SceneUnsupported(
+                f"{self.name} reads the whole deformation, and a flow law forgets what flowed of it"
+            )
+        factor = 1.0 if problem.stiffness_factor is None else problem.stiffness_factor
+        fields = [problem.lattice.particle_measures * factor, *([] if self.fields is None else self.fields)]
+        rows = np.zeros((len(fields), body.padded), dtype=np.float32)
+        rows[:, : len(body.solid)] = np.stack(fields)[:, body.solid]
+        frequency = self.bind(problem).frequency_rad_s
+        return BoundModel(self.model, self.parameters, rows, problem.device, frequency)
 
     def bind(self, problem: Problem) -> BoundStress:
         """Device arrays; raises ValueError where the model is of another dimension."""
@@ -105,6 +128,43 @@ class BoundStress(BoundTerm):
             outputs=[force],
             device=self.device,
         )
+
+
+class BoundModel(BoundParticleStress):
+    """A model on the particles of the updated Lagrangian form.
+
+    Args:
+        model: what sets the stress.
+        parameters: what PARAMETER(k) reads.
+        fields: what FIELD(k) reads, (k, P padded) float32.
+        device: Warp device.
+        frequency_rad_s: what it adds to the fastest mode.
+    """
+
+    def __init__(
+        self,
+        model: StressModel,
+        parameters: tuple[float, ...],
+        fields: np.ndarray,
+        device: str,
+        frequency_rad_s: float,
+    ) -> None:
+        self.frequency_rad_s, self._device, self._groups = frequency_rad_s, device, fields.shape[1] // 8
+        self._kernel = particle_model(model.text)
+        numbers = np.array(parameters or (0.0,), dtype=np.float32)
+        self._inputs = [
+            self._groups, model.rows, wp.array(numbers, dtype=wp.float32, device=device),
+            wp.array(fields.reshape(-1), dtype=wp.float32, device=device),
+        ]  # fmt: skip
+        self._state = wp.zeros(max(1, model.rows * fields.shape[1]), dtype=wp.float32, device=device)
+
+    def launch(self, F: wp.array, stress: wp.array, clock: wp.array, counter: wp.array) -> None:
+        """Add the model's stress."""
+        flat = wp.array(ptr=F.ptr, dtype=wp.float64, shape=9 * len(F), device=self._device)
+        wp.launch(
+            self._kernel, dim=self._groups, inputs=[*self._inputs, clock, counter, flat],
+            outputs=[self._state, stress], device=self._device,
+        )  # fmt: skip
 
 
 class _AboutRest:

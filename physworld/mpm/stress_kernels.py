@@ -29,7 +29,7 @@ import warp as wp
 
 from physworld.mpm.lanes import lanes_double, lanes_float8
 
-_ROWS = r"""
+ROWS = r"""
     #define FIELD(k) (*(const V*)&fields.data[((k) * cells + cell) * WIDTH + q])
     #define STATE(k) (*(V*)&state.data[(cell * rows + (k)) * WIDTH + q])
     #define PARAMETER(k) parameters.data[k]
@@ -74,7 +74,7 @@ MODEL
 
 _SOLID = (
     lanes_float8()
-    + _ROWS.replace("WIDTH", "8")
+    + ROWS.replace("WIDTH", "8")
     + r"""
     const int* node = &cell_nodes.data[cell * 27];
     const double* anchor = &x.data[3 * node[13]];
@@ -154,7 +154,7 @@ MODEL
 
 _SHEET = (
     lanes_double(4)
-    + _ROWS.replace("WIDTH", "4")
+    + ROWS.replace("WIDTH", "4")
     + r"""
     const int* node = &cell_nodes.data[cell * 9];
     #define DOT(u, w) ((u)[0] * (w)[0] + (u)[1] * (w)[1] + (u)[2] * (w)[2])
@@ -210,7 +210,7 @@ MODEL
 
 _ROD = (
     lanes_double(2)
-    + _ROWS.replace("WIDTH", "2")
+    + ROWS.replace("WIDTH", "2")
     + r"""
     const int* node = &cell_nodes.data[cell * 3];
     #define DOT(u, w) ((u)[0] * (w)[0] + (u)[1] * (w)[1] + (u)[2] * (w)[2])

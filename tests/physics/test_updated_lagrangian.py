@@ -285,6 +285,10 @@ def test_an_inverted_body_is_refused() -> None:
         engine.run_particles(rest * [1, 1, -1], np.zeros_like(rest), unheld(2), np.array([0.0, 0.1]))
 
 
+class Draught:
+    """A term on nodes that knows no particles."""
+
+
 def test_what_the_form_cannot_hold_is_refused() -> None:
     rod = box_lattice(np.zeros(1), np.array([1.0]), (10,))
     with pytest.raises(SceneUnsupported, match="dimension 1"):
@@ -292,6 +296,8 @@ def test_what_the_form_cannot_hold_is_refused() -> None:
     lattice = block()
     rest = rest_nodes(lattice)
     engine = UpdatedLagrangian(Problem(lattice, SolidLaw(1e5, 0.3), rest, GRAVITY))
+    with pytest.raises(SceneUnsupported, match=r"Draught acts on the nodes .* has 128 particles"):
+        UpdatedLagrangian(replace(engine.problem, terms=(Draught(),)))
     single = HeldNodes(np.array([0]), rest[None, :1].repeat(2, axis=0), np.zeros((2, 1, 3)))
     with pytest.raises(SceneUnsupported, match="1 nodes are held"):
         engine.run_particles(rest, np.zeros_like(rest), single, np.array([0.0, 0.1]))

@@ -6,14 +6,13 @@ import io
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from tiny_scene import tiny_scene
 
 from physworld.build import build_twin
-from physworld.effects.registry import effect
-from physworld.errors import SceneUnsupported
+from physworld.colliders import TwinCollider
+from physworld.geometry.sdf import sphere
 from physworld.materials.plastic import DruckerPrager, VonMises
-from physworld.scene import Body, Ground
+from physworld.scene import Body, DeclaredCollider, Ground
 from physworld.twin import Twin
 
 BUDGET = 300
@@ -92,9 +91,20 @@ def test_grains_that_nobody_holds_are_tracked_into_their_heap() -> None:
     assert nearest.max() < float(twin.lattice.spacing.max())  # and every point is in the heap
 
 
-def test_effects_on_nodes_are_refused_by_name_and_others_act() -> None:
-    twin = stiff(build_twin(tiny_scene(), BUDGET, formulation="updated_lagrangian"))
-    with pytest.raises(SceneUnsupported, match="QuadraticDrag acts on the nodes"):
-        observed(twin.with_effect(effect("air_drag_quadratic", coefficient_per_m=3.0)))
-    heavy = observed(twin.with_effect(effect("air_drag_linear", rate_per_s=20.0)))
-    assert np.abs(heavy - observed(twin)).max() > 1e-4
+def test_a_ball_pushes_a_bar_of_particles_as_it_pushes_one_of_nodes() -> None:
+    """The ball comes from the side of the free end and carries it along."""
+    scene = tiny_scene()
+    tracks = {}
+    for form in ("total_lagrangian", "updated_lagrangian"):
+        twin = stiff(build_twin(scene, BUDGET, formulation=form)).with_parameters(air_drag_per_s=20.0)
+        poses = np.zeros((3, 7))
+        poses[:, 3] = 1.0
+        poses[:, 0], poses[:, 2] = scene.body.box_max_m[0], 0.0
+        poses[:, 1] = scene.body.box_min_m[1] - np.array([0.045, 0.024, 0.024])
+        times = scene.times[[0, len(scene.times) // 2, -1]]
+        declared = DeclaredCollider("ball", "sphere", radius_m=0.03, poses="ball", friction=0.0)
+        pushed = replace(twin, colliders=(TwinCollider(declared, sphere(0.03), times, poses),))
+        tracks[form] = observed(pushed) - observed(twin)
+    total, updated = tracks.values()
+    assert np.abs(total).max() > 2e-3
+    assert np.abs(updated - total).max() < 0.35 * np.abs(total).max()  # three cells, one of them in the grip
