@@ -21,7 +21,8 @@ from benchmarks.harness import Report, run_alone
 from physworld.build import build_twin
 from physworld.calibrate import CalibrationConfig, calibrate
 from physworld.calibrate.global_stage import prior_twin
-from physworld.calibrate.local_stage import LocalConfig, LocalResult, fit_fields
+from physworld.calibrate.local_search import LocalConfig
+from physworld.calibrate.local_stage import LocalResult, fit_fields
 from physworld.evaluate.metrics import noise_floor, track_error
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Scene
 from physworld.twin import Twin

@@ -9,7 +9,8 @@ import pytest
 from made_scene import box_body, made_scene
 
 from physworld.build import build_twin
-from physworld.calibrate.local_stage import LocalConfig, field_modes, fit_fields
+from physworld.calibrate.local_search import LocalConfig, field_modes
+from physworld.calibrate.local_stage import fit_fields
 from physworld.errors import CalibrationError, Cancelled
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
 from physworld.twin import Twin
