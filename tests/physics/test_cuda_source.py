@@ -19,7 +19,18 @@ def compiles(module: object, folder: Path) -> bool:
     return bool(list(folder.glob("*.ptx")))
 
 
-@pytest.mark.parametrize("name", ["sheet_kernels", "rod_kernels", "thin_tangent_kernels", "node_kernels"])
+PLAIN = (
+    "sheet_kernels",
+    "rod_kernels",
+    "thin_tangent_kernels",
+    "node_kernels",
+    "twist_kernels",
+    "ground_kernels",
+    "energy_kernels",
+)
+
+
+@pytest.mark.parametrize("name", PLAIN)
 def test_the_kernels_compile_for_cuda(name: str, tmp_path: Path) -> None:
     assert compiles(import_module(f"physworld.mpm.{name}"), tmp_path)
 

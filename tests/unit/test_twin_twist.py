@@ -11,9 +11,13 @@ import pytest
 from made_scene import made_scene
 from scipy.spatial.transform import Rotation
 
+from physworld.batch import Episode, simulate_batch
 from physworld.build import build_twin
 from physworld.calibrate.parameters import parameters_of
+from physworld.effects.registry import effect
 from physworld.errors import SceneUnsupported
+from physworld.mpm.gradient import Direction
+from physworld.mpm.gradient_forward import sensitivities
 from physworld.mpm.gradient_twin import TwinRun, parameter
 from physworld.mpm.total_lagrangian import TotalLagrangian
 from physworld.mpm.twist import BoundTwist, Twist
@@ -121,8 +125,7 @@ def test_a_torsion_that_is_no_ratio_is_refused(value: object) -> None:
 
 def test_a_gradient_by_the_torsion_is_that_of_whole_runs() -> None:
     scene = rope(turns=1.9)
-    twin = build_twin(scene).with_parameters(bending_n_m2=2e-3)
-    twin = replace(twin, gravity_m_s2=np.array([0.0, 0.0, -9.81]))
+    twin = buckling(scene)
     track = scene.control_track()
     step = 0.9 * TwinRun(twin, *track, scene.times).time_step_s
     run = TwinRun(twin, *track, scene.times, time_step_s=step)
@@ -137,3 +140,51 @@ def test_a_gradient_by_the_torsion_is_that_of_whole_runs() -> None:
     ]
     expected = np.sum(weights * (ends[0] - ends[1])) / (2 * h)
     assert found["torsion"] == pytest.approx(expected, rel=1e-3)
+
+
+def test_twisted_ropes_side_by_side_are_those_alone() -> None:
+    scenes = [rope(turns=turns) for turns in (1.9, -1.2)]
+    twin = buckling(scenes[0])
+    track = [scene.control_track() for scene in scenes]
+    step = 0.5 * TwinRun(twin, *track[0], scenes[0].times).time_step_s
+    outcomes = simulate_batch(twin, [Episode(*t, scenes[0].times) for t in track], time_step_s=step)
+    for outcome, (times, controls) in zip(outcomes, track, strict=True):
+        alone = TwinRun(twin, times, controls, scenes[0].times, time_step_s=step)
+        assert np.array_equal(outcome.trusted(), alone.nodes)
+    assert np.abs(outcomes[0].trusted() - outcomes[1].trusted()).max() > 1e-4
+
+
+def test_forward_sensitivities_know_twist() -> None:
+    scene = rope(turns=1.9)
+    twin, track = buckling(scene), scene.control_track()
+    value, h = twin.law.torsion_ratio, 1e-4
+    near = [twin.with_parameters(torsion_ratio=value + sign * h) for sign in (1, -1)]
+    here, high, low = (t.integration(*track, scene.times) for t in (twin, *near))
+    step = 0.5 * TwinRun(twin, *track, scene.times).time_step_s
+    _, found = sensitivities(here, twin.body.start, here.knots, {"t": Direction(high, low, 2 * h)}, step)
+    ends = [
+        TotalLagrangian(side.problem, step).run(twin.body.start, side.velocity, side.held, side.knots)
+        for side in (high, low)
+    ]
+    expected = (ends[0] - ends[1]) / (2 * h)
+    assert np.abs(expected).max() > 1e-6
+    assert np.abs(found["t"] - expected).max() < 1e-3 * np.abs(expected).max()
+
+
+def test_a_grip_that_gives_still_twists() -> None:
+    scene = rope(turns=1.9)
+    twin = buckling(scene)
+    assert any(isinstance(term, Twist) for term in terms(twin, scene))
+    soft = twin.with_effect(effect("grip_slip", compliance_m_n=1e-3))
+    bent = [
+        t.simulate_nodes(*scene.control_track(), scene.times)
+        for t in (soft, soft.with_parameters(torsion_ratio=0.0))
+    ]
+    assert np.isfinite(bent[0]).all()
+    assert np.abs(bent[0] - bent[1]).max() > 1e-4
+
+
+def buckling(scene: Scene) -> Twin:
+    """A rope that sags a little, so that twist bends it at once."""
+    twin = build_twin(scene).with_parameters(bending_n_m2=2e-3)
+    return replace(twin, gravity_m_s2=np.array([0.0, 0.0, -9.81]))
