@@ -15,6 +15,7 @@ bodies belong to the other form.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 
 import numpy as np
 import warp as wp
@@ -177,24 +178,33 @@ class UpdatedLagrangian:
         rows = lattice.interpolation(lattice.particle_coordinates[self.solid]).multiply(self.volume[:, None])
         return np.asarray(rows @ (added / np.maximum(np.asarray(rows.sum(axis=0)).ravel(), 1e-30)))
 
+    def _at_particles(self, nodal: np.ndarray, orders: tuple[int, int, int] = (0, 0, 0)) -> np.ndarray:
+        """Values at the particles, (P, 3), of a nodal field (n, 3), differentiated ``orders`` times in cells."""
+        lattice = self.problem.lattice
+        table = lattice.table(orders)
+        return np.einsum("cai,ap->cpi", nodal[lattice.cell_nodes], table, optimize=True).reshape(-1, 3)[
+            self.solid
+        ]
+
+    def _gradient(self, nodal: np.ndarray) -> np.ndarray:
+        """Gradients at the particles in the reference body, (P, 3, 3), of a nodal field (n, 3)."""
+        slopes = [self._at_particles(nodal, axis) for axis in _AXES]
+        return np.stack(slopes, axis=-1) / self.problem.lattice.spacing
+
+    @cached_property
+    def _rest_inverse(self) -> np.ndarray:
+        return np.linalg.inv(self._gradient(self.problem.rest))
+
     def _start(self, x: np.ndarray, v: np.ndarray) -> Particles:
-        lattice, device = self.problem.lattice, self.problem.device
-        coordinates = lattice.particle_coordinates[self.solid]
-        value = lattice.interpolation(coordinates)
-        slopes = [lattice.interpolation(coordinates, axis) for axis in _AXES]
-
-        def gradient(nodal: np.ndarray) -> np.ndarray:
-            return np.stack([slope @ nodal for slope in slopes], axis=-1)
-
-        shape, rest = gradient(x), gradient(self.problem.rest)
-        C = gradient(v) @ np.linalg.inv(shape)
-        F = shape @ np.linalg.inv(rest)
+        device, shape = self.problem.device, self._gradient(x)
+        C = self._gradient(v) @ np.linalg.inv(shape)
+        F = shape @ self._rest_inverse
         room = padded(len(self.solid))
         F = np.concatenate([F, np.repeat(np.eye(3)[None], room - len(F), axis=0)])
         C = np.concatenate([C, np.zeros((room - len(C), 3, 3))])
         return Particles(
-            x=wp.array((value @ x).reshape(-1), dtype=wp.float64, device=device),
-            v=wp.array((value @ v).reshape(-1).astype(np.float32), dtype=wp.float32, device=device),
+            x=wp.array(self._at_particles(x).reshape(-1), dtype=wp.float64, device=device),
+            v=wp.array(self._at_particles(v).reshape(-1).astype(np.float32), dtype=wp.float32, device=device),
             C=wp.array(C.reshape(-1).astype(np.float32), dtype=wp.float32, device=device),
             F=wp.array(np.ascontiguousarray(F), dtype=wp.mat33d, device=device),
             stress=wp.zeros(6 * room, dtype=wp.float32, device=device),

@@ -8,10 +8,12 @@ from pathlib import Path
 import pytest
 import warp as wp
 
+from physworld.effects import plasticity, strain_stiffening
 from physworld.materials.plastic import PLASTICITIES
 from physworld.materials.solid import SolidLaw
 from physworld.mpm.elastic_stress_kernels import elastic_stress
 from physworld.mpm.hencky_kernels import plastic_kernel
+from physworld.mpm.particle_stress_kernels import particle_model
 
 
 def compiled(module: object, folder: Path) -> bool:
@@ -19,7 +21,16 @@ def compiled(module: object, folder: Path) -> bool:
     return bool(list(folder.glob("*.ptx")))
 
 
-@pytest.mark.parametrize("name", ["transfer_kernels", "grid_kernels", "grid_contact_kernels", "particle_kernels"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "transfer_kernels",
+        "grid_kernels",
+        "grid_contact_kernels",
+        "particle_kernels",
+        "particle_stress_kernels",
+    ],
+)
 def test_the_transfers_compile_for_cuda(name: str, tmp_path: Path) -> None:
     wp.init()
     assert compiled(import_module(f"physworld.mpm.{name}"), tmp_path)
@@ -35,3 +46,10 @@ def test_the_stresses_compile_for_cuda(tmp_path: Path) -> None:
 def test_the_return_mappings_compile_for_cuda(name: str, tmp_path: Path) -> None:
     wp.init()
     assert compiled(plastic_kernel(PLASTICITIES[name].project).module, tmp_path)
+
+
+def test_the_stresses_of_effects_compile_for_cuda(tmp_path: Path) -> None:
+    wp.init()
+    texts = [strain_stiffening._MODELS[3].text, plasticity._MODELS[3].text]
+    for number, text in enumerate(texts):
+        assert compiled(particle_model(text).module, tmp_path / str(number))
