@@ -31,9 +31,12 @@ class GridContact:
     Args:
         collider: what pushes.
         lattice: the grid.
-        lenient: particles that start inside touch where they are and further in.
         friction: factors of the collider's friction, a particle (P,).
+        lenient: particles that start inside touch where they are and further in.
         device: Warp device.
+
+    Attributes:
+        at_once: the particles act all at once, as they do on CUDA, instead of in turns.
     """
 
     def __init__(
@@ -43,6 +46,7 @@ class GridContact:
         self.collider, self._lattice, self._count, self._device = collider, lattice, count, device
         self._friction = wp.array(collider.friction * friction, dtype=wp.float32, device=device)
         self._lenient = lenient
+        self.at_once = wp.get_device(device).is_cuda
         self._cell = float(lattice.spacing.min())
         self._half = GAUSS_POINTS[0] * lattice.spacing
         sight = _SIGHT * self._cell
@@ -120,21 +124,29 @@ class GridContact:
             outputs=[self._near, self._contact, self._drive, self._impulse, self._totals], device=self._device,
         )  # fmt: skip
 
-    def press(self, x: wp.array, box: wp.array, velocity: wp.array, again: bool) -> None:
-        """One turn of every near particle on the nodes' ``velocity``; ``again``: with the last substep's impulses."""
-        relaxation = _RELAXATION if wp.get_device(self._device).is_cuda else 1.0
+    def press(self, x: wp.array, box: wp.array, velocity: wp.array, seen: wp.array, again: bool) -> None:
+        """One turn of every near particle on the nodes' ``velocity``; ``again``: with the last substep's impulses.
+
+        ``seen`` has room for a copy of the velocities where all particles act at once.
+        """
+        relaxation = _RELAXATION if self.at_once else 1.0
+        if self.at_once:
+            wp.copy(seen, velocity)
         grid = [wp.vec3d(*self._lattice.origin), wp.vec3d(*(1.0 / self._lattice.spacing)), box]
         wp.launch(
             press, self._count,
-            inputs=[self._friction, relaxation, int(again), *grid, x, self._near, self._contact, self._drive],
+            inputs=[self._friction, relaxation, int(again), *grid, x, self._near, self._contact, self._drive,
+                    seen if self.at_once else velocity],
             outputs=[self._impulse, velocity, self._totals], device=self._device,
         )  # fmt: skip
 
 
-def press_all(contacts: tuple[GridContact, ...], x: wp.array, box: wp.array, velocity: wp.array) -> None:
+def press_all(
+    contacts: tuple[GridContact, ...], x: wp.array, box: wp.array, velocity: wp.array, seen: wp.array
+) -> None:
     """All contacts of a substep: the last impulses first, then the corrections in turns."""
     for contact in contacts:
-        contact.press(x, box, velocity, again=True)
+        contact.press(x, box, velocity, seen, again=True)
     for _ in range(_SWEEPS if contacts else 0):
         for contact in contacts:
-            contact.press(x, box, velocity, again=False)
+            contact.press(x, box, velocity, seen, again=False)

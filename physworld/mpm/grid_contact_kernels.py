@@ -159,12 +159,16 @@ def press(
     near: wp.array(dtype=wp.int32),
     contact: wp.array(dtype=wp.vec4f),
     drive: wp.array(dtype=wp.vec3f),
+    seen: wp.array(dtype=wp.vec4f),
     # in, out
     impulse: wp.array(dtype=wp.vec3f),
     velocity: wp.array(dtype=wp.vec4f),
     totals: wp.array(dtype=wp.float64),
 ):
-    """Correct the impulse [N s] of one near particle; with ``again`` give it the last substep's, within its cone."""
+    """Correct the impulse [N s] of one near particle; with ``again`` give it the last substep's, within its cone.
+
+    ``seen`` is ``velocity`` itself where particles take their turns, a copy where they act at once.
+    """
     turn = wp.tid()
     if turn >= near[0]:
         return
@@ -179,7 +183,7 @@ def press(
     along = known - normal * n
     given = wp.vec3f()
     if again == 0:
-        now = carried(s, box, velocity)
+        now = carried(s, box, seen)
         if now[3] <= 0.0:
             return
         mass = relaxation / now[3]

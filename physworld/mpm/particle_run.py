@@ -166,6 +166,7 @@ class ParticleRun:
 
         self.momentum, self.impulse, self.grip = nodal(True), nodal(split), nodal(gripped)
         self.velocity, self.velocity_old = nodal(True), nodal(split)
+        self.seen = nodal(any(contact.at_once for contact in self.engine.terms.contacts))
         with wp.ScopedCapture(device=device) as capture:
             for _ in range(_CHUNK):
                 self._substep()
@@ -206,7 +207,7 @@ class ParticleRun:
              self.momentum, self.impulse, self.grip],
             [self.velocity, self.velocity_old, split],
         )  # fmt: skip
-        press_all(terms.contacts, q.x, box, self.velocity)
+        press_all(terms.contacts, q.x, box, self.velocity, self.seen)
         sharing = [split, engine.velocity_share, engine.separating_volume, wp.float64(clear)]
         launch(
             grid_to_particles, groups,
