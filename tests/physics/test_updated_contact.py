@@ -48,12 +48,15 @@ def free(frames: int) -> HeldNodes:
 def simulate(
     lattice: Lattice, law: SolidLaw, terms: tuple, times: np.ndarray, *, gravity=GRAVITY, velocity=None,
     shift=(0.0, 0.0, 0.0), drag: float = 0.0, plasticity: Plasticity | None = None,
+    at_once: bool = False,
 ) -> tuple[UpdatedLagrangian, np.ndarray, np.ndarray]:  # fmt: skip
     """Engine, particles (T, P, 3), and impulses of the contacts at the frames (T, terms, 3)."""
     rest = rest_nodes(lattice)
     v = np.zeros_like(rest) if velocity is None else np.broadcast_to(velocity, rest.shape).copy()
     problem = Problem(lattice, law, rest, np.asarray(gravity, dtype=float), drag_per_s=drag, terms=terms)
     engine = UpdatedLagrangian(problem, plasticity=plasticity)
+    for contact in engine.terms.contacts:
+        contact.at_once = at_once
     impulses = [np.zeros((len(terms), 3))]
 
     def keep(frame: int, frames: int) -> None:
@@ -67,14 +70,14 @@ def centre(engine: UpdatedLagrangian, particles: np.ndarray) -> np.ndarray:
     return np.einsum("p,tpi->ti", engine.mass, particles) / engine.mass.sum()
 
 
-@pytest.mark.parametrize("friction", [0.3, 0.6])
-def test_a_pushed_block_resists_with_coulombs_force(friction: float) -> None:
+@pytest.mark.parametrize(("friction", "at_once"), [(0.3, False), (0.6, False), (0.3, True)])
+def test_a_pushed_block_resists_with_coulombs_force(friction: float, at_once: bool) -> None:
     pusher = Collider(
         "pusher", sdf.box((0.05, 0.2, 0.06)), path([0, 1], [(-0.08, 0, 0.04), (0.07, 0, 0.04)]), 0.0
     )
     times = np.linspace(0, 1, 41)
     terms = (GroundContact(BLOCK, LAW, 0.0, friction), ColliderContact(pusher))
-    engine, particles, impulses = simulate(BLOCK, LAW, terms, times)
+    engine, particles, impulses = simulate(BLOCK, LAW, terms, times, at_once=at_once)
     force = (impulses[40] - impulses[20]) / 0.5
     assert force[0, 2] + force[1, 2] == pytest.approx(MASS * G, rel=COULOMB)
     assert force[1, 0] == pytest.approx(friction * force[0, 2], rel=COULOMB)
@@ -87,11 +90,16 @@ def test_a_pushed_block_resists_with_coulombs_force(friction: float) -> None:
     )
 
 
-@pytest.mark.parametrize(("degrees", "friction"), [(20.0, 0.5), (35.0, 0.9)])
-def test_a_block_on_a_gentle_slope_sticks_and_does_not_creep(degrees: float, friction: float) -> None:
+@pytest.mark.parametrize(
+    ("degrees", "friction", "at_once"), [(20.0, 0.5, False), (35.0, 0.9, False), (35.0, 0.9, True)]
+)
+def test_a_block_on_a_gentle_slope_sticks_and_does_not_creep(
+    degrees: float, friction: float, at_once: bool
+) -> None:
     slope = G * np.array([np.sin(np.radians(degrees)), 0.0, -np.cos(np.radians(degrees))])
     terms = (GroundContact(BLOCK, LAW, 0.0, friction),)
-    engine, particles, _ = simulate(BLOCK, LAW, terms, np.linspace(0, 2, 21), gravity=slope)
+    times = np.linspace(0, 2, 21)
+    engine, particles, _ = simulate(BLOCK, LAW, terms, times, gravity=slope, at_once=at_once)
     x = centre(engine, particles)[:, 0]
     assert abs(x[20] - x[10]) < 1e-6  # free, it would slide 5 m
 
