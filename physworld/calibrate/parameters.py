@@ -4,10 +4,10 @@ Stiffness and friction are positive and span decades: they are searched in the l
 as it is. With gravity, ground and prescribed grips only ratios to the density show, so the density is never a
 parameter here: it stays as declared, or at its prior, and the report says so.
 
-A *stiffness* is always searched, and with it where a flow law yields, if the body has one and the data show it: the
-prior of a yield stress is a value that nothing reaches. The others are *optional*: air drag, internal friction,
-Poisson's ratio, the friction of a ground that declares none, and the torsion of a rope that two grips twist; each is
-freed only if the data ask for it, and else stays at its prior.
+A *stiffness* is always searched, and with it where a flow law yields and the torsion of a rope that two grips turn, if
+the body has them and the data show them: the prior of a yield stress is a value that nothing reaches. The others are
+*optional*: air drag, internal friction, Poisson's ratio, and the friction of a ground that declares none; each is freed
+only if the data ask for it, and else stays at its prior.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ class Parameter:
         low, high: bounds of the search.
         start: starts of the search, best first by prior knowledge; for an optional one the value that is tried first.
         apply: a twin with this value.
-        stage: "stiffness" parameters come first, with where a "flow" law yields; "optional" ones are freed only if the
-            data ask for them.
+        stage: "stiffness" parameters come first, and over a grid with them what a "flow" law or a twisted rope has,
+            which is dropped again if the data do not need it; "optional" ones are freed only if the data ask for them.
         scale: searched in the logarithm, or as it is.
         step: of finite differences, in the searched scale.
         prior: value of an optional parameter that is not freed.
@@ -98,18 +98,13 @@ def parameters_of(
             Parameter("poissons_ratio", "1", *_POISSON_BOUNDS, (prior,), apply, "optional", _POISSON_STEP, "linear",
                       prior, _POISSON_GAIN)
         )  # fmt: skip
-    if isinstance(law, RodLaw) and len(twin.turning) > 1 and law.torsion_ratio > 0:
-        optional.append(
-            Parameter("torsion_ratio", "1", 0.02, 10.0, (law.torsion_ratio,), _set("torsion_ratio"), "optional", 0.1,
-                      prior=law.torsion_ratio)
-        )  # fmt: skip
     if ground_friction and "ground_friction" in twin.parameters:
         prior = twin.parameters["ground_friction"]
         optional.append(
             Parameter("ground_friction", "1", *_FRICTION_BOUNDS, (prior,), _set("ground_friction"), "optional",
                       0.05, prior=prior)
         )  # fmt: skip
-    return [*_stiffness(twin, separate_bending), *_flow(twin), *optional]
+    return [*_stiffness(twin, separate_bending), *_torsion(twin), *_flow(twin), *optional]
 
 
 def flow_law(name: str) -> Plasticity:
@@ -124,6 +119,18 @@ def flow_law(name: str) -> Plasticity:
     if law is VonMises or law is StVenantKirchhoff:
         return law(yield_stress_pa=_NEVER_PA)
     return law(friction_angle_rad=_SAND_RAD) if law is DruckerPrager else law()
+
+
+def _torsion(twin: Twin) -> list[Parameter]:
+    """GJ / EI of a rope that two grips turn: a rope that is twisted far bends and buckles by both."""
+    law = twin.law
+    if not isinstance(law, RodLaw) or len(twin.turning) < 2 or law.torsion_ratio == 0:
+        return []
+    starts = tuple(law.torsion_ratio * factor for factor in (1.0, 0.5, 2.0))
+    return [
+        Parameter("torsion_ratio", "1", 0.02, 10.0, starts, _set("torsion_ratio"), "flow", 0.05,
+                  prior=law.torsion_ratio)
+    ]  # fmt: skip
 
 
 def _flow(twin: Twin) -> list[Parameter]:
