@@ -22,6 +22,7 @@ _LEAVING = 0.1  # of its depth that material inside a collider leaves in a subst
 _FASTEST = 0.002  # cells a substep, at most, that it leaves
 _SWEEPS = 2  # of all contacts a substep; the warm start carries on
 _RELAXATION = 1.0 / 16.0  # where all particles of a contact act at once: up to 9 nodes' worth of them overlap
+_CRUSHED = 30.0  # wave moduli: an impact at the speed of waves presses with about one
 _DEPTH_SHARE = 0.9  # of a collider's own depth: deeper, the nearest way out may be the wrong one
 
 
@@ -32,6 +33,7 @@ class GridContact:
         collider: what pushes.
         lattice: the grid.
         friction: factors of the collider's friction, a particle (P,).
+        modulus_pa: of the body's stiffest pressure waves.
         lenient: particles that start inside touch where they are and further in.
         device: Warp device.
 
@@ -40,12 +42,18 @@ class GridContact:
     """
 
     def __init__(
-        self, collider: Collider, lattice: GridLattice, friction: np.ndarray, lenient: bool, device: str
+        self,
+        collider: Collider,
+        lattice: GridLattice,
+        friction: np.ndarray,
+        modulus_pa: float,
+        lenient: bool,
+        device: str,
     ) -> None:
         count = len(friction)
         self.collider, self._lattice, self._count, self._device = collider, lattice, count, device
         self._friction = wp.array(collider.friction * friction, dtype=wp.float32, device=device)
-        self._lenient = lenient
+        self._lenient, self._modulus = lenient, modulus_pa
         self.at_once = wp.get_device(device).is_cuda
         self._cell = float(lattice.spacing.min())
         self._half = GAUSS_POINTS[0] * lattice.spacing
@@ -61,6 +69,7 @@ class GridContact:
         self._near = wp.zeros(count + 1, dtype=wp.int32, device=device)
         self._contact = wp.zeros(count, dtype=wp.vec4f, device=device)
         self._drive = wp.zeros(count, dtype=wp.vec3f, device=device)
+        self._hardest = wp.zeros(1, dtype=wp.float32, device=device)
         self._impulse = wp.zeros(count, dtype=wp.vec3f, device=device)
         self._times = wp.zeros(1, dtype=wp.float64, device=device)
 
@@ -88,18 +97,27 @@ class GridContact:
         """A run over the frames ``times`` (T,) [s] starts with particles at ``x`` (P, 3) [m]."""
         self._times = wp.array(np.ascontiguousarray(times), dtype=wp.float64, device=self._device)
         self._impulse.zero_()
+        self._hardest.zero_()
         relief = np.zeros(self._count)
         if self._lenient:
             half = np.linalg.norm(self.collider.normal(x, times[0]) * self._half, axis=1)
             relief = np.minimum(self.collider.distance(x, times[0]) - half, 0.0)
         self._relief.assign(relief)
 
-    def check(self, time_s: float) -> None:
-        """After some substeps.
+    def check(self, time_s: float, dt_s: float) -> None:
+        """After some substeps of ``dt_s``.
 
         Raises:
-            ContactFailed: a particle came so deep that it may leave on the wrong side.
+            ContactFailed: a particle came so deep that it may leave on the wrong side, or is crushed.
         """
+        area = 0.25 * float(np.prod(self._lattice.spacing)) ** (2 / 3)
+        pressure = float(self._hardest.numpy()[0]) / (dt_s * area)
+        if pressure > _CRUSHED * self._modulus:
+            raise ContactFailed(
+                f"{self.collider.name} pressed with {pressure:.3g} Pa on a particle before t = {time_s:.4f} s, "
+                f"{pressure / self._modulus:.3g} times the body's wave modulus of {self._modulus:.3g} Pa: material "
+                f"between colliders is thinner than the cells of {self._cell:.3g} m can show, or hit too fast"
+            )
         allowed = _DEPTH_SHARE * self.collider.shape.inner_m
         deepest = self.deepest_m
         if np.isfinite(allowed) and deepest > allowed:
@@ -137,7 +155,7 @@ class GridContact:
             press, self._count,
             inputs=[self._friction, relaxation, int(again), *grid, x, self._near, self._contact, self._drive,
                     seen if self.at_once else velocity],
-            outputs=[self._impulse, velocity, self._totals], device=self._device,
+            outputs=[self._impulse, velocity, self._totals, self._hardest], device=self._device,
         )  # fmt: skip
 
 

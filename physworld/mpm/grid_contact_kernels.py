@@ -164,10 +164,12 @@ def press(
     impulse: wp.array(dtype=wp.vec3f),
     velocity: wp.array(dtype=wp.vec4f),
     totals: wp.array(dtype=wp.float64),
+    hardest: wp.array(dtype=wp.float32),
 ):
     """Correct the impulse [N s] of one near particle; with ``again`` give it the last substep's, within its cone.
 
-    ``seen`` is ``velocity`` itself where particles take their turns, a copy where they act at once.
+    ``seen`` is ``velocity`` itself where particles take their turns, a copy where they act at once; ``hardest`` becomes
+    the greatest normal impulse.
     """
     turn = wp.tid()
     if turn >= near[0]:
@@ -198,6 +200,7 @@ def press(
     most = friction[p] * normal
     if size > most:
         along *= most / size
+    wp.atomic_max(hardest, 0, normal)
     wanted = normal * n + along
     impulse[p] = wanted
     change = wanted - given

@@ -134,7 +134,7 @@ class ParticleRun:
                 f"a particle's state is not finite at t = {time:.4f} s with time step {dt:.3g} s "
                 f"(stable: {engine.time_step_s:.3g} s)"
             )
-        engine.terms.check(time)
+        engine.terms.check(time, dt)
         if flags[INVERTED]:
             raise UnstableSimulation(
                 f"a particle inverted by t = {time:.4f} s with time step {dt:.3g} s: its volume ratio fell below 0.02 "

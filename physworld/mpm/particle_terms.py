@@ -84,6 +84,9 @@ class ParticleTerms:
         problem, count = body.problem, len(body.solid)
         self._device, self._count = problem.device, count
         self.ground_height_m: float | None = None
+        mu, lam = problem.law.lame
+        stiffest = 1.0 if problem.stiffness_factor is None else float(np.max(problem.stiffness_factor))
+        modulus = (lam + 2 * mu) * stiffest
         contacts: list[GridContact] = []
         bound: list[BoundTerm | BoundParticleStress] = []
         for term in problem.terms:
@@ -91,10 +94,12 @@ class ParticleTerms:
                 plane = ground(term.height_m, term.friction)
                 factor = problem.friction_factor
                 friction = np.ones(count) if factor is None else factor[body.solid]
-                contacts.append(GridContact(plane, lattice, friction, False, self._device))
+                contacts.append(GridContact(plane, lattice, friction, modulus, False, self._device))
                 self.ground_height_m = term.height_m
             elif isinstance(term, ColliderContact):
-                contacts.append(GridContact(term.collider, lattice, np.ones(count), True, self._device))
+                contacts.append(
+                    GridContact(term.collider, lattice, np.ones(count), modulus, True, self._device)
+                )
             else:
                 bound.append(_on_particles(term, body))
         self.contacts = tuple(contacts)
@@ -115,10 +120,12 @@ class ParticleTerms:
         for contact in self.contacts:
             contact.begin(times, x)
 
-    def check(self, time_s: float) -> None:
-        """Some substeps ended: raises a :class:`physworld.errors.SimulationError` if it cannot be trusted."""
-        for term in (*self._forces, *self.contacts):
+    def check(self, time_s: float, dt_s: float) -> None:
+        """After substeps of ``dt_s``: a :class:`physworld.errors.SimulationError` where they cannot be trusted."""
+        for term in self._forces:
             term.check(time_s)
+        for contact in self.contacts:
+            contact.check(time_s, dt_s)
 
     def launch(
         self, x: wp.array, v: wp.array, F: wp.array, stress: wp.array, clock: wp.array, counter: wp.array

@@ -262,6 +262,19 @@ def test_material_that_starts_inside_is_not_thrown_out() -> None:
     assert np.abs(particles[..., 2].mean(axis=1) - particles[0, :, 2].mean()).max() < 2e-4
 
 
+def test_grains_that_a_paddle_crushes_on_the_ground_are_not_trusted() -> None:
+    law = SolidLaw(2e5, 0.3, density_kg_m3=1500.0)
+    lattice = box_lattice(np.array([-0.06, -0.06, 0.0]), np.array([0.12, 0.12, 0.06]), (6, 6, 3))
+    paddle = Collider(
+        "paddle", sdf.box((0.08, 0.04, 0.06)), path([0, 0.3], [(0, 0, 0.12), (0, 0, 0.032)]), 0.3
+    )
+    terms = (GroundContact(lattice, law, 0.0, 0.5), ColliderContact(paddle))
+    with pytest.raises(
+        ContactFailed, match=r"times the body's wave modulus of 2\.69e\+05 Pa: material between"
+    ):
+        simulate(lattice, law, terms, np.linspace(0, 0.3, 13), plasticity=DruckerPrager(0.6))
+
+
 def test_a_grip_that_carries_material_through_a_collider_is_not_trusted() -> None:
     shelf = Collider("shelf", sdf.box((0.3, 0.3, 0.02)), path([0], [(0, 0, -0.015)]), 0.0)
     rest, times = rest_nodes(BLOCK), np.linspace(0, 0.2, 21)
