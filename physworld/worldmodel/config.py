@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+PRIORS = ("auto", "modal", "chain")
+
 
 @dataclass(frozen=True)
 class WorldModelConfig:
@@ -59,6 +61,7 @@ class TrainingConfig:
         validation_fraction: share of the episodes held out whole.
         validation_every: steps between open-loop validations.
         patience: validations in a row without a better one after which the training ends early; 0: never.
+        prior: what stands under the network: "modal", "chain", or "auto": whichever errs less on validation episodes.
         start_share: share of the episodes that the training begins with; 1: it has all of them from the start.
         checkpoint_every: steps between checkpoints.
         threads: torch threads.
@@ -77,6 +80,7 @@ class TrainingConfig:
     validation_fraction: float = 0.1
     validation_every: int = 250
     patience: int = 0
+    prior: str = "auto"
     start_share: float = 1.0
     checkpoint_every: int = 250
     threads: int = 1
@@ -87,6 +91,8 @@ class TrainingConfig:
             raise ValueError(
                 f"patience {self.patience}, start share {self.start_share:g} (above 0, at most 1)"
             )
+        if self.prior not in PRIORS:
+            raise ValueError(f"prior {self.prior!r}; known are {', '.join(PRIORS)}")
 
 
 @dataclass(frozen=True)

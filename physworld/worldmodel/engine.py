@@ -15,6 +15,8 @@ from types import ModuleType
 import numpy as np
 import torch
 
+from physworld.worldmodel.chain_native import chain_arrays, chain_scratch, chain_sizes
+from physworld.worldmodel.chain_step import ChainStep
 from physworld.worldmodel.messages import warp_module
 from physworld.worldmodel.model import WorldModel
 
@@ -29,7 +31,7 @@ class RolloutEngine:
         spec, config, norm = model.spec, model.config, model.norm
         self.history, self.objects, self.vertices = config.history, spec.object_count, spec.vertex_count
         self.hidden = -(-config.hidden // REGISTER) * REGISTER
-        prior = model.prior
+        chain = model.prior.prior if isinstance(model.prior, ChainStep) else None
         self._fixed = _pack_weights(model, self.hidden) | {
             "offsets": _integers(model.edges.offsets),
             "edge_sender": _integers(model._senders),
@@ -37,12 +39,17 @@ class RolloutEngine:
             "edge_offset": _floats(model._offset),
             "share": _floats(model._share),
             "reference": _floats(model._reference),
-            "mean": _floats(prior.mean),
-            "basis": _floats(prior.basis),
-            "shape": _floats(prior.shape),
-            "prior_weight": _floats(prior.weight),
-            "prior_response": _floats(prior.response),
         }
+        if chain is not None:
+            self._fixed |= chain_arrays(chain)
+        else:
+            self._fixed |= {
+                "mean": _floats(model.prior.mean),
+                "basis": _floats(model.prior.basis),
+                "shape": _floats(model.prior.shape),
+                "prior_weight": _floats(model.prior.weight),
+                "prior_response": _floats(model.prior.response),
+            }
         self._property_scale = norm.properties.numpy()
         change, velocity, length = (float(x) for x in (norm.change, norm.velocity, norm.length))
         self._scalars = np.array([1.0 / velocity, change, 1.0 / length], dtype=np.float32)
@@ -55,12 +62,14 @@ class RolloutEngine:
             "edges": spec.edge_count,
             "layers": config.message_passing_steps,
             "hidden": self.hidden,
-            "modes": prior.basis.shape[0],
+            "chained": int(chain is not None),
+            "modes": 0 if chain is not None else model.prior.basis.shape[0],
             "controls": spec.control_count,
             "inputs": model.skip.in_features,
             "places_width": 3 * (config.history + 2),
             "grounded": int(spec.ground_height_m is not None),
         }
+        self._sizes |= chain_sizes(chain, config.history) if chain is not None else {}
 
     def run(self, start: np.ndarray, driven: np.ndarray, phi: np.ndarray) -> np.ndarray:
         """All vertices (T, V, 3) float32 from object frames (h+1, n, 3), control vertices (T, C, 3), Φ (n, 2)."""
@@ -83,10 +92,11 @@ class RolloutEngine:
         path[:, :, n:] = driven
         shared = np.broadcast_to(np.asarray(phi, dtype=np.float64), (candidates, n, 2))
         scaled = np.ascontiguousarray(shared / self._property_scale, dtype=np.float32)
+        logs = np.ascontiguousarray(shared, dtype=np.float32)
         soft = (shared[..., 0] - shared[..., 1]).mean(axis=1).astype(np.float32)
         bounds = np.linspace(0, candidates, min(threads, candidates) + 1).astype(int)
         parts = [slice(a, b) for a, b in pairwise(bounds) if b > a]
-        launches = [(path[part], scaled[part], soft[part]) for part in parts]
+        launches = [(path[part], scaled[part], soft[part], logs[part]) for part in parts]
         if len(launches) <= 1:
             for launch in launches:
                 self._launch(*launch)
@@ -97,7 +107,7 @@ class RolloutEngine:
                 done.result()
         return path
 
-    def _launch(self, path: np.ndarray, phi: np.ndarray, soft: np.ndarray) -> None:
+    def _launch(self, path: np.ndarray, phi: np.ndarray, soft: np.ndarray, logs: np.ndarray) -> None:
         """Fill in ``path`` (B, T, V, 3) in place; the arrays are contiguous float32."""
         kernels, candidates, frames = _kernels(), path.shape[0], path.shape[1]
         sizes = self._sizes | {"candidates": candidates, "frames": frames}
@@ -109,13 +119,16 @@ class RolloutEngine:
             "places": self.vertices * sizes["places_width"],
             "correction": self.objects * REGISTER,
             "length": edges,
-            "regressors": self._fixed["prior_weight"].shape[1],
+            "regressors": 0 if sizes["chained"] else self._fixed["prior_weight"].shape[1],
             "ahead": 3 * self.vertices,
         }
         arrays = self._fixed | {name: np.zeros(count, dtype=np.float32) for name, count in scratch.items()}
-        arrays |= {"paths": path, "phis": phi, "softnesses": soft}
-        table = np.array([arrays[name].ctypes.data for name in kernels.ARRAYS], dtype=np.int64)
-        numbers = np.array([sizes[name] for name in kernels.SIZES], dtype=np.int32)
+        arrays |= {"paths": path, "phis": phi, "softnesses": soft, "logs": logs}
+        if sizes["chained"]:
+            arrays["chain_scratch"] = chain_scratch(sizes["chain_width"])
+        addresses_of = [arrays[name].ctypes.data if name in arrays else 0 for name in kernels.ARRAYS]
+        table = np.array(addresses_of, dtype=np.int64)
+        numbers = np.array([sizes.get(name, 0) for name in kernels.SIZES], dtype=np.int32)
         addresses = [numbers.ctypes.data, self._scalars.ctypes.data, table.ctypes.data]
         warp_module().launch(kernels.rollout, dim=1, inputs=addresses, device="cpu", record_tape=False)
 

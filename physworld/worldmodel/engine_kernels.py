@@ -1,7 +1,7 @@
 """Whole rollouts of a batch of candidates as one native function: no Python and no launch between steps.
 
 Candidates run one after another: a network of this size keeps the arithmetic units busy by itself, and its scratch
-stays in the cache. Where the network adds nothing to the modal prior (``corrected`` is 0) only the prior is run.
+stays in the cache. Where the network adds nothing to the prior (``corrected`` is 0) only the prior is run.
 
 Rows of 16 floats are one vector register (two or four of them on older CPUs); every width is padded to a multiple
 of 16 with zeros, which a ReLU leaves zero. ``product`` multiplies four rows at a time, so that a weight is
@@ -13,11 +13,14 @@ from __future__ import annotations
 
 import warp as wp
 
+from physworld.worldmodel.chain_kernels import CHAIN_ARRAYS, CHAIN_SIZES
+from physworld.worldmodel.chain_text import STEP, TEXT, VECTORS
+
 wp.set_module_options({"enable_backward": False})
 
 SIZES = (
     "candidates", "corrected", "first", "frames", "history", "objects", "vertices", "edges", "layers", "hidden",
-    "modes", "controls", "inputs", "places_width", "grounded",
+    "modes", "controls", "inputs", "places_width", "grounded", "chained", *CHAIN_SIZES,
 )  # fmt: skip
 SCALARS = ("per_velocity", "change", "per_length")
 ARRAYS = (
@@ -29,7 +32,7 @@ ARRAYS = (
     "update_in", "update_in_bias", "update_out", "update_out_bias",
     "decode_in", "decode_in_bias", "decode_out", "decode_out_bias", "skip",
     "features", "places", "state", "hear", "say", "placed", "heard", "sent", "sums", "inner", "correction",
-    "length", "regressors", "ahead",
+    "length", "regressors", "ahead", "logs", *CHAIN_ARRAYS,
 )  # fmt: skip
 INTEGER_ARRAYS = frozenset({"offsets", "edge_sender", "edge_receiver", "gapped"})
 
@@ -45,16 +48,16 @@ def _unpack() -> str:
 
 
 _ROLLOUT = (
-    r"""
-    typedef float V __attribute__((ext_vector_type(16), aligned(4)));
-    typedef int I __attribute__((ext_vector_type(16), aligned(4)));
-"""
+    VECTORS
     + _unpack()
     + r"""
     const int H = hidden, N = objects, VN = vertices, C = controls, R = modes;
     float* path = paths;
     auto positive = [](V x) -> V { return (V)((I)x & (x > 0.0f)); };
-    auto fused = [](float a, V b, V c) -> V { return __builtin_elementwise_fma((V)a, b, c); };
+"""
+    + TEXT
+    + STEP
+    + r"""
     // out (rows, width) = [out +] in (rows, depth) * weight (depth, width) [+ bias]
     auto product = [&](float* out, const float* in, const float* weight, const float* bias, int rows, int depth,
                       int width, bool add) {
@@ -113,41 +116,45 @@ _ROLLOUT = (
         path = paths + (long long)b * frames * VN * 3;
         const float* phi = phis + (long long)b * N * 2;
         const float softness = softnesses[b];
-        for (int t = first - history; t < first; ++t) project(t);
+        if (chained) load(logs + (long long)b * N * 2);
+        for (int t = first - history; t < first && !chained; ++t) project(t);
         for (int t = first; t < frames - 1; ++t) {
             const float* now = path + (long long)t * VN * 3;
             float* next = path + (long long)(t + 1) * VN * 3;
-            // modal prior
-            project(t);
-            int f = 0;
-            for (int s = 0; s <= history; ++s)
-                for (int m = 0; m < R; ++m) regressors[f++] = amplitudes[(long long)(t - s) * R + m];
-            float centre[3], here[3], there[3];
-            centre_of(t, here);
-            centre_of(t + 1, there);
-            for (int s = -1; s <= history; ++s) {
-                centre_of(t - s, centre);
-                for (int c = 0; c < C; ++c)
-                    for (int k = 0; k < 3; ++k)
-                        regressors[f++] =
-                            path[((long long)(t - s) * VN + N + c) * 3 + k] - centre[k] - shape[c * 3 + k];
-            }
-            for (int s = -1; s <= history; ++s) {
-                if (s == 0) continue;
-                centre_of(t - s, centre);
-                for (int k = 0; k < 3; ++k) regressors[f++] = centre[k] - here[k];
-            }
-            regressors[f++] = 1.0f;
-            for (int i = 0; i < N; ++i)
-                for (int k = 0; k < 3; ++k) ahead[i * 3 + k] = there[k] + mean[i * 3 + k];
-            for (int m = 0; m < R; ++m) {
-                float a = 0.0f;
-                for (int k = 0; k < f; ++k) a += prior_weight[(long long)m * f + k] * regressors[k];
-                const int lagged = (history + 1) * R;
-                const float* answer = prior_response + (long long)m * (lagged + 1);
-                for (int k = 0; k < lagged; ++k) a += softness * answer[k] * regressors[k];
-                a += softness * answer[lagged];
-                for (int i = 0; i < 3 * N; ++i) ahead[i] += a * basis[(long long)m * N * 3 + i];
+            if (chained) {
+                chain(t, ahead);
+            } else {  // modal prior
+                project(t);
+                int f = 0;
+                for (int s = 0; s <= history; ++s)
+                    for (int m = 0; m < R; ++m) regressors[f++] = amplitudes[(long long)(t - s) * R + m];
+                float centre[3], here[3], there[3];
+                centre_of(t, here);
+                centre_of(t + 1, there);
+                for (int s = -1; s <= history; ++s) {
+                    centre_of(t - s, centre);
+                    for (int c = 0; c < C; ++c)
+                        for (int k = 0; k < 3; ++k)
+                            regressors[f++] =
+                                path[((long long)(t - s) * VN + N + c) * 3 + k] - centre[k] - shape[c * 3 + k];
+                }
+                for (int s = -1; s <= history; ++s) {
+                    if (s == 0) continue;
+                    centre_of(t - s, centre);
+                    for (int k = 0; k < 3; ++k) regressors[f++] = centre[k] - here[k];
+                }
+                regressors[f++] = 1.0f;
+                for (int i = 0; i < N; ++i)
+                    for (int k = 0; k < 3; ++k) ahead[i * 3 + k] = there[k] + mean[i * 3 + k];
+                for (int m = 0; m < R; ++m) {
+                    float a = 0.0f;
+                    for (int k = 0; k < f; ++k) a += prior_weight[(long long)m * f + k] * regressors[k];
+                    const int lagged = (history + 1) * R;
+                    const float* answer = prior_response + (long long)m * (lagged + 1);
+                    for (int k = 0; k < lagged; ++k) a += softness * answer[k] * regressors[k];
+                    a += softness * answer[lagged];
+                    for (int i = 0; i < 3 * N; ++i) ahead[i] += a * basis[(long long)m * N * 3 + i];
+                }
             }
             for (int i = 3 * N; i < 3 * VN; ++i) ahead[i] = next[i];
             if (!corrected) {

@@ -12,7 +12,7 @@ Vertex features f_i, in this order (no positions: the network is equivariant to 
     (x_i^{t-k} - x_i^{t-k-1}) / σ_velocity   for k = 0 … h-1      3h   (own velocities, as in GNS: relative
                                                                         positions hide a whole body's fall)
     (x̂_i^{t+1} - x_i^t) / σ_velocity, for control vertices
-        (c_i^{t+1} - c_i^t) / σ_velocity                           3   (the modal prior; the action a_t)
+        (c_i^{t+1} - c_i^t) / σ_velocity                           3   (the prior; the action a_t)
     φ_i / σ_properties; 0 for control vertices                     2
     1 if object vertex, 1 if control vertex                        2
     clip(z_i^t / σ_length, 0, 1), only with a ground               1
@@ -34,7 +34,7 @@ The type of an edge is not a feature: each kind has weights of its own.
         s_iκ = mean_{j of kind κ} m_ij                             κ = 0, 1, 2
         h_i  = h_i + update_out.l(relu(update_in.l.weight [h_i, s_i0, s_i1, s_i2] + update_in.l.bias))
     y_i  = decoder.out(relu(decoder.in(h_i))) + skip.weight f_i     (n, 3), object vertices only
-    x_i^{t+1} = x̂_i^{t+1} + σ_change · y_i                         x̂: the modal prior
+    x_i^{t+1} = x̂_i^{t+1} + σ_change · y_i                         x̂: the prior, modal or chain
     x_i^{t+1} = c_i^{t+1}                                          for control vertices
 
 **Modal prior** (``physworld.worldmodel.modal`` says why). c̄^s: mean of the control vertices at frame s,
@@ -45,6 +45,9 @@ where s = t+1 takes c^{t+1}.
     a^{t+1} = prior.weight [a^t … a^{t-h}, d^{t+1}, d^t … d^{t-h}, e^{t+1}, e^{t-1} … e^{t-h}, 1]
             + ζ prior.response [a^t … a^{t-h}, 1],   ζ = mean_i (φ_i0 - φ_i1)
     x̂_i^{t+1} = c̄^{t+1} + prior.mean_i + Σ_r a_r^{t+1} prior.basis[r, i]
+
+**Chain prior**, of ropes, in place of the modal one: ``physworld.worldmodel.chain`` has its equations; its tensors are
+``prior.`` and the fields of ``ChainPrior``, float32, and prior.substeps (1,) int64.
 
 **Tensors** of ``model.safetensors`` (float32 unless said; ``.weight`` is (out, in)):
     encoder.in.weight (H, 3h+7 or 3h+8), encoder.in.bias (H), encoder.out.weight (H, H), encoder.out.bias (H),
@@ -83,6 +86,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from physworld.worldmodel.chain import ChainPrior
+from physworld.worldmodel.chain_step import ChainStep
 from physworld.worldmodel.config import WorldModelConfig
 from physworld.worldmodel.graph import EDGE_KINDS, GraphSpec
 from physworld.worldmodel.messages import EdgeList, sum_messages
@@ -97,7 +102,7 @@ class Normalisation:
 
     Attributes:
         velocity: of vertex displacements per step.
-        change: of what the modal prior leaves, x^{t+1} - x̂^{t+1}.
+        change: of what the prior leaves, x^{t+1} - x̂^{t+1}.
         relative: of relative displacements per step along edges, by edge kind.
         strain: of r - r_rest along edges, by edge kind.
         stretch: of |r| - |r_rest| along edges, by edge kind.
@@ -123,14 +128,14 @@ class EdgeConstants:
 
 
 class WorldModel(nn.Module):
-    """Encode, process, decode: what every object vertex does in one step beyond the modal prior."""
+    """Encode, process, decode: what every object vertex does in one step beyond the prior."""
 
     def __init__(
         self,
         config: WorldModelConfig,
         spec: GraphSpec,
         normalisation: Normalisation | None = None,
-        prior: ModalPrior | None = None,
+        prior: ModalPrior | ChainPrior | None = None,
     ) -> None:
         super().__init__()
         self.config = config
@@ -153,7 +158,7 @@ class WorldModel(nn.Module):
         self.norm = _Scales(normalisation, spec)
         reference = _reference_positions(spec)
         n = spec.object_count
-        self.prior = PriorStep(prior or rigid_prior(reference[:n], reference[n:], h), h)
+        self.prior = prior_step(prior or rigid_prior(reference[:n], reference[n:], h), h)
 
     def _set_graph(self, spec: GraphSpec) -> None:
         """The edges, kind by kind, and their constants, in the order of the edge list."""
@@ -218,7 +223,7 @@ class WorldModel(nn.Module):
         return torch.cat([ahead[:n] + self.norm.change * correction, control_next])
 
     def corrects_prior(self) -> bool:
-        """Whether the network adds anything to the modal prior: not before the first step of training."""
+        """Whether the network adds anything to the prior: not before the first step of training."""
         ends = (self.skip.weight, self.decoder.out.weight, self.decoder.out.bias)
         return any(bool(torch.any(weight != 0)) for weight in ends)
 
@@ -269,6 +274,11 @@ class WorldModel(nn.Module):
         if self.spec.ground_height_m is not None:
             parts.append(torch.clamp(window[-1, :, :, 2:] / self.norm.length, 0.0, 1.0))
         return torch.cat(parts, dim=-1)
+
+
+def prior_step(prior: ModalPrior | ChainPrior, history: int) -> PriorStep | ChainStep:
+    """The module that computes x̂^{t+1} from ``prior``."""
+    return ChainStep(prior, history) if isinstance(prior, ChainPrior) else PriorStep(prior, history)
 
 
 class PriorStep(nn.Module):

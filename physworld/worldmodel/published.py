@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from physworld.worldmodel.chain import ChainPrior
 from physworld.worldmodel.config import WorldModelConfig
 from physworld.worldmodel.engine import RolloutEngine
 from physworld.worldmodel.graph import GraphSpec
@@ -147,8 +148,7 @@ class PublishedModel:
             edge_radius_m=facts["edge_radius_m"],
             ground_height_m=facts["ground_height_m"],
         )
-        prior = ModalPrior(**{part: tensors[f"prior.{part}"] for part in ModalPrior.__dataclass_fields__})
-        model = WorldModel(config, spec, prior=prior)
+        model = WorldModel(config, spec, prior=_prior_of(tensors))
         network = {name: value for name, value in tensors.items() if not name.startswith(_OWN)}
         model.load_state_dict({name: torch.as_tensor(value) for name, value in network.items()})
         return cls(
@@ -160,3 +160,11 @@ class PublishedModel:
             start_time_s=float(tensors["start.time"][0]),
             skin=Skin(tensors["skin.index"], tensors["skin.weight"].astype(np.float64)),
         )
+
+
+def _prior_of(tensors: dict[str, np.ndarray]) -> ModalPrior | ChainPrior:
+    """The prior whose tensors there are."""
+    if "prior.spread" not in tensors:
+        return ModalPrior(**{part: tensors[f"prior.{part}"] for part in ModalPrior.__dataclass_fields__})
+    parts = {part: tensors[f"prior.{part}"] for part in ChainPrior.__dataclass_fields__}
+    return ChainPrior(**(parts | {"substeps": int(parts["substeps"][0])}))

@@ -8,6 +8,9 @@ candidates; episodes that each start elsewhere go through torch.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -17,6 +20,9 @@ from physworld.worldmodel.engine import RolloutEngine
 from physworld.worldmodel.errors import GraphInvalid
 from physworld.worldmodel.graph import GraphSpec
 from physworld.worldmodel.model import WorldModel
+
+Step = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""All vertices at t + 1 (V, B, 3) from a window (h+1, V, B, 3), control vertices at t + 1 and Φ (n, B, ·)."""
 
 
 def rollout(
@@ -72,24 +78,49 @@ def rollout_batch(
 
 def rollout_tracks(model: WorldModel, tracks: list[Track]) -> list[Tensor]:
     """Rollouts (T, V, 3) of episodes from their first h + 1 frames, all in one batch."""
-    n, frames = model.spec.object_count, model.config.history + 1
+    return unroll_tracks(_with_constants(model), tracks, model.spec.object_count, model.config.history)
+
+
+def unroll_tracks(step: Step, tracks: list[Track], n: int, history: int) -> list[Tensor]:
+    """The same with any ``step``."""
     lengths = [track.positions.shape[0] for track in tracks]
     longest = max(lengths)
     padded = torch.stack([_held(track.positions, longest) for track in tracks], dim=2)
     phi = torch.stack([track.phi for track in tracks], dim=1)
-    predicted = unroll(model, padded[:frames, :n], padded[:, n:], phi)
+    predicted = _unroll(step, padded[: history + 1, :n], padded[:, n:], phi)
     return [predicted[:length, :, i] for i, length in enumerate(lengths)]
 
 
 def unroll(model: WorldModel, start: Tensor, driven: Tensor, phi: Tensor) -> Tensor:
     """All vertices (T, V, B, 3) from object frames (h+1, n, B, 3) and control vertices (T, C, B, 3)."""
+    return _unroll(_with_constants(model), start, driven, phi)
+
+
+def _unroll(step: Step, start: Tensor, driven: Tensor, phi: Tensor) -> Tensor:
     frames = start.shape[0]
     with torch.inference_mode():
-        constants = model.edge_constants()
         path = list(torch.cat([start, driven[:frames]], dim=1))
         for t in range(frames, driven.shape[0]):
-            path.append(model.step(torch.stack(path[-frames:]), driven[t], phi, constants))
+            path.append(step(torch.stack(path[-frames:]), driven[t], phi))
         return torch.stack(path)
+
+
+def _with_constants(model: WorldModel) -> Step:
+    """The model's step, its edge constants computed once."""
+    with torch.inference_mode():
+        constants = model.edge_constants()
+    return lambda window, control_next, phi: model.step(window, control_next, phi, constants)
+
+
+def mean_error(predicted: list[Tensor], tracks: list[Track], spec: GraphSpec) -> float:
+    """Mean distance [m] over frames, object vertices and episodes; infinite where a rollout left the numbers."""
+    n = spec.object_count
+    errors = [
+        torch.linalg.vector_norm(guess[:, :n].double() - track.positions[:, :n].double(), dim=-1).mean()
+        for guess, track in zip(predicted, tracks, strict=True)
+    ]
+    mean = float(torch.stack(errors).mean())
+    return mean if math.isfinite(mean) else math.inf
 
 
 def _held(positions: Tensor, frames: int) -> Tensor:

@@ -3,7 +3,7 @@
     loss = mean_b Σ_{i=1..τ} ‖x_pred^{t+i} - x^{t+i}‖² / (Σ_{i=1..τ} ‖x̂^{t+i} - x^{t+i}‖² + τ σ_change²)
 
 unrolled from a random frame t whose history carries random-walk noise, so that training sees the kind of
-errors that a rollout makes; Φ carries noise too, so that it can be fine-tuned later. x̂ is the modal prior unrolled
+errors that a rollout makes; Φ carries noise too, so that it can be fine-tuned later. x̂ is the prior unrolled
 alone from the same frame: a sub-sequence counts by the share of the prior's error that is left, so that the few in
 which small errors grow fast do not drown the others. With a τ of a few frames the network learns corrections that do
 not last: τ is long from the first step. A running average of the weights is what is validated (open-loop
@@ -12,7 +12,7 @@ the training. The same seed, data and settings give the same weights, and so doe
 from a checkpoint.
 
 **While episodes still arrive** (``start_share`` below 1): the first share of the episodes by index is enough to begin.
-Validation episodes, scales and modal prior come from it and stay. The others join in the order of their index at steps
+Validation episodes, scales and prior come from it and stay. The others join in the order of their index at steps
 that the settings alone decide, spread over the first ``JOIN_SHARE`` of the training, which waits for one that is not
 there yet: the weights do not depend on when an episode arrived.
 """
@@ -29,6 +29,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from physworld.worldmodel.chain import ChainPrior
 from physworld.worldmodel.config import TrainingConfig, WorldModelConfig
 from physworld.worldmodel.dataset import Track, WindowSampler, measure_scales, split_tracks
 from physworld.worldmodel.errors import (
@@ -38,9 +39,10 @@ from physworld.worldmodel.errors import (
     TrainingDiverged,
 )
 from physworld.worldmodel.graph import GraphSpec
-from physworld.worldmodel.modal import ModalPrior, fit_prior
-from physworld.worldmodel.model import Normalisation, PriorStep, WorldModel
-from physworld.worldmodel.rollout import rollout_tracks
+from physworld.worldmodel.modal import ModalPrior
+from physworld.worldmodel.model import Normalisation, WorldModel, prior_step
+from physworld.worldmodel.priors import fit_priors, prior_error
+from physworld.worldmodel.rollout import mean_error, rollout_tracks
 
 WARM_UP_SHARE = 0.1
 JOIN_SHARE = 0.5
@@ -51,6 +53,7 @@ JOIN_BATCHES = 10
 class TrainingResult:
     """The best averaged model; ``validation`` holds (step, open-loop error [m]); ``losses`` (step, loss).
 
+    ``prior``: which one is under the network; ``prior_errors_m``: open-loop errors of those that were tried;
     ``steps``: taken, fewer than asked for where the patience ended; ``episodes``: trained or validated on.
     """
 
@@ -60,6 +63,8 @@ class TrainingResult:
     best_step: int
     best_error_m: float
     prior_error_m: float
+    prior: str
+    prior_errors_m: dict[str, float]
     static_error_m: float
     steps: int
     episodes: int
@@ -114,12 +119,14 @@ def train(
         raise DatasetUnusable(f"{len(tracks)} of {total} episodes are here; the training begins with {first}")
     later = later or tracks.__getitem__
     fitting, held_out = split_tracks(list(tracks[:first]), training.validation_fraction, training.seed)
-    n, h = spec.object_count, config.history
+    h = config.history
     positions, phis = [track.positions.numpy() for track in fitting], [track.phi.numpy() for track in fitting]
-    prior = fit_prior(positions, phis, n, h, config.modes)
-    scales = measure_scales(
-        fitting, spec, lambda track: PriorStep(prior, h).residual(track.positions, track.phi)
-    )
+    priors = fit_priors(positions, phis, spec, config, training.prior)
+    prior_errors = {name: prior_error(prior, held_out, spec, h) for name, prior in priors.items()}
+    chosen = min(prior_errors, key=prior_errors.__getitem__)
+    prior = priors[chosen]
+    alone = prior_step(prior, h)
+    scales = measure_scales(fitting, spec, lambda track: alone.residual(track.positions, track.phi))
     run = _start(config, spec, scales, prior, training)
     identity = _identity(config, training, scales)
     if checkpoint is not None:
@@ -153,7 +160,9 @@ def train(
         best_step=run.best_step,
         best_error_m=run.best_error_m,
         prior_error_m=run.validation[0][1],
-        static_error_m=_mean_error([_static(track, config.history) for track in held_out], held_out, spec),
+        prior=chosen,
+        prior_errors_m=prior_errors,
+        static_error_m=mean_error([_static(track, config.history) for track in held_out], held_out, spec),
         steps=run.step,
         episodes=joined,
     )
@@ -174,14 +183,14 @@ def open_loop_error(model: WorldModel, tracks: list[Track]) -> float:
     """Mean distance [m] of predicted object vertices over whole episodes, after the given first h + 1
     frames.
     """
-    return _mean_error(rollout_tracks(model, tracks), tracks, model.spec)
+    return mean_error(rollout_tracks(model, tracks), tracks, model.spec)
 
 
 def _start(
     config: WorldModelConfig,
     spec: GraphSpec,
     scales: Normalisation,
-    prior: ModalPrior,
+    prior: ModalPrior | ChainPrior,
     training: TrainingConfig,
 ) -> _Run:
     with torch.random.fork_rng(devices=[]):
@@ -257,17 +266,6 @@ def _out_of_patience(run: _Run, training: TrainingConfig) -> bool:
     """Whether the last ``patience`` validations brought nothing better."""
     since = sum(step > run.best_step for step, _ in run.validation)
     return 0 < training.patience <= since
-
-
-def _mean_error(predicted: list[Tensor], tracks: list[Track], spec: GraphSpec) -> float:
-    """Mean over frames, vertices and episodes; infinite where a rollout left the numbers."""
-    n = spec.object_count
-    errors = [
-        torch.linalg.vector_norm(guess[:, :n].double() - track.positions[:, :n].double(), dim=-1).mean()
-        for guess, track in zip(predicted, tracks, strict=True)
-    ]
-    mean = float(torch.stack(errors).mean())
-    return mean if math.isfinite(mean) else math.inf
 
 
 def _static(track: Track, history: int) -> Tensor:

@@ -25,7 +25,7 @@ from physworld.worldmodel.published import PublishedModel
 from schemas.base import Reference
 from schemas.model import ModelVersion
 from services.trainer.closed_loop import METRIC, WORLD_MODEL
-from services.trainer.training import json_safe
+from services.trainer.measuring import json_safe
 from storage import registry, resources
 from workers.context import TaskContext
 from workers.lineage import lineage_of

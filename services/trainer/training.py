@@ -17,61 +17,37 @@ version's files:
 
 from __future__ import annotations
 
-import json
 import logging
-import math
-import os
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from safetensors.numpy import save as save_tensors
 
 from physworld.demonstrate.config import StrengthRange
-from physworld.evaluate.blocks import mean_with_interval
-from physworld.evaluate.table import held_out_table
 from physworld.worldmodel import config as settings_of
-from physworld.worldmodel import export
-from physworld.worldmodel.clock import resample_smooth
 from physworld.worldmodel.errors import CheckpointMismatch, TrainingCancelled
 from physworld.worldmodel.finetune import FineTuneResult, fine_tune
-from physworld.worldmodel.published import PublishedModel
 from physworld.worldmodel.scene_view import SceneView, view_scene
 from physworld.worldmodel.training import TrainingResult, first_episodes, train
-from schemas.base import Artifact
 from schemas.model import TrainingConfig
-from schemas.signing import SIGNATURE_NAME
 from services.trainer.closed_loop import closed_loop
 from services.trainer.episodes import Episodes, half
-from storage import signing, traces
+from services.trainer.measuring import Measured, json_safe, measure
+from services.trainer.publishing import MANIFEST_NAME, card_of, store_version
+from services.trainer.settings import translate
+from storage import traces
 from workers.context import TaskContext
 from workers.lineage import lineage_of
 from workers.registry import HandlerResult
 from workers.stores import Stores
 from workers.tasks.dataset import strength_ranges
-from workers.tasks.inputs import made_from, npz_bytes, scene_of, twin_of
+from workers.tasks.inputs import made_from, scene_of, twin_of
 
 logger = logging.getLogger(__name__)
 
 CHECKPOINT = "training.pt"
-MANIFEST_NAME = "manifest.json"
-PROGRAMS = {"torch_export": ("step.pt2", export.torch_program), "onnx": ("step.onnx", export.onnx_program)}
-SPEED_REPEATS = 3
-
-
-@dataclass(frozen=True)
-class Measured:
-    """Predictions of tracked points at the measured times (T, N, 3) [m], their table, steps per second."""
-
-    tracks: np.ndarray
-    tracks_calibrated: np.ndarray
-    twin_tracks: np.ndarray
-    vertices: np.ndarray
-    table: dict[str, Any]
-    steps_per_second: dict[str, float]
 
 
 def run(context: TaskContext, stores: Stores) -> HandlerResult:
@@ -115,8 +91,8 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     metrics["closed_loop"] = json_safe(closed_loop(stores, payload, metrics, architecture))
     dataset = episodes.sealed()
     lineage = lineage_of([dataset, *made_from(stores, payload)], payload["config"], {"training": config.seed})
-    card = _card(payload, config, published, metrics, lineage) | {"trained_on": episodes.description()}
-    artifacts = _store(stores, payload, published, view, measured, card)
+    card = card_of(payload, config, published, metrics, lineage) | {"trained_on": episodes.description()}
+    artifacts = store_version(stores, payload, published, view, measured, card)
     manifest = next(artifact for artifact in artifacts if artifact.name == MANIFEST_NAME)
     context.check()
     stores.scratch.remove(context.lease.job_id)
@@ -127,94 +103,6 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
         "lineage": lineage,
     }
     return HandlerResult(result, manifest.sha256)
-
-
-def translate(
-    config: TrainingConfig,
-) -> tuple[settings_of.WorldModelConfig, settings_of.TrainingConfig, settings_of.FineTuneConfig]:
-    """The wire's settings as the library's; threads from ``PHYSWORLD_TRAINER_THREADS``, 1 without it."""
-    interval = max(1, min(250, config.steps // 8))
-    return (
-        settings_of.WorldModelConfig(
-            hidden=config.hidden,
-            message_passing_steps=config.message_passing_steps,
-            history=config.history,
-            vertices=config.vertices,
-        ),
-        settings_of.TrainingConfig(
-            steps=config.steps,
-            batch_size=config.batch_size,
-            look_ahead=config.look_ahead,
-            learning_rate=config.learning_rate,
-            validation_every=interval,
-            patience=config.patience,
-            start_share=config.start_share,
-            checkpoint_every=interval,
-            threads=int(os.environ.get("PHYSWORLD_TRAINER_THREADS", "1")),
-            seed=config.seed,
-        ),
-        settings_of.FineTuneConfig(steps=config.fine_tune_steps),
-    )
-
-
-def measure(view: SceneView, published: PublishedModel, before: PublishedModel | None = None) -> Measured:
-    """Open-loop predictions over the whole recording, and what they cost; ``before``: without fine-tuned strengths."""
-    controllers = view.controllers[view.first :]
-    seconds = []
-    for _ in range(SPEED_REPEATS):
-        started = time.perf_counter()
-        rolled = published.rollout(controllers)
-        seconds.append(time.perf_counter() - started)
-    calibrated = (before or published).rollout(controllers, phi=published.phi_calibrated)
-    frame_times = view.scene.times - view.scene.times[0]
-    tracks, tracks_calibrated = view.tracks_of(rolled), view.tracks_of(calibrated)
-    twin_tracks = resample_smooth(view.twin_tracks, view.times, frame_times)
-    predictions = {"twin": twin_tracks, "world_model": tracks_calibrated, "world_model_finetuned": tracks}
-    finite = {name: path for name, path in predictions.items() if np.isfinite(path).all()}
-    table = _with_intervals(held_out_table(view.scene, finite))
-    return Measured(
-        tracks=tracks,
-        tracks_calibrated=tracks_calibrated,
-        twin_tracks=twin_tracks,
-        vertices=np.concatenate([np.repeat(view.vertices[:1], view.first, axis=0), rolled]),
-        table=_with_absent(table, sorted(set(predictions) - set(finite))),
-        steps_per_second={
-            "twin": view.twin_steps_per_second,
-            "world_model": (len(rolled) - view.history - 1) / min(seconds),
-        },
-    )
-
-
-def json_safe(value: Any) -> Any:
-    """Plain JSON types; a number that is not finite (a rollout that blew up) becomes None."""
-    if isinstance(value, dict):
-        return {str(key): json_safe(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [json_safe(item) for item in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _with_intervals(table: dict[str, Any]) -> dict[str, Any]:
-    """The table with ``ci95``: metric to name to the 95 % interval of the mean [m], by blocks of frames."""
-    table["ci95"] = {
-        metric: {
-            name: list(mean_with_interval(np.array(curve, dtype=float)).ci95)
-            for name, curve in table["per_frame"][metric].items()
-            if any(value is not None for value in curve)
-        }
-        for metric in ("track_m", "chamfer_phystwin_m", "chamfer_l2_m")
-    }
-    return table
-
-
-def _with_absent(table: dict[str, Any], absent: list[str]) -> dict[str, Any]:
-    """The table with None for predictions that left the numbers: they have no error, and the rest is published."""
-    for name in absent:
-        for metric in ("track_m", "track_phystwin_m", "chamfer_phystwin_m", "chamfer_l2_m"):
-            table[metric][name] = None
-    return table
 
 
 def _strengths(stores: Stores, payload: dict[str, Any]) -> tuple[StrengthRange, ...]:
@@ -301,7 +189,9 @@ def _metrics(
         "validation": {
             "open_loop_m": trained.best_error_m,
             "static_m": trained.static_error_m,
+            "prior": trained.prior,
             "prior_m": trained.prior_error_m,
+            "priors_m": trained.prior_errors_m,
             "best_step": trained.best_step,
             "steps": trained.steps,
             "curve": trained.validation,
@@ -319,88 +209,3 @@ def _metrics(
             np.linalg.norm(measured.tracks_calibrated - measured.twin_tracks, axis=2).mean()
         ),
     }
-
-
-def _card(
-    payload: dict[str, Any],
-    config: TrainingConfig,
-    published: PublishedModel,
-    metrics: dict[str, Any],
-    lineage: dict[str, Any],
-) -> dict[str, Any]:
-    return {
-        "schema_version": 1,
-        "name": payload["name"],
-        "version": payload["version"],
-        "scene_id": payload["scene_id"],
-        "fit_id": payload["fit_id"],
-        "trace_id": payload.get("trace_id"),
-        "dataset_id": payload["dataset_id"],
-        "closed_loop": metrics["closed_loop"],
-        "dt_s": published.spec.dt_s,
-        "architecture": published.facts(),
-        "training": config.model_dump(mode="json"),
-        "library_settings": [asdict(part) for part in translate(config)],
-        "metrics": {name: value for name, value in metrics.items() if name != "closed_loop"},
-        "lineage": lineage,
-        "seeds": {"training": config.seed},
-        "versions": {
-            "torch": torch.__version__,
-            "numpy": np.__version__,
-            "physworld": lineage["code_version"],
-        },
-        "intended_use": (
-            "Predict the motion of this object under motions of its grips like those of the demonstrations, "
-            "open loop, at the clock dt_s."
-        ),
-        "limits": (
-            "One object and its grips, as recorded: edges are material, so contact of the object with itself, "
-            "fracture, flow and other grips are not represented; motions much faster or wider than the "
-            "demonstrations are extrapolated; the start needs history + 1 frames."
-        ),
-    }
-
-
-def _store(
-    stores: Stores,
-    payload: dict[str, Any],
-    published: PublishedModel,
-    view: SceneView,
-    measured: Measured,
-    card: dict[str, Any],
-) -> list[Artifact]:
-    """The version's files, the manifest and its signature last."""
-    put = stores.artifacts.put_bytes
-    prediction = {
-        "times": view.scene.times,
-        "tracks": measured.tracks.astype(np.float32),
-        "tracks_calibrated": measured.tracks_calibrated.astype(np.float32),
-        "twin_tracks": measured.twin_tracks.astype(np.float32),
-        "tick_times": view.times,
-        "vertices": measured.vertices.astype(np.float32),
-    }
-    facts = {"format": "physworld-world-model", "name": payload["name"], "version": str(payload["version"])}
-    programs = [
-        put(PROGRAMS[name][1](published.model), PROGRAMS[name][0], "application/octet-stream")
-        for name in dict.fromkeys(card["training"]["formats"])
-    ]
-    artifacts = [
-        put(save_tensors(published.to_tensors(), facts), "model.safetensors", "application/octet-stream"),
-        *programs,
-        put(json.dumps(card, indent=1, allow_nan=False).encode(), "card.json", "application/json"),
-        put(npz_bytes(prediction), "prediction.npz", "application/x-npz"),
-    ]
-    manifest = {
-        "name": payload["name"],
-        "version": payload["version"],
-        "files": {item.name: {"sha256": item.sha256, "size": item.size} for item in artifacts},
-    }
-    text = json.dumps(manifest, indent=1, sort_keys=True).encode()
-    signer = signing.open_signer(stores.settings)
-    with stores.database.session() as session:
-        signing.register(session, signer)
-    return [
-        *artifacts,
-        put(text, MANIFEST_NAME, "application/json"),
-        put(signer.sign(text), SIGNATURE_NAME, "application/json"),
-    ]

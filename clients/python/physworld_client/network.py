@@ -14,6 +14,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from physworld_client.chain import Chain
 from physworld_client.errors import ModelUnreadable
 
 EDGE_KINDS = 3  # near, coarse, grip
@@ -47,6 +48,7 @@ class Network:
                 f"{self.history}"
             )
         self.has_ground = inputs == 1
+        self._chain = Chain(tensors) if "prior.spread" in tensors else None
         self._sort_edges(vertex_count)
         layers = [self._tensor(f"edge.{layer}.weight") for layer in range(self.layers)]
         self._edge_weights = np.concatenate(layers, axis=1).transpose(0, 2, 1).copy()
@@ -60,7 +62,8 @@ class Network:
             phi: log property ratios of the object vertices, (n, 2).
         """
         n = self.object_count
-        ahead = np.concatenate([self._modal_prior(window, control_next, phi), control_next])
+        prior = self._modal_prior if self._chain is None else self._chain.ahead
+        ahead = np.concatenate([prior(window, control_next, phi), control_next])
         features = self._vertex_features(window, ahead, phi)
         state = self._mlp("encoder", features)
         edges = self._edge_terms(window)

@@ -25,7 +25,8 @@ from schemas.job import Job
 from schemas.model import ModelVersion, TrainingConfig, TrainingCreate
 from schemas.signing import ManifestSignature
 from services.trainer import training
-from services.trainer.training import json_safe, translate
+from services.trainer.measuring import json_safe
+from services.trainer.settings import translate
 from storage import jobs, leases, registry, resources, signing
 from storage.database import open_database
 from storage.settings import Settings

@@ -1,0 +1,90 @@
+"""What a version predicts of its recording, what that errs, and what it costs."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from physworld.evaluate.blocks import mean_with_interval
+from physworld.evaluate.table import held_out_table
+from physworld.worldmodel.clock import resample_smooth
+from physworld.worldmodel.published import PublishedModel
+from physworld.worldmodel.scene_view import SceneView
+
+SPEED_REPEATS = 3
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Predictions of tracked points at the measured times (T, N, 3) [m], their table, steps per second."""
+
+    tracks: np.ndarray
+    tracks_calibrated: np.ndarray
+    twin_tracks: np.ndarray
+    vertices: np.ndarray
+    table: dict[str, Any]
+    steps_per_second: dict[str, float]
+
+
+def measure(view: SceneView, published: PublishedModel, before: PublishedModel | None = None) -> Measured:
+    """Open-loop predictions over the whole recording, and what they cost; ``before``: without fine-tuned strengths."""
+    controllers = view.controllers[view.first :]
+    seconds = []
+    for _ in range(SPEED_REPEATS):
+        started = time.perf_counter()
+        rolled = published.rollout(controllers)
+        seconds.append(time.perf_counter() - started)
+    calibrated = (before or published).rollout(controllers, phi=published.phi_calibrated)
+    frame_times = view.scene.times - view.scene.times[0]
+    tracks, tracks_calibrated = view.tracks_of(rolled), view.tracks_of(calibrated)
+    twin_tracks = resample_smooth(view.twin_tracks, view.times, frame_times)
+    predictions = {"twin": twin_tracks, "world_model": tracks_calibrated, "world_model_finetuned": tracks}
+    finite = {name: path for name, path in predictions.items() if np.isfinite(path).all()}
+    table = _with_intervals(held_out_table(view.scene, finite))
+    return Measured(
+        tracks=tracks,
+        tracks_calibrated=tracks_calibrated,
+        twin_tracks=twin_tracks,
+        vertices=np.concatenate([np.repeat(view.vertices[:1], view.first, axis=0), rolled]),
+        table=_with_absent(table, sorted(set(predictions) - set(finite))),
+        steps_per_second={
+            "twin": view.twin_steps_per_second,
+            "world_model": (len(rolled) - view.history - 1) / min(seconds),
+        },
+    )
+
+
+def json_safe(value: Any) -> Any:
+    """Plain JSON types; a number that is not finite (a rollout that blew up) becomes None."""
+    if isinstance(value, dict):
+        return {str(key): json_safe(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [json_safe(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _with_intervals(table: dict[str, Any]) -> dict[str, Any]:
+    """The table with ``ci95``: metric to name to the 95 % interval of the mean [m], by blocks of frames."""
+    table["ci95"] = {
+        metric: {
+            name: list(mean_with_interval(np.array(curve, dtype=float)).ci95)
+            for name, curve in table["per_frame"][metric].items()
+            if any(value is not None for value in curve)
+        }
+        for metric in ("track_m", "chamfer_phystwin_m", "chamfer_l2_m")
+    }
+    return table
+
+
+def _with_absent(table: dict[str, Any], absent: list[str]) -> dict[str, Any]:
+    """The table with None for predictions that left the numbers: they have no error, and the rest is published."""
+    for name in absent:
+        for metric in ("track_m", "track_phystwin_m", "chamfer_phystwin_m", "chamfer_l2_m"):
+            table[metric][name] = None
+    return table

@@ -1,0 +1,112 @@
+"""A version's files: the card, the weights, one step as a program, the predictions, and the signed manifest."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors.numpy import save as save_tensors
+
+from physworld.worldmodel import export
+from physworld.worldmodel.published import PublishedModel
+from physworld.worldmodel.scene_view import SceneView
+from schemas.base import Artifact
+from schemas.model import TrainingConfig
+from schemas.signing import SIGNATURE_NAME
+from services.trainer.measuring import Measured
+from services.trainer.settings import translate
+from storage import signing
+from workers.stores import Stores
+from workers.tasks.inputs import npz_bytes
+
+MANIFEST_NAME = "manifest.json"
+PROGRAMS = {"torch_export": ("step.pt2", export.torch_program), "onnx": ("step.onnx", export.onnx_program)}
+
+
+def card_of(
+    payload: dict[str, Any],
+    config: TrainingConfig,
+    published: PublishedModel,
+    metrics: dict[str, Any],
+    lineage: dict[str, Any],
+) -> dict[str, Any]:
+    """What the version is: lineage, architecture, settings, metrics, intended use, limits."""
+    return {
+        "schema_version": 1,
+        "name": payload["name"],
+        "version": payload["version"],
+        "scene_id": payload["scene_id"],
+        "fit_id": payload["fit_id"],
+        "trace_id": payload.get("trace_id"),
+        "dataset_id": payload["dataset_id"],
+        "closed_loop": metrics["closed_loop"],
+        "dt_s": published.spec.dt_s,
+        "architecture": published.facts(),
+        "training": config.model_dump(mode="json"),
+        "library_settings": [asdict(part) for part in translate(config)],
+        "metrics": {name: value for name, value in metrics.items() if name != "closed_loop"},
+        "lineage": lineage,
+        "seeds": {"training": config.seed},
+        "versions": {
+            "torch": torch.__version__,
+            "numpy": np.__version__,
+            "physworld": lineage["code_version"],
+        },
+        "intended_use": (
+            "Predict the motion of this object under motions of its grips like those of the demonstrations, "
+            "open loop, at the clock dt_s."
+        ),
+        "limits": (
+            "One object and its grips, as recorded: edges are material, so contact of the object with itself, "
+            "fracture, flow and other grips are not represented; motions much faster or wider than the "
+            "demonstrations are extrapolated; the start needs history + 1 frames."
+        ),
+    }
+
+
+def store_version(
+    stores: Stores,
+    payload: dict[str, Any],
+    published: PublishedModel,
+    view: SceneView,
+    measured: Measured,
+    card: dict[str, Any],
+) -> list[Artifact]:
+    """The version's files, the manifest and its signature last."""
+    put = stores.artifacts.put_bytes
+    prediction = {
+        "times": view.scene.times,
+        "tracks": measured.tracks.astype(np.float32),
+        "tracks_calibrated": measured.tracks_calibrated.astype(np.float32),
+        "twin_tracks": measured.twin_tracks.astype(np.float32),
+        "tick_times": view.times,
+        "vertices": measured.vertices.astype(np.float32),
+    }
+    facts = {"format": "physworld-world-model", "name": payload["name"], "version": str(payload["version"])}
+    programs = [
+        put(PROGRAMS[name][1](published.model), PROGRAMS[name][0], "application/octet-stream")
+        for name in dict.fromkeys(card["training"]["formats"])
+    ]
+    artifacts = [
+        put(save_tensors(published.to_tensors(), facts), "model.safetensors", "application/octet-stream"),
+        *programs,
+        put(json.dumps(card, indent=1, allow_nan=False).encode(), "card.json", "application/json"),
+        put(npz_bytes(prediction), "prediction.npz", "application/x-npz"),
+    ]
+    manifest = {
+        "name": payload["name"],
+        "version": payload["version"],
+        "files": {item.name: {"sha256": item.sha256, "size": item.size} for item in artifacts},
+    }
+    text = json.dumps(manifest, indent=1, sort_keys=True).encode()
+    signer = signing.open_signer(stores.settings)
+    with stores.database.session() as session:
+        signing.register(session, signer)
+    return [
+        *artifacts,
+        put(text, MANIFEST_NAME, "application/json"),
+        put(signer.sign(text), SIGNATURE_NAME, "application/json"),
+    ]

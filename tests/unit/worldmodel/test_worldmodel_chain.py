@@ -1,0 +1,218 @@
+"""The chain prior: against a rope of point masses, against closed forms, and one form of it against another."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from functools import cache
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+from hanging_rope import LENGTH_M, SMALL, episode, graph
+from held_bar import graph as bar_graph
+from physworld_client.network import Network
+
+from physworld.worldmodel import PublishedModel, affine_skin
+from physworld.worldmodel.chain import ChainPhysics, ChainPrior, chain_of
+from physworld.worldmodel.chain_fit import fit_chain
+from physworld.worldmodel.chain_layout import Held, arc_lengths, grip_frames, lay_out
+from physworld.worldmodel.chain_native import ChainRoller
+from physworld.worldmodel.chain_step import ChainStep
+from physworld.worldmodel.config import TrainingConfig
+from physworld.worldmodel.dataset import Track, read_track
+from physworld.worldmodel.engine import RolloutEngine
+from physworld.worldmodel.export import edge_list, onnx_program, torch_program
+from physworld.worldmodel.model import Normalisation, WorldModel
+from physworld.worldmodel.priors import fit_priors, prior_error
+from physworld.worldmodel.rollout import unroll
+from physworld.worldmodel.training import train
+
+FOLLOWED = 0.04  # mean distance over an episode, as a share of the length; this rope falls and whips
+AGREEMENT_M = 2e-5  # single precision over a tick of some hundred substeps
+FIRST_ROOT = 2.404826  # of the Bessel function J0: the hanging chain swings at that times sqrt(g / L) / 2
+
+
+@cache
+def rope(markers: int) -> tuple[list[Track], list[Track]]:
+    """Episodes to learn from and to judge by."""
+    spec = graph(markers)
+    every = [read_track(spec, episode(seed, markers=markers), SMALL.history) for seed in range(12)]
+    return every[:9], every[9:]
+
+
+@cache
+def fitted(markers: int) -> ChainPrior:
+    learn, _ = rope(markers)
+    found = fit_chain(
+        [t.positions.numpy() for t in learn], [t.phi.numpy() for t in learn], graph(markers), SMALL.history
+    )
+    assert found is not None
+    return found
+
+
+def network(markers: int) -> WorldModel:
+    """An untrained network that moves the rope beside its chain."""
+    torch.manual_seed(4)
+    scales = dict.fromkeys(("relative", "strain", "stretch"), (0.01, 0.02, 0.03))
+    model = WorldModel(
+        SMALL, graph(markers), Normalisation(velocity=2e-2, change=1e-3, **scales), fitted(markers)
+    )
+    with torch.no_grad():
+        model.skip.weight.normal_(0.0, 0.02)
+        model.decoder.out.weight.normal_(0.0, 0.1)
+    return model
+
+
+@pytest.mark.parametrize("markers", [2, 3])
+def test_the_chain_follows_a_rope_that_it_has_not_seen(markers: int) -> None:
+    learn, judge = rope(markers)
+    spec = graph(markers)
+    positions, phis = [t.positions.numpy() for t in learn], [t.phi.numpy() for t in learn]
+    modal = fit_priors(positions, phis, spec, SMALL, "modal")["modal"]
+    error = prior_error(fitted(markers), judge, spec, SMALL.history)
+    assert error < FOLLOWED * LENGTH_M
+    assert error < 0.3 * prior_error(modal, judge, spec, SMALL.history)
+
+
+def test_the_chain_answers_to_the_properties_of_an_episode() -> None:
+    _, judge = rope(2)
+    spec = graph(2)
+    known = prior_error(fitted(2), judge, spec, SMALL.history)
+    turned = [Track(t.positions, -t.phi) for t in judge]
+    assert known < 0.9 * prior_error(fitted(2), turned, spec, SMALL.history)
+
+
+def test_a_body_that_is_no_line_gets_no_chain() -> None:
+    assert arc_lengths(bar_graph()) is None
+
+
+@pytest.mark.parametrize("swing", [0.02, 0.3])
+def test_a_limp_chain_swings_at_the_closed_form_s_rate_and_goes_on(swing: float) -> None:
+    """Bernoulli's hanging chain, first mode; the larger swing only has to go on as it began."""
+    prior, offsets = _pendulum()
+    frames = 600
+    shape = _bessel_mode(prior)
+    start = np.zeros((1, 3, len(shape), 3), dtype=np.float32)
+    order = np.argsort(-offsets)  # from the top; every segment keeps its length
+    aside, length = np.diff(swing * shape[order]), np.diff(-offsets[order])
+    start[..., order, 0] = swing * shape[order]
+    start[..., order[1:], 2] = -np.cumsum(np.sqrt(length**2 - aside**2))
+    driven = np.zeros((1, frames, 1, 3), dtype=np.float32)
+    path = ChainRoller(prior, 2).run(start, driven, np.zeros((1, len(shape), 2)))[0]
+    tip = path[:, int(np.argmin(offsets)), 0]
+    assert np.abs(tip[-150:]).max() > 0.85 * np.abs(tip[:150]).max()
+    assert np.abs(tip[-150:]).max() < 1.1 * np.abs(tip[:150]).max()
+    if swing < 0.1:
+        rises = np.flatnonzero((tip[:-1] < 0.0) & (tip[1:] >= 0.0))
+        period = (rises[-1] - rises[0]) / (len(rises) - 1) / 30.0
+        expected = 4.0 * np.pi / FIRST_ROOT * np.sqrt(1.0 / 9.81)
+        assert period == pytest.approx(expected, rel=0.02)
+
+
+@pytest.mark.parametrize("markers", [2, 3])
+def test_the_native_flow_is_the_plain_one_and_so_are_its_gradients(markers: int) -> None:
+    step, n = ChainStep(fitted(markers), SMALL.history), graph(markers).object_count
+    tracks = rope(markers)[1]
+    window = torch.stack([t.positions[6:9] for t in tracks], dim=2)
+    following = torch.stack([t.positions[9, n:] for t in tracks], dim=1)
+    phi = torch.stack([t.phi for t in tracks], dim=1)
+    found = []
+    for flow in (step.native, step.flow):
+        step._flow = lambda *start, f=flow: f(*start)  # type: ignore[method-assign]
+        inputs = [window.clone().requires_grad_(), phi.clone().requires_grad_()]
+        ahead = step(inputs[0], following, inputs[1])
+        slopes = torch.linspace(-1.0, 1.0, ahead.numel()).view_as(ahead)
+        by_window, by_phi = torch.autograd.grad((ahead * slopes).sum(), inputs)
+        found.append((ahead.detach(), by_window[:, :n], by_phi))
+    for native, plain in zip(*found, strict=True):
+        assert torch.allclose(native, plain, rtol=1e-3, atol=1e-4 * float(plain.abs().max()))
+    assert float(found[0][2].abs().max()) > 0.0
+
+
+@pytest.mark.parametrize("markers", [2, 3])
+@pytest.mark.parametrize("corrected", [False, True])
+def test_the_engine_rolls_the_chain_out_as_torch_does(markers: int, corrected: bool) -> None:
+    model = network(markers)
+    if not corrected:
+        model = WorldModel(SMALL, graph(markers), None, fitted(markers))
+    track, n, frames = rope(markers)[1][0], graph(markers).object_count, 12
+    start, driven = track.positions[:3, :n], track.positions[:frames, n:]
+    expected = unroll(model, start[:, :, None], driven[:, :, None], track.phi[:, None])[:, :, 0].numpy()
+    found = RolloutEngine(model).run(start.numpy(), driven.numpy(), track.phi.double().numpy())
+    assert np.abs(found - expected).max() < AGREEMENT_M
+
+
+def test_a_published_rope_is_read_back_and_exported() -> None:
+    model, track, n = network(2), rope(2)[1][0], graph(2).object_count
+    held = _published(model, track).to_tensors()
+    facts = _published(model, track).facts()
+    window, following = track.positions[4:7], track.positions[7, n:]
+    with torch.no_grad():
+        expected = model.step(window[:, :, None], following[:, None], track.phi[:, None])[:, 0].numpy()
+    again = PublishedModel.from_tensors(held, facts).model
+    with torch.no_grad():
+        read = again.step(window[:, :, None], following[:, None], track.phi[:, None])[:, 0].numpy()
+    assert np.array_equal(read, expected)
+    client = Network(held, n).step(window.double().numpy(), following.double().numpy(), track.phi.numpy())
+    assert np.abs(client - expected).max() < AGREEMENT_M
+    inputs = {"window": window, "control_next": following, "phi": track.phi}
+    inputs |= {name: torch.as_tensor(value) for name, value in edge_list(model.spec).items()}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of torch's own container
+        program = torch.export.load(io.BytesIO(torch_program(model))).module()
+    assert np.abs(program(*inputs.values()).detach().numpy() - expected).max() < AGREEMENT_M
+    session = onnxruntime.InferenceSession(onnx_program(model), providers=["CPUExecutionProvider"])
+    (onnx,) = session.run(None, {name: value.numpy() for name, value in inputs.items()})
+    assert np.abs(onnx - expected).max() < AGREEMENT_M
+
+
+def test_training_takes_the_prior_that_errs_less_and_says_so() -> None:
+    learn, judge = rope(3)
+    result = train([*learn, *judge], graph(3), SMALL, TrainingConfig(steps=1, batch_size=1, look_ahead=2))
+    assert result.prior == "chain" and set(result.prior_errors_m) == {"chain", "modal"}
+    assert result.prior_error_m == pytest.approx(result.prior_errors_m["chain"], rel=1e-3)
+    plain = train(learn, graph(3), SMALL, TrainingConfig(steps=1, batch_size=1, look_ahead=2, prior="modal"))
+    assert plain.prior == "modal" and set(plain.prior_errors_m) == {"modal"}
+
+
+def _pendulum() -> tuple[ChainPrior, np.ndarray]:
+    """A limp chain of 1 m that hangs from one point, and the heights of its vertices [m]."""
+    spec = graph(3)
+    along = arc_lengths(spec)
+    assert along is not None
+    along = (along - along.min()) / np.ptp(along)
+    top = int(np.argmin(along))
+    frames = grip_frames(spec)
+    one = type(frames)(np.ones((1, 1)), np.zeros((1, 1)), np.zeros((1, 1)), np.zeros((1, 3)), np.ones(1))
+    owner, offset = np.full(len(along), -1), np.zeros((len(along), 3))
+    owner[top] = 0
+    layout = lay_out(along, Held(one, owner, offset), 16)
+    physics = ChainPhysics(40.0, 1e-6, 1e-4, 0.0, np.array([0.0, 0.0, -9.81]))
+    return chain_of(layout, physics, 1.0 / 30.0, np.zeros(2)), -along
+
+
+def _bessel_mode(prior: ChainPrior) -> np.ndarray:
+    """J0 of the first root times the square root of the height above the free end, largest value 1."""
+    from scipy.special import j0
+
+    spec = graph(3)
+    along = arc_lengths(spec)
+    assert along is not None
+    along = (along - along.min()) / np.ptp(along)
+    return np.asarray(j0(FIRST_ROOT * np.sqrt(1.0 - along)))
+
+
+def _published(model: WorldModel, track: Track) -> PublishedModel:
+    n = model.spec.object_count
+    vertices = track.positions[:, :n].double().numpy()
+    return PublishedModel(
+        model=model,
+        phi=track.phi.numpy(),
+        phi_calibrated=track.phi.numpy(),
+        start_history=vertices[:3],
+        start_controllers=track.positions[:3, n:].double().numpy(),
+        start_time_s=0.0,
+        skin=affine_skin(vertices[0, :5], vertices[0]),
+    )
