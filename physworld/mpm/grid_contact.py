@@ -20,7 +20,6 @@ from physworld.mpm.grid_contact_kernels import find_near, forget_near, press
 _SIGHT = 0.5  # cells: particles cross less than that in a substep
 _LEAVING = 0.1  # of its depth that material inside a collider leaves in a substep
 _FASTEST = 0.002  # cells a substep, at most, that it leaves
-_SWEEPS = 2  # of all contacts a substep; the warm start carries on
 _RELAXATION = 1.0 / 16.0  # where all particles of a contact act at once: up to 9 nodes' worth of them overlap
 _CRUSHED = 30.0  # wave moduli: an impact at the speed of waves presses with about one
 _DEPTH_SHARE = 0.9  # of a collider's own depth: deeper, the nearest way out may be the wrong one
@@ -66,6 +65,8 @@ class GridContact:
         self._pose = wp.zeros(6, dtype=wp.vec3d, device=device)
         self._totals = wp.zeros(4, dtype=wp.float64, device=device)
         self._relief = wp.zeros(count, dtype=wp.float64, device=device)
+        self._turn = wp.zeros(1, dtype=wp.int32, device=device)
+        self._last = wp.zeros(count, dtype=wp.int32, device=device)
         self._near = wp.zeros(count + 1, dtype=wp.int32, device=device)
         self._contact = wp.zeros(count, dtype=wp.vec4f, device=device)
         self._drive = wp.zeros(count, dtype=wp.vec3f, device=device)
@@ -132,14 +133,15 @@ class GridContact:
             move_collider, 1, inputs=[self._times, *self._path, clock, counter], outputs=[self._pose, self._totals],
             device=self._device,
         )  # fmt: skip
-        wp.launch(forget_near, 1, inputs=[self._near], device=self._device)
+        wp.launch(forget_near, 1, inputs=[self._near, self._turn], device=self._device)
         model = [
             wp.float64(self._reach), wp.vec3d(*self._half), self._relief, wp.float64(self._sight),
-            wp.float64(_LEAVING), wp.float64(_FASTEST * self._cell), clock,
+            wp.float64(_LEAVING), wp.float64(_FASTEST * self._cell), clock, self._turn,
         ]  # fmt: skip
         wp.launch(
             find_near, self._count, inputs=[*self._shape, *model, self._pose, x],
-            outputs=[self._near, self._contact, self._drive, self._impulse, self._totals], device=self._device,
+            outputs=[self._last, self._near, self._contact, self._drive, self._impulse, self._totals],
+            device=self._device,
         )  # fmt: skip
 
     def press(self, x: wp.array, box: wp.array, velocity: wp.array, seen: wp.array, again: bool) -> None:
@@ -162,9 +164,7 @@ class GridContact:
 def press_all(
     contacts: tuple[GridContact, ...], x: wp.array, box: wp.array, velocity: wp.array, seen: wp.array
 ) -> None:
-    """All contacts of a substep: the last impulses first, then the corrections in turns."""
-    for contact in contacts:
-        contact.press(x, box, velocity, seen, again=True)
-    for _ in range(_SWEEPS if contacts else 0):
+    """All contacts of a substep: the last impulses first, then one correction each, from which the next goes on."""
+    for again in (True, False):
         for contact in contacts:
-            contact.press(x, box, velocity, seen, again=False)
+            contact.press(x, box, velocity, seen, again)

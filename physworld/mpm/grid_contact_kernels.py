@@ -21,7 +21,12 @@ from __future__ import annotations
 
 import warp as wp
 
-from physworld.mpm.colliders_kernels import collider_distance, collider_velocity
+from physworld.geometry.sdf_kernels import HALF_SPACE, SAMPLED, signed_distance
+from physworld.mpm.colliders_kernels import collider_velocity
+
+_HALF_SPACE = wp.constant(HALF_SPACE)
+_SAMPLED = wp.constant(SAMPLED)
+_INSIDE = wp.constant(wp.float64(1.0e-6))  # of a sample's spacing
 
 
 @wp.struct
@@ -58,40 +63,116 @@ def inside(s: Stencil, box: wp.array(dtype=wp.int32)) -> bool:
 
 
 @wp.func
-def carried(s: Stencil, box: wp.array(dtype=wp.int32), velocity: wp.array(dtype=wp.vec4f)) -> wp.vec4f:
-    """Grid velocity at the particle [m/s], and what an impulse of 1 N s there adds to it [1/kg]."""
-    total = wp.vec4f()
-    for a in range(3):
-        for b in range(3):
-            row = ((s.i + a) * box[4] + s.j + b) * box[5] + s.k
-            plane = s.weights[0, a] * s.weights[1, b]
-            for c in range(3):
-                w = plane * s.weights[2, c]
-                v = velocity[row + c]
-                total += w * wp.vec4f(v[0], v[1], v[2], w * v[3])
-    return total
+def distance_from(
+    kind: int,
+    size: wp.vec3d,
+    values: wp.array3d(dtype=wp.float32),
+    low: wp.vec3d,
+    inverse: wp.vec3d,
+    pose: wp.array(dtype=wp.vec3d),
+    x: wp.vec3d,
+) -> wp.vec4d:
+    """Outward normal in the world and distance [m] of a collider at ``x``.
+
+    Beyond the samples of a mesh, which end close to it, a point is as far as from what its nearest sample is next to.
+    """
+    turn = wp.matrix_from_rows(pose[1], pose[2], pose[3])
+    local = wp.transpose(turn) * (x - pose[0])
+    sampled = local
+    if kind == _SAMPLED:
+        for i in range(3):
+            last = low[i] + (wp.float64(values.shape[i] - 1) - _INSIDE) / inverse[i]
+            sampled[i] = wp.clamp(local[i], low[i] + _INSIDE / inverse[i], last)
+    found = signed_distance(kind, size, values, low, inverse, sampled)
+    n = wp.normalize(wp.vec3d(found[0], found[1], found[2]))
+    distance = found[3]
+    beyond = local - sampled
+    if wp.dot(beyond, beyond) > wp.float64(0.0):
+        beyond += distance * n
+        distance = wp.length(beyond)
+        n = beyond / distance
+    n = turn * n
+    return wp.vec4d(n[0], n[1], n[2], distance)
 
 
-@wp.func
-def push(s: Stencil, box: wp.array(dtype=wp.int32), impulse: wp.vec3f, velocity: wp.array(dtype=wp.vec4f)):
-    """Give an impulse [N s] at the particle to its nodes."""
-    for a in range(3):
-        for b in range(3):
-            row = ((s.i + a) * box[4] + s.j + b) * box[5] + s.k
-            plane = s.weights[0, a] * s.weights[1, b]
-            for c in range(3):
-                share = plane * s.weights[2, c] * velocity[row + c][3]
-                wp.atomic_add(
-                    velocity,
-                    row + c,
-                    wp.vec4f(share * impulse[0], share * impulse[1], share * impulse[2], 0.0),
-                )
+_CARRIED = r"""
+    const float* grid = (const float*)velocity.data;
+    const int n1 = box.data[4], n2 = box.data[5];
+    wp::vec_t<4, float> out;
+#if defined(__CUDA_ARCH__)
+    float total[4] = {0.0f, 0.0f, 0.0f, 0.0f};
+#else
+    typedef float V4 __attribute__((vector_size(16), aligned(4)));
+    V4 total = V4{};
+#endif
+    float mobility = 0.0f;
+    for (int a = 0; a < 3; ++a)
+        for (int b = 0; b < 3; ++b) {
+            const float* row = grid + 4 * (((i + a) * n1 + j + b) * n2 + k);
+            const float plane = weights.data[0][a] * weights.data[1][b];
+            for (int c = 0; c < 3; ++c) {
+                const float w = plane * weights.data[2][c];
+                mobility += w * w * row[4 * c + 3];
+#if defined(__CUDA_ARCH__)
+                for (int q = 0; q < 3; ++q) total[q] += w * row[4 * c + q];
+#else
+                total += w * *(const V4*)(row + 4 * c);
+#endif
+            }
+        }
+    for (int q = 0; q < 3; ++q) out[q] = total[q];
+    out[3] = mobility;
+    return out;
+"""
+
+_PUSH = r"""
+    float* grid = (float*)velocity.data;
+    const int n1 = box.data[4], n2 = box.data[5];
+#if !defined(__CUDA_ARCH__)
+    typedef float V4 __attribute__((vector_size(16), aligned(4)));
+    const V4 given = V4{impulse[0], impulse[1], impulse[2], 0.0f};
+#endif
+    for (int a = 0; a < 3; ++a)
+        for (int b = 0; b < 3; ++b) {
+            float* row = grid + 4 * (((i + a) * n1 + j + b) * n2 + k);
+            const float plane = weights.data[0][a] * weights.data[1][b];
+            for (int c = 0; c < 3; ++c) {
+                const float share = plane * weights.data[2][c] * row[4 * c + 3];
+#if defined(__CUDA_ARCH__)
+                for (int q = 0; q < 3; ++q) atomicAdd(row + 4 * c + q, share * impulse[q]);
+#else
+                *(V4*)(row + 4 * c) = *(V4*)(row + 4 * c) + share * given;
+#endif
+            }
+        }
+"""
+
+
+@wp.func_native(_CARRIED)
+def carried(
+    i: int,
+    j: int,
+    k: int,
+    weights: wp.mat33f,
+    box: wp.array(dtype=wp.int32),
+    velocity: wp.array(dtype=wp.vec4f),
+) -> wp.vec4f:
+    """Grid velocity at a particle [m/s], and what an impulse of 1 N s there adds to it [1/kg]."""
+
+
+@wp.func_native(_PUSH)
+def push(
+    i: int, j: int, k: int, weights: wp.mat33f, box: wp.array(dtype=wp.int32), impulse: wp.vec3f,
+    velocity: wp.array(dtype=wp.vec4f),
+):  # fmt: skip
+    """Give an impulse [N s] at a particle to its nodes."""
 
 
 @wp.kernel(enable_backward=False)
-def forget_near(near: wp.array(dtype=wp.int32)):
-    """No particle is near any more."""
+def forget_near(near: wp.array(dtype=wp.int32), turn: wp.array(dtype=wp.int32)):
+    """No particle is near any more: a new turn."""
     near[0] = 0
+    turn[0] = turn[0] + 1
 
 
 @wp.kernel(enable_backward=False)
@@ -102,7 +183,7 @@ def find_near(
     values: wp.array3d(dtype=wp.float32),
     low: wp.vec3d,
     inverse: wp.vec3d,
-    # model: distance of the shape's farthest point from its frame, half a particle an axis, depths at the start, 1
+    # model: distance of the shape's farthest point from its frame, half a particle an axis, depths at the start
     reach: wp.float64,
     half: wp.vec3d,
     relief: wp.array(dtype=wp.float64),
@@ -110,9 +191,12 @@ def find_near(
     leaving: wp.float64,
     fastest: wp.float64,
     clock: wp.array(dtype=wp.float64),
+    turn: wp.array(dtype=wp.int32),
     # in
     pose: wp.array(dtype=wp.vec3d),
     x: wp.array(dtype=wp.float64),
+    # in, out
+    last: wp.array(dtype=wp.int32),
     # out
     near: wp.array(dtype=wp.int32),
     contact: wp.array(dtype=wp.vec4f),
@@ -122,19 +206,28 @@ def find_near(
 ):
     """List one particle if its face is within ``sight`` [m] of the collider, with what it asks for.
 
-    What is inside leaves at ``leaving`` of its depth a substep, at most at ``fastest`` dx / dt [m].
+    What is inside leaves at ``leaving`` of its depth a substep, at most at ``fastest`` dx / dt [m]. ``last`` is the
+    turn in which a particle was near: an impulse is remembered for one turn.
     """
     p = wp.tid()
     here = wp.vec3d(x[3 * p], x[3 * p + 1], x[3 * p + 2])
-    if wp.length(here - pose[0]) > reach:
-        impulse[p] = wp.vec3f()
+    away = here - pose[0]
+    wide = sight + wp.max(half)
+    if kind == _HALF_SPACE:  # most particles are far: decided before any root is taken
+        if away[0] * pose[1][2] + away[1] * pose[2][2] + away[2] * pose[3][2] > wide:
+            return
+    elif wp.dot(away, away) > reach * reach:
         return
-    found = collider_distance(kind, size, values, low, inverse, pose, here)
-    n = wp.normalize(wp.vec3d(found[0], found[1], found[2]))
+    found = distance_from(kind, size, values, low, inverse, pose, here)
+    if found[3] > wide:
+        return
+    n = wp.vec3d(found[0], found[1], found[2])
     gap = found[3] - relief[p] - wp.length(wp.cw_mul(n, half))
     if gap > sight:
-        impulse[p] = wp.vec3f()
         return
+    if last[p] + 1 < turn[0]:
+        impulse[p] = wp.vec3f()
+    last[p] = turn[0]
     least = -gap * clock[1]
     if gap < wp.float64(0.0):
         least = wp.min(leaving * least, fastest * clock[1])
@@ -185,7 +278,7 @@ def press(
     along = known - normal * n
     given = wp.vec3f()
     if again == 0:
-        now = carried(s, box, seen)
+        now = carried(s.i, s.j, s.k, s.weights, box, seen)
         if now[3] <= 0.0:
             return
         mass = relaxation / now[3]
@@ -204,6 +297,6 @@ def press(
     wanted = normal * n + along
     impulse[p] = wanted
     change = wanted - given
-    push(s, box, change, velocity)
+    push(s.i, s.j, s.k, s.weights, box, change, velocity)
     for i in range(3):
         wp.atomic_add(totals, i, wp.float64(change[i]))

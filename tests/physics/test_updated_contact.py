@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 import pytest
+import trimesh
 from bodies import GRAVITY, SolidLaw, rest_nodes
 
 from physworld.errors import ContactFailed
@@ -204,6 +205,19 @@ def test_a_block_rides_on_a_turntable() -> None:
     assert np.abs(particles[..., :2].mean(axis=1) - carried).max() < 1e-3
     end = turns[-1] @ particles[0].T
     assert np.abs(particles[-1] - end.T).max() < 2e-3
+
+
+def test_a_mesh_pushes_as_the_box_that_it_is() -> None:
+    """Its samples end half a cell before the body's particles touch it."""
+    whole = trimesh.creation.box((0.05, 0.06, 0.06))
+    way, times = path([0, 0.5], [(-0.08, 0, 0.035), (0.0, 0, 0.035)]), np.linspace(0, 0.5, 11)
+    ends = []
+    for shape in (sdf.box((0.05, 0.06, 0.06)), sdf.mesh_shape(whole)):
+        terms = (GroundContact(BLOCK, LAW, 0.0, 0.3), ColliderContact(Collider("pusher", shape, way, 0.2)))
+        _, particles, impulses = simulate(BLOCK, LAW, terms, times)
+        ends.append((particles[-1], impulses[-1, 1, 0]))
+    assert np.abs(ends[1][0] - ends[0][0]).max() < 1e-3  # edges of a mesh are rounded by half a sample
+    assert ends[1][1] == pytest.approx(ends[0][1], rel=0.02)
 
 
 def test_a_collider_thinner_than_a_cell_holds() -> None:
