@@ -11,15 +11,17 @@ import numpy as np
 import warp as wp
 
 from physworld.errors import ContactFailed
+from physworld.geometry.sdf_kernels import HALF_SPACE
 from physworld.mpm.bspline import GAUSS_POINTS
 from physworld.mpm.colliders import Collider
 from physworld.mpm.colliders_kernels import move_collider
 from physworld.mpm.grid_box import GridLattice
-from physworld.mpm.grid_contact_kernels import find_near, forget_near, press
+from physworld.mpm.grid_contact_kernels import find_near, forget_near, press, sift
 
 _SIGHT = 0.5  # cells: particles cross less than that in a substep
 _LEAVING = 0.1  # of its depth that material inside a collider leaves in a substep
 _FASTEST = 0.002  # cells a substep, at most, that it leaves
+_GROUP = 32  # particles that a thread sifts in turn on a CPU
 _RELAXATION = 1.0 / 16.0  # where all particles of a contact act at once: up to 9 nodes' worth of them overlap
 _CRUSHED = 30.0  # wave moduli: an impact at the speed of waves presses with about one
 _DEPTH_SHARE = 0.9  # of a collider's own depth: deeper, the nearest way out may be the wrong one
@@ -57,8 +59,11 @@ class GridContact:
         self._cell = float(lattice.spacing.min())
         self._half = GAUSS_POINTS[0] * lattice.spacing
         sight = _SIGHT * self._cell
-        reach = collider.shape.reach_m + sight + 2 * float(np.linalg.norm(self._half))
-        self._reach = reach if np.isfinite(collider.shape.inner_m) else np.inf
+        self._threads = (
+            count if wp.get_device(device).is_cuda else 1
+        )  # a thread that finds nothing costs as much
+        self._plane = collider.shape.kind == HALF_SPACE
+        self._reach = collider.shape.reach_m + sight + float(self._half.max())
         self._sight = sight
         self._path = collider.path.on_device(device)
         self._shape = collider.shape.on_device(device)
@@ -67,6 +72,7 @@ class GridContact:
         self._relief = wp.zeros(count, dtype=wp.float64, device=device)
         self._turn = wp.zeros(1, dtype=wp.int32, device=device)
         self._last = wp.zeros(count, dtype=wp.int32, device=device)
+        self._candidates = wp.zeros(count + 1, dtype=wp.int32, device=device)
         self._near = wp.zeros(count + 1, dtype=wp.int32, device=device)
         self._contact = wp.zeros(count, dtype=wp.vec4f, device=device)
         self._drive = wp.zeros(count, dtype=wp.vec3f, device=device)
@@ -133,13 +139,19 @@ class GridContact:
             move_collider, 1, inputs=[self._times, *self._path, clock, counter], outputs=[self._pose, self._totals],
             device=self._device,
         )  # fmt: skip
-        wp.launch(forget_near, 1, inputs=[self._near, self._turn], device=self._device)
+        wp.launch(forget_near, 1, inputs=[self._candidates, self._near, self._turn], device=self._device)
+        group = 1 if self._threads > 1 else _GROUP
+        wp.launch(
+            sift, -(-self._count // group),
+            inputs=[group, self._count, int(self._plane), wp.float64(self._reach), self._pose, x],
+            outputs=[self._candidates], device=self._device,
+        )  # fmt: skip
         model = [
-            wp.float64(self._reach), wp.vec3d(*self._half), self._relief, wp.float64(self._sight),
+            wp.vec3d(*self._half), self._relief, wp.float64(self._sight),
             wp.float64(_LEAVING), wp.float64(_FASTEST * self._cell), clock, self._turn,
         ]  # fmt: skip
         wp.launch(
-            find_near, self._count, inputs=[*self._shape, *model, self._pose, x],
+            find_near, self._threads, inputs=[self._threads, *self._shape, *model, self._pose, x, self._candidates],
             outputs=[self._last, self._near, self._contact, self._drive, self._impulse, self._totals],
             device=self._device,
         )  # fmt: skip
@@ -154,9 +166,9 @@ class GridContact:
             wp.copy(seen, velocity)
         grid = [wp.vec3d(*self._lattice.origin), wp.vec3d(*(1.0 / self._lattice.spacing)), box]
         wp.launch(
-            press, self._count,
-            inputs=[self._friction, relaxation, int(again), *grid, x, self._near, self._contact, self._drive,
-                    seen if self.at_once else velocity],
+            press, self._threads,
+            inputs=[self._threads, self._friction, relaxation, int(again), *grid, x, self._near, self._contact,
+                    self._drive, seen if self.at_once else velocity],
             outputs=[self._impulse, velocity, self._totals, self._hardest], device=self._device,
         )  # fmt: skip
 

@@ -21,10 +21,9 @@ from __future__ import annotations
 
 import warp as wp
 
-from physworld.geometry.sdf_kernels import HALF_SPACE, SAMPLED, signed_distance
+from physworld.geometry.sdf_kernels import SAMPLED, signed_distance
 from physworld.mpm.colliders_kernels import collider_velocity
 
-_HALF_SPACE = wp.constant(HALF_SPACE)
 _SAMPLED = wp.constant(SAMPLED)
 _INSIDE = wp.constant(wp.float64(1.0e-6))  # of a sample's spacing
 
@@ -168,23 +167,72 @@ def push(
     """Give an impulse [N s] at a particle to its nodes."""
 
 
+_SIFT = r"""
+    const double* place = (const double*)pose.data;   // position, then the three rows of the rotation
+    const double nx = place[5], ny = place[8], nz = place[11];
+    for (int p = group * batch; p < group * (batch + 1) && p < count; ++p) {
+        const double a = x.data[3 * p] - place[0], b = x.data[3 * p + 1] - place[1], c = x.data[3 * p + 2] - place[2];
+        const bool far = plane ? a * nx + b * ny + c * nz > reach : a * a + b * b + c * c > reach * reach;
+        if (far) continue;
+#if defined(__CUDA_ARCH__)
+        candidates.data[1 + atomicAdd(&candidates.data[0], 1)] = p;
+#else
+        candidates.data[1 + candidates.data[0]++] = p;
+#endif
+    }
+"""
+
+
+@wp.func_native(_SIFT)
+def _sift(
+    batch: int,
+    group: int,
+    count: int,
+    plane: int,
+    reach: wp.float64,
+    pose: wp.array(dtype=wp.vec3d),
+    x: wp.array(dtype=wp.float64),
+    candidates: wp.array(dtype=wp.int32),
+): ...
+
+
 @wp.kernel(enable_backward=False)
-def forget_near(near: wp.array(dtype=wp.int32), turn: wp.array(dtype=wp.int32)):
+def sift(
+    group: int,
+    count: int,
+    # model
+    plane: int,
+    reach: wp.float64,
+    # in
+    pose: wp.array(dtype=wp.vec3d),
+    x: wp.array(dtype=wp.float64),
+    # out
+    candidates: wp.array(dtype=wp.int32),
+):
+    """List those of ``group`` particles that may be near: within ``reach`` [m] of the frame, or over a ``plane``."""
+    _sift(wp.tid(), group, count, plane, reach, pose, x, candidates)
+
+
+@wp.kernel(enable_backward=False)
+def forget_near(
+    candidates: wp.array(dtype=wp.int32), near: wp.array(dtype=wp.int32), turn: wp.array(dtype=wp.int32)
+):
     """No particle is near any more: a new turn."""
+    candidates[0] = 0
     near[0] = 0
     turn[0] = turn[0] + 1
 
 
 @wp.kernel(enable_backward=False)
 def find_near(
+    stride: int,
     # model: shape
     kind: int,
     size: wp.vec3d,
     values: wp.array3d(dtype=wp.float32),
     low: wp.vec3d,
     inverse: wp.vec3d,
-    # model: distance of the shape's farthest point from its frame, half a particle an axis, depths at the start
-    reach: wp.float64,
+    # model: half a particle an axis, depths at the start
     half: wp.vec3d,
     relief: wp.array(dtype=wp.float64),
     sight: wp.float64,
@@ -195,6 +243,7 @@ def find_near(
     # in
     pose: wp.array(dtype=wp.vec3d),
     x: wp.array(dtype=wp.float64),
+    candidates: wp.array(dtype=wp.int32),
     # in, out
     last: wp.array(dtype=wp.int32),
     # out
@@ -204,42 +253,34 @@ def find_near(
     impulse: wp.array(dtype=wp.vec3f),
     totals: wp.array(dtype=wp.float64),
 ):
-    """List one particle if its face is within ``sight`` [m] of the collider, with what it asks for.
+    """List every ``stride``-th candidate whose face is within ``sight`` [m] of the collider, with what it asks for.
 
     What is inside leaves at ``leaving`` of its depth a substep, at most at ``fastest`` dx / dt [m]. ``last`` is the
     turn in which a particle was near: an impulse is remembered for one turn.
     """
-    p = wp.tid()
-    here = wp.vec3d(x[3 * p], x[3 * p + 1], x[3 * p + 2])
-    away = here - pose[0]
-    wide = sight + wp.max(half)
-    if kind == _HALF_SPACE:  # most particles are far: decided before any root is taken
-        if away[0] * pose[1][2] + away[1] * pose[2][2] + away[2] * pose[3][2] > wide:
-            return
-    elif wp.dot(away, away) > reach * reach:
-        return
-    found = distance_from(kind, size, values, low, inverse, pose, here)
-    if found[3] > wide:
-        return
-    n = wp.vec3d(found[0], found[1], found[2])
-    gap = found[3] - relief[p] - wp.length(wp.cw_mul(n, half))
-    if gap > sight:
-        return
-    if last[p] + 1 < turn[0]:
-        impulse[p] = wp.vec3f()
-    last[p] = turn[0]
-    least = -gap * clock[1]
-    if gap < wp.float64(0.0):
-        least = wp.min(leaving * least, fastest * clock[1])
-        wp.atomic_max(totals, 3, -gap)
-    wall = collider_velocity(pose, here)
-    near[1 + wp.atomic_add(near, 0, 1)] = p
-    contact[p] = wp.vec4f(wp.float32(n[0]), wp.float32(n[1]), wp.float32(n[2]), wp.float32(least))
-    drive[p] = wp.vec3f(wp.float32(wall[0]), wp.float32(wall[1]), wp.float32(wall[2]))
+    for c in range(wp.tid(), candidates[0], stride):
+        p = candidates[1 + c]
+        here = wp.vec3d(x[3 * p], x[3 * p + 1], x[3 * p + 2])
+        found = distance_from(kind, size, values, low, inverse, pose, here)
+        n = wp.vec3d(found[0], found[1], found[2])
+        gap = found[3] - relief[p] - wp.length(wp.cw_mul(n, half))
+        if gap <= sight:
+            if last[p] + 1 < turn[0]:
+                impulse[p] = wp.vec3f()
+            last[p] = turn[0]
+            least = -gap * clock[1]
+            if gap < wp.float64(0.0):
+                least = wp.min(leaving * least, fastest * clock[1])
+                wp.atomic_max(totals, 3, -gap)
+            wall = collider_velocity(pose, here)
+            near[1 + wp.atomic_add(near, 0, 1)] = p
+            contact[p] = wp.vec4f(wp.float32(n[0]), wp.float32(n[1]), wp.float32(n[2]), wp.float32(least))
+            drive[p] = wp.vec3f(wp.float32(wall[0]), wp.float32(wall[1]), wp.float32(wall[2]))
 
 
-@wp.kernel(enable_backward=False)
-def press(
+@wp.func
+def correct(
+    p: int,
     # model
     friction: wp.array(dtype=wp.float32),
     relaxation: float,
@@ -249,7 +290,6 @@ def press(
     box: wp.array(dtype=wp.int32),
     # in
     x: wp.array(dtype=wp.float64),
-    near: wp.array(dtype=wp.int32),
     contact: wp.array(dtype=wp.vec4f),
     drive: wp.array(dtype=wp.vec3f),
     seen: wp.array(dtype=wp.vec4f),
@@ -259,15 +299,7 @@ def press(
     totals: wp.array(dtype=wp.float64),
     hardest: wp.array(dtype=wp.float32),
 ):
-    """Correct the impulse [N s] of one near particle; with ``again`` give it the last substep's, within its cone.
-
-    ``seen`` is ``velocity`` itself where particles take their turns, a copy where they act at once; ``hardest`` becomes
-    the greatest normal impulse.
-    """
-    turn = wp.tid()
-    if turn >= near[0]:
-        return
-    p = near[1 + turn]
+    """Correct the impulse [N s] of one particle; see :func:`press`."""
     s = stencil_of(wp.vec3d(x[3 * p], x[3 * p + 1], x[3 * p + 2]), origin, inv_dx, box)
     if not inside(s, box):
         impulse[p] = wp.vec3f()
@@ -300,3 +332,37 @@ def press(
     push(s.i, s.j, s.k, s.weights, box, change, velocity)
     for i in range(3):
         wp.atomic_add(totals, i, wp.float64(change[i]))
+
+
+@wp.kernel(enable_backward=False)
+def press(
+    stride: int,
+    # model
+    friction: wp.array(dtype=wp.float32),
+    relaxation: float,
+    again: int,
+    origin: wp.vec3d,
+    inv_dx: wp.vec3d,
+    box: wp.array(dtype=wp.int32),
+    # in
+    x: wp.array(dtype=wp.float64),
+    near: wp.array(dtype=wp.int32),
+    contact: wp.array(dtype=wp.vec4f),
+    drive: wp.array(dtype=wp.vec3f),
+    seen: wp.array(dtype=wp.vec4f),
+    # in, out
+    impulse: wp.array(dtype=wp.vec3f),
+    velocity: wp.array(dtype=wp.vec4f),
+    totals: wp.array(dtype=wp.float64),
+    hardest: wp.array(dtype=wp.float32),
+):
+    """Correct the impulses [N s] of every ``stride``-th near particle; with ``again`` give them the last substep's.
+
+    ``seen`` is ``velocity`` itself where particles take their turns, a copy where they act at once; ``hardest`` becomes
+    the greatest normal impulse.
+    """
+    for c in range(wp.tid(), near[0], stride):
+        correct(
+            near[1 + c], friction, relaxation, again, origin, inv_dx, box, x, contact, drive, seen, impulse, velocity,
+            totals, hardest,
+        )  # fmt: skip
