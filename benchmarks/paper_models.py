@@ -57,7 +57,7 @@ TRAINING = TrainingConfig(
     checkpoint_every=10_000,
 )
 TUNING = FineTuneConfig(steps=40)
-EPISODES = 60
+EPISODES = 48
 FIT = CalibrationConfig(particle_budget=500, max_simulations=40)
 SKIN_STATES = 24
 

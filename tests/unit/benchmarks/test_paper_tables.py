@@ -31,7 +31,7 @@ def cell(model: float, tuned: float, twin: float = 0.002) -> dict[str, Any]:
 def held(scenes: list[str]) -> dict[str, dict[str, Any] | None]:
     """Everything of the first two seeds; the third one is not done."""
     found: dict[str, dict[str, Any] | None] = {key: None for key, _ in plan(scenes)}
-    worse = {"full": 1.0, "linear": 2.0, "none": 1.0 / 1.1, "uniform": 1.2, "random": 1.4}
+    worse = {"full": 1.0, "vmp": 1.5, "linear": 3.0, "none": 1.0 / 1.1, "uniform": 1.2, "random": 1.4}
     for scene in scenes:
         for seed in SEEDS[:2]:
             for condition, factor in worse.items():
@@ -44,7 +44,7 @@ def held(scenes: list[str]) -> dict[str, dict[str, Any] | None]:
 
 def test_every_relation_of_the_paper_is_planned_for_every_scene_and_seed() -> None:
     keys = [key for key, _ in plan(["soft_beam", "d02"])]
-    assert len(keys) == len(set(keys)) == len(SEEDS) * (2 * (len(CONDITIONS) + 1) + len(unseen_motion.KINDS))
+    assert len(keys) == len(set(keys)) == len(SEEDS) * (2 * (len(CONDITIONS) + 1) + 1)
     first = [key for key in keys if key.endswith("/0")]
     assert keys[: len(first)] == first, "a whole seed comes before the next one"
 
@@ -58,8 +58,8 @@ def test_a_relation_is_judged_pair_by_pair() -> None:
     assert relations["p3_against_none"]["holds_in"] == 0
     assert not relations["p3_against_none"]["by_scene"]["soft_beam"]["holds"]
     assert relations["finetuned_against_twin"]["by_scene"]["soft_beam"]["by_seed"]["0"] == pytest.approx(2.0)
-    assert report.figures["cells"]["done"] == 12
-    assert f"12 of {len(held(['soft_beam']))} cells are done" in report.markdown()
+    assert report.figures["cells"]["done"] == 14
+    assert f"14 of {len(held(['soft_beam']))} cells are done" in report.markdown()
     assert report.figures["steps_per_second"]["soft_beam"]["ratio"] == pytest.approx(40.0)
 
 
@@ -74,7 +74,7 @@ def test_a_report_without_a_cell_says_that_nothing_was_measured() -> None:
 def test_a_finished_cell_is_not_done_again_and_no_cell_begins_after_the_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Cells, "_case", lambda self, name: name)
+    monkeypatch.setattr(Cells, "case", lambda self, name: name)
     cells = Cells(tmp_path, None)
     done: list[str] = []
 
