@@ -7,7 +7,7 @@ PhysworldError
 │   ├── CFLViolation        a forced time step exceeds the stable one
 │   ├── ParticlesLeftTheGrid  material left the stated workspace
 │   ├── TwistLost           a rope folded, or a grip turned so far in a frame that its turns cannot be counted
-│   ├── ContactFailed       a collider is too fast for its contact, or material came too deep into it
+│   ├── ContactFailed       a collider is too fast for its contact, or material came too deep into it or is crushed
 │   └── EpisodeRejected     every try at a demonstration was rejected
 ├── UnknownEffect           no effect or strength of that name
 ├── EffectRefused           the effect makes no sense for this twin
@@ -48,7 +48,7 @@ class ParticlesLeftTheGrid(SimulationError):
 
 
 class ContactFailed(SimulationError):
-    """A collider is too fast for its contact, or material came too deep into it."""
+    """A collider is too fast for its contact, or material came too deep into it or is crushed by it."""
 
 
 class TwistLost(SimulationError):

@@ -115,6 +115,34 @@ def test_a_block_on_a_steep_slope_slides_at_coulombs_acceleration() -> None:
     assert moved == pytest.approx(slid, rel=COULOMB)
 
 
+def test_the_grounds_friction_may_be_a_field_over_the_body() -> None:
+    """The half of the block that is rough brings all of it to rest: mu is the mean of what carries the weight."""
+    rest, times = rest_nodes(BLOCK), np.linspace(0, 0.4, 5)
+    rough = np.where(BLOCK.particle_coordinates[:, 1] > 0, 1.5, 0.5)
+    terms = (GroundContact(BLOCK, LAW, 0.0, 0.4),)
+    problem = Problem(BLOCK, LAW, rest, GRAVITY, friction_factor=rough, terms=terms)
+    engine = UpdatedLagrangian(problem)
+    start = np.tile([0.5, 0.0, 0.0], (len(rest), 1))
+    moved = np.diff(centre(engine, engine.run_particles(rest, start, free(5), times))[[0, -1]], axis=0)[0]
+    assert moved[0] == pytest.approx(0.25 / (2 * 0.4 * G), rel=0.05)
+    particles = engine.run_particles(rest, start, free(5), times)[-1]
+    ahead = particles[BLOCK.particle_coordinates[:, 1] < 0, 0].mean() - particles[:, 0].mean()
+    assert ahead > 1e-4  # the smooth side runs ahead: the block turns
+
+
+def test_contact_gives_no_energy_to_a_block_that_bounces() -> None:
+    law, times = SolidLaw(2e5, 0.3, 0.0, 1000.0), np.linspace(0, 1.0, 101)
+    terms = (GroundContact(BLOCK, law, -0.05, 0.3),)
+    engine, particles, _ = simulate(BLOCK, law, terms, times)
+    height = centre(engine, particles)[:, 2]
+    floor = height[0] - 0.05
+    peaks = [
+        h for before, h, after in zip(height, height[1:], height[2:], strict=False) if before < h > after
+    ]
+    assert len(peaks) > 2 and peaks[0] < height[0] and peaks[1] < peaks[0]
+    assert (height > floor - 0.01).all()
+
+
 def test_a_plate_that_presses_drags_a_block_along_until_its_friction_gives_way() -> None:
     """On a frictionless ground; the plate's own pull is at most mu times what it presses with."""
     places = [(0, 0, 0.08), (0, 0, 0.068), (0, 0, 0.068), (0.05, 0, 0.068)]
