@@ -10,7 +10,7 @@ import warp as wp
 from physworld.materials.laws import SolidLaw
 from physworld.materials.plastic import Plasticity
 from physworld.mpm.elastic_stress_kernels import elastic_stress
-from physworld.mpm.hencky_kernels import plastic_kernel
+from physworld.mpm.hencky_kernels import eigen_type, plastic_kernel, stretch
 
 LANES = 8  # particles that an elastic kernel takes at once: arrays are padded to a multiple
 
@@ -67,13 +67,16 @@ class ParticleStress:
                 wp.vec3d(*plasticity.parameters()),
             ]  # fmt: skip
             self._kernel = plastic_kernel(type(plasticity).project)
+            self._eigen = wp.zeros(len(measure), dtype=eigen_type, device=device)
 
     def launch(self, F: wp.array, C: wp.array, stress: wp.array, clock: wp.array, flags: wp.array) -> None:
         """Advance ``F`` (P padded, mat33d) by ``clock[2]`` [s] of ``C`` [1/s], and write ``stress`` [J], (6P,)."""
         outputs = [stress, self.ratio, flags]
+        flat = wp.array(ptr=F.ptr, dtype=wp.float64, shape=9 * len(F), device=self._device)
         if self._plasticity is None:
-            flat = wp.array(ptr=F.ptr, dtype=wp.float64, shape=9 * len(F), device=self._device)
             dim, inputs = len(F) // LANES, [*self._model, clock, C, flat]
         else:
-            dim, inputs = self._count, [*self._model, clock, C, F, self.memory]
+            groups = len(F) // LANES
+            wp.launch(stretch, groups, inputs=[clock, C, flat], outputs=[self._eigen], device=self._device)
+            dim, inputs = self._count, [*self._model, clock, C, self._eigen, F, self.memory]
         wp.launch(self._kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._device)

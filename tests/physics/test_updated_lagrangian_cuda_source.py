@@ -29,6 +29,7 @@ def compiled(module: object, folder: Path) -> bool:
         "grid_contact_kernels",
         "particle_kernels",
         "particle_stress_kernels",
+        "hencky_kernels",
     ],
 )
 def test_the_transfers_compile_for_cuda(name: str, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import warp as wp
 
 from physworld.materials.laws import SolidLaw
 from physworld.materials.plastic import DruckerPrager, Identity, Plasticity, StVenantKirchhoff, VonMises
-from physworld.mpm.particle_stress import ParticleStress
+from physworld.mpm.particle_stress import ParticleStress, padded
 
 LAW = SolidLaw(1e5, 0.3)
 MU, LAM = LAW.lame
@@ -25,8 +25,11 @@ def mapped(
     stress = ParticleStress(LAW, law, np.ones(count), np.ones(count), "cpu")
     if memory is not None:
         stress.memory.assign(memory)
-    F_d = wp.array(F, dtype=wp.mat33d, device="cpu")
-    C = wp.zeros(9 * count, dtype=wp.float32, device="cpu")
+    room = padded(count)
+    F_d = wp.array(
+        np.concatenate([F, np.tile(np.eye(3), (room - count, 1, 1))]), dtype=wp.mat33d, device="cpu"
+    )
+    C = wp.zeros(9 * room, dtype=wp.float32, device="cpu")
     out = wp.zeros(6 * count, dtype=wp.float32, device="cpu")
     flags = wp.zeros(4, dtype=wp.int32, device="cpu")
     clock = wp.array([DT, 1.0 / dt, dt], dtype=wp.float64, device="cpu")
@@ -34,7 +37,7 @@ def mapped(
     assert not flags.numpy().any()
     xx, yy, zz, yz, xz, xy = out.numpy().reshape(-1, 6).T
     tau = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
-    return F_d.numpy(), tau, stress.memory.numpy()
+    return F_d.numpy()[:count], tau, stress.memory.numpy()
 
 
 def gradients(scale: float, seed: int = 0, volume: float = 1.0) -> np.ndarray:
