@@ -19,7 +19,9 @@ from physworld.geometry.rigid import least_rotation
 from physworld.worldmodel.graph import GraphSpec
 
 STRAIGHT = 1e-3  # rest vertices leave a line by less than that share of its length
-HELD = 2e-4  # a held vertex moves in its grip's frame by less than that share of the length
+HELD = (2e-4, 1e-3, 4e-3)
+"""A held vertex moves in its grip's frame by less than that share of the length: by the first that any vertex meets.
+The twin's frame of a grip is fitted to all its markers, this one to three of them, and markers are noisy."""
 IN_LINE = (
     1e-3  # control vertices nearer to the line of two others than that share of their distance are on it
 )
@@ -126,7 +128,7 @@ def held_vertices(spec: GraphSpec, paths: np.ndarray, length_m: float) -> Held:
     """Who is held, from vertex tracks (F, V, 3) of frames that show the grips turning."""
     n, grips = spec.object_count, grip_frames(spec)
     controls = paths[:, n:]
-    owner, offset, best = np.full(n, -1), np.zeros((n, 3)), np.full(n, HELD * length_m)
+    owner, offset, best = np.full(n, -1), np.zeros((n, 3)), np.full(n, HELD[-1] * length_m)
     for g in range(len(grips.markers)):
         centre = np.einsum("c,tcx->tx", grips.anchor[g], controls)
         turns = frame_rotations(grips, g, controls)
@@ -135,6 +137,11 @@ def held_vertices(spec: GraphSpec, paths: np.ndarray, length_m: float) -> Held:
         moved = np.sqrt(np.square(local - mean).sum(axis=2).mean(axis=0))
         better = moved < best
         owner[better], offset[better], best[better] = g, mean[better], moved[better]
+    for share in HELD:
+        near = (owner >= 0) & (best <= share * length_m)
+        if near.any():
+            owner[~near] = -1
+            break
     return Held(grips, owner, offset)
 
 

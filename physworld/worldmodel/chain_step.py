@@ -84,23 +84,29 @@ class ChainStep(nn.Module):
         The driven nodes are at here + s slope + s²/2 turn; ``pull`` (K-1, M, 1), ``bend`` (K-2, M, 1), ``ease`` (K, M,
         1).
         """
-        substeps = self.prior.substeps
-        step, every = 1.0 / substeps, substeps // CALMINGS
-        weight, tense = self._free * self.gravity, pull * self.length[:, None, None]
-        dash, before = self.dash[:, None, None] * substeps, None
+        substeps, every = self.prior.substeps, self.prior.substeps // CALMINGS
+        step = 1.0 / substeps
+        place, move, here, slope, turn = (
+            values.permute(2, 0, 1) for values in (place, step * velocity, here, slope, turn)
+        )  # (3, K, M): a matrix times it is one operation
+        pull, bend, ease = pull[..., 0], bend[..., 0], step**2 * ease[..., 0]
+        weight = step**2 * (self._free * self.gravity).permute(2, 0, 1)
+        tense, dash, before = pull * self.length[:, None], self.dash[:, None] * substeps, None
+        still, back = 1.0 - self._free[..., 0], -self._differ.T
+        times = step * torch.arange(substeps + 1, dtype=place.dtype)[:, None, None, None]
+        led = torch.diff(here + times * (slope + 0.5 * times * turn), dim=0)
         for substep in range(substeps):
-            pulled, bent = _times(self._differ, place).split(self._counts)
-            size = torch.sqrt(pulled.square().sum(dim=-1, keepdim=True) + _LENGTH_FLOOR_M2)
+            pulled, bent = (self._differ @ place).split(self._counts, dim=1)
+            size = torch.sqrt(pulled.square().sum(dim=0) + _LENGTH_FLOOR_M2)
             tension = -tense if before is None else dash * (size - before) - tense
             before = size
-            force = torch.cat([pulled * (pull + tension / size), bent * bend])
-            velocity = velocity + step * (weight - _times(self._differ.T, force) * ease)
-            now = step * (substep + 1)
+            force = torch.cat([pulled * (pull + tension / size), bent * bend], dim=1)
+            move = move + ((back @ force) * ease + weight)
             if substep % every == every - 1:
-                whole = velocity + (1.0 - self._free) * (slope + now * turn)
-                velocity = self._free * _times(self.calm, whole)
-            place = self._free * (place + step * velocity) + (here + now * (slope + 0.5 * now * turn))
-        return place
+                now = step * (substep + 1)
+                move = self._free[..., 0] * (self.calm @ (move + step * still * (slope + now * turn)))
+            place = place + move + led[substep]
+        return place.permute(1, 2, 0)
 
     def driven(self, controls: Tensor) -> Tensor:
         """Places of the driven nodes from control vertices (C, B, 3), (K, B, 3); 0 of the free ones."""
