@@ -32,6 +32,7 @@ from physworld.mpm.choose import FormulationName
 from physworld.mpm.contact import GroundContact, ground, touching
 from physworld.mpm.following import follow
 from physworld.mpm.lattice import Lattice
+from physworld.mpm.soft_grips import soften
 from physworld.mpm.terms import Term
 from physworld.mpm.total_lagrangian import Problem, TotalLagrangian
 from physworld.mpm.updated_lagrangian import UpdatedLagrangian
@@ -56,6 +57,8 @@ class Twin:
         held_nodes: nodes that each grip holds, one array a group.
         controllers_start: controllers at the first frame [m], (K, 3).
         release_s: the body is held at its start until then (somebody let go of it).
+        grip_softness: of a solid, cells over which a grip's hold sets in (:mod:`physworld.mpm.soft_grips`); 0: every
+            node that gripped material touches is prescribed. Total Lagrangian only.
         turning: numbers of the groups whose control points show how a rope's section turns about its axis; between
             two of them the rope carries twist (:mod:`physworld.mpm.twist`).
         effects: what acts beside the declared physics.
@@ -75,6 +78,7 @@ class Twin:
     held_nodes: tuple[np.ndarray, ...]
     controllers_start: np.ndarray
     release_s: float = 0.0
+    grip_softness: float = 0.0
     turning: tuple[int, ...] = ()
     effects: tuple[Effect, ...] = ()
     colliders: tuple[TwinCollider, ...] = ()
@@ -256,6 +260,8 @@ class Twin:
         problem = replace(problem, terms=(*problem.terms, *twist_between_grips(gripped, knots, controls)))
         for known in active:
             problem, held = known.attach(problem, held, self)
+        if self.grip_softness > 0 and self.lattice.dim == 3 and self.formulation == "total_lagrangian":
+            problem, held = soften(problem, held, self.grip_softness)
         return Integration(problem, velocity, held, knots, frame_index)
 
     def particles_at(self, nodes: np.ndarray) -> np.ndarray:

@@ -27,6 +27,9 @@ if TYPE_CHECKING:
     from physworld.twin import Twin
 
 
+_SOFT = 1 / 200  # cells: softer grips are no small change from springs on nodes that are all held
+
+
 @wp.kernel
 def pull_of_grip(
     # model
@@ -135,9 +138,13 @@ class GripSlip(Effect):
 
     @classmethod
     def refuses(cls, twin: Twin) -> str | None:
-        """A body that nobody holds."""
+        """A body that nobody holds, or that is held softly already."""
         held = held_count(twin)
-        return f"{held} nodes are held: no grip that could give" if held == 0 else None
+        if held == 0:
+            return f"{held} nodes are held: no grip that could give"
+        if twin.grip_softness > _SOFT:
+            return f"the grips take hold over {twin.grip_softness:.2g} cells already"
+        return None
 
     def attach(self, problem: Problem, held: HeldNodes, twin: Twin) -> tuple[Problem, HeldNodes]:
         """Frees the held nodes and pulls them instead."""

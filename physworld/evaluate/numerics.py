@@ -131,6 +131,7 @@ def refined(scene: Scene, twin: Twin, particle_budget: int, refinement: float = 
         law=twin.law,
         gravity_m_s2=twin.gravity_m_s2,
         air_drag_per_s=twin.air_drag_per_s,
+        grip_softness=twin.grip_softness,
         ground_height_m=twin.ground_height_m,
         ground_friction=twin.ground_friction,
         effects=twin.effects,

@@ -168,6 +168,9 @@ class _Recorder:
     def begin(self, times: np.ndarray) -> None:
         return None
 
+    def pace(self, time_step_s: float) -> None:
+        return None
+
     def check(self, time_s: float) -> None:
         return None
 

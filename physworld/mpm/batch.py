@@ -181,6 +181,11 @@ class _BatchRun(Run):
             share = slice(body * width, (body + 1) * width)
             self._acting.append((terms, [self.x[share], self.v[share], self.force[share]]))
 
+    def _pace(self, time_step_s: float) -> None:
+        for terms, _ in self._acting:
+            for term in terms:
+                term.pace(time_step_s)
+
     def _launch_terms(self) -> None:
         for terms, (x, v, force) in self._acting:
             for term in terms:

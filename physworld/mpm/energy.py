@@ -176,6 +176,9 @@ class _Marker:
     def begin(self, times: np.ndarray) -> None:
         return None
 
+    def pace(self, time_step_s: float) -> None:
+        return None
+
     def check(self, time_s: float) -> None:
         return None
 
@@ -222,6 +225,9 @@ class _Meter:
         return self
 
     def begin(self, times: np.ndarray) -> None:
+        return None
+
+    def pace(self, time_step_s: float) -> None:
         return None
 
     def check(self, time_s: float) -> None:

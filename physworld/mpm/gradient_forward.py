@@ -117,6 +117,12 @@ class _Tangent:
         self._still = wp.zeros(3, dtype=wp.float64, device=device)
         return self
 
+    def pace(self, time_step_s: float) -> None:
+        """Substeps have this length [s] from now on."""
+        for side in self._terms:
+            for term in side:
+                term.pace(time_step_s)
+
     def begin(self, times: np.ndarray) -> None:
         """A run starts."""
         for side in self._terms:

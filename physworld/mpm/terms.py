@@ -38,6 +38,10 @@ class BoundTerm(Protocol):
         """A run over the frames ``times`` (T,) [s] starts: for terms that need the absolute time. May raise."""
         return None
 
+    def pace(self, time_step_s: float) -> None:
+        """Substeps have this length [s] from now on: for terms that are implicit."""
+        return None
+
     def check(self, time_s: float) -> None:
         """A frame ended at ``time_s``: raises a :class:`physworld.errors.SimulationError` if it cannot be trusted."""
         return None

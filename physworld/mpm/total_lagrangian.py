@@ -257,7 +257,12 @@ class Run:
         counter.numpy()[:] = frame, 0, substeps
         wp.copy(self.clock, clock)
         wp.copy(self.counter, counter)
+        self._pace(dt)
         return substeps
+
+    def _pace(self, time_step_s: float) -> None:
+        for term in self._solver.terms:
+            term.pace(time_step_s)
 
     def _half_a_step_back(self, v: np.ndarray, interval: float) -> np.ndarray:
         """Velocities (n, 3) half a substep before the start, where a scheme of second order wants them.

@@ -15,7 +15,7 @@ import numpy as np
 from physworld.effects.base import Strength
 from physworld.effects.places import body_size, free_end
 from physworld.effects.registry import EFFECTS
-from physworld.trace.unknowns import Unknown, of_strength, with_strengths
+from physworld.trace.unknowns import Unknown, grip_softness, of_strength, with_strengths
 from physworld.twin import Twin
 
 Shape = dict[str, float]
@@ -167,6 +167,13 @@ def _fields(twin: Twin, known: Known) -> list[_Variant]:
     return variants
 
 
+def _clamps(twin: Twin, known: Known) -> list[_Variant]:
+    """Angles; the reach only where no softness of the grips is calibrated, which is what a reach within a cell is."""
+    angles = _Variant(("angle_x_rad", "angle_y_rad", "angle_z_rad"), "angle_x_rad")
+    reach = [_Variant(("reach_m",), "reach_m")] if grip_softness(twin) is None else []
+    return [*reach, angles]
+
+
 _VARIANTS: dict[str, Callable[[Twin, Known], list[_Variant]]] = {
     "rest_shape": _one_by_one(
         ("strain_x", "strain_y", "strain_z"), ("curvature_1_per_m", "curvature_2_per_m")
@@ -178,5 +185,5 @@ _VARIANTS: dict[str, Callable[[Twin, Known], list[_Variant]]] = {
     "anisotropy": _fibres,
     "tether": _tethers,
     "ground_friction": _one_by_one(("change",), ("height_m",)),
-    "clamp_offset": _one_by_one(("reach_m",), ("angle_x_rad", "angle_y_rad", "angle_z_rad")),
+    "clamp_offset": _clamps,
 }

@@ -16,6 +16,7 @@ from physworld.trace.comparison import CrossValidation, cross_validated, differe
 from physworld.trace.refit import Refit, refit
 from physworld.trace.score import Score, orthonormal, project
 from physworld.trace.simulations import Job, Simulations
+from physworld.trace.soft_starts import soft_places
 from physworld.trace.unknowns import CLAMP, Unknown, at
 from physworld.trace.whitening import Whitener
 
@@ -118,7 +119,7 @@ class Confirmation:
         fitted = model.fitted
         first = np.eye(len(fitted.theta))[0]
         scan = [fitted.theta + shift * first for shift in _ELSEWHERE]
-        reaches = _other_reaches(fitted)
+        reaches = [*_other_reaches(fitted), *soft_places(fitted)]
         costs = self._costs(fitted, [*scan, *reaches])
         line = np.array(costs[: len(scan)])
         middle = len(scan) // 2

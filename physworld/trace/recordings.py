@@ -173,6 +173,7 @@ def taken_over(twin: Twin, other: Twin) -> Twin:
         other,
         law=twin.law,
         air_drag_per_s=twin.air_drag_per_s,
+        grip_softness=twin.grip_softness,
         ground_friction=twin.ground_friction,
         effects=twin.effects,
     )

@@ -54,8 +54,9 @@ from physworld.trace.simulations import (
     in_turn,
     stable_step_s,
 )
+from physworld.trace.soft_starts import softer
 from physworld.trace.start_pose import turned_starts
-from physworld.trace.unknowns import Unknown, bending_factor, clamp_reach, of_parameter
+from physworld.trace.unknowns import Unknown, bending_factor, clamp_reach, grip_softness, of_parameter
 from physworld.trace.verdict import (
     NOTHING,
     UNEXPLAINED,
@@ -239,6 +240,8 @@ class _Trace:
         )
         if fitted is None:
             raise RuntimeError("the calibrated twin cannot be simulated again")
+        if fitted.misfit > self.config.near_floor:
+            fitted = softer(fitted, self.simulations, white, self.frames, self.config.iterations)
         return Model((), fitted, cross_validated(fitted, block_of_row))
 
     def _calibrated_unknowns(self, twin: Twin) -> list[Unknown]:
@@ -250,10 +253,11 @@ class _Trace:
             ground_friction=ground is not None and ground.friction is None,
         )
         spread = {"poissons_ratio": _POISSON_SPREAD}
-        reach = clamp_reach(twin)
+        softness = grip_softness(twin)
+        reach = clamp_reach(twin) if softness is None else None
         bending = None if any(p.name == "bending_n_m" for p in known) else bending_factor(twin)
         found = [of_parameter(p, twin, spread.get(p.name)) for p in known]
-        return [*found, *(unknown for unknown in (bending, reach) if unknown is not None)]
+        return [*found, *(unknown for unknown in (bending, reach, softness) if unknown is not None)]
 
     def _turns(self, tracks: np.ndarray, sigma: float) -> list[np.ndarray]:
         """What the uncertain pose of the start does to the prediction, (frames, N, 3) each."""

@@ -141,6 +141,7 @@ def refinement_of(twin: Twin, finer: Twin) -> Twin:
         body=replace(finer.body, points=twin.body.points, offsets=twin.body.offsets),
         law=twin.law,
         air_drag_per_s=twin.air_drag_per_s,
+        grip_softness=twin.grip_softness,
         ground_friction=twin.ground_friction,
         effects=twin.effects,
     )

@@ -10,10 +10,14 @@ import numpy as np
 from physworld.calibrate.parameters import Parameter
 from physworld.effects.base import Strength
 from physworld.effects.registry import EFFECTS
+from physworld.mpm.soft_grips import holds_a_part
 from physworld.twin import Twin
 
 _BENDING_SPREAD, _BENDING_RANGE = 0.5, 2.0
 CLAMP = "clamp_offset"
+SOFTNESS = "grip_softness"
+SOFTNESS_CELLS = (1 / 300, 1 / 3)  # from as good as prescribed to what lets a grip's own cells move
+_SOFTNESS_STEP = 0.1
 _CLAMP_STEP, _CLAMP_SPREAD = 0.25, 0.5  # cells: difference step, and deviation of what is known beforehand
 
 
@@ -124,6 +128,25 @@ def clamp_reach(twin: Twin) -> Unknown | None:
     known = replace(reach, low=max(reach.low, -cell), high=min(reach.high, cell))
     unknown = of_strength(CLAMP, known, _CLAMP_STEP * cell)
     return replace(unknown, prior=(0.0, _CLAMP_SPREAD / _CLAMP_STEP))
+
+
+def grip_softness(twin: Twin) -> Unknown | None:
+    """Over how many cells grips take hold that hold a part of a solid's section, as a logarithm; None without one.
+
+    No lattice of splines holds a part of a section as sharply as a grip does, and how sharply decides what stiffness
+    and damping fit: see :mod:`physworld.mpm.soft_grips`. At the lower end all nodes are as good as prescribed. A clamp
+    across a whole section needs no more than its reach.
+    """
+    held = np.concatenate([np.empty(0, dtype=int), *twin.held_nodes])
+    solid = twin.lattice.dim == 3 and twin.formulation == "total_lagrangian"
+    if not solid or not holds_a_part(twin.lattice, held):
+        return None
+    low, high = (float(np.log(end)) for end in SOFTNESS_CELLS)
+    start = float(np.log(np.clip(twin.grip_softness, *SOFTNESS_CELLS)))
+    return Unknown(
+        SOFTNESS, "cells", low, high, start, _SOFTNESS_STEP, lambda s: float(np.exp(s)),
+        lambda changed, s: replace(changed, grip_softness=float(np.exp(s))),
+    )  # fmt: skip
 
 
 def with_strengths(twin: Twin, effect: str, strengths: dict[str, float]) -> Twin:

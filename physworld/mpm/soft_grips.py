@@ -1,0 +1,256 @@
+"""Grips that hold the material in their region instead of every node that it touches.
+
+A quadratic spline has no kink, so a body whose gripped nodes are all prescribed is held with zero strain at the grip's
+face: too stiff by a quarter of a cell at a plane clamp, and by far more where a grip holds a part of a section and the
+free material pulls around its edges. Here the gripped material is tied to the grip's motion y by a spring per volume,
+
+    E = 1/2 rho (c / l)^2 int_grip |x - y|^2 dV        c speed of pressure waves, l = softness * cell
+
+so what the grip holds well follows it, and what only reaches into the grip, a strain at its face, gives. l is the
+length over which the hold sets in; l = 0 prescribes all nodes. The springs are implicit: in the modes of the gripped
+volume's Gram matrix relative to the nodal masses a substep removes the share s dt^2 / (1 + s dt^2) of a mode's distance
+from the path, s the square of its frequency (backward Euler of the springs alone), so the stable time step stays as it
+is. Nodes that see gripped material only are prescribed. Compare the finite cell method's weak boundary conditions
+(Ruess et al. 2013).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import warp as wp
+from scipy.linalg import eigh
+from scipy.spatial import cKDTree
+
+from physworld.mpm.bspline import gauss_points, tensor_weights
+from physworld.mpm.lattice import Lattice
+from physworld.mpm.node_kernels import on_path
+from physworld.mpm.terms import BoundTerm
+from physworld.mpm.total_lagrangian import HeldNodes, Problem
+
+_POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(3)  # exact for products of quadratic splines
+
+
+def soften(problem: Problem, held: HeldNodes, softness: float) -> tuple[Problem, HeldNodes]:
+    """The problem with grips that hold their material over ``softness`` cells, and the nodes that stay prescribed.
+
+    Args:
+        problem: of a solid.
+        held: all nodes that gripped material touches.
+        softness: l over the smallest side of a cell; 0 changes nothing.
+    """
+    lattice = problem.lattice
+    gripped = held_cells(lattice, held.nodes)
+    if softness <= 0 or not gripped.any():
+        return problem, held
+    firm = ~np.isin(held.nodes, lattice.cell_nodes[~gripped])
+    soft = _part(held, ~firm)
+    if not len(soft.nodes):
+        return problem, held
+    rate = problem.law.wave_speed_m_s / (softness * float(lattice.spacing.min()))
+    stiffness = problem.law.density_kg_m3 * rate**2
+    grips = SoftGrips(soft, stiffness * gram_matrix(lattice, gripped, soft.nodes))
+    return replace(problem, terms=(*problem.terms, grips)), _part(held, firm)
+
+
+def held_cells(lattice: Lattice, nodes: np.ndarray) -> np.ndarray:
+    """Cells all of whose nodes are among ``nodes`` (H,), (C,) bool."""
+    return np.isin(lattice.cell_nodes, nodes).all(axis=1)
+
+
+def holds_a_part(lattice: Lattice, nodes: np.ndarray) -> bool:
+    """Whether cells that are held whole are no clamp across a box's section.
+
+    Either material beside them lies off them along more than one axis, so a section goes on; or they are cut by a
+    surface, and hold more of a round section than a grip's box does.
+    """
+    held = held_cells(lattice, nodes)
+    if not held.any() or np.any(lattice.fill[held] < 1.0):
+        return bool(held.any())
+    reach, _ = cKDTree(lattice.cells[held]).query(lattice.cells[~held], p=np.inf)
+    beside = lattice.cells[~held][reach == 1]
+    near = cKDTree(lattice.cells[held]).query(beside)[1]
+    return int(np.any(beside != lattice.cells[held][near], axis=0).sum()) > 1
+
+
+def gram_matrix(lattice: Lattice, cells: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    """Integrals of products of the splines of ``nodes`` (k,) over the material of ``cells`` (C,) bool, (k, k) [m^d]."""
+    dim = lattice.dim
+    halves = 0.25 * (1.0 + _POINTS)
+    line = np.concatenate([halves, 0.5 + halves])
+    weight = np.tile(0.25 * _WEIGHTS, 2)
+    half = np.repeat([0, 1], len(_POINTS))
+    places = np.stack(np.meshgrid(*[line] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
+    weights = np.prod(np.stack(np.meshgrid(*[weight] * dim, indexing="ij"), axis=-1).reshape(-1, dim), axis=1)
+    sides = np.stack(np.meshgrid(*[half] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
+    corners = (gauss_points(dim) >= 0.5).astype(int)
+    owner = np.array([int(np.flatnonzero((corners == side).all(axis=1))[0]) for side in sides])
+    splines = tensor_weights(places, (0,) * dim)
+    volume = float(np.prod(lattice.spacing))
+    place = np.full(len(lattice.nodes), -1)
+    place[nodes] = np.arange(len(nodes))
+    gram = np.zeros((len(nodes), len(nodes)))
+    for cell in np.flatnonzero(cells):
+        local = splines.T @ (splines * (volume * weights * lattice.fill[cell][owner])[:, None])
+        numbers = place[lattice.cell_nodes[cell]]
+        own = numbers >= 0
+        gram[np.ix_(numbers[own], numbers[own])] += local[np.ix_(own, own)]
+    return gram
+
+
+@dataclass(frozen=True)
+class SoftGrips:
+    """Term: nodes on springs to their paths, ``stiffness`` (k, k) [N/m] between them."""
+
+    held: HeldNodes
+    stiffness: np.ndarray
+
+    def bind(self, problem: Problem) -> BoundSoftGrips:
+        """Device arrays."""
+        device, frames = problem.device, len(self.held.positions)
+        mass = problem.nodal_mass()[self.held.nodes]
+        squares, modes = eigh(self.stiffness, np.diag(mass))
+
+        def upload(values: np.ndarray, dtype: type = wp.float64) -> wp.array:
+            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
+
+        count = len(mass)
+        width = _LANES * -(-count // _LANES)
+        return BoundSoftGrips(
+            [
+                upload(self.held.nodes, wp.int32),
+                upload(mass),
+                upload(self.held.positions.reshape(frames, -1)),
+                upload(self.held.velocities.reshape(frames, -1)),
+                wp.vec3d(*problem.gravity_m_s2),
+                wp.float64(problem.drag_per_s),
+                width,
+            ],
+            wp.zeros((count, width), dtype=wp.float64, device=device),
+            wp.zeros(3 * width, dtype=wp.float64, device=device),
+            np.maximum(squares, 0.0),
+            mass[:, None] * modes,
+            device,
+        )
+
+
+@dataclass
+class BoundSoftGrips(BoundTerm):
+    """Springs on the device; ``pull`` (k, k) [kg/s^2], padded, takes distances to forces.
+
+    The distances are those from the paths after a substep without springs. ``squares`` (k,) [1/s^2] and ``modes``
+    (k, k), times the nodal masses, are on the host.
+    """
+
+    model: list
+    pull: wp.array
+    gap: wp.array
+    squares: np.ndarray
+    modes: np.ndarray
+    device: str
+    frequency_rad_s: float = 0.0
+    friction_per_s: float = 0.0
+    _paced_s: float = field(default=0.0)
+
+    def pace(self, time_step_s: float) -> None:
+        """The springs' implicit step of this length."""
+        if time_step_s == self._paced_s:
+            return
+        self._paced_s = time_step_s
+        reach = self.squares * time_step_s**2
+        share = reach / (1.0 + reach)
+        rows = np.zeros(self.pull.shape)
+        rows[:, : len(rows)] = (self.modes * share) @ self.modes.T / time_step_s**2
+        self.pull.assign(rows)
+
+    def launch(self, x: wp.array, v: wp.array, clock: wp.array, counter: wp.array, force: wp.array) -> None:
+        """Add the pulls [N]; the term must come last, it takes the others' forces into account."""
+        count = self.pull.shape[0]
+        inputs = [*self.model, clock, counter, x, v, force]
+        wp.launch(distance_from_path, dim=count, inputs=inputs, outputs=[self.gap], device=self.device)
+        inputs = [self.model[0], self.pull, self.gap]
+        wp.launch(pull_to_path, dim=count, inputs=inputs, outputs=[force], device=self.device)
+
+
+@wp.kernel(enable_backward=False)
+def distance_from_path(
+    # model
+    nodes: wp.array(dtype=wp.int32),
+    mass: wp.array(dtype=wp.float64),
+    path_x: wp.array2d(dtype=wp.float64),
+    path_v: wp.array2d(dtype=wp.float64),
+    gravity: wp.vec3d,
+    drag: wp.float64,
+    width: int,
+    clock: wp.array(dtype=wp.float64),
+    counter: wp.array(dtype=wp.int32),
+    # in
+    x: wp.array(dtype=wp.float64),
+    v: wp.array(dtype=wp.float64),
+    force: wp.array(dtype=wp.float64),
+    # out
+    gap: wp.array(dtype=wp.float64),
+):
+    """Where a node would be after this substep without the springs, minus where its grip takes it [m]."""
+    held = wp.tid()
+    dt = clock[2]
+    share = wp.float64(counter[1] + 1) / wp.float64(counter[2])
+    for i in range(3):
+        k = 3 * nodes[held] + i
+        speed = v[k] + dt * (force[k] / mass[held] + gravity[i] - drag * v[k])
+        goal = on_path(path_x, path_v, counter[0], 3 * held + i, share, clock[0])
+        gap[i * width + held] = x[k] + dt * speed - goal
+
+
+_ROW = """
+#if defined(__CUDA_ARCH__)
+    typedef double V;
+    const int LANES = 1;
+#else
+    typedef double V __attribute__((vector_size(32), aligned(8)));
+    const int LANES = 4;
+#endif
+    const int width = pull.shape[1];
+    const double* row = &pull.data[(long long)held * width];
+    V sum[3] = {V{}, V{}, V{}};
+    for (int j = 0; j < width; j += LANES)
+        for (int i = 0; i < 3; ++i) sum[i] += *(const V*)&row[j] * *(const V*)&gap.data[i * width + j];
+    for (int i = 0; i < 3; ++i) {
+#if defined(__CUDA_ARCH__)
+        force.data[3 * node + i] -= sum[i];
+#else
+        force.data[3 * node + i] -= (sum[i][0] + sum[i][1]) + (sum[i][2] + sum[i][3]);
+#endif
+    }
+"""
+_LANES = 4  # rows are padded to whole vectors
+
+
+@wp.func_native(_ROW)
+def pull_node(
+    held: int,
+    node: int,
+    pull: wp.array2d(dtype=wp.float64),
+    gap: wp.array(dtype=wp.float64),
+    force: wp.array(dtype=wp.float64),
+): ...
+
+
+@wp.kernel(enable_backward=False)
+def pull_to_path(
+    # model
+    nodes: wp.array(dtype=wp.int32),
+    pull: wp.array2d(dtype=wp.float64),
+    # in
+    gap: wp.array(dtype=wp.float64),
+    # out
+    force: wp.array(dtype=wp.float64),
+):
+    """Pull one node."""
+    held = wp.tid()
+    pull_node(held, nodes[held], pull, gap, force)
+
+
+def _part(held: HeldNodes, which: np.ndarray) -> HeldNodes:
+    return HeldNodes(held.nodes[which], held.positions[:, which], held.velocities[:, which])
