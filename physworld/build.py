@@ -11,7 +11,7 @@ from physworld.errors import SceneUnsupported
 from physworld.geometry.declared import grips_of
 from physworld.geometry.reference import ReferenceBody, reference_body
 from physworld.geometry.rigid import rigid_groups
-from physworld.grips import gripped_nodes, why_no_turn
+from physworld.grips import declared_region, gripped_nodes, why_no_turn
 from physworld.materials.laws import Law, RodLaw, SheetLaw, SolidLaw
 from physworld.materials.plastic import Plasticity
 from physworld.mpm.choose import choose_formulation
@@ -77,6 +77,9 @@ def build_twin(
         ground_friction=PRIOR_FRICTION if friction is None else friction,
         controller_groups=groups,
         held_nodes=tuple(held),
+        grip_regions=tuple(
+            declared_region(grips[k] if grips else None, body.lattice.dim) for k in range(len(groups))
+        ),
         controllers_start=controls[0],
         release_s=_release_time(scene),
         turning=turning,

@@ -6,6 +6,7 @@ more, not on a line, and far enough from the rope's axis for a turn to stand out
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,7 @@ import numpy as np
 from physworld.geometry.reference import ReferenceBody
 from physworld.geometry.rigid import rigid_motion
 from physworld.materials.rod import RodLaw
+from physworld.mpm.soft_grips import gripped_points, touched_nodes
 from physworld.mpm.terms import Term
 from physworld.mpm.total_lagrangian import HeldNodes
 from physworld.mpm.twist import Twist, span_between
@@ -54,6 +56,35 @@ def gripped_nodes(body: ReferenceBody, controllers: np.ndarray, grip: Grip | Non
         cells = np.zeros(len(lattice.cells), dtype=bool)
         cells[np.unique(_nearest(particles, controllers) // lattice.fill.shape[1])] = True
     return np.unique(lattice.cell_nodes[cells])
+
+
+def declared_region(grip: Grip | None, dim: int) -> np.ndarray | None:
+    """The box that a grip of a solid holds at the start, (2, 3) [m]; None where none with a depth is declared."""
+    if dim != 3 or grip is None or grip.region_min_m is None:
+        return None
+    box = np.array([grip.region_min_m, grip.region_max_m], dtype=float)
+    return box if np.all(box[1] > box[0]) else None
+
+
+def gripped_shares(twin: Twin) -> np.ndarray | None:
+    """Which quadrature points soft grips hold, (C, Q) bool; None where all gripped nodes are prescribed."""
+    regions = [region for region in twin.grip_regions if region is not None]
+    if twin.grip_softness <= 0 or not regions or twin.formulation != "total_lagrangian":
+        return None
+    return np.any([gripped_points(twin.lattice, twin.body.start, region) for region in regions], axis=0)
+
+
+def with_touched_nodes(twin: Twin, start: np.ndarray) -> Twin:
+    """A twin whose declared grips hold every node that material in their boxes touches at ``start`` (n, 3)."""
+    held = []
+    taken = np.concatenate([np.empty(0, dtype=int), *twin.held_nodes])
+    for nodes, region in zip(twin.held_nodes, twin.grip_regions, strict=True):
+        if region is not None:
+            touched = touched_nodes(twin.lattice, gripped_points(twin.lattice, start, region))
+            more = np.setdiff1d(touched, taken)
+            nodes, taken = np.concatenate([nodes, more]), np.concatenate([taken, more])
+        held.append(nodes)
+    return replace(twin, held_nodes=tuple(held))
 
 
 def held_paths(twin: Twin, times: np.ndarray, controls: np.ndarray) -> HeldNodes:

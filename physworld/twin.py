@@ -24,7 +24,7 @@ from physworld.effects.registry import in_order
 from physworld.errors import EffectRefused, SceneUnsupported
 from physworld.geometry.reference import ReferenceBody
 from physworld.geometry.rigid import least_rotation
-from physworld.grips import held_paths, twist_between_grips
+from physworld.grips import gripped_shares, held_paths, twist_between_grips, with_touched_nodes
 from physworld.integration import Integration, solver_knots
 from physworld.materials.laws import Law
 from physworld.materials.plastic import Plasticity
@@ -59,6 +59,7 @@ class Twin:
         release_s: the body is held at its start until then (somebody let go of it).
         grip_softness: of a solid, cells over which a grip's hold sets in (:mod:`physworld.mpm.soft_grips`); 0: every
             node that gripped material touches is prescribed. Total Lagrangian only.
+        grip_regions: box that each grip of a solid holds at the start, (2, 3) [m], or None where none is declared.
         turning: numbers of the groups whose control points show how a rope's section turns about its axis; between
             two of them the rope carries twist (:mod:`physworld.mpm.twist`).
         effects: what acts beside the declared physics.
@@ -79,6 +80,7 @@ class Twin:
     controllers_start: np.ndarray
     release_s: float = 0.0
     grip_softness: float = 0.0
+    grip_regions: tuple[np.ndarray | None, ...] = ()
     turning: tuple[int, ...] = ()
     effects: tuple[Effect, ...] = ()
     colliders: tuple[TwinCollider, ...] = ()
@@ -256,12 +258,15 @@ class Twin:
         gripped = self
         for known in active:
             gripped = known.grips(gripped)
+        shares = gripped_shares(self)
+        if shares is not None:
+            gripped = with_touched_nodes(gripped, self.body.start)
         held = held_paths(gripped, knots, controls)
         problem = replace(problem, terms=(*problem.terms, *twist_between_grips(gripped, knots, controls)))
         for known in active:
             problem, held = known.attach(problem, held, self)
-        if self.grip_softness > 0 and self.lattice.dim == 3 and self.formulation == "total_lagrangian":
-            problem, held = soften(problem, held, self.grip_softness)
+        if shares is not None:
+            problem, held = soften(problem, held, self.grip_softness, shares)
         return Integration(problem, velocity, held, knots, frame_index)
 
     def particles_at(self, nodes: np.ndarray) -> np.ndarray:

@@ -33,6 +33,7 @@ def arrays_of(twin: Twin) -> dict[str, np.ndarray]:
         "ground_friction": twin.ground_friction,
         "release_s": twin.release_s,
         "grip_softness": twin.grip_softness,
+        "grip_regions": [None if region is None else region.tolist() for region in twin.grip_regions],
         "thickness_m": body.thickness_m,
         "notes": list(body.notes),
         "groups": [g.tolist() for g in twin.controller_groups],
@@ -80,6 +81,9 @@ def parts_of(arrays: dict[str, np.ndarray]) -> dict[str, Any]:
         "controllers_start": arrays["controllers_start"],
         "release_s": facts["release_s"],
         "grip_softness": facts.get("grip_softness", 0.0),
+        "grip_regions": tuple(
+            None if region is None else np.array(region) for region in facts.get("grip_regions", ())
+        ),
         "turning": tuple(facts.get("turning", ())),
         "effects": tuple(effect(e["name"], **e["strengths"]) for e in facts.get("effects", ())),
         "colliders": from_parts(facts.get("colliders", []), arrays, body.half_thickness_m),

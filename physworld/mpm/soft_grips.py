@@ -30,28 +30,47 @@ from physworld.mpm.terms import BoundTerm
 from physworld.mpm.total_lagrangian import HeldNodes, Problem
 
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(3)  # exact for products of quadratic splines
+_SLACK_M = 1e-6  # around a declared region
 
 
-def soften(problem: Problem, held: HeldNodes, softness: float) -> tuple[Problem, HeldNodes]:
+def soften(
+    problem: Problem, held: HeldNodes, softness: float, shares: np.ndarray
+) -> tuple[Problem, HeldNodes]:
     """The problem with grips that hold their material over ``softness`` cells, and the nodes that stay prescribed.
 
     Args:
         problem: of a solid.
-        held: all nodes that gripped material touches.
+        held: all nodes that gripped material touches (:func:`touched_nodes`), and those of other grips.
         softness: l over the smallest side of a cell; 0 changes nothing.
+        shares: of the quadrature points, gripped, (C, Q) bool, see :func:`gripped_points`.
     """
     lattice = problem.lattice
-    gripped = held_cells(lattice, held.nodes)
-    if softness <= 0 or not gripped.any():
+    material = lattice.fill[:, _owners(lattice.dim)] > 0.0
+    if softness <= 0 or not np.any(shares & material):
         return problem, held
-    firm = ~np.isin(held.nodes, lattice.cell_nodes[~gripped])
-    soft = _part(held, ~firm)
+    gripped = np.any(shares & material, axis=1)
+    free = np.any(~shares & material, axis=1)
+    loose = np.isin(held.nodes, lattice.cell_nodes[gripped]) & np.isin(held.nodes, lattice.cell_nodes[free])
+    soft = _part(held, loose)
     if not len(soft.nodes):
         return problem, held
     rate = problem.law.wave_speed_m_s / (softness * float(lattice.spacing.min()))
     stiffness = problem.law.density_kg_m3 * rate**2
-    grips = SoftGrips(soft, stiffness * gram_matrix(lattice, gripped, soft.nodes))
-    return replace(problem, terms=(*problem.terms, grips)), _part(held, firm)
+    grips = SoftGrips(soft, stiffness * gram_matrix(lattice, shares, soft.nodes))
+    return replace(problem, terms=(*problem.terms, grips)), _part(held, ~loose)
+
+
+def gripped_points(lattice: Lattice, start: np.ndarray, region: np.ndarray) -> np.ndarray:
+    """Which of the cells' quadrature points lie in a box (2, 3) [m] when nodes are at ``start`` (n, 3), (C, Q) bool."""
+    splines = tensor_weights(_places(lattice.dim), (0,) * lattice.dim)
+    places = np.einsum("qa,cai->cqi", splines, start[lattice.cell_nodes])
+    return np.all((places >= region[0] - _SLACK_M) & (places <= region[1] + _SLACK_M), axis=2)
+
+
+def touched_nodes(lattice: Lattice, shares: np.ndarray) -> np.ndarray:
+    """Every node that gripped material touches, (k,)."""
+    material = lattice.fill[:, _owners(lattice.dim)] > 0.0
+    return np.unique(lattice.cell_nodes[np.any(shares & material, axis=1)])
 
 
 def held_cells(lattice: Lattice, nodes: np.ndarray) -> np.ndarray:
@@ -74,29 +93,40 @@ def holds_a_part(lattice: Lattice, nodes: np.ndarray) -> bool:
     return int(np.any(beside != lattice.cells[held][near], axis=0).sum()) > 1
 
 
-def gram_matrix(lattice: Lattice, cells: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """Integrals of products of the splines of ``nodes`` (k,) over the material of ``cells`` (C,) bool, (k, k) [m^d]."""
+def gram_matrix(lattice: Lattice, shares: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    """Integrals of products of the splines of ``nodes`` (k,) over gripped material, (k, k) [m^d].
+
+    Args:
+        shares: which of the cells' quadrature points are gripped, (C, Q) bool.
+    """
     dim = lattice.dim
-    halves = 0.25 * (1.0 + _POINTS)
-    line = np.concatenate([halves, 0.5 + halves])
-    weight = np.tile(0.25 * _WEIGHTS, 2)
-    half = np.repeat([0, 1], len(_POINTS))
-    places = np.stack(np.meshgrid(*[line] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
-    weights = np.prod(np.stack(np.meshgrid(*[weight] * dim, indexing="ij"), axis=-1).reshape(-1, dim), axis=1)
-    sides = np.stack(np.meshgrid(*[half] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
-    corners = (gauss_points(dim) >= 0.5).astype(int)
-    owner = np.array([int(np.flatnonzero((corners == side).all(axis=1))[0]) for side in sides])
-    splines = tensor_weights(places, (0,) * dim)
-    volume = float(np.prod(lattice.spacing))
+    splines = tensor_weights(_places(dim), (0,) * dim)
+    line = np.tile(0.25 * _WEIGHTS, 2)
+    weights = np.prod(np.stack(np.meshgrid(*[line] * dim, indexing="ij"), axis=-1).reshape(-1, dim), axis=1)
+    volumes = float(np.prod(lattice.spacing)) * weights * lattice.fill[:, _owners(dim)] * shares
     place = np.full(len(lattice.nodes), -1)
     place[nodes] = np.arange(len(nodes))
     gram = np.zeros((len(nodes), len(nodes)))
-    for cell in np.flatnonzero(cells):
-        local = splines.T @ (splines * (volume * weights * lattice.fill[cell][owner])[:, None])
+    for cell in np.flatnonzero(volumes.any(axis=1)):
+        local = splines.T @ (splines * volumes[cell][:, None])
         numbers = place[lattice.cell_nodes[cell]]
         own = numbers >= 0
         gram[np.ix_(numbers[own], numbers[own])] += local[np.ix_(own, own)]
     return gram
+
+
+def _places(dim: int) -> np.ndarray:
+    """Local coordinates of a cell's quadrature points, three to each half along an axis, (6**dim, dim)."""
+    halves = 0.25 * (1.0 + _POINTS)
+    line = np.concatenate([halves, 0.5 + halves])
+    return np.stack(np.meshgrid(*[line] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
+
+
+def _owners(dim: int) -> np.ndarray:
+    """The particle whose part of the cell each quadrature point lies in, (6**dim,)."""
+    corners = (gauss_points(dim) >= 0.5).astype(int)
+    sides = (_places(dim) >= 0.5).astype(int)
+    return np.argmax((sides[:, None] == corners[None]).all(axis=2), axis=1)
 
 
 @dataclass(frozen=True)

@@ -142,6 +142,20 @@ class Confirmation:
                 best = Model(model.members, other, cross_validated(other, self.block_of_row))
         return best
 
+    def from_place_of(self, model: Model, other: Model, strength: float) -> Model:
+        """The model refitted from another one's calibrated numbers and this strength of its one gate, if better."""
+        fitted, member = model.fitted, model.members[-1]
+        known = dict(zip([u.name for u in other.fitted.unknowns], other.fitted.theta, strict=True))
+        known[member.unknowns()[0].name] = strength
+        low, high = _bounds(fitted)
+        place = [known.get(u.name, t) for u, t in zip(fitted.unknowns, fitted.theta, strict=True)]
+        place = np.clip(place, low, high)
+        unknowns = [u.starting(t) for u, t in zip(fitted.unknowns, place, strict=True)]
+        again = refit(self.simulations, self.whitener, fitted.twin, unknowns, self.frames, self.iterations)
+        if again is None or again.misfit >= fitted.misfit:
+            return model
+        return Model(model.members, again, cross_validated(again, self.block_of_row))
+
     def _costs(self, fitted: Refit, places: list[np.ndarray]) -> list[float]:
         """Squared residuals at places (p,); infinite where a run cannot be trusted."""
         low, high = _bounds(fitted)

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physworld.trace.comparison import alikeness
 from physworld.trace.config import TraceConfig
 from physworld.trace.confirm import Confirmation, Model, best_variants
 from physworld.trace.result import Step
-from physworld.trace.score import Score, Scores, scores
+from physworld.trace.score import Score, Scores, orthonormal, project, scores
 from physworld.trace.sensitivity import Response, candidate_responses, decoys
 from physworld.trace.simulations import Simulations
 from physworld.trace.valleys import FAR, with_valleys
@@ -18,6 +19,7 @@ from physworld.trace.whitening import Whitener
 
 _OUTDONE = 0.5  # share of what a complete model's effect explains that a rival must explain to be refitted
 _LEADING = 2  # models that are refitted from elsewhere
+_CLEARLY = 1.02  # misfit over the best one's from which a model that does the same is worth another search
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,7 @@ class Selection:
                 self.simulations.stage = "refit from other valleys"
                 tried = with_valleys(confirmation, base, ranked, columns, tried)
             tried = self._again(confirmation, base, tried, ranked)
+            tried = self._alike(confirmation, base, tried, columns)
             good = [m for m in tried if helps(m, base, config)]
             kept = simplest(good, base) if good else None
             path.append(Step(base, ranked, tuple(tried), kept))
@@ -111,6 +114,29 @@ class Selection:
                 found[id(m)] = confirmation.elsewhere(m)
         return [found[id(m)] for m in tried]
 
+    def _alike(
+        self, confirmation: Confirmation, base: Model, tried: list[Model], columns: dict[str, np.ndarray]
+    ) -> list[Model]:
+        """Models that to first order do what the best does, refitted from where that one fits.
+
+        A lag and a clock that is off do the same; that one search found the better place is no reason to prefer it.
+        """
+        self.simulations.stage = "refit of the like"
+        best = min(tried, key=lambda m: m.fitted.misfit, default=None)
+        if best is None:
+            return tried
+        basis = orthonormal(base.fitted.free_jacobian)
+        does = project(basis, columns[best.members[-1].label] @ _strengths(best))
+        found = []
+        for model in tried:
+            own = project(basis, columns[model.members[-1].label])
+            like = own.shape[1] == 1 and alikeness(own[:, 0], does) > self.config.alike
+            if model is not best and like and model.fitted.misfit > _CLEARLY * best.fitted.misfit:
+                strength = float(own[:, 0] @ does) / float(own[:, 0] @ own[:, 0])
+                model = confirmation.from_place_of(model, best, strength)
+            found.append(model)
+        return found
+
     def _scores(self, base: Model, usable: list[Response]) -> Scores:
         config, white = self.config, self.white
         rest = [r for r in usable if r.candidate.effect not in base.names]
@@ -120,6 +146,13 @@ class Selection:
             base.fitted.residual, base.fitted.free_jacobian, rest, fakes, self.block_of_row,
             config.family_wise_level, config.resamples, config.seed,
         )  # fmt: skip
+
+
+def _strengths(model: Model) -> np.ndarray:
+    """Strengths of the last effect's gates in units of their probes, (k,)."""
+    member, known = model.members[-1], model.fitted
+    names = [unknown.name for unknown in known.unknowns]
+    return np.array([known.theta[names.index(gate.name)] for gate in member.unknowns()])
 
 
 def by_chance(model: Model, scores: Scores) -> bool:

@@ -138,8 +138,8 @@ def grip_softness(twin: Twin) -> Unknown | None:
     across a whole section needs no more than its reach.
     """
     held = np.concatenate([np.empty(0, dtype=int), *twin.held_nodes])
-    solid = twin.lattice.dim == 3 and twin.formulation == "total_lagrangian"
-    if not solid or not holds_a_part(twin.lattice, held):
+    declared = any(region is not None for region in twin.grip_regions)
+    if not declared or twin.formulation != "total_lagrangian" or not holds_a_part(twin.lattice, held):
         return None
     low, high = (float(np.log(end)) for end in SOFTNESS_CELLS)
     start = float(np.log(np.clip(twin.grip_softness, *SOFTNESS_CELLS)))

@@ -1,9 +1,10 @@
-"""Other valleys: where a dissipative effect fits with another stiffness than the one that does best without it.
+"""Other valleys: where an effect fits with another stiffness than the one that does best without it.
 
-Linear scores ask what an effect does near the optimum of the declared physics. Where the misfit is many times the noise
-that optimum may be a compromise far from the truth: a body that rings down is fitted without damping by one so stiff
-that it hardly rings, and there damping does nothing. So the effects that take energy are tried at other stiffnesses as
-well, with strengths over their range, by simulation. What does much better there is refitted from there.
+Linear scores ask what an effect does near the optimum of the declared physics. That optimum may be a compromise far
+from the truth: a body that rings down is fitted without damping by one so stiff that it hardly rings, and there damping
+does nothing; or the phase has slipped by a period; or fibres are so stiff that nothing about them is small. So where
+something is to be explained at all, the effects that take energy and fibres are tried at other stiffnesses as well,
+with strengths over their range, by simulation. What does much better there is refitted from there.
 """
 
 from __future__ import annotations
@@ -22,12 +23,13 @@ from physworld.trace.simulations import Job, Simulations
 from physworld.trace.unknowns import at
 from physworld.trace.whitening import Whitener
 
-FAR = 3.0  # misfit over the noise from which on a linear score is not relied on alone
+FAR = 3.0  # misfit over the noise from which on linear scores are asked again after an effect was added
 DISSIPATIVE = (
     "air_drag_linear", "air_drag_quadratic", "viscosity_kelvin_voigt", "viscoelastic_maxwell"
 )  # fmt: skip
-_SHIFTS = (-1.0, -0.8, -0.6, -0.4, -0.2, 0.0, 0.25, 0.5)  # of the stiffness, logarithms
+_SHIFTS = (-0.9, -0.6, -0.4, -0.2, 0.0, 0.25, 0.5)  # of the stiffness, logarithms
 _SHARES = (0.01, 0.1, 0.5)  # of a strength's upper bound
+_FIBRES, _FIBRE_SHIFTS, _FIBRE_SHARES = "anisotropy", (-0.4, -0.2, 0.0), (0.025, 0.1, 0.4)
 _BETTER = 0.7  # share of the squared residual that a valley may leave
 
 
@@ -72,25 +74,33 @@ def with_valleys(
 
 
 def valleys(
-    simulations: Simulations, whitener: Whitener, fitted: Refit, chosen: Sequence[Candidate], frames: int
+    simulations: Simulations,
+    whitener: Whitener,
+    fitted: Refit,
+    chosen: Sequence[Candidate],
+    frames: int,
+    complete: float = 1.2,
 ) -> list[Valley]:
-    """The best valley of every dissipative effect that leaves at most 70 % of the squared residual, best first.
+    """The best valley of every such effect that leaves at most 70 % of the squared residual, best first.
 
     Args:
         fitted: the optimum without the effects; its first unknown is the stiffness.
         chosen: candidates, in the variants that are tried.
+        complete: misfit over the noise up to which nothing is left to explain.
     """
-    if fitted.misfit <= FAR:
+    if fitted.misfit <= complete:
         return []
-    known = [c for c in chosen if c.effect in DISSIPATIVE and len(c.gates) == 1]
+    known = [c for c in chosen if c.effect in (*DISSIPATIVE, _FIBRES) and len(c.gates) == 1]
     low, high = (np.array([getattr(u, end) for u in fitted.unknowns]) for end in ("low", "high"))
-    places = [np.clip(fitted.theta + shift * np.eye(len(low))[0], low, high) for shift in _SHIFTS]
+    first = np.eye(len(low))[0]
     tries, jobs = [], []
     for candidate in known:
         prepared, gate = candidate.prepared(fitted.twin), candidate.unknowns()[0]
-        for place in places:
+        fibres = candidate.effect == _FIBRES
+        for shift in _FIBRE_SHIFTS if fibres else _SHIFTS:
+            place = np.clip(fitted.theta + shift * first, low, high)
             there = at(prepared, fitted.unknowns, place)
-            for share in _SHARES:
+            for share in _FIBRE_SHARES if fibres else _SHARES:
                 strength = share * gate.high
                 tries.append((candidate, place, strength))
                 jobs.append(Job(gate.apply(there, strength), frames))

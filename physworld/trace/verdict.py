@@ -24,6 +24,7 @@ from physworld.trace.confirm import MEANINGFUL, Model, beats, explained_directio
 NAMED, EQUIVALENT, DATA, NUMERICAL = "named", "equivalent_set", "data_issue", "numerical_issue"
 UNEXPLAINED, NOTHING = "unexplained", "nothing_to_explain"
 FASTEST_WIND_M_S = 20.0
+LARGEST_TILT_RAD = 0.2
 _DISCREPANCY = 0.05
 _NOISE_KNOWN = 0.05  # share to which the variance of the noise is known
 
@@ -157,9 +158,14 @@ def implausible(model: Model) -> str | None:
     """Why nobody would believe a model's numbers; None where one may.
 
     A wind is a push with the drag that it comes with: without the drag the push is other gravity, which has its own
-    name, and a push over a drag that is a gale is no wind in a room.
+    name, and a push over a drag that is a gale is no wind in a room. A plumb line shows a frame that is far off the
+    vertical before a recording does.
     """
     for known in model.fitted.twin.effects:
+        if known.name == "gravity_tilt" and "gravity_tilt" in model.names:
+            tilt = float(np.hypot(known.values["tilt_x_rad"], known.values["tilt_y_rad"]))
+            if tilt > LARGEST_TILT_RAD:
+                return f"gravity tilted by {np.degrees(tilt):.0f}° is not believed"
         if known.name == "wind" and "wind" in model.names:
             values = known.values
             push = float(np.linalg.norm([values[f"push_{axis}_m_s2"] for axis in "xyz"]))
@@ -170,10 +176,13 @@ def implausible(model: Model) -> str | None:
 
 
 def accounts(model: Model, declared: Model, config: TraceConfig) -> bool:
-    """The model is complete, or nearly so and has removed most of what was above the noise."""
+    """The model is complete, or one effect alone is nearly so and has removed most of what was above the noise.
+
+    Two effects have so much freedom that a nearly complete pair is no evidence for either.
+    """
     after, before = model.fitted.misfit, declared.fitted.misfit
-    if after <= config.near_floor:
-        return True
+    if after <= config.near_floor or len(model.members) > 1:
+        return after <= config.near_floor
     removed = (before**2 - after**2) / max(before**2 - 1.0, 1e-12)
     return after <= config.acceptable and removed >= config.most_of_it
 

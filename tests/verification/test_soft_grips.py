@@ -12,7 +12,7 @@ from skfem.helpers import ddot, sym_grad, trace
 
 from physworld.materials.laws import SolidLaw
 from physworld.mpm.lattice import Lattice, box_lattice
-from physworld.mpm.soft_grips import gram_matrix, held_cells, holds_a_part, soften
+from physworld.mpm.soft_grips import gram_matrix, gripped_points, holds_a_part, soften, touched_nodes
 from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian
 
 SIZE = np.array([0.12, 0.06, 0.06])
@@ -58,7 +58,7 @@ def sag(cells: int, softness: float) -> float:
     paths = np.repeat(start[nodes][None], len(times), axis=0)
     held = HeldNodes(nodes, paths, np.zeros_like(paths))
     problem = Problem(lattice, LAW, start, GRAVITY, drag_per_s=30.0)
-    problem, held = soften(problem, held, softness)
+    problem, held = soften(problem, held, softness, _shares(lattice))
     found = TotalLagrangian(problem).run(start, np.zeros_like(start), held, times)
     tip = lattice.interpolation(TIP)
     return float((tip @ (start - found[-1]))[0, 2])
@@ -79,21 +79,20 @@ def test_the_softer_the_grip_the_more_it_gives() -> None:
     assert found[1] == pytest.approx(found[0], rel=0.01)
 
 
-def test_softness_zero_changes_nothing() -> None:
-    _, problem, held = _gripped_box()
-    assert soften(problem, held, 0.0) == (problem, held)
-    assert (
-        soften(problem, HeldNodes(held.nodes[:1], held.positions[:, :1], held.velocities[:, :1]), 0.1)[0]
-        is problem
-    )
+def test_softness_zero_or_a_grip_without_material_changes_nothing() -> None:
+    lattice, problem, held = _gripped_box()
+    shares = _shares(lattice)
+    assert soften(problem, held, 0.0, shares) == (problem, held)
+    assert soften(problem, held, 0.1, np.zeros_like(shares)) == (problem, held)
 
 
 def test_the_gram_matrix_of_all_splines_sums_up_to_the_gripped_volume() -> None:
     lattice, _, held = _gripped_box()
-    cells = held_cells(lattice, held.nodes)
-    gram = gram_matrix(lattice, cells, np.arange(len(lattice.nodes)))
-    assert gram.sum() == pytest.approx(cells.sum() * np.prod(lattice.spacing), rel=1e-12)
+    shares = _shares(lattice)
+    gram = gram_matrix(lattice, shares, np.arange(len(lattice.nodes)))
+    assert gram.sum() == pytest.approx(np.prod(GRIP_HIGH - GRIP_LOW), rel=1e-12)
     assert np.allclose(gram, gram.T)
+    assert np.array_equal(touched_nodes(lattice, shares), held.nodes)
 
 
 def test_what_a_soft_grip_holds_follows_its_motion_at_any_frame_rate() -> None:
@@ -101,7 +100,7 @@ def test_what_a_soft_grip_holds_follows_its_motion_at_any_frame_rate() -> None:
     shift = np.array([0.05, 0.02, 0.0]) * np.sin(np.pi * TIMES / TIMES[-1])[:, None] ** 2
     paths = held.positions + shift[:, None]
     moved = HeldNodes(held.nodes, paths, np.gradient(paths, TIMES, axis=0, edge_order=2))
-    soft, firm = soften(problem, moved, 1 / 40)
+    soft, firm = soften(problem, moved, 1 / 40, _shares(lattice))
     start = lattice.node_coordinates
     found = TotalLagrangian(soft).run(start, np.zeros_like(start), firm, TIMES)
     middle = lattice.interpolation(np.array([[0.5 * GRIP_HIGH[0], 0.03, 0.03]]))
@@ -110,6 +109,10 @@ def test_what_a_soft_grip_holds_follows_its_motion_at_any_frame_rate() -> None:
 
 
 TIMES = np.concatenate([np.linspace(0.0, 0.2, 5), np.linspace(0.23, 0.5, 4)])  # uneven
+
+
+def _shares(lattice: Lattice) -> np.ndarray:
+    return gripped_points(lattice, lattice.node_coordinates, np.stack([GRIP_LOW, GRIP_HIGH]))
 
 
 def _gripped_box() -> tuple[Lattice, Problem, HeldNodes]:
