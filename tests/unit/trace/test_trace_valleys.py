@@ -64,3 +64,25 @@ def test_damping_is_found_at_another_stiffness_where_the_misfit_is_far_from_the_
     assert found[0].start.value("youngs_modulus_pa") == pytest.approx(TRUE_PA, rel=0.25)
     assert found[0].cost < 0.2 * float(np.sum(fitted.residual**2))
     assert found[0].start.jacobian.shape == (len(fitted.residual), 1)
+
+
+def test_stiff_fibres_are_found_where_a_small_share_of_them_says_little() -> None:
+    scene = sagging()
+    plain = build_twin(scene, BUDGET).with_parameters(youngs_modulus_pa=TRUE_PA)
+    truth = plain.with_effect(effect("anisotropy", ratio=2.0))
+    tracks = truth.observe(truth.simulate_nodes(*scene.control_track(), scene.times), scene.times)
+    scene = replace(scene, points=tracks)
+    recordings = Recordings([scene], (), 12, 3)
+    simulations = JointSimulations(recordings, plain, BUDGET, 1.25)
+    frames = recordings.split.train[1]
+    tracks, answers = simulations.first_look(Job(plain, frames))
+    white = whitener(recordings.scene, recordings.split, SIGMA, answers)
+    known = parameters_of(plain, separate_bending=False, damping=False)
+    stiffness = [of_parameter(p, plain, None) for p in known if p.name == "youngs_modulus_pa"]
+    slope, _ = sensitivities(simulations, white, plain, tracks, stiffness, frames)
+    fitted = Refit(stiffness, plain, np.array([stiffness[0].start]), tracks, white.residual(tracks), slope)
+    chosen, _ = candidates(plain, ("anisotropy", "gravity_tilt"))
+    found = valleys(simulations, white, fitted, chosen, frames)
+    assert [valley.candidate.effect for valley in found] == ["anisotropy"]
+    assert found[0].candidate.fixed["azimuth_rad"] == found[0].candidate.fixed["elevation_rad"] == 0.0
+    assert found[0].strengths[0] * 0.05 == pytest.approx(2.0, rel=0.3)

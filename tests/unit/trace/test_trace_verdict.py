@@ -8,13 +8,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from physworld.effects.registry import effect
 from physworld.trace.candidates import Candidate
 from physworld.trace.comparison import cross_validated
 from physworld.trace.config import TraceConfig
 from physworld.trace.confirm import Model
 from physworld.trace.refit import Refit
 from physworld.trace.unknowns import Unknown
-from physworld.trace.verdict import decide
+from physworld.trace.verdict import decide, implausible
 
 BLOCKS, ROWS = 10, 2000
 BLOCK_OF_ROW = np.repeat(np.arange(BLOCKS), ROWS // BLOCKS)
@@ -110,3 +111,20 @@ def test_near_the_noise_a_score_that_chance_reaches_is_nothing() -> None:
     assert answer([model(NOISE, "drag")], before) == ("named", ("drag",))
     assert answer([model(NOISE, "drag")], before, chance=lambda m: True) == ("nothing_to_explain", ())
     assert answer([model(NOISE, "drag")], NOISE + 2 * DRAG, chance=lambda m: True) == ("named", ("drag",))
+
+
+def test_a_nearly_complete_pair_is_no_evidence_where_a_nearly_complete_effect_is() -> None:
+    before, left = NOISE + 4 * DRAG, NOISE + 0.85 * OTHER
+    single, pair = model(left, "drag"), model(left, "drag", "viscosity", unknowns=2)
+    assert CONFIG.near_floor < single.fitted.misfit < CONFIG.acceptable
+    assert answer([single], before) == ("named", ("drag",))
+    assert answer([pair], before) == ("unexplained", ())
+
+
+@pytest.mark.parametrize(("tilt_rad", "believed"), [(0.15, True), (0.3, False)])
+def test_gravity_that_a_plumb_line_shows_to_be_off_is_not_believed(tilt_rad: float, believed: bool) -> None:
+    tilted = model(NOISE, "gravity_tilt")
+    known = effect("gravity_tilt", tilt_x_rad=0.6 * tilt_rad, tilt_y_rad=-0.8 * tilt_rad)
+    tilted.fitted.twin.effects = (known,)
+    assert (implausible(tilted) is None) == believed
+    assert answer([tilted], NOISE + 2 * DRAG)[0] == ("named" if believed else "unexplained")
