@@ -21,7 +21,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import warp as wp
 from scipy.linalg import eigh
-from scipy.spatial import cKDTree
 
 from physworld.mpm.bspline import gauss_points, tensor_weights
 from physworld.mpm.lattice import Lattice
@@ -31,6 +30,7 @@ from physworld.mpm.total_lagrangian import HeldNodes, Problem
 
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(3)  # exact for products of quadratic splines
 _SLACK_M = 1e-6  # around a declared region
+_WHOLE = 0.9  # share of a section that a clamp across it holds at least, as far as cells show
 
 
 def soften(
@@ -73,24 +73,16 @@ def touched_nodes(lattice: Lattice, shares: np.ndarray) -> np.ndarray:
     return np.unique(lattice.cell_nodes[np.any(shares & material, axis=1)])
 
 
-def held_cells(lattice: Lattice, nodes: np.ndarray) -> np.ndarray:
-    """Cells all of whose nodes are among ``nodes`` (H,), (C,) bool."""
-    return np.isin(lattice.cell_nodes, nodes).all(axis=1)
-
-
-def holds_a_part(lattice: Lattice, nodes: np.ndarray) -> bool:
-    """Whether cells that are held whole are no clamp across a box's section.
-
-    Either material beside them lies off them along more than one axis, so a section goes on; or they are cut by a
-    surface, and hold more of a round section than a grip's box does.
-    """
-    held = held_cells(lattice, nodes)
-    if not held.any() or np.any(lattice.fill[held] < 1.0):
-        return bool(held.any())
-    reach, _ = cKDTree(lattice.cells[held]).query(lattice.cells[~held], p=np.inf)
-    beside = lattice.cells[~held][reach == 1]
-    near = cKDTree(lattice.cells[held]).query(beside)[1]
-    return int(np.any(beside != lattice.cells[held][near], axis=0).sum()) > 1
+def holds_a_part(lattice: Lattice, start: np.ndarray, region: np.ndarray) -> bool:
+    """Whether a box (2, 3) [m] holds a part of the body's section only, along whichever axis it is a clamp."""
+    volumes = lattice.fill[:, _owners(lattice.dim)] * _weights(lattice.dim)
+    gripped = float(volumes[gripped_points(lattice, start, region)].sum())
+    for axis in range(lattice.dim):
+        slab = np.array([[-np.inf], [np.inf]]) * np.ones(lattice.dim)
+        slab[:, axis] = region[:, axis]
+        if gripped >= _WHOLE * float(volumes[gripped_points(lattice, start, slab)].sum()):
+            return False
+    return gripped > 0.0
 
 
 def gram_matrix(lattice: Lattice, shares: np.ndarray, nodes: np.ndarray) -> np.ndarray:
@@ -101,9 +93,7 @@ def gram_matrix(lattice: Lattice, shares: np.ndarray, nodes: np.ndarray) -> np.n
     """
     dim = lattice.dim
     splines = tensor_weights(_places(dim), (0,) * dim)
-    line = np.tile(0.25 * _WEIGHTS, 2)
-    weights = np.prod(np.stack(np.meshgrid(*[line] * dim, indexing="ij"), axis=-1).reshape(-1, dim), axis=1)
-    volumes = float(np.prod(lattice.spacing)) * weights * lattice.fill[:, _owners(dim)] * shares
+    volumes = float(np.prod(lattice.spacing)) * _weights(dim) * lattice.fill[:, _owners(dim)] * shares
     place = np.full(len(lattice.nodes), -1)
     place[nodes] = np.arange(len(nodes))
     gram = np.zeros((len(nodes), len(nodes)))
@@ -120,6 +110,12 @@ def _places(dim: int) -> np.ndarray:
     halves = 0.25 * (1.0 + _POINTS)
     line = np.concatenate([halves, 0.5 + halves])
     return np.stack(np.meshgrid(*[line] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
+
+
+def _weights(dim: int) -> np.ndarray:
+    """Shares of a cell that its quadrature points stand for, (6**dim,)."""
+    line = np.tile(0.25 * _WEIGHTS, 2)
+    return np.prod(np.stack(np.meshgrid(*[line] * dim, indexing="ij"), axis=-1).reshape(-1, dim), axis=1)
 
 
 def _owners(dim: int) -> np.ndarray:

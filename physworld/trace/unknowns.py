@@ -137,9 +137,9 @@ def grip_softness(twin: Twin) -> Unknown | None:
     and damping fit: see :mod:`physworld.mpm.soft_grips`. At the lower end all nodes are as good as prescribed. A clamp
     across a whole section needs no more than its reach.
     """
-    held = np.concatenate([np.empty(0, dtype=int), *twin.held_nodes])
-    declared = any(region is not None for region in twin.grip_regions)
-    if not declared or twin.formulation != "total_lagrangian" or not holds_a_part(twin.lattice, held):
+    declared = [region for region in twin.grip_regions if region is not None]
+    parts = any(holds_a_part(twin.lattice, twin.body.start, region) for region in declared)
+    if not parts or twin.formulation != "total_lagrangian":
         return None
     low, high = (float(np.log(end)) for end in SOFTNESS_CELLS)
     start = float(np.log(np.clip(twin.grip_softness, *SOFTNESS_CELLS)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -129,11 +128,12 @@ def _gripped_box() -> tuple[Lattice, Problem, HeldNodes]:
 
 
 def test_a_clamp_across_a_whole_section_holds_no_part() -> None:
-    lattice = box_lattice(np.zeros(3), SIZE, (8, 4, 4))
-    clamp = np.unique(lattice.cell_nodes[lattice.cells[:, 0] < 2])
-    assert not holds_a_part(lattice, clamp)
-    assert not holds_a_part(lattice, np.arange(2))
-    corner = np.unique(lattice.cell_nodes[(lattice.cells < 2).all(axis=1)])
-    assert holds_a_part(lattice, corner)
-    cut = replace(lattice, fill=np.where(lattice.cells[:, :1] == 0, 0.5, lattice.fill))
-    assert holds_a_part(cut, clamp)
+    lattice = box_lattice(
+        np.array([-0.001, 0.0, 0.0]), SIZE, (8, 4, 4)
+    )  # cells that begin before the body does
+    start = lattice.node_coordinates
+    across = np.array([[0.0, 0.0, 0.0], [0.03, 0.06, 0.06]])
+    assert not holds_a_part(lattice, start, across)
+    assert not holds_a_part(lattice, start, across + 1.0)  # nothing is there
+    assert holds_a_part(lattice, start, np.stack([GRIP_LOW, GRIP_HIGH]))
+    assert holds_a_part(lattice, start, np.array([[0.0, 0.0, 0.03], [0.03, 0.06, 0.06]]))

@@ -1,0 +1,76 @@
+"""A twin whose grip takes hold softly: the same to the last bit at softness 0, stored, and refused by gradients."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_scene import box_body, made_scene
+
+from physworld.build import build_twin
+from physworld.errors import NotDifferentiable
+from physworld.grips import gripped_shares
+from physworld.mpm.gradient_twin import TwinRun
+from physworld.scene import Grip
+from physworld.trace.candidates import candidates
+from physworld.trace.unknowns import SOFTNESS, grip_softness
+from physworld.twin import Twin
+
+LOW, HIGH = np.array([0.0, -0.03, -0.03]), np.array([0.12, 0.03, 0.03])
+
+
+def twin_held_by(region_max_m: np.ndarray) -> tuple[Twin, np.ndarray, np.ndarray]:
+    """A block that a grip shakes; its box begins at the block's lower corner. With its control track."""
+    grip = np.array([[0.0, y, z] for y in (-0.02, 0.0) for z in (-0.02, 0.0)])
+    points = [[0.12, y, z] for y in (-0.03, 0.03) for z in (-0.03, 0.03)]
+    scene = made_scene(
+        points, "block", grip, 8, body=box_body(LOW, HIGH, density_kg_m3=500.0),
+        grips=(Grip((0, 1, 2, 3), LOW, region_max_m),),
+    )  # fmt: skip
+    shake = 0.01 * np.sin(20.0 * scene.times)[:, None, None] * np.array([0.0, 1.0, 0.0])
+    return build_twin(scene, 256).with_parameters(youngs_modulus_pa=3e4), scene.times, grip + shake
+
+
+CORNER, WHOLE = np.array([0.03, 0.0, 0.0]), np.array([0.03, 0.03, 0.03])
+
+
+def test_at_softness_zero_the_declared_box_changes_no_bit() -> None:
+    twin, times, controls = twin_held_by(CORNER)
+    plain = replace(twin, grip_regions=())
+    assert gripped_shares(twin) is None
+    same = [t.simulate_nodes(times, controls, times) for t in (twin, plain)]
+    assert np.array_equal(*same)
+
+
+def test_a_soft_grip_gives_and_survives_being_stored() -> None:
+    twin, times, controls = twin_held_by(CORNER)
+    soft = replace(twin, grip_softness=1 / 10)
+    found = soft.simulate_nodes(times, controls, times)
+    again = Twin.from_arrays(soft.to_arrays()).simulate_nodes(times, controls, times)
+    assert np.array_equal(found, again)
+    firm = twin.simulate_nodes(times, controls, times)
+    assert np.abs(found - firm).max() > 2e-3
+    middle = twin.lattice.interpolation(np.array([[0.015, -0.015, -0.015]]))
+    shift = (controls - controls[0]).mean(axis=1)
+    gap = np.stack([(middle @ (now - found[0]))[0] for now in found]) - shift
+    assert np.abs(gap).max() < 1e-3  # of a shake by 10 mm
+
+
+def test_only_what_a_box_holds_of_a_section_has_its_softness_calibrated() -> None:
+    corner, whole = twin_held_by(CORNER)[0], twin_held_by(WHOLE)[0]
+    assert grip_softness(whole) is None
+    unknown = grip_softness(corner)
+    assert unknown is not None and unknown.name == SOFTNESS
+    assert unknown.apply(corner, np.log(0.05)).grip_softness == pytest.approx(0.05)
+    assert "reach_m" not in {gate.name for c in candidates(corner)[0] for gate in c.gates}
+    assert "reach_m" in {gate.name for c in candidates(whole)[0] for gate in c.gates}
+    refused = candidates(replace(corner, grip_softness=0.05), ("grip_slip",))[1]
+    assert "0.05 cells" in refused["grip_slip"]
+
+
+def test_gradients_refuse_a_soft_grip() -> None:
+    twin, times, controls = twin_held_by(CORNER)
+    run = TwinRun(replace(twin, grip_softness=0.05), times, controls, times)
+    with pytest.raises(NotDifferentiable, match="BoundSoftGrips"):
+        run.gradient(np.ones_like(run.tracks))
