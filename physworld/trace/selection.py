@@ -13,12 +13,13 @@ from physworld.trace.result import Step
 from physworld.trace.score import Score, Scores, orthonormal, project, scores
 from physworld.trace.sensitivity import Response, candidate_responses, decoys
 from physworld.trace.simulations import Simulations
-from physworld.trace.valleys import FAR, with_valleys
+from physworld.trace.valleys import with_valleys
 from physworld.trace.verdict import helps, simplest
 from physworld.trace.whitening import Whitener
 
 _OUTDONE = 0.5  # share of what a complete model's effect explains that a rival must explain to be refitted
 _LEADING = 2  # models that are refitted from elsewhere
+_FAR = 3.0  # misfit over the noise from which on sensitivities are asked again after an effect was added
 _CLEARLY = 1.02  # misfit over the best one's from which a model that does the same is worth another search
 
 
@@ -56,7 +57,7 @@ class Selection:
                     tried.append(model)
             if number == 0:
                 self.simulations.stage = "refit from other valleys"
-                tried = with_valleys(confirmation, base, ranked, columns, tried)
+                tried = with_valleys(confirmation, base, ranked, columns, tried, config.near_floor)
             tried = self._again(confirmation, base, tried, ranked)
             tried = self._alike(confirmation, base, tried, columns)
             good = [m for m in tried if helps(m, base, config)]
@@ -65,7 +66,9 @@ class Selection:
             if kept is None or kept.fitted.misfit <= config.near_floor:
                 break
             base = kept
-            if declared.fitted.misfit > FAR:  # what the candidates did there says little of what they do here
+            if (
+                declared.fitted.misfit > _FAR
+            ):  # what the candidates did there says little of what they do here
                 usable = self._afresh(base, usable)
                 columns = {response.candidate.label: response.columns for response in usable}
         return tuple(path)

@@ -23,7 +23,6 @@ from physworld.trace.simulations import Job, Simulations
 from physworld.trace.unknowns import at
 from physworld.trace.whitening import Whitener
 
-FAR = 3.0  # misfit over the noise from which on linear scores are asked again after an effect was added
 DISSIPATIVE = (
     "air_drag_linear", "air_drag_quadratic", "viscosity_kelvin_voigt", "viscoelastic_maxwell"
 )  # fmt: skip
@@ -49,6 +48,7 @@ def with_valleys(
     ranked: Scores,
     columns: dict[str, np.ndarray],
     tried: list[Model],
+    complete: float,
 ) -> list[Model]:
     """The models that were refitted; one from another valley in the place of its like where it is better.
 
@@ -57,12 +57,14 @@ def with_valleys(
         ranked: all scores against it.
         columns: whitened sensitivities of every variant, by label, (M, k).
         tried: models with one effect.
+        complete: misfit over the noise up to which nothing is left to explain.
     """
     scores = {score.candidate.label: score for score in ranked.ranked}
     chosen = [score.candidate for score in ranked.ranked]
     best = {model.names: model for model in tried}
     frames = confirmation.frames
-    for valley in valleys(confirmation.simulations, confirmation.whitener, base.fitted, chosen, frames):
+    found = valleys(confirmation.simulations, confirmation.whitener, base.fitted, chosen, frames, complete)
+    for valley in found:
         score = replace(scores[valley.candidate.label], strengths=valley.strengths)
         model = confirmation.model(replace(base, fitted=valley.start), [score], columns)
         if model is None:
@@ -79,7 +81,7 @@ def valleys(
     fitted: Refit,
     chosen: Sequence[Candidate],
     frames: int,
-    complete: float = 1.2,
+    complete: float,
 ) -> list[Valley]:
     """The best valley of every such effect that leaves at most 70 % of the squared residual, best first.
 
