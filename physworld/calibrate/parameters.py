@@ -6,8 +6,8 @@ parameter here: it stays as declared, or at its prior, and the report says so.
 
 A *stiffness* is always searched, and with it where a flow law yields and the torsion of a rope that two grips turn, if
 the body has them and the data show them: the prior of a yield stress is a value that nothing reaches. The others are
-*optional*: air drag, internal friction, Poisson's ratio, and the friction of a ground that declares none; each is freed
-only if the data ask for it, and else stays at its prior.
+*optional*: air drag, internal friction, Poisson's ratio, how stiff a sheet is in twist beside bending, and the friction
+of a ground that declares none; each is freed only if the data ask for it, and else stays at its prior.
 """
 
 from __future__ import annotations
@@ -29,10 +29,13 @@ from physworld.materials.plastic import (
 )
 from physworld.twin import Twin
 
+TWIST_RATIO = "bending_twist_ratio"
 _LOG_STEP = 0.02  # finite-difference step in the logarithm
 _POISSON_BOUNDS, _POISSON_STEP = (0.0, 0.48), 0.02
 _LEAST_GAIN = 0.02  # share of the training cost that an optional parameter must remove
 _POISSON_GAIN = 0.15  # the same of Poisson's ratio, which absorbs a little of whatever else is missing
+_TWIST_BOUNDS = (0.1, 10.0)
+_TWIST_GAIN = 0.1  # share of the training cost
 _FRICTION_BOUNDS = (0.02, 3.0)
 _NEVER_PA = 1e12  # a yield stress that nothing reaches
 _SAND_RAD = 0.6  # friction angle of loose dry sand
@@ -97,6 +100,12 @@ def parameters_of(
         optional.append(
             Parameter("poissons_ratio", "1", *_POISSON_BOUNDS, (prior,), apply, "optional", _POISSON_STEP, "linear",
                       prior, _POISSON_GAIN)
+        )  # fmt: skip
+    if isinstance(law, SheetLaw):
+        prior = law.bending_twist_ratio
+        optional.append(
+            Parameter(TWIST_RATIO, "1", *_TWIST_BOUNDS, (prior,), _set(TWIST_RATIO), "optional", 0.05, prior=prior,
+                      least_gain=_TWIST_GAIN)
         )  # fmt: skip
     if ground_friction and "ground_friction" in twin.parameters:
         prior = twin.parameters["ground_friction"]

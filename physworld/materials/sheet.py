@@ -18,7 +18,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class SheetLaw:
-    """Thin isotropic sheet.
+    """Thin sheet, the same along both axes; isotropic unless its twisting stiffness says otherwise.
 
     Attributes:
         membrane_n_m: K = h E / (1 - nu^2), in-plane stiffness [N/m].
@@ -26,6 +26,8 @@ class SheetLaw:
         poissons_ratio: of the sheet.
         relaxation_s: Kelvin-Voigt time tau of stretch and bending.
         density_kg_m2: mass per area.
+        bending_twist_ratio: t, twisting stiffness over an isotropic sheet's. A homogeneous plate has 1; a mesh of
+            triangles whose edges bend like hinges has about 3.
     """
 
     name: ClassVar[str] = "isotropic_sheet"
@@ -35,6 +37,7 @@ class SheetLaw:
     poissons_ratio: float = 0.3
     relaxation_s: float = 0.0
     density_kg_m2: float = 0.3
+    bending_twist_ratio: float = 1.0
 
     @property
     def membrane_shape(self) -> tuple[float, float, float, float]:
@@ -44,7 +47,8 @@ class SheetLaw:
     @property
     def bending_shape(self) -> tuple[float, float, float, float]:
         """The same of the moments, over D."""
-        return 1.0, 1.0, self.poissons_ratio, 1.0 - self.poissons_ratio
+        nu = self.poissons_ratio
+        return 1.0, 1.0, nu, (1.0 - nu) * self.bending_twist_ratio
 
     @property
     def wave_speed_m_s(self) -> float:
@@ -67,7 +71,6 @@ class OrthotropicSheetLaw(SheetLaw):
         weft_ratio: r, in-plane stiffness along the weft over the warp's.
         shear_ratio: s, shear stiffness over an isotropic sheet's; about 0.01 to 0.1 for woven cloth.
         bending_weft_ratio: b, bending stiffness along the weft over the warp's.
-        bending_twist_ratio: t, twisting stiffness over an isotropic sheet's.
     """
 
     name: ClassVar[str] = "orthotropic_sheet"
@@ -75,7 +78,6 @@ class OrthotropicSheetLaw(SheetLaw):
     weft_ratio: float = 1.0
     shear_ratio: float = 1.0
     bending_weft_ratio: float = 1.0
-    bending_twist_ratio: float = 1.0
 
     @property
     def membrane_shape(self) -> tuple[float, float, float, float]:

@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from physworld.calibrate import Journal, calibrate
-from physworld.calibrate.parameters import parameters_of
+from physworld.calibrate.parameters import TWIST_RATIO, parameters_of
 from physworld.scene import Scene
 from physworld.trace.candidates import Candidate, candidates
 from physworld.trace.comparison import cross_validated
@@ -68,8 +68,10 @@ from physworld.trace.whitening import Whitener, whitener
 from physworld.twin import Twin
 
 _POISSON_SPREAD = 0.08  # of what is known of a soft solid's Poisson's ratio beforehand
+_TWIST_SPREAD = 0.7  # of the logarithm of a sheet's twisting stiffness over an isotropic one's
 _OTHER_STIFFNESSES = tuple(0.12 * k for k in (-6, -5, -4, -3, -2, -1, 1, 2, 3, 4, 5, 6))
 """Logarithms: a phase that has slipped by a period is a local minimum, so others are looked at before a descent."""
+_OTHER_TWIST = float(np.log(2.0))
 _NEAR = (-0.12, 0.12)  # on finer cells, where the coarser ones have looked farther
 _SLOWEST = 8.0  # times the cost of the declared physics that a run may take: explicit friction is dear
 
@@ -234,7 +236,10 @@ class _Trace:
         self.simulations.stage = "declared physics"
         unknowns = self._calibrated_unknowns(self.twin)
         own = np.array([u.start for u in unknowns])
-        starts = [own + shift * np.eye(len(own))[0] for shift in shifts]
+        axes = dict(zip([u.name for u in unknowns], np.eye(len(own)), strict=True))
+        starts = [own + shift * axes[unknowns[0].name] for shift in shifts]
+        if TWIST_RATIO in axes:  # how stiff a sheet is in twist decides in which valley its stiffness lies
+            starts += [start + _OTHER_TWIST * axes[TWIST_RATIO] for start in [own, *starts]]
         fitted = refit(
             self.simulations, white, self.twin, unknowns, self.frames, self.config.iterations, starts
         )
@@ -252,7 +257,7 @@ class _Trace:
             damping=False,
             ground_friction=ground is not None and ground.friction is None,
         )
-        spread = {"poissons_ratio": _POISSON_SPREAD}
+        spread = {"poissons_ratio": _POISSON_SPREAD, TWIST_RATIO: _TWIST_SPREAD}
         softness = grip_softness(twin)
         reach = clamp_reach(twin) if softness is None else None
         bending = None if any(p.name == "bending_n_m" for p in known) else bending_factor(twin)
