@@ -15,7 +15,7 @@ import numpy as np
 from physworld.geometry.reference import ReferenceBody
 from physworld.geometry.rigid import rigid_motion
 from physworld.materials.rod import RodLaw
-from physworld.mpm.soft_grips import gripped_points, touched_nodes
+from physworld.mpm.soft_grips import AS_HELD, gripped_points, holds_a_part, touched_nodes
 from physworld.mpm.terms import Term
 from physworld.mpm.total_lagrangian import HeldNodes
 from physworld.mpm.twist import Twist, span_between
@@ -66,12 +66,24 @@ def declared_region(grip: Grip | None, dim: int) -> np.ndarray | None:
     return box if np.all(box[1] > box[0]) else None
 
 
-def gripped_shares(twin: Twin) -> np.ndarray | None:
-    """Which quadrature points soft grips hold, (C, Q) bool; None where all gripped nodes are prescribed."""
+def softly_held(twin: Twin) -> Twin:
+    """A twin of a solid whose grips hold the material in their boxes, if one holds a part of a section; else the same.
+
+    No lattice of splines holds a part of a section as a grip does: prescribed nodes hold far too much. A clamp across
+    a whole section needs no more than its reach.
+    """
     regions = [region for region in twin.grip_regions if region is not None]
-    if twin.grip_softness <= 0 or not regions or twin.formulation != "total_lagrangian":
-        return None
-    return np.any([gripped_points(twin.lattice, twin.body.start, region) for region in regions], axis=0)
+    parts = any(holds_a_part(twin.lattice, twin.body.start, region) for region in regions)
+    if not parts or twin.formulation != "total_lagrangian" or twin.grip_softness > 0:
+        return twin
+    return replace(twin, grip_softness=AS_HELD)
+
+
+def soft_regions(twin: Twin) -> list[np.ndarray]:
+    """Boxes (2, 3) [m] that soft grips hold; none where all gripped nodes are prescribed."""
+    if twin.grip_softness <= 0 or twin.formulation != "total_lagrangian":
+        return []
+    return [region for region in twin.grip_regions if region is not None]
 
 
 def with_touched_nodes(twin: Twin, start: np.ndarray) -> Twin:

@@ -24,7 +24,7 @@ from physworld.effects.registry import in_order
 from physworld.errors import EffectRefused, SceneUnsupported
 from physworld.geometry.reference import ReferenceBody
 from physworld.geometry.rigid import least_rotation
-from physworld.grips import gripped_shares, held_paths, twist_between_grips, with_touched_nodes
+from physworld.grips import held_paths, soft_regions, twist_between_grips, with_touched_nodes
 from physworld.integration import Integration, solver_knots
 from physworld.materials.laws import Law
 from physworld.materials.plastic import Plasticity
@@ -258,15 +258,14 @@ class Twin:
         gripped = self
         for known in active:
             gripped = known.grips(gripped)
-        shares = gripped_shares(self)
-        if shares is not None:
+        regions = soft_regions(self)
+        if regions:
             gripped = with_touched_nodes(gripped, self.body.start)
         held = held_paths(gripped, knots, controls)
         problem = replace(problem, terms=(*problem.terms, *twist_between_grips(gripped, knots, controls)))
         for known in active:
             problem, held = known.attach(problem, held, self)
-        if shares is not None:
-            problem, held = soften(problem, held, self.grip_softness, shares)
+        problem, held = soften(problem, held, self.grip_softness, regions)
         return Integration(problem, velocity, held, knots, frame_index)
 
     def particles_at(self, nodes: np.ndarray) -> np.ndarray:

@@ -4,10 +4,11 @@ A quadratic spline has no kink, so a body whose gripped nodes are all prescribed
 face: too stiff by a quarter of a cell at a plane clamp, and by far more where a grip holds a part of a section and the
 free material pulls around its edges. Here the gripped material is tied to the grip's motion y by a spring per volume,
 
-    E = 1/2 rho (c / l)^2 int_grip |x - y|^2 dV        c speed of pressure waves, l = softness * cell
+    E = 1/2 rho (c / l)^2 int_grip |x - y|^2 dV        c speed of pressure waves, l = softness * (cell volume)^(1/3)
 
 so what the grip holds well follows it, and what only reaches into the grip, a strain at its face, gives. l is the
-length over which the hold sets in; l = 0 prescribes all nodes. The springs are implicit: in the modes of the gripped
+length over which the hold sets in; l = 0 prescribes all nodes. ``AS_HELD`` of a cell is as stiff as the region itself
+(``docs/adr/0012-soft-grips.md``). The springs are implicit: in the modes of the gripped
 volume's Gram matrix relative to the nodal masses a substep removes the share s dt^2 / (1 + s dt^2) of a mode's distance
 from the path, s the square of its frequency (backward Euler of the springs alone), so the stable time step stays as it
 is. Nodes that see gripped material only are prescribed. Compare the finite cell method's weak boundary conditions
@@ -16,6 +17,7 @@ is. Nodes that see gripped material only are prescribed. Compare the finite cell
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -28,35 +30,38 @@ from physworld.mpm.node_kernels import on_path
 from physworld.mpm.terms import BoundTerm
 from physworld.mpm.total_lagrangian import HeldNodes, Problem
 
+AS_HELD = 0.16
+"""Softness with which a body rings as finite elements do whose nodes in the region are prescribed."""
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(3)  # exact for products of quadratic splines
 _SLACK_M = 1e-6  # around a declared region
 _WHOLE = 0.9  # share of a section that a clamp across it holds at least, as far as cells show
 
 
 def soften(
-    problem: Problem, held: HeldNodes, softness: float, shares: np.ndarray
+    problem: Problem, held: HeldNodes, softness: float, regions: Sequence[np.ndarray]
 ) -> tuple[Problem, HeldNodes]:
     """The problem with grips that hold their material over ``softness`` cells, and the nodes that stay prescribed.
 
     Args:
         problem: of a solid.
         held: all nodes that gripped material touches (:func:`touched_nodes`), and those of other grips.
-        softness: l over the smallest side of a cell; 0 changes nothing.
-        shares: of the quadrature points, gripped, (C, Q) bool, see :func:`gripped_points`.
+        softness: l over the side of a cube of a cell's volume; 0 changes nothing.
+        regions: boxes that grips hold, (2, 3) [m] each.
     """
     lattice = problem.lattice
     material = lattice.fill[:, _owners(lattice.dim)] > 0.0
-    if softness <= 0 or not np.any(shares & material):
+    if softness <= 0 or not regions:
         return problem, held
+    shares = np.any([gripped_points(lattice, lattice.node_coordinates, box) for box in regions], axis=0)
     gripped = np.any(shares & material, axis=1)
     free = np.any(~shares & material, axis=1)
     loose = np.isin(held.nodes, lattice.cell_nodes[gripped]) & np.isin(held.nodes, lattice.cell_nodes[free])
     soft = _part(held, loose)
     if not len(soft.nodes):
         return problem, held
-    rate = problem.law.wave_speed_m_s / (softness * float(lattice.spacing.min()))
+    rate = problem.law.wave_speed_m_s / (softness * float(np.prod(lattice.spacing)) ** (1 / lattice.dim))
     stiffness = problem.law.density_kg_m3 * rate**2
-    grips = SoftGrips(soft, stiffness * gram_matrix(lattice, shares, soft.nodes))
+    grips = SoftGrips(soft, stiffness * gram_matrix(lattice, regions, soft.nodes))
     return replace(problem, terms=(*problem.terms, grips)), _part(held, ~loose)
 
 
@@ -85,37 +90,48 @@ def holds_a_part(lattice: Lattice, start: np.ndarray, region: np.ndarray) -> boo
     return gripped > 0.0
 
 
-def gram_matrix(lattice: Lattice, shares: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """Integrals of products of the splines of ``nodes`` (k,) over gripped material, (k, k) [m^d].
+def gram_matrix(lattice: Lattice, regions: Sequence[np.ndarray], nodes: np.ndarray) -> np.ndarray:
+    """Integrals of products of the splines of ``nodes`` (k,) over material in boxes (2, 3) [m], (k, k) [m^3].
 
-    Args:
-        shares: which of the cells' quadrature points are gripped, (C, Q) bool.
+    The parts of the cells' octants inside a box are integrated exactly: how hard a grip holds hangs on a tenth of a
+    cell at its faces. Where octants are filled in part, their material counts as spread evenly.
     """
-    dim = lattice.dim
-    splines = tensor_weights(_places(dim), (0,) * dim)
-    volumes = float(np.prod(lattice.spacing)) * _weights(dim) * lattice.fill[:, _owners(dim)] * shares
     place = np.full(len(lattice.nodes), -1)
     place[nodes] = np.arange(len(nodes))
     gram = np.zeros((len(nodes), len(nodes)))
-    for cell in np.flatnonzero(volumes.any(axis=1)):
-        local = splines.T @ (splines * volumes[cell][:, None])
-        numbers = place[lattice.cell_nodes[cell]]
-        own = numbers >= 0
-        gram[np.ix_(numbers[own], numbers[own])] += local[np.ix_(own, own)]
+    sides = 0.5 * (gauss_points(lattice.dim) >= 0.5)
+    for region in regions:
+        box = (region - lattice.origin) / lattice.spacing
+        begin = lattice.cells[:, None] + sides
+        low, high = np.maximum(begin, box[0]), np.minimum(begin + 0.5, box[1])
+        inside = np.all(high > low, axis=2) & (lattice.fill > 0.0)
+        for cell, part in np.argwhere(inside):
+            size = high[cell, part] - low[cell, part]
+            lines = 0.5 * (1.0 + _POINTS)[:, None] * size + (low[cell, part] - lattice.cells[cell])
+            splines = tensor_weights(_grid(lines), (0,) * lattice.dim)
+            shares = np.prod(_grid(0.5 * _WEIGHTS[:, None] * size), axis=1)
+            volume = float(np.prod(lattice.spacing)) * lattice.fill[cell, part]
+            local = splines.T @ (splines * (volume * shares)[:, None])
+            numbers = place[lattice.cell_nodes[cell]]
+            own = numbers >= 0
+            gram[np.ix_(numbers[own], numbers[own])] += local[np.ix_(own, own)]
     return gram
 
 
 def _places(dim: int) -> np.ndarray:
     """Local coordinates of a cell's quadrature points, three to each half along an axis, (6**dim, dim)."""
     halves = 0.25 * (1.0 + _POINTS)
-    line = np.concatenate([halves, 0.5 + halves])
-    return np.stack(np.meshgrid(*[line] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
+    return _grid(np.tile(np.concatenate([halves, 0.5 + halves])[:, None], dim))
+
+
+def _grid(lines: np.ndarray) -> np.ndarray:
+    """All combinations of the entries of columns (k, dim), (k**dim, dim)."""
+    return np.stack(np.meshgrid(*lines.T, indexing="ij"), axis=-1).reshape(-1, lines.shape[1])
 
 
 def _weights(dim: int) -> np.ndarray:
     """Shares of a cell that its quadrature points stand for, (6**dim,)."""
-    line = np.tile(0.25 * _WEIGHTS, 2)
-    return np.prod(np.stack(np.meshgrid(*[line] * dim, indexing="ij"), axis=-1).reshape(-1, dim), axis=1)
+    return np.prod(_grid(np.tile(np.tile(0.25 * _WEIGHTS, 2)[:, None], dim)), axis=1)
 
 
 def _owners(dim: int) -> np.ndarray:

@@ -15,7 +15,7 @@ import numpy as np
 from physworld.effects.base import Strength
 from physworld.effects.places import body_size, free_end
 from physworld.effects.registry import EFFECTS
-from physworld.trace.unknowns import Unknown, grip_softness, of_strength, with_strengths
+from physworld.trace.unknowns import Unknown, of_strength, with_strengths
 from physworld.twin import Twin
 
 Shape = dict[str, float]
@@ -168,9 +168,9 @@ def _fields(twin: Twin, known: Known) -> list[_Variant]:
 
 
 def _clamps(twin: Twin, known: Known) -> list[_Variant]:
-    """Angles; the reach only where no softness of the grips is calibrated, which is what a reach within a cell is."""
+    """Angles; the reach only where grips prescribe nodes: a reach within a cell is what softness is."""
     angles = _Variant(("angle_x_rad", "angle_y_rad", "angle_z_rad"), "angle_x_rad")
-    reach = [_Variant(("reach_m",), "reach_m")] if grip_softness(twin) is None else []
+    reach = [_Variant(("reach_m",), "reach_m")] if twin.grip_softness == 0 else []
     return [*reach, angles]
 
 

@@ -13,10 +13,10 @@ import numpy as np
 
 from physworld.trace.candidates import Candidate
 from physworld.trace.comparison import CrossValidation, cross_validated, difference
+from physworld.trace.holds import held_otherwise
 from physworld.trace.refit import Refit, refit
 from physworld.trace.score import Score, orthonormal, project
 from physworld.trace.simulations import Job, Simulations
-from physworld.trace.soft_starts import soft_places
 from physworld.trace.unknowns import CLAMP, Unknown, at
 from physworld.trace.whitening import Whitener
 
@@ -119,7 +119,7 @@ class Confirmation:
         fitted = model.fitted
         first = np.eye(len(fitted.theta))[0]
         scan = [fitted.theta + shift * first for shift in _ELSEWHERE]
-        reaches = [*_other_reaches(fitted), *soft_places(fitted)]
+        reaches = _other_reaches(fitted)
         costs = self._costs(fitted, [*scan, *reaches])
         line = np.array(costs[: len(scan)])
         middle = len(scan) // 2
@@ -141,6 +141,13 @@ class Confirmation:
             if other is not None and other.misfit < best.fitted.misfit:
                 best = Model(model.members, other, cross_validated(other, self.block_of_row))
         return best
+
+    def held_otherwise(self, model: Model) -> Model:
+        """The model refitted from grips that hold harder and softer, if that is better; else itself."""
+        other = held_otherwise(model.fitted, self.simulations, self.whitener, self.frames, self.iterations)
+        if other is model.fitted:
+            return model
+        return Model(model.members, other, cross_validated(other, self.block_of_row))
 
     def from_place_of(self, model: Model, other: Model, strength: float) -> Model:
         """The model refitted from another one's calibrated numbers and this strength of its one gate, if better."""

@@ -18,6 +18,7 @@ import numpy as np
 
 from physworld.calibrate import Journal, calibrate
 from physworld.calibrate.parameters import TWIST_RATIO, parameters_of
+from physworld.grips import softly_held
 from physworld.scene import Scene
 from physworld.trace.candidates import Candidate, candidates
 from physworld.trace.comparison import cross_validated
@@ -26,6 +27,7 @@ from physworld.trace.confirm import Model
 from physworld.trace.describe import describe
 from physworld.trace.experiment import Experiment, propose, rival_of
 from physworld.trace.held_out import HeldOut, Unseen, measure, measure_all
+from physworld.trace.holds import held_otherwise
 from physworld.trace.intervals import calibrated, named, numbers
 from physworld.trace.noise import noise_sigma
 from physworld.trace.recordings import (
@@ -54,7 +56,6 @@ from physworld.trace.simulations import (
     in_turn,
     stable_step_s,
 )
-from physworld.trace.soft_starts import softer
 from physworld.trace.start_pose import turned_starts
 from physworld.trace.unknowns import Unknown, bending_factor, clamp_reach, grip_softness, of_parameter
 from physworld.trace.verdict import (
@@ -115,6 +116,7 @@ def trace(
     if calibrated_twin is None:
         fitted = calibrate(recordings.lead.scene, config.calibration, progress, cancelled, journal)
         calibrated_twin, calibrated_runs = fitted.twin, fitted.simulations
+    calibrated_twin = softly_held(calibrated_twin)
     simulations = JointSimulations(
         recordings,
         calibrated_twin,
@@ -245,8 +247,7 @@ class _Trace:
         )
         if fitted is None:
             raise RuntimeError("the calibrated twin cannot be simulated again")
-        if fitted.misfit > self.config.near_floor:
-            fitted = softer(fitted, self.simulations, white, self.frames, self.config.iterations)
+        fitted = held_otherwise(fitted, self.simulations, white, self.frames, self.config.iterations)
         return Model((), fitted, cross_validated(fitted, block_of_row))
 
     def _calibrated_unknowns(self, twin: Twin) -> list[Unknown]:
@@ -259,7 +260,7 @@ class _Trace:
         )
         spread = {"poissons_ratio": _POISSON_SPREAD, TWIST_RATIO: _TWIST_SPREAD}
         softness = grip_softness(twin)
-        reach = clamp_reach(twin) if softness is None else None
+        reach = clamp_reach(twin) if softness is None else None  # a reach within a cell is what softness is
         bending = None if any(p.name == "bending_n_m" for p in known) else bending_factor(twin)
         found = [of_parameter(p, twin, spread.get(p.name)) for p in known]
         return [*found, *(unknown for unknown in (bending, reach, softness) if unknown is not None)]

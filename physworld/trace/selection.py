@@ -19,6 +19,7 @@ from physworld.trace.whitening import Whitener
 
 _OUTDONE = 0.5  # share of what a complete model's effect explains that a rival must explain to be refitted
 _LEADING = 2  # models that are refitted from elsewhere
+_NEAR = 3.0  # times what the best leaves above the noise
 _FAR = 3.0  # misfit over the noise from which on sensitivities are asked again after an effect was added
 _CLEARLY = 1.02  # misfit over the best one's from which a model that does the same is worth another search
 
@@ -59,7 +60,7 @@ class Selection:
                 self.simulations.stage = "refit from other valleys"
                 tried = with_valleys(confirmation, base, ranked, columns, tried, config.near_floor)
             tried = self._again(confirmation, base, tried, ranked)
-            tried = self._alike(confirmation, base, tried, columns)
+            tried = self._alike(confirmation, base, self._held_otherwise(confirmation, tried), columns)
             good = [m for m in tried if helps(m, base, config)]
             kept = simplest(good, base) if good else None
             path.append(Step(base, ranked, tuple(tried), kept))
@@ -116,6 +117,12 @@ class Selection:
             if found[id(m)] is m:
                 found[id(m)] = confirmation.elsewhere(m)
         return [found[id(m)] for m in tried]
+
+    def _held_otherwise(self, confirmation: Confirmation, tried: list[Model]) -> list[Model]:
+        """Models, those that are near the best refitted from grips that hold otherwise."""
+        self.simulations.stage = "refit of the grips"
+        least = min((model.explained for model in tried), default=0.0)
+        return [confirmation.held_otherwise(m) if m.explained <= _NEAR * least else m for m in tried]
 
     def _alike(
         self, confirmation: Confirmation, base: Model, tried: list[Model], columns: dict[str, np.ndarray]

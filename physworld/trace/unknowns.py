@@ -10,13 +10,13 @@ import numpy as np
 from physworld.calibrate.parameters import Parameter
 from physworld.effects.base import Strength
 from physworld.effects.registry import EFFECTS
-from physworld.mpm.soft_grips import holds_a_part
+from physworld.mpm.soft_grips import AS_HELD
 from physworld.twin import Twin
 
 _BENDING_SPREAD, _BENDING_RANGE = 0.5, 2.0
 CLAMP = "clamp_offset"
 SOFTNESS = "grip_softness"
-SOFTNESS_CELLS = (1 / 300, 1 / 3)  # from as good as prescribed to what lets a grip's own cells move
+_SOFTNESS_SHARES = (0.1, 1.5)  # of ``AS_HELD``: finite elements as large as the grip hold so much harder
 _SOFTNESS_STEP = 0.1
 _CLAMP_STEP, _CLAMP_SPREAD = 0.25, 0.5  # cells: difference step, and deviation of what is known beforehand
 
@@ -131,18 +131,16 @@ def clamp_reach(twin: Twin) -> Unknown | None:
 
 
 def grip_softness(twin: Twin) -> Unknown | None:
-    """Over how many cells grips take hold that hold a part of a solid's section, as a logarithm; None without one.
+    """Over how many cells grips take hold, as a logarithm; None for a twin whose grips prescribe nodes.
 
-    No lattice of splines holds a part of a section as sharply as a grip does, and how sharply decides what stiffness
-    and damping fit: see :mod:`physworld.mpm.soft_grips`. At the lower end all nodes are as good as prescribed. A clamp
-    across a whole section needs no more than its reach.
+    What recorded the body, another engine's mesh or a real grip, holds a part of a section harder or softer than the
+    declared box would. The range is what coarse finite elements do. A search starts at ``AS_HELD``: with grips that
+    hold as hard as prescribed nodes another, softer body fits about as well, and nothing leads away from there.
     """
-    declared = [region for region in twin.grip_regions if region is not None]
-    parts = any(holds_a_part(twin.lattice, twin.body.start, region) for region in declared)
-    if not parts or twin.formulation != "total_lagrangian":
+    if twin.grip_softness <= 0:
         return None
-    low, high = (float(np.log(end)) for end in SOFTNESS_CELLS)
-    start = float(np.log(np.clip(twin.grip_softness, *SOFTNESS_CELLS)))
+    low, high = (float(np.log(share * AS_HELD)) for share in _SOFTNESS_SHARES)
+    start = float(np.clip(np.log(twin.grip_softness), low, high))
     return Unknown(
         SOFTNESS, "cells", low, high, start, _SOFTNESS_STEP, lambda s: float(np.exp(s)),
         lambda changed, s: replace(changed, grip_softness=float(np.exp(s))),

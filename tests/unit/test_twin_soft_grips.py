@@ -10,8 +10,9 @@ from made_scene import box_body, made_scene
 
 from physworld.build import build_twin
 from physworld.errors import NotDifferentiable
-from physworld.grips import gripped_shares
+from physworld.grips import soft_regions, softly_held
 from physworld.mpm.gradient_twin import TwinRun
+from physworld.mpm.soft_grips import AS_HELD
 from physworld.scene import Grip
 from physworld.trace.candidates import candidates
 from physworld.trace.unknowns import SOFTNESS, grip_softness
@@ -38,7 +39,7 @@ CORNER, WHOLE = np.array([0.03, 0.0, 0.0]), np.array([0.03, 0.03, 0.03])
 def test_at_softness_zero_the_declared_box_changes_no_bit() -> None:
     twin, times, controls = twin_held_by(CORNER)
     plain = replace(twin, grip_regions=())
-    assert gripped_shares(twin) is None
+    assert soft_regions(twin) == []
     same = [t.simulate_nodes(times, controls, times) for t in (twin, plain)]
     assert np.array_equal(*same)
 
@@ -57,16 +58,18 @@ def test_a_soft_grip_gives_and_survives_being_stored() -> None:
     assert np.abs(gap).max() < 1e-3  # of a shake by 10 mm
 
 
-def test_only_what_a_box_holds_of_a_section_has_its_softness_calibrated() -> None:
+def test_only_a_grip_that_holds_a_part_of_a_section_holds_softly_and_has_its_softness_calibrated() -> None:
     corner, whole = twin_held_by(CORNER)[0], twin_held_by(WHOLE)[0]
-    assert grip_softness(whole) is None
-    unknown = grip_softness(corner)
+    assert softly_held(whole) is whole and grip_softness(whole) is None
+    soft = softly_held(corner)
+    assert soft.grip_softness == AS_HELD and softly_held(soft) is soft
+    unknown = grip_softness(soft)
     assert unknown is not None and unknown.name == SOFTNESS
+    assert unknown.start == pytest.approx(np.log(AS_HELD))
     assert unknown.apply(corner, np.log(0.05)).grip_softness == pytest.approx(0.05)
-    assert "reach_m" not in {gate.name for c in candidates(corner)[0] for gate in c.gates}
+    assert "reach_m" not in {gate.name for c in candidates(soft)[0] for gate in c.gates}
     assert "reach_m" in {gate.name for c in candidates(whole)[0] for gate in c.gates}
-    refused = candidates(replace(corner, grip_softness=0.05), ("grip_slip",))[1]
-    assert "0.05 cells" in refused["grip_slip"]
+    assert "0.16 cells" in candidates(soft, ("grip_slip",))[1]["grip_slip"]
 
 
 def test_gradients_refuse_a_soft_grip() -> None:

@@ -31,6 +31,7 @@ from physworld.worldmodel.training import train
 
 FOLLOWED = 0.04  # mean distance over an episode, as a share of the length; this rope falls and whips
 AGREEMENT_M = 2e-5  # single precision over a tick of some hundred substeps
+ROUND_OFF_M = 1e-6
 FIRST_ROOT = 2.404826  # of the Bessel function J0: the hanging chain swings at that times sqrt(g / L) / 2
 
 
@@ -154,7 +155,7 @@ def test_a_published_rope_is_read_back_and_exported() -> None:
     again = PublishedModel.from_tensors(held, facts).model
     with torch.no_grad():
         read = again.step(window[:, :, None], following[:, None], track.phi[:, None])[:, 0].numpy()
-    assert np.array_equal(read, expected)
+    assert np.abs(read - expected).max() < ROUND_OFF_M  # vector code rounds by where an array lies in memory
     client = Network(held, n).step(window.double().numpy(), following.double().numpy(), track.phi.numpy())
     assert np.abs(client - expected).max() < AGREEMENT_M
     inputs = {"window": window, "control_next": following, "phi": track.phi}
