@@ -5,16 +5,20 @@ same time step and the same first motion (stretching along x, no gravity) in all
 twin uses for elastic bodies: total Lagrangian, nodes in float64, the grid bound to the reference body; beside it
 ours for flowing ones: updated Lagrangian MLS-MPM with APIC, like the peer. The peer is the usual MLS-MPM with
 quadratic B-splines and APIC in float32, as Taichi's own examples write it, on two grids: 64³ nodes, as is
-usual, and just large enough for the motion.
+usual, and just large enough for the motion. The limit is the same MLS-MPM written by hand in C++ for this processor,
+on the tight grid.
 
 The forms discretise differently, so the table also shows what they agree on: the block's largest length.
 """
 
 from __future__ import annotations
 
+import ctypes
 import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from multiprocessing import get_context
 
 import numpy as np
 import taichi as ti
@@ -22,6 +26,7 @@ import warp as wp
 
 from benchmarks.gradients import cost
 from benchmarks.harness import Report, interleave, run_alone
+from benchmarks.mpm_limit import library, mls_mpm
 from physworld.build import build_twin
 from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian
 from physworld.mpm.updated_lagrangian import UpdatedLagrangian
@@ -37,6 +42,7 @@ SUBSTEPS = {"2k": 1600, "10k": 400}
 TIMED_RECORDS = 10
 CHECKED_SUBSTEPS, CHECKED_RECORDS = 160, 20  # more than half a period of the stretching
 TAICHI_MARGIN_CELLS = 6
+COLUMNS = ("ours", "ours_updated", "taichi_grid64", "taichi_tight", "limit")
 
 Engine = Callable[[int, int], tuple[float, np.ndarray]]
 """(substeps, records) to seconds a substep and the length along x at every record [m]."""
@@ -69,6 +75,8 @@ def measure(repeats: int, seed: int) -> Report:
     ti.init(arch=ti.cpu, cpu_max_num_threads=1, default_fp=ti.f32, log_level=ti.ERROR, offline_cache=True)
     figures: dict[str, object] = {}
     rows = []
+    compiled = library()
+    medians: dict[str, dict[str, float]] = {"ours": {}, "ours_updated": {}, "taichi": {}, "limit": {}}
     for size, budget in BUDGETS.items():
         block = make_block(budget, SUBSTEPS[size])
         engines = {
@@ -77,6 +85,8 @@ def measure(repeats: int, seed: int) -> Report:
             "taichi_grid64": taichi_mls_mpm(block, USUAL_GRID),
             "taichi_tight": taichi_mls_mpm(block, _tight_grid(block)),
         }
+        if compiled is not None:
+            engines["limit"] = limit(compiled, block)
         # also compiles, captures and warms the caches
         lengths = {}
         for name, run in engines.items():
@@ -93,16 +103,24 @@ def measure(repeats: int, seed: int) -> Report:
             "ratio_to_ours": ratios,
             "peak_length_m": lengths,
         }
+        for name, key in (("ours",) * 2, ("ours_updated",) * 2, ("taichi", "taichi_tight"), ("limit",) * 2):
+            if key in timings:
+                medians[name][size] = timings[key].median
         rows.append(
             [
                 f"{count}",
-                *(f"{timings[name].median:.0f} ± {timings[name].spread:.0f}" for name in engines),
+                *(
+                    f"{timings[n].median:.0f} ± {timings[n].spread:.0f}" if n in timings else "-"
+                    for n in COLUMNS
+                ),
                 " / ".join(f"{ratio:.1f}" for ratio in ratios.values()),
                 " / ".join(f"{1e3 * lengths[name]:.1f}" for name in engines),
             ]
         )
     gradient = cost(repeats)
     figures |= {key: gradient[key] for key in ("gradient_in_forwards", "gradient_memory_mb")}
+    figures["ns_per_particle_substep"] = medians
+    figures["two_worker_speedup"] = speedup = two_worker_speedup(repeats)
     return Report(
         name="mpm",
         title="MPM forward, ns per particle-substep, one thread",
@@ -113,6 +131,7 @@ def measure(repeats: int, seed: int) -> Report:
             "ours, updated",
             "Taichi, 64³ grid",
             "Taichi, tight grid",
+            "C++ by hand",
             "ratio to total",
             "peak length, mm",
         ],
@@ -123,7 +142,9 @@ def measure(repeats: int, seed: int) -> Report:
             "engines: they simulate the same thing.",
             "Ours, total: total Lagrangian (fixed weights, no transfer), nodes in float64, strains in float32. Ours, "
             "updated: MLS-MPM with APIC as Taichi's, positions and deformation gradients in float64, the rest in "
-            "float32, the grid on the body's box. Taichi: MLS-MPM (APIC), float32.",
+            "float32, the grid on the body's box. Taichi and C++ by hand (`benchmarks/mpm_limit.cpp`): "
+            "MLS-MPM (APIC), float32.",
+            f"Two processes against one, total Lagrangian, 2000 particles: {speedup:.2f} times the substeps a second.",
             f"One gradient through 100 frames of 2000 particles (total Lagrangian) takes "
             f"{gradient['gradient_in_forwards']:.1f} forward runs and keeps {gradient['gradient_memory_mb']:.0f} MB; "
             "see docs/gradients.md.",
@@ -198,6 +219,38 @@ def ours_updated(block: Block) -> Engine:
         return seconds / engine.substeps, np.ptp(particles[..., 0], axis=1)
 
     return run
+
+
+def limit(compiled: ctypes.CDLL, block: Block) -> Engine:
+    """The step written by hand, on the tight grid."""
+    mu = MODULUS_PA / (2 * (1 + POISSON))
+    lam = MODULUS_PA * POISSON / ((1 + POISSON) * (1 - 2 * POISSON))
+    centred, material = block.particles - SIZE_M / 2, (mu, lam, DENSITY_KG_M3)
+    grid = _tight_grid(block)
+    return mls_mpm(
+        compiled, centred, block.volumes, STRAIN_RATE_PER_S, grid, block.spacing_m, block.dt_s, material
+    )
+
+
+def two_worker_speedup(repeats: int) -> float:
+    """Substeps a second of two processes that simulate the small block side by side, over one's."""
+    ratios = []
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        list(pool.map(_seconds_a_substep, range(2)))  # compiles and warms the caches
+        for _ in range(repeats):
+            alone = pool.submit(_seconds_a_substep, 0).result()
+            together = list(pool.map(_seconds_a_substep, range(2)))
+            ratios.append(alone * sum(1.0 / seconds for seconds in together))
+    return float(np.median(ratios))
+
+
+def _seconds_a_substep(number: int) -> float:
+    del number
+    wp.config.quiet = True
+    block = make_block(BUDGETS["2k"], SUBSTEPS["2k"])
+    engine = ours(block)
+    engine(SUBSTEPS["10k"], 1)
+    return engine(10 * SUBSTEPS["2k"], TIMED_RECORDS)[0]
 
 
 def taichi_mls_mpm(block: Block, grid: int) -> Engine:
