@@ -13,7 +13,6 @@ from schemas.fit import FitConfig
 Verdict = Literal[
     "named", "equivalent_set", "data_issue", "numerical_issue", "unexplained", "nothing_to_explain"
 ]
-NAMED: Verdict = "named"
 TraceState = Literal["pending", "ready", "failed"]
 
 
@@ -96,7 +95,8 @@ class Trace(Resource):
     """A trace. Once ready it holds every key of its ``report.json``, also those that are not named here.
 
     ``held_out`` are errors on frames that nothing before the report has seen, of the recordings that are held out if
-    there are any; ``recordings`` has those of each. ``twin.npz`` is among the artifacts where the verdict is ``named``.
+    there are any; ``recordings`` has those of each. ``twin.npz`` is among the artifacts where an effect is
+    added: one that is ``named``, or the best of an ``equivalent_set`` unless that is a fault of the measurement.
     """
 
     model_config = ConfigDict(extra="allow")

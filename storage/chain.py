@@ -3,8 +3,8 @@
 ::
 
     fit -> dataset -> training                                           without a trace
-    fit -> trace -> dataset -> training                                  ``close_the_loop``, nothing named
-    fit -> trace -> dataset -> training -> dataset -> training           ... an effect named: first on the fit's own
+    fit -> trace -> dataset -> training                                  ``close_the_loop``, nothing added
+    fit -> trace -> dataset -> training -> dataset -> training           ... an effect added: first on the fit's own
                                                                          twin, for comparison, then with the effect
 
 A training whose ``start_share`` is below 1 is opened as soon as its dataset is planned, and runs beside it.
@@ -88,7 +88,7 @@ def _wants_comparison(
 
 
 def _is_comparison(session: Session, children: Sequence[JobRow]) -> bool:
-    """Whether the training that has just ended was the one without the effects that the trace named."""
+    """Whether the training that has just ended was the one without the effects that the trace added."""
     kinds = [job.kind for job in children]
     if "trace" not in kinds or kinds.count("training") > 1:
         return False

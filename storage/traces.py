@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 
 from schemas.assessment import Assessment
 from schemas.base import Artifact, Lineage, Page
-from schemas.trace import NAMED, Trace
+from schemas.trace import Trace
 from storage.errors import Conflict, NotFound
 from storage.pages import page_of
 from storage.tables import AssessmentRow, FitRow, TraceRow, columns_of
@@ -83,8 +83,9 @@ def trace_row(session: Session, trace_id: str) -> TraceRow:
 
 
 def adds_effects(trace: Trace | TraceRow) -> bool:
-    """Whether the trace named an effect, so that its own twin is the better one."""
-    return trace.state == "ready" and trace.verdict == NAMED
+    """Whether the trace left a twin that carries an effect: one that it named, or the best of an equivalent set."""
+    names = [item["name"] if isinstance(item, dict) else item.name for item in trace.artifacts]
+    return trace.state == "ready" and TWIN in names
 
 
 def fit_digest(fit: FitRow) -> str | None:

@@ -45,6 +45,16 @@ class Verdict:
     equivalent: tuple[Model, ...] = ()
     reason: str = ""
 
+    @property
+    def added(self) -> Model | None:
+        """What a twin is given to predict with: what is named, or the best of an equivalent set.
+
+        The models of a set predict the same as far as the data tell, so the best one is better than none. A fault of
+        the measurement is nothing that a body carries.
+        """
+        physical = any(member.kind != "measurement" for member in self.model.members)
+        return self.model if self.name in (NAMED, EQUIVALENT) and physical else None
+
 
 def decide(
     declared: Model,

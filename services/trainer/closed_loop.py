@@ -80,7 +80,8 @@ def statement(trace: Trace) -> str:
         for effect in trace.effects:
             strengths = [_figure(name, value.model_dump()) for name, value in effect.parameters.items()]
             found.append(f"{effect.name} ({', '.join(strengths)})")
-        return f"The twin carries {' and '.join(found)}: {trace.reason}"
+        known = "" if trace.verdict == "named" else ", the best of a set that these data cannot tell apart"
+        return f"The twin carries {' and '.join(found)}{known}: {trace.reason}"
     return f"Nothing was added to the twin, the verdict is {trace.verdict}: {trace.reason}"
 
 

@@ -27,7 +27,7 @@ def scene_of(stores: Stores, scene_id: str) -> Scene:
 
 
 def twin_of(stores: Stores, fit_id: str, trace_id: str | None = None) -> Twin:
-    """The calibrated twin of a ready fit, or of the trace where that named an effect. Raises NotFound, Conflict."""
+    """The calibrated twin of a ready fit, or of the trace where that added an effect. Raises NotFound, Conflict."""
     return stores.cached(("twin", fit_id, trace_id), lambda: _read_twin(stores, fit_id, trace_id))
 
 

@@ -4,7 +4,7 @@ Files: ``report.json`` (:func:`physworld.trace.document`), ``tracks.npz`` (``tim
 ``after`` (T, N, 3) f8 [m]: open loop from frame 0 without and with the effects, each calibrated on the training frames;
 of several recordings those of the first, and ``before_k``, ``after_k`` of each), ``report.html`` (one self-contained
 page), ``declared.npz``: the twin of the declared physics alone, calibrated anew (``Twin.to_arrays``), and, where the
-verdict is ``named``, ``twin.npz``: the twin that carries the effects.
+verdict adds one (``Verdict.added``), ``twin.npz``: the twin that carries the effects.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 from physworld.trace import document
 from physworld.trace.html import render
-from schemas.trace import NAMED
 from storage.traces import DECLARED, PAGE, REPORT, TRACKS, TWIN
 from workers.tasks.inputs import npz_bytes
 
@@ -41,6 +40,7 @@ def trace_files(scene: Scene, result: TraceResult, report: dict[str, Any]) -> li
         (PAGE, HTML, render(report, scene, result.before, result.after).encode()),
         (DECLARED, NPZ, npz_bytes(result.declared.fitted.twin.to_arrays())),
     ]
-    if report["verdict"] == NAMED:
-        files.append((TWIN, NPZ, npz_bytes(result.verdict.model.fitted.twin.to_arrays())))
+    added = result.verdict.added
+    if added is not None:
+        files.append((TWIN, NPZ, npz_bytes(added.fitted.twin.to_arrays())))
     return files

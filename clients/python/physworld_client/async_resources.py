@@ -92,7 +92,7 @@ class AsyncDatasets(AsyncResource):
     async def create(
         self, fit_id: str, config: DatasetConfig | None = None, *, trace_id: str | None = None
     ) -> Job:
-        """Starts writing a dataset, in the twin that the trace made where it named an effect."""
+        """Starts writing a dataset, in the twin that the trace made where it added an effect."""
         return await self._client.send(calls.dataset_create(fit_id, config, trace_id))
 
     async def get(self, dataset_id: str) -> Dataset:

@@ -15,7 +15,7 @@ from physworld.trace.config import TraceConfig
 from physworld.trace.confirm import Model
 from physworld.trace.refit import Refit
 from physworld.trace.unknowns import Unknown
-from physworld.trace.verdict import decide, implausible
+from physworld.trace.verdict import Verdict, decide, implausible
 
 BLOCKS, ROWS = 10, 2000
 BLOCK_OF_ROW = np.repeat(np.arange(BLOCKS), ROWS // BLOCKS)
@@ -74,6 +74,17 @@ def test_effects_that_do_the_same_are_a_set_and_faults_of_the_data_are_called_so
     before = NOISE + 2 * DRAG
     rivals = [model(NOISE, "lag", kind=kinds[0]), model(NOISE + 1e-3 * OTHER, "clock", kind=kinds[1])]
     assert answer(rivals, before)[0] == verdict
+
+
+@pytest.mark.parametrize(("verdict", "kind", "added"), [("named", "force", True), ("equivalent_set", "boundary", True),
+                                                        ("equivalent_set", "measurement", False),
+                                                        ("data_issue", "measurement", False),
+                                                        ("unexplained", "force", False)])  # fmt: skip
+def test_a_twin_carries_what_is_named_or_the_best_of_a_set_but_no_fault_of_the_data(
+    verdict: str, kind: str, added: bool
+) -> None:
+    best = model(NOISE, "lag", kind=kind)
+    assert Verdict(verdict, best).added is (best if added else None)
 
 
 def test_a_strength_that_moves_with_the_resolution_is_numerical() -> None:

@@ -104,7 +104,8 @@ def _trace(runtime: Runtime, scene_id: str, fit_id: str, verdict: str) -> str:
             npz_bytes(twin_of(runtime.stores, fit_id).to_arrays()), "declared.npz"
         )
         row.state, row.verdict = "ready", verdict
-        row.artifacts = [artifact.model_dump(), alone.model_dump()]
+        added = [artifact.model_dump()] if verdict in ("named", "equivalent_set") else []
+        row.artifacts = [*added, alone.model_dump()]
         effects = [{"name": "air_drag_linear", "parameters": {"rate_per_s": number}}]
         row.report = {
             "verdict": verdict,
@@ -151,13 +152,23 @@ def test_the_card_says_which_effect_and_the_errors_before_and_after(
 def test_the_card_says_why_nothing_was_added(
     runtime: Runtime, scene_id: str, fit_id: str, plain: ModelVersion
 ) -> None:
-    version = _version(runtime, fit_id, _trace(runtime, scene_id, fit_id, "equivalent_set"))
+    version = _version(runtime, fit_id, _trace(runtime, scene_id, fit_id, "unexplained"))
     section = version.metrics["closed_loop"]
     assert section["effects_added"] == [] and "world_model" not in section
     assert section["statement"].startswith(
-        "Nothing was added to the twin, the verdict is equivalent_set: it fits"
+        "Nothing was added to the twin, the verdict is unexplained: it fits"
     )
     assert version.metrics["held_out"]["track_m"]["twin"] == plain.metrics["held_out"]["track_m"]["twin"]
+
+
+def test_the_best_of_an_equivalent_set_is_added_and_called_that(
+    runtime: Runtime, scene_id: str, fit_id: str, plain: ModelVersion
+) -> None:
+    version = _version(runtime, fit_id, _trace(runtime, scene_id, fit_id, "equivalent_set"))
+    section = version.metrics["closed_loop"]
+    assert [effect["name"] for effect in section["effects_added"]] == ["air_drag_linear"]
+    assert "the best of a set that these data cannot tell apart" in section["statement"]
+    assert section["twin"]["after_m"] is not None and section["baseline_version"] == plain.version
 
 
 def _assess(runtime: Runtime, scene_id: str, **request: object) -> tuple[Job, Assessment]:

@@ -160,7 +160,7 @@ def test_what_an_ended_job_left_in_the_scratch_is_swept(stores: Stores, scene_id
     assert stores.scratch.jobs() == [running.id]
 
 
-def test_a_dataset_comes_from_the_twin_with_the_named_effect(
+def test_a_dataset_comes_from_the_twin_with_the_added_effect(
     runtime_with: Callable[..., Runtime], stores: Stores, scene_id: str
 ) -> None:
     from physworld.effects.registry import effect
@@ -173,10 +173,14 @@ def test_a_dataset_comes_from_the_twin_with_the_named_effect(
     artifact = stores.artifacts.put_bytes(npz_bytes(with_drag.to_arrays()), "twin.npz")
     job = _open(stores, scene_id)
     trace_id = job.outputs[0].id
-    for verdict, effects in (("named", 1), ("equivalent_set", 0)):
+    for verdict, left, effects in (
+        ("named", [artifact.model_dump()], 1),
+        ("equivalent_set", [artifact.model_dump()], 1),
+        ("equivalent_set", [], 0),
+    ):
         with stores.database.session() as session:
             row = session.get_one(TraceRow, trace_id)
-            row.state, row.verdict, row.artifacts = "ready", verdict, [artifact.model_dump()]
+            row.state, row.verdict, row.artifacts = "ready", verdict, left
         fresh = Stores(stores.settings, stores.database)
         twin: Twin = twin_of(fresh, fit_id, trace_id)
         assert len(twin.effects) == effects
