@@ -237,6 +237,8 @@ def summarise(scenes: list[str], held: dict[str, dict[str, Any] | None]) -> Repo
         for name, found in speeds.items()
         if found is not None
     ]
+    priors = {name: priors_by_condition(name, held) for name in scenes}
+    notes += [prior_in_words(name, found) for name, found in priors.items() if found]
     unseen_cells = [held.get(f"soft_beam/{UNSEEN}/{seed}") for seed in SEEDS]
     unseen = {
         kind: unseen_motion.pooled([cell and cell[kind] for cell in unseen_cells])
@@ -255,6 +257,7 @@ def summarise(scenes: list[str], held: dict[str, dict[str, Any] | None]) -> Repo
             "errors": errors,
             "relations": relations,
             "steps_per_second": speeds,
+            "priors": priors,
             "unseen_motion": unseen,
             "settings": settings(),
         },
@@ -333,6 +336,34 @@ def speed(name: str, held: dict[str, dict[str, Any] | None]) -> dict[str, float]
         return None
     medians = {side: float(np.median([cell[side] for cell in found])) for side in ("world_model", "twin")}
     return medians | {"ratio": medians["world_model"] / medians["twin"]}
+
+
+def priors_by_condition(name: str, held: dict[str, dict[str, Any] | None]) -> dict[str, dict[str, float]]:
+    """Condition → mean error [m] of the closed-form prior alone on left-out episodes of that condition, and cells.
+
+    ``untouched`` counts the cells in which the network brought no better validation error than its prior.
+    """
+    found = {}
+    for condition in CONDITIONS:
+        cells = [held.get(f"{name}/{condition}/{seed}") for seed in SEEDS]
+        own = [cell for cell in cells if cell is not None and "validation_prior_m" in cell]
+        if own:
+            found[condition] = {
+                "validation_prior_m": float(np.mean([cell["validation_prior_m"] for cell in own])),
+                "cells": len(own),
+                "untouched": sum(cell["best_step"] == 0 for cell in own),
+            }
+    return found
+
+
+def prior_in_words(name: str, found: dict[str, dict[str, float]]) -> str:
+    """One line."""
+    errors = ", ".join(f"{key} {1e3 * entry['validation_prior_m']:.1f}" for key, entry in found.items())
+    untouched, cells = (sum(entry[key] for entry in found.values()) for key in ("untouched", "cells"))
+    return (
+        f"{name}: the closed-form prior alone on left-out episodes of each condition, mm: {errors}; in {untouched} of "
+        f"{cells} cells the network brought nothing beyond it."
+    )
 
 
 def in_millimetres(by_seed: dict[str, float]) -> str:
