@@ -15,7 +15,7 @@ from pathlib import Path
 
 import warp as wp
 
-from benchmarks import calibration_known, calibration_measured
+from benchmarks import calibration_known, calibration_measured, calibration_sheets
 from benchmarks.harness import Report
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -23,6 +23,7 @@ PARTS: dict[str, Callable[[int, Path], Report]] = {
     "recovery": calibration_known.recovery,
     "coverage": calibration_known.coverage,
     "identifiability": calibration_known.identifiability,
+    "sheets": calibration_sheets.sheets,
     "undeclared": calibration_measured.undeclared,
     "beam": calibration_measured.beam,
     "ropes_and_cloths": calibration_measured.ropes_and_cloths,

@@ -4,10 +4,10 @@ Stiffness and friction are positive and span decades: they are searched in the l
 as it is. With gravity, ground and prescribed grips only ratios to the density show, so the density is never a
 parameter here: it stays as declared, or at its prior, and the report says so.
 
-A *stiffness* is always searched, and with it where a flow law yields and the torsion of a rope that two grips turn, if
-the body has them and the data show them: the prior of a yield stress is a value that nothing reaches. The others are
-*optional*: air drag, internal friction, Poisson's ratio, how stiff a sheet is in twist beside bending, and the friction
-of a ground that declares none; each is freed only if the data ask for it, and else stays at its prior.
+A *stiffness* is always searched, and with it where a flow law yields, the torsion of a rope that two grips turn and how
+stiff a sheet is in twist beside bending, if the body has them and the data show them: the prior of a yield stress is a
+value that nothing reaches. The others are *optional*: air drag, internal friction, Poisson's ratio, and the friction of
+a ground that declares none; each is freed only if the data ask for it, and else stays at its prior.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ _LEAST_GAIN = 0.02  # share of the training cost that an optional parameter must
 _POISSON_GAIN = 0.15  # the same of Poisson's ratio, which absorbs a little of whatever else is missing
 _TWIST_BOUNDS = (0.1, 10.0)
 _TWIST_GAIN = 0.1  # share of the training cost
+_SHEET_STARTS = 14  # of a sheet's stiffness: its phase slips within a factor of two
 _FRICTION_BOUNDS = (0.02, 3.0)
 _NEVER_PA = 1e12  # a yield stress that nothing reaches
 _SAND_RAD = 0.6  # friction angle of loose dry sand
@@ -101,19 +102,13 @@ def parameters_of(
             Parameter("poissons_ratio", "1", *_POISSON_BOUNDS, (prior,), apply, "optional", _POISSON_STEP, "linear",
                       prior, _POISSON_GAIN)
         )  # fmt: skip
-    if isinstance(law, SheetLaw):
-        prior = law.bending_twist_ratio
-        optional.append(
-            Parameter(TWIST_RATIO, "1", *_TWIST_BOUNDS, (prior,), _set(TWIST_RATIO), "optional", 0.05, prior=prior,
-                      least_gain=_TWIST_GAIN)
-        )  # fmt: skip
     if ground_friction and "ground_friction" in twin.parameters:
         prior = twin.parameters["ground_friction"]
         optional.append(
             Parameter("ground_friction", "1", *_FRICTION_BOUNDS, (prior,), _set("ground_friction"), "optional",
                       0.05, prior=prior)
         )  # fmt: skip
-    return [*_stiffness(twin, separate_bending), *_torsion(twin), *_flow(twin), *optional]
+    return [*_stiffness(twin, separate_bending), *_torsion(twin), *_twist(twin), *_flow(twin), *optional]
 
 
 def flow_law(name: str) -> Plasticity:
@@ -139,6 +134,18 @@ def _torsion(twin: Twin) -> list[Parameter]:
     return [
         Parameter("torsion_ratio", "1", 0.02, 10.0, starts, _set("torsion_ratio"), "flow", 0.05,
                   prior=law.torsion_ratio)
+    ]  # fmt: skip
+
+
+def _twist(twin: Twin) -> list[Parameter]:
+    """How stiff a sheet is in twist beside bending, which decides in which valley its stiffness lies."""
+    law = twin.law
+    if not isinstance(law, SheetLaw):
+        return []
+    known = law.bending_twist_ratio
+    return [
+        Parameter(TWIST_RATIO, "1", *_TWIST_BOUNDS, (known, 2.5 * known), _set(TWIST_RATIO), "flow", 0.05, prior=known,
+                  least_gain=_TWIST_GAIN)
     ]  # fmt: skip
 
 
@@ -171,7 +178,7 @@ def _stiffness(twin: Twin, separate_bending: bool) -> list[Parameter]:
         ]  # fmt: skip
     if isinstance(law, SheetLaw):
         unit = density * 9.81 * length
-        grid = tuple(float(unit * f) for f in np.logspace(1.0, 3.5, 6))
+        grid = tuple(float(unit * f) for f in np.logspace(1.0, 3.5, _SHEET_STARTS))
         thickness = twin.body.thickness_m
         if not separate_bending:
             scale = (1 - law.poissons_ratio**2) / thickness
