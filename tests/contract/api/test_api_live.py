@@ -192,6 +192,7 @@ def test_sessions_are_limited_and_a_place_is_free_again_when_one_ends(served: Se
             try:
                 await socket.recv()
             except ConnectionClosed:
+                await socket.close()
                 await asyncio.sleep(0.1)
                 continue
             sockets.append(socket)
