@@ -1,7 +1,7 @@
 """Recordings of sheets by an engine that is not ours: MuJoCo flex, linear triangles whose edges bend like hinges.
 
 A sheet hangs by two corners that move. Cells have alternate diagonals and vertices their share of the area's mass, as a
-mesh of triangles should. No damping, no contact. What else may act on it is one of :data:`EFFECTS`.
+mesh of triangles should. No damping, no contact.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ Floats = NDArray[np.float64]
 
 FPS, TRAIN_SHARE = 30.0, 0.7
 GRAVITY = (0.0, 0.0, -9.81)
-EFFECTS = ("linear_drag", "quadratic_drag", "gravity_tilt", "control_lag")
 _TOP_M = 0.6
 _HELD_CELLS = 2  # of the coarsest mesh, along either edge of a held corner
 _TRACKED = 300
@@ -26,12 +25,10 @@ _TRACKED = 300
 
 @dataclass(frozen=True)
 class FlexSheet:
-    """A sheet of ``cells`` times ``subdivision`` cells, and what acts on it beside gravity.
+    """A sheet of ``cells`` times ``subdivision`` cells.
 
     Attributes:
         size_m: width and height.
-        effect, strength: one of :data:`EFFECTS` or "" with its strength: 1/s, 1/m, rad or s.
-        declared_density: over the true one.
         seed: of the motion, the places of the points and the noise.
     """
 
@@ -42,10 +39,7 @@ class FlexSheet:
     poisson: float = 0.3
     thickness_m: float = 0.005
     density_kg_m3: float = 380.0
-    effect: str = ""
-    strength: float = 0.0
     noise_sigma_m: float = 1e-3
-    declared_density: float = 1.0
     frames: int = 70
     steps_per_frame: int = 340  # for one subdivision
     seed: int = 0
@@ -95,11 +89,9 @@ class FlexSheet:
         """The sheet as MuJoCo has it."""
         numbers = " ".join(f"{value:.9g}" for value in self.vertices().ravel())
         elements = " ".join(str(number) for number in self.triangles().ravel())
-        tilt = self.strength if self.effect == "gravity_tilt" else 0.0
-        gravity = 9.81 * np.array([np.sin(tilt), 0.0, -np.cos(tilt)])
         model = mujoco.MjModel.from_xml_string(
             f"""<mujoco><option timestep="{1.0 / FPS / self.steps}" solver="CG" iterations="1"
-            gravity="{" ".join(map(str, gravity))}"><flag contact="disable"/></option><worldbody><body name="frame">
+            gravity="{" ".join(map(str, GRAVITY))}"><flag contact="disable"/></option><worldbody><body name="frame">
             <flexcomp name="sheet" type="direct" dim="2" mass="1" radius="{0.5 * self.thickness_m}" point="{numbers}"
             element="{elements}"><edge equality="false" damping="0"/><contact selfcollide="none" contype="0"
             conaffinity="0"/><elasticity young="{self.young_pa}" poisson="{self.poisson}" damping="0"
@@ -212,7 +204,7 @@ def record(sheet: FlexSheet) -> Scene:
         body=Body(
             size_m=size,
             thickness_m=sheet.thickness_m,
-            density_kg_m3=sheet.declared_density * sheet.density_kg_m3,
+            density_kg_m3=sheet.density_kg_m3,
         ),
         grips=grips,
         declared={},
@@ -221,19 +213,14 @@ def record(sheet: FlexSheet) -> Scene:
 
 def _simulate(sheet: FlexSheet, motion: _Motion, held: list[NDArray[np.int64]]) -> Floats:
     """Vertices of every frame (T, V, 3) [m]."""
-    model, rest, mass = sheet.model(), sheet.vertices(), np.repeat(sheet.masses(), 3)
+    model, rest = sheet.model(), sheet.vertices()
     data = mujoco.MjData(model)
-    step, late = model.opt.timestep, sheet.strength if sheet.effect == "control_lag" else 0.0
+    step = model.opt.timestep
     rows = [(3 * nodes[:, None] + np.arange(3)).ravel() for nodes in held]
     frames = [rest.copy()]
     for count in range(1, (sheet.frames - 1) * sheet.steps + 1):
-        if sheet.effect == "linear_drag":
-            data.qfrc_applied[:] = -sheet.strength * mass * data.qvel
-        elif sheet.effect == "quadratic_drag":
-            speed = np.repeat(np.linalg.norm(data.qvel.reshape(-1, 3), axis=1), 3)
-            data.qfrc_applied[:] = -sheet.strength * mass * speed * data.qvel
         mujoco.mj_step(model, data)
-        now, before = motion.shifts(count * step - late), motion.shifts((count - 1) * step - late)
+        now, before = motion.shifts(count * step), motion.shifts((count - 1) * step)
         for g, row in enumerate(rows):
             data.qpos[row] = np.tile(now[g], len(row) // 3)
             data.qvel[row] = np.tile((now[g] - before[g]) / step, len(row) // 3)
