@@ -4,8 +4,10 @@ Candidates run one after another: a network of this size keeps the arithmetic un
 stays in the cache. Where the network adds nothing to the prior (``corrected`` is 0) only the prior is run.
 
 Rows of 16 floats are one vector register (two or four of them on older CPUs); every width is padded to a multiple
-of 16 with zeros, which a ReLU leaves zero. ``product`` multiplies four rows at a time, so that a weight is
-read once for four vertices; products are fused with sums by hand, since Warp's compiler does not contract them.
+of 16 with zeros, which a ReLU leaves zero. ``product`` keeps the sums of a tile in registers, so that a weight is read
+once for all vertices of the tile: four vertices by 32 columns where registers hold 16 floats, six by 16 where there are
+16 registers of 8 (AVX2); fewer sums would wait for each other, more would not stay there. Products are fused with sums
+by hand, since Warp's compiler does not contract them.
 Equations: ``physworld.worldmodel.model``. CPU only.
 """
 
@@ -58,39 +60,48 @@ _ROLLOUT = (
     + TEXT
     + STEP
     + r"""
+#if defined(__AVX512F__)
+    const int ROWS = 4, COLUMNS = 2;
+#else
+    const int ROWS = 6, COLUMNS = 1;
+#endif
     // out (rows, width) = [out +] in (rows, depth) * weight (depth, width) [+ bias]
     auto product = [&](float* out, const float* in, const float* weight, const float* bias, int rows, int depth,
                       int width, bool add) {
-        for (int c = 0; c < width; c += 32) {
-            const bool two = c + 16 < width;
-            const int d = two ? c + 16 : c;
-            for (int r = 0; r < rows; r += 4) {
-                const int last = rows - 1;
-                const int r1 = r + 1 < last ? r + 1 : last, r2 = r + 2 < last ? r + 2 : last;
-                const int r3 = r + 3 < last ? r + 3 : last;
-                const float *x0 = in + (long long)r * depth, *x1 = in + (long long)r1 * depth;
-                const float *x2 = in + (long long)r2 * depth, *x3 = in + (long long)r3 * depth;
-                float *y0 = out + (long long)r * width, *y1 = out + (long long)r1 * width;
-                float *y2 = out + (long long)r2 * width, *y3 = out + (long long)r3 * width;
-                V b0 = 0.0f, b1 = 0.0f;
-                if (bias) { b0 = *(const V*)(bias + c); b1 = *(const V*)(bias + d); }
-                V p0 = b0, p1 = b0, p2 = b0, p3 = b0, q0 = b1, q1 = b1, q2 = b1, q3 = b1;
-                if (add) {
-                    p0 += *(V*)(y0 + c); p1 += *(V*)(y1 + c); p2 += *(V*)(y2 + c); p3 += *(V*)(y3 + c);
-                    q0 += *(V*)(y0 + d); q1 += *(V*)(y1 + d); q2 += *(V*)(y2 + d); q3 += *(V*)(y3 + d);
+        for (int c = 0; c < width; c += 16 * COLUMNS)
+            for (int r = 0; r < rows; r += ROWS) {
+                const float* x[ROWS];
+                float* y[ROWS];
+                int column[COLUMNS];
+                V sum[ROWS][COLUMNS];
+                #pragma clang loop unroll(full)
+                for (int j = 0; j < COLUMNS; ++j) column[j] = c + 16 * j < width ? c + 16 * j : c;
+                #pragma clang loop unroll(full)
+                for (int i = 0; i < ROWS; ++i) {
+                    const long long row = r + i < rows ? r + i : rows - 1;
+                    x[i] = in + row * depth;
+                    y[i] = out + row * width;
+                    #pragma clang loop unroll(full)
+                    for (int j = 0; j < COLUMNS; ++j) {
+                        sum[i][j] = 0.0f;
+                        if (bias) sum[i][j] = *(const V*)(bias + column[j]);
+                        if (add) sum[i][j] += *(V*)(y[i] + column[j]);
+                    }
                 }
                 for (int k = 0; k < depth; ++k) {
-                    const V w = *(const V*)(weight + (long long)k * width + c);
-                    const V u = *(const V*)(weight + (long long)k * width + d);
-                    p0 = fused(x0[k], w, p0); p1 = fused(x1[k], w, p1);
-                    p2 = fused(x2[k], w, p2); p3 = fused(x3[k], w, p3);
-                    q0 = fused(x0[k], u, q0); q1 = fused(x1[k], u, q1);
-                    q2 = fused(x2[k], u, q2); q3 = fused(x3[k], u, q3);
+                    V w[COLUMNS];
+                    #pragma clang loop unroll(full)
+                    for (int j = 0; j < COLUMNS; ++j) w[j] = *(const V*)(weight + (long long)k * width + column[j]);
+                    #pragma clang loop unroll(full)
+                    for (int i = 0; i < ROWS; ++i)
+                        #pragma clang loop unroll(full)
+                        for (int j = 0; j < COLUMNS; ++j) sum[i][j] = fused(x[i][k], w[j], sum[i][j]);
                 }
-                *(V*)(y3 + c) = p3; *(V*)(y2 + c) = p2; *(V*)(y1 + c) = p1; *(V*)(y0 + c) = p0;
-                *(V*)(y3 + d) = q3; *(V*)(y2 + d) = q2; *(V*)(y1 + d) = q1; *(V*)(y0 + d) = q0;
+                #pragma clang loop unroll(full)
+                for (int i = ROWS - 1; i >= 0; --i)
+                    #pragma clang loop unroll(full)
+                    for (int j = COLUMNS - 1; j >= 0; --j) *(V*)(y[i] + column[j]) = sum[i][j];
             }
-        }
     };
     auto rectify = [&](float* x, int count) {
         for (int c = 0; c < count; c += 16) *(V*)(x + c) = positive(*(V*)(x + c));
