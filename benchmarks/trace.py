@@ -53,7 +53,7 @@ def strength(effect: dict[str, Any], report: dict[str, Any]) -> float:
         return float(np.degrees(np.hypot(values.get("tilt_x_rad", 0.0), values.get("tilt_y_rad", 0.0))))
     if name == "anisotropy":
         modulus = known["youngs_modulus_pa"]
-        if "bending_factor" in known:  # a sheet's fibres are stiff in units of its membrane
+        if "bending_ratio" in known:  # a sheet's fibres are stiff in units of its membrane
             modulus /= 1.0 - known.get("poissons_ratio", 0.3) ** 2
         return values["ratio"] * modulus
     if name == "viscosity_kelvin_voigt" and "viscosity_pa_s" not in values:

@@ -26,7 +26,7 @@ class FitConfig(Request):
     """
 
     particle_budget: int = Field(default=2000, ge=50, le=200_000)
-    max_simulations: int = Field(default=160, ge=1, le=5000)
+    max_simulations: int = Field(default=400, ge=1, le=5000)
     damping: Literal["auto", "none"] = "auto"
     law: ElasticLaw | None = None
     plasticity: FlowLaw | None = None

@@ -74,13 +74,13 @@ def estimates(
 
 
 def held_at_priors(
-    scene: Scene, twin: Twin, rejected: dict[str, float], units: dict[str, str]
+    scene: Scene, twin: Twin, rejected: dict[str, float], parameters: list[Parameter]
 ) -> dict[str, Estimate]:
     """What was held: the density (only ratios to it show), what the data did not ask for, and a rod's stretch.
 
     Args:
         rejected: share of the training cost that freeing each of them removes.
-        units: unit of every parameter.
+        parameters: all that could be searched.
     """
     unit = {3: "kg/m^3", 2: "kg/m^2", 1: "kg/m"}[twin.lattice.dim]
     declared = scene.body.density_kg_m3 is not None or scene.body.mass_kg is not None
@@ -93,17 +93,17 @@ def held_at_priors(
     if "stretching_n" in values:
         note = "held: stiff enough to stretch by less than a percent"
         held["stretching_n"] = Estimate(values["stretching_n"], "N", None, False, note)
+    by_name = {parameter.name: parameter for parameter in parameters}
     for name, gain in rejected.items():
+        value = values.get(name, by_name[name].prior)
         share = (
             f"freeing it removes {max(gain, 0.0):.1%} of the training cost"
             if np.isfinite(gain)
             else "not tried to its end"
         )
-        needless = (
-            not values[name] or name == "yield_stress_pa"
-        )  # nothing reaches the prior of a yield stress
+        needless = not value or name == "yield_stress_pa"  # nothing reaches the prior of a yield stress
         kept = "not needed" if needless else "held at its prior"
-        held[name] = Estimate(values[name], units[name], None, False, f"{kept}: {share}")
+        held[name] = Estimate(value, by_name[name].unit, None, False, f"{kept}: {share}")
     for name in ("poissons_ratio", "ground_friction"):
         if name in values and name not in held:
             held[name] = Estimate(values[name], "1", None, False, "held at its prior")

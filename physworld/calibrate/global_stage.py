@@ -3,11 +3,12 @@
 1. Scan the stiffness over its decades on a first window of frames, where phases have not slipped yet, and follow the
    three best starts there by Gauss-Newton.
 2. Gauss-Newton on all training frames from the two best.
-3. Free optional parameters (drag, internal friction, Poisson's ratio, an undeclared ground's friction), the best one
-   first. A screening by one run each skips those that cannot help to first order; of the others each must lower
-   the training cost by more than 2 % (Poisson's ratio: 15 %). After one that removed half of it, start again from a
-   quarter and four times the stiffness: the first scan knew less. Drop again what the others made needless, also the
-   yield of a flow law, which is searched with the stiffness from the first scan on.
+3. Free how a sheet bends, if that removes 10 % of the cost. Then free optional parameters (drag, internal friction,
+   Poisson's ratio, an undeclared ground's friction), the best one first. A screening by one run each skips those that
+   cannot help to first order; of the others each must lower the training cost by more than 2 % (Poisson's ratio:
+   15 %). After one that removed half of it, start again from a quarter and four times the stiffness: the first scan
+   knew less. Drop again what the others made needless, also the yield of a flow law, which is searched with the
+   stiffness from the first scan on.
 4. Shift the tracked points inside the body by their mean residual (frame 0 is noisy too), clipped at 3 sigma.
 5. Gauss-Newton again on all that were kept; hold at its prior what the data turn out not to fix; intervals and
    correlations from the sensitivities at the optimum.
@@ -61,6 +62,7 @@ class CalibrationConfig:
         max_simulations: at most this many runs over the training frames.
         device: Warp device of the simulations.
         damping: "auto" adds drag and internal friction where the data ask; "none" keeps the declared physics only.
+        bending: "auto" frees how a sheet bends where the data ask; "declared" keeps what its thickness says.
         law: name of the elastic law (:mod:`physworld.materials.library`); None for the shape's usual one.
         formulation: "auto", "total_lagrangian" or "updated_lagrangian": see :mod:`physworld.mpm.choose`.
         plasticity: name of the flow law (:mod:`physworld.materials.plastic`), whose yield is searched too; None for an
@@ -68,9 +70,10 @@ class CalibrationConfig:
     """
 
     particle_budget: int = 2000
-    max_simulations: int = 160
+    max_simulations: int = 400
     device: str = "cpu"
     damping: Literal["auto", "none"] = "auto"
+    bending: Literal["auto", "declared"] = "auto"
     law: str | None = None
     formulation: str = "auto"
     plasticity: str | None = None
@@ -137,12 +140,12 @@ def calibrate(
     kept, optimum, rejected = select(search, parameters)
     search.limit = config.max_simulations - (len(kept) + 1 if config.max_simulations > _KEPT_BACK else 0)
     if search.shift_points(kept, optimum.theta):
-        optimum = search.solve(kept, optimum.theta, 3)
+        optimum = search.solve(kept, optimum.theta, 5)
     search.limit = config.max_simulations
     kept, optimum, solution = _hold_the_unknown(search, kept, optimum, rejected)
     twin = search.twin_at(kept, optimum.theta)
     found, correlated = _estimates(search, kept, optimum, solution)
-    held = held_at_priors(scene, twin, rejected, {p.name: p.unit for p in parameters})
+    held = held_at_priors(scene, twin, rejected, parameters)
     times, controls = scene.control_track()
     nodes = twin.simulate_nodes(times, controls, scene.times)
     tracks = twin.observe(nodes, scene.times)
@@ -175,20 +178,31 @@ def prior_twin(scene: Scene, config: CalibrationConfig) -> Twin:
 
 def searched_parameters(scene: Scene, twin: Twin, config: CalibrationConfig) -> list[Parameter]:
     """What may be searched in this scene."""
-    return parameters_of(
+    found = parameters_of(
         twin,
         separate_bending=scene.body.thickness_m is None and scene.body.size_m is None,
         damping=config.damping == "auto",
         ground_friction=scene.ground is not None and scene.ground.friction is None,
     )
+    return found if config.bending == "auto" else [p for p in found if p.stage != "shape"]
 
 
 def select(search: Search, parameters: list[Parameter]) -> tuple[list[Parameter], Optimum, dict[str, float]]:
     """Steps 1 to 3: the parameters to keep, their optimum, and what the others would have removed."""
-    kept = [p for p in parameters if p.stage != "optional"]
+    kept = [p for p in parameters if p.stage in ("stiffness", "flow")]
     optimum = search.scan(kept)
     candidates = [p for p in parameters if p.stage == "optional"]
     rejected: dict[str, float] = {}
+    shape = [p for p in parameters if p.stage == "shape"]
+    if shape:
+        freed = _followed(
+            search, [*kept, *shape], np.append(optimum.theta, [p.searched(p.start[0]) for p in shape])
+        )
+        gain = 1.0 - freed.cost / optimum.cost
+        if gain > min(p.least_gain for p in shape):
+            kept, optimum = [*kept, *shape], freed
+        else:
+            rejected.update({p.name: gain for p in shape})
     while candidates:
         screened = search.screen(kept, optimum, candidates)
         hopeful = [c for c in candidates if screened[c.name] >= _LEAST_SCREENED * c.least_gain]
@@ -214,6 +228,14 @@ def select(search: Search, parameters: list[Parameter]) -> tuple[list[Parameter]
             rejected[needless.name] = 1.0 - optimum.cost / trial.cost
             kept, optimum = [kept[k] for k in others], trial
     return kept, optimum, rejected
+
+
+def _followed(search: Search, parameters: list[Parameter], theta: np.ndarray) -> Optimum:
+    """An optimum over a window that grows to all training frames: phases that slip make a long one's cost rugged."""
+    window = search.first_window()
+    for end, iterations in ((window, 4), ((window + search.end) // 2, 3)):
+        theta = search.solve(parameters, theta, iterations, end).theta
+    return search.solve(parameters, theta, 5)
 
 
 def _restarted(search: Search, kept: list[Parameter], optimum: Optimum) -> Optimum:

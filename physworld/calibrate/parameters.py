@@ -6,8 +6,10 @@ parameter here: it stays as declared, or at its prior, and the report says so.
 
 A *stiffness* is always searched, and with it where a flow law yields, the torsion of a rope that two grips turn and how
 stiff a sheet is in twist beside bending, if the body has them and the data show them: the prior of a yield stress is a
-value that nothing reaches. The others are *optional*: air drag, internal friction, Poisson's ratio, and the friction of
-a ground that declares none; each is freed only if the data ask for it, and else stays at its prior.
+value that nothing reaches. A *shape* of the bending energy is freed next, as a whole: how stiff a sheet bends beside
+what its declared thickness says, and how its two curvatures are coupled. The others are *optional*: air drag, internal
+friction, Poisson's ratio, and the friction of a ground that declares none; each is freed only if the data ask for it,
+and else stays at its prior.
 """
 
 from __future__ import annotations
@@ -30,12 +32,15 @@ from physworld.materials.plastic import (
 from physworld.twin import Twin
 
 TWIST_RATIO = "bending_twist_ratio"
+BENDING_RATIO = "bending_ratio"  # D over K h^2 / 12
+BENDING_COUPLING = "bending_coupling"
 _LOG_STEP = 0.02  # finite-difference step in the logarithm
 _POISSON_BOUNDS, _POISSON_STEP = (0.0, 0.48), 0.02
 _LEAST_GAIN = 0.02  # share of the training cost that an optional parameter must remove
 _POISSON_GAIN = 0.15  # the same of Poisson's ratio, which absorbs a little of whatever else is missing
 _TWIST_BOUNDS = (0.1, 10.0)
-_TWIST_GAIN = 0.1  # share of the training cost
+_BENDING_BOUNDS, _COUPLING_BOUNDS = (0.1, 10.0), (-2.0, 2.0)
+_BENDING_GAIN = 0.1  # share of the training cost, of the shape of a sheet's bending energy
 _SHEET_STARTS = 14  # of a sheet's stiffness: its phase slips within a factor of two
 _FRICTION_BOUNDS = (0.02, 3.0)
 _NEVER_PA = 1e12  # a yield stress that nothing reaches
@@ -53,7 +58,8 @@ class Parameter:
         start: starts of the search, best first by prior knowledge; for an optional one the value that is tried first.
         apply: a twin with this value.
         stage: "stiffness" parameters come first, and over a grid with them what a "flow" law or a twisted rope has,
-            which is dropped again if the data do not need it; "optional" ones are freed only if the data ask for them.
+            which is dropped again if the data do not need it; those of a "shape" are freed together, "optional" ones
+            one by one, if the data ask for them.
         scale: searched in the logarithm, or as it is.
         step: of finite differences, in the searched scale.
         prior: value of an optional parameter that is not freed.
@@ -66,7 +72,7 @@ class Parameter:
     high: float
     start: tuple[float, ...]
     apply: Callable[[Twin, float], Twin]
-    stage: Literal["stiffness", "flow", "optional"]
+    stage: Literal["stiffness", "flow", "shape", "optional"]
     step: float = _LOG_STEP
     scale: Literal["log", "linear"] = "log"
     prior: float = 0.0
@@ -108,7 +114,14 @@ def parameters_of(
             Parameter("ground_friction", "1", *_FRICTION_BOUNDS, (prior,), _set("ground_friction"), "optional",
                       0.05, prior=prior)
         )  # fmt: skip
-    return [*_stiffness(twin, separate_bending), *_torsion(twin), *_twist(twin), *_flow(twin), *optional]
+    return [
+        *_stiffness(twin, separate_bending),
+        *_torsion(twin),
+        *_twist(twin),
+        *_flow(twin),
+        *_shape(twin, separate_bending),
+        *optional,
+    ]
 
 
 def flow_law(name: str) -> Plasticity:
@@ -145,8 +158,39 @@ def _twist(twin: Twin) -> list[Parameter]:
     known = law.bending_twist_ratio
     return [
         Parameter(TWIST_RATIO, "1", *_TWIST_BOUNDS, (known, 2.5 * known), _set(TWIST_RATIO), "flow", 0.05, prior=known,
-                  least_gain=_TWIST_GAIN)
+                  least_gain=_BENDING_GAIN)
     ]  # fmt: skip
+
+
+def _shape(twin: Twin, separate_bending: bool) -> list[Parameter]:
+    """What makes a sheet bend otherwise than a homogeneous plate of its thickness does, apart from its twist.
+
+    The thickness of a sheet is declared roughly and enters with its cube, and what bends may not be what stretches.
+    """
+    law = twin.law
+    if not isinstance(law, SheetLaw):
+        return []
+    found = [
+        Parameter(BENDING_COUPLING, "1", *_COUPLING_BOUNDS, (law.bending_coupling,), _set(BENDING_COUPLING), "shape",
+                  0.1, "linear", law.bending_coupling, _BENDING_GAIN)
+    ]  # fmt: skip
+    if not separate_bending:
+        ratio = bending_ratio(twin)
+        found.append(
+            Parameter(BENDING_RATIO, "1", *_BENDING_BOUNDS, (ratio,), _bends, "shape", 0.05, prior=ratio,
+                      least_gain=_BENDING_GAIN)
+        )  # fmt: skip
+    return found
+
+
+def bending_ratio(twin: Twin) -> float:
+    """D over K h^2 / 12: bending stiffness of a sheet over that of a homogeneous plate which stretches as it does."""
+    known = twin.parameters
+    return known["bending_n_m"] / (known["membrane_n_m"] * twin.body.thickness_m**2 / 12)
+
+
+def _bends(twin: Twin, ratio: float) -> Twin:
+    return twin.with_parameters(bending_n_m=twin.parameters["bending_n_m"] * ratio / bending_ratio(twin))
 
 
 def _flow(twin: Twin) -> list[Parameter]:
@@ -221,7 +265,7 @@ def _sheet_modulus(thickness: float) -> Callable[[Twin, float], Twin]:
     def apply(twin: Twin, modulus: float) -> Twin:
         nu = twin.parameters["poissons_ratio"]
         membrane = modulus * thickness / (1 - nu**2)
-        return twin.with_parameters(membrane_n_m=membrane, bending_n_m=membrane * thickness**2 / 12)
+        return _bends(twin.with_parameters(membrane_n_m=membrane), bending_ratio(twin))
 
     return apply
 

@@ -31,7 +31,7 @@ from physworld.scene import AS_MEASURED, Scene
 ROD_KINDS = ("rope", "rod")
 SHEET_KINDS = ("sheet", "cloth")
 _ROD_CELLS = 32
-_SHEET_CELLS = 18
+_SHEET_CELLS = 24
 _BOX_KINDS = ("beam", "block")
 _FLAT = 0.08  # a sheet's points lie within this share of its width of their plane (root mean square)
 _TIGHTER = 0.97  # a sheet is turned in its plane if that shrinks its bounding rectangle below this share

@@ -1,11 +1,12 @@
 """Laws of thin sheets, flat at rest: quadratic in the membrane strain and in the change of curvature (Koiter 1966).
 
     W = K/2 [e11^2 + r e22^2 + 2 nu sqrt(r) e11 e22 + 2 (1 - nu) s e12^2]       membrane
-      + D/2 [k11^2 + b k22^2 + 2 nu sqrt(b) k11 k22 + 2 (1 - nu) t k12^2]       bending
+      + D/2 [k11^2 + b k22^2 + 2 nu c sqrt(b) k11 k22 + 2 (1 - nu) t k12^2]     bending
     e_ab = (a_a . a_b - delta_ab) / 2       k_ab = n . x,ab
 
 K = h E / (1 - nu^2) and D are stiffnesses along the first axis (warp); r and b are the ratios of the second (weft) to
-them, s and t the ratios of shear and twist to an isotropic sheet's. An isotropic sheet has all four at 1.
+them, s, t and c the ratios of shear, twist and of the coupling of the two curvatures to an isotropic sheet's. An
+isotropic sheet has all five at 1.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class SheetLaw:
-    """Thin sheet, the same along both axes; isotropic unless its twisting stiffness says otherwise.
+    """Thin sheet, the same along both axes; isotropic unless the shape of its bending energy says otherwise.
 
     Attributes:
         membrane_n_m: K = h E / (1 - nu^2), in-plane stiffness [N/m].
@@ -28,6 +29,8 @@ class SheetLaw:
         density_kg_m2: mass per area.
         bending_twist_ratio: t, twisting stiffness over an isotropic sheet's. A homogeneous plate has 1; a mesh of
             triangles whose edges bend like hinges has about 3.
+        bending_coupling: c, how much a curvature along one axis calls for the opposite one along the other, over an
+            isotropic sheet's; the energy is positive while abs(c nu) is below 1.
     """
 
     name: ClassVar[str] = "isotropic_sheet"
@@ -38,6 +41,7 @@ class SheetLaw:
     relaxation_s: float = 0.0
     density_kg_m2: float = 0.3
     bending_twist_ratio: float = 1.0
+    bending_coupling: float = 1.0
 
     @property
     def membrane_shape(self) -> tuple[float, float, float, float]:
@@ -48,7 +52,7 @@ class SheetLaw:
     def bending_shape(self) -> tuple[float, float, float, float]:
         """The same of the moments, over D."""
         nu = self.poissons_ratio
-        return 1.0, 1.0, nu, (1.0 - nu) * self.bending_twist_ratio
+        return 1.0, 1.0, nu * self.bending_coupling, (1.0 - nu) * self.bending_twist_ratio
 
     @property
     def wave_speed_m_s(self) -> float:
@@ -89,7 +93,8 @@ class OrthotropicSheetLaw(SheetLaw):
     def bending_shape(self) -> tuple[float, float, float, float]:
         """The same of the moments, over D."""
         nu, ratio = self.poissons_ratio, self.bending_weft_ratio
-        return 1.0, ratio, nu * float(np.sqrt(ratio)), (1.0 - nu) * self.bending_twist_ratio
+        coupling = nu * float(np.sqrt(ratio)) * self.bending_coupling
+        return 1.0, ratio, coupling, (1.0 - nu) * self.bending_twist_ratio
 
 
 def sheet_strains(derivatives: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

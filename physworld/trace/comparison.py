@@ -1,8 +1,8 @@
 """Which of several refits predicts best, by blocks of training frames that it was not fitted to.
 
 Leaving a block out moves the optimum little, so the refit without it is the linear one from the optimum's own
-sensitivities; the block's error is measured with that. Differences between models are taken block by block, so what
-all of them suffer from cancels, and their standard error is that of the block means.
+sensitivities, within the bounds of what was fitted; the block's error is measured with that. Differences between models
+are taken block by block, so what all of them suffer from cancels, and their standard error is that of the block means.
 """
 
 from __future__ import annotations
@@ -10,8 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.optimize import lsq_linear
 
 from physworld.trace.refit import Refit, prior_rows
+
+_RIDGE = 1e-9  # of the normal matrix's diagonal
 
 
 @dataclass(frozen=True)
@@ -41,15 +45,28 @@ def cross_validated(fitted: Refit, block_of_row: np.ndarray) -> CrossValidation:
     errors, sizes = [], []
     for k, block in enumerate(blocks):
         rows = block_of_row == block
-        without = all_normal - normal[k]
-        ridge = 1e-9 * np.diag(np.diag(all_normal) + 1e-30)
-        change = np.linalg.solve(without + ridge, all_gradient - gradient[k])
-        low = np.array([u.low for u in fitted.unknowns]) - fitted.theta
-        high = np.array([u.high for u in fitted.unknowns]) - fitted.theta
-        left = fitted.residual[rows] - fitted.jacobian[rows] @ np.clip(change, low, high)
+        ridge = _RIDGE * np.diag(np.diag(all_normal) + 1e-30)
+        change = _within_bounds(all_normal - normal[k] + ridge, all_gradient - gradient[k], fitted)
+        left = fitted.residual[rows] - fitted.jacobian[rows] @ change
         errors.append(float(np.mean(left**2)))
         sizes.append(int(rows.sum()))
     return CrossValidation(np.array(errors), np.array(sizes))
+
+
+def _within_bounds(normal: np.ndarray, gradient: np.ndarray, fitted: Refit) -> np.ndarray:
+    """The step (p,) that minimises d.normal.d / 2 - gradient.d and leaves no unknown outside its bounds.
+
+    A step that is clipped afterwards leaves the others where they made up for what was cut off.
+    """
+    if not len(fitted.unknowns):
+        return np.zeros(0)
+    scale = 1.0 / np.sqrt(np.diag(normal))
+    factor = np.linalg.cholesky(normal * scale * scale[:, None])
+    low = np.array([u.low for u in fitted.unknowns]) - fitted.theta
+    high = np.array([u.high for u in fitted.unknowns]) - fitted.theta
+    bounds = np.minimum(low, 0.0) / scale, np.maximum(high, 0.0) / scale
+    target = solve_triangular(factor, gradient * scale, lower=True)
+    return scale * lsq_linear(factor.T, target, bounds, method="bvls").x
 
 
 def seen_through(residual: np.ndarray, basis: np.ndarray, block_of_row: np.ndarray) -> CrossValidation:

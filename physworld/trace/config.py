@@ -28,7 +28,8 @@ class TraceConfig:
             The method's prototype saw at most 0.01 on bodies without an effect and at least 0.09 with one.
         near_floor: training misfit over the noise up to which a model is complete.
         acceptable: misfit up to which a name is given although something remains, if the effect explains
-            ``most_of_it`` of the misfit above the noise.
+            ``most_of_it`` of the misfit above the noise. Where the declared physics leaves no more than this, no
+            effect is named whose score chance reaches.
         most_of_it: share, see ``acceptable``.
         alike: projected sensitivities that correlate more than this are suspected to be one effect.
         confirmed: candidates that are refitted with the full simulator.

@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from physworld.calibrate import Journal, calibrate
-from physworld.calibrate.parameters import TWIST_RATIO, parameters_of
+from physworld.calibrate.parameters import BENDING_COUPLING, BENDING_RATIO, TWIST_RATIO, parameters_of
 from physworld.grips import softly_held
 from physworld.scene import Scene
 from physworld.trace.candidates import Candidate, candidates
@@ -57,7 +57,7 @@ from physworld.trace.simulations import (
     stable_step_s,
 )
 from physworld.trace.start_pose import turned_starts
-from physworld.trace.unknowns import Unknown, bending_factor, clamp_reach, grip_softness, of_parameter
+from physworld.trace.unknowns import Unknown, clamp_reach, grip_softness, of_parameter
 from physworld.trace.verdict import (
     NOTHING,
     UNEXPLAINED,
@@ -70,6 +70,7 @@ from physworld.twin import Twin
 
 _POISSON_SPREAD = 0.08  # of what is known of a soft solid's Poisson's ratio beforehand
 _TWIST_SPREAD = 0.7  # of the logarithm of a sheet's twisting stiffness over an isotropic one's
+_BENDING_SPREAD = 0.5  # of the logarithm of a sheet's bending stiffness over what its thickness says
 _OTHER_STIFFNESSES = tuple(0.12 * k for k in (-6, -5, -4, -3, -2, -1, 1, 2, 3, 4, 5, 6))
 """Logarithms: a phase that has slipped by a period is a local minimum, so others are looked at before a descent."""
 _OTHER_TWIST = float(np.log(2.0))
@@ -114,7 +115,10 @@ def trace(
     recordings = Recordings(scenes, held_out, config.blocks, config.shortest_block)
     calibrated_runs = 0
     if calibrated_twin is None:
-        fitted = calibrate(recordings.lead.scene, config.calibration, progress, cancelled, journal)
+        declared = replace(
+            config.calibration, bending="declared"
+        )  # fibres would go into a free shape of bending
+        fitted = calibrate(recordings.lead.scene, declared, progress, cancelled, journal)
         calibrated_twin, calibrated_runs = fitted.twin, fitted.simulations
     calibrated_twin = softly_held(calibrated_twin)
     simulations = JointSimulations(
@@ -258,12 +262,15 @@ class _Trace:
             damping=False,
             ground_friction=ground is not None and ground.friction is None,
         )
-        spread = {"poissons_ratio": _POISSON_SPREAD, TWIST_RATIO: _TWIST_SPREAD}
+        spread = {
+            "poissons_ratio": _POISSON_SPREAD,
+            TWIST_RATIO: _TWIST_SPREAD,
+            BENDING_RATIO: _BENDING_SPREAD,
+        }
         softness = grip_softness(twin)
         reach = clamp_reach(twin) if softness is None else None  # a reach within a cell is what softness is
-        bending = None if any(p.name == "bending_n_m" for p in known) else bending_factor(twin)
-        found = [of_parameter(p, twin, spread.get(p.name)) for p in known]
-        return [*found, *(unknown for unknown in (bending, reach, softness) if unknown is not None)]
+        found = [of_parameter(p, twin, spread.get(p.name)) for p in known if p.name != BENDING_COUPLING]
+        return [*found, *(unknown for unknown in (reach, softness) if unknown is not None)]
 
     def _turns(self, tracks: np.ndarray, sigma: float) -> list[np.ndarray]:
         """What the uncertain pose of the start does to the prediction, (frames, N, 3) each."""

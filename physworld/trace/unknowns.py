@@ -7,13 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from physworld.calibrate.parameters import Parameter
+from physworld.calibrate.parameters import BENDING_RATIO, Parameter, bending_ratio
 from physworld.effects.base import Strength
 from physworld.effects.registry import EFFECTS
 from physworld.mpm.soft_grips import AS_HELD
 from physworld.twin import Twin
 
-_BENDING_SPREAD, _BENDING_RANGE = 0.5, 2.0
 CLAMP = "clamp_offset"
 SOFTNESS = "grip_softness"
 _SOFTNESS_SHARES = (0.1, 1.5)  # of ``AS_HELD``: finite elements as large as the grip hold so much harder
@@ -69,6 +68,8 @@ def _value(twin: Twin, parameter: Parameter) -> float:
     known = twin.parameters
     if parameter.name in known:
         return known[parameter.name]
+    if parameter.name == BENDING_RATIO:
+        return bending_ratio(twin)
     if parameter.name == "youngs_modulus_pa":  # of a sheet: what its membrane stiffness says
         thickness = twin.body.thickness_m
         return known["membrane_n_m"] * (1 - known["poissons_ratio"] ** 2) / thickness
@@ -87,34 +88,6 @@ def of_strength(effect: str, strength: Strength, scale: float | None = None, sta
         1.0,
         lambda searched: float(searched * unit),
         lambda twin, searched: with_strengths(twin, effect, {strength.name: float(searched * unit)}),
-    )
-
-
-def bending_factor(twin: Twin) -> Unknown | None:
-    """How much stiffer a sheet bends than its thickness says, as a logarithm; None for other bodies.
-
-    The thickness of a sheet is declared roughly and enters with its cube, and what bends may not be what stretches.
-    """
-    if twin.lattice.dim != 2:
-        return None
-    stretch = twin.parameters["membrane_n_m"] * twin.body.thickness_m**2 / 12.0
-
-    def apply(changed: Twin, searched: float) -> Twin:
-        implied = changed.parameters["membrane_n_m"] * changed.body.thickness_m**2 / 12.0
-        return changed.with_parameters(bending_n_m=implied * float(np.exp(searched)))
-
-    start = float(np.log(twin.parameters["bending_n_m"] / stretch))
-    low, high = -_BENDING_RANGE, _BENDING_RANGE
-    return Unknown(
-        "bending_factor",
-        "1",
-        low,
-        high,
-        start,
-        0.05,
-        lambda s: float(np.exp(s)),
-        apply,
-        (0.0, _BENDING_SPREAD),
     )
 
 

@@ -142,10 +142,10 @@ def claimable(
 ) -> list[Model]:
     """Models that help, also where the solver's own directions are taken out of what they explain.
 
-    Where the declared physics is near the noise already, nothing says that there is anything to explain but the score:
+    Where the declared physics is near the noise already, little says that there is anything to explain but the score:
     there it has to be beyond chance.
     """
-    quiet = declared.fitted.misfit <= config.near_floor
+    quiet = declared.fitted.misfit <= config.acceptable
     return [
         model
         for model in models

@@ -19,12 +19,15 @@ DOUBLE_DIFFERENCE = 2e-6  # central differences of the energy in float64
 SOLID = SolidLaw(9e4, 0.33, density_kg_m3=800.0)
 SHEET = SheetLaw(120.0, 2e-4, 0.3)
 CLOTH = OrthotropicSheetLaw(
-    120.0, 2e-4, 0.2, weft_ratio=0.6, shear_ratio=0.1, bending_weft_ratio=0.5, bending_twist_ratio=0.3
-)
+    120.0, 2e-4, 0.2, weft_ratio=0.6, shear_ratio=0.1, bending_weft_ratio=0.5, bending_twist_ratio=0.3,
+    bending_coupling=-1.4,
+)  # fmt: skip
+HINGED = SheetLaw(120.0, 2e-4, 0.3, bending_twist_ratio=2.9, bending_coupling=-0.5)
 ROD = RodLaw(90.0, 3e-3)
 BODIES = {
     "solid": (box_lattice(np.zeros(3), np.array([0.2, 0.05, 0.04]), (5, 2, 1)), SOLID),
     "sheet": (box_lattice(np.zeros(2), np.array([0.2, 0.15]), (5, 4)), SHEET),
+    "hinged sheet": (box_lattice(np.zeros(2), np.array([0.2, 0.15]), (5, 4)), HINGED),
     "cloth": (box_lattice(np.zeros(2), np.array([0.2, 0.15]), (5, 4)), CLOTH),
     "rod": (box_lattice(np.zeros(1), np.array([0.4]), (9,)), ROD),
 }
@@ -64,14 +67,15 @@ def energy(lattice: Lattice, law: Law, x: np.ndarray) -> float:
         k = [np.sum(normal * at(*o), 1) for o in ((2, 0), (0, 2), (1, 1))]
         nu = law.poissons_ratio
 
-        def form(s: list[np.ndarray], weft: float, shear: float) -> np.ndarray:
-            coupling = 2 * nu * np.sqrt(weft) * s[0] * s[1]
-            return s[0] ** 2 + weft * s[1] ** 2 + coupling + 2 * (1 - nu) * shear * s[2] ** 2
+        def form(s: list[np.ndarray], weft: float, shear: float, coupling: float) -> np.ndarray:
+            both = 2 * nu * coupling * np.sqrt(weft) * s[0] * s[1]
+            return s[0] ** 2 + weft * s[1] ** 2 + both + 2 * (1 - nu) * shear * s[2] ** 2
 
-        ratios = [1.0] * 4
-        if isinstance(law, OrthotropicSheetLaw):
-            ratios = [law.weft_ratio, law.shear_ratio, law.bending_weft_ratio, law.bending_twist_ratio]
-        density = 0.5 * law.membrane_n_m * form(e, *ratios[:2]) + 0.5 * law.bending_n_m * form(k, *ratios[2:])
+        woven = isinstance(law, OrthotropicSheetLaw)
+        stretch = (law.weft_ratio, law.shear_ratio) if woven else (1.0, 1.0)
+        weft = law.bending_weft_ratio if woven else 1.0
+        density = 0.5 * law.membrane_n_m * form(e, *stretch, 1.0)
+        density += 0.5 * law.bending_n_m * form(k, weft, law.bending_twist_ratio, law.bending_coupling)
     else:
         t, c = at(1), at(2)
         length = np.linalg.norm(t, axis=1)

@@ -32,7 +32,14 @@ LAWS: dict[str, Law] = {
     ),
     "isotropic_sheet": SheetLaw(120.0, 2e-2, 0.3, relaxation_s=5e-4),
     "orthotropic_sheet": OrthotropicSheetLaw(
-        120.0, 2e-2, 0.3, relaxation_s=5e-4, weft_ratio=0.6, shear_ratio=0.1, bending_twist_ratio=0.3
+        120.0,
+        2e-2,
+        0.3,
+        relaxation_s=5e-4,
+        weft_ratio=0.6,
+        shear_ratio=0.1,
+        bending_twist_ratio=0.3,
+        bending_coupling=-1.4,
     ),
     "rod": RodLaw(90.0, 3e-3, relaxation_s=5e-4),
 }

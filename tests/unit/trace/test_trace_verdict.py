@@ -124,6 +124,13 @@ def test_near_the_noise_a_score_that_chance_reaches_is_nothing() -> None:
     assert answer([model(NOISE, "drag")], NOISE + 2 * DRAG, chance=lambda m: True) == ("named", ("drag",))
 
 
+def test_a_little_more_than_the_noise_that_chance_explains_is_unexplained() -> None:
+    before = NOISE + 0.85 * DRAG
+    assert CONFIG.near_floor < model(before).fitted.misfit < CONFIG.acceptable
+    assert answer([model(NOISE, "drag")], before) == ("named", ("drag",))
+    assert answer([model(NOISE, "drag")], before, chance=lambda m: True) == ("unexplained", ())
+
+
 def test_a_nearly_complete_pair_is_no_evidence_where_a_nearly_complete_effect_is() -> None:
     before, left = NOISE + 4 * DRAG, NOISE + 0.85 * OTHER
     single, pair = model(left, "drag"), model(left, "drag", "viscosity", unknowns=2)
