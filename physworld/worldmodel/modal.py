@@ -19,6 +19,11 @@ place, large rotations, stretching, contact. The prior is equivariant to transla
 ridges, and whether there is a response at all, are those with the least open-loop error in a cross-validation over
 episodes.
 
+A passive body's motion does not grow of itself, a least-squares map of a few noisy modes may: for some mode an
+eigenvalue lies outside the unit circle, and a session that runs longer than an episode blows up. With A_k the weight
+of a^{t-k}, k = 0 … h, the maps γ^{k+1} A_k have γ times the eigenvalues of the A_k; so every map is shrunk by the
+largest γ ≤ 1 that leaves none outside at any ζ of the episodes, before it is judged.
+
 Legend: T frames, n object vertices, C control vertices, R modes, F regressors, h history. NumPy only.
 """
 
@@ -34,6 +39,7 @@ RIDGES = (1e-5, 1e-4, 1e-3)
 RESPONSE_RIDGES = (1e-4, 1e-2)
 MODE_COUNTS = (6, 12, 24, 48)
 FOLDS = 5  # of the cross-validation that chooses among these
+SOFTNESSES = 5  # values of ζ over the episodes' range at which no motion may grow
 SCALE_FLOOR = 1e-3  # of the largest: a regressor that hardly moves must not get a large weight
 
 
@@ -93,7 +99,7 @@ def fit_prior(
     scale = _scale(seen, size[: len(basis)], history)
     grams = _grams(seen, scale, history)
     choice = _choose(seen, scale, grams, history)
-    weight, response = _regress(grams, scale, choice, len(basis), history)
+    weight, response = _bounded(*_regress(grams, scale, choice, len(basis), history), seen, history)
     kept = basis[: choice.modes].reshape(choice.modes, n, 3)
     return ModalPrior(mean.reshape(n, 3), kept, shape, weight, response)
 
@@ -190,6 +196,32 @@ def _regress(
     return solution[:, :own], response
 
 
+def growth(weight: np.ndarray, response: np.ndarray, zeta: float, history: int) -> float:
+    """Largest factor by which a free motion of the modes grows in a step: the spectral radius at ζ."""
+    count = len(weight)
+    lags = (history + 1) * count
+    companion = np.eye(lags, k=-count)
+    companion[:count] = weight[:, :lags] + zeta * response[:, :lags]
+    return float(np.abs(np.linalg.eigvals(companion)).max())
+
+
+def _bounded(
+    weight: np.ndarray, response: np.ndarray, seen: list[_Seen], history: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """The map shrunk until no free motion grows, see the module's text."""
+    zetas = [0.0, *(s.softness for s in seen)]
+    span = np.linspace(min(zetas), max(zetas), SOFTNESSES) if response.any() else [0.0]
+    most = max(growth(weight, response, float(zeta), history) for zeta in span)
+    if most <= 1.0:
+        return weight, response
+    lags = (history + 1) * len(weight)
+    shrink = np.repeat(most ** -np.arange(1.0, history + 2), len(weight))
+    weight, response = weight.copy(), response.copy()
+    weight[:, :lags] *= shrink
+    response[:, :lags] *= shrink
+    return weight, response
+
+
 def _choose(seen: list[_Seen], scale: np.ndarray, grams: _Grams, history: int) -> _Choice:
     """The choice with the least open-loop error on episodes left out, each once (cross-validation)."""
     modes = seen[0].amplitudes.shape[1]
@@ -207,7 +239,9 @@ def _choose(seen: list[_Seen], scale: np.ndarray, grams: _Grams, history: int) -
 
     def error(choice: _Choice) -> float:
         return sum(
-            _open_loop_error(*_regress(kept, scale, choice, modes, history), judged, history)
+            _open_loop_error(
+                *_bounded(*_regress(kept, scale, choice, modes, history), seen, history), judged, history
+            )
             for kept, judged in splits
         )
 

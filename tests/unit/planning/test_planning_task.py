@@ -37,7 +37,8 @@ def test_the_twin_starts_a_plan_where_the_model_does(task: PlanningTask) -> None
     assert np.linalg.norm(recorded[-1] - task.start_points, axis=1).max() < 5e-4
     apart = np.linalg.norm(executed - predicted, axis=2).mean()
     a_tick_late = np.linalg.norm(executed[1:] - predicted[:-1], axis=2).mean()
-    assert apart < 0.5 * a_tick_late
+    # a start that is a tick off turns the two round; what the tiny model itself errs depends on the processor's algebra
+    assert apart < 0.75 * a_tick_late
 
 
 def test_a_planned_motion_brings_the_twin_nearer_to_the_goal(task: PlanningTask) -> None:
