@@ -9,6 +9,7 @@ from typing import TypeVar
 import httpx
 
 from physworld_client import transport as wire
+from physworld_client.async_live import AsyncLive
 from physworld_client.async_loop import AsyncAssessments, AsyncTraces
 from physworld_client.async_predict import AsyncPlans, AsyncRollouts
 from physworld_client.async_resources import (
@@ -48,6 +49,7 @@ class AsyncClient:
         self.assessments = AsyncAssessments(self)
         self.rollouts = AsyncRollouts(self)
         self.plans = AsyncPlans(self)
+        self.live = AsyncLive(self)
         self.jobs = AsyncJobs(self)
         self.pipelines = AsyncPipelines(self)
         self.artifacts = AsyncArtifacts(self)

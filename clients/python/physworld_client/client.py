@@ -10,6 +10,7 @@ import httpx
 
 from physworld_client import transport as wire
 from physworld_client.calls import Call
+from physworld_client.live import Live
 from physworld_client.loop import Assessments, Traces
 from physworld_client.predict import Plans, Rollouts
 from physworld_client.resources import Artifacts, Datasets, Fits, Jobs, Models, Pipelines, Scenes
@@ -28,8 +29,8 @@ class Client:
         transport: a transport of httpx, for tests or a Unix socket.
 
     Attributes:
-        scenes, fits, traces, datasets, models, assessments, rollouts, plans, jobs, pipelines, artifacts: the
-            resources.
+        scenes, fits, traces, datasets, models, assessments, rollouts, plans, live, jobs, pipelines, artifacts:
+            the resources.
     """
 
     def __init__(
@@ -52,6 +53,7 @@ class Client:
         self.assessments = Assessments(self)
         self.rollouts = Rollouts(self)
         self.plans = Plans(self)
+        self.live = Live(self)
         self.jobs = Jobs(self)
         self.pipelines = Pipelines(self)
         self.artifacts = Artifacts(self)

@@ -16,6 +16,7 @@
     │   └── ServerError             5xx
     ├── JobFailed                   a job waited for has failed; ``.job``, ``.problem``
     ├── JobCancelled                a job waited for was cancelled; ``.job``
+    ├── LiveSessionEnded            a live session is over; ``.code``, ``.reason`` of its WebSocket
     ├── WaitTimedOut                the job goes on, the caller's patience ended; ``.job``
     ├── DigestMismatch              bytes are not those that their SHA-256 promises; nothing was kept
     ├── ExportRefused               episodes cannot be written in that form or to that place: what, and why
@@ -132,6 +133,14 @@ class WaitTimedOut(PhysWorldError):
         self.job = job
         done = f"{job.progress.done:g} of {job.progress.total:g} {job.progress.unit}".strip()
         super().__init__(f"{job.kind} job {job.id} is still {job.state} ({done}) after {timeout_s:g} s")
+
+
+class LiveSessionEnded(PhysWorldError):
+    """A live session is over. ``code`` 1000: the client left; 1013: all sessions are taken; 4408: it was silent."""
+
+    def __init__(self, code: int, reason: str) -> None:
+        self.code, self.reason = code, reason
+        super().__init__(f"the live session has ended ({code}): {reason or 'no reason was given'}")
 
 
 class DigestMismatch(PhysWorldError):

@@ -13,10 +13,12 @@ import pytest
 from physworld_client import (
     AsyncClient,
     Client,
+    async_live,
     async_loop,
     async_predict,
     async_resources,
     errors,
+    live,
     loop,
     predict,
     resources,
@@ -168,7 +170,15 @@ def test_the_asynchronous_resources_have_the_same_names_and_arguments() -> None:
                 found[name.removeprefix("Async")] = methods
         return found
 
+    def called(found: dict[str, dict[str, list[str]]]) -> dict[str, dict[str, list[str]]]:
+        """Without what only one of the two languages of waiting has: ``__iter__``, ``__aiter__``."""
+        return {
+            name: {method: given for method, given in methods.items() if method[0] != "_"}
+            for name, methods in found.items()
+        }
+
     assert public(resources) == public(async_resources)
     assert public(loop) == public(async_loop)
     assert public(predict) == public(async_predict)
+    assert called(public(live)) == called(public(async_live))
     assert list(inspect.signature(Client).parameters) == list(inspect.signature(AsyncClient).parameters)

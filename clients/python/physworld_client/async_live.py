@@ -1,0 +1,124 @@
+"""Live sessions with a published model, asynchronous.
+
+    async with client.live.open("beam") as session:
+        async for frame in session:
+            await session.steer([0.0, 0.0, 0.1])
+
+The classes of ``live`` with the same names and arguments; a test compares them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack, asynccontextmanager
+from typing import Literal
+
+import numpy as np
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
+
+from physworld_client import live_frames
+from physworld_client.async_resources import AsyncResource
+from physworld_client.errors import ConnectionFailed, RequestTimedOut
+from physworld_client.live_frames import LiveFrame, LiveStart
+from physworld_client.resources import LATEST
+from physworld_client.transport import is_loopback
+from schemas.rollout import Part
+
+
+class AsyncLiveSession:
+    """One open session; an iterator over its frames.
+
+    Frames that have arrived wait to be read: read them at the rate at which they come.
+
+    Attributes:
+        start: the body, the grips, the limits.
+    """
+
+    def __init__(self, socket: ClientConnection, start: LiveStart, timeout: float) -> None:
+        self._socket, self._timeout, self._number = socket, timeout, 0
+        self.start = start
+
+    async def steer(self, velocity: np.ndarray) -> int:
+        """Sets velocities [m/s]: (3,) for every grip, (G, 3), or (K, 3) control points; they last 0.3 s.
+
+        Returns:
+            The number that frames bear in ``control`` from now on.
+
+        Raises:
+            ValueError: another shape, or a velocity that is no number.
+            LiveSessionEnded: the session is over.
+        """
+        message = live_frames.write_control(self._number + 1, velocity, self.start)
+        await self._send(message)
+        self._number += 1
+        return self._number
+
+    async def frame(self) -> LiveFrame:
+        """The next frame.
+
+        Raises:
+            LiveSessionEnded: the session is over.
+            RequestTimedOut: none came within the client's timeout.
+        """
+        return live_frames.read_frame(await _received(self._socket, self._timeout), self.start)
+
+    async def reset(self) -> None:
+        """Puts the body back to its start; velocities that were set go on for their 0.3 s."""
+        await self._send(live_frames.RESET)
+
+    async def _send(self, message: bytes | str) -> None:
+        try:
+            await self._socket.send(message)
+        except ConnectionClosed as error:
+            raise live_frames.ended(error) from error
+
+    async def __aiter__(self) -> AsyncIterator[LiveFrame]:
+        while True:
+            yield await self.frame()
+
+
+class AsyncLive(AsyncResource):
+    """Bodies that answer while they are moved."""
+
+    @asynccontextmanager
+    async def open(
+        self, model: str, version: int | str = LATEST, *, frames: int = 1, part: Part = "points"
+    ) -> AsyncIterator[AsyncLiveSession]:
+        """Opens a session, which ends with the ``async with`` block.
+
+        Args:
+            frames: 1 to 4 a tick, interpolated between ticks; the model's clock is near 30 Hz.
+            part: "points" (measured points) or "vertices" (the graph's).
+
+        Raises:
+            NotFound: no such model or version.
+            LiveSessionEnded: all sessions of the service are taken (``code`` 1013).
+            ConnectionFailed: no WebSocket could be opened.
+        """
+        ticket = await self._client.send(live_frames.ticket_create(model, version))
+        where = live_frames.address(self._client.base_url, ticket, frames, part)
+        proxy: Literal[True] | None = None if is_loopback(self._client.base_url) else True
+        async with AsyncExitStack() as stack:
+            try:
+                line = connect(
+                    where, open_timeout=self._client.timeout, max_size=live_frames.MOST_BYTES, proxy=proxy
+                )
+                socket = await stack.enter_async_context(line)
+            except (OSError, InvalidHandshake, TimeoutError) as error:
+                raise ConnectionFailed(
+                    f"no live session at {self._client.base_url}: {str(error) or type(error).__name__}"
+                ) from error
+            start = live_frames.read_start(await _received(socket, self._client.timeout))
+            yield AsyncLiveSession(socket, start, self._client.timeout)
+
+
+async def _received(socket: ClientConnection, timeout: float) -> bytes | str:
+    try:
+        async with asyncio.timeout(timeout):
+            return await socket.recv()
+    except ConnectionClosed as error:
+        raise live_frames.ended(error) from error
+    except TimeoutError as error:
+        raise RequestTimedOut(f"a live session sent nothing within {timeout:g} s") from error
