@@ -99,7 +99,7 @@ def test_what_cannot_be_opened_is_a_typed_error(
         assert refused.value.code == 1013
     elsewhere = served.url.replace("http", "ws") + "/no"
     monkeypatch.setattr("physworld_client.live.live_frames.address", lambda *_: elsewhere)
-    with pytest.raises(ConnectionFailed, match="no live session at http://127.*rejected"):
+    with pytest.raises(ConnectionFailed, match=r"no live session at http://127.*rejected"):
         opened(client.live.open(served.model))
 
 
