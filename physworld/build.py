@@ -37,7 +37,8 @@ def build_twin(
 
     Args:
         scene: the recording.
-        particle_budget: about how many particles a solid gets; rods and sheets take what their shape needs.
+        particle_budget: about how many particles a solid gets, see :func:`physworld.geometry.reference.reference_body`
+            for sheets and rods.
         device: Warp device of the simulations.
         refinement: cells are this many times smaller along every axis, whatever the body.
         plasticity: flow law, or None.

@@ -45,9 +45,9 @@ class ClampOffset(Effect):
 
     @classmethod
     def strengths(cls, twin: Twin) -> tuple[Strength, ...]:
-        """Two cells either way, a fifth of the body at most; angles up to 0.2 rad."""
+        """Two cells or the thickness either way, a fifth of the body at most; angles up to 0.2 rad."""
         cell = float(twin.lattice.spacing.max())
-        most = min(2.0 * cell, 0.2 * body_size(twin))
+        most = min(max(2.0 * cell, 2.0 * twin.body.half_thickness_m), 0.2 * body_size(twin))
         return (
             Strength("reach_m", "m", -most, most, 0.25 * min(cell, most)),
             *(Strength(f"angle_{axis}_rad", "rad", -0.2, 0.2, 0.005) for axis in "xyz"),

@@ -31,7 +31,8 @@ from physworld.scene import AS_MEASURED, Scene
 ROD_KINDS = ("rope", "rod")
 SHEET_KINDS = ("sheet", "cloth")
 _ROD_CELLS = 32
-_SHEET_CELLS = 24
+_SHEET_CELLS, _SHEET_BUDGET = 24, 2000  # along the longer side at that budget, as its square root
+_FEWEST_SHEET_CELLS = 12
 _BOX_KINDS = ("beam", "block")
 _FLAT = 0.08  # a sheet's points lie within this share of its width of their plane (root mean square)
 _TIGHTER = 0.97  # a sheet is turned in its plane if that shrinks its bounding rectangle below this share
@@ -77,7 +78,8 @@ def reference_body(scene: Scene, particle_budget: int, refinement: float = 1.0) 
 
     Args:
         scene: the recording.
-        particle_budget: about how many particles a solid gets.
+        particle_budget: about how many particles a solid gets; the cells of a sheet's longer side go by its square
+            root, 24 at 2000 and at least 12. Rods have 32 cells.
         refinement: cells are this many times smaller along every axis, whatever the body.
 
     Raises:
@@ -91,7 +93,7 @@ def reference_body(scene: Scene, particle_budget: int, refinement: float = 1.0) 
     if scene.kind in ROD_KINDS:
         return _rod(scene, refinement)
     if scene.kind in SHEET_KINDS:
-        sheet = _sheet(scene, refinement)
+        sheet = _sheet(scene, particle_budget, refinement)
         if sheet is not None:
             return sheet
     if scene.kind == "branched_rope":
@@ -346,7 +348,7 @@ def _tightest_turn(plane: np.ndarray) -> np.ndarray:
     return turns[np.argmin(areas)] if areas.min() < _TIGHTER * areas[0] else np.eye(2)
 
 
-def _sheet(scene: Scene, refinement: float) -> ReferenceBody | None:
+def _sheet(scene: Scene, particle_budget: int, refinement: float) -> ReferenceBody | None:
     points = _first_points(scene)
     notes: list[str] = []
     thickness = scene.body.thickness_m
@@ -370,7 +372,8 @@ def _sheet(scene: Scene, refinement: float) -> ReferenceBody | None:
             return None
         material = ((points - origin) @ axes.T)[:, :2]
         flat_map = (origin, axes)
-    cell = max(float(size.max()) / (refinement * _SHEET_CELLS), 1e-4)
+    along = max(_SHEET_CELLS * np.sqrt(particle_budget / _SHEET_BUDGET), _FEWEST_SHEET_CELLS)
+    cell = max(float(size.max()) / (refinement * along), 1e-4)
     lattice = sheet_lattice(size, cell, grips_in_plane(scene, flat_map))
     rest = np.zeros((len(lattice.nodes), 3))
     rest[:, :2] = lattice.node_coordinates

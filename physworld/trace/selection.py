@@ -6,15 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from physworld.trace.comparison import alikeness
+from physworld.trace.comparison import alikeness, cross_validated
 from physworld.trace.config import TraceConfig
 from physworld.trace.confirm import Confirmation, Model, best_variants
+from physworld.trace.plates import as_a_plate
 from physworld.trace.result import Step
 from physworld.trace.score import Score, Scores, orthonormal, project, scores
 from physworld.trace.sensitivity import Response, candidate_responses, decoys
 from physworld.trace.simulations import Simulations
 from physworld.trace.valleys import with_valleys
-from physworld.trace.verdict import helps, simplest
+from physworld.trace.verdict import as_good, helps, simplest
 from physworld.trace.whitening import Whitener
 
 _OUTDONE = 0.5  # share of what a complete model's effect explains that a rival must explain to be refitted
@@ -61,6 +62,7 @@ class Selection:
                 tried = with_valleys(confirmation, base, ranked, columns, tried, config.near_floor)
             tried = self._again(confirmation, base, tried, ranked)
             tried = self._alike(confirmation, base, self._held_otherwise(confirmation, tried), columns)
+            tried = self._as_plates(base, tried)
             good = [m for m in tried if helps(m, base, config)]
             kept = simplest(good, base) if good else None
             path.append(Step(base, ranked, tuple(tried), kept))
@@ -123,6 +125,22 @@ class Selection:
         self.simulations.stage = "refit of the grips"
         least = min((model.explained for model in tried), default=0.0)
         return [confirmation.held_otherwise(m) if m.explained <= _NEAR * least else m for m in tried]
+
+    def _as_plates(self, base: Model, tried: list[Model]) -> list[Model]:
+        """Models of sheets, those that are near the best without numbers of their own for bending where that does."""
+        self.simulations.stage = "refit as a plate"
+        least = min((model.explained for model in tried), default=0.0)
+        found = []
+        for model in tried:
+            if model.explained <= _NEAR * least:
+                fitted = as_a_plate(
+                    model.fitted, self.simulations, self.white, self.frames, self.config.iterations
+                )
+                if fitted is not None:
+                    plate = Model(model.members, fitted, cross_validated(fitted, self.block_of_row))
+                    model = plate if as_good(plate, model, base) else model
+            found.append(model)
+        return found
 
     def _alike(
         self, confirmation: Confirmation, base: Model, tried: list[Model], columns: dict[str, np.ndarray]

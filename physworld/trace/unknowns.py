@@ -92,11 +92,14 @@ def of_strength(effect: str, strength: Strength, scale: float | None = None, sta
 
 
 def clamp_reach(twin: Twin) -> Unknown | None:
-    """How far the clamps hold, within a cell: no lattice knows it better, so it is calibrated. None without one."""
+    """How far the clamps hold, within a cell: no lattice knows it better, so it is calibrated. None without one.
+
+    Within its thickness for a body thicker than its cells: what it does next to a clamp no plate and no rod does.
+    """
     clamp = EFFECTS[CLAMP]
     if clamp.refuses(twin) is not None:
         return None
-    cell = float(twin.lattice.spacing.max())
+    cell = max(float(twin.lattice.spacing.max()), 2.0 * twin.body.half_thickness_m)
     reach = next(s for s in clamp.strengths(twin) if s.name == "reach_m")
     known = replace(reach, low=max(reach.low, -cell), high=min(reach.high, cell))
     unknown = of_strength(CLAMP, known, _CLAMP_STEP * cell)
