@@ -1,6 +1,6 @@
-"""The message sum of one layer: what every vertex hears along its edges, differentiable.
+"""The mean message of one layer: what every vertex hears along its edges, differentiable.
 
-    out_{k,i} = Σ_{e of kind k into i} relu(heard_{k,i} + sent_{k,s(e)} + bias_e + length_e · weight_k)
+    out_{k,i} = mean_{e of kind k into i} relu(heard_{k,i} + sent_{k,s(e)} + bias_e + length_e · weight_k)
 
 Shapes: heard, sent, out (K, V, B, H); bias (E, H); length (E, B); weight (K, H), for K kinds.
 On a CPU in single precision the native rows of ``message_kernels`` do it, elsewhere and in double precision
@@ -51,16 +51,16 @@ class EdgeList:
         )
 
 
-def sum_messages(
+def mean_messages(
     edges: EdgeList, heard: Tensor, sent: Tensor, bias: Tensor, length: Tensor, weight: Tensor
 ) -> Tensor:
-    """Summed messages of every vertex, by kind, (K, V, B, H)."""
+    """Mean messages of every vertex, by kind, (K, V, B, H); 0 where it has no edge of that kind."""
     if heard.device.type == "cpu" and heard.dtype == torch.float32:
-        return _NativeSum.apply(edges, heard, sent, bias, length, weight)
-    return sum_messages_torch(edges, heard, sent, bias, length, weight)
+        return _NativeMean.apply(edges, heard, sent, bias, length, weight)
+    return mean_messages_torch(edges, heard, sent, bias, length, weight)
 
 
-def sum_messages_torch(
+def mean_messages_torch(
     edges: EdgeList, heard: Tensor, sent: Tensor, bias: Tensor, length: Tensor, weight: Tensor
 ) -> Tensor:
     """The same in plain torch, on any device and in any precision."""
@@ -68,10 +68,11 @@ def sum_messages_torch(
     weights = weight[edges.receivers // heard.shape[1]]
     messages = torch.relu(along + bias[:, None] + length[..., None] * weights[:, None])
     total = torch.zeros_like(heard).flatten(0, 1).index_add(0, edges.receivers, messages)
-    return total.view_as(heard)
+    degree = torch.bincount(edges.receivers, minlength=len(total)).clamp(min=1)
+    return (total / degree[:, None, None]).view_as(heard)
 
 
-class _NativeSum(torch.autograd.Function):
+class _NativeMean(torch.autograd.Function):
     """Warp rows, forward and adjoint; keeps the inputs only."""
 
     @staticmethod
@@ -82,15 +83,34 @@ class _NativeSum(torch.autograd.Function):
         ctx.edges = edges
         ctx.save_for_backward(*inputs)
         out = torch.empty_like(inputs[0])
-        _launch("message_sum", edges, (*inputs, out), out.shape)
+        _launch("message_mean", edges, (*inputs, out), out.shape)
         return out
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         inputs = ctx.saved_tensors
-        grads = tuple(torch.zeros_like(x) for x in inputs)
-        _launch("message_sum_adjoint", ctx.edges, (*inputs, grad.contiguous(), *grads), grad.shape)
+        grads = (torch.empty_like(inputs[0]), *(torch.zeros_like(x) for x in inputs[1:]))
+        _launch("message_mean_adjoint", ctx.edges, (*inputs, grad.contiguous(), *grads), grad.shape)
         return (None, *grads)
+
+
+class _AsSeen(torch.autograd.Function):
+    """``heard - placed`` and ``sent + placed``, (K, V, B, H), of heard and sent (V, B, H)."""
+
+    @staticmethod
+    def forward(ctx: Any, heard: Tensor, sent: Tensor, placed: Tensor) -> tuple[Tensor, Tensor]:
+        return heard - placed, sent + placed
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        heard, sent = grads
+        return heard.sum(0), sent.sum(0), sent - heard  # autograd's own way takes a pass more
+
+
+def as_seen(heard: Tensor, sent: Tensor, placed: Tensor) -> tuple[Tensor, Tensor]:
+    """What is heard and sent (V, B, H) with the places of both ends (K, V, B, H), of which the difference counts."""
+    seen: tuple[Tensor, Tensor] = _AsSeen.apply(heard, sent, placed)
+    return seen
 
 
 def _launch(name: str, edges: EdgeList, tensors: tuple[Tensor, ...], shape: torch.Size) -> None:

@@ -90,7 +90,7 @@ from physworld.worldmodel.chain import ChainPrior
 from physworld.worldmodel.chain_step import ChainStep
 from physworld.worldmodel.config import WorldModelConfig
 from physworld.worldmodel.graph import EDGE_KINDS, GraphSpec
-from physworld.worldmodel.messages import EdgeList, sum_messages
+from physworld.worldmodel.messages import EdgeList, as_seen, mean_messages
 from physworld.worldmodel.modal import ModalPrior, rigid_prior
 
 PROPERTY_COUNT = 2
@@ -203,11 +203,11 @@ class WorldModel(nn.Module):
         state = self.encoder(features)
         for layer in range(self.config.message_passing_steps):
             placed = torch.bmm(places, constants.position[layer]).unflatten(1, window.shape[1:3])
-            heard, sent = self.receive[layer](state) - placed, self.send[layer](state) + placed
-            total = sum_messages(
+            heard, sent = as_seen(self.receive[layer](state), self.send[layer](state), placed)
+            mean = mean_messages(
                 self.edges, heard, sent, constants.bias[layer], length, constants.length[layer]
             )
-            inner = self.update_in[layer](torch.cat([state, *(total * self._share).unbind(0)], dim=-1))
+            inner = self.update_in[layer](torch.cat([state, *mean.unbind(0)], dim=-1))
             state = state + self.update_out[layer](torch.relu(inner))
         return self.decoder(state[:n]) + self.skip(features[:n])
 

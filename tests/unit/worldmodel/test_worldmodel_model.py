@@ -11,7 +11,7 @@ from held_bar import SMALL, graph
 
 from physworld.worldmodel.engine import RolloutEngine
 from physworld.worldmodel.graph import EDGE_KINDS, GraphSpec
-from physworld.worldmodel.messages import EdgeList, sum_messages, sum_messages_torch
+from physworld.worldmodel.messages import EdgeList, mean_messages, mean_messages_torch
 from physworld.worldmodel.modal import rigid_prior
 from physworld.worldmodel.model import Normalisation, WorldModel
 from physworld.worldmodel.naive import NaiveWorldModel
@@ -152,8 +152,8 @@ def test_the_native_rollout_is_that_of_torch(hidden: int, ground: float | None) 
     assert native == pytest.approx(expected, abs=1e-5)
 
 
-@pytest.mark.parametrize("hidden", [16, 40, 7])
-def test_native_message_sums_are_those_of_torch(hidden: int) -> None:
+@pytest.mark.parametrize("hidden", [16, 40, 7, 64, 90])
+def test_native_mean_messages_are_those_of_torch(hidden: int) -> None:
     generator = torch.Generator().manual_seed(2)
     spec = graph()
     edges = EdgeList.from_neighbours(spec.neighbours, spec.edge_kind, EDGE_KINDS)
@@ -170,7 +170,7 @@ def test_native_message_sums_are_those_of_torch(hidden: int) -> None:
         normal(EDGE_KINDS, hidden),
     )
     slope = torch.randn(inputs[0].shape, generator=generator)
-    native, plain = sum_messages(edges, *inputs), sum_messages_torch(edges, *inputs)
+    native, plain = mean_messages(edges, *inputs), mean_messages_torch(edges, *inputs)
     assert torch.allclose(native, plain, atol=1e-5)
     for a, b in zip(
         torch.autograd.grad(native, inputs, slope), torch.autograd.grad(plain, inputs, slope), strict=True
@@ -182,6 +182,6 @@ def test_a_vertex_that_nobody_speaks_to_hears_nothing() -> None:
     neighbours = np.array([[2, 2], [0, 2]])
     edges = EdgeList.from_neighbours(neighbours, np.zeros_like(neighbours), 1)
     one = torch.ones((1, 2, 1, 16))
-    heard = sum_messages(edges, one, one, torch.zeros(1, 16), torch.zeros(1, 1), torch.zeros(1, 16))
+    heard = mean_messages(edges, one, one, torch.zeros(1, 16), torch.zeros(1, 1), torch.zeros(1, 16))
     assert heard[0, 0].abs().max() == 0.0
     assert torch.equal(heard[0, 1], 2.0 * one[0, 1])
