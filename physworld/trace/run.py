@@ -115,9 +115,8 @@ def trace(
     recordings = Recordings(scenes, held_out, config.blocks, config.shortest_block)
     calibrated_runs = 0
     if calibrated_twin is None:
-        declared = replace(
-            config.calibration, bending="declared"
-        )  # fibres would go into a free shape of bending
+        # fibres would go into a free shape of bending
+        declared = replace(config.calibration, bending="declared")
         fitted = calibrate(recordings.lead.scene, declared, progress, cancelled, journal)
         calibrated_twin, calibrated_runs = fitted.twin, fitted.simulations
     calibrated_twin = softly_held(calibrated_twin)

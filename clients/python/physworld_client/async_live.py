@@ -14,7 +14,7 @@ from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 from typing import Literal
 
-import numpy as np
+from numpy.typing import ArrayLike
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
@@ -40,7 +40,7 @@ class AsyncLiveSession:
         self._socket, self._timeout, self._number = socket, timeout, 0
         self.start = start
 
-    async def steer(self, velocity: np.ndarray) -> int:
+    async def steer(self, velocity: ArrayLike) -> int:
         """Sets velocities [m/s]: (3,) for every grip, (G, 3), or (K, 3) control points; they last 0.3 s.
 
         Returns:

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Literal
 
-import numpy as np
+from numpy.typing import ArrayLike
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.sync.client import ClientConnection, connect
 
@@ -39,7 +39,7 @@ class LiveSession:
         self._socket, self._timeout, self._number = socket, timeout, 0
         self.start = start
 
-    def steer(self, velocity: np.ndarray) -> int:
+    def steer(self, velocity: ArrayLike) -> int:
         """Sets velocities [m/s]: (3,) for every grip, (G, 3), or (K, 3) control points; they last 0.3 s.
 
         Returns:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from urllib.parse import urlencode
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import TypeAdapter
 from websockets.exceptions import ConnectionClosed
 
@@ -106,7 +107,7 @@ def read_frame(message: bytes | str, start: LiveStart) -> LiveFrame:
     return LiveFrame(tick, control, time_s, bool(flags & _SET_BACK), points, controllers)
 
 
-def write_control(number: int, velocity: np.ndarray, start: LiveStart) -> bytes:
+def write_control(number: int, velocity: ArrayLike, start: LiveStart) -> bytes:
     """The message that steers. ``velocity`` [m/s]: (3,) for every grip, (G, 3), or (K, 3).
 
     Raises:

@@ -12,7 +12,7 @@ OMEGA = 0.4  # radians a step
 
 
 def episodes(factor: float, noise_m: float = 0.0) -> list[np.ndarray]:
-    """Tracks (T, 5, 3): four vertices in a row swing about a resting grip with ``factor`` per step, at three phases."""
+    """Tracks (T, 5, 3): four vertices in a row swing about a resting grip with ``factor`` per step, at five phases."""
     rng = np.random.default_rng(0)
     t = np.arange(FRAMES)
     rest = np.concatenate([np.linspace(0.05, 0.2, VERTICES), [0.0]])[:, None] * np.array([1.0, 0.0, 0.0])
