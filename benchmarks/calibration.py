@@ -2,6 +2,7 @@
 
 Every part is one table of ``docs/calibration.md`` (``--docs`` replaces it there); ``--only NAME ...`` runs some of
 them. Parts that need the recordings beside the repository are left out, and said so, where these are absent.
+With ``--resume DIR`` the fits of recordings keep their finished steps there, and a run that was ended goes on.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from benchmarks import calibration_known, calibration_measured, calibration_shee
 from benchmarks.harness import Report
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
-PARTS: dict[str, Callable[[int, Path], Report]] = {
+PARTS: dict[str, Callable[..., Report]] = {
     "recovery": calibration_known.recovery,
     "coverage": calibration_known.coverage,
     "identifiability": calibration_known.identifiability,
@@ -39,6 +40,7 @@ def main() -> int:
     parser.add_argument("--docs", type=Path, default=None, help="Markdown file whose tables are replaced")
     parser.add_argument("--only", nargs="*", choices=sorted(PARTS), default=list(PARTS))
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--resume", type=Path, default=None, help="folder of the fits' finished steps")
     given = parser.parse_args()
     wp.config.quiet = True
     figures: dict[str, object] = {}
@@ -47,7 +49,8 @@ def main() -> int:
             print(f"{name}: left out, the recordings are not at {SHARED}", file=sys.stderr)
             continue
         begun = time.perf_counter()
-        report = PARTS[name](given.seed, SHARED)
+        measured = {"resume": given.resume} if name in NEEDS_RECORDINGS else {}
+        report = PARTS[name](given.seed, SHARED, **measured)
         print(report.markdown(), flush=True)
         figures[name] = {**report.figures, "seconds": time.perf_counter() - begun, "machine": report.machine}
         if given.json is not None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,13 +13,13 @@ import numpy as np
 from benchmarks.calibration_known import MODULUS, kilo, searched_words, with_interval
 from benchmarks.harness import Report
 from physworld.build import build_twin
-from physworld.calibrate import CalibrationConfig, calibrate
+from physworld.calibrate import CalibrationConfig, FitResult, Journal, calibrate
 from physworld.calibrate.discretisation import converged_parameters
 from physworld.evaluate.metrics import track_error
 from physworld.evaluate.numerics import dominant_frequency
 from physworld.evaluate.table import held_out_table
 from physworld.scene import Scene
-from storage.scene_bundle import read_bundle
+from storage.scene_bundle import canonical_archive, read_bundle
 
 CLEAN = ("d02", "d07")
 SOURCE_PA = 263824.0
@@ -29,14 +31,14 @@ THIN = (
 BASELINES = ("static", "rigid_follow", "constant_velocity")
 
 
-def undeclared(seed: int, shared: Path) -> Report:
+def undeclared(seed: int, shared: Path, resume: Path | None = None) -> Report:
     """Scenes of independent engines in which nothing is hidden."""
     figures, rows = {}, []
     config = CalibrationConfig()
     for name in CLEAN:
         scene = read_bundle(shared / "undeclared" / name)
         truth = json.loads((shared / "undeclared" / name / "truth.json").read_text())
-        fitted = calibrate(scene, config)
+        fitted = fit(scene, config, resume)
         estimate = fitted.parameters[MODULUS]
         # stiffness over density shows: the truth at the declared density
         true_pa = truth["young"] * scene.body.density_kg_m3 / truth["density"]
@@ -83,11 +85,11 @@ def undeclared(seed: int, shared: Path) -> Report:
     )
 
 
-def beam(seed: int, shared: Path) -> Report:
+def beam(seed: int, shared: Path, resume: Path | None = None) -> Report:
     """A real silicone beam: fitted to one recording, predicted in two others, one of them with a declared load."""
     config = CalibrationConfig()
     first = read_bundle(shared / "real" / "beam_free_a")
-    fitted = calibrate(first, config)
+    fitted = fit(first, config, resume)
     converged = converged_parameters(first, fitted, config.particle_budget)[MODULUS]
     estimate = fitted.parameters[MODULUS]
     figures = {
@@ -147,12 +149,13 @@ def beam(seed: int, shared: Path) -> Report:
     )
 
 
-def ropes_and_cloths(seed: int, shared: Path) -> Report:
+def ropes_and_cloths(seed: int, shared: Path, resume: Path | None = None) -> Report:
     """Held-out errors of thin bodies against all baselines."""
     figures, rows = {}, []
     for name in THIN:
         scene = read_bundle(shared / "real" / name)
-        fitted = calibrate(scene)
+        fitted = fit(scene, CalibrationConfig(), resume)
+        print(f"{name}: {fitted.simulations} simulations, {fitted.seconds:.0f} s", file=sys.stderr, flush=True)
         table = held_out_table(scene, {"twin": fitted.tracks})
         figures[name] = {
             key: table[key] for key in ("track_m", "chamfer_phystwin_m", "chamfer_l2_m", "noise_floor_m")
@@ -176,6 +179,17 @@ def ropes_and_cloths(seed: int, shared: Path) -> Report:
         notes=["Track error in mm, open loop from the first frame, on the last 30 % of the frames."],
         seed=seed,
     )  # fmt: skip
+
+
+def fit(scene: Scene, config: CalibrationConfig, resume: Path | None) -> FitResult:
+    """The calibration, its finished steps read from and kept in ``resume``."""
+    if resume is None:
+        return calibrate(scene, config)
+    resume.mkdir(parents=True, exist_ok=True)
+    path = resume / f"{scene.name}.json"
+    stored = path.read_text() if path.exists() else None
+    key = f"{hashlib.sha256(canonical_archive(scene)).hexdigest()} {config}"
+    return calibrate(scene, config, journal=Journal(key, stored, path.write_text))
 
 
 def rms(tracks: np.ndarray, scene: Scene, frames: tuple[int, int]) -> float:
