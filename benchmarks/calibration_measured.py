@@ -155,7 +155,9 @@ def ropes_and_cloths(seed: int, shared: Path, resume: Path | None = None) -> Rep
     for name in THIN:
         scene = read_bundle(shared / "real" / name)
         fitted = fit(scene, CalibrationConfig(), resume)
-        print(f"{name}: {fitted.simulations} simulations, {fitted.seconds:.0f} s", file=sys.stderr, flush=True)
+        print(
+            f"{name}: {fitted.simulations} simulations, {fitted.seconds:.0f} s", file=sys.stderr, flush=True
+        )
         table = held_out_table(scene, {"twin": fitted.tracks})
         figures[name] = {
             key: table[key] for key in ("track_m", "chamfer_phystwin_m", "chamfer_l2_m", "noise_floor_m")

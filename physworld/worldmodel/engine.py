@@ -50,6 +50,8 @@ class RolloutEngine:
                 "prior_weight": _floats(model.prior.weight),
                 "prior_response": _floats(model.prior.response),
             }
+        self._placing = None if chain is not None else model.prior.placing.numpy().astype(np.float64)
+        self._span = (0.0, 0.0) if chain is not None else tuple(model.prior.span.tolist())
         self._property_scale = norm.properties.numpy()
         change, velocity, length = (float(x) for x in (norm.change, norm.velocity, norm.length))
         self._scalars = np.array([1.0 / velocity, change, 1.0 / length], dtype=np.float32)
@@ -93,7 +95,7 @@ class RolloutEngine:
         shared = np.broadcast_to(np.asarray(phi, dtype=np.float64), (candidates, n, 2))
         scaled = np.ascontiguousarray(shared / self._property_scale, dtype=np.float32)
         logs = np.ascontiguousarray(shared, dtype=np.float32)
-        soft = (shared[..., 0] - shared[..., 1]).mean(axis=1).astype(np.float32)
+        soft = self._softness(shared).astype(np.float32)
         bounds = np.linspace(0, candidates, min(threads, candidates) + 1).astype(int)
         parts = [slice(a, b) for a, b in pairwise(bounds) if b > a]
         launches = [(path[part], scaled[part], soft[part], logs[part]) for part in parts]
@@ -106,6 +108,12 @@ class RolloutEngine:
             for done in [pool.submit(self._launch, *launch) for launch in launches]:
                 done.result()
         return path
+
+    def _softness(self, phi: np.ndarray) -> np.ndarray:
+        """ζ of the modal prior from Φ (B, n, 2), (B,); 0 where there is a chain."""
+        if self._placing is None:
+            return np.zeros(len(phi))
+        return np.clip(np.tensordot(phi, self._placing, axes=2), *self._span)
 
     def _launch(self, path: np.ndarray, phi: np.ndarray, soft: np.ndarray, logs: np.ndarray) -> None:
         """Fill in ``path`` (B, T, V, 3) in place; the arrays are contiguous float32."""

@@ -161,9 +161,11 @@ _ROLLOUT = (
                     float a = 0.0f;
                     for (int k = 0; k < f; ++k) a += prior_weight[(long long)m * f + k] * regressors[k];
                     const int lagged = (history + 1) * R;
-                    const float* answer = prior_response + (long long)m * (lagged + 1);
-                    for (int k = 0; k < lagged; ++k) a += softness * answer[k] * regressors[k];
-                    a += softness * answer[lagged];
+                    const float* once = prior_response + (long long)m * (lagged + 1);
+                    const float* twice = once + (long long)R * (lagged + 1);
+                    float answer = once[lagged] + softness * twice[lagged];
+                    for (int k = 0; k < lagged; ++k) answer += (once[k] + softness * twice[k]) * regressors[k];
+                    a += softness * answer;
                     for (int i = 0; i < 3 * N; ++i) ahead[i] += a * basis[(long long)m * N * 3 + i];
                 }
             }

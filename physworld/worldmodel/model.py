@@ -43,7 +43,8 @@ where s = t+1 takes c^{t+1}.
     d^s = c^s - c̄^s - prior.shape                                  (C, 3), s = t+1, t … t-h
     e^s = c̄^s - c̄^t                                                (3,), s = t+1, t-1 … t-h
     a^{t+1} = prior.weight [a^t … a^{t-h}, d^{t+1}, d^t … d^{t-h}, e^{t+1}, e^{t-1} … e^{t-h}, 1]
-            + ζ prior.response [a^t … a^{t-h}, 1],   ζ = mean_i (φ_i0 - φ_i1)
+            + ζ prior.response[0] [a^t … a^{t-h}, 1] + ζ² prior.response[1] [a^t … a^{t-h}, 1]
+    ζ = Σ_i prior.placing_i · φ_i, cut to prior.span
     x̂_i^{t+1} = c̄^{t+1} + prior.mean_i + Σ_r a_r^{t+1} prior.basis[r, i]
 
 **Chain prior**, of ropes, in place of the modal one: ``physworld.worldmodel.chain`` has its equations; its tensors are
@@ -58,7 +59,7 @@ where s = t+1 takes c^{t+1}.
     norm.velocity, norm.change, norm.length (1,), norm.relative, norm.strain, norm.stretch (3,),
     norm.properties (2,);
     prior.mean (n, 3), prior.basis (R, n, 3), prior.shape (C, 3), prior.weight (R, F) with
-    F = (h+1) R + (h+2) 3C + (h+1) 3 + 1, prior.response (R, (h+1) R + 1);
+    F = (h+1) R + (h+2) 3C + (h+1) 3 + 1, prior.response (2, R, (h+1) R + 1), prior.placing (n, 2), prior.span (2,);
     graph.neighbours (V, D) int64, V where the slot is empty; graph.edge_kind (V, D) int64;
     graph.rest_relative (V, D, 3).
 
@@ -287,7 +288,7 @@ class PriorStep(nn.Module):
     def __init__(self, prior: ModalPrior, history: int) -> None:
         super().__init__()
         self.history = history
-        for name in ("mean", "basis", "shape", "weight", "response"):
+        for name in ModalPrior.__dataclass_fields__:
             self.register_buffer(name, _single(getattr(prior, name)))
 
     def forward(self, window: Tensor, control_next: Tensor, phi: Tensor) -> Tensor:
@@ -308,10 +309,12 @@ class PriorStep(nn.Module):
             ],
             dim=1,
         )
-        lagged = regressors[:, : self.response.shape[1] - 1]
-        answer = lagged @ self.response[:, :-1].T + self.response[:, -1]
-        softness = (phi[..., 0] - phi[..., 1]).mean(dim=0)
-        ahead = torch.tensordot(regressors @ self.weight.T + softness[:, None] * answer, self.basis, dims=1)
+        lagged = regressors[:, : self.response.shape[2] - 1]
+        first, second = (lagged @ part[:, :-1].T + part[:, -1] for part in self.response)
+        softness = (phi[..., :2] * self.placing[:, None]).sum(dim=(0, 2))
+        softness = torch.minimum(torch.maximum(softness, self.span[0]), self.span[1])[:, None]
+        next_amplitudes = regressors @ self.weight.T + softness * (first + softness * second)
+        ahead = torch.tensordot(next_amplitudes, self.basis, dims=1)
         return ahead.transpose(0, 1) + self.mean[:, None] + centre[0]
 
     def residual(self, positions: Tensor, phi: Tensor) -> Tensor:

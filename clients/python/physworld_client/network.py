@@ -92,9 +92,10 @@ class Network:
         weight = self._tensor("prior.weight").astype(np.float64)
         if weight.shape != (len(basis), len(regressors)):
             raise ModelUnreadable(f"prior.weight is {weight.shape}, not {(len(basis), len(regressors))}")
-        response = self._tensor("prior.response").astype(np.float64)
-        softness = float(np.mean(phi[:, 0] - phi[:, 1]))
-        next_amplitudes = weight @ regressors + softness * (response @ np.append(amplitudes.ravel(), 1.0))
+        answers = self._tensor("prior.response").astype(np.float64) @ np.append(amplitudes.ravel(), 1.0)
+        placed = float(np.sum(self._tensor("prior.placing") * phi))
+        softness = float(np.clip(placed, *self._tensor("prior.span")))
+        next_amplitudes = weight @ regressors + softness * (answers[0] + softness * answers[1])
         return np.asarray(centre[0] + mean + np.tensordot(next_amplitudes, basis, axes=1))
 
     def _sort_edges(self, vertex_count: int) -> None:

@@ -29,6 +29,7 @@ def published(*, trained: bool = True, ground: float | None = None) -> Published
             for parameter in (model.skip.weight, model.decoder.out.weight):
                 parameter.normal_(0.0, 0.2)
             model.prior.response.normal_(0.0, 0.01)
+            model.prior.span.copy_(torch.tensor([-0.1, 0.1]))
     rest = spec.rest_vertices
     controls = rest[spec.neighbours[spec.object_count :, 0]]
     frames = SMALL.history + 1

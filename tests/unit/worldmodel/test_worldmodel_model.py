@@ -38,6 +38,7 @@ def _model(spec: GraphSpec, hidden: int = SMALL.hidden) -> WorldModel:
         model.prior.basis.normal_(0.0, 0.1)
         model.prior.weight.normal_(0.0, 0.1)
         model.prior.response.normal_(0.0, 0.1)
+        model.prior.span.copy_(torch.tensor([-0.1, 0.1]))
     return model
 
 
