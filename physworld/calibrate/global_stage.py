@@ -34,6 +34,7 @@ from physworld.calibrate.estimates import (
     estimates,
     held_at_priors,
 )
+from physworld.calibrate.friction_bound import affordable
 from physworld.calibrate.journal import Journal
 from physworld.calibrate.least_squares import Solution
 from physworld.calibrate.losses import training_losses
@@ -191,7 +192,6 @@ def select(search: Search, parameters: list[Parameter]) -> tuple[list[Parameter]
     """Steps 1 to 3: the parameters to keep, their optimum, and what the others would have removed."""
     kept = [p for p in parameters if p.stage in ("stiffness", "flow")]
     optimum = search.scan(kept)
-    candidates = [p for p in parameters if p.stage == "optional"]
     rejected: dict[str, float] = {}
     shape = [p for p in parameters if p.stage == "shape"]
     if shape:
@@ -203,6 +203,8 @@ def select(search: Search, parameters: list[Parameter]) -> tuple[list[Parameter]
             kept, optimum = [*kept, *shape], freed
         else:
             rejected.update({p.name: gain for p in shape})
+    twin = search.twin_at(kept, optimum.theta)
+    candidates = [affordable(search.scene, twin, p) for p in parameters if p.stage == "optional"]
     while candidates:
         screened = search.screen(kept, optimum, candidates)
         hopeful = [c for c in candidates if screened[c.name] >= _LEAST_SCREENED * c.least_gain]

@@ -1,0 +1,49 @@
+"""How much internal friction a fit can wait for.
+
+Friction that is proportional to stiffness damps the lattice's fastest motions most, and the explicit step has to
+resolve that: beyond a point the stable time step is inversely proportional to it. A recording shows nothing of these
+motions. So the search ends where the step is ``SLOWEST`` times smaller than without friction; a value found there is
+reported to be at the bound of its search.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.optimize import brentq
+
+from physworld.calibrate.parameters import Parameter
+from physworld.mpm.total_lagrangian import TotalLagrangian
+from physworld.scene import Scene
+from physworld.twin import Twin
+
+SLOWEST = 10.0
+_NAMES = ("relaxation_s", "viscosity_pa_s")
+_CLOSE = 0.05  # in the logarithm
+
+
+def affordable(scene: Scene, twin: Twin, parameter: Parameter) -> Parameter:
+    """The parameter with the upper bound that ``twin``, otherwise at its optimum, can be simulated at.
+
+    Parameters other than internal friction, and twins of the updated Lagrangian form, keep theirs.
+    """
+    if parameter.name not in _NAMES or twin.formulation != "total_lagrangian":
+        return parameter
+    controls = scene.control_track()
+
+    def step_s(changed: Twin) -> float:
+        run = changed.integration(*controls, scene.times)
+        return float(TotalLagrangian(run.problem).time_step_s)
+
+    least_s = step_s(parameter.apply(twin, parameter.prior)) / SLOWEST
+
+    def spare(searched: float) -> float:
+        return step_s(parameter.apply(twin, parameter.value(searched))) / least_s - 1.0
+
+    low, high = parameter.searched(parameter.low), parameter.searched(parameter.high)
+    if spare(high) >= 0.0:
+        return parameter
+    high = brentq(spare, low, high, xtol=_CLOSE) if spare(low) > 0.0 else low + _CLOSE
+    start = tuple(float(min(value, parameter.value(0.5 * (low + high)))) for value in parameter.start)
+    return replace(parameter, high=float(np.exp(high)), start=start)
