@@ -49,14 +49,17 @@ class Grams:
 
 def grams_of(seen: list[Seen], scale: np.ndarray, history: int) -> Grams:
     """The normal equations of episodes, regressors divided by ``scale`` (G,)."""
-    past = np.concatenate([_past(s.amplitudes, history) for s in seen])
-    drive = np.concatenate([s.drive for s in seen])
-    zeta = np.concatenate([np.full((len(s.drive), 1), s.softness) for s in seen])
-    answer = np.concatenate([past, np.ones_like(zeta)], axis=1)
-    powers = [zeta**k * answer for k in range(1, POWERS + 1)]
-    inputs = np.concatenate([past, drive, *powers], axis=1) / scale
-    target = np.concatenate([s.amplitudes[history + 1 :] for s in seen])
-    return Grams(inputs.T @ inputs, inputs.T @ target, len(inputs))
+    inputs = np.zeros((len(scale), len(scale)))
+    targets, rows = np.zeros((len(scale), seen[0].amplitudes.shape[1])), 0
+    for s in seen:
+        past = _past(s.amplitudes, history)
+        answer = np.append(past, np.ones((len(past), 1)), axis=1)
+        powers = [s.softness**k * answer for k in range(1, POWERS + 1)]
+        given = np.concatenate([past, s.drive, *powers], axis=1) / scale
+        inputs += given.T @ given
+        targets += given.T @ s.amplitudes[history + 1 :]
+        rows += len(given)
+    return Grams(inputs, targets, rows)
 
 
 def scale_of(seen: list[Seen], size: np.ndarray, history: int) -> np.ndarray:
