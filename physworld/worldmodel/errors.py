@@ -3,7 +3,7 @@
 WorldModelError
 ├── GraphInvalid         too few particles or controllers for a graph, shapes that disagree
 ├── DatasetUnusable      episodes too short, at another clock, or not numbers
-├── TrainingDiverged     the loss or the gradient stopped being a number (``step`` says when)
+├── TrainingDiverged     loss or gradient exploded several times in a row (``step`` says from when)
 ├── TrainingCancelled    the caller's ``cancelled`` said so
 ├── CheckpointMismatch   a checkpoint of other settings or other data
 └── ControlsInvalid      control paths that cannot drive this model (``field`` says which part of them)
@@ -25,7 +25,7 @@ class DatasetUnusable(WorldModelError):
 
 
 class TrainingDiverged(WorldModelError):
-    """Loss or gradient stopped being finite at ``step``."""
+    """From ``step`` on loss or gradient were no numbers, or exploded, several times in a row."""
 
     def __init__(self, step: int, loss: float) -> None:
         super().__init__(f"training diverged at step {step}: loss {loss}")

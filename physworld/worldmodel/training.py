@@ -11,6 +11,10 @@ rollouts of whole held-out episodes) and returned; the best one wins; ``patience
 the training. The same seed, data and settings give the same weights, and so does a run that was interrupted and resumed
 from a checkpoint.
 
+A slack rope or a body that snaps through has sub-sequences in which a gradient grows without end over the unrolled
+frames. A step whose gradient is ``EXPLODED`` times the usual one, or no number, is left out and counted;
+``MOST_LEFT_OUT`` in a row are a training that diverged.
+
 **While episodes still arrive** (``start_share`` below 1): the first share of the episodes by index is enough to begin.
 Validation episodes, scales and prior come from it and stay. The others join in the order of their index at steps
 that the settings alone decide, spread over the first ``JOIN_SHARE`` of the training, which waits for one that is not
@@ -47,6 +51,10 @@ from physworld.worldmodel.rollout import mean_error, rollout_tracks
 WARM_UP_SHARE = 0.1
 JOIN_SHARE = 0.5
 JOIN_BATCHES = 10
+EXPLODED = 30.0  # times the usual gradient
+MOST_LEFT_OUT = 10  # steps in a row
+_FORGET = 0.1  # share of the usual gradient that the newest one makes
+_GIVE = 1.5  # by which the usual gradient grows with each step left out: a training may become another one
 
 
 @dataclass(frozen=True)
@@ -54,7 +62,8 @@ class TrainingResult:
     """The best averaged model; ``validation`` holds (step, open-loop error [m]); ``losses`` (step, loss).
 
     ``prior``: which one is under the network; ``prior_errors_m``: open-loop errors of those that were tried;
-    ``steps``: taken, fewer than asked for where the patience ended; ``episodes``: trained or validated on.
+    ``steps``: taken, fewer than asked for where the patience ended; ``steps_left_out`` of them for an exploding
+    gradient; ``episodes``: trained or validated on.
     """
 
     model: WorldModel
@@ -67,12 +76,17 @@ class TrainingResult:
     prior_errors_m: dict[str, float]
     static_error_m: float
     steps: int
+    steps_left_out: int
     episodes: int
 
 
 @dataclass
 class _Run:
-    """Everything that changes while training; what a checkpoint holds."""
+    """Everything that changes while training; what a checkpoint holds.
+
+    ``usual``: running norm of the gradient, 0 before the first; ``loss`` of the last step that was used, at first that
+    of the prior alone; ``in_a_row`` and ``left_out``: steps left out, lately and in all.
+    """
 
     model: WorldModel
     average: WorldModel
@@ -84,6 +98,15 @@ class _Run:
     best_weights: dict[str, Tensor] = field(default_factory=dict)
     validation: list[tuple[int, float]] = field(default_factory=list)
     losses: list[tuple[int, float]] = field(default_factory=list)
+    usual: float = 0.0
+    loss: float = 1.0
+    in_a_row: int = 0
+    left_out: int = 0
+
+
+_FIGURES = (
+    "step", "best_error_m", "best_step", "validation", "losses", "usual", "loss", "in_a_row", "left_out",
+)  # fmt: skip
 
 
 def train(
@@ -143,15 +166,15 @@ def train(
             fitting += [later(index) for index in range(joined, present)]
             sampler, joined = WindowSampler(fitting), present
         longest = max(sampler.lengths) - config.history - 1
-        loss = _train_step(run, sampler, training, min(training.look_ahead, longest))
+        _train_step(run, sampler, training, min(training.look_ahead, longest))
         run.step += 1
         if run.step % training.validation_every == 0 or run.step == training.steps:
-            run.losses.append((run.step, loss))
+            run.losses.append((run.step, run.loss))
             _validate(run, held_out)
         if save_checkpoint is not None and run.step % training.checkpoint_every == 0:
             save_checkpoint(_checkpoint(run, identity))
         if progress is not None:
-            progress(run.step, training.steps, loss)
+            progress(run.step, training.steps, run.loss)
     run.average.load_state_dict(run.best_weights)
     return TrainingResult(
         model=run.average,
@@ -164,6 +187,7 @@ def train(
         prior_errors_m=prior_errors,
         static_error_m=mean_error([_static(track, config.history) for track in held_out], held_out, spec),
         steps=run.step,
+        steps_left_out=run.left_out,
         episodes=joined,
     )
 
@@ -201,8 +225,8 @@ def _start(
     return _Run(model, copy.deepcopy(model), optimiser, generator)
 
 
-def _train_step(run: _Run, sampler: WindowSampler, training: TrainingConfig, look_ahead: int) -> float:
-    """One optimiser step; the loss. Raises TrainingDiverged."""
+def _train_step(run: _Run, sampler: WindowSampler, training: TrainingConfig, look_ahead: int) -> None:
+    """One optimiser step, or none where the gradient explodes. Raises TrainingDiverged."""
     model, h = run.model, run.model.config.history
     batch = sampler.draw(h + 1 + look_ahead, training.batch_size, run.generator)
     n, change = model.spec.object_count, model.norm.change
@@ -230,13 +254,27 @@ def _train_step(run: _Run, sampler: WindowSampler, training: TrainingConfig, loo
     run.optimiser.zero_grad(set_to_none=True)
     loss.backward()
     norm = torch.nn.utils.clip_grad_norm_(model.parameters(), training.gradient_clip)
-    if not (torch.isfinite(loss) and torch.isfinite(norm)):
-        raise TrainingDiverged(run.step, loss.item())
+    if not _usable(run, loss.item(), norm.item()):
+        return
     run.optimiser.step()
     keep = min(training.average_decay, (1.0 + run.step) / (10.0 + run.step))
     with torch.no_grad():
         torch._foreach_lerp_(list(run.average.parameters()), list(model.parameters()), 1.0 - keep)
-    return loss.item()
+
+
+def _usable(run: _Run, loss: float, norm: float) -> bool:
+    """Whether a step's gradient is of the usual size; keeps count. Raises TrainingDiverged."""
+    usual = run.usual or norm
+    if math.isfinite(loss) and math.isfinite(norm) and norm <= EXPLODED * usual:
+        run.usual = (1.0 - _FORGET) * usual + _FORGET * norm
+        run.loss, run.in_a_row = loss, 0
+        return True
+    run.usual *= _GIVE
+    run.in_a_row += 1
+    run.left_out += 1
+    if run.in_a_row >= MOST_LEFT_OUT:
+        raise TrainingDiverged(run.step + 1 - run.in_a_row, loss)
+    return False
 
 
 def _squared(gap: Tensor) -> Tensor:
@@ -275,8 +313,9 @@ def _static(track: Track, history: int) -> Tensor:
 
 
 def _identity(config: WorldModelConfig, training: TrainingConfig, scales: Normalisation) -> dict[str, Any]:
-    """What a checkpoint must agree with: settings, and the data's scales as their fingerprint."""
-    return {"config": asdict(config), "training": asdict(training), "scales": asdict(scales)}
+    """What a checkpoint must agree with: settings, the data's scales as their fingerprint, what it holds."""
+    held = {"config": asdict(config), "training": asdict(training), "scales": asdict(scales)}
+    return held | {"figures": _FIGURES}
 
 
 def _checkpoint(run: _Run, identity: dict[str, Any]) -> bytes:
@@ -287,7 +326,7 @@ def _checkpoint(run: _Run, identity: dict[str, Any]) -> bytes:
         "optimiser": run.optimiser.state_dict(),
         "generator": run.generator.get_state(),
         "best_weights": run.best_weights,
-        "figures": [run.step, run.best_error_m, run.best_step, run.validation, run.losses],
+        "figures": {name: getattr(run, name) for name in _FIGURES},
     }
     buffer = io.BytesIO()
     torch.save(held, buffer)
@@ -303,4 +342,5 @@ def _restore(run: _Run, checkpoint: bytes, identity: dict[str, Any]) -> None:
     run.optimiser.load_state_dict(held["optimiser"])
     run.generator.set_state(held["generator"])
     run.best_weights = held["best_weights"]
-    run.step, run.best_error_m, run.best_step, run.validation, run.losses = held["figures"]
+    for name, value in held["figures"].items():
+        setattr(run, name, value)

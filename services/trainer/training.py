@@ -194,6 +194,7 @@ def _metrics(
             "priors_m": trained.prior_errors_m,
             "best_step": trained.best_step,
             "steps": trained.steps,
+            "steps_left_out": trained.steps_left_out,
             "curve": trained.validation,
             "training_loss": trained.losses,
         },

@@ -9,6 +9,7 @@ import pytest
 import torch
 from held_bar import SMALL, graph
 
+from physworld.worldmodel import training as training_module
 from physworld.worldmodel.config import TrainingConfig
 from physworld.worldmodel.dataset import Track, WindowSampler, read_track, split_tracks
 from physworld.worldmodel.errors import (
@@ -92,6 +93,41 @@ def test_a_loss_that_is_not_a_number_is_named_with_its_step(
     with pytest.raises(TrainingDiverged, match="step 0") as caught:
         train(tracks, graph(), SMALL, SHORT)
     assert caught.value.step == 0
+
+
+def test_a_step_whose_gradient_explodes_is_left_out(
+    tracks: list[Track], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    draw, drawn = WindowSampler.draw, []
+
+    def now_and_then(self, frames, count, generator):
+        batch = draw(self, frames, count, generator)
+        drawn.append(0)
+        return dataclasses.replace(batch, phi=batch.phi * float("nan")) if len(drawn) in (1, 6, 7) else batch
+
+    undisturbed = train(tracks, graph(), SMALL, SHORT)
+    monkeypatch.setattr(WindowSampler, "draw", now_and_then)
+    losses: list[float] = []
+    found = train(tracks, graph(), SMALL, SHORT, progress=lambda step, steps, loss: losses.append(loss))
+    assert (undisturbed.steps_left_out, found.steps_left_out, found.steps) == (0, 3, 12)
+    assert np.isfinite(losses).all()
+    assert losses[0] == 1.0
+    assert losses[6] == losses[4]
+    assert torch.isfinite(_weights(found.model)).all()
+
+
+def test_only_what_is_far_from_usual_explodes() -> None:
+    run = training_module._Run(None, None, None, None)  # type: ignore[arg-type]
+    used = [training_module._usable(run, 0.5, norm) for norm in (2.0, 3.0, 40.0, 1e9, float("inf"), 5.0)]
+    assert used == [True, True, True, False, False, True]
+    assert (run.left_out, run.in_a_row) == (2, 0)
+    for _ in range(
+        training_module.MOST_LEFT_OUT - 1
+    ):  # a training that has become another one is not given up
+        if training_module._usable(run, 0.5, 2000.0):
+            break
+    else:
+        pytest.fail("a gradient that stays larger was never used")
 
 
 def test_progress_tells_every_step(tracks: list[Track]) -> None:
