@@ -4,6 +4,7 @@ PhysworldError
 ├── SceneUnsupported        the scene lacks what a twin needs (a size, a topology), or has what no law covers yet
 ├── SimulationError         a simulation cannot be trusted
 │   ├── UnstableSimulation  a state is not finite, or an element inverted
+│   │   └── BlewUp          it is not finite
 │   ├── CFLViolation        a forced time step exceeds the stable one
 │   ├── ParticlesLeftTheGrid  material left the stated workspace
 │   ├── TwistLost           a rope folded, or a grip turned so far in a frame that its turns cannot be counted
@@ -37,6 +38,10 @@ class SimulationError(PhysworldError):
 
 class UnstableSimulation(SimulationError):
     """A state is not finite, or an element inverted."""
+
+
+class BlewUp(UnstableSimulation):
+    """Positions left the numbers: the time step was too long for what the body had become."""
 
 
 class CFLViolation(SimulationError):

@@ -20,7 +20,7 @@ from typing import Protocol
 import numpy as np
 import warp as wp
 
-from physworld.errors import CFLViolation, ParticlesLeftTheGrid, UnstableSimulation
+from physworld.errors import BlewUp, CFLViolation, ParticlesLeftTheGrid, UnstableSimulation
 from physworld.materials.laws import Law, friction_law
 from physworld.mpm.forces import InternalForces
 from physworld.mpm.lattice import Lattice
@@ -126,6 +126,7 @@ class TotalLagrangian:
                 f"{frequency:.4g} rad/s (wave speed {law.wave_speed_m_s:.4g} m/s, cell {lattice.spacing.min():.3g} m)"
             )
         self.time_step_s = time_step_s or stable_time_step(frequency, rate)
+        self._forced = time_step_s is not None
         self.substeps = 0
 
     def run(
@@ -137,6 +138,9 @@ class TotalLagrangian:
         progress: Callable[[int, int], None] | None = None,
     ) -> np.ndarray:
         """Integrate from ``times[0]`` and record the nodes at every time.
+
+        The stable time step is the undeformed body's. Where a body that strain has stiffened blows up at it, the run is
+        repeated at half of it, once; not where the time step was given.
 
         Args:
             x, v: nodal positions [m] and velocities [m/s] at the first time, (n, 3).
@@ -151,6 +155,21 @@ class TotalLagrangian:
             UnstableSimulation: a cell inverted or a state is not finite.
             ParticlesLeftTheGrid: a node is absurdly far from its start.
         """
+        try:
+            return self._recorded(x, v, held, times, progress)
+        except BlewUp:
+            if self._forced:
+                raise
+        return TotalLagrangian(self.problem, 0.5 * self.time_step_s).run(x, v, held, times, progress)
+
+    def _recorded(
+        self,
+        x: np.ndarray,
+        v: np.ndarray,
+        held: HeldNodes,
+        times: np.ndarray,
+        progress: Callable[[int, int], None] | None,
+    ) -> np.ndarray:
         run = Run(self, x, v, held, times)
         frames = len(times)
         recorded = np.empty((frames, *x.shape))
@@ -309,7 +328,8 @@ def check_state(
         ParticlesLeftTheGrid: a node is absurdly far from its start.
     """
     if inverted or not np.isfinite(now).all():
-        raise UnstableSimulation(
+        kind = UnstableSimulation if np.isfinite(now).all() else BlewUp
+        raise kind(
             f"the body inverted or blew up at t = {time:.4f} s with time step {dt:.3g} s ({inverted} cells inverted, "
             f"{int((~np.isfinite(now)).any(axis=1).sum())} of {len(now)} nodes not finite)"
         )

@@ -1,0 +1,55 @@
+"""A body that blows up at its stable time step, which is the undeformed one's, is run again at half of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from made_scene import box_body, made_scene
+
+from physworld.build import build_twin
+from physworld.errors import BlewUp
+from physworld.integration import Integration
+from physworld.mpm import total_lagrangian
+from physworld.mpm.stability import SAFETY, stable_time_step
+from physworld.mpm.total_lagrangian import TotalLagrangian
+from physworld.scene import UNDEFORMED_AT_REST
+
+LOW, HIGH = np.array([0.0, -0.015, -0.015]), np.array([0.12, 0.015, 0.015])
+
+
+@pytest.fixture
+def swing(monkeypatch: pytest.MonkeyPatch) -> tuple[Integration, np.ndarray]:
+    """A bar under gravity whose own time step is half as long again as what is stable."""
+    grip = np.array([[0.0, y, z] for y in (-0.01, 0.01) for z in (-0.01, 0.01)])
+    scene = made_scene(
+        [[0.06, 0.0, 0.015], [0.12, 0.0, 0.015]],
+        "beam",
+        grip,
+        6,
+        body=box_body(LOW, HIGH, density_kg_m3=300.0),
+        initial_state=UNDEFORMED_AT_REST,
+    )
+    twin = build_twin(scene, 60).with_parameters(youngs_modulus_pa=4e4)
+
+    def too_long(frequency: float, rate: float, safety: float = SAFETY) -> float:
+        return stable_time_step(frequency, rate, 1.5 if safety == SAFETY else safety)
+
+    monkeypatch.setattr(total_lagrangian, "stable_time_step", too_long)
+    return twin.integration(*scene.control_track(), scene.times), twin.body.start
+
+
+def test_it_is_run_again_at_half_the_step(swing: tuple[Integration, np.ndarray]) -> None:
+    run, start = swing
+    solver = TotalLagrangian(run.problem)
+    half = TotalLagrangian(run.problem, 0.5 * solver.time_step_s)
+    expected = half.run(start, run.velocity, run.held, run.knots)
+    assert np.array_equal(solver.run(start, run.velocity, run.held, run.knots), expected)
+    assert np.isfinite(expected).all()
+
+
+def test_a_step_that_was_asked_for_is_kept(swing: tuple[Integration, np.ndarray]) -> None:
+    run, start = swing
+    solver = TotalLagrangian(run.problem)
+    solver._forced = True
+    with pytest.raises(BlewUp, match="nodes not finite"):
+        solver.run(start, run.velocity, run.held, run.knots)
