@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 from scipy.optimize import brentq
 
 from physworld.calibrate.parameters import Parameter
@@ -46,4 +45,4 @@ def affordable(scene: Scene, twin: Twin, parameter: Parameter) -> Parameter:
         return parameter
     high = brentq(spare, low, high, xtol=_CLOSE) if spare(low) > 0.0 else low + _CLOSE
     start = tuple(float(min(value, parameter.value(0.5 * (low + high)))) for value in parameter.start)
-    return replace(parameter, high=float(np.exp(high)), start=start)
+    return replace(parameter, high=parameter.value(high), start=start)
