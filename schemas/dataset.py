@@ -17,8 +17,8 @@ class DatasetConfig(Request):
     """How many episodes, how they move, and what their twins differ in.
 
     ``motion``: ``vmp`` (curved paths at three-phase speed) or ``linear`` (straight lines at constant speed);
-    ``patterns``: weights of the patterns, none given: motions in any direction four times as often as each directed
-    one (lift, push, stretch, twist); ``replay_share`` of the episodes replay the recording's training frames.
+    ``patterns``: weights of the patterns, none given: motions in any direction alike, and none of the directed ones
+    (lift, push, stretch, twist); ``replay_share`` of the episodes replay the recording's training frames.
     ``perturbation``: ``p3`` (a Gaussian field over part features), ``uniform`` (one factor for the whole body),
     ``random`` (each particle on its own) or ``none``, of the
     ``properties`` named, with ``property_sigma`` the standard deviation of the log of the stiffness; a kernel of

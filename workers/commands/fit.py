@@ -1,7 +1,8 @@
 """``python -m workers.commands.fit SCENE --json FILE``: calibrate a twin in this process and measure it.
 
 The figures are those of :func:`fit_document`; ``--out DIR`` also keeps the twin and its prediction, the files of
-the service's fit. Ctrl-C cancels; nothing is written before the end.
+the service's fit. Ctrl-C cancels; nothing is written before the end but the finished steps, in the file of
+``--resume``, from which the next call goes on.
 
 ``--law auto`` chooses the law first: by the model behind PHYSWORLD_LAW_URL where one is set (see
 :mod:`workers.law_endpoint`), else by cross-validation.
@@ -10,12 +11,17 @@ the service's fit. Ctrl-C cancels; nothing is written before the end.
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import sys
 from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from physworld.calibrate import Journal
+    from physworld.scene import Scene
 
 SCHEMA_VERSION = 1
 
@@ -38,6 +44,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--law", default=None, help="elastic law by name, or auto: choose it by the data")
     parser.add_argument("--plasticity", default=None, help="flow law by name; its yield is calibrated too")
     parser.add_argument("--formulation", default="auto", help="total_lagrangian, updated_lagrangian or auto")
+    parser.add_argument(
+        "--resume",
+        type=Path,
+        default=None,
+        help="file of finished steps: a fit that was ended goes on from it",
+    )
     parser.add_argument(
         "--quick", action="store_true", help="leave out the runs on finer cells and time steps"
     )
@@ -69,10 +81,11 @@ def _fit(given: argparse.Namespace) -> None:
         formulation=given.formulation,
         plasticity=given.plasticity,
     )
+    journal = None if given.resume is None else _journal(given.resume, scene, f"{given.law} {config}")
     with progress_bar(f"law {scene.name}") if given.law == AUTO else nullcontext() as shown:
-        config, choice = chosen_laws(given.law, scene, config, shown)
+        config, choice = chosen_laws(given.law, scene, config, shown, journal=journal)
     with progress_bar(f"fit {scene.name}") as shown:
-        fitted = calibrate(scene, config, progress=shown)
+        fitted = calibrate(scene, config, progress=shown, journal=journal)
     report = fit_report(scene, fitted, choice)
     document = fit_document(scene.name, report)
     if not given.quick and fitted.twin.formulation == "total_lagrangian":
@@ -91,6 +104,21 @@ def _fit(given: argparse.Namespace) -> None:
     if given.json is not None:
         given.json.parent.mkdir(parents=True, exist_ok=True)
         given.json.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n")
+
+
+def _journal(path: Path, scene: Scene, settings: str) -> Journal:
+    """Finished steps of this scene under these settings, kept in ``path``."""
+    from physworld.calibrate import Journal
+    from storage.scene_bundle import canonical_archive
+
+    def save(text: str) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_name(f"{path.name}.part")
+        partial.write_text(text)
+        partial.replace(path)
+
+    key = f"{hashlib.sha256(canonical_archive(scene)).hexdigest()} {settings}"
+    return Journal(key, path.read_text() if path.exists() else None, save)
 
 
 def fit_document(scene_name: str, report: dict[str, Any]) -> dict[str, Any]:

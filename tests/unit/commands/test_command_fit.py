@@ -9,6 +9,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -126,3 +127,24 @@ def test_an_interrupt_cancels_and_says_so(bundle: Path, tmp_path: Path) -> None:
     assert first.startswith("fit bar 1/")
     assert process.returncode == 130 and "cancelled; nothing was written" in rest and "Traceback" not in rest
     assert not figures.exists()
+
+
+def test_a_fit_that_was_ended_goes_on_from_its_file(bundle: Path, tmp_path: Path) -> None:
+    journal = tmp_path / "deep" / "steps.json"
+
+    def fitted(name: str, *more: str) -> dict[str, Any]:
+        figures = tmp_path / name
+        given = arguments(bundle, "--quick", "--json", str(figures), "--resume", str(journal), *more)
+        assert fit.main(given) == 0
+        found: dict[str, Any] = json.loads(figures.read_text())
+        return {key: value for key, value in found.items() if key != "seconds"}
+
+    whole = fitted("whole.json")
+    stored = json.loads(journal.read_text())
+    assert len(stored["entries"]) > 2
+    ended = stored | {"entries": stored["entries"][:1]}
+    journal.write_text(json.dumps(ended))
+    assert fitted("again.json") == whole
+    assert json.loads(journal.read_text()) == stored
+    fitted("other.json", "--simulations", "40")  # other settings: none of those steps is read
+    assert json.loads(journal.read_text())["key"] != stored["key"]

@@ -34,6 +34,9 @@ def fit(
     formulation: Annotated[
         str | None, typer.Option(help="total_lagrangian, updated_lagrangian or auto.")
     ] = None,
+    resume: Annotated[
+        Path | None, typer.Option(help="File of finished steps: a fit that was ended goes on from it.")
+    ] = None,
     quick: Annotated[
         bool, typer.Option("--quick", help="Leave out the runs on finer cells and steps.")
     ] = False,
@@ -47,6 +50,7 @@ def fit(
         "--law": law,
         "--plasticity": plasticity,
         "--formulation": formulation,
+        "--resume": resume,
     }
     options = [text for name, value in given.items() if value is not None for text in (name, str(value))]
     become(MODULE, [*options, *(["--quick"] if quick else []), "--", str(scene)])
