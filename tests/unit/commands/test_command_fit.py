@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from chat_model import serving
 from made_scene import box_body, made_scene, recorded_by
 
 from physworld.build import build_twin
@@ -148,3 +149,19 @@ def test_a_fit_that_was_ended_goes_on_from_its_file(bundle: Path, tmp_path: Path
     assert json.loads(journal.read_text()) == stored
     fitted("other.json", "--simulations", "40")  # other settings: none of those steps is read
     assert json.loads(journal.read_text())["key"] != stored["key"]
+
+
+def test_the_law_may_be_a_models_choice(
+    bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answer = "Elastic: FCR | Plastic: Purely Elastic | Reason: it turns more than it stretches"
+    with serving(answer) as model:
+        monkeypatch.setenv("PHYSWORLD_LAW_URL", model.url)
+        monkeypatch.setenv("PHYSWORLD_LAW_MODEL", "eye-1")
+        figures = tmp_path / "fit.json"
+        assert fit.main(arguments(bundle, "--quick", "--law", "auto", "--json", str(figures))) == 0
+        ((path, _, body),) = model.asked
+    assert path == "/v1/chat/completions" and body["model"] == "eye-1"
+    law = json.loads(figures.read_text())["law"]
+    assert (law["elastic"], law["decided_by"]) == ("fixed_corotated", "model eye-1")
+    assert law["reason"] == "it turns more than it stretches"

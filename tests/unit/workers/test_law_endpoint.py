@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import base64
 import io
-import json
-import threading
 import time
 from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 import numpy as np
 import pytest
+from chat_model import completion, serving
 from made_scene import made_scene
 from PIL import Image
 
@@ -24,45 +22,14 @@ ANSWER = "Elastic: FCR | Plastic: Purely Elastic | Reason: it turns more than it
 KEY = "secret-of-the-test"
 
 
-class Model(BaseHTTPRequestHandler):
-    """Answers as the server's ``status``, ``content`` (bytes) and ``delay_s`` say; remembers what it was asked."""
-
-    def do_POST(self) -> None:
-        server: Any = self.server
-        body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
-        server.asked.append((self.path, dict(self.headers), body))
-        if server.delay_s and server.asleep.wait(server.delay_s):
-            return
-        self.send_response(server.status)
-        self.send_header("Content-Type", "application/json")
-        self.send_header("Content-Length", str(len(server.content)))
-        self.end_headers()
-        self.wfile.write(server.content)
-
-    def log_message(self, *arguments: object) -> None:
-        """Says nothing."""
-
-
-def completion(text: object) -> bytes:
-    return json.dumps({"choices": [{"message": {"role": "assistant", "content": text}}]}).encode()
-
-
 @pytest.fixture
 def server() -> Iterator[Any]:
-    served: Any = ThreadingHTTPServer(("127.0.0.1", 0), Model)
-    served.asked, served.status, served.content, served.delay_s = [], 200, completion(ANSWER), 0.0
-    served.asleep = threading.Event()
-    thread = threading.Thread(target=served.serve_forever, daemon=True)
-    thread.start()
-    yield served
-    served.asleep.set()
-    served.shutdown()
-    served.server_close()
-    thread.join()
+    with serving(ANSWER) as served:
+        yield served
 
 
 def endpoint(server: Any, **options: Any) -> LawEndpoint:
-    return LawEndpoint(f"http://127.0.0.1:{server.server_address[1]}/v1", "eye-1", **options)
+    return LawEndpoint(server.url, "eye-1", **options)
 
 
 def test_a_chat_completion_with_pictures_is_asked_and_its_text_returned(server: Any) -> None:
