@@ -35,6 +35,7 @@ NOT_SMOOTH = {
 }
 LARGE = {"air_drag_quadratic", "air_drag_linear", "wind", "viscosity_kelvin_voigt"}  # small in 0.13 s
 GOAL, FRICTION_GOAL = 0.01, 0.03
+ON_THE_GROUND = (("adhesion", "traction_pa", 50.0), ("ground_friction", "height_m", 2e-4))
 
 
 def measure(repeats: int, seed: int) -> Report:
@@ -68,6 +69,9 @@ def measure(repeats: int, seed: int) -> Report:
     for shape in ("solid", "sheet", "rope"):
         name = f"{shape} on the ground: log friction"
         rows.append([name, f"{errors[name]:.1e}", f"{FRICTION_GOAL:.0e}"])
+    for known, which, _ in ON_THE_GROUND:
+        name = f"on the ground: {known} {which}"
+        rows.append([f"solid {name}", f"{errors[name]:.1e}", f"{FRICTION_GOAL:.0e}"])
     rows.append(["friction of the ground", f"{errors['friction of the ground']:.1e}", f"{FRICTION_GOAL:.0e}"])
     return Report(
         name="gradients",
@@ -130,6 +134,10 @@ def agreement(seed: int) -> dict[str, float]:
     for shape, scene in _scenes().items():
         errors[f"{shape} on the ground: log friction"] = _friction_field(build_twin(scene, 300), scene, seed)
     scene = _scenes()["solid"]
+    for name, which, value in ON_THE_GROUND:
+        errors[f"on the ground: {name} {which}"] = _strength(
+            _sliding(build_twin(scene, 300)), scene, name, which, value, 0.02 * value, seed
+        )
     errors["friction of the ground"] = _strength(
         build_twin(scene, 300), scene, "ground_friction", "change", 0.1, 2e-3, seed
     )
@@ -161,16 +169,7 @@ def _fields(shape: str, twin: Twin, scene: Scene, seed: int) -> dict[str, float]
 
 def _friction_field(twin: Twin, scene: Scene, seed: int) -> float:
     """Error of the gradient by the ground's friction of a body that slides on it, on an uneven field."""
-    low = float(twin.body.start[:, 2].min() if twin.lattice.dim < 3 else twin.particles_start[:, 2].min())
-    twin = replace(
-        twin,
-        ground_height_m=low - 1e-3,
-        ground_friction=0.4,
-        held_nodes=tuple(h[:0] for h in twin.held_nodes),
-    )
-    velocity = np.zeros_like(twin.body.start)
-    velocity[:, :2] = [0.3, 0.5]
-    twin = replace(twin, body=replace(twin.body, start_velocity=velocity))
+    twin = _sliding(twin)
     count, step = twin.lattice.fill.size, 1e-3 if twin.lattice.dim < 3 else 1e-2
     field, dt = 0.5 * np.linspace(-1.0, 1.0, count), 0.5 * _step()
     track = scene.control_track()
@@ -186,6 +185,20 @@ def _friction_field(twin: Twin, scene: Scene, seed: int) -> float:
         expected = (ends[0] - ends[1]) / (2 * step)
         worst = max(worst, abs(gradient.log_friction @ along - expected) / abs(expected))
     return float(worst)
+
+
+def _sliding(twin: Twin) -> Twin:
+    """The body let go on the ground, sliding."""
+    low = float(twin.body.start[:, 2].min() if twin.lattice.dim < 3 else twin.particles_start[:, 2].min())
+    velocity = np.zeros_like(twin.body.start)
+    velocity[:, :2] = [0.3, 0.5]
+    return replace(
+        twin,
+        ground_height_m=low - 1e-3,
+        ground_friction=0.4,
+        held_nodes=tuple(h[:0] for h in twin.held_nodes),
+        body=replace(twin.body, start_velocity=velocity),
+    )
 
 
 def _strength(twin: Twin, scene: Scene, name: str, which: str, value: float, step: float, seed: int) -> float:
