@@ -15,6 +15,7 @@ from physworld.grips import declared_region, gripped_nodes, why_no_turn
 from physworld.materials.laws import Law, RodLaw, SheetLaw, SolidLaw
 from physworld.materials.plastic import Plasticity
 from physworld.mpm.choose import choose_formulation
+from physworld.mpm.transfer import TRANSFERS, Apic
 from physworld.scene import AS_MEASURED, Scene
 from physworld.twin import Twin
 
@@ -32,6 +33,7 @@ def build_twin(
     refinement: float = 1.0,
     plasticity: Plasticity | None = None,
     formulation: str = "auto",
+    transfer: str = Apic.name,
 ) -> Twin:
     """A twin of the scene with prior parameters, to be calibrated.
 
@@ -44,13 +46,19 @@ def build_twin(
         plasticity: flow law, or None.
         formulation: "total_lagrangian", "updated_lagrangian", or "auto": by the law and the scene. The body's notes say
             which was taken and why.
+        transfer: of the updated Lagrangian form, "apic" or "asflip" (:mod:`physworld.mpm.transfer`).
 
     Raises:
         SceneUnsupported: the scene declares too little for a body, or the formulation cannot hold it.
+        ValueError: there is no such formulation or transfer.
     """
+    if transfer not in TRANSFERS:
+        raise ValueError(f"no transfer is called {transfer!r}; there are {sorted(TRANSFERS)}")
     body = reference_body(scene, particle_budget, refinement)
     choice = choose_formulation(body.lattice.dim, scene.kind, scene.declared, plasticity, formulation)
     taken_form = f"{choice.formulation.replace('_', ' ')} form: {choice.reason}"
+    if choice.formulation == "updated_lagrangian":
+        taken_form += f"; transfers by {transfer}"
     body = replace(body, notes=(*body.notes, taken_form))
     _, controls = scene.control_track()
     reach = 0.6 * float(np.ptp(body.start, axis=0).max())
@@ -87,6 +95,7 @@ def build_twin(
         colliders=twin_colliders(scene, body.half_thickness_m, PRIOR_FRICTION),
         plasticity=plasticity,
         formulation=choice.formulation,
+        transfer=transfer,
         device=device,
     )
 

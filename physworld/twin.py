@@ -35,6 +35,7 @@ from physworld.mpm.lattice import Lattice
 from physworld.mpm.soft_grips import soften
 from physworld.mpm.terms import Term
 from physworld.mpm.total_lagrangian import Problem, TotalLagrangian
+from physworld.mpm.transfer import TRANSFERS, Apic
 from physworld.mpm.updated_lagrangian import UpdatedLagrangian
 from physworld.twin_arrays import arrays_of, parts_of
 
@@ -66,6 +67,7 @@ class Twin:
         colliders: rigid bodies that push, still, on their own track or carried by controllers.
         plasticity: flow law, or None; updated Lagrangian only.
         formulation: which form integrates the body.
+        transfer: how particles and grid exchange velocities, "apic" or "asflip"; updated Lagrangian only.
         device: Warp device of the simulations; not part of the twin's identity.
     """
 
@@ -86,6 +88,7 @@ class Twin:
     colliders: tuple[TwinCollider, ...] = ()
     plasticity: Plasticity | None = None
     formulation: FormulationName = "total_lagrangian"
+    transfer: str = Apic.name
     device: str = "cpu"
 
     @property
@@ -213,7 +216,7 @@ class Twin:
         if self.formulation == "total_lagrangian":
             nodes = TotalLagrangian(run.problem).run(start, run.velocity, run.held, run.knots, progress)
             return run.at_frames(start, nodes)
-        form = UpdatedLagrangian(run.problem, plasticity=self.plasticity)
+        form = UpdatedLagrangian(run.problem, transfer=TRANSFERS[self.transfer](), plasticity=self.plasticity)
         solid = form.run_particles(start, run.velocity, run.held, run.knots, progress)
         particles = np.empty((len(solid), len(self.particles_start), 3))
         particles[:, form.solid] = solid

@@ -42,6 +42,7 @@ def arrays_of(twin: Twin) -> dict[str, np.ndarray]:
         "effects": [{"name": known.name, "strengths": known.values} for known in twin.effects],
         "colliders": collider_facts,
         "formulation": twin.formulation,
+        "transfer": twin.transfer,
         "plasticity": None
         if twin.plasticity is None
         else {"name": twin.plasticity.name, "parameters": asdict(twin.plasticity)},
@@ -89,4 +90,5 @@ def parts_of(arrays: dict[str, np.ndarray]) -> dict[str, Any]:
         "colliders": from_parts(facts.get("colliders", []), arrays, body.half_thickness_m),
         "plasticity": None if flow is None else PLASTICITIES[flow["name"]](**flow["parameters"]),
         "formulation": facts.get("formulation", "total_lagrangian"),
+        "transfer": facts.get("transfer", "apic"),
     }

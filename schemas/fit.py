@@ -23,6 +23,7 @@ class FitConfig(Request):
     ``law``: an elastic law of ``GET /v1/materials``; "auto" lets the worker's language model or cross-validation choose
     one; null is the usual one of the body's shape. ``plasticity``: a flow law, whose yield is calibrated too.
     ``formulation``: which form integrates the body; "auto" takes the one that its laws and its scene need.
+    ``transfer``: how the updated Lagrangian form's particles and grid exchange velocities; "asflip" damps less.
     """
 
     particle_budget: int = Field(default=2000, ge=50, le=200_000)
@@ -31,6 +32,7 @@ class FitConfig(Request):
     law: ElasticLaw | None = None
     plasticity: FlowLaw | None = None
     formulation: Literal["auto", "total_lagrangian", "updated_lagrangian"] = "auto"
+    transfer: Literal["apic", "asflip"] = "apic"
 
     @property
     def usual_physics(self) -> bool:

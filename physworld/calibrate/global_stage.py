@@ -66,6 +66,7 @@ class CalibrationConfig:
         bending: "auto" frees how a sheet bends where the data ask; "declared" keeps what its thickness says.
         law: name of the elastic law (:mod:`physworld.materials.library`); None for the shape's usual one.
         formulation: "auto", "total_lagrangian" or "updated_lagrangian": see :mod:`physworld.mpm.choose`.
+        transfer: of the updated Lagrangian form, "apic" or "asflip".
         plasticity: name of the flow law (:mod:`physworld.materials.plastic`), whose yield is searched too; None for an
             elastic body.
     """
@@ -77,6 +78,7 @@ class CalibrationConfig:
     bending: Literal["auto", "declared"] = "auto"
     law: str | None = None
     formulation: str = "auto"
+    transfer: str = "apic"
     plasticity: str | None = None
 
 
@@ -173,6 +175,7 @@ def prior_twin(scene: Scene, config: CalibrationConfig) -> Twin:
         config.device,
         plasticity=None if config.plasticity is None else flow_law(config.plasticity),
         formulation=config.formulation,
+        transfer=config.transfer,
     )
     return twin if config.law is None else replace(twin, law=with_law(twin.law, config.law))
 

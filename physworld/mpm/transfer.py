@@ -53,3 +53,4 @@ class Asflip:
 
 
 Transfer = Apic | Asflip
+TRANSFERS: dict[str, type[Apic | Asflip]] = {kind.name: kind for kind in (Apic, Asflip)}

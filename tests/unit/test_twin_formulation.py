@@ -6,6 +6,7 @@ import io
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from tiny_scene import tiny_scene
 
 from physworld.build import build_twin
@@ -35,6 +36,28 @@ def test_the_two_forms_agree_on_an_elastic_bar_in_a_grip() -> None:
     moved = np.abs(tracks[0] - tracks[0][0]).max()
     assert np.abs(tracks[1] - tracks[0]).max() < 0.2 * moved  # three cells, one of them in the grip
     assert np.abs(tracks[1][0] - tracks[0][0]).max() < 1e-12
+
+
+def test_a_transfer_that_damps_less_may_be_asked_for() -> None:
+    scene = tiny_scene()
+    kinds = {
+        name: stiff(build_twin(scene, BUDGET, formulation="updated_lagrangian", transfer=name))
+        for name in ("apic", "asflip")
+    }
+    assert kinds["asflip"].body.notes[-1].endswith("; transfers by asflip")
+    assert Twin.from_arrays(kinds["asflip"].to_arrays()).transfer == "asflip"
+    times = np.linspace(0.0, 1.0, 61)
+    still = np.repeat(scene.control_track()[1][:1], 2, axis=0)
+    late = {}
+    for name, twin in kinds.items():
+        path = twin.observe(twin.simulate_nodes(np.array([0.0, 1.0]), still, times, from_rest=True), times)
+        late[name] = np.ptp(path[40:, -1, 2])  # how far it still swings in the last third
+    assert late["asflip"] > 1.2 * late["apic"] > 0.0
+
+
+def test_an_unknown_transfer_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"no transfer is called 'pic'; there are \['apic', 'asflip'\]"):
+        build_twin(tiny_scene(), BUDGET, transfer="pic")
 
 
 def test_the_choice_and_its_reason_stand_in_the_notes() -> None:

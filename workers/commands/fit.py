@@ -44,6 +44,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--law", default=None, help="elastic law by name, or auto: choose it by the data")
     parser.add_argument("--plasticity", default=None, help="flow law by name; its yield is calibrated too")
     parser.add_argument("--formulation", default="auto", help="total_lagrangian, updated_lagrangian or auto")
+    parser.add_argument("--transfer", default="apic", help="of the updated Lagrangian form: apic or asflip")
     parser.add_argument(
         "--resume",
         type=Path,
@@ -79,6 +80,7 @@ def _fit(given: argparse.Namespace) -> None:
     config = CalibrationConfig(
         **{name: value for name, value in numbers.items() if value is not None},
         formulation=given.formulation,
+        transfer=given.transfer,
         plasticity=given.plasticity,
     )
     journal = None if given.resume is None else _journal(given.resume, scene, f"{given.law} {config}")

@@ -41,6 +41,7 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
         damping=config.damping,
         plasticity=config.plasticity,
         formulation=config.formulation,
+        transfer=config.transfer,
     )
     folder = Path(stores.settings.data_dir) / "checkpoints" / context.lease.job_id
     journal = stored_journal(folder / JOURNAL, payload)

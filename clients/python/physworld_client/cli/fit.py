@@ -34,6 +34,9 @@ def fit(
     formulation: Annotated[
         str | None, typer.Option(help="total_lagrangian, updated_lagrangian or auto.")
     ] = None,
+    transfer: Annotated[
+        str | None, typer.Option(help="Of the updated Lagrangian form: apic or asflip.")
+    ] = None,
     resume: Annotated[
         Path | None, typer.Option(help="File of finished steps: a fit that was ended goes on from it.")
     ] = None,
@@ -50,6 +53,7 @@ def fit(
         "--law": law,
         "--plasticity": plasticity,
         "--formulation": formulation,
+        "--transfer": transfer,
         "--resume": resume,
     }
     options = [text for name, value in given.items() if value is not None for text in (name, str(value))]
