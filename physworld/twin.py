@@ -34,7 +34,7 @@ from physworld.mpm.following import follow
 from physworld.mpm.lattice import Lattice
 from physworld.mpm.soft_grips import soften
 from physworld.mpm.terms import Term
-from physworld.mpm.total_lagrangian import Problem, TotalLagrangian
+from physworld.mpm.total_lagrangian import Problem, TotalLagrangian, run_again_if_blown_up
 from physworld.mpm.transfer import TRANSFERS, Apic
 from physworld.mpm.updated_lagrangian import UpdatedLagrangian
 from physworld.twin_arrays import arrays_of, parts_of
@@ -214,7 +214,8 @@ class Twin:
         )
         start = self.body.start
         if self.formulation == "total_lagrangian":
-            nodes = TotalLagrangian(run.problem).run(start, run.velocity, run.held, run.knots, progress)
+            solver = TotalLagrangian(run.problem)
+            nodes = run_again_if_blown_up(solver, start, run.velocity, run.held, run.knots, progress)
             return run.at_frames(start, nodes)
         form = UpdatedLagrangian(run.problem, transfer=TRANSFERS[self.transfer](), plasticity=self.plasticity)
         solid = form.run_particles(start, run.velocity, run.held, run.knots, progress)

@@ -126,7 +126,6 @@ class TotalLagrangian:
                 f"{frequency:.4g} rad/s (wave speed {law.wave_speed_m_s:.4g} m/s, cell {lattice.spacing.min():.3g} m)"
             )
         self.time_step_s = time_step_s or stable_time_step(frequency, rate)
-        self._forced = time_step_s is not None
         self.substeps = 0
 
     def run(
@@ -138,9 +137,6 @@ class TotalLagrangian:
         progress: Callable[[int, int], None] | None = None,
     ) -> np.ndarray:
         """Integrate from ``times[0]`` and record the nodes at every time.
-
-        The stable time step is the undeformed body's. Where a body that strain has stiffened blows up at it, the run is
-        repeated at half of it, once; not where the time step was given.
 
         Args:
             x, v: nodal positions [m] and velocities [m/s] at the first time, (n, 3).
@@ -155,21 +151,6 @@ class TotalLagrangian:
             UnstableSimulation: a cell inverted or a state is not finite.
             ParticlesLeftTheGrid: a node is absurdly far from its start.
         """
-        try:
-            return self._recorded(x, v, held, times, progress)
-        except BlewUp:
-            if self._forced:
-                raise
-        return TotalLagrangian(self.problem, 0.5 * self.time_step_s).run(x, v, held, times, progress)
-
-    def _recorded(
-        self,
-        x: np.ndarray,
-        v: np.ndarray,
-        held: HeldNodes,
-        times: np.ndarray,
-        progress: Callable[[int, int], None] | None,
-    ) -> np.ndarray:
         run = Run(self, x, v, held, times)
         frames = len(times)
         recorded = np.empty((frames, *x.shape))
@@ -310,6 +291,24 @@ class Run:
 def whole_chunks(interval: float, time_step_s: float) -> int:
     """Substeps of at most ``time_step_s`` that an interval [s] takes: whole chunks, the captured graph's length."""
     return _CHUNK * max(1, int(np.ceil(interval / (time_step_s * _CHUNK))))
+
+
+def run_again_if_blown_up(
+    solver: TotalLagrangian,
+    x: np.ndarray,
+    v: np.ndarray,
+    held: HeldNodes,
+    times: np.ndarray,
+    progress: Callable[[int, int], None] | None = None,
+) -> np.ndarray:
+    """:meth:`TotalLagrangian.run`, and once more at half the time step where the body blew up.
+
+    The stable time step is the undeformed body's; strain may stiffen a body beyond it. Raises what ``run`` raises.
+    """
+    try:
+        return solver.run(x, v, held, times, progress)
+    except BlewUp:
+        return TotalLagrangian(solver.problem, 0.5 * solver.time_step_s).run(x, v, held, times, progress)
 
 
 def check_state(

@@ -18,7 +18,7 @@ from typing import Protocol
 import numpy as np
 
 from physworld.errors import Cancelled, CFLViolation, SimulationError
-from physworld.mpm.total_lagrangian import TotalLagrangian
+from physworld.mpm.total_lagrangian import TotalLagrangian, run_again_if_blown_up
 from physworld.twin import Twin
 
 Progress = Callable[[int, int, str], None]
@@ -78,7 +78,7 @@ def nodes_of(job: Job, drive: Drive, poll: Callable[[int, int], None] | None = N
         )
     if job.step_share != 1.0:
         solver = TotalLagrangian(run.problem, job.step_share * solver.time_step_s)
-    nodes = solver.run(job.twin.body.start, run.velocity, run.held, run.knots, poll)
+    nodes = run_again_if_blown_up(solver, job.twin.body.start, run.velocity, run.held, run.knots, poll)
     return run.at_frames(job.twin.body.start, nodes)
 
 
