@@ -66,6 +66,16 @@ class ModalPrior:
     placing: np.ndarray
     span: np.ndarray
 
+    def __post_init__(self) -> None:
+        """The rollout engine reads these arrays by their sizes. Raises ValueError for others."""
+        modes, n = self.basis.shape[:2]
+        found = (len(self.weight), *self.response.shape[:2], *self.placing.shape, *self.span.shape)
+        if found != (modes, POWERS, modes, n, 2, 2):
+            raise ValueError(
+                f"{modes} modes of {n} vertices, but weight {self.weight.shape}, response {self.response.shape}, "
+                f"placing {self.placing.shape}, span {self.span.shape}"
+            )
+
 
 def regressor_count(modes: int, controls: int, history: int) -> int:
     """F."""

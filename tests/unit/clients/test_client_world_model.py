@@ -87,8 +87,11 @@ def some_prior(spec: GraphSpec, history: int, rng: np.random.Generator) -> Modal
     weight = rng.normal(0.0, 0.02, (modes, regressor_count(modes, spec.control_count, history)))
     weight[:, :modes] += 1.8 * np.eye(modes)
     weight[:, modes : 2 * modes] -= 0.85 * np.eye(modes)
-    response = rng.normal(0.0, 0.005, (modes, (history + 1) * modes + 1))
-    return dataclasses.replace(prior, basis=basis, weight=weight, response=response)
+    response = rng.normal(0.0, 0.005, (2, modes, (history + 1) * modes + 1))
+    placing = prior.placing + rng.normal(0.0, 0.5 / n, (n, 2))
+    return dataclasses.replace(
+        prior, basis=basis, weight=weight, response=response, placing=placing, span=np.array([-0.4, 0.3])
+    )
 
 
 def write(folder: Path, model: PublishedModel) -> str:

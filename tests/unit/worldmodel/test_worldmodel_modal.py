@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -60,6 +62,12 @@ def error_m(prior: ModalPrior, track: np.ndarray, phi: np.ndarray) -> float:
         path.append(prior.weight @ np.concatenate([past, still]) + zeta * answers[0] + zeta**2 * answers[1])
     gone = np.array(path) @ prior.basis.reshape(len(prior.basis), -1) - flat
     return float(np.sqrt(np.mean(gone**2)))
+
+
+def test_arrays_that_do_not_fit_are_refused() -> None:
+    prior = prior_of(episodes(0.97), [0.0] * 5)
+    with pytest.raises(ValueError, match=r"6 modes of 4 vertices, but .* response \(6, 19\)"):
+        replace(prior, response=prior.response[0])
 
 
 def test_a_motion_that_dies_out_keeps_its_decay() -> None:
