@@ -25,13 +25,15 @@ class TraceConfig(Request):
 
     candidates: list[str] = Field(default_factory=list, max_length=64)
     effects_at_most: int = Field(default=2, ge=1, le=4)
-    confirmed: int = Field(default=4, ge=1, le=32)
+    confirmed: int = Field(default=8, ge=1, le=32)
     iterations: int = Field(default=5, ge=1, le=50)
     resamples: int = Field(default=2000, ge=100, le=100_000)
     seed: Seed = 0
 
 
 MOST_RECORDINGS = 8
+TRACE_PARTICLES = 1000
+"""Coarser than a fit's: a trace runs a thousand simulations, and asks finer cells in the end."""
 
 NO_OTHER_PHYSICS = (
     "a trace calibrates the usual elastic law: fit.law, fit.plasticity and fit.formulation must be left out"
@@ -42,7 +44,7 @@ class TraceCreate(Request):
     """Body of POST /v1/traces.
 
     A trace calibrates the declared physics itself, with ``fit``'s budgets and never with damping. ``fit_id`` names a
-    ready fit of the scene: its twin is taken instead where it holds no damping.
+    ready fit of the scene: its twin is taken instead where it holds no damping and has ``fit``'s number of particles.
 
     ``scene_ids`` are further recordings of the same object, fitted together with ``scene_id``;
     ``held_out_scene_ids`` are recordings that only the report sees.
@@ -52,7 +54,7 @@ class TraceCreate(Request):
     scene_ids: list[str] = Field(default_factory=list, max_length=MOST_RECORDINGS)
     held_out_scene_ids: list[str] = Field(default_factory=list, max_length=MOST_RECORDINGS)
     fit_id: str | None = None
-    fit: FitConfig = Field(default_factory=lambda: FitConfig(damping="none"))
+    fit: FitConfig = Field(default_factory=lambda: FitConfig(damping="none", particle_budget=TRACE_PARTICLES))
     config: TraceConfig = Field(default_factory=TraceConfig)
 
     @model_validator(mode="after")

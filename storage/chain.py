@@ -22,6 +22,7 @@ from sqlalchemy.orm import Session
 from schemas.job import TERMINAL_STATES, Progress
 from schemas.model import TrainingCreate
 from schemas.pipeline import PipelineCreate
+from schemas.trace import TRACE_PARTICLES
 from storage.opening import open_dataset, open_trace, open_training
 from storage.registry import find_baseline
 from storage.tables import JobRow, TraceRow
@@ -38,8 +39,9 @@ def open_next(session: Session, parent: JobRow, children: Sequence[JobRow]) -> b
     outputs = {job.kind: str(job.outputs[0]["id"]) for job in children}
     last = children[-1]
     if last.kind == "fit" and request.close_the_loop:
-        scene_id = request.scene_id
-        open_trace(session, scene_id, request.fit, request.trace, outputs["fit"], parent=parent)
+        particles = min(request.fit.particle_budget, TRACE_PARTICLES)
+        declared = request.fit.model_copy(update={"damping": "none", "particle_budget": particles})
+        open_trace(session, request.scene_id, declared, request.trace, outputs["fit"], parent=parent)
     elif last.kind == "dataset":
         name = request.model_name or ""
         training = TrainingCreate(name=name, dataset_id=outputs["dataset"], config=request.training)

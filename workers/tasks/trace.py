@@ -26,7 +26,7 @@ from physworld.twin import Twin
 from schemas.base import Reference
 from schemas.fit import FitConfig
 from schemas.trace import TraceConfig as WireConfig
-from storage import helpers
+from storage import helpers, resources
 from storage.errors import NotFound
 from storage.opening import DONE, QUEUED
 from workers.context import TaskContext
@@ -196,7 +196,7 @@ def _traced(context: TaskContext, stores: Stores, scene: Scene) -> Any:
         runner=SharedRunner(context, stores),
         memory=SharedMemory(stores, context.lease.job_id),
         journal=_journal(stores, context.lease.job_id, payload),
-        calibrated_twin=_undamped_twin(stores, payload["fit_id"]),
+        calibrated_twin=_undamped_twin(stores, payload["fit_id"], fit.particle_budget),
         progress=shown,
         cancelled=context.cancelled,
     )
@@ -238,10 +238,13 @@ class _Progress:
         self._context.progress(round(100 * self._share, 1), 100, "percent", text)
 
 
-def _undamped_twin(stores: Stores, fit_id: str | None) -> Twin | None:
-    """The fit's twin where its physics is the declared one; None where damping was added, or without a fit."""
+def _undamped_twin(stores: Stores, fit_id: str | None, budget: int) -> Twin | None:
+    """The fit's twin where its physics is the declared one and its cells are of this budget; else None."""
     if fit_id is None:
         return None
+    with stores.database.reading() as session:
+        if resources.get_fit(session, fit_id).config.particle_budget != budget:
+            return None
     twin = twin_of(stores, fit_id)
     damped = re.compile("drag|viscosity|relaxation")
     return None if any(value for name, value in twin.parameters.items() if damped.search(name)) else twin

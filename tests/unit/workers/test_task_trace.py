@@ -11,6 +11,7 @@ import pytest
 from tiny_scene import register, tiny_scene
 
 from physworld.trace import Memory
+from physworld.trace import TraceConfig as LibraryConfig
 from physworld.twin import Twin
 from schemas.dataset import DatasetConfig
 from schemas.fit import FitConfig
@@ -188,3 +189,8 @@ def test_a_dataset_comes_from_the_twin_with_the_added_effect(
         opened = jobs.create_dataset(session, fit_id, DatasetConfig(episodes=1), trace_id)
         assert [item.kind for item in opened.inputs] == ["fit", "trace"]
         assert resources.get_dataset(session, opened.outputs[0].id).trace_id == trace_id
+
+
+def test_a_service_traces_as_the_library_does_unless_it_is_told_otherwise() -> None:
+    asked = TraceCreate(scene_id="scn_a")
+    assert task.translate(asked.fit, asked.config, "cpu") == LibraryConfig()
