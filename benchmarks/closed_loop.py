@@ -85,7 +85,7 @@ def close(client: Client, loop: Loop, episodes: int, steps: int, seed: int) -> d
         recording = client.scenes.create(path).id
         row: dict[str, Any] = {"scene": path.name}
         for when, number in versions.items():
-            job = client.assessments.create(name, number, recording, open_trace=False)
+            job = client.assessments.create(name, recording, number, open_trace=False)
             client.jobs.wait(job)
             found = client.assessments.get(job.outputs[0].id)
             row[when] = found.model_dump(mode="json", include=_KEPT)

@@ -2,7 +2,7 @@
 
 Leaving a block out moves the optimum little, so the refit without it is the linear one from the optimum's own
 sensitivities, within the bounds of what was fitted; the block's error is measured with that. Differences between models
-are taken block by block, so what all of them suffer from cancels, and their standard error is that of the block means.
+are taken block by block, so what all of them suffer from cancels, and their standard error is that of the blocks.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from scipy.optimize import lsq_linear
 
 from physworld.trace.refit import Refit, prior_rows
 
+MEANINGFUL = 2.0  # standard errors by which a model must predict better than a simpler one
 _RIDGE = 1e-9  # of the normal matrix's diagonal
 
 
@@ -80,11 +81,29 @@ def seen_through(residual: np.ndarray, basis: np.ndarray, block_of_row: np.ndarr
 def difference(worse: CrossValidation, better: CrossValidation) -> tuple[float, float]:
     """Mean of the blocks' differences of squared error, and its standard error."""
     gap = worse.errors - better.errors
-    weights = worse.sizes / worse.sizes.sum()
-    mean = float(weights @ gap)
-    if len(gap) < 2:
+    return _mean_with_error(gap, worse.sizes)
+
+
+def better_beyond_chance(better: CrossValidation, worse: CrossValidation) -> bool:
+    """Whether the blocks' errors are smaller, by more than two standard errors of the blocks.
+
+    Blocks are compared by the logarithm of their ratio. An effect that grows over time, or acts while a grip is fast,
+    explains little of some blocks and much of others: differences then vary as much as the effect does, and their
+    standard error says that of the effect rather than of chance.
+    """
+    floor = np.finfo(float).tiny
+    ratio = np.log(np.maximum(worse.errors, floor)) - np.log(np.maximum(better.errors, floor))
+    gain, spread = _mean_with_error(ratio, worse.sizes)
+    return gain > MEANINGFUL * spread and better.mean < worse.mean
+
+
+def _mean_with_error(values: np.ndarray, sizes: np.ndarray) -> tuple[float, float]:
+    """Mean of the blocks' values (B,) weighted with their sizes, and its standard error; infinite for one block."""
+    weights = sizes / sizes.sum()
+    mean = float(weights @ values)
+    if len(values) < 2:
         return mean, float("inf")
-    spread = float(np.sqrt(np.sum(weights**2 * (gap - mean) ** 2) * len(gap) / (len(gap) - 1)))
+    spread = float(np.sqrt(np.sum(weights**2 * (values - mean) ** 2) * len(values) / (len(values) - 1)))
     return mean, spread
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from physworld.trace.candidates import Candidate
-from physworld.trace.comparison import CrossValidation, cross_validated, difference
+from physworld.trace.comparison import CrossValidation, better_beyond_chance, cross_validated
 from physworld.trace.holds import held_otherwise
 from physworld.trace.refit import Refit, refit
 from physworld.trace.score import Score, orthonormal, project
@@ -21,7 +21,6 @@ from physworld.trace.unknowns import CLAMP, Unknown, at
 from physworld.trace.whitening import Whitener
 
 REACH = f"{CLAMP}.reach_m"
-MEANINGFUL = 2.0  # standard errors by which a model must predict better than a simpler one
 _STARTS, _GLANCE = 3, 2  # variants of an effect that are tried, and iterations after which the best goes on
 _WORSE = 3.0  # a search is left that is this many times as far from the noise as the best so far
 _HALF = 0.5  # and has not removed this share of what the model without the effect leaves
@@ -60,8 +59,7 @@ class Model:
 
 def beats(better: Model, worse: Model) -> bool:
     """Whether left-out blocks are predicted better by more than chance."""
-    gain, spread = difference(worse.validated, better.validated)
-    return gain > MEANINGFUL * spread
+    return better_beyond_chance(better.validated, worse.validated)
 
 
 @dataclass

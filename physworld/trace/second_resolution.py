@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from physworld.trace.candidates import Candidate
-from physworld.trace.comparison import cross_validated, difference
+from physworld.trace.comparison import better_beyond_chance, cross_validated
 from physworld.trace.config import TraceConfig
-from physworld.trace.confirm import MEANINGFUL, Model
+from physworld.trace.confirm import Model
 from physworld.trace.intervals import numbers
 from physworld.trace.refit import Refit, refit
 from physworld.trace.result import Number
@@ -78,8 +78,8 @@ class SecondResolution:
         if plain is None:
             return False
         before, after = (cross_validated(fitted, self.block_of_row) for fitted in (plain, fine))
-        gain, spread = difference(before, after)
-        return gain > MEANINGFUL * spread and gain >= self.config.material_share * before.mean
+        share = 1.0 - after.mean / before.mean
+        return better_beyond_chance(after, before) and share >= self.config.material_share
 
     def _alike(self, coarse: Refit, fine: Refit, member: Candidate) -> bool:
         """Whether an effect does the same to the prediction at both resolutions, whatever its numbers.

@@ -17,14 +17,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from physworld.trace.comparison import alikeness, difference, seen_through
+from physworld.trace.comparison import alikeness, better_beyond_chance, difference, seen_through
 from physworld.trace.config import TraceConfig
-from physworld.trace.confirm import MEANINGFUL, Model, beats, explained_direction
+from physworld.trace.confirm import Model, beats, explained_direction
 
 NAMED, EQUIVALENT, DATA, NUMERICAL = "named", "equivalent_set", "data_issue", "numerical_issue"
 UNEXPLAINED, NOTHING = "unexplained", "nothing_to_explain"
 FASTEST_WIND_M_S = 20.0
 LARGEST_TILT_RAD = 0.2
+LARGEST_MAGNITUDE = 0.01  # over the Earth gravity's strength differs by half as much
 _DISCREPANCY = 0.05
 _NOISE_KNOWN = 0.05  # share to which the variance of the noise is known
 
@@ -160,8 +161,8 @@ def survives(
 ) -> bool:
     """Whether what a model explains is more than what other cells and time steps would change."""
     before, after = (seen_through(m.fitted.residual, solver, block_of_row) for m in (declared, model))
-    gain, spread = difference(before, after)
-    return gain > MEANINGFUL * spread and gain >= config.material_share * before.mean
+    share = 1.0 - after.mean / before.mean
+    return better_beyond_chance(after, before) and share >= config.material_share
 
 
 def implausible(model: Model) -> str | None:
@@ -169,13 +170,15 @@ def implausible(model: Model) -> str | None:
 
     A wind is a push with the drag that it comes with: without the drag the push is other gravity, which has its own
     name, and a push over a drag that is a gale is no wind in a room. A plumb line shows a frame that is far off the
-    vertical before a recording does.
+    vertical before a recording does. Its strength is known everywhere; a body that weighs less is carried by a fluid.
     """
     for known in model.fitted.twin.effects:
         if known.name == "gravity_tilt" and "gravity_tilt" in model.names:
             tilt = float(np.hypot(known.values["tilt_x_rad"], known.values["tilt_y_rad"]))
             if tilt > LARGEST_TILT_RAD:
                 return f"gravity tilted by {np.degrees(tilt):.0f}° is not believed"
+            if abs(known.values["magnitude"] or 0.0) > LARGEST_MAGNITUDE:
+                return f"gravity that differs by {known.values['magnitude']:+.0%} is not believed"
         if known.name == "wind" and "wind" in model.names:
             values = known.values
             push = float(np.linalg.norm([values[f"push_{axis}_m_s2"] for axis in "xyz"]))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from physworld.trace.comparison import cross_validated
+from physworld.trace.comparison import CrossValidation, better_beyond_chance, cross_validated, difference
 from physworld.trace.refit import Refit
 from physworld.trace.unknowns import Unknown
 
@@ -57,3 +57,32 @@ def test_what_a_left_out_block_alone_shows_does_not_blow_up_its_error() -> None:
     observed = shown + rng.normal(size=100)
     found = cross_validated(refit(jacobian, observed, [(-5.0, 5.0), (-0.5, 0.5)]), block_of_row)
     assert found.errors.max() < 1.6
+
+
+def blocks(*errors: float) -> CrossValidation:
+    return CrossValidation(np.array(errors), np.full(len(errors), 30))
+
+
+def test_an_effect_that_grows_over_time_is_beyond_chance() -> None:
+    """Its differences spread as widely as the effect does; in every block the error is a share of what it was."""
+    before, after = blocks(1.1, 1.6, 2.5, 3.5, 5.5, 16.0), blocks(1.0, 1.1, 0.9, 1.2, 1.0, 1.1)
+    gain, spread = difference(before, after)
+    assert gain < 2.0 * spread
+    assert better_beyond_chance(after, before)
+    assert not better_beyond_chance(before, after)
+
+
+def test_a_gain_in_one_block_only_is_within_chance() -> None:
+    assert not better_beyond_chance(
+        blocks(1.0, 1.02, 0.98, 1.1, 1.0, 1.0), blocks(1.0, 1.0, 1.0, 1.05, 1.0, 9.0)
+    )
+
+
+def test_a_smaller_error_in_most_blocks_is_no_gain_where_the_whole_is_worse() -> None:
+    assert not better_beyond_chance(
+        blocks(0.5, 0.5, 0.5, 0.5, 0.5, 9.0), blocks(1.0, 1.0, 1.0, 1.0, 1.0, 6.0)
+    )
+
+
+def test_one_block_tells_nothing() -> None:
+    assert not better_beyond_chance(blocks(1.0), blocks(9.0))

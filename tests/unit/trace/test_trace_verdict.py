@@ -139,6 +139,13 @@ def test_a_nearly_complete_pair_is_no_evidence_where_a_nearly_complete_effect_is
     assert answer([pair], before) == ("unexplained", ())
 
 
+@pytest.mark.parametrize(("share", "believed"), [(-0.005, True), (0.04, False), (-0.12, False)])
+def test_a_body_that_weighs_less_is_not_in_other_gravity(share: float, believed: bool) -> None:
+    weaker = model(NOISE, "gravity_tilt")
+    weaker.fitted.twin.effects = (effect("gravity_tilt", magnitude=share),)
+    assert (implausible(weaker) is None) == believed
+
+
 @pytest.mark.parametrize(("tilt_rad", "believed"), [(0.15, True), (0.3, False)])
 def test_gravity_that_a_plumb_line_shows_to_be_off_is_not_believed(tilt_rad: float, believed: bool) -> None:
     tilted = model(NOISE, "gravity_tilt")
