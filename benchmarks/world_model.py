@@ -8,8 +8,9 @@ One graph of 150 vertices and about 1950 directed edges, 7 message passing steps
   Geometric ``MessagePassing``, eager, on the same graph and features;
 * ``pytorch_naive``: our own function written the plain way (``physworld.worldmodel.naive``), eager torch.
 
-All roll the same sequence out, features included, with the material graph kept. Training is one sample (one
-sub-sequence and one step, forward and backward) out of a batch.
+All roll the same sequence out, features included, with the material graph kept; ``ours_rebuilt`` is ours with its NEAR
+edges found anew at every step (``near_edges = "current"``). Training is one sample (one sub-sequence and one step,
+forward and backward) out of a batch.
 
 ``batch_rollouts_per_second``: candidates of BATCH_STEPS steps from one start, together in the native engine (``ours``,
 one thread and as many as there are cores), one call each (``one_by_one``), and together in torch (``torch``, the
@@ -102,20 +103,23 @@ def measure(repeats: int, seed: int) -> Report:
     """Rollouts, batches and training at both widths; the simulators once."""
     torch.set_num_threads(1)
     wp.config.quiet = True
-    speeds: dict[str, dict[str, float]] = {"ours": {}, "pyg": {}, "pytorch_naive": {}}
-    training: dict[str, dict[str, float]] = {"ours": {}, "naive": {}}
+    speeds: dict[str, dict[str, float]] = {"ours": {}, "ours_rebuilt": {}, "pyg": {}, "pytorch_naive": {}}
+    training: dict[str, dict[str, float]] = {"ours": {}, "ours_rebuilt": {}, "naive": {}}
     batches: dict[str, dict[str, float]] = {}
     rows = []
     spec = None
     for hidden in HIDDEN:
         model, spec = _model(hidden, seed)
+        rebuilt, _ = _model(hidden, seed, "current")
         naive = NaiveWorldModel(model)
         start, driven, phi = _sequence(spec, seed)
         cases = {
             "ours": _engine_case(model, start, driven, phi),
+            "ours_rebuilt": _engine_case(rebuilt, start, driven, phi),
             "pyg": _torch_case(model, _PygNetwork(naive), start, driven, phi),
             "pytorch_naive": _torch_case(model, naive, start, driven, phi),
             "train ours": _training_case(model, model, start, driven, phi),
+            "train ours_rebuilt": _training_case(rebuilt, rebuilt, start, driven, phi),
             "train naive": _training_case(model, naive, start, driven, phi),
             **_batch_cases(model, start, driven, phi),
         }
@@ -148,7 +152,7 @@ def measure(repeats: int, seed: int) -> Report:
         rows=rows,
         notes=(
             f"{spec.vertex_count} vertices, {spec.edge_count} edges, 7 message passing steps, history 3; the graph "
-            "is material and kept.",
+            "is material and kept, but for ours_rebuilt, which finds its near edges (7 a vertex) at every step.",
             "The peer of rollouts is PyG eager, of training our function written the plain way.",
             f"Batches: {CANDIDATES} candidates of {BATCH_STEPS} steps from one start; the peer is torch, where the "
             "whole batch is one tensor.",
@@ -161,11 +165,13 @@ def measure(repeats: int, seed: int) -> Report:
     )
 
 
-def _model(hidden: int, seed: int) -> tuple[WorldModel, GraphSpec]:
+def _model(hidden: int, seed: int, near_edges: str = "material") -> tuple[WorldModel, GraphSpec]:
     """A bar held at one end, random weights."""
     axes = (np.arange(40), np.arange(8), np.arange(8))
     bar = SPACING_M * np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    config = WorldModelConfig(hidden=hidden, vertices=VERTICES, neighbours=7, coarse_vertices=8)
+    config = WorldModelConfig(
+        hidden=hidden, vertices=VERTICES, neighbours=7, coarse_vertices=8, near_edges=near_edges
+    )
     groups = (np.arange(CONTROLS),)
     spec = build_graph(bar, bar, bar[:CONTROLS], dt_s=1 / 30, config=config, control_groups=groups)
     scales = Normalisation(3e-3, 1e-3, (1e-3,) * 3, (4e-3,) * 3, (4e-3,) * 3, (0.2, 0.1))

@@ -19,7 +19,9 @@ class TrainingConfig(Request):
 
     The defaults are meant for some minutes on one core. ``patience``: validations without a better one after which
     the training ends (0: never). ``start_share`` below 1: the training may begin once that share of the dataset's
-    episodes is committed, and takes the others in as it goes (``physworld.worldmodel.training``).
+    episodes is committed, and takes the others in as it goes (``physworld.worldmodel.training``). ``prior``: what the
+    network corrects; ``none``: it stands alone. ``near_edges``: ``current`` finds the neighbours anew at every step, so
+    that parts of the object that meet see each other.
     """
 
     hidden: int = Field(default=64, ge=8, le=1024)
@@ -30,6 +32,8 @@ class TrainingConfig(Request):
     steps: int = Field(default=240, ge=1, le=1_000_000)
     batch_size: int = Field(default=6, ge=1, le=256)
     learning_rate: float = Field(default=1e-3, gt=0, le=1)
+    prior: Literal["auto", "modal", "chain", "none"] = "auto"
+    near_edges: Literal["material", "current"] = "material"
     patience: int = Field(default=8, ge=0, le=1000)
     start_share: float = Field(default=1.0, gt=0, le=1)
     fine_tune_steps: int = Field(default=60, ge=0, le=10_000)

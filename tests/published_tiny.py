@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 from functools import cache
+from typing import Any
 
 import numpy as np
 from safetensors.numpy import save as save_tensors
@@ -46,8 +47,17 @@ def tiny_model() -> tuple[Scene, Twin, PublishedModel]:
     return scene, twin, view.published(trained.model, phi, phi)
 
 
-def publish_tiny(database: Database, artifacts: ArtifactStore) -> tuple[str, int]:
-    """Register scene, fit and model; the model's name and version."""
+def publish_tiny(
+    database: Database,
+    artifacts: ArtifactStore,
+    *,
+    lacking: str | None = None,
+    card: dict[str, Any] | None = None,
+) -> tuple[str, int]:
+    """Register scene, fit and model; the model's name and version.
+
+    ``lacking``: a tensor that is left out, as in a version of an older layout; ``card``: more of its card.
+    """
     scene, twin, model = tiny_model()
     scene_id = register(scene, database, artifacts)
     buffer = io.BytesIO()
@@ -62,10 +72,11 @@ def publish_tiny(database: Database, artifacts: ArtifactStore) -> tuple[str, int
         assert lease is not None
         result = {"parameters": {}, "metrics": {}, "artifacts": [file.model_dump()]}
         assert leases.complete(session, lease, result, None)
-    card = json.dumps({"architecture": model.facts()}).encode()
+    text = json.dumps({"architecture": model.facts()} | (card or {})).encode()
+    tensors = {name: values for name, values in model.to_tensors().items() if name != lacking}
     files = [
-        artifacts.put_bytes(save_tensors(model.to_tensors(), {}), "model.safetensors"),
-        artifacts.put_bytes(card, "card.json", "application/json"),
+        artifacts.put_bytes(save_tensors(tensors, {}), "model.safetensors"),
+        artifacts.put_bytes(text, "card.json", "application/json"),
     ]
     config = WireConfig(hidden=16, message_passing_steps=2, history=2, vertices=20)
     with database.session() as session:

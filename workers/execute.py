@@ -20,6 +20,7 @@ from celery.exceptions import SoftTimeLimitExceeded
 
 from physworld.errors import Cancelled as LibraryCancelled
 from physworld.errors import PhysworldError
+from physworld.worldmodel.errors import WorldModelError
 from schemas.base import Problem
 from storage import leases
 from storage.database import Database, open_database
@@ -42,7 +43,14 @@ WORTH_A_RETRY = (
     StoreWriteFailed,
     UnknownShardKind,
 )
-SAID_BY_THE_WORK = (PhysworldError, StorageError, WorkerError, ValueError, SoftTimeLimitExceeded)
+SAID_BY_THE_WORK = (
+    PhysworldError,
+    WorldModelError,
+    StorageError,
+    WorkerError,
+    ValueError,
+    SoftTimeLimitExceeded,
+)
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from physworld.worldmodel.chain import CALMINGS, ChainPrior
 from physworld.worldmodel.chain_native import NativeFlow
+from physworld.worldmodel.inertia import one_step_residual
 
 LEAN_FLOOR = 1e-6  # 1 + cosine of a grip's turn; near 180 degrees the least rotation is not determined
 _LENGTH_FLOOR_M2 = 1e-24
@@ -121,11 +122,7 @@ class ChainStep(nn.Module):
 
     def residual(self, positions: Tensor, phi: Tensor) -> Tensor:
         """What the prior leaves of each step of a track (T, V, 3) with Φ (n, 2): x^{t+1} - x̂^{t+1}, (n, T-1-h, 3)."""
-        n, h = self.spread.shape[0], self.history
-        count = positions.shape[0] - 1 - h
-        window = torch.stack([positions[k : k + count].transpose(0, 1) for k in range(h + 1)])
-        following = positions[h + 1 :].transpose(0, 1)
-        return following[:n] - self(window, following[n:], phi[:, None].expand(-1, count, -1))
+        return one_step_residual(self, positions, phi, self.spread.shape[0], self.history)
 
     def _flow(self, *start: Tensor) -> Tensor:
         native = start[0].device.type == "cpu" and start[0].dtype == torch.float32

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-PRIORS = ("auto", "modal", "chain")
+PRIORS = ("auto", "modal", "chain", "none")
+NEAR_EDGES = ("material", "current")
 
 
 @dataclass(frozen=True)
@@ -18,6 +19,8 @@ class WorldModelConfig:
         vertices: object vertices by farthest-point sampling, 100 to 150 in the paper.
         neighbours: each vertex hears at least its so many nearest; the edge set is made symmetric, so the
             mean degree comes out about a fifth higher.
+        near_edges: "material": those nearest at rest, kept; "current": the ``neighbours`` nearest within the edge
+            radius at every step, so that parts that meet see each other (``physworld.worldmodel.nearest``).
         edge_radius_spacings: no edge between object vertices is longer than this many vertex spacings d_v.
         coarse_vertices: so many vertices, spread over the body, are linked with each other.
         coarse_links: and every vertex with so many of them; 0 leaves the paper's local graph.
@@ -31,6 +34,7 @@ class WorldModelConfig:
     history: int = 3
     vertices: int = 100
     neighbours: int = 10
+    near_edges: str = "material"
     edge_radius_spacings: float = 6.0
     coarse_vertices: int = 12
     coarse_links: int = 2
@@ -42,6 +46,8 @@ class WorldModelConfig:
         for name in ("hidden", "message_passing_steps", "history", "vertices", "neighbours"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, but must be at least 1")
+        if self.near_edges not in NEAR_EDGES:
+            raise ValueError(f"near_edges {self.near_edges!r}; known are {', '.join(NEAR_EDGES)}")
 
 
 @dataclass(frozen=True)
@@ -61,7 +67,8 @@ class TrainingConfig:
         validation_fraction: share of the episodes held out whole.
         validation_every: steps between open-loop validations.
         patience: validations in a row without a better one after which the training ends early; 0: never.
-        prior: what stands under the network: "modal", "chain", or "auto": whichever errs less on validation episodes.
+        prior: what stands under the network: "modal", "chain", "auto": whichever of the two errs less on validation
+            episodes, or "none": the network alone gives the accelerations (``physworld.worldmodel.inertia``).
         start_share: share of the episodes that the training begins with; 1: it has all of them from the start.
         checkpoint_every: steps between checkpoints.
         threads: torch threads.

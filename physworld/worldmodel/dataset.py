@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 
 from physworld.worldmodel.errors import DatasetUnusable
-from physworld.worldmodel.graph import EDGE_KINDS, GraphSpec
+from physworld.worldmodel.graph import EDGE_KINDS, NEAR, GraphSpec
 from physworld.worldmodel.model import Normalisation
+from physworld.worldmodel.nearest import cut_rest_length, cut_strain, near_ends
 
 SCALE_FLOOR_M = 1e-7
 PROPERTY_FLOOR = 0.05
@@ -102,6 +103,10 @@ def measure_scales(
         _add(squares, "velocity", x[1:, :n] - x[:-1, :n])
         _add(squares, "change", residual(track))
         for kind in range(EDGE_KINDS):
+            if kind == NEAR and spec.current_neighbours:
+                for name, values in _current_scales(x, spec).items():
+                    _add(squares, f"{name}{kind}", values)
+                continue
             taken = (spec.neighbours < spec.vertex_count) & (spec.edge_kind == kind)
             rest = torch.as_tensor(spec.rest_relative[taken], dtype=torch.float32)
             relative = x[:, spec.neighbours[taken]] - x[:, np.nonzero(taken)[0]]
@@ -121,6 +126,22 @@ def measure_scales(
         properties=tuple(max(float(value), PROPERTY_FLOOR) for value in spread),
         **by_kind,
     )
+
+
+def _current_scales(x: Tensor, spec: GraphSpec) -> dict[str, Tensor]:
+    """The same of the NEAR edges that each frame of a track (T, V, 3) has, as the network sees them."""
+    n, radius = spec.object_count, spec.edge_radius_m
+    frame, receiver, sender = near_ends(x[:, :n].numpy(), spec.current_neighbours, radius)
+    rest = torch.as_tensor(spec.rest_vertices[sender] - spec.rest_vertices[receiver], dtype=torch.float32)
+    relative = x[frame, sender] - x[frame, receiver]
+    before = np.maximum(frame - 1, 0)
+    moved = relative - (x[before, sender] - x[before, receiver])
+    rest_length = cut_rest_length(torch.linalg.vector_norm(rest, dim=-1), radius)
+    return {
+        "relative": moved[torch.as_tensor(frame > 0)],
+        "strain": cut_strain(relative - rest, radius),
+        "stretch": torch.linalg.vector_norm(relative, dim=-1) - rest_length,
+    }
 
 
 class WindowSampler:

@@ -17,8 +17,10 @@ import torch
 
 from physworld.worldmodel.chain_native import chain_arrays, chain_scratch, chain_sizes
 from physworld.worldmodel.chain_step import ChainStep
+from physworld.worldmodel.inertia import InertialStep
 from physworld.worldmodel.messages import warp_module
-from physworld.worldmodel.model import WorldModel
+from physworld.worldmodel.model import PriorStep, WorldModel
+from physworld.worldmodel.nearest import REST_RADII
 
 REGISTER = 16
 GAP_FLOOR_M = 1e-7  # rounding: the reference places of object vertices are their rest places
@@ -42,7 +44,7 @@ class RolloutEngine:
         }
         if chain is not None:
             self._fixed |= chain_arrays(chain)
-        else:
+        elif isinstance(model.prior, PriorStep):
             self._fixed |= {
                 "mean": _floats(model.prior.mean),
                 "basis": _floats(model.prior.basis),
@@ -50,11 +52,13 @@ class RolloutEngine:
                 "prior_weight": _floats(model.prior.weight),
                 "prior_response": _floats(model.prior.response),
             }
-        self._placing = None if chain is not None else model.prior.placing.numpy().astype(np.float64)
-        self._span = (0.0, 0.0) if chain is not None else tuple(model.prior.span.tolist())
+        modal = model.prior if isinstance(model.prior, PriorStep) else None
+        self._placing = None if modal is None else modal.placing.numpy().astype(np.float64)
+        self._span = (0.0, 0.0) if modal is None else tuple(modal.span.tolist())
         self._property_scale = norm.properties.numpy()
         change, velocity, length = (float(x) for x in (norm.change, norm.velocity, norm.length))
-        self._scalars = np.array([1.0 / velocity, change, 1.0 / length], dtype=np.float32)
+        scalars = [1.0 / velocity, change, 1.0 / length, spec.edge_radius_m, REST_RADII * spec.edge_radius_m]
+        self._scalars = np.array(scalars, dtype=np.float32)
         self._sizes = {
             "corrected": int(model.corrects_prior()),
             "first": config.history,
@@ -65,7 +69,9 @@ class RolloutEngine:
             "layers": config.message_passing_steps,
             "hidden": self.hidden,
             "chained": int(chain is not None),
-            "modes": 0 if chain is not None else model.prior.basis.shape[0],
+            "inertial": int(isinstance(model.prior, InertialStep)),
+            "nearest": spec.current_neighbours,
+            "modes": 0 if modal is None else modal.basis.shape[0],
             "controls": spec.control_count,
             "inputs": model.skip.in_features,
             "places_width": 3 * (config.history + 2),
@@ -110,10 +116,24 @@ class RolloutEngine:
         return path
 
     def _softness(self, phi: np.ndarray) -> np.ndarray:
-        """ζ of the modal prior from Φ (B, n, 2), (B,); 0 where there is a chain."""
+        """ζ of the modal prior from Φ (B, n, 2), (B,); 0 where there is another one or none."""
         if self._placing is None:
             return np.zeros(len(phi))
         return np.clip(np.tensordot(phi, self._placing, axes=2), *self._span)
+
+    def _with_room(self, nearest: int) -> dict[str, np.ndarray]:
+        """Edge arrays of one call with room for the NEAR edges of a step, and the search's working memory."""
+        room = self.objects * nearest
+
+        def longer(kept: np.ndarray) -> np.ndarray:
+            return np.concatenate([kept, np.zeros((room, *kept.shape[1:]), dtype=kept.dtype)])
+
+        edges = {name: longer(self._fixed[name]) for name in ("edge_sender", "edge_rest", "edge_gap")}
+        return edges | {
+            "gapped": self._fixed["gapped"].copy(),
+            "found": np.zeros(self.objects, dtype=np.int32),
+            "reach": np.zeros(nearest, dtype=np.float32),
+        }
 
     def _launch(self, path: np.ndarray, phi: np.ndarray, soft: np.ndarray, logs: np.ndarray) -> None:
         """Fill in ``path`` (B, T, V, 3) in place; the arrays are contiguous float32."""
@@ -126,12 +146,14 @@ class RolloutEngine:
             "features": self.vertices * sizes["inputs"],
             "places": self.vertices * sizes["places_width"],
             "correction": self.objects * REGISTER,
-            "length": edges,
-            "regressors": 0 if sizes["chained"] else self._fixed["prior_weight"].shape[1],
+            "length": edges + self.objects * sizes["nearest"],
+            "regressors": self._fixed["prior_weight"].shape[1] if sizes["modes"] else 0,
             "ahead": 3 * self.vertices,
         }
         arrays = self._fixed | {name: np.zeros(count, dtype=np.float32) for name, count in scratch.items()}
         arrays |= {"paths": path, "phis": phi, "softnesses": soft, "logs": logs}
+        if sizes["nearest"]:
+            arrays |= self._with_room(sizes["nearest"])
         if sizes["chained"]:
             arrays["chain_scratch"] = chain_scratch(sizes["chain_width"])
         addresses_of = [arrays[name].ctypes.data if name in arrays else 0 for name in kernels.ARRAYS]

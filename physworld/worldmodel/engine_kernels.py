@@ -17,14 +17,15 @@ import warp as wp
 
 from physworld.worldmodel.chain_kernels import CHAIN_ARRAYS, CHAIN_SIZES
 from physworld.worldmodel.chain_text import STEP, TEXT, VECTORS
+from physworld.worldmodel.nearest_kernels import NEAREST
 
 wp.set_module_options({"enable_backward": False})
 
 SIZES = (
     "candidates", "corrected", "first", "frames", "history", "objects", "vertices", "edges", "layers", "hidden",
-    "modes", "controls", "inputs", "places_width", "grounded", "chained", *CHAIN_SIZES,
+    "modes", "controls", "inputs", "places_width", "grounded", "chained", "inertial", "nearest", *CHAIN_SIZES,
 )  # fmt: skip
-SCALARS = ("per_velocity", "change", "per_length")
+SCALARS = ("per_velocity", "change", "per_length", "radius", "longest_rest")
 ARRAYS = (
     "paths", "amplitudes", "offsets", "edge_sender", "edge_receiver", "edge_offset", "share",
     "reference", "phis", "softnesses", "mean", "basis", "shape", "prior_weight", "prior_response",
@@ -34,9 +35,9 @@ ARRAYS = (
     "update_in", "update_in_bias", "update_out", "update_out_bias",
     "decode_in", "decode_in_bias", "decode_out", "decode_out_bias", "skip",
     "features", "places", "state", "hear", "say", "placed", "heard", "sent", "sums", "inner", "correction",
-    "length", "regressors", "ahead", "logs", *CHAIN_ARRAYS,
+    "length", "regressors", "ahead", "logs", "found", "reach", *CHAIN_ARRAYS,
 )  # fmt: skip
-INTEGER_ARRAYS = frozenset({"offsets", "edge_sender", "edge_receiver", "gapped"})
+INTEGER_ARRAYS = frozenset({"offsets", "edge_sender", "edge_receiver", "gapped", "found"})
 
 
 def _unpack() -> str:
@@ -59,6 +60,7 @@ _ROLLOUT = (
 """
     + TEXT
     + STEP
+    + NEAREST
     + r"""
 #if defined(__AVX512F__)
     const int ROWS = 4, COLUMNS = 2;
@@ -134,6 +136,8 @@ _ROLLOUT = (
             float* next = path + (long long)(t + 1) * VN * 3;
             if (chained) {
                 chain(t, ahead);
+            } else if (inertial) {
+                for (int i = 0; i < 3 * N; ++i) ahead[i] = 2.0f * now[i] - now[i - 3LL * VN];
             } else {  // modal prior
                 project(t);
                 int f = 0;
@@ -208,6 +212,31 @@ _ROLLOUT = (
                 }
                 length[e] = __builtin_sqrtf(square);
             }
+            if (nearest) {  // NEAR edges of the places now: those of vertex i lie from edges + i nearest on
+                gapped[0] = 0;
+                find_nearest(now, N, nearest, radius, edge_sender + edges, found, reach);
+                for (int i = 0; i < N; ++i)
+                    for (int e = edges + i * nearest; e < edges + i * nearest + found[i]; ++e) {
+                        const float *x = now + 3 * i, *y = now + 3 * edge_sender[e];
+                        const float* here = places + (long long)i * places_width;
+                        const float* there = places + (long long)edge_sender[e] * places_width;
+                        float apart = 0.0f, rest = 0.0f, strain = 0.0f;
+                        for (int k = 0; k < 3; ++k) {
+                            const float gap = y[k] - x[k], own = there[k] - here[k];
+                            const float before = there[places_width - 3 + k] - here[places_width - 3 + k];
+                            apart += gap * gap;
+                            strain += own * own;
+                            rest += before * before;
+                        }
+                        rest = __builtin_sqrtf(rest);
+                        strain = __builtin_sqrtf(strain);
+                        length[e] = __builtin_sqrtf(apart);
+                        edge_rest[e] = rest < longest_rest ? rest : longest_rest;
+                        const float cut = strain > radius ? radius / strain - 1.0f : 0.0f;
+                        if (cut != 0.0f) gapped[0] = 1;
+                        for (int k = 0; k < 3; ++k) edge_gap[3 * e + k] = cut * (there[k] - here[k]);
+                    }
+            }
             product(inner, features, encode_in, encode_in_bias, VN, inputs, H, false);
             rectify(inner, VN * H);
             product(state, inner, encode_out, encode_out_bias, VN, H, H, false);
@@ -225,7 +254,14 @@ _ROLLOUT = (
                         *(V*)(sent + c) = *(V*)(say + c) + *(V*)(placed + c);
                     }
                     for (int i = 0; i < VN; ++i) {
-                        const int row = kind * VN + i, from = offsets[row], to = offsets[row + 1];
+                        const int row = kind * VN + i;
+                        int from = offsets[row], to = offsets[row + 1];
+                        float part = share[row];
+                        if (nearest && kind == 0) {
+                            from = edges + i * nearest;
+                            to = from + (i < N ? found[i] : 0);
+                            part = to > from ? 1.0f / (to - from) : 0.0f;
+                        }
                         for (int c = 0; c < H; c += 16) {
                             const V p = *(const V*)(heard + (long long)i * H + c);
                             const V w = *(const V*)(length_weight + row_of_kind * H + c);
@@ -247,7 +283,7 @@ _ROLLOUT = (
                                     sum += positive(fused(length[e], w, fused(edge_rest[e], u, m)));
                                 }
                             }
-                            *(V*)(sums + (long long)i * H + c) = sum * share[row];
+                            *(V*)(sums + (long long)i * H + c) = sum * part;
                         }
                     }
                     product(inner, sums, update_in + 4 * square + (1 + kind) * H * H, nullptr, VN, H, H, true);

@@ -6,6 +6,7 @@ WorldModelError
 ├── TrainingDiverged     loss or gradient exploded several times in a row (``step`` says from when)
 ├── TrainingCancelled    the caller's ``cancelled`` said so
 ├── CheckpointMismatch   a checkpoint of other settings or other data
+├── VersionUnreadable    a published version that this one cannot read: an older or newer layout
 └── ControlsInvalid      control paths that cannot drive this model (``field`` says which part of them)
 """
 
@@ -43,6 +44,12 @@ class TrainingCancelled(WorldModelError):
 
 class CheckpointMismatch(WorldModelError):
     """The checkpoint belongs to other settings or other data."""
+
+
+class VersionUnreadable(WorldModelError):
+    """The tensors or facts of a published version are not of a layout that is read here."""
+
+    code = "model_unreadable"
 
 
 class ControlsInvalid(WorldModelError):

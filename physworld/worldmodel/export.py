@@ -10,9 +10,11 @@
     next           (V, 3)       all vertices at t + 1 [m]
 
 float32 but for the indices. V, C, n and h are the model's; the number of edges E is free, so that another graph over
-the same vertices (an edge that tore, a contact) can be given at each step; ``edge_list`` is the model's own. The
-equations are those of ``physworld.worldmodel.model``, written edge by edge: the split form keeps its constants per
-graph and would freeze E. The substeps of a rope's chain are unrolled: one to two thousand operations more.
+the same vertices (an edge that tore, a contact) can be given at each step; ``edge_list`` is the model's own. A model
+whose NEAR edges are those of the current shape (``physworld.worldmodel.nearest``) is given them by its caller: the
+search is no part of the program. The equations are those of ``physworld.worldmodel.model``, written edge by edge: the
+split form keeps its constants per graph and would freeze E. The substeps of a rope's chain are unrolled: one to two
+thousand operations more.
 """
 
 from __future__ import annotations
@@ -28,8 +30,9 @@ import torch
 from torch import Tensor, nn
 
 from physworld.worldmodel.chain_step import ChainStep
-from physworld.worldmodel.graph import EDGE_KINDS, GraphSpec
+from physworld.worldmodel.graph import EDGE_KINDS, NEAR, GraphSpec
 from physworld.worldmodel.model import WorldModel
+from physworld.worldmodel.nearest import cut_rest_length, cut_strain, near_ends
 
 INPUTS = ("window", "control_next", "phi", "senders", "receivers", "kinds", "rest_relative")
 OUTPUT = "next"
@@ -49,6 +52,7 @@ class StepProgram(nn.Module):
         self.receive, self.send, self.edge = model.receive, model.send, model.edge
         self.update_in, self.update_out, self.skip = model.update_in, model.update_out, model.skip
         self.norm, self.prior = model.norm, model.prior
+        self.radius = spec.edge_radius_m if spec.current_neighbours else None
 
     def forward(
         self,
@@ -114,10 +118,15 @@ class StepProgram(nn.Module):
         moves = (relative[1:] - relative[:-1]).flip(0) / drift
         length = torch.linalg.vector_norm(relative[-1], dim=-1, keepdim=True)
         rest_length = torch.linalg.vector_norm(rest, dim=-1, keepdim=True)
+        strained = relative[-1] - rest
+        if self.radius is not None:
+            near = (kinds == NEAR)[:, None]
+            strained = torch.where(near, cut_strain(strained, self.radius), strained)
+            rest_length = torch.where(near, cut_rest_length(rest_length, self.radius), rest_length)
         return torch.cat(
             [
                 relative[-1] / norm.length,
-                (relative[-1] - rest) / strain,
+                strained / strain,
                 *moves.unbind(0),
                 rest_length / norm.length,
                 (length - rest_length) / stretch,
@@ -126,15 +135,29 @@ class StepProgram(nn.Module):
         )
 
 
-def edge_list(spec: GraphSpec) -> dict[str, np.ndarray]:
-    """The model's own edges as the program takes them."""
+def edge_list(spec: GraphSpec, places: np.ndarray | None = None) -> dict[str, np.ndarray]:
+    """The model's own edges as the program takes them.
+
+    With ``places`` (V or n, 3) [m] also its NEAR edges there, if they are those of the current shape.
+    """
     receivers, slots = np.nonzero(spec.neighbours < spec.vertex_count)
-    return {
+    edges = {
         "senders": spec.neighbours[receivers, slots].astype(np.int64),
         "receivers": receivers.astype(np.int64),
         "kinds": spec.edge_kind[receivers, slots].astype(np.int64),
         "rest_relative": spec.rest_relative[receivers, slots].astype(np.float32),
     }
+    if places is None or not spec.current_neighbours:
+        return edges
+    n, rest = spec.object_count, spec.rest_vertices.astype(np.float32)
+    _, hears, heard = near_ends(places[None, :n], spec.current_neighbours, spec.edge_radius_m)
+    near = {
+        "senders": heard,
+        "receivers": hears,
+        "kinds": np.full(len(heard), NEAR),
+        "rest_relative": rest[heard] - rest[hears],
+    }
+    return {name: np.concatenate([near[name], values], dtype=values.dtype) for name, values in edges.items()}
 
 
 def example_inputs(model: WorldModel) -> dict[str, np.ndarray]:
@@ -145,7 +168,7 @@ def example_inputs(model: WorldModel) -> dict[str, np.ndarray]:
         "window": np.repeat(rest[None], frames, axis=0).astype(np.float32),
         "control_next": rest[spec.object_count :].astype(np.float32),
         "phi": np.zeros((spec.object_count, model.norm.properties.shape[0]), dtype=np.float32),
-        **edge_list(spec),
+        **edge_list(spec, rest),
     }
 
 

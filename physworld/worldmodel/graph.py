@@ -10,11 +10,12 @@ followed by the control vertices (C). Edges are bidirectional, of three kinds:
 * GRIP: with control vertices. A marker of the gripper may sit outside the body, so no radius is asked of
   these.
 
-Neighbours are *material*: found once on the undeformed body and kept. An elastic solid keeps its
-neighbours, so the force on a vertex comes from the same vertices at all times; parts that merely pass close
-by (a folded rope) exert no elastic force, while a spatial radius would connect them; and a fixed graph
-trains as one dense batch and rolls out without a search. What it cannot express is contact of the object
-with itself, fracture and flow.
+Neighbours are *material* unless the config says otherwise: found once on the undeformed body and kept. An elastic
+solid keeps its neighbours, so the force on a vertex comes from the same vertices at all times; parts that merely pass
+close by (a folded rope) exert no elastic force, while a spatial radius would connect them; and a fixed graph trains as
+one dense batch and rolls out without a search. What it cannot express is contact of the object with itself, fracture
+and flow. With ``near_edges = "current"`` the table holds COARSE and GRIP edges only, and the NEAR ones are found at
+every step (``physworld.worldmodel.nearest``).
 
 Legend: n object vertices, C control vertices, V = n + C, D slots per vertex (largest degree), K controllers.
 """
@@ -48,6 +49,8 @@ class GraphSpec:
         vertex_spacing_m: d_v, the smallest separation of object vertices.
         edge_radius_m: d_e, the longest edge allowed between object vertices, the network's unit of length.
         ground_height_m: the plane's height, or None.
+        current_neighbours: how many nearest object vertices each of them hears by NEAR edges, found at every step; 0:
+            the NEAR edges are material and stand in ``neighbours``.
     """
 
     dt_s: float
@@ -60,6 +63,7 @@ class GraphSpec:
     vertex_spacing_m: float
     edge_radius_m: float
     ground_height_m: float | None = None
+    current_neighbours: int = 0
 
     @property
     def object_count(self) -> int:
@@ -78,7 +82,7 @@ class GraphSpec:
 
     @property
     def edge_count(self) -> int:
-        """Directed edges."""
+        """Directed edges that are kept."""
         return int((self.neighbours < self.vertex_count).sum())
 
 
@@ -151,7 +155,10 @@ def build_graph(
     kind = np.full((vertex_count, vertex_count), -1)
     object_kind = kind[:n, :n]
     object_kind[_coarse_links(distances, min(config.coarse_vertices, n), config.coarse_links)] = COARSE
-    object_kind[_near_links(distances, min(config.neighbours, n - 1), radius)] = NEAR
+    nearest = min(config.neighbours, n - 1)
+    material = config.near_edges == "material"
+    if material:
+        object_kind[_near_links(distances, nearest, radius)] = NEAR
     reach = np.linalg.norm(start[:, None] - controllers[control][None], axis=2)
     for block, links in zip(
         (kind[:n, n:], kind[n:, :n], kind[n:, n:]),
@@ -174,6 +181,7 @@ def build_graph(
         vertex_spacing_m=spacing,
         edge_radius_m=radius,
         ground_height_m=ground_height_m,
+        current_neighbours=0 if material else nearest,
     )
 
 

@@ -50,6 +50,12 @@ where s = t+1 takes c^{t+1}.
 **Chain prior**, of ropes, in place of the modal one: ``physworld.worldmodel.chain`` has its equations; its tensors are
 ``prior.`` and the fields of ``ChainPrior``, float32, and prior.substeps (1,) int64.
 
+**No prior**: ``physworld.worldmodel.inertia``; prior.lags (2,) in place of the modal prior's tensors.
+
+**NEAR edges of the current shape**, where ``graph.current_neighbours`` (1,) int64 is among the tensors:
+``physworld.worldmodel.nearest`` says which they are and what is cut off their features. The others then stand in
+``graph.kept_neighbours``, of the shape and meaning of ``graph.neighbours``, which such a model lacks.
+
 **Tensors** of ``model.safetensors`` (float32 unless said; ``.weight`` is (out, in)):
     encoder.in.weight (H, 3h+7 or 3h+8), encoder.in.bias (H), encoder.out.weight (H, H), encoder.out.bias (H),
     receive.{l}.weight (H, H), receive.{l}.bias (H), send.{l}.weight (H, H), edge.{l}.weight (3, H, 3h+8),
@@ -81,6 +87,7 @@ and |r^t|. The product of the messages with update_in follows the sum. The funct
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -90,11 +97,16 @@ from torch import Tensor, nn
 from physworld.worldmodel.chain import ChainPrior
 from physworld.worldmodel.chain_step import ChainStep
 from physworld.worldmodel.config import WorldModelConfig
-from physworld.worldmodel.graph import EDGE_KINDS, GraphSpec
+from physworld.worldmodel.graph import EDGE_KINDS, NEAR, GraphSpec
+from physworld.worldmodel.inertia import InertialPrior, InertialStep, one_step_residual
 from physworld.worldmodel.messages import EdgeList, as_seen, mean_messages
 from physworld.worldmodel.modal import ModalPrior, rigid_prior
+from physworld.worldmodel.nearest import CurrentEdges, KeptEdges
 
 PROPERTY_COUNT = 2
+
+Means = Callable[[int, Tensor, Tensor], Tensor]
+"""Mean messages (K, V, B, H) of a layer from what is heard and sent (K, V, B, H)."""
 
 
 @dataclass(frozen=True)
@@ -121,11 +133,13 @@ class Normalisation:
 @dataclass(frozen=True)
 class EdgeConstants:
     """Edge terms by layer that depend on weights and graph only: ``bias`` (E, H), ``position`` (3, 3(h+1), H) for
-    the linear part of the positions, ``length`` (3, H) for |r^t|."""
+    the linear part of the positions, ``length`` (3, H) for |r^t|, ``near`` (7, H) for what NEAR edges keep: r_rest,
+    what is cut off their strain, and |r_rest|."""
 
     bias: tuple[Tensor, ...]
     position: tuple[Tensor, ...]
     length: tuple[Tensor, ...]
+    near: tuple[Tensor, ...]
 
 
 class WorldModel(nn.Module):
@@ -136,7 +150,7 @@ class WorldModel(nn.Module):
         config: WorldModelConfig,
         spec: GraphSpec,
         normalisation: Normalisation | None = None,
-        prior: ModalPrior | ChainPrior | None = None,
+        prior: ModalPrior | ChainPrior | InertialPrior | None = None,
     ) -> None:
         super().__init__()
         self.config = config
@@ -181,6 +195,7 @@ class WorldModel(nn.Module):
         self.register_buffer("_receivers", receivers, persistent=False)
         kind_of_edge = self.edges.receivers // spec.vertex_count
         self._edges_by_kind = torch.bincount(kind_of_edge, minlength=EDGE_KINDS).tolist()
+        self._copies: dict[int, KeptEdges] = {}
 
     def forward(
         self, window: Tensor, ahead: Tensor, phi: Tensor, constants: EdgeConstants | None = None
@@ -199,18 +214,52 @@ class WorldModel(nn.Module):
         features = self._vertex_features(window, moves, ahead, phi)
         shifted = window[-1] - self._reference[:, None]
         places = torch.cat([shifted, *moves.unbind(0)], dim=-1).flatten(0, 1).expand(EDGE_KINDS, -1, -1)
-        relative = shifted.index_select(0, self._senders) - shifted.index_select(0, self._receivers)
-        length = torch.linalg.vector_norm(relative + self._offset[:, None], dim=-1)
+        means = self._material_means if not self.spec.current_neighbours else self._current_means
+        mean_of = means(window[-1], shifted, constants)
         state = self.encoder(features)
         for layer in range(self.config.message_passing_steps):
             placed = torch.bmm(places, constants.position[layer]).unflatten(1, window.shape[1:3])
             heard, sent = as_seen(self.receive[layer](state), self.send[layer](state), placed)
-            mean = mean_messages(
-                self.edges, heard, sent, constants.bias[layer], length, constants.length[layer]
-            )
+            mean = mean_of(layer, heard, sent)
             inner = self.update_in[layer](torch.cat([state, *mean.unbind(0)], dim=-1))
             state = state + self.update_out[layer](torch.relu(inner))
         return self.decoder(state[:n]) + self.skip(features[:n])
+
+    def _material_means(self, now: Tensor, shifted: Tensor, constants: EdgeConstants) -> Means:
+        """Mean messages of a layer over the graph's own edges, at places and displacements from the reference (V, B,
+        3).
+        """
+        relative = shifted.index_select(0, self._senders) - shifted.index_select(0, self._receivers)
+        length = torch.linalg.vector_norm(relative + self._offset[:, None], dim=-1)
+
+        def mean(layer: int, heard: Tensor, sent: Tensor) -> Tensor:
+            return mean_messages(
+                self.edges, heard, sent, constants.bias[layer], length, constants.length[layer]
+            )
+
+        return mean
+
+    def _current_means(self, now: Tensor, shifted: Tensor, constants: EdgeConstants) -> Means:
+        """The same with the NEAR edges of where the vertices are now."""
+        batch, spec = shifted.shape[1], self.spec
+        if batch not in self._copies:
+            self._copies[batch] = KeptEdges(self.edges, spec.vertex_count, batch)
+        found = CurrentEdges(
+            self._copies[batch],
+            now[: spec.object_count],
+            shifted,
+            self._reference,
+            self._offset,
+            neighbours=spec.current_neighbours,
+            radius_m=spec.edge_radius_m,
+        )
+
+        def mean(layer: int, heard: Tensor, sent: Tensor) -> Tensor:
+            return found.means(
+                heard, sent, constants.near[layer], constants.bias[layer], constants.length[layer]
+            )
+
+        return mean
 
     def step(
         self, window: Tensor, control_next: Tensor, phi: Tensor, constants: EdgeConstants | None = None
@@ -246,11 +295,10 @@ class WorldModel(nn.Module):
     def edge_constants(self) -> EdgeConstants:
         """What of the edge products depends on weights and graph only; valid until the weights change."""
         terms = [self._edge_terms(layer.weight) for layer in self.edge]
-        bias, position, length = (tuple(layer[term] for layer in terms) for term in range(3))
-        return EdgeConstants(bias, position, length)
+        return EdgeConstants(*(tuple(layer[term] for layer in terms) for term in range(4)))
 
-    def _edge_terms(self, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Bias, position and length terms of one layer from its weights (3, H, 3h+8)."""
+    def _edge_terms(self, weights: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Bias, position, length and NEAR terms of one layer from its weights (3, H, 3h+8)."""
         h, norm, weight = self.config.history, self.norm, weights.transpose(1, 2)
         strain_scale, drift_scale = norm.strain[:, None, None], norm.relative[:, None, None]
         near, strain = weight[:, 0:3] / norm.length, weight[:, 3:6] / strain_scale
@@ -259,7 +307,7 @@ class WorldModel(nn.Module):
         table = torch.cat([near, strain, (rest - stretch)[:, None]], dim=1)
         parts = self._constants.split(self._edges_by_kind)
         bias = torch.cat([part @ table[kind] for kind, part in enumerate(parts)])
-        return bias, torch.cat([near + strain, moves], dim=1), stretch
+        return bias, torch.cat([near + strain, moves], dim=1), stretch, table[NEAR]
 
     def _vertex_features(self, window: Tensor, moves: Tensor, ahead: Tensor, phi: Tensor) -> Tensor:
         """f_i, (V, B, F)."""
@@ -277,8 +325,12 @@ class WorldModel(nn.Module):
         return torch.cat(parts, dim=-1)
 
 
-def prior_step(prior: ModalPrior | ChainPrior, history: int) -> PriorStep | ChainStep:
+def prior_step(
+    prior: ModalPrior | ChainPrior | InertialPrior, history: int
+) -> PriorStep | ChainStep | InertialStep:
     """The module that computes x̂^{t+1} from ``prior``."""
+    if isinstance(prior, InertialPrior):
+        return InertialStep(prior, history)
     return ChainStep(prior, history) if isinstance(prior, ChainPrior) else PriorStep(prior, history)
 
 
@@ -319,11 +371,7 @@ class PriorStep(nn.Module):
 
     def residual(self, positions: Tensor, phi: Tensor) -> Tensor:
         """What the prior leaves of each step of a track (T, V, 3) with Φ (n, 2): x^{t+1} - x̂^{t+1}, (n, T-1-h, 3)."""
-        n, h = self.mean.shape[0], self.history
-        count = positions.shape[0] - 1 - h
-        window = torch.stack([positions[k : k + count].transpose(0, 1) for k in range(h + 1)])
-        following = positions[h + 1 :].transpose(0, 1)
-        return following[:n] - self(window, following[n:], phi[:, None].expand(-1, count, -1))
+        return one_step_residual(self, positions, phi, self.mean.shape[0], self.history)
 
 
 class _EdgeWeights(nn.Module):

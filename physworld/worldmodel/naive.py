@@ -6,11 +6,14 @@ meant to be used: it is several times slower. Equations and names: ``physworld.w
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
-from physworld.worldmodel.graph import EDGE_KINDS
+from physworld.worldmodel.export import edge_list
+from physworld.worldmodel.graph import EDGE_KINDS, NEAR
 from physworld.worldmodel.model import WorldModel
+from physworld.worldmodel.nearest import cut_rest_length, cut_strain
 
 
 class NaiveWorldModel(nn.Module):
@@ -19,14 +22,12 @@ class NaiveWorldModel(nn.Module):
     def __init__(self, model: WorldModel) -> None:
         super().__init__()
         self.model = model
-        spec = model.spec
-        neighbours = torch.as_tensor(spec.neighbours)
-        receiver, slot = torch.nonzero(neighbours < spec.vertex_count, as_tuple=True)
-        rest = torch.as_tensor(spec.rest_relative, dtype=torch.float32)[receiver, slot]
-        self.register_buffer("receiver", receiver, persistent=False)
-        self.register_buffer("sender", neighbours[receiver, slot], persistent=False)
-        self.register_buffer("kind", torch.as_tensor(spec.edge_kind)[receiver, slot], persistent=False)
-        self.register_buffer("rest", rest, persistent=False)
+        self._set_edges(edge_list(model.spec))
+
+    def _set_edges(self, edges: dict[str, np.ndarray]) -> None:
+        for name, key in (("receiver", "receivers"), ("sender", "senders"), ("kind", "kinds")):
+            self.register_buffer(name, torch.as_tensor(edges[key]), persistent=False)
+        self.register_buffer("rest", torch.as_tensor(edges["rest_relative"]), persistent=False)
 
     def edge_features(self, window: Tensor) -> Tensor:
         """e_ij of every edge, (E, B, 3h + 8)."""
@@ -35,6 +36,11 @@ class NaiveWorldModel(nn.Module):
         relative = window[:, self.sender] - window[:, self.receiver]
         rest = self.rest[:, None].expand(-1, batch, -1)
         rest_length = torch.linalg.vector_norm(rest, dim=-1, keepdim=True)
+        strained = relative[-1] - rest
+        if self.model.spec.current_neighbours:
+            near, radius = (self.kind == NEAR)[:, None, None], self.model.spec.edge_radius_m
+            strained = torch.where(near, cut_strain(strained, radius), strained)
+            rest_length = torch.where(near, cut_rest_length(rest_length, radius), rest_length)
         length = torch.linalg.vector_norm(relative[-1], dim=-1, keepdim=True)
         strain, drift, stretch = (
             scale[self.kind][:, None, None] for scale in (norm.strain, norm.relative, norm.stretch)
@@ -43,7 +49,7 @@ class NaiveWorldModel(nn.Module):
         return torch.cat(
             [
                 relative[-1] / norm.length,
-                (relative[-1] - rest) / strain,
+                strained / strain,
                 *moves.unbind(0),
                 rest_length / norm.length,
                 (length - rest_length) / stretch,
@@ -53,7 +59,12 @@ class NaiveWorldModel(nn.Module):
 
     def forward(self, window: Tensor, ahead: Tensor, phi: Tensor) -> Tensor:
         """y (n, B, 3); arguments as ``WorldModel.forward``."""
+        if self.model.spec.current_neighbours and window.shape[2] > 1:  # every element has edges of its own
+            parts = (part.split(1, dim=-2) for part in (window, ahead, phi))
+            return torch.cat([self(*element) for element in zip(*parts, strict=True)], dim=1)
         model = self.model
+        if model.spec.current_neighbours:
+            self._set_edges(edge_list(model.spec, window[-1, :, 0].detach().numpy()))
         moves = (window[1:] - window[:-1]).flip(0)
         features = model._vertex_features(window, moves, ahead, phi)
         state = model.encoder(features)

@@ -15,11 +15,13 @@ from physworld.worldmodel.chain_fit import fit_chain
 from physworld.worldmodel.config import WorldModelConfig
 from physworld.worldmodel.dataset import Track
 from physworld.worldmodel.graph import GraphSpec
+from physworld.worldmodel.inertia import InertialPrior
 from physworld.worldmodel.modal import ModalPrior, fit_prior
 from physworld.worldmodel.model import prior_step
 from physworld.worldmodel.rollout import mean_error, unroll_tracks
 
-MODAL, CHAIN = "modal", "chain"
+MODAL, CHAIN, NONE = "modal", "chain", "none"
+Prior = ModalPrior | ChainPrior | InertialPrior
 
 
 def fit_priors(
@@ -28,12 +30,14 @@ def fit_priors(
     spec: GraphSpec,
     config: WorldModelConfig,
     wanted: str = "auto",
-) -> dict[str, ModalPrior | ChainPrior]:
+) -> dict[str, Prior]:
     """Priors by name of vertex tracks (T, V, 3) and Φ (n, ·): the ``wanted`` one, or with "auto" all there are.
 
     A chain that is wanted where the body is no rope gives way to the modal prior.
     """
-    found: dict[str, ModalPrior | ChainPrior] = {}
+    if wanted == NONE:
+        return {NONE: InertialPrior(spec.object_count)}
+    found: dict[str, Prior] = {}
     if wanted != MODAL:
         chain = fit_chain(positions, phis, spec, config.history)
         if chain is not None:
@@ -43,7 +47,7 @@ def fit_priors(
     return found
 
 
-def prior_error(prior: ModalPrior | ChainPrior, tracks: list[Track], spec: GraphSpec, history: int) -> float:
+def prior_error(prior: Prior, tracks: list[Track], spec: GraphSpec, history: int) -> float:
     """Mean distance [m] of object vertices over whole episodes, predicted by the prior alone."""
     step = prior_step(prior, history)
 

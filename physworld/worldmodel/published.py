@@ -30,12 +30,15 @@ import torch
 from physworld.worldmodel.chain import ChainPrior
 from physworld.worldmodel.config import WorldModelConfig
 from physworld.worldmodel.engine import RolloutEngine
+from physworld.worldmodel.errors import VersionUnreadable, WorldModelError
 from physworld.worldmodel.graph import GraphSpec
+from physworld.worldmodel.inertia import InertialPrior
 from physworld.worldmodel.modal import ModalPrior
 from physworld.worldmodel.model import WorldModel
 from physworld.worldmodel.rollout import rollout, rollout_batch
 from physworld.worldmodel.skinning import Skin
 
+CARD_SCHEMA = 1
 _OWN = ("rest.", "particle.", "control.", "phi", "start.", "skin.", "graph.")
 
 
@@ -104,12 +107,14 @@ class PublishedModel:
             "skin.weight": self.skin.weight,
         }
         whole = {
-            "graph.neighbours": spec.neighbours,
+            _table_name(spec.current_neighbours): spec.neighbours,
             "graph.edge_kind": spec.edge_kind,
             "particle.index": spec.particle_index,
             "control.index": spec.control_index,
             "skin.index": self.skin.index,
         }
+        if spec.current_neighbours:
+            whole["graph.current_neighbours"] = np.array([spec.current_neighbours])
         network = {name: value.numpy(force=True) for name, value in self.model.state_dict().items()}
         return (
             {name: np.ascontiguousarray(value) for name, value in network.items()}
@@ -133,20 +138,49 @@ class PublishedModel:
 
     @classmethod
     def from_tensors(cls, tensors: dict[str, np.ndarray], facts: dict[str, Any]) -> PublishedModel:
-        """The inverse of :meth:`to_tensors` and :meth:`facts`."""
+        """The inverse of :meth:`to_tensors` and :meth:`facts`. Raises VersionUnreadable for any other layout."""
+        try:
+            return cls._read(tensors, _FACTS_BEFORE | facts)
+        except KeyError as error:
+            raise VersionUnreadable(f"it lacks {error}") from error
+        except (TypeError, ValueError, RuntimeError, WorldModelError) as error:
+            raise VersionUnreadable(f"its parts do not fit together: {error}") from error
+
+    @classmethod
+    def from_card(cls, tensors: dict[str, np.ndarray], card: dict[str, Any]) -> PublishedModel:
+        """The model of a version's tensors and its card.
+
+        Raises:
+            VersionUnreadable: it has another layout; the message says which, who wrote it, and what to do.
+        """
+        layout, writer = card.get("schema_version", CARD_SCHEMA), card.get("versions", {}).get("physworld")
+        try:
+            if layout != CARD_SCHEMA:
+                raise VersionUnreadable(f"cards of layout {CARD_SCHEMA} are read here")
+            return cls.from_tensors(tensors, card.get("architecture", {}))
+        except VersionUnreadable as error:
+            raise VersionUnreadable(
+                f"the version was published by {writer or 'an unknown version of physworld'} with a card of layout "
+                f"{layout}; {error}. Train it anew from its dataset ({card.get('dataset_id') or 'POST /v1/models'})"
+            ) from error
+
+    @classmethod
+    def _read(cls, tensors: dict[str, np.ndarray], facts: dict[str, Any]) -> PublishedModel:
         names = WorldModelConfig.__dataclass_fields__
         config = WorldModelConfig(**{name: facts[name] for name in names})
+        current = int(tensors["graph.current_neighbours"][0]) if config.near_edges == "current" else 0
         spec = GraphSpec(
             dt_s=facts["dt_s"],
             rest_vertices=tensors["rest.vertices"].astype(np.float64),
             particle_index=tensors["particle.index"],
             control_index=tensors["control.index"],
-            neighbours=tensors["graph.neighbours"],
+            neighbours=tensors[_table_name(current)],
             edge_kind=tensors["graph.edge_kind"],
             rest_relative=tensors["graph.rest_relative"].astype(np.float64),
             vertex_spacing_m=facts["vertex_spacing_m"],
             edge_radius_m=facts["edge_radius_m"],
             ground_height_m=facts["ground_height_m"],
+            current_neighbours=current,
         )
         model = WorldModel(config, spec, prior=_prior_of(tensors))
         network = {name: value for name, value in tensors.items() if not name.startswith(_OWN)}
@@ -162,8 +196,19 @@ class PublishedModel:
         )
 
 
-def _prior_of(tensors: dict[str, np.ndarray]) -> ModalPrior | ChainPrior:
+_FACTS_BEFORE = {"near_edges": "material"}  # what versions were that do not say it
+
+
+def _table_name(current_neighbours: int) -> str:
+    """Tensor of the edges that are kept: another name where the NEAR ones are not among them, so that a reader that
+    does not know of it finds none."""
+    return "graph.kept_neighbours" if current_neighbours else "graph.neighbours"
+
+
+def _prior_of(tensors: dict[str, np.ndarray]) -> ModalPrior | ChainPrior | InertialPrior:
     """The prior whose tensors there are."""
+    if "prior.lags" in tensors:
+        return InertialPrior(len(tensors["rest.vertices"]))
     if "prior.spread" not in tensors:
         return ModalPrior(**{part: tensors[f"prior.{part}"] for part in ModalPrior.__dataclass_fields__})
     parts = {part: tensors[f"prior.{part}"] for part in ChainPrior.__dataclass_fields__}

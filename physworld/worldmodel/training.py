@@ -33,7 +33,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from physworld.worldmodel.chain import ChainPrior
 from physworld.worldmodel.config import TrainingConfig, WorldModelConfig
 from physworld.worldmodel.dataset import Track, WindowSampler, measure_scales, split_tracks
 from physworld.worldmodel.errors import (
@@ -43,9 +42,8 @@ from physworld.worldmodel.errors import (
     TrainingDiverged,
 )
 from physworld.worldmodel.graph import GraphSpec
-from physworld.worldmodel.modal import ModalPrior
 from physworld.worldmodel.model import Normalisation, WorldModel, prior_step
-from physworld.worldmodel.priors import fit_priors, prior_error
+from physworld.worldmodel.priors import Prior, fit_priors, prior_error
 from physworld.worldmodel.rollout import mean_error, rollout_tracks
 
 WARM_UP_SHARE = 0.1
@@ -214,7 +212,7 @@ def _start(
     config: WorldModelConfig,
     spec: GraphSpec,
     scales: Normalisation,
-    prior: ModalPrior | ChainPrior,
+    prior: Prior,
     training: TrainingConfig,
 ) -> _Run:
     with torch.random.fork_rng(devices=[]):

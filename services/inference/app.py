@@ -21,7 +21,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route, WebSocketRoute
 
-from physworld.worldmodel.errors import ControlsInvalid, WorldModelError
+from physworld.worldmodel.errors import ControlsInvalid, VersionUnreadable, WorldModelError
 from schemas.arrays import EncodedArray
 from schemas.base import FieldError, Problem
 from schemas.rollout import MAX_REQUEST_BYTES, Rollout, RolloutCreate
@@ -105,6 +105,8 @@ def problem_of(error: StorageError | WorldModelError) -> Response:
     if isinstance(error, ControlsInvalid):
         fault = FieldError(loc=["body", error.field], msg=str(error))
         return _problem(422, "invalid_request", str(error), [fault])
+    if isinstance(error, VersionUnreadable):
+        return _problem(409, error.code, str(error))
     if isinstance(error, WorldModelError):
         return _problem(422, "rollout_diverged", str(error))
     status = {NotFound: 404, Conflict: 409, ArtifactCorrupt: 500}.get(type(error), 503)

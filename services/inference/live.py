@@ -22,6 +22,7 @@ import structlog
 from starlette.concurrency import run_in_threadpool
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
+from physworld.worldmodel.errors import VersionUnreadable
 from services.inference.models import Models
 from services.inference.session import Control, ControlRefused, LiveSession
 from storage import tickets
@@ -64,7 +65,7 @@ class LiveSessions:
             vertices = query.get("part") == "vertices"
             session = await run_in_threadpool(LiveSession, published, vertices=vertices)
             await _Connection(socket, session, self._pool, frames, self._idle_s).run()
-        except StorageError as error:
+        except (StorageError, VersionUnreadable) as error:
             await socket.close(POLICY, str(error)[:120])
         except WebSocketDisconnect:
             pass

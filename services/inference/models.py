@@ -27,7 +27,10 @@ class Models:
         self._lock = threading.Lock()
 
     def get(self, name: str, version: int | str) -> tuple[ModelVersion, PublishedModel]:
-        """The version and its network. Raises NotFound, Conflict when it is not ready, ArtifactCorrupt."""
+        """The version and its network.
+
+        Raises NotFound, Conflict when it is not ready, ArtifactCorrupt, VersionUnreadable.
+        """
         with self._database.reading() as session:
             found = registry.get_version(session, name, version)
         if found.state != "ready" or found.sha256 is None:
@@ -50,4 +53,4 @@ class Models:
                 raise NotFound("artifact", f"{name} of {version.name}:{version.version}")
         card = json.loads(self._artifacts.read_bytes(files["card.json"]))
         tensors = load_tensors(self._artifacts.read_bytes(files["model.safetensors"]))
-        return PublishedModel.from_tensors(tensors, card["architecture"])
+        return PublishedModel.from_card(tensors, card)

@@ -128,4 +128,4 @@ def _model(stores: Stores, version: ModelVersion) -> PublishedModel:
     read = stores.artifacts.read_bytes
     card = json.loads(read(named(version.artifacts, "card.json", version.name).sha256))
     tensors = load_tensors(read(named(version.artifacts, "model.safetensors", version.name).sha256))
-    return PublishedModel.from_tensors(tensors, card["architecture"])
+    return PublishedModel.from_card(tensors, card)

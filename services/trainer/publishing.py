@@ -25,6 +25,11 @@ from workers.tasks.inputs import npz_bytes
 MANIFEST_NAME = "manifest.json"
 PROGRAMS = {"torch_export": ("step.pt2", export.torch_program), "onnx": ("step.onnx", export.onnx_program)}
 
+_SEEN = {
+    "material": "edges are material, so contact of the object with itself, ",
+    "current": "of contact of the object with itself what the demonstrations showed, ",
+}
+
 
 def card_of(
     payload: dict[str, Any],
@@ -60,9 +65,9 @@ def card_of(
             "open loop, at the clock dt_s."
         ),
         "limits": (
-            "One object and its grips, as recorded: edges are material, so contact of the object with itself, "
-            "fracture, flow and other grips are not represented; motions much faster or wider than the "
-            "demonstrations are extrapolated; the start needs history + 1 frames."
+            f"One object and its grips, as recorded: {_SEEN[config.near_edges]}fracture, flow and other grips are not "
+            "represented; motions much faster or wider than the demonstrations are extrapolated; the start needs "
+            "history + 1 frames."
         ),
     }
 

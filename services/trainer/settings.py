@@ -19,6 +19,7 @@ def translate(
             message_passing_steps=config.message_passing_steps,
             history=config.history,
             vertices=config.vertices,
+            near_edges=config.near_edges,
         ),
         settings_of.TrainingConfig(
             steps=config.steps,
@@ -27,6 +28,7 @@ def translate(
             learning_rate=config.learning_rate,
             validation_every=interval,
             patience=config.patience,
+            prior=config.prior,
             start_share=config.start_share,
             checkpoint_every=interval,
             threads=int(os.environ.get("PHYSWORLD_TRAINER_THREADS", "1")),

@@ -4,6 +4,8 @@ The equations and the names of the tensors are those of ``physworld.worldmodel.m
 from them alone and needs neither torch nor the library. Geometry is computed in double precision, the layers
 in single precision, as they were trained.
 
+The NEAR edges of a model that finds them at every step are those of ``physworld.worldmodel.nearest``.
+
 Legend: n object vertices, C control vertices, V = n + C; E directed edges, sorted by receiver and kind; H
 width; h history; L message passing steps; F edge features, 3h + 8.
 """
@@ -11,6 +13,7 @@ width; h history; L message passing steps; F edge features, 3h + 8.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,6 +22,41 @@ from physworld_client.errors import ModelUnreadable
 
 EDGE_KINDS = 3  # near, coarse, grip
 PROPERTY_COUNT = 2
+NEAR = 0
+REST_RADII = 2.0  # longest rest length that a NEAR edge found at a step tells, in edge radii
+
+
+@dataclass(frozen=True)
+class Edges:
+    """Directed edges, sorted by receiver and kind.
+
+    Attributes:
+        receivers, senders, kinds: (E,).
+        rest: undeformed x_sender - x_receiver [m], (E, 3).
+        segments, first: receiver and kind as one number, and where its edges begin, (S,).
+        share: one over their number, (S, 1).
+    """
+
+    receivers: np.ndarray
+    senders: np.ndarray
+    kinds: np.ndarray
+    rest: np.ndarray
+    segments: np.ndarray
+    first: np.ndarray
+    share: np.ndarray
+
+    @classmethod
+    def sorted(cls, receivers: np.ndarray, senders: np.ndarray, kinds: np.ndarray, rest: np.ndarray) -> Edges:
+        """From edges in any order."""
+        segments = receivers * EDGE_KINDS + kinds
+        order = np.argsort(segments, kind="stable")
+        ends, first, counts = np.unique(segments[order], return_index=True, return_counts=True)
+        share = (1.0 / counts[:, None]).astype(np.float32)
+        return cls(receivers[order], senders[order], kinds[order], rest[order], ends, first, share)
+
+    def of_kind(self, kind: int) -> np.ndarray:
+        """Rows of that kind."""
+        return np.nonzero(self.kinds == kind)[0]
 
 
 class Network:
@@ -34,7 +72,9 @@ class Network:
     def __init__(self, tensors: Mapping[str, np.ndarray], object_count: int) -> None:
         self._tensors = tensors
         self.layers = sum(name.startswith("receive.") and name.endswith(".weight") for name in tensors)
-        vertex_count = self._tensor("graph.neighbours").shape[0]
+        self._nearest = int(tensors.get("graph.current_neighbours", np.zeros(1))[0])
+        self._table = "graph.kept_neighbours" if self._nearest else "graph.neighbours"
+        vertex_count = self._tensor(self._table).shape[0]
         self.object_count = object_count
         self.control_count = vertex_count - object_count
         kinds, _, features = self._tensor("edge.0.weight").shape
@@ -49,7 +89,7 @@ class Network:
             )
         self.has_ground = inputs == 1
         self._chain = Chain(tensors) if "prior.spread" in tensors else None
-        self._sort_edges(vertex_count)
+        self._kept = self._kept_edges(vertex_count)
         layers = [self._tensor(f"edge.{layer}.weight") for layer in range(self.layers)]
         self._edge_weights = np.concatenate(layers, axis=1).transpose(0, 2, 1).copy()
 
@@ -62,20 +102,31 @@ class Network:
             phi: log property ratios of the object vertices, (n, 2).
         """
         n = self.object_count
-        prior = self._modal_prior if self._chain is None else self._chain.ahead
-        ahead = np.concatenate([prior(window, control_next, phi), control_next])
+        ahead = np.concatenate([self._prior(window, control_next, phi), control_next])
         features = self._vertex_features(window, ahead, phi)
         state = self._mlp("encoder", features)
-        edges = self._edge_terms(window)
+        edges = self._edges_at(window[-1]) if self._nearest else self._kept
+        terms = self._edge_terms(edges, window)
         for layer in range(self.layers):
             heard = self._linear(f"receive.{layer}", state)
             sent = state @ self._tensor(f"send.{layer}.weight").T
-            messages = np.maximum(heard[self._receivers] + sent[self._senders] + edges[:, layer], 0.0)
-            inner = self._linear(f"update_in.{layer}", np.hstack([state, self._means(messages)]))
+            messages = np.maximum(heard[edges.receivers] + sent[edges.senders] + terms[:, layer], 0.0)
+            inner = self._linear(f"update_in.{layer}", np.hstack([state, self._means(edges, messages)]))
             state = state + self._linear(f"update_out.{layer}", np.maximum(inner, 0.0))
         correction = self._mlp("decoder", state[:n]) + features[:n] @ self._tensor("skip.weight").T
         ahead[:n] += self._scale("change") * correction.astype(np.float64)
         return ahead
+
+    def _prior(self, window: np.ndarray, control_next: np.ndarray, phi: np.ndarray) -> np.ndarray:
+        """x̂^{t+1} of the object vertices [m], (n, 3)."""
+        if self._chain is not None:
+            return self._chain.ahead(window, control_next, phi)
+        if "prior.lags" in self._tensors:
+            now, before = self._tensor("prior.lags").astype(np.float64)
+            return np.asarray(
+                now * window[-1, : self.object_count] + before * window[-2, : self.object_count]
+            )
+        return self._modal_prior(window, control_next, phi)
 
     def _modal_prior(self, window: np.ndarray, control_next: np.ndarray, phi: np.ndarray) -> np.ndarray:
         """x̂^{t+1} of the object vertices [m], (n, 3)."""
@@ -98,28 +149,35 @@ class Network:
         next_amplitudes = weight @ regressors + softness * (answers[0] + softness * answers[1])
         return np.asarray(centre[0] + mean + np.tensordot(next_amplitudes, basis, axes=1))
 
-    def _sort_edges(self, vertex_count: int) -> None:
-        """The edge list, and where the edges of one receiver and kind begin in it."""
-        neighbours = self._tensor("graph.neighbours")
+    def _kept_edges(self, vertex_count: int) -> Edges:
+        """The edges of the published table."""
+        neighbours = self._tensor(self._table)
         receivers, slots = np.nonzero(neighbours < vertex_count)
         kinds = self._tensor("graph.edge_kind")[receivers, slots]
-        segments = receivers * EDGE_KINDS + kinds
-        order = np.argsort(segments, kind="stable")
-        receivers, slots, self._kinds = receivers[order], slots[order], kinds[order]
-        self._receivers, self._senders = receivers, neighbours[receivers, slots]
-        self._rest = self._tensor("graph.rest_relative").astype(np.float64)[receivers, slots]
-        self._rest_length = np.linalg.norm(self._rest, axis=1, keepdims=True)
-        self._segments, self._first, counts = np.unique(
-            segments[order], return_index=True, return_counts=True
-        )
-        self._share = (1.0 / counts[:, None]).astype(np.float32)
-        self._of_kind = [np.nonzero(self._kinds == kind)[0] for kind in range(EDGE_KINDS)]
+        rest = self._tensor("graph.rest_relative").astype(np.float64)[receivers, slots]
+        return Edges.sorted(receivers, neighbours[receivers, slots], kinds, rest)
 
-    def _means(self, messages: np.ndarray) -> np.ndarray:
+    def _edges_at(self, places: np.ndarray) -> Edges:
+        """The kept edges and the NEAR ones of the places (V, 3): the nearest within the edge radius."""
+        n, radius = self.object_count, np.float32(self._scale("length"))
+        now, rest = places[:n].astype(np.float32), self._tensor("rest.vertices").astype(np.float64)
+        squares = np.square(now[None] - now[:, None]).sum(axis=2)
+        np.fill_diagonal(squares, np.inf)
+        nearest = np.sort(np.argsort(squares, axis=1, kind="stable")[:, : self._nearest], axis=1)
+        receivers, slots = np.nonzero(np.take_along_axis(squares, nearest, axis=1) <= radius * radius)
+        senders, kept = nearest[receivers, slots], self._kept
+        return Edges.sorted(
+            np.concatenate([receivers, kept.receivers]),
+            np.concatenate([senders, kept.senders]),
+            np.concatenate([np.full(len(receivers), NEAR), kept.kinds]),
+            np.concatenate([rest[senders] - rest[receivers], kept.rest]),
+        )
+
+    def _means(self, edges: Edges, messages: np.ndarray) -> np.ndarray:
         """Means of the messages (E, H) by receiver and kind, (V, 3H); 0 where there is no such edge."""
         vertex_count, width = self.object_count + self.control_count, messages.shape[1]
         means = np.zeros((vertex_count * EDGE_KINDS, width), dtype=messages.dtype)
-        means[self._segments] = np.add.reduceat(messages, self._first, axis=0) * self._share
+        means[edges.segments] = np.add.reduceat(messages, edges.first, axis=0) * edges.share
         return means.reshape(vertex_count, EDGE_KINDS * width)
 
     def _vertex_features(self, window: np.ndarray, ahead: np.ndarray, phi: np.ndarray) -> np.ndarray:
@@ -136,22 +194,30 @@ class Network:
             parts.append(np.clip(window[-1, :, 2:] / self._scale("length"), 0.0, 1.0))
         return np.concatenate(parts, axis=1).astype(np.float32)
 
-    def _edge_terms(self, window: np.ndarray) -> np.ndarray:
+    def _edge_terms(self, edges: Edges, window: np.ndarray) -> np.ndarray:
         """edge.l.weight[κ] e_ij of every edge and layer, (E, L, H)."""
-        relative = window[:, self._senders] - window[:, self._receivers]
+        relative = window[:, edges.senders] - window[:, edges.receivers]
         length = np.linalg.norm(relative[-1], axis=1, keepdims=True)
-        moves = (relative[1:] - relative[:-1])[::-1] / self._scale_by_kind("relative")
+        moves = (relative[1:] - relative[:-1])[::-1] / self._scale_by_kind("relative", edges)
+        strain = relative[-1] - edges.rest
+        rest_length = np.linalg.norm(edges.rest, axis=1, keepdims=True)
+        if self._nearest:
+            near, radius = (edges.kinds == NEAR)[:, None], self._scale("length")
+            size = np.linalg.norm(strain, axis=1, keepdims=True)
+            strain = np.where(near, strain * (radius / np.maximum(size, radius)), strain)
+            rest_length = np.where(near, np.minimum(rest_length, REST_RADII * radius), rest_length)
         parts = [
             relative[-1] / self._scale("length"),
-            (relative[-1] - self._rest) / self._scale_by_kind("strain"),
+            strain / self._scale_by_kind("strain", edges),
             *moves,
-            self._rest_length / self._scale("length"),
-            (length - self._rest_length) / self._scale_by_kind("stretch"),
+            rest_length / self._scale("length"),
+            (length - rest_length) / self._scale_by_kind("stretch", edges),
         ]
         features = np.concatenate(parts, axis=1).astype(np.float32)
         terms = np.empty((len(features), self._edge_weights.shape[2]), dtype=np.float32)
-        for kind, edges in enumerate(self._of_kind):
-            terms[edges] = features[edges] @ self._edge_weights[kind]
+        for kind in range(EDGE_KINDS):
+            rows = edges.of_kind(kind)
+            terms[rows] = features[rows] @ self._edge_weights[kind]
         return terms.reshape(len(features), self.layers, -1)
 
     def _mlp(self, name: str, values: np.ndarray) -> np.ndarray:
@@ -163,9 +229,9 @@ class Network:
     def _scale(self, name: str) -> float:
         return float(self._tensor(f"norm.{name}")[0])
 
-    def _scale_by_kind(self, name: str) -> np.ndarray:
+    def _scale_by_kind(self, name: str, edges: Edges) -> np.ndarray:
         """σ_name[κ] of every edge, (E, 1)."""
-        return self._tensor(f"norm.{name}").astype(np.float64)[self._kinds][:, None]
+        return self._tensor(f"norm.{name}").astype(np.float64)[edges.kinds][:, None]
 
     def _tensor(self, name: str) -> np.ndarray:
         try:

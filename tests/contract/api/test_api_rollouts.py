@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from inference_serving import Served, serve_inference
-from published_tiny import tiny_model
+from published_tiny import publish_tiny, tiny_model
 
 from schemas.arrays import EncodedArray
 from schemas.rollout import SYNC_STEPS
@@ -43,7 +43,7 @@ def body(served: Served, controllers: np.ndarray, **more: object) -> dict[str, o
     return {"model": served.model, "controllers": encoded, **more}
 
 
-def _work(served: Served) -> None:
+def _work(served: Served, ends: str = "done") -> None:
     register("rollout", "services.inference.jobs:rollout")
     runtime = Runtime(served.settings, served.database, served.stores, "test")
     while True:
@@ -53,7 +53,7 @@ def _work(served: Served) -> None:
         if not waiting:
             return
         for publication in waiting:
-            assert run_shard(runtime, publication.shard_id) == "done"
+            assert run_shard(runtime, publication.shard_id) == ends
 
 
 def test_a_small_rollout_is_answered_at_once_with_what_the_model_predicts(served: Served) -> None:
@@ -218,3 +218,29 @@ def test_the_inference_service_answers_nobody_without_a_ticket(served: Served) -
     asked = {**body(served, paths()), "version": served.version}
     bare = httpx.post(f"{served.inference_url}/rollouts", json=asked, trust_env=False)
     assert bare.status_code == 401
+
+
+def test_a_version_of_another_layout_is_named_and_not_loaded(served: Served) -> None:
+    """Nothing of it runs; who wrote it, what it lacks and what to do stand in the answer, of a job too."""
+    written = {"versions": {"physworld": "physworld 0.0.7"}, "schema_version": 1, "dataset_id": "dst_old"}
+    for lacking, extra, said in (
+        ("prior.placing", written, "it lacks 'prior.placing'"),
+        (None, written | {"schema_version": 7}, "card of layout 7"),
+        (None, written | {"architecture": {}}, "it lacks 'hidden'"),
+    ):
+        name, version = publish_tiny(served.database, served.stores.artifacts, lacking=lacking, card=extra)
+        asked = body(served, paths()) | {"model": name, "version": version}
+        with served.client() as client:
+            answer = client.post("/v1/rollouts", json=asked)
+            job = client.post("/v1/rollouts", json=asked | {"mode": "job"}).json()
+        assert answer.status_code == 409
+        assert answer.headers["Content-Type"] == "application/problem+json"
+        problem = answer.json()
+        assert problem["code"] == "model_unreadable"
+        for words in (said, "physworld 0.0.7", "Train it anew", "dst_old"):
+            assert words in problem["detail"]
+        _work(served, ends="failed")
+        with served.client() as client:
+            ended = client.get(f"/v1/jobs/{job['id']}").json()
+        assert ended["state"] == "failed"
+        assert ended["error"]["code"] == "model_unreadable"

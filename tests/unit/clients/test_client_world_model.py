@@ -20,6 +20,7 @@ from safetensors.numpy import load_file, save_file
 
 from physworld.worldmodel import PublishedModel, WorldModelConfig, affine_skin, build_graph
 from physworld.worldmodel.graph import GraphSpec
+from physworld.worldmodel.inertia import InertialPrior
 from physworld.worldmodel.modal import ModalPrior, regressor_count, rigid_prior
 from physworld.worldmodel.model import Normalisation
 from physworld.worldmodel.model import WorldModel as Network
@@ -38,13 +39,19 @@ def known(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPa
     remember([SigningKey(key_id=SIGNER.key_id, public_key=SIGNER.public_key)], "the test")
 
 
-def published(ground_height_m: float | None = None) -> PublishedModel:
-    """An untrained network on a bar that two grips of three controllers hold, with weights that move it."""
+def published(
+    ground_height_m: float | None = None, near_edges: str = "material", *, alone: bool = False
+) -> PublishedModel:
+    """An untrained network on a bar that two grips of three controllers hold, with weights that move it; ``alone``:
+    without a prior.
+    """
     rng = np.random.default_rng(7)
     particles = rng.uniform(0.0, 1.0, (400, 3)) * [0.3, 0.04, 0.04]
     ends = np.array([[0.0, 0.0, 0.0], [0.0, 0.04, 0.0], [0.0, 0.0, 0.04]])
     controllers = np.concatenate([ends, ends + np.array([0.3, 0.0, 0.0])])
-    config = WorldModelConfig(hidden=24, message_passing_steps=3, history=3, vertices=40, neighbours=6)
+    config = WorldModelConfig(
+        hidden=24, message_passing_steps=3, history=3, vertices=40, neighbours=6, near_edges=near_edges
+    )
     spec = build_graph(
         particles,
         particles,
@@ -57,9 +64,8 @@ def published(ground_height_m: float | None = None) -> PublishedModel:
     scales = {"velocity": 5e-3, "change": 1e-3}
     names = {field.name for field in dataclasses.fields(Normalisation)} - {*scales, "properties"}
     torch.manual_seed(3)
-    model = Network(
-        config, spec, Normalisation(**scales, properties=(0.2, 0.1)), some_prior(spec, config.history, rng)
-    )
+    prior = InertialPrior(spec.object_count) if alone else some_prior(spec, config.history, rng)
+    model = Network(config, spec, Normalisation(**scales, properties=(0.2, 0.1)), prior)
     with torch.no_grad():
         model.skip.weight.normal_(0.0, 0.02)
         for name in names:
@@ -121,9 +127,20 @@ def driven(model: PublishedModel) -> np.ndarray:
     return controllers
 
 
-@pytest.mark.parametrize("ground", [None, -0.02], ids=["free", "ground"])
-def test_both_networks_move_the_same_way(tmp_path: Path, ground: float | None) -> None:
-    original = published(ground)
+@pytest.mark.parametrize(
+    ("ground", "near_edges", "alone"),
+    [
+        (None, "material", False),
+        (-0.02, "material", False),
+        (None, "current", False),
+        (None, "material", True),
+    ],
+    ids=["free", "ground", "current edges", "no prior"],
+)
+def test_both_networks_move_the_same_way(
+    tmp_path: Path, ground: float | None, near_edges: str, alone: bool
+) -> None:
+    original = published(ground, near_edges, alone=alone)
     write(tmp_path, original)
     reference = PublishedModel.from_tensors(load_file(tmp_path / "model.safetensors"), original.facts())
     loaded = WorldModel.load(tmp_path)
