@@ -24,6 +24,7 @@ class FitConfig(Request):
     one; null is the usual one of the body's shape. ``plasticity``: a flow law, whose yield is calibrated too.
     ``formulation``: which form integrates the body; "auto" takes the one that its laws and its scene need.
     ``transfer``: how the updated Lagrangian form's particles and grid exchange velocities; "asflip" damps less.
+    ``numerics``: measure the engine's own damping on the scene, and the numbers with cells of no size.
     """
 
     particle_budget: int = Field(default=2000, ge=50, le=200_000)
@@ -33,6 +34,7 @@ class FitConfig(Request):
     plasticity: FlowLaw | None = None
     formulation: Literal["auto", "total_lagrangian", "updated_lagrangian"] = "auto"
     transfer: Literal["apic", "asflip"] = "apic"
+    numerics: bool = True
 
     @property
     def usual_physics(self) -> bool:
@@ -57,8 +59,41 @@ class Parameter(Resource):
     note: str = ""
 
 
+class Numerics(Resource):
+    """What the engine itself does to a twin's prediction of its scene, by runs without any friction and on finer cells.
+
+    ``equivalent_drag_per_s``: linear drag that would lose as much energy; ``damping_ratio``: the same as a share of
+    critical damping of the mode at ``dominant_mode_hz``; ``half_step_m`` and ``finer_cells_m``: root mean squared
+    change of the predicted tracks with half the time step, and with cells ``refinement`` times smaller [m].
+    """
+
+    equivalent_drag_per_s: float
+    damping_ratio: float | None = None
+    dominant_mode_hz: float | None = None
+    lost_share: float
+    time_step_s: float
+    half_step_m: float
+    finer_cells_m: float
+    refinement: float
+    particles: int
+    finer_particles: int
+    simulations: int
+    seconds: float
+
+
+class SearchState(Resource):
+    """Whether the search converged; ``open`` says why not, by parameter."""
+
+    converged: bool
+    open: dict[str, str] = Field(default_factory=dict)
+
+
 class Fit(Resource):
-    """A calibrated twin: parameters, metrics on held-out frames, ``twin.npz`` and ``report.json``."""
+    """A calibrated twin: parameters, metrics on held-out frames, ``twin.npz`` and ``report.json``.
+
+    ``numerics``, and ``converged``, the searched parameters extrapolated to cells of no size, are null where they were
+    not measured; ``not_measured`` says why. ``notes`` say how the body was built.
+    """
 
     id: str
     scene_id: str
@@ -68,5 +103,10 @@ class Fit(Resource):
     config: FitConfig
     parameters: dict[str, Parameter] = Field(default_factory=dict)
     metrics: dict[str, Any] = Field(default_factory=dict)
+    numerics: Numerics | None = None
+    converged: dict[str, Parameter] | None = None
+    not_measured: str = ""
+    search: SearchState | None = None
+    notes: list[str] = Field(default_factory=list)
     lineage: Lineage = Field(default_factory=Lineage)
     artifacts: list[Artifact] = Field(default_factory=list)

@@ -15,7 +15,6 @@ import hashlib
 import json
 import sys
 from contextlib import nullcontext
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,7 +30,7 @@ def main(arguments: list[str] | None = None) -> int:
     given = _parser().parse_args(arguments)
     from workers.commands.terminal import guarded
 
-    return guarded(lambda: _fit(given))
+    return guarded(lambda: _fit(given), lambda: _kept(given.resume))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -69,11 +68,10 @@ def _fit(given: argparse.Namespace) -> None:
 
     wp.config.quiet = True  # before the first import that starts it
     from physworld.calibrate import CalibrationConfig, calibrate
-    from physworld.calibrate.discretisation import converged_parameters
-    from physworld.evaluate.numerics import measure_numerics
     from workers.commands.terminal import progress_bar, read_scene
     from workers.law_choice import AUTO, chosen_laws
-    from workers.tasks.fit_report import fit_files, fit_report, json_safe, parameter_json
+    from workers.tasks.fit_accuracy import fit_accuracy, not_measured
+    from workers.tasks.fit_report import fit_files, fit_report
 
     scene = read_scene(given.scene)
     numbers = {"particle_budget": given.particles, "max_simulations": given.simulations}
@@ -88,16 +86,12 @@ def _fit(given: argparse.Namespace) -> None:
         config, choice = chosen_laws(given.law, scene, config, shown, journal=journal)
     with progress_bar(f"fit {scene.name}") as shown:
         fitted = calibrate(scene, config, progress=shown, journal=journal)
-    report = fit_report(scene, fitted, choice)
-    document = fit_document(scene.name, report)
-    if not given.quick and fitted.twin.formulation == "total_lagrangian":
-        budget = config.particle_budget
+    accuracy = not_measured("left out by --quick")
+    if not given.quick:
         with progress_bar(f"numerics {scene.name}") as shown:
-            numerics = measure_numerics(scene, fitted.twin, particle_budget=budget, progress=shown)
-            shown(4, 4, "sensitivities")
-            converged = converged_parameters(scene, fitted, budget)
-        document["numerics"] = json_safe(asdict(numerics))
-        document["converged"] = {name: parameter_json(estimate) for name, estimate in converged.items()}
+            accuracy = fit_accuracy(scene, fitted, config.particle_budget, shown, journal=journal)
+    report = fit_report(scene, fitted, choice, accuracy)
+    document = fit_document(scene.name, report)
     _print(document)
     if given.out is not None:
         given.out.mkdir(parents=True, exist_ok=True)
@@ -106,6 +100,15 @@ def _fit(given: argparse.Namespace) -> None:
     if given.json is not None:
         given.json.parent.mkdir(parents=True, exist_ok=True)
         given.json.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n")
+
+
+def _kept(path: Path | None) -> str:
+    """What an interrupted fit leaves behind."""
+    from workers.commands.terminal import NOTHING_WRITTEN
+
+    if path is None or not path.exists():
+        return NOTHING_WRITTEN
+    return f"no figures were written; the steps in {path} are kept, and the same command goes on from them"
 
 
 def _journal(path: Path, scene: Scene, settings: str) -> Journal:
@@ -125,15 +128,12 @@ def _journal(path: Path, scene: Scene, settings: str) -> Journal:
 
 def fit_document(scene_name: str, report: dict[str, Any]) -> dict[str, Any]:
     """The machine-readable answer: the report's figures under stable keys at the top."""
-    metrics = dict(report["metrics"])
     return {
         "schema_version": SCHEMA_VERSION,
         "scene": scene_name,
         "parameters": report["parameters"],
-        **metrics,
+        **report["metrics"],
         "notes": report["notes"],
-        "numerics": None,
-        "converged": None,
     }
 
 
@@ -155,6 +155,10 @@ def _print(document: dict[str, Any]) -> None:
         print(
             f"the engine's own damping: a drag of {drag:.3g} 1/s; finer cells move points by {1e3 * cells:.3g} mm"
         )
+    elif document["not_measured"]:
+        print(f"the engine's own damping was not measured: {document['not_measured']}")
+    for name, why in document["search"]["open"].items():
+        print(f"{name} is not converged: {why}")
     for name, parameter in (document["converged"] or {}).items():
         low, high = parameter["ci95"] or (float("nan"), float("nan"))
         value = f"{parameter['value']:.5g} {parameter['unit']} [{low:.5g}, {high:.5g}]"

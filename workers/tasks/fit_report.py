@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from physworld.calibrate import Estimate, FitResult
+from physworld.calibrate.estimates import NOT_CONVERGED
 from physworld.calibrate.law_choice import LawChoice
 from physworld.evaluate.table import held_out_table
 from physworld.scene import Scene
@@ -27,11 +28,22 @@ SHOWN_PARTICLES = 1500
 MEDIA_TYPES = {TWIN: "application/x-npz", PREDICTION: "application/x-npz", REPORT: "application/json"}
 
 
-def fit_report(scene: Scene, fitted: FitResult, law: LawChoice | None = None) -> dict[str, Any]:
+def fit_report(
+    scene: Scene, fitted: FitResult, law: LawChoice | None, accuracy: dict[str, Any]
+) -> dict[str, Any]:
     """``parameters``, ``metrics`` and ``notes`` as plain JSON; a number that is not finite is None.
 
-    ``law`` is how the law was chosen; None: it is the usual one.
+    Args:
+        scene: the recording.
+        fitted: its calibration.
+        law: how the law was chosen; None: it is the usual one.
+        accuracy: of :func:`workers.tasks.fit_accuracy.fit_accuracy`.
     """
+    open_ones = {
+        known.name: fitted.parameters[known.name].note
+        for known in fitted.searched
+        if fitted.parameters[known.name].note in NOT_CONVERGED
+    }
     metrics = {
         "held_out": held_out_table(scene, {"twin": fitted.tracks}),
         "simulations": fitted.simulations,
@@ -46,6 +58,8 @@ def fit_report(scene: Scene, fitted: FitResult, law: LawChoice | None = None) ->
         "training": fitted.losses,
         "law": asdict(law or LawChoice(fitted.twin.law.name)),
         "formulation": {"name": fitted.twin.formulation, "reason": _formulation_reason(fitted)},
+        "search": {"converged": not open_ones, "open": open_ones},
+        **accuracy,
     }
     return {
         "parameters": {name: parameter_json(estimate) for name, estimate in fitted.parameters.items()},
