@@ -26,6 +26,7 @@ _LIFTED = (
     "converged",
     "not_measured",
     "search",
+    "local",
     "notes",
 )  # of a fit's metrics: fields of their own
 

@@ -22,6 +22,7 @@ import numpy as np
 from physworld.build import build_twin
 from physworld.mpm.energy import EnergyLedger, run_with_ledger, without_friction
 from physworld.mpm.total_lagrangian import TotalLagrangian
+from physworld.properties import carried
 from physworld.scene import Scene
 from physworld.twin import Twin
 
@@ -140,6 +141,7 @@ def refined(scene: Scene, twin: Twin, particle_budget: int, refinement: float = 
         ground_height_m=twin.ground_height_m,
         ground_friction=twin.ground_friction,
         effects=twin.effects,
+        properties=carried(twin.properties, twin.particles_rest, finer.particles_rest),
     )
 
 

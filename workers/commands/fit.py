@@ -45,6 +45,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--formulation", default="auto", help="total_lagrangian, updated_lagrangian or auto")
     parser.add_argument("--transfer", default="apic", help="of the updated Lagrangian form: apic or asflip")
     parser.add_argument(
+        "--stages", default="global", help="global, or global+local: a field on top if it holds"
+    )
+    parser.add_argument(
         "--resume",
         type=Path,
         default=None,
@@ -67,7 +70,7 @@ def _fit(given: argparse.Namespace) -> None:
     import warp as wp
 
     wp.config.quiet = True  # before the first import that starts it
-    from physworld.calibrate import CalibrationConfig, calibrate
+    from physworld.calibrate import CalibrationConfig, calibrate_in_stages
     from workers.commands.terminal import progress_bar, read_scene
     from workers.law_choice import AUTO, chosen_laws
     from workers.tasks.fit_accuracy import fit_accuracy, not_measured
@@ -85,7 +88,7 @@ def _fit(given: argparse.Namespace) -> None:
     with progress_bar(f"law {scene.name}") if given.law == AUTO else nullcontext() as shown:
         config, choice = chosen_laws(given.law, scene, config, shown, journal=journal)
     with progress_bar(f"fit {scene.name}") as shown:
-        fitted = calibrate(scene, config, progress=shown, journal=journal)
+        fitted = calibrate_in_stages(scene, config, given.stages, progress=shown, journal=journal)
     accuracy = not_measured("left out by --quick")
     if not given.quick:
         with progress_bar(f"numerics {scene.name}") as shown:
@@ -148,6 +151,8 @@ def _print(document: dict[str, Any]) -> None:
     print(f"held-out track error [mm]{'' if floor is None else f', noise floor {1e3 * floor:.4g}'}:")
     for name, error in sorted(held_out["track_m"].items(), key=lambda item: item[1] or 0.0):
         print(f"  {name:<20} {'-' if error is None else format(1e3 * error, '.4g')}")
+    if document["local"] is not None:
+        print(f"field over the body: {document['local']['reason']}")
     law, numerics = document["law"], document["numerics"]
     print(f"laws {law['elastic']} and {law['plastic']}, decided by {law['decided_by']}: {law['reason']}")
     if numerics is not None:

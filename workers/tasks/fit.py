@@ -12,7 +12,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from physworld.calibrate import CalibrationConfig, Journal, calibrate
+from physworld.calibrate import CalibrationConfig, Journal, calibrate_in_stages
 from schemas.fit import FitConfig
 from workers.context import TaskContext
 from workers.law_choice import chosen_laws
@@ -47,14 +47,18 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     folder = Path(stores.settings.data_dir) / "checkpoints" / context.lease.job_id
     journal = stored_journal(folder / JOURNAL, payload)
     calibration, law = chosen_laws(config.law, scene, calibration, progress, context.cancelled, journal)
-    fitted = calibrate(scene, calibration, progress, context.cancelled, journal)
+    fitted = calibrate_in_stages(
+        scene, calibration, config.stages, progress=progress, cancelled=context.cancelled, journal=journal
+    )
     accuracy = not_measured("left out by the request")
     if config.numerics:
 
         def measuring(done: int, total: int, message: str) -> None:
-            spent = fitted.simulations
             most = max(config.max_simulations, spent + total)
             context.progress(spent + done, most, "simulations", f"numerics: {message}")
+
+        local = fitted.local
+        spent = fitted.simulations + (0 if local is None else local.runs + local.simulations)
 
         accuracy = fit_accuracy(scene, fitted, config.particle_budget, measuring, context.cancelled, journal)
     context.check()
