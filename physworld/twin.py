@@ -37,6 +37,7 @@ from physworld.mpm.terms import Term
 from physworld.mpm.total_lagrangian import Problem, TotalLagrangian, run_again_if_blown_up
 from physworld.mpm.transfer import TRANSFERS, Apic
 from physworld.mpm.updated_lagrangian import UpdatedLagrangian
+from physworld.properties import together
 from physworld.twin_arrays import arrays_of, parts_of
 
 Progress = Callable[[int, int], None]
@@ -68,6 +69,8 @@ class Twin:
         plasticity: flow law, or None; updated Lagrangian only.
         formulation: which form integrates the body.
         transfer: how particles and grid exchange velocities, "apic" or "asflip"; updated Lagrangian only.
+        properties: the fields of the local stage, or None: log factors of stiffness and density, (P, 2), or with the
+            ground's friction (P, 3), under everything that a run is given.
         device: Warp device of the simulations; not part of the twin's identity.
     """
 
@@ -89,6 +92,7 @@ class Twin:
     plasticity: Plasticity | None = None
     formulation: FormulationName = "total_lagrangian"
     transfer: str = Apic.name
+    properties: np.ndarray | None = None
     device: str = "cpu"
 
     @property
@@ -198,7 +202,8 @@ class Twin:
         Args:
             control_times, control_points: (Tc,) [s] and (Tc, K, 3) [m]; first time is the start.
             frame_times: (T,) [s], the first one is the start.
-            properties: log factors of stiffness and density, (P, 2), and of the ground's friction, (P, 3), or None.
+            properties: log factors of stiffness and density, (P, 2), and of the ground's friction, (P, 3), or None;
+                they come on top of the twin's own.
             progress: called with (knots done, knots in all); may raise to stop.
             from_rest: start with zero velocity and release at once.
 
@@ -236,6 +241,7 @@ class Twin:
         from_rest: bool = False,
     ) -> Integration:
         """What :meth:`simulate_nodes` integrates, for whoever wants to integrate it otherwise: same arguments."""
+        properties = together(self.properties, properties)
         knots, frame_index = solver_knots(control_times, frame_times, 0.0 if from_rest else self.release_s)
         active = in_order(self.effects)
         for known in active:

@@ -54,6 +54,7 @@ def arrays_of(twin: Twin) -> dict[str, np.ndarray]:
         **{f"lattice_{f.name}": getattr(lattice, f.name) for f in fields(lattice)},
         **{f"body_{name}": getattr(body, name) for name in _BODY},
         **({} if body.added_mass is None else {"body_added_mass": body.added_mass}),
+        **({} if twin.properties is None else {"properties": twin.properties}),
         **collider_arrays,
     }
 
@@ -91,4 +92,5 @@ def parts_of(arrays: dict[str, np.ndarray]) -> dict[str, Any]:
         "plasticity": None if flow is None else PLASTICITIES[flow["name"]](**flow["parameters"]),
         "formulation": facts.get("formulation", "total_lagrangian"),
         "transfer": facts.get("transfer", "apic"),
+        "properties": arrays.get("properties"),
     }

@@ -36,7 +36,8 @@ TRACE_PARTICLES = 1000
 """Coarser than a fit's: a trace runs a thousand simulations, and asks finer cells in the end."""
 
 NO_OTHER_PHYSICS = (
-    "a trace calibrates the usual elastic law: fit.law, fit.plasticity and fit.formulation must be left out"
+    "a trace calibrates the usual elastic law, the same all over the body: fit.law, fit.plasticity, fit.formulation "
+    "and fit.stages must be left out"
 )
 
 

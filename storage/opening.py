@@ -93,6 +93,11 @@ def open_trace(
         known = _ready_fit(session, fit_id, "a trace")
         if known.scene_id != scene_id:
             raise Conflict(f"fit {fit_id} is of scene {known.scene_id}, not of {scene_id}")
+        if (known.metrics.get("local") or {}).get("kept"):
+            raise Conflict(
+                f"fit {fit_id} carries a field over its body, which a trace would have to search with its effects; "
+                "leave fit_id out, and the trace calibrates a homogeneous twin of its own"
+            )
         inputs.append(Reference(kind="fit", id=fit_id, digest=fit_digest(known)))
     trace_id = new_id("trace")
     settings = {"fit": fit.model_dump(mode="json"), "trace": config.model_dump(mode="json")}

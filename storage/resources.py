@@ -21,6 +21,14 @@ from storage.pages import page_of
 from storage.tables import DatasetRow, EpisodeRow, FitRow, SceneRow, columns_of, insert_if_absent, utc_now
 
 Row = TypeVar("Row", SceneRow, FitRow, DatasetRow)
+_LIFTED = (
+    "numerics",
+    "converged",
+    "not_measured",
+    "search",
+    "local",
+    "notes",
+)  # of a fit's metrics: fields of their own
 
 
 def create_scene(
@@ -267,7 +275,10 @@ def _scene(row: SceneRow) -> Scene:
 
 
 def _fit(row: FitRow) -> Fit:
-    return Fit.model_validate(columns_of(row))
+    values = columns_of(row)
+    metrics = dict(values["metrics"])
+    lifted = {name: metrics.pop(name) for name in _LIFTED if name in metrics}
+    return Fit.model_validate({**values, "metrics": metrics, **lifted})
 
 
 def _dataset(row: DatasetRow) -> Dataset:

@@ -3,5 +3,15 @@
 from physworld.calibrate.estimates import Correlations, Estimate
 from physworld.calibrate.global_stage import CalibrationConfig, FitResult, calibrate
 from physworld.calibrate.journal import Journal
+from physworld.calibrate.stages import Stages, calibrate_in_stages
 
-__all__ = ["CalibrationConfig", "Correlations", "Estimate", "FitResult", "Journal", "calibrate"]
+__all__ = [
+    "CalibrationConfig",
+    "Correlations",
+    "Estimate",
+    "FitResult",
+    "Journal",
+    "Stages",
+    "calibrate",
+    "calibrate_in_stages",
+]

@@ -12,6 +12,8 @@ the twin keeps the numbers of its own lattice, which predict best there; these a
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from physworld.calibrate.estimates import Estimate
@@ -24,7 +26,11 @@ _DOUBT = 0.5  # of the correction
 
 
 def converged_parameters(
-    scene: Scene, fitted: FitResult, particle_budget: int, refinement: float = REFINEMENT
+    scene: Scene,
+    fitted: FitResult,
+    particle_budget: int,
+    refinement: float = REFINEMENT,
+    poll: Callable[[int, int], None] | None = None,
 ) -> dict[str, Estimate]:
     """Estimates of the searched parameters without the error of the lattice.
 
@@ -33,6 +39,7 @@ def converged_parameters(
         fitted: the calibration.
         particle_budget: the one that it was made with.
         refinement: cells of the finer lattice are this many times smaller.
+        poll: called with (frames done, frames in all) of every run; may raise to stop.
 
     Raises:
         SimulationError: a run cannot be trusted.
@@ -42,7 +49,7 @@ def converged_parameters(
     times, controls = scene.control_track()
 
     def predicted(twin) -> np.ndarray:
-        nodes = twin.simulate_nodes(times, controls, scene.times[:end])
+        nodes = twin.simulate_nodes(times, controls, scene.times[:end], progress=poll)
         return twin.observe(nodes, scene.times[:end])[visible].reshape(-1)
 
     base = fitted.tracks[:end][visible].reshape(-1)

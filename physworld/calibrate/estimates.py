@@ -16,6 +16,11 @@ UNIDENTIFIED_HALF_WIDTH = {"log": 1.5, "linear": 0.25}
 
 _EDGE = 0.01  # closer than this to a bound, in the scale of the search, is at it
 
+NOT_MEASURED = "its sensitivity was not measured: the budget of simulations ended first"
+MOVING = "the search had not converged on it"
+NOT_CONVERGED = (NOT_MEASURED, MOVING)
+"""Notes of a number on which the search did not converge, or cannot say so."""
+
 RATIO_NOTE = "only stiffness over density shows in the motion under gravity, ground and prescribed grips"
 
 
@@ -112,7 +117,7 @@ def held_at_priors(
 
 def _why_not(at_bound: bool, insensitive: bool, moving: bool) -> str:
     if insensitive:
-        return "its sensitivity was not measured: the budget of simulations ended first"
+        return NOT_MEASURED
     if at_bound:
         return "at the bound of its search"
-    return "the search had not converged on it" if moving else "the data do not fix it"
+    return MOVING if moving else "the data do not fix it"

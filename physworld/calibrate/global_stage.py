@@ -37,6 +37,7 @@ from physworld.calibrate.estimates import (
 from physworld.calibrate.friction_bound import affordable
 from physworld.calibrate.journal import Journal
 from physworld.calibrate.least_squares import Solution
+from physworld.calibrate.local_stage import LocalResult
 from physworld.calibrate.losses import training_losses
 from physworld.calibrate.parameters import Parameter, flow_law, parameters_of
 from physworld.calibrate.search import Optimum, Progress, Search
@@ -98,6 +99,8 @@ class FitResult:
         seconds: wall time.
         loss_history: root mean squared training residual after each run [m], best so far.
         rejected: parameters that were tried and not kept, with the share of the cost that they removed.
+        local: what the local stage found, or None where it was not asked for; a field that it kept is the twin's.
+        homogeneous: tracks of the twin without that field, (T, N, 3) [m]; None without one.
     """
 
     twin: Twin
@@ -111,6 +114,8 @@ class FitResult:
     seconds: float
     loss_history: list[float]
     rejected: dict[str, float] = field(default_factory=dict)
+    local: LocalResult | None = None
+    homogeneous: np.ndarray | None = None
 
 
 def calibrate(

@@ -10,10 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.optimize import OptimizeResult, minimize
 
+from physworld.calibrate.journal import Journal
 from physworld.errors import CalibrationError, Cancelled, SimulationError
 from physworld.geometry.features import carry_features, part_features
 from physworld.mpm.gradient_twin import TwinRun
@@ -99,13 +101,22 @@ class FieldSearch:
         size: how many coefficients.
         begin, end: training frames.
         runs: forward runs with a gradient so far.
+        simulations: forward runs without one.
+
+    What a search finished is in the journal, if there is one, and is not simulated again.
 
     Raises:
         ValueError: an unknown field, or none that could be searched.
     """
 
     def __init__(
-        self, scene: Scene, twin: Twin, config: LocalConfig, cancelled: Callable[[], bool] | None
+        self,
+        scene: Scene,
+        twin: Twin,
+        config: LocalConfig,
+        cancelled: Callable[[], bool] | None = None,
+        progress: Callable[[int, int, str], None] | None = None,
+        journal: Journal | None = None,
     ) -> None:
         unknown = sorted(set(config.fields) - set(FIELDS))
         if unknown or not config.fields:
@@ -119,12 +130,19 @@ class FieldSearch:
         constant = np.ones((len(self.modes), 1))
         self._basis = np.concatenate([constant, self.modes], axis=1)
         self._curvatures: dict[int, np.ndarray] = {}
-        self.runs = 0
+        self.runs = self.simulations = 0
+        self.stage, self._progress, self._journal = "local stage", progress, journal or Journal()
 
     @property
     def size(self) -> int:
         """Coefficients of all fields."""
         return self._basis.shape[1] * len(self.fields)
+
+    @property
+    def most(self) -> int:
+        """About how many runs the stage takes at most: two Hessians, and a descent for each strength and two more."""
+        descents = len(self._config.strengths) + 2
+        return 2 * (self.size + 2) + descents * (self._config.iterations + 2)
 
     def known(self, name: str, end: int, variance: float) -> float:
         """How many times as precisely as the prior the data know the best of a field's coefficients, at no field.
@@ -174,6 +192,8 @@ class FieldSearch:
     def errors(self, z: np.ndarray, end: int) -> np.ndarray:
         """Mean squared error [m^2] of every training frame up to ``end``; NaN where the run fails."""
         times, controls = self.scene.control_track()
+        self.simulations += 1
+        self._tell()
         try:
             nodes = self.twin.simulate_nodes(
                 times, controls, self.scene.times[:end], properties=self.properties(z), progress=self._poll
@@ -185,8 +205,12 @@ class FieldSearch:
 
     def validation_error(self, z: np.ndarray, split: int) -> float:
         """Mean squared error [m^2] on the validation frames; infinite where the run fails."""
-        found = float(self.errors(z, self.end)[split - self.begin :].mean())
-        return found if np.isfinite(found) else float("inf")
+
+        def measured() -> dict[str, float]:
+            return {"error": float(self.errors(z, self.end)[split - self.begin :].mean())}
+
+        found = self._step(f"field error from {split}", measured)["error"]
+        return float("inf") if found is None else found
 
     def descend(
         self, z: np.ndarray, end: int, scale: float, strength: float | None
@@ -218,27 +242,55 @@ class FieldSearch:
             "gtol": _FLAT,
             "hess_inv0": 0.5 * (inverse + inverse.T),
         }
-        found = minimize(objective, z[free], jac=True, method="BFGS", callback=watch, options=options)
+
+        def searched() -> dict[str, Any]:
+            found = minimize(objective, z[free], jac=True, method="BFGS", callback=watch, options=options)
+            return {"z": found.x.tolist(), "value": float(found.fun)}
+
+        self.stage = "moduli of the field" if strength is None else f"field at prior strength {strength:g}"
+        found = self._step(f"{self.stage} to {end}", searched)
         best = z.copy()
-        best[free] = found.x
-        return best, float(found.fun)
+        best[free] = found["z"]
+        return best, float("inf") if found["value"] is None else found["value"]
 
     def _curvature(self, z: np.ndarray, end: int) -> np.ndarray:
         """Gauss-Newton's Hessian of the mean squared error [m^2], (k, k), by one run a coefficient; kept."""
         if end not in self._curvatures:
-            here = self._tracks(z, end)
-            columns = []
-            for k in range(self.size):
-                probe = z.copy()
-                probe[k] += _PROBE
-                columns.append((self._tracks(probe, end) - here) / _PROBE)
-            jacobian = np.nan_to_num(np.array(columns).T)
-            self._curvatures[end] = 2.0 * jacobian.T @ jacobian / len(here)
+            self.stage = "sensitivities of the field"
+            found = self._step(f"{self.stage} to {end}", lambda: {"hessian": self._hessian(z, end).tolist()})
+            self._curvatures[end] = np.array(found["hessian"])
         return self._curvatures[end]
+
+    def _hessian(self, z: np.ndarray, end: int) -> np.ndarray:
+        here = self._tracks(z, end)
+        columns = []
+        for k in range(self.size):
+            probe = z.copy()
+            probe[k] += _PROBE
+            columns.append((self._tracks(probe, end) - here) / _PROBE)
+        jacobian = np.nan_to_num(np.array(columns).T)
+        return 2.0 * jacobian.T @ jacobian / len(here)
+
+    def _step(self, name: str, compute: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """A journalled step, which also brings the counts of runs to where they were after it."""
+
+        def counted() -> dict[str, Any]:
+            return {**compute(), "runs": self.runs, "simulations": self.simulations}
+
+        found = self._journal.step(name, counted)
+        self.runs, self.simulations = found["runs"], found["simulations"]
+        return found
+
+    def _tell(self) -> None:
+        if self._progress is not None:
+            done = self.runs + self.simulations
+            self._progress(done, max(self.most, done), self.stage)
 
     def _tracks(self, z: np.ndarray, end: int) -> np.ndarray:
         """Predicted coordinates that were seen in the frames up to ``end``, flat; NaN where the run fails."""
         times, controls = self.scene.control_track()
+        self.simulations += 1
+        self._tell()
         seen = self.scene.visible[self.begin : end]
         try:
             nodes = self.twin.simulate_nodes(
@@ -253,6 +305,7 @@ class FieldSearch:
         properties = self.properties(z)
         times, controls = self.scene.control_track()
         self.runs += 1
+        self._tell()
         try:
             run = TwinRun(
                 self.twin, times, controls, self.scene.times[:end], properties=properties,

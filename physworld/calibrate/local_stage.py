@@ -26,6 +26,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from physworld.calibrate.journal import Journal
 from physworld.calibrate.local_search import FieldSearch, LocalConfig
 from physworld.errors import CalibrationError
 from physworld.scene import Scene
@@ -51,6 +52,7 @@ class LocalResult:
         validation: mean squared error on the validation frames over the homogeneous fit's, by strength.
         tracks: tracked points over all frames, (T, N, 3) [m].
         runs: forward runs with a gradient.
+        simulations: forward runs without one.
         seconds: wall time.
         reason: a sentence.
     """
@@ -63,6 +65,7 @@ class LocalResult:
     validation: dict[float, float]
     tracks: np.ndarray
     runs: int
+    simulations: int
     seconds: float
     reason: str
     modes: np.ndarray = field(repr=False, default_factory=lambda: np.empty((0, 0)))
@@ -72,8 +75,9 @@ def fit_fields(
     scene: Scene,
     twin: Twin,
     config: LocalConfig | None = None,
-    progress: Callable[[str], None] | None = None,
+    progress: Callable[[int, int, str], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
+    journal: Journal | None = None,
 ) -> LocalResult:
     """Fit fields to the training frames of a scene, on a twin that the global stage has fitted.
 
@@ -81,17 +85,19 @@ def fit_fields(
         scene: the recording.
         twin: the homogeneous fit.
         config: settings; None for the defaults.
-        progress: called with a sentence after every search.
+        progress: called with (runs done, runs about, what for) before every run.
         cancelled: polled every frame of every run.
+        journal: finished steps of an earlier attempt, which are not simulated again.
 
     Raises:
         CalibrationError: the twin's own run fails, or no training frame is left for the validation.
         Cancelled: ``cancelled`` returned true.
+        NotDifferentiable: something that acts on the twin has no derivative.
         ValueError: an unknown field.
     """
     config = config or LocalConfig()
     started = time.perf_counter()
-    search = FieldSearch(scene, twin, config, cancelled)
+    search = FieldSearch(scene, twin, config, cancelled, progress, journal)
     split = search.split()
     plain = search.errors(np.zeros(search.size), search.end)
     if not np.isfinite(plain).all():
@@ -109,8 +115,6 @@ def fit_fields(
         z, _ = search.descend(z, split, before, strength)
         ratio = search.validation_error(z, split) / reference
         validation[strength] = ratio
-        if progress is not None:
-            progress(f"prior strength {strength:g}: validation error {ratio:.3f} of the homogeneous fit's")
         if best is None or ratio < _WORTH * validation[best]:  # a weaker prior has to be worth it
             best, best_z = strength, z
     kept = best is not None and validation[best] < 1.0 - config.least_gain
@@ -160,6 +164,7 @@ def _result(
         validation=validation,
         tracks=twin.observe(nodes, scene.times),
         runs=search.runs,
+        simulations=search.simulations,
         seconds=time.perf_counter() - started,
         reason="; ".join([reason, *(f"{name} {why}" for name, why in held.items())]),
         modes=search.modes,

@@ -22,6 +22,7 @@ import numpy as np
 from physworld.build import build_twin
 from physworld.mpm.energy import EnergyLedger, run_with_ledger, without_friction
 from physworld.mpm.total_lagrangian import TotalLagrangian
+from physworld.properties import carried
 from physworld.scene import Scene
 from physworld.twin import Twin
 
@@ -74,6 +75,7 @@ def measure_numerics(
     particle_budget: int = 2000,
     refinement: float = REFINEMENT,
     progress: Callable[[int, int, str], None] | None = None,
+    poll: Callable[[int, int], None] | None = None,
 ) -> Numerics:
     """Measure a calibrated twin's numerics on its scene.
 
@@ -83,6 +85,7 @@ def measure_numerics(
         particle_budget: the one that the twin was built with.
         refinement: cells of the finer lattice are this many times smaller.
         progress: called with (runs done, runs in all, what comes next); may raise to stop.
+        poll: called with (frames done, frames in all) of every run; may raise to stop.
 
     Raises:
         SimulationError: a run cannot be trusted.
@@ -90,20 +93,23 @@ def measure_numerics(
     begun = time.perf_counter()
     tell = progress or (lambda done, most, text: None)
     tell(0, 4, "free swing without friction")
-    damping = free_swing(scene, twin)
+    damping = free_swing(scene, twin, poll=poll)
     tell(1, 4, "prediction with its energy ledger")
     control_times, controls = scene.control_track()
     run = twin.integration(control_times, controls, scene.times)
-    nodes, ledger = run_with_ledger(run.problem, twin.body.start, run.velocity, run.held, run.knots)
+    nodes, ledger = run_with_ledger(
+        run.problem, twin.body.start, run.velocity, run.held, run.knots, progress=poll
+    )
     track = twin.observe(run.at_frames(twin.body.start, nodes), scene.times)
     step = TotalLagrangian(run.problem).time_step_s
     tell(2, 4, "half the time step")
     halved = TotalLagrangian(run.problem, 0.5 * step)
-    nodes = halved.run(twin.body.start, run.velocity, run.held, run.knots)
+    nodes = halved.run(twin.body.start, run.velocity, run.held, run.knots, poll)
     half_track = twin.observe(run.at_frames(twin.body.start, nodes), scene.times)
     tell(3, 4, "finer cells")
     finer = refined(scene, twin, particle_budget, refinement)
-    finer_track = finer.observe(finer.simulate_nodes(control_times, controls, scene.times), scene.times)
+    finer_nodes = finer.simulate_nodes(control_times, controls, scene.times, progress=poll)
+    finer_track = finer.observe(finer_nodes, scene.times)
     tell(4, 4, "done")
     return Numerics(
         equivalent_drag_per_s=damping.equivalent_drag_per_s,
@@ -135,6 +141,7 @@ def refined(scene: Scene, twin: Twin, particle_budget: int, refinement: float = 
         ground_height_m=twin.ground_height_m,
         ground_friction=twin.ground_friction,
         effects=twin.effects,
+        properties=carried(twin.properties, twin.particles_rest, finer.particles_rest),
     )
 
 
@@ -158,7 +165,13 @@ class FreeSwing:
         return None if self.mode_hz is None else self.equivalent_drag_per_s / (4 * np.pi * self.mode_hz)
 
 
-def free_swing(scene: Scene, twin: Twin, *, time_step_s: float | None = None) -> FreeSwing:
+def free_swing(
+    scene: Scene,
+    twin: Twin,
+    *,
+    time_step_s: float | None = None,
+    poll: Callable[[int, int], None] | None = None,
+) -> FreeSwing:
     """The twin's body, let go at the start of the scene with all physical friction off and its grips at rest.
 
     A body that hangs in balance is kicked sideways first. Frames are those of the scene.
@@ -181,13 +194,13 @@ def free_swing(scene: Scene, twin: Twin, *, time_step_s: float | None = None) ->
     size = float(np.ptp(start, axis=0).max())
     held = np.unique(run.held.nodes)
     nodes, ledger = run_with_ledger(
-        run.problem, start, velocity, run.held, run.knots, time_step_s=time_step_s
+        run.problem, start, velocity, run.held, run.knots, time_step_s=time_step_s, progress=poll
     )
     if np.linalg.norm(nodes - nodes[0], axis=2).max() < _STILL * size:
         free = np.setdiff1d(np.arange(len(start)), held)
         velocity[free] += _KICK_PER_S * size * _across(start, twin.gravity_m_s2)
         nodes, ledger = run_with_ledger(
-            run.problem, start, velocity, run.held, run.knots, time_step_s=time_step_s
+            run.problem, start, velocity, run.held, run.knots, time_step_s=time_step_s, progress=poll
         )
     spent = float(np.trapezoid(ledger.kinetic - ledger.kinetic.min(), ledger.times))
     drag = 0.0 if spent == 0 else float(ledger.lost[-1]) / (2 * spent)

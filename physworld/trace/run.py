@@ -18,6 +18,7 @@ import numpy as np
 
 from physworld.calibrate import Journal, calibrate
 from physworld.calibrate.parameters import BENDING_COUPLING, BENDING_RATIO, TWIST_RATIO, parameters_of
+from physworld.errors import SceneUnsupported
 from physworld.grips import softly_held
 from physworld.scene import Scene
 from physworld.trace.candidates import Candidate, candidates
@@ -107,8 +108,14 @@ def trace(
     Raises:
         CalibrationError: no start gave a usable simulation.
         Cancelled: ``cancelled`` returned true.
-        SceneUnsupported: the scene declares too little for a body; or the recordings are of different kinds.
+        SceneUnsupported: the scene declares too little for a body; the recordings are of different kinds; or the
+            calibrated twin carries a field.
     """
+    if calibrated_twin is not None and calibrated_twin.properties is not None:
+        raise SceneUnsupported(
+            f"the calibrated twin carries a field over its {len(calibrated_twin.properties)} particles; a trace "
+            "works on a homogeneous one, so that an effect is not hidden by it"
+        )
     config = config or TraceConfig()
     begun = time.perf_counter()
     scenes = [scene] if isinstance(scene, Scene) else list(scene)

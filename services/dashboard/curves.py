@@ -20,11 +20,12 @@ LABELS = {
     "constant_velocity": ("Constant velocity", "velocity"),
     "before": ("Before", "other"),
     "after": ("After", "predicted"),
+    "twin_homogeneous": ("Twin without its field", "other"),
     "twin": ("Twin", "predicted"),
     "world_model": ("World model", "other"),
     "world_model_finetuned": ("World model, fine-tuned", "model"),
 }
-PREDICTORS = ("after", "twin", "world_model", "world_model_finetuned")
+PREDICTORS = ("after", "twin_homogeneous", "twin", "world_model", "world_model_finetuned")
 TIMES_KEY = "times_s"
 
 

@@ -15,7 +15,6 @@ import hashlib
 import json
 import sys
 from contextlib import nullcontext
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,7 +30,7 @@ def main(arguments: list[str] | None = None) -> int:
     given = _parser().parse_args(arguments)
     from workers.commands.terminal import guarded
 
-    return guarded(lambda: _fit(given))
+    return guarded(lambda: _fit(given), lambda: _kept(given.resume))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -45,6 +44,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--plasticity", default=None, help="flow law by name; its yield is calibrated too")
     parser.add_argument("--formulation", default="auto", help="total_lagrangian, updated_lagrangian or auto")
     parser.add_argument("--transfer", default="apic", help="of the updated Lagrangian form: apic or asflip")
+    parser.add_argument(
+        "--stages", default="global", help="global, or global+local: a field on top if it holds"
+    )
     parser.add_argument(
         "--resume",
         type=Path,
@@ -68,12 +70,11 @@ def _fit(given: argparse.Namespace) -> None:
     import warp as wp
 
     wp.config.quiet = True  # before the first import that starts it
-    from physworld.calibrate import CalibrationConfig, calibrate
-    from physworld.calibrate.discretisation import converged_parameters
-    from physworld.evaluate.numerics import measure_numerics
+    from physworld.calibrate import CalibrationConfig, calibrate_in_stages
     from workers.commands.terminal import progress_bar, read_scene
     from workers.law_choice import AUTO, chosen_laws
-    from workers.tasks.fit_report import fit_files, fit_report, json_safe, parameter_json
+    from workers.tasks.fit_accuracy import fit_accuracy, not_measured
+    from workers.tasks.fit_report import fit_files, fit_report
 
     scene = read_scene(given.scene)
     numbers = {"particle_budget": given.particles, "max_simulations": given.simulations}
@@ -87,17 +88,13 @@ def _fit(given: argparse.Namespace) -> None:
     with progress_bar(f"law {scene.name}") if given.law == AUTO else nullcontext() as shown:
         config, choice = chosen_laws(given.law, scene, config, shown, journal=journal)
     with progress_bar(f"fit {scene.name}") as shown:
-        fitted = calibrate(scene, config, progress=shown, journal=journal)
-    report = fit_report(scene, fitted, choice)
-    document = fit_document(scene.name, report)
-    if not given.quick and fitted.twin.formulation == "total_lagrangian":
-        budget = config.particle_budget
+        fitted = calibrate_in_stages(scene, config, given.stages, progress=shown, journal=journal)
+    accuracy = not_measured("left out by --quick")
+    if not given.quick:
         with progress_bar(f"numerics {scene.name}") as shown:
-            numerics = measure_numerics(scene, fitted.twin, particle_budget=budget, progress=shown)
-            shown(4, 4, "sensitivities")
-            converged = converged_parameters(scene, fitted, budget)
-        document["numerics"] = json_safe(asdict(numerics))
-        document["converged"] = {name: parameter_json(estimate) for name, estimate in converged.items()}
+            accuracy = fit_accuracy(scene, fitted, config.particle_budget, shown, journal=journal)
+    report = fit_report(scene, fitted, choice, accuracy)
+    document = fit_document(scene.name, report)
     _print(document)
     if given.out is not None:
         given.out.mkdir(parents=True, exist_ok=True)
@@ -106,6 +103,15 @@ def _fit(given: argparse.Namespace) -> None:
     if given.json is not None:
         given.json.parent.mkdir(parents=True, exist_ok=True)
         given.json.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n")
+
+
+def _kept(path: Path | None) -> str:
+    """What an interrupted fit leaves behind."""
+    from workers.commands.terminal import NOTHING_WRITTEN
+
+    if path is None or not path.exists():
+        return NOTHING_WRITTEN
+    return f"no figures were written; the steps in {path} are kept, and the same command goes on from them"
 
 
 def _journal(path: Path, scene: Scene, settings: str) -> Journal:
@@ -125,15 +131,12 @@ def _journal(path: Path, scene: Scene, settings: str) -> Journal:
 
 def fit_document(scene_name: str, report: dict[str, Any]) -> dict[str, Any]:
     """The machine-readable answer: the report's figures under stable keys at the top."""
-    metrics = dict(report["metrics"])
     return {
         "schema_version": SCHEMA_VERSION,
         "scene": scene_name,
         "parameters": report["parameters"],
-        **metrics,
+        **report["metrics"],
         "notes": report["notes"],
-        "numerics": None,
-        "converged": None,
     }
 
 
@@ -148,6 +151,8 @@ def _print(document: dict[str, Any]) -> None:
     print(f"held-out track error [mm]{'' if floor is None else f', noise floor {1e3 * floor:.4g}'}:")
     for name, error in sorted(held_out["track_m"].items(), key=lambda item: item[1] or 0.0):
         print(f"  {name:<20} {'-' if error is None else format(1e3 * error, '.4g')}")
+    if document["local"] is not None:
+        print(f"field over the body: {document['local']['reason']}")
     law, numerics = document["law"], document["numerics"]
     print(f"laws {law['elastic']} and {law['plastic']}, decided by {law['decided_by']}: {law['reason']}")
     if numerics is not None:
@@ -155,6 +160,10 @@ def _print(document: dict[str, Any]) -> None:
         print(
             f"the engine's own damping: a drag of {drag:.3g} 1/s; finer cells move points by {1e3 * cells:.3g} mm"
         )
+    elif document["not_measured"]:
+        print(f"the engine's own damping was not measured: {document['not_measured']}")
+    for name, why in document["search"]["open"].items():
+        print(f"{name} is not converged: {why}")
     for name, parameter in (document["converged"] or {}).items():
         low, high = parameter["ci95"] or (float("nan"), float("nan"))
         value = f"{parameter['value']:.5g} {parameter['unit']} [{low:.5g}, {high:.5g}]"

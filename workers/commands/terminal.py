@@ -24,6 +24,7 @@ from storage.scene_bundle import read_bundle
 FAILED, INTERRUPTED = 2, 130
 PLAIN_INTERVAL_S = 5.0
 WIDTH_ELSEWHERE = 140
+NOTHING_WRITTEN = "nothing was written"
 
 
 def read_scene(path: Path) -> Scene:
@@ -63,12 +64,15 @@ def progress_bar(title: str) -> Iterator[Callable[[int, int, str], None]]:
         yield lambda done, total, message: shown.update(task, completed=done, total=total, message=message)
 
 
-def guarded(command: Callable[[], None]) -> int:
-    """Run a command; its exit code. An error that we know is one line on standard error, never a traceback."""
+def guarded(command: Callable[[], None], left: Callable[[], str] = lambda: NOTHING_WRITTEN) -> int:
+    """Run a command; its exit code. An error that we know is one line on standard error, never a traceback.
+
+    ``left`` says after an interrupt what the command leaves behind.
+    """
     try:
         command()
     except (KeyboardInterrupt, Cancelled):
-        _say("cancelled; nothing was written")
+        _say(f"cancelled; {left()}")
         return INTERRUPTED
     except (PhysworldError, StorageError, OSError, ValueError) as error:
         _say(f"error: {type(error).__name__}: {error}")

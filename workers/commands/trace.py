@@ -26,9 +26,14 @@ PROCESSES = 2
 def main(arguments: list[str] | None = None) -> int:
     """Parse the command line, trace, write."""
     given = _parser().parse_args(arguments)
-    from workers.commands.terminal import guarded
+    from workers.commands.terminal import NOTHING_WRITTEN, guarded
 
-    return guarded(lambda: _trace(given))
+    def left() -> str:
+        if given.resume is None or not given.resume.exists():
+            return NOTHING_WRITTEN
+        return f"no figures were written; what {given.resume} holds is kept, and the same command goes on from it"
+
+    return guarded(lambda: _trace(given), left)
 
 
 def _parser() -> argparse.ArgumentParser:

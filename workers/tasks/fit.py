@@ -12,13 +12,14 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from physworld.calibrate import CalibrationConfig, Journal, calibrate
+from physworld.calibrate import CalibrationConfig, Journal, calibrate_in_stages
 from schemas.fit import FitConfig
 from workers.context import TaskContext
 from workers.law_choice import chosen_laws
 from workers.lineage import lineage_of
 from workers.registry import HandlerResult
 from workers.stores import Stores
+from workers.tasks.fit_accuracy import fit_accuracy, not_measured
 from workers.tasks.fit_report import MEDIA_TYPES, fit_files, fit_report
 from workers.tasks.inputs import scene_of, scene_reference
 
@@ -46,16 +47,29 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     folder = Path(stores.settings.data_dir) / "checkpoints" / context.lease.job_id
     journal = stored_journal(folder / JOURNAL, payload)
     calibration, law = chosen_laws(config.law, scene, calibration, progress, context.cancelled, journal)
-    fitted = calibrate(scene, calibration, progress, context.cancelled, journal)
+    fitted = calibrate_in_stages(
+        scene, calibration, config.stages, progress=progress, cancelled=context.cancelled, journal=journal
+    )
+    accuracy = not_measured("left out by the request")
+    if config.numerics:
+
+        def measuring(done: int, total: int, message: str) -> None:
+            most = max(config.max_simulations, spent + total)
+            context.progress(spent + done, most, "simulations", f"numerics: {message}")
+
+        local = fitted.local
+        spent = fitted.simulations + (0 if local is None else local.runs + local.simulations)
+
+        accuracy = fit_accuracy(scene, fitted, config.particle_budget, measuring, context.cancelled, journal)
     context.check()
-    report = fit_report(scene, fitted, law)
+    report = fit_report(scene, fitted, law, accuracy)
     artifacts = [
         stores.artifacts.put_bytes(content, name, MEDIA_TYPES[name])
         for name, content in fit_files(scene, fitted, report).items()
     ]
     result = {
         "parameters": report["parameters"],
-        "metrics": report["metrics"],
+        "metrics": {**report["metrics"], "notes": report["notes"]},
         "artifacts": [artifact.model_dump(mode="json") for artifact in artifacts],
         "seconds": fitted.seconds,
         "lineage": lineage_of([scene_reference(stores, payload["scene_id"])], payload["config"], {}),

@@ -15,7 +15,10 @@ from typing import Any
 import numpy as np
 
 from physworld.calibrate import Estimate, FitResult
+from physworld.calibrate.estimates import NOT_CONVERGED
 from physworld.calibrate.law_choice import LawChoice
+from physworld.calibrate.local_search import FIELDS
+from physworld.calibrate.local_stage import LocalResult
 from physworld.evaluate.table import held_out_table
 from physworld.scene import Scene
 from schemas.fit import Parameter
@@ -27,13 +30,24 @@ SHOWN_PARTICLES = 1500
 MEDIA_TYPES = {TWIN: "application/x-npz", PREDICTION: "application/x-npz", REPORT: "application/json"}
 
 
-def fit_report(scene: Scene, fitted: FitResult, law: LawChoice | None = None) -> dict[str, Any]:
+def fit_report(
+    scene: Scene, fitted: FitResult, law: LawChoice | None, accuracy: dict[str, Any]
+) -> dict[str, Any]:
     """``parameters``, ``metrics`` and ``notes`` as plain JSON; a number that is not finite is None.
 
-    ``law`` is how the law was chosen; None: it is the usual one.
+    Args:
+        scene: the recording.
+        fitted: its calibration.
+        law: how the law was chosen; None: it is the usual one.
+        accuracy: of :func:`workers.tasks.fit_accuracy.fit_accuracy`.
     """
+    open_ones = {
+        known.name: fitted.parameters[known.name].note
+        for known in fitted.searched
+        if fitted.parameters[known.name].note in NOT_CONVERGED
+    }
     metrics = {
-        "held_out": held_out_table(scene, {"twin": fitted.tracks}),
+        "held_out": held_out_table(scene, _predictors(fitted)),
         "simulations": fitted.simulations,
         "seconds": fitted.seconds,
         "training_loss_m": fitted.loss_history,
@@ -46,6 +60,9 @@ def fit_report(scene: Scene, fitted: FitResult, law: LawChoice | None = None) ->
         "training": fitted.losses,
         "law": asdict(law or LawChoice(fitted.twin.law.name)),
         "formulation": {"name": fitted.twin.formulation, "reason": _formulation_reason(fitted)},
+        "local": _local_record(fitted.local),
+        "search": {"converged": not open_ones, "open": open_ones},
+        **accuracy,
     }
     return {
         "parameters": {name: parameter_json(estimate) for name, estimate in fitted.parameters.items()},
@@ -82,6 +99,33 @@ def json_safe(value: Any) -> Any:
     if isinstance(value, np.generic):
         value = value.item()
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _predictors(fitted: FitResult) -> dict[str, np.ndarray]:
+    """Tracks whose errors are reported: the twin's, and where it carries a field also those without it."""
+    found = {"twin": fitted.tracks}
+    return found if fitted.homogeneous is None else {"twin_homogeneous": fitted.homogeneous, **found}
+
+
+def _local_record(local: LocalResult | None) -> dict[str, Any] | None:
+    """What the local stage found, without its arrays: the field itself is the twin's."""
+    if local is None:
+        return None
+    columns = {name: local.properties[:, FIELDS.index(name)] for name in local.fields}
+    return {
+        "kept": local.kept,
+        "reason": local.reason,
+        "held": local.held,
+        "strength": local.strength,
+        "validation": {f"{strength:g}": ratio for strength, ratio in local.validation.items()},
+        "log_factors": {
+            name: {"mean": values.mean(), "low": values.min(), "high": values.max()}
+            for name, values in columns.items()
+        },
+        "runs": local.runs,
+        "simulations": local.simulations,
+        "seconds": local.seconds,
+    }
 
 
 def _formulation_reason(fitted: FitResult) -> str:

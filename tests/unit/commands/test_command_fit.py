@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -72,6 +73,7 @@ def test_the_figures_and_the_files_of_a_fit(
     assert found["formulation"]["name"] == "total_lagrangian" and found["formulation"]["reason"]
     assert abs(found["numerics"]["equivalent_drag_per_s"]) < 0.5
     assert found["converged"]["youngs_modulus_pa"]["unit"] == "Pa"
+    assert found["not_measured"] == "" and found["search"] == {"converged": True, "open": {}}
     with np.load(out / "twin.npz", allow_pickle=False) as arrays:
         twin = Twin.from_arrays(dict(arrays))
     assert twin.parameters["youngs_modulus_pa"] == modulus["value"]
@@ -86,7 +88,7 @@ def test_a_given_law_is_used_and_an_unknown_one_refused(
     assert fit.main(arguments(bundle, "--quick", "--law", "hencky", "--json", str(figures))) == 0
     found = json.loads(figures.read_text())
     assert found["law"]["elastic"] == "hencky" and found["law"]["decided_by"] == "given"
-    assert found["numerics"] is None and found["converged"] is None
+    assert found["numerics"] is None and found["converged"] is None and "--quick" in found["not_measured"]
     capsys.readouterr()
     assert fit.main(arguments(bundle, "--law", "jelly")) == 2
     assert "no law 'jelly'" in capsys.readouterr().err
@@ -128,6 +130,21 @@ def test_an_interrupt_cancels_and_says_so(bundle: Path, tmp_path: Path) -> None:
     assert first.startswith("fit bar 1/")
     assert process.returncode == 130 and "cancelled; nothing was written" in rest and "Traceback" not in rest
     assert not figures.exists()
+
+
+def test_an_interrupt_says_that_finished_steps_are_kept(bundle: Path, tmp_path: Path) -> None:
+    journal = tmp_path / "steps.json"
+    command = [sys.executable, "-m", "workers.commands.fit", *arguments(bundle, "--resume", str(journal))]
+    command += ["--particles", "4000"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=dict(os.environ)) as process:
+        assert process.stderr is not None
+        while not journal.exists() and process.poll() is None:
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        rest = process.stderr.read()
+    assert process.returncode == 130
+    assert f"no figures were written; the steps in {journal} are kept" in rest
+    assert len(json.loads(journal.read_text())["entries"]) >= 1
 
 
 def test_a_fit_that_was_ended_goes_on_from_its_file(bundle: Path, tmp_path: Path) -> None:

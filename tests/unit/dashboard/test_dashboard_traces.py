@@ -220,3 +220,30 @@ def test_artifacts_of_a_trace_are_files_to_download(
     files = [Artifact.model_validate(item) for item in _files(world[2])]
     page = client.get(f"/dashboard/traces/{trace_id}").text
     assert all(file.sha256 in page for file in files)
+
+
+def test_the_page_of_a_fit_says_what_the_engine_itself_does(
+    client: httpx.Client, world: tuple[Settings, Database, Stores]
+) -> None:
+    _, database, stores = world
+    scene_id = register(tiny_scene(), database, stores.artifacts)
+    with database.session() as session:
+        fit_id = jobs.create_fit(session, scene_id, FitConfig()).outputs[0].id
+    numerics = {
+        "equivalent_drag_per_s": 0.0612, "damping_ratio": 0.00125, "dominant_mode_hz": 7.7, "lost_share": 0.01,
+        "time_step_s": 1e-4, "half_step_m": 2e-6, "finer_cells_m": 4.2e-4, "refinement": 1.5, "particles": 2000,
+        "finer_particles": 6750, "simulations": 4, "seconds": 3.0,
+    }  # fmt: skip
+    modulus = {"value": 2.0e5, "unit": "Pa", "ci95": [1.9e5, 2.1e5]}
+    metrics = {
+        "numerics": numerics,
+        "converged": {"E": modulus | {"value": 2.04e5}},
+        "search": {"converged": False, "open": {"E": "the search had not converged on it"}},
+        "notes": ["a clamp of 4 markers"],
+    }
+    _complete(database, {"parameters": {"E": modulus}, "metrics": metrics, "artifacts": []})
+    page = client.get(f"/dashboard/fits/{fit_id}", follow_redirects=True).text
+    for text in (
+        "0.0612 1/s", "7.7 Hz", "0.420 mm", "6,750", "204,000", "not converged: E, the search", "a clamp of 4 markers",
+    ):  # fmt: skip
+        assert text in page, text

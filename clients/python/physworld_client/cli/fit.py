@@ -37,6 +37,9 @@ def fit(
     transfer: Annotated[
         str | None, typer.Option(help="Of the updated Lagrangian form: apic or asflip.")
     ] = None,
+    stages: Annotated[
+        str | None, typer.Option(help="global, or global+local: a field over the body on top, if it holds.")
+    ] = None,
     resume: Annotated[
         Path | None, typer.Option(help="File of finished steps: a fit that was ended goes on from it.")
     ] = None,
@@ -54,6 +57,7 @@ def fit(
         "--plasticity": plasticity,
         "--formulation": formulation,
         "--transfer": transfer,
+        "--stages": stages,
         "--resume": resume,
     }
     options = [text for name, value in given.items() if value is not None for text in (name, str(value))]

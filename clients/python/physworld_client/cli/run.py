@@ -46,6 +46,9 @@ def run(
     transfer: Annotated[
         str | None, typer.Option(help="Of the updated Lagrangian form: apic or asflip.")
     ] = None,
+    stages: Annotated[
+        str | None, typer.Option(help="Of the fit: global, or global+local with a field over the body.")
+    ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of demonstration and training.")] = None,
     name: Annotated[str | None, typer.Option(help="Name of the model [the scene's name].")] = None,
     close_the_loop: Annotated[
@@ -71,7 +74,13 @@ def run(
         "vertices": vertices,
     }
     settings |= {"seed": seed, "particle_budget": particles, "max_simulations": simulations}
-    settings |= {"law": law, "plasticity": plasticity, "formulation": formulation, "transfer": transfer}
+    settings |= {
+        "law": law,
+        "plasticity": plasticity,
+        "formulation": formulation,
+        "transfer": transfer,
+        "stages": stages,
+    }
     with _service(url, token, data, workers, keep_up) as (address, alive):
         with Client(address.url, address.token) as client:
             loop = {"close_the_loop": True, "compare": compare} if close_the_loop else {}

@@ -1,0 +1,83 @@
+"""How far a fit's figures are the engine's own: its numerics on the scene, and its numbers with cells of no size.
+
+The same for the service's task and for ``physworld fit``. A body whose numerics cannot be measured keeps its fit; the
+record says why it has none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+from physworld.calibrate import FitResult, Journal
+from physworld.calibrate.discretisation import converged_parameters
+from physworld.calibrate.search import Progress
+from physworld.errors import Cancelled, SimulationError
+from physworld.evaluate.numerics import measure_numerics
+from physworld.scene import Scene
+from workers.tasks.fit_report import json_safe, parameter_json
+
+MEASURED_RUNS = 4
+
+
+def fit_accuracy(
+    scene: Scene,
+    fitted: FitResult,
+    particle_budget: int,
+    progress: Progress | None = None,
+    cancelled: Callable[[], bool] | None = None,
+    journal: Journal | None = None,
+) -> dict[str, Any]:
+    """``numerics``, ``converged`` and ``not_measured`` (why they are null, else empty), as plain JSON.
+
+    Args:
+        scene: the recording.
+        fitted: its calibration.
+        particle_budget: the one that it was made with.
+        progress: called with (runs done, runs in all, what comes next).
+        cancelled: polled every frame of every run.
+        journal: keeps what was measured for a later attempt.
+
+    Raises:
+        Cancelled: ``cancelled`` returned true.
+    """
+    return (journal or Journal()).step(
+        "accuracy", lambda: _measured(scene, fitted, particle_budget, progress, cancelled)
+    )
+
+
+def not_measured(reason: str) -> dict[str, Any]:
+    """The record of a fit whose accuracy was not measured."""
+    return {"numerics": None, "converged": None, "not_measured": reason}
+
+
+def _measured(
+    scene: Scene,
+    fitted: FitResult,
+    budget: int,
+    progress: Progress | None,
+    cancelled: Callable[[], bool] | None,
+) -> dict[str, Any]:
+    if fitted.twin.formulation != "total_lagrangian":
+        return not_measured("the updated Lagrangian form has no measure of its own damping")
+    total = MEASURED_RUNS + 1 + len(fitted.searched)
+
+    def poll(done: int, frames: int) -> None:
+        if cancelled is not None and cancelled():
+            raise Cancelled(f"numerics cancelled at frame {done} of {frames}")
+
+    def tell(done: int, _: int, message: str) -> None:
+        if progress is not None:
+            progress(done, total, "sensitivities and finer cells" if done == MEASURED_RUNS else message)
+
+    try:
+        numerics = measure_numerics(scene, fitted.twin, particle_budget=budget, progress=tell, poll=poll)
+        converged = converged_parameters(scene, fitted, budget, poll=poll)
+    except SimulationError as error:
+        return not_measured(f"{type(error).__name__}: {error}")
+    return {
+        "numerics": json_safe(asdict(numerics)),
+        "converged": {name: parameter_json(estimate) for name, estimate in converged.items()},
+        "not_measured": "",
+    }
