@@ -171,6 +171,7 @@ def free_swing(scene: Scene, twin: Twin, *, time_step_s: float | None = None) ->
         law=without_friction(twin.law),
         air_drag_per_s=0.0,
         ground_friction=0.0,
+        self_friction=None if twin.self_friction is None else 0.0,
         effects=(),
         release_s=0.0,
     )
