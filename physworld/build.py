@@ -15,6 +15,7 @@ from physworld.grips import declared_region, gripped_nodes, why_no_turn
 from physworld.materials.laws import Law, RodLaw, SheetLaw, SolidLaw
 from physworld.materials.plastic import Plasticity
 from physworld.mpm.choose import choose_formulation
+from physworld.mpm.self_contact import COARSE, apart_m, refuse_thickness
 from physworld.mpm.transfer import TRANSFERS, Apic
 from physworld.scene import AS_MEASURED, Scene
 from physworld.twin import Twin
@@ -75,7 +76,8 @@ def build_twin(
         held.append(nodes)
         taken = np.concatenate([taken, nodes])
     turning, notes = _turning(scene, body, controls[0], groups, held)
-    body = replace(body, notes=(*body.notes, *notes))
+    self_friction, touching = _touching_itself(scene, body)
+    body = replace(body, notes=(*body.notes, *notes, *touching))
     friction = scene.ground.friction if scene.ground is not None else None
     return Twin(
         body=body,
@@ -93,6 +95,7 @@ def build_twin(
         release_s=_release_time(scene),
         turning=turning,
         colliders=twin_colliders(scene, body.half_thickness_m, PRIOR_FRICTION),
+        self_friction=self_friction,
         plasticity=plasticity,
         formulation=choice.formulation,
         transfer=transfer,
@@ -120,6 +123,34 @@ def _turning(
     if len(turning) > 1:
         notes.append(f"twist is carried between grips {', '.join(map(str, turning))}")
     return turning, tuple(notes)
+
+
+def _touching_itself(scene: Scene, body: ReferenceBody) -> tuple[float | None, tuple[str, ...]]:
+    """Friction of a rope or sheet against itself where its scene declares that it touches itself, and notes on that.
+
+    Raises:
+        SceneUnsupported: the friction is no number of 0 or more, or the body is too thin for its cells.
+    """
+    declared = scene.declared.get("body") or {}
+    if body.lattice.dim == 3 or not declared.get("self_contact"):
+        return None, ()
+    friction = declared.get("self_friction")
+    said = "declared"
+    if friction is None:
+        friction, said = PRIOR_FRICTION, "assumed"
+    if isinstance(friction, bool) or not isinstance(friction, int | float) or not 0 <= friction < np.inf:
+        raise SceneUnsupported(f"body.self_friction is {friction!r}; it is Coulomb's coefficient, 0 or more")
+    thickness, cell = 2 * body.half_thickness_m, float(body.lattice.spacing.max())
+    refuse_thickness(body.lattice, thickness)
+    notes = [
+        f"it touches itself {thickness:.3g} m apart, with friction {friction:g} ({said}); places less than "
+        f"{apart_m(body.lattice, thickness):.3g} m apart along it do not"
+    ]
+    if thickness < COARSE * cell:
+        notes.append(
+            f"layers {thickness:.3g} m thick may cross where they bend within a cell of {cell:.3g} m: take finer cells"
+        )
+    return float(friction), tuple(notes)
 
 
 def _prior_law(scene: Scene, body: ReferenceBody) -> Law:

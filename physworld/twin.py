@@ -32,6 +32,7 @@ from physworld.mpm.choose import FormulationName
 from physworld.mpm.contact import GroundContact, ground, touching
 from physworld.mpm.following import follow
 from physworld.mpm.lattice import Lattice
+from physworld.mpm.self_contact import SelfContact
 from physworld.mpm.soft_grips import soften
 from physworld.mpm.terms import Term
 from physworld.mpm.total_lagrangian import Problem, TotalLagrangian, run_again_if_blown_up
@@ -66,6 +67,7 @@ class Twin:
             two of them the rope carries twist (:mod:`physworld.mpm.twist`).
         effects: what acts beside the declared physics.
         colliders: rigid bodies that push, still, on their own track or carried by controllers.
+        self_friction: Coulomb's coefficient of a rope or sheet against itself; None: it passes through itself.
         plasticity: flow law, or None; updated Lagrangian only.
         formulation: which form integrates the body.
         transfer: how particles and grid exchange velocities, "apic" or "asflip"; updated Lagrangian only.
@@ -89,6 +91,7 @@ class Twin:
     turning: tuple[int, ...] = ()
     effects: tuple[Effect, ...] = ()
     colliders: tuple[TwinCollider, ...] = ()
+    self_friction: float | None = None
     plasticity: Plasticity | None = None
     formulation: FormulationName = "total_lagrangian"
     transfer: str = Apic.name
@@ -134,12 +137,14 @@ class Twin:
             values.update(asdict(self.plasticity))
         if self.ground_height_m is not None:
             values["ground_friction"] = self.ground_friction
+        if self.self_friction is not None:
+            values["self_friction"] = self.self_friction
         return values
 
     def with_parameters(self, **values: float) -> Twin:
         """A twin with other parameters; names are those of :attr:`parameters`. Raises KeyError for an unknown one."""
         law_names = {f.name for f in fields(self.law)}
-        own = {"air_drag_per_s"} if self.ground_height_m is None else {"air_drag_per_s", "ground_friction"}
+        own = {"air_drag_per_s", "ground_friction", "self_friction"} & set(self.parameters)
         flow_names = set() if self.plasticity is None else {f.name for f in fields(self.plasticity)}
         unknown = set(values) - law_names - own - flow_names
         if unknown:
@@ -272,7 +277,8 @@ class Twin:
         if regions:
             gripped = with_touched_nodes(gripped, self.body.start)
         held = held_paths(gripped, knots, controls)
-        problem = replace(problem, terms=(*problem.terms, *twist_between_grips(gripped, knots, controls)))
+        twists = twist_between_grips(gripped, knots, controls)
+        problem = replace(problem, terms=(*problem.terms, *self._touching_itself(held.nodes), *twists))
         for known in active:
             problem, held = known.attach(problem, held, self)
         problem, held = soften(problem, held, self.grip_softness, regions)
@@ -349,6 +355,12 @@ class Twin:
                 self.lattice, self.body.start, plane, self.release_s, self.body.half_thickness_m
             )
         return (GroundContact(self.lattice, self.law, self.ground_height_m, self.ground_friction, offsets),)
+
+    def _touching_itself(self, held: np.ndarray) -> tuple[Term, ...]:
+        """Contact of the body with itself, but for what the grips hold."""
+        if self.self_friction is None:
+            return ()
+        return (SelfContact(2 * self.body.half_thickness_m, self.self_friction, held),)
 
     def _friction_factor(self, properties: np.ndarray | None) -> np.ndarray | None:
         if properties is None or properties.shape[1] < 3:

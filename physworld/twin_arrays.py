@@ -41,6 +41,7 @@ def arrays_of(twin: Twin) -> dict[str, np.ndarray]:
         "turning": list(twin.turning),
         "effects": [{"name": known.name, "strengths": known.values} for known in twin.effects],
         "colliders": collider_facts,
+        "self_friction": twin.self_friction,
         "formulation": twin.formulation,
         "transfer": twin.transfer,
         "plasticity": None
@@ -89,6 +90,7 @@ def parts_of(arrays: dict[str, np.ndarray]) -> dict[str, Any]:
         "turning": tuple(facts.get("turning", ())),
         "effects": tuple(effect(e["name"], **e["strengths"]) for e in facts.get("effects", ())),
         "colliders": from_parts(facts.get("colliders", []), arrays, body.half_thickness_m),
+        "self_friction": facts.get("self_friction"),
         "plasticity": None if flow is None else PLASTICITIES[flow["name"]](**flow["parameters"]),
         "formulation": facts.get("formulation", "total_lagrangian"),
         "transfer": facts.get("transfer", "apic"),

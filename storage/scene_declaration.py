@@ -70,6 +70,7 @@ class BodyForm(Form):
     segment_rest_lengths_m: list[Positive] | None = None
     topology: Topology | None = None
     self_contact: bool | None = None
+    self_friction: Annotated[float, Field(allow_inf_nan=False, ge=0)] | None = None
     topology_change: bool | None = None
 
 

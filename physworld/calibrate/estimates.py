@@ -109,7 +109,7 @@ def held_at_priors(
         needless = not value or name == "yield_stress_pa"  # nothing reaches the prior of a yield stress
         kept = "not needed" if needless else "held at its prior"
         held[name] = Estimate(value, by_name[name].unit, None, False, f"{kept}: {share}")
-    for name in ("poissons_ratio", "ground_friction"):
+    for name in ("poissons_ratio", "ground_friction", "self_friction"):
         if name in values and name not in held:
             held[name] = Estimate(values[name], "1", None, False, "held at its prior")
     return held

@@ -184,6 +184,7 @@ def free_swing(
         law=without_friction(twin.law),
         air_drag_per_s=0.0,
         ground_friction=0.0,
+        self_friction=None if twin.self_friction is None else 0.0,
         effects=(),
         release_s=0.0,
     )

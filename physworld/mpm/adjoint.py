@@ -23,7 +23,7 @@ from physworld.mpm.adjoint_kernels import keep_velocities
 from physworld.mpm.adjoint_pairs import ForcePair
 from physworld.mpm.adjoint_reverse import Gradient, ReversePass
 from physworld.mpm.adjoint_terms import Memory, memories_of
-from physworld.mpm.terms import BoundTerm
+from physworld.mpm.terms import BoundTerm, refuse_undifferentiable
 from physworld.mpm.total_lagrangian import HeldNodes, Problem, Run, TotalLagrangian
 
 MEMORY_MB = 100.0
@@ -39,6 +39,7 @@ class Adjoint:
 
     Raises:
         CFLViolation: the forced time step exceeds the stable limit.
+        NotDifferentiable: a term has no derivative.
     """
 
     def __init__(
@@ -48,6 +49,7 @@ class Adjoint:
         self.memory_mb = memory_mb
         self.recorder = _Recorder()
         self.solver = TotalLagrangian(replace(problem, terms=(*problem.terms, self.recorder)), time_step_s)
+        refuse_undifferentiable(self.solver.terms)
 
     @property
     def time_step_s(self) -> float:

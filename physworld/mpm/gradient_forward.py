@@ -27,6 +27,7 @@ from physworld.materials.laws import friction_law
 from physworld.mpm.gradient import Direction, Setting, internal_forces, same_internal_forces
 from physworld.mpm.gradient_forward_kernels import add_slope, advance_tangent, set_sides
 from physworld.mpm.tangent import InternalTangent
+from physworld.mpm.terms import refuse_undifferentiable
 from physworld.mpm.total_lagrangian import Problem, TotalLagrangian
 
 
@@ -50,7 +51,7 @@ def sensitivities(
         Positions (T, n, 3) [m], and their derivatives by every scalar, (T, n, 3) each.
 
     Raises:
-        NotDifferentiable: a scalar changes which nodes are held, or the number of terms.
+        NotDifferentiable: a scalar changes which nodes are held, or the number of terms; or a term has no derivative.
         SimulationError: the run cannot be trusted.
     """
     tangents = {name: _Tangent(setting, direction, times) for name, direction in directions.items()}
@@ -110,6 +111,7 @@ class _Tangent:
         self._elastic = InternalTangent(own.lattice, own.law, factor, own.rest, device)
         self._viscous = any(friction_law(s.problem.law) is not None for s in (setting, high, low))
         self._terms = [[t.bind(s.problem) for t in s.problem.terms] for s in (high, low)]
+        refuse_undifferentiable(self._terms[0])
         by_difference = self._viscous or any(getattr(t, "multiplies", False) for t in self._terms[0])
         self._launched = by_difference or not same_internal_forces(high.problem, low.problem)
         self._internal = [internal_forces(s.problem) for s in (high, low)] if self._launched else []

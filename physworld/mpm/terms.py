@@ -9,10 +9,13 @@ term serves any number of runs.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import warp as wp
+
+from physworld.errors import NotDifferentiable
 
 if TYPE_CHECKING:
     from physworld.mpm.total_lagrangian import Problem
@@ -26,12 +29,14 @@ class BoundTerm(Protocol):
             frequencies add up in the stable time step.
         friction_per_s: fastest damping rate that it adds (0 for none). Rates add up in the stable time step.
         memory: arrays that one substep leaves for the next; a gradient keeps and restores them.
+        differentiable: whether gradients may pass through it.
         multiplies: scales the internal forces instead of adding to them; such a term comes first.
     """
 
     frequency_rad_s: float = 0.0
     friction_per_s: float = 0.0
     memory: tuple[wp.array, ...] = ()
+    differentiable: bool = True
     multiplies: bool = False
 
     def begin(self, times: np.ndarray) -> None:
@@ -60,3 +65,17 @@ class Term(Protocol):
     def bind(self, problem: Problem) -> BoundTerm:
         """Device arrays for this problem; called once for each formulation that integrates it."""
         ...
+
+
+def refuse_undifferentiable(terms: Iterable[BoundTerm]) -> None:
+    """Whether gradients may pass through all of these terms.
+
+    Raises:
+        NotDifferentiable: they may not through one of them.
+    """
+    for number, term in enumerate(terms):
+        if not getattr(term, "differentiable", True):
+            raise NotDifferentiable(
+                f"term {number}, {type(term).__name__.removeprefix('Bound')}, has no derivative: fit by "
+                "simulations alone, or leave it out"
+            )

@@ -27,6 +27,7 @@ PLAIN = (
     "twist_kernels",
     "ground_kernels",
     "energy_kernels",
+    "self_contact_kernels",
 )
 
 

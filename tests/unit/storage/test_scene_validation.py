@@ -59,6 +59,7 @@ def test_a_sound_scene_has_neither_fault_nor_warning() -> None:
 
 FAULTS: list[tuple[str, Break, str, str]] = [
     ("a word for a flag", set_body(self_contact="no"), "self_contact", "boolean"),
+    ("a friction below zero", set_body(self_friction=-0.1), "self_friction", "greater than or equal to 0"),
     (
         "millimetres",
         scale("points", "controllers", "rest_volume_points", by=1000.0),
