@@ -6,7 +6,8 @@ its path and digest; anything else below ``episodes/`` is an orphan of a dead at
 manifest: an artifact that lists (path, digest) of every episode.
 
 Arrays (T frames, P particles, K controllers): ``times`` (T,) f8 [s]; ``particles`` (T, P, 3) f4 [m];
-``controllers`` (T, K, 3) f4 [m]; ``properties`` (P, 2) f4, log(E/E_fit) and log(rho/rho_fit).
+``controllers`` (T, K, 3) f4 [m]; ``properties`` (P, 2 or 3) f4, log(E/E_fit), log(rho/rho_fit) and, where the
+ground's friction is perturbed, log(mu/mu_fit).
 Chunks lie along the first axis inside a shard, so a window of frames can be read without the rest.
 """
 

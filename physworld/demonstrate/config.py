@@ -52,7 +52,8 @@ class DemonstrationConfig:
         arc_tolerance: relative accuracy of the arc-length parameterisation.
         perturbation: ``p3``: a Gaussian field over part features (P3-Pert); ``uniform``: one factor for the whole body;
             ``random``: each particle on its own; ``none``.
-        properties: what is perturbed: ``stiffness`` and ``density`` per particle, ``friction`` of the ground at large.
+        properties: what is perturbed: ``stiffness`` and ``density`` per particle, ``friction`` of the ground under
+            each particle too; one factor for the whole ground where the twin is of the updated Lagrangian form.
         property_sigma: σ of log(E/E_fit).
         density_ratio, friction_ratio: σ of log(ρ/ρ_fit) and log(μ/μ_fit), in shares of ``property_sigma``.
         largest_factor: no property leaves its fitted value by more than this factor.

@@ -7,7 +7,7 @@ thousands of episodes fit in memory. ``summary`` is plain JSON; the arrays that 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -68,6 +68,8 @@ class Coverage:
                 "log_density_mean": float(properties[:, 1].mean()),
                 "log_density_std": float(properties[:, 1].std()),
                 "ground_friction": float(attributes.get("parameters", {}).get("ground_friction", np.nan)),
+                "log_friction_mean": _of_column(properties, 2, np.mean),
+                "log_friction_std": _of_column(properties, 2, np.std),
             }
         )
         for name, value in attributes.get("effect_strengths", {}).items():
@@ -82,11 +84,12 @@ class Coverage:
     def summary(self) -> dict[str, Any]:
         """Counts and percentiles; JSON types only."""
         places = np.concatenate(self.places)
-        names = [name for name in self.rows[0] if name not in ("motion", "ground_friction")]
-        figures = {name: _percentiles(self.column(name)) for name in names}
-        friction = self.column("ground_friction")
-        if np.isfinite(friction).any():
-            figures["ground_friction"] = _percentiles(friction[np.isfinite(friction)])
+        columns = {name: self.column(name) for name in self.rows[0] if name != "motion"}
+        figures = {
+            name: _percentiles(values[np.isfinite(values)])
+            for name, values in columns.items()
+            if np.isfinite(values).any()
+        }
         kinds = Counter(str(one.get("kind", "")) for one in self.rejections)
         tried = Counter(self.motions)
         tried.update(str(one.get("motion", "")) for one in self.rejections)
@@ -125,6 +128,11 @@ def workspace(places: np.ndarray) -> dict[str, Any]:
         "voxels_visited": len(cells),
         "occupancy": len(cells) / inside,
     }
+
+
+def _of_column(values: np.ndarray, column: int, figure: Callable[[np.ndarray], Any]) -> float:
+    """A figure of a column of (P, ·), no number where there is no such column."""
+    return float(figure(values[:, column])) if values.shape[1] > column else float("nan")
 
 
 def _percentiles(values: np.ndarray) -> dict[str, float]:

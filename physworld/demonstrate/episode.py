@@ -79,7 +79,7 @@ class EpisodePlan:
 
     @property
     def properties(self) -> np.ndarray:
-        """log(E/E_fit) and log(ρ/ρ_fit), (P, 2) float64."""
+        """log(E/E_fit) and log(ρ/ρ_fit), and log(μ/μ_fit) where it is perturbed, (P, 2 or 3) float64."""
         return self.drawn.fields
 
     def attributes(self) -> dict[str, Any]:
@@ -136,7 +136,7 @@ def plan_episode(scene: Scene, twin: Twin, config: DemonstrationConfig, seed: in
 
 
 def run_episode(twin: Twin, plan: EpisodePlan, progress: Progress | None = None) -> dict[str, np.ndarray]:
-    """Simulate a plan: times (T,) f8; f4: particles (T, P, 3), controllers (T, K, 3), properties (P, 2)."""
+    """Simulate a plan: times (T,) f8; f4: particles (T, P, 3), controllers (T, K, 3), properties (P, 2 or 3)."""
     particles = plan.drawn.twin(twin).simulate(
         plan.control_times,
         plan.control_points,

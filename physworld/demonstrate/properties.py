@@ -1,4 +1,4 @@
-"""What the twin of one episode is made of: fields of stiffness and density, friction, and strengths of effects.
+"""What the twin of one episode is made of: fields of stiffness, density and friction, and strengths of effects.
 
 The kernel of the fields is over part features: those that the scene brings (PartField's), carried to the particles,
 or a spectral embedding of the rest shape (:mod:`physworld.geometry.features`). A strength of an effect is drawn from
@@ -35,7 +35,8 @@ class Drawn:
     """What an episode's twin differs in from the fitted one; P particles.
 
     Attributes:
-        fields: log(E/E_fit) and log(ρ/ρ_fit), (P, 2) float64.
+        fields: log(E/E_fit) and log(ρ/ρ_fit), (P, 2) float64; (P, 3) with log(μ/μ_fit) of the ground under each
+            particle where the friction is perturbed as a field.
         parameters: changed scalars of the twin, by name.
         strengths: drawn strengths of effects, ``effect.strength`` to value.
         roughness: RMS step of a field between neighbouring particles, in its σ; 0 where it is not perturbed.
@@ -45,7 +46,7 @@ class Drawn:
     fields: np.ndarray
     parameters: dict[str, float] = field(default_factory=dict)
     strengths: dict[str, float] = field(default_factory=dict)
-    roughness: tuple[float, float] = (0.0, 0.0)
+    roughness: tuple[float, ...] = (0.0, 0.0)
     unresolved: float = 0.0
 
     def twin(self, fitted: Twin) -> Twin:
@@ -63,13 +64,17 @@ class Drawn:
 
     def attributes(self) -> dict[str, Any]:
         """What is recorded of it; JSON types only."""
-        modulus, density = self.fields[:, 0], self.fields[:, 1]
+        names = ("log_modulus", "log_density", "log_friction")[: self.fields.shape[1]]
+        figures = {
+            name: {
+                "mean": float(values.mean()),
+                "std": float(values.std()),
+                "range": [float(values.min()), float(values.max())],
+            }
+            for name, values in zip(names, self.fields.T, strict=True)
+        }
         return {
-            "log_modulus_mean": float(modulus.mean()),
-            "log_modulus_std": float(modulus.std()),
-            "log_modulus_range": [float(modulus.min()), float(modulus.max())],
-            "log_density_mean": float(density.mean()),
-            "log_density_std": float(density.std()),
+            **{f"{name}_{kind}": value for name, own in figures.items() for kind, value in own.items()},
             "property_roughness": [round(value, 6) for value in self.roughness],
             "parameters": dict(self.parameters),
             "effect_strengths": dict(self.strengths),
@@ -86,19 +91,22 @@ def draw_properties(
         UnstableSimulation: a field passes its bounds or jumps.
     """
     law = None
-    if config.perturbation == "p3" and (config.sigma_of("stiffness") or config.sigma_of("density")):
+    rubs = config.sigma_of("friction") > 0.0 and twin.ground_height_m is not None
+    as_field = rubs and twin.formulation == "total_lagrangian"
+    named = ("stiffness", "density", "friction") if as_field else ("stiffness", "density")
+    if config.perturbation == "p3" and any(config.sigma_of(name) for name in named):
         law = property_field(scene, twin, config)
     count = len(twin.particles_rest)
     columns, roughness = [], []
     pairs = _pairs(_key(twin))
-    for name in ("stiffness", "density"):
+    for name in named:
         sigma = config.sigma_of(name)
         values = perturb(config.perturbation, sigma, count, law, generator, config.largest_factor)
         roughness.append(check_field(values, sigma, pairs, law, config.largest_factor))
         columns.append(values)
     parameters: dict[str, float] = {}
-    sigma = config.sigma_of("friction")
-    if sigma > 0.0 and "ground_friction" in twin.parameters:
+    if rubs and not as_field:  # its contact knows one coefficient
+        sigma = config.sigma_of("friction")
         log_factor = perturb("uniform", sigma, 1, None, generator, config.largest_factor)[0]
         parameters["ground_friction"] = float(twin.ground_friction * np.exp(log_factor))
     strengths = {
@@ -108,7 +116,7 @@ def draw_properties(
         fields=np.stack(columns, axis=1),
         parameters=parameters,
         strengths=strengths,
-        roughness=(roughness[0], roughness[1]),
+        roughness=tuple(roughness),
         unresolved=0.0 if law is None else law.unresolved,
     )
 

@@ -1,7 +1,8 @@
 """Episodes as training data: the vertices' tracks, their scales, and batches of sub-sequences.
 
 An episode's arrays: ``times`` (T,) [s], ``particles`` (T, P, 3) [m], ``controllers`` (T, K, 3) [m],
-``properties`` (P, 2) = log(E/E_fit), log(ρ/ρ_fit). Everything random comes from the ``torch.Generator``
+``properties`` (P, 2) = log(E/E_fit), log(ρ/ρ_fit), and log(μ/μ_fit) as a third where the ground's friction was
+perturbed. Everything random comes from the ``torch.Generator``
 that is passed in.
 """
 
@@ -53,7 +54,7 @@ def graph_origin(spec: GraphSpec, vertices: np.ndarray) -> np.ndarray:
 def read_track(
     spec: GraphSpec, arrays: dict[str, np.ndarray], history: int, strengths: np.ndarray | None = None
 ) -> Track:
-    """The graph's vertices of an episode, with ``strengths`` (m,) of effects as further columns of Φ.
+    """The graph's vertices of an episode; ``strengths`` (m,) of effects are further columns of Φ after its properties.
 
     Raises DatasetUnusable with the numbers.
     """

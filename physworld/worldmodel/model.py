@@ -71,9 +71,10 @@ where s = t+1 takes c^{t+1}.
 
 **Strengths.** Where episodes differ in the strengths of effects as well, Φ has m more columns while the network learns
 and is fine-tuned: each strength's distance from its estimate in half-widths of its interval, the same at every object
-vertex. A published version stands at fixed strengths: what they add to the first layers is constant over the object's
-vertices and goes into the weight of its kind (:meth:`WorldModel.at_strengths`), so that all of the above stays as it
-is.
+vertex. The ground's friction is such a column too, log(μ/μ_fit), in the episodes a field over the object; fine-tuning
+sets it by one number, since a recording hardly shows where the object rubs. A published version stands at fixed
+strengths: what they add to the first layers is constant over the object's vertices and goes into the weight of its kind
+(:meth:`WorldModel.at_strengths`), so that all of the above stays as it is.
 
 What a published version adds for its scene is told in ``physworld.worldmodel.published``.
 

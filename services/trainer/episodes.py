@@ -14,8 +14,10 @@ from typing import Any
 import numpy as np
 
 from physworld.demonstrate.config import StrengthRange
+from physworld.demonstrate.perturbation import BOUND_SIGMAS
 from physworld.worldmodel.dataset import Track, read_track
 from physworld.worldmodel.graph import GraphSpec
+from physworld.worldmodel.model import PROPERTY_COUNT
 from schemas.base import Reference
 from schemas.dataset import Dataset, Episode
 from storage import resources
@@ -23,6 +25,7 @@ from storage.errors import NotFound
 from workers.context import TaskContext
 from workers.errors import DatasetIncomplete
 from workers.stores import Stores
+from workers.tasks.dataset import demonstration_of
 
 POLL_S = 0.5
 
@@ -38,6 +41,7 @@ class Episodes:
     Attributes:
         total: how many there are, or will be.
         strengths: of the trace's effects that the episodes differ in, with their intervals.
+        friction: the ground's fitted coefficient where the episodes differ in it, else None.
         reached: steps taken and to take, for the progress while it waits.
     """
 
@@ -49,6 +53,7 @@ class Episodes:
         spec: GraphSpec,
         history: int,
         strengths: Sequence[StrengthRange] = (),
+        ground_friction: float | None = None,
     ) -> None:
         self._context, self._stores, self._dataset_id = context, stores, dataset_id
         self._spec, self._history = spec, history
@@ -56,6 +61,10 @@ class Episodes:
         self.total = dataset.config.episodes
         perturbed = dataset.config.effects != "as_found"
         self.strengths = tuple(one for one in strengths if perturbed and one.low < one.high)
+        demonstration = demonstration_of(dataset.config)
+        self._friction_sigma = demonstration.sigma_of("friction")
+        self._most_friction = min(BOUND_SIGMAS * self._friction_sigma, np.log(demonstration.largest_factor))
+        self.friction = ground_friction if self._friction_sigma > 0.0 else None
         self.reached = (0, 1)
 
     def track(self, index: int) -> Track:
@@ -73,12 +82,38 @@ class Episodes:
             (drawn.get(f"{one.effect}.{one.name}", one.value) - one.value) / half(one)
             for one in self.strengths
         ]
+        if (
+            self.friction is not None and arrays["properties"].shape[1] == PROPERTY_COUNT
+        ):  # one factor for all of it
+            drawn_friction = attributes.get("parameters", {}).get("ground_friction", self.friction)
+            own.insert(0, float(np.log(drawn_friction / self.friction)))
         return read_track(self._spec, arrays, self._history, np.array(own))
 
     def bounds(self) -> np.ndarray:
-        """Ends of the strengths' intervals as distances from the estimates in half-widths, (m, 2)."""
+        """Ends of what fine-tuning may choose: of log(μ/μ_fit), if the episodes differ in it, and of the strengths'
+        intervals as distances from the estimates in half-widths, (m, 2)."""
         ends = [[(end - one.value) / half(one) for end in (one.low, one.high)] for one in self.strengths]
+        if self.friction is not None:
+            ends.insert(0, [-self._most_friction, self._most_friction])
         return np.array(ends).reshape(-1, 2)
+
+    def tuned(self, found: np.ndarray) -> dict[str, Any]:
+        """What fine-tuning chose (m,) of :meth:`bounds`, in physical units beside what the calibration said."""
+        values, said = list(found), {}
+        if self.friction is not None:
+            most = float(np.exp(self._most_friction))
+            said["ground.friction"] = {
+                "calibrated": self.friction,
+                "bounds": [self.friction / most, self.friction * most],
+                "tuned": self.friction * float(np.exp(values.pop(0))),
+            }
+        for one, value in zip(self.strengths, values, strict=True):
+            said[f"{one.effect}.{one.name}"] = {
+                "calibrated": one.value,
+                "ci95": [one.low, one.high],
+                "tuned": one.value + half(one) * float(value),
+            }
+        return said
 
     def description(self) -> dict[str, Any]:
         """What the dataset says of itself: kinds of motion, lengths, settings; the limits of what was learned."""

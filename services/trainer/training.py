@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -33,7 +32,7 @@ from physworld.worldmodel.scene_view import SceneView, view_scene
 from physworld.worldmodel.training import TrainingResult, first_episodes, train
 from schemas.model import TrainingConfig
 from services.trainer.closed_loop import closed_loop
-from services.trainer.episodes import Episodes, half
+from services.trainer.episodes import Episodes
 from services.trainer.measuring import Measured, json_safe, measure
 from services.trainer.publishing import MANIFEST_NAME, card_of, store_version
 from services.trainer.settings import translate
@@ -60,7 +59,15 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     context.progress(0, config.steps, "steps", "reading the dataset")
     view = view_scene(scene, twin, architecture)
     strengths = _strengths(stores, payload)
-    episodes = Episodes(context, stores, payload["dataset_id"], view.spec, architecture.history, strengths)
+    episodes = Episodes(
+        context,
+        stores,
+        payload["dataset_id"],
+        view.spec,
+        architecture.history,
+        strengths,
+        None if twin.ground_height_m is None else twin.ground_friction,
+    )
     started = time.perf_counter()
     trained = _train(context, stores, episodes, view, architecture, training)
     training_s = time.perf_counter() - started
@@ -87,7 +94,7 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     measured = measure(view, published, before)
     seconds = {"training": training_s, "fine_tuning": tuning_s}
     metrics = json_safe(_metrics(view, trained, tuned, measured, seconds))
-    metrics["fine_tuning"]["strengths"] = json_safe(_tuned_strengths(episodes.strengths, tuned.strengths))
+    metrics["fine_tuning"]["strengths"] = json_safe(episodes.tuned(tuned.strengths))
     metrics["closed_loop"] = json_safe(closed_loop(stores, payload, metrics, architecture))
     dataset = episodes.sealed()
     lineage = lineage_of([dataset, *made_from(stores, payload)], payload["config"], {"training": config.seed})
@@ -112,18 +119,6 @@ def _strengths(stores: Stores, payload: dict[str, Any]) -> tuple[StrengthRange, 
     with stores.database.reading() as session:
         trace = traces.get_trace(session, payload["trace_id"])
     return strength_ranges(trace.effects) if traces.adds_effects(trace) else ()
-
-
-def _tuned_strengths(ranges: Sequence[StrengthRange], found: np.ndarray) -> dict[str, Any]:
-    """Strengths of effects at which the version stands, beside what the trace said."""
-    return {
-        f"{one.effect}.{one.name}": {
-            "calibrated": one.value,
-            "ci95": [one.low, one.high],
-            "tuned": one.value + half(one) * float(value),
-        }
-        for one, value in zip(ranges, found, strict=True)
-    }
 
 
 def _train(

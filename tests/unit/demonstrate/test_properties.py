@@ -10,10 +10,12 @@ import pytest
 
 from physworld.build import build_twin
 from physworld.demonstrate import DemonstrationConfig, StrengthRange, make_episode, plan_episode
+from physworld.demonstrate.perturbation import check_field
 from physworld.demonstrate.properties import draw_properties, draw_strength, property_field, ranges_of
 from physworld.demonstrate.side_by_side import make_episodes
 from physworld.effects.registry import effect
-from physworld.errors import BatchRefused, SceneUnsupported
+from physworld.errors import BatchRefused, SceneUnsupported, UnstableSimulation
+from physworld.scene import Ground
 
 DRAG = StrengthRange("air_drag_linear", "rate_per_s", 2.0, 1.0, 3.5)
 
@@ -42,14 +44,54 @@ def test_only_the_properties_that_are_named_are_perturbed(block, block_twin):
     assert not drawn(block, block_twin, properties=()).fields.any()
 
 
-def test_friction_is_one_factor_of_the_ground(held_block):
+def test_friction_is_a_field_over_the_ground(held_block):
     scene = held_block(ground=True)
     twin = build_twin(scene, particle_budget=200)
+    seen = [drawn(scene, twin, seed, properties=("friction",)) for seed in range(200)]
+    fields = np.stack([one.fields[:, 2] for one in seen])
+    assert fields.std() == pytest.approx(0.2, rel=0.15)
+    assert np.abs(fields).max() <= 0.6 and np.ptp(fields, axis=1).min() > 0.0
+    assert all(one.roughness[2] < 0.7 for one in seen)  # neighbours differ by a fraction of σ
+    assert not any(one.fields[:, :2].any() or one.parameters for one in seen)
+    said = seen[0].attributes()
+    assert said["log_friction_mean"] == pytest.approx(fields[0].mean())
+    with pytest.raises(UnstableSimulation, match="the bound is"):
+        check_field(fields[0] + 0.6, 0.2, np.zeros((0, 2), dtype=int), None)
+
+
+def test_the_other_baselines_of_friction_are_what_they_are_called(held_block):
+    scene = held_block(ground=True)
+    twin = build_twin(scene, particle_budget=200)
+    uniform = drawn(scene, twin, properties=("friction",), perturbation="uniform")
+    assert np.ptp(uniform.fields[:, 2]) == 0.0 and uniform.fields[0, 2] != 0.0
+    assert drawn(scene, twin, perturbation="p3").fields.shape[1] == 2  # not among the defaults
+
+
+def test_friction_is_one_factor_where_the_contact_knows_one(held_block):
+    scene = held_block(ground=True)
+    twin = replace(build_twin(scene, particle_budget=200), formulation="updated_lagrangian")
     seen = [drawn(scene, twin, seed, properties=("friction",)) for seed in range(200)]
     factors = np.log([one.parameters["ground_friction"] / twin.ground_friction for one in seen])
     assert factors.std() == pytest.approx(0.2, rel=0.2)
     assert seen[0].twin(twin).ground_friction == seen[0].parameters["ground_friction"]
     assert not any(one.fields.any() for one in seen)
+
+
+def test_a_field_of_friction_acts_on_what_slides(held_block):
+    """A block that is dragged over the ground: rough places lag behind what the same block does on an even ground."""
+    scene = held_block(ground=True)
+    scene = replace(scene, ground=Ground(0.001))
+    twin = build_twin(scene, particle_budget=200)
+    config = DemonstrationConfig(frames=12, properties=("friction",), property_sigma=0.5, replay_share=0.0)
+    seeds = [
+        seed for seed in range(40) if np.ptp(plan_episode(scene, twin, config, seed).drawn.fields[:, 2]) > 1.0
+    ]
+    arrays, attributes = make_episode(scene, twin, config, seeds[0])
+    assert arrays["properties"].shape == (len(twin.particles_rest), 3)
+    even, _ = make_episode(scene, twin, replace(config, perturbation="none"), seeds[0])
+    np.testing.assert_array_equal(arrays["controllers"], even["controllers"])
+    assert np.abs(arrays["particles"] - even["particles"]).max() > 1e-5
+    json.dumps(attributes)
 
 
 def test_without_a_ground_there_is_no_friction_to_perturb(block, block_twin):

@@ -8,6 +8,7 @@ import json
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from safetensors.numpy import load
 from tiny_scene import register, tiny_scene
 
 from physworld.build import build_twin
+from physworld.scene import Ground
 from physworld.worldmodel import PublishedModel
 from schemas.dataset import DatasetConfig
 from schemas.fit import FitConfig
@@ -130,6 +132,32 @@ def test_a_training_publishes_a_version_that_rolls_out(runtime: Runtime, dataset
     assert card["intended_use"] and card["limits"]
     assert set(card["metrics"]["held_out"]["per_frame"]["track_m"]) >= {"twin", "world_model", "static"}
     assert not runtime.stores.scratch.has(job.id, training.CHECKPOINT)
+
+
+def test_a_field_of_friction_is_stored_learned_and_tuned_as_one_number(runtime: Runtime) -> None:
+    scene = replace(tiny_scene(FRAMES), ground=Ground(-0.01))
+    scene_id = register(scene, runtime.database, runtime.stores.artifacts)
+    with runtime.database.session() as session:
+        fit = jobs.create_fit(session, scene_id, FitConfig(particle_budget=60, max_simulations=4))
+    assert _drain(runtime) == {"done"}
+    asked = DatasetConfig(episodes=4, properties=["stiffness", "friction"])
+    with runtime.database.session() as session:
+        job = jobs.create_dataset(session, fit.outputs[0].id, asked)
+    assert _drain(runtime) == {"done"}
+    with runtime.database.reading() as session:
+        stored = resources.all_episodes(session, job.outputs[0].id)
+        figures = resources.get_dataset(session, job.outputs[0].id).statistics
+    for one in stored:
+        properties = runtime.stores.episodes.verified(one.path, one.digest)[0]["properties"]
+        assert properties.shape[1] == 3 and np.ptp(properties[:, 2]) > 0.0
+    assert json.dumps(figures)
+    _, version = _train(runtime, job.outputs[0].id)
+    assert version.state == "ready"
+    tuned = version.metrics["fine_tuning"]["strengths"]["ground.friction"]
+    assert tuned["bounds"][0] <= tuned["tuned"] <= tuned["bounds"][1]
+    assert tuned["bounds"][1] == pytest.approx(tuned["calibrated"] * np.exp(0.6))
+    weights = load(_files(runtime, version)["model.safetensors"])
+    assert weights["norm.properties"].shape == (2,)  # it stands at the tuned friction
 
 
 def test_the_metrics_have_every_row_of_the_table(runtime: Runtime, dataset_id: str) -> None:

@@ -144,7 +144,7 @@ class LeRobotWriter:
         velocity = np.zeros(controllers.shape)
         velocity[:-1] = np.diff(controllers.astype(np.float64), axis=0) / np.diff(times)[:, None, None]
         properties = np.broadcast_to(
-            arrays["properties"][self._chosen].ravel(), (frames, 2 * len(self._chosen))
+            arrays["properties"][self._chosen, :2].ravel(), (frames, 2 * len(self._chosen))
         )
         counted = np.arange(frames)
         return {
