@@ -3,8 +3,9 @@
 1. Scan the stiffness over its decades on a first window of frames, where phases have not slipped yet, and follow the
    three best starts there by Gauss-Newton.
 2. Gauss-Newton on all training frames from the two best.
-3. Free how a sheet bends, if that removes 10 % of the cost. Then free optional parameters (drag, internal friction,
-   Poisson's ratio, an undeclared ground's friction), the best one first. A screening by one run each skips those that
+3. Free how a sheet bends, if that removes 10 % of the cost, or the fibres of a solid whose law has them.
+   Then free optional parameters (drag, internal friction, Poisson's ratio, an undeclared ground's friction, the weave
+   of a sheet whose law has one), the best one first. A screening by one run each skips those that
    cannot help to first order; of the others each must lower the training cost by more than 2 % (Poisson's ratio:
    15 %). After one that removed half of it, start again from a quarter and four times the stiffness: the first scan
    knew less. Drop again what the others made needless, also the yield of a flow law, which is searched with the
@@ -34,6 +35,7 @@ from physworld.calibrate.estimates import (
     estimates,
     held_at_priors,
 )
+from physworld.calibrate.fibres import free_fibres
 from physworld.calibrate.friction_bound import affordable
 from physworld.calibrate.journal import Journal
 from physworld.calibrate.least_squares import Solution
@@ -211,8 +213,29 @@ def select(search: Search, parameters: list[Parameter]) -> tuple[list[Parameter]
             kept, optimum = [*kept, *shape], freed
         else:
             rejected.update({p.name: gain for p in shape})
+    kept, optimum, without = free_fibres(
+        search, kept, optimum, [p for p in parameters if p.stage == "fibres"]
+    )
+    rejected.update(without)
+    optional = [p for p in parameters if p.stage == "optional"]
+    kept, optimum, without = free_optional(search, kept, optimum, optional)
+    rejected.update(without)
+    for needless in _groups(kept):
+        others = [k for k, p in enumerate(kept) if p not in needless]
+        trial = search.solve([kept[k] for k in others], optimum.theta[others], 2)
+        if trial.cost * (1.0 - needless[0].least_gain) <= optimum.cost:
+            rejected[needless[0].name] = 1.0 - optimum.cost / trial.cost
+            kept, optimum = [kept[k] for k in others], trial
+    return kept, optimum, rejected
+
+
+def free_optional(
+    search: Search, kept: list[Parameter], optimum: Optimum, candidates: list[Parameter]
+) -> tuple[list[Parameter], Optimum, dict[str, float]]:
+    """What of optional parameters the data ask for, the best first: those kept, their optimum, what others remove."""
     twin = search.twin_at(kept, optimum.theta)
-    candidates = [affordable(search.scene, twin, p) for p in parameters if p.stage == "optional"]
+    candidates = [affordable(search.scene, twin, p) for p in candidates]
+    rejected: dict[str, float] = {}
     while candidates:
         screened = search.screen(kept, optimum, candidates)
         hopeful = [c for c in candidates if screened[c.name] >= _LEAST_SCREENED * c.least_gain]
@@ -231,13 +254,14 @@ def select(search: Search, parameters: list[Parameter]) -> tuple[list[Parameter]
         candidates.remove(hopeful[best])
         if gains[hopeful[best].name] > _RESTART_GAIN:
             optimum = _restarted(search, kept, optimum)
-    for needless in [p for p in kept if p.stage != "stiffness"]:
-        others = [k for k, p in enumerate(kept) if p is not needless]
-        trial = search.solve([kept[k] for k in others], optimum.theta[others], 2)
-        if trial.cost * (1.0 - needless.least_gain) <= optimum.cost:
-            rejected[needless.name] = 1.0 - optimum.cost / trial.cost
-            kept, optimum = [kept[k] for k in others], trial
     return kept, optimum, rejected
+
+
+def _groups(kept: list[Parameter]) -> list[list[Parameter]]:
+    """What may turn out needless once others are free: every parameter but the stiffness by itself, fibres as one."""
+    fibres = [p for p in kept if p.stage == "fibres"]
+    alone = [[p] for p in kept if p.stage not in ("stiffness", "fibres")]
+    return [*alone, fibres] if fibres else alone
 
 
 def _followed(search: Search, parameters: list[Parameter], theta: np.ndarray) -> Optimum:

@@ -1,6 +1,7 @@
 """Which constitutive law a body gets, and who decided it on what figures.
 
-(a) *Cross-validation.* Every candidate is fitted to all but one block of the training frames and measured on the block
+(a) *Cross-validation.* Every candidate whose further constants (fibres; weft and shear of a sheet) the data ask for is
+fitted to all but one block of the training frames and measured on the block
 that was left out, open loop; of those within one standard error of the best, the simplest is taken (Breiman et al.
 1984, section 3.4.3). The blocks are few, so this names a law only where it matters, and the simplest one otherwise.
 
@@ -19,8 +20,15 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from physworld.calibrate.global_stage import CalibrationConfig, prior_twin, searched_parameters, select
-from physworld.calibrate.parameters import Parameter
+from physworld.calibrate.fibres import free_fibres
+from physworld.calibrate.global_stage import (
+    CalibrationConfig,
+    free_optional,
+    prior_twin,
+    searched_parameters,
+    select,
+)
+from physworld.calibrate.parameters import WEAVE, Parameter
 from physworld.calibrate.search import Optimum, Progress, Search
 from physworld.errors import LawAnswerRefused, LawAnswerUnavailable
 from physworld.scene import Scene
@@ -33,11 +41,12 @@ Elastic: [model] | Plastic: [model] | Reason: [justification]"""  # noqa: E501 -
 
 FOLDS = 3
 SIMPLEST_FIRST = {
-    3: ("neo_hookean", "fixed_corotated", "st_venant_kirchhoff", "hencky"),
-    2: ("isotropic_sheet",),
+    3: ("neo_hookean", "fixed_corotated", "st_venant_kirchhoff", "hencky", "transversely_isotropic"),
+    2: ("isotropic_sheet", "orthotropic_sheet"),
     1: ("rod",),
 }
-"""Candidates of the cross-validation by dimension: laws with the same two constants, the usual one first."""
+"""Candidates of the cross-validation by dimension: laws with the same constants, the usual one first, then those with
+more; these are fitted to the blocks only if all training frames together ask for what they have more."""
 
 PURELY_ELASTIC = "identity"
 _PLASTIC = {
@@ -163,19 +172,24 @@ def cross_validate(
         return LawChoice(names[0], reason=reason)
     search = Search(scene, twin, config.max_simulations, progress, cancelled)
     kept, optimum, _ = select(search, searched_parameters(scene, search.twin, config))
-    scores = {
-        name: _fold_errors(scene, replace(config, law=name), kept, optimum, progress, cancelled)
-        for name in names
-    }
+    scores, needless = {}, {}
+    for name in names:
+        named = replace(config, law=name)
+        fitted, at, without = _freed(scene, named, kept, optimum, progress, cancelled)
+        if without and len(fitted) == len(kept):
+            needless[name] = without
+        else:
+            scores[name] = _fold_errors(scene, named, fitted, at, progress, cancelled)
     means = {name: float(np.mean(errors)) for name, errors in scores.items()}
     best = min(means, key=lambda name: means[name])
     spread = float(np.std(scores[best], ddof=1) / np.sqrt(FOLDS))
-    chosen = next(name for name in names if means[name] <= means[best] + spread)
+    chosen = next(name for name in names if name in means and means[name] <= means[best] + spread)
     figures = {
         "held_out_rms_m": {
             name: {"mean": means[name], "blocks": list(errors)} for name, errors in scores.items()
         },
         "standard_error_m": spread,
+        "needless_constants": needless,
     }
     reason = (
         f"least error on {FOLDS} blocks of training frames that its fit did not see"
@@ -183,6 +197,24 @@ def cross_validate(
         else f"the simplest within one standard error ({spread:.3g} m) of {best}: these data do not tell them apart"
     )
     return LawChoice(chosen, decided_by="cross_validation", reason=reason, figures=figures)
+
+
+def _freed(
+    scene: Scene,
+    config: CalibrationConfig,
+    kept: list[Parameter],
+    optimum: Optimum,
+    progress: Progress | None,
+    cancelled: Callable[[], bool] | None,
+) -> tuple[list[Parameter], Optimum, dict[str, float]]:
+    """What a law has more than the usual one, freed on all training frames, and what it has that removes too little."""
+    search = Search(scene, prior_twin(scene, config), config.max_simulations, progress, cancelled)
+    parameters = searched_parameters(scene, search.twin, config)
+    fibres = [p for p in parameters if p.stage == "fibres"]
+    with_fibres, at, without = free_fibres(search, kept, optimum, fibres)
+    weave = [p for p in parameters if p.name in WEAVE]
+    found, at, more = free_optional(search, with_fibres, at, weave)
+    return found, at, {**without, **more}
 
 
 def _fold_errors(

@@ -7,9 +7,10 @@ parameter here: it stays as declared, or at its prior, and the report says so.
 A *stiffness* is always searched, and with it where a flow law yields, the torsion of a rope that two grips turn and how
 stiff a sheet is in twist beside bending, if the body has them and the data show them: the prior of a yield stress is a
 value that nothing reaches. A *shape* of the bending energy is freed next, as a whole: how stiff a sheet bends beside
-what its declared thickness says, and how its two curvatures are coupled. The others are *optional*: air drag, internal
-friction, Poisson's ratio, and the friction of a ground that declares none; each is freed only if the data ask for it,
-and else stays at its prior.
+what its declared thickness says, and how its two curvatures are coupled. The *fibres* of a transversely isotropic
+solid are freed together too, modulus and direction (:mod:`physworld.calibrate.fibres`); their prior is none. The others
+are *optional*: air drag, internal friction, Poisson's ratio, the friction of a ground that declares none, and what weft
+and shear of a woven sheet have over its warp; each is freed only if the data ask for it, and else stays at its prior.
 """
 
 from __future__ import annotations
@@ -29,6 +30,8 @@ from physworld.materials.plastic import (
     StVenantKirchhoff,
     VonMises,
 )
+from physworld.materials.sheet import OrthotropicSheetLaw
+from physworld.materials.transversely_isotropic import TransverselyIsotropic
 from physworld.twin import Twin
 
 TWIST_RATIO = "bending_twist_ratio"
@@ -42,6 +45,11 @@ _TWIST_BOUNDS = (0.1, 10.0)
 _BENDING_BOUNDS, _COUPLING_BOUNDS = (0.1, 10.0), (-2.0, 2.0)
 _BENDING_GAIN = 0.1  # share of the training cost, of the shape of a sheet's bending energy
 _SHEET_STARTS = 14  # of a sheet's stiffness: its phase slips within a factor of two
+FIBRE_MODULUS = "fibre_modulus_pa"
+FIBRE_ANGLES = ("fibre_azimuth_rad", "fibre_elevation_rad")
+WEAVE = ("weft_ratio", "shear_ratio", "bending_weft_ratio")
+_WEAVE_BOUNDS = {"weft_ratio": (0.05, 20.0), "shear_ratio": (0.003, 5.0), "bending_weft_ratio": (0.02, 50.0)}
+_FIBRES_GAIN = 0.1  # share of the training cost, of fibres
 _FRICTION_BOUNDS = (0.02, 3.0)
 _NEVER_PA = 1e12  # a yield stress that nothing reaches
 _SAND_RAD = 0.6  # friction angle of loose dry sand
@@ -58,8 +66,8 @@ class Parameter:
         start: starts of the search, best first by prior knowledge; for an optional one the value that is tried first.
         apply: a twin with this value.
         stage: "stiffness" parameters come first, and over a grid with them what a "flow" law or a twisted rope has,
-            which is dropped again if the data do not need it; those of a "shape" are freed together, "optional" ones
-            one by one, if the data ask for them.
+            which is dropped again if the data do not need it; those of a "shape" and of "fibres" are freed together,
+            "optional" ones one by one, if the data ask for them.
         scale: searched in the logarithm, or as it is.
         step: of finite differences, in the searched scale.
         prior: value of an optional parameter that is not freed.
@@ -72,7 +80,7 @@ class Parameter:
     high: float
     start: tuple[float, ...]
     apply: Callable[[Twin, float], Twin]
-    stage: Literal["stiffness", "flow", "shape", "optional"]
+    stage: Literal["stiffness", "flow", "shape", "fibres", "optional"]
     step: float = _LOG_STEP
     scale: Literal["log", "linear"] = "log"
     prior: float = 0.0
@@ -120,6 +128,8 @@ def parameters_of(
         *_twist(twin),
         *_flow(twin),
         *_shape(twin, separate_bending),
+        *_fibres(twin),
+        *_weave(twin),
         *optional,
     ]
 
@@ -181,6 +191,35 @@ def _shape(twin: Twin, separate_bending: bool) -> list[Parameter]:
                       least_gain=_BENDING_GAIN)
         )  # fmt: skip
     return found
+
+
+def _fibres(twin: Twin) -> list[Parameter]:
+    """Modulus and direction of the fibres of a solid: a direction and its opposite are one, so angles have no ends."""
+    law = twin.law
+    if not isinstance(law, TransverselyIsotropic):
+        return []
+    soft = twin.density * 9.81 * float(np.ptp(twin.body.start, axis=0).max())
+    angles = (law.fibre_azimuth_rad, law.fibre_elevation_rad)
+    return [
+        Parameter(FIBRE_MODULUS, "Pa", 0.1 * soft, 1e5 * soft, (10 * soft,), _set(FIBRE_MODULUS), "fibres", 0.05,
+                  least_gain=_FIBRES_GAIN),
+        *(
+            Parameter(name, "rad", known - 2 * np.pi, known + 2 * np.pi, (known,), _set(name), "fibres", 0.03, "linear",
+                      known, _FIBRES_GAIN)
+            for name, known in zip(FIBRE_ANGLES, angles, strict=True)
+        ),
+    ]  # fmt: skip
+
+
+def _weave(twin: Twin) -> list[Parameter]:
+    """What the weft and the shear of a woven sheet have over its warp; an isotropic sheet's are the prior."""
+    if not isinstance(twin.law, OrthotropicSheetLaw):
+        return []
+    return [
+        Parameter(name, "1", *_WEAVE_BOUNDS[name], (getattr(twin.law, name),), _set(name), "optional", 0.05,
+                  prior=getattr(twin.law, name))
+        for name in WEAVE
+    ]  # fmt: skip
 
 
 def bending_ratio(twin: Twin) -> float:

@@ -125,7 +125,7 @@ class Search:
             np.array([p.searched(value) for p, value in zip(parameters, values, strict=True)])
             for values in product(*tried)
         ]
-        costs = self._step(
+        costs = self.step(
             "scan",
             lambda: {"costs": [float(np.mean(self.residual(parameters, t, window) ** 2)) for t in starts]},
         )["costs"]
@@ -160,7 +160,7 @@ class Search:
             )
             return {"theta": found.theta.tolist(), "cost": found.cost}
 
-        found = self._step("solve " + " ".join(p.name for p in parameters), descend)
+        found = self.step("solve " + " ".join(p.name for p in parameters), descend)
         cost = float("nan") if found["cost"] is None else found["cost"]
         return Optimum(np.array(found["theta"]), cost)
 
@@ -206,7 +206,7 @@ class Search:
                 gains[candidate.name] = along**2 / size if helps and size > 0 else 0.0 * size
             return {"gains": gains}
 
-        found = self._step("screen " + " ".join(c.name for c in candidates), measure)["gains"]
+        found = self.step("screen " + " ".join(c.name for c in candidates), measure)["gains"]
         return {name: float("nan") if gain is None else gain for name, gain in found.items()}
 
     def shift_points(self, parameters: list[Parameter], theta: np.ndarray) -> bool:
@@ -215,7 +215,7 @@ class Search:
         lattice = self.twin.lattice
         if self.scene.initial_state != UNDEFORMED_AT_REST or lattice.dim == 1 or not sigma:
             return False
-        found = self._step("shift", lambda: {"shift": self._mean_offsets(parameters, theta, sigma)})["shift"]
+        found = self.step("shift", lambda: {"shift": self._mean_offsets(parameters, theta, sigma)})["shift"]
         if found is None:
             return False
         body, shift = self.twin.body, np.array(found)
@@ -247,7 +247,7 @@ class Search:
         limit = _OFFSET_CLIP_SIGMAS * sigma
         return np.clip(local.sum(axis=0) / seen, -limit, limit).tolist()
 
-    def _step(self, name: str, compute: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    def step(self, name: str, compute: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         """A journalled step, which also brings the count of runs and their history to where they were after it."""
 
         def counted() -> dict[str, Any]:

@@ -11,6 +11,7 @@ from made_scene import made_scene, recorded_by
 from physworld.build import build_twin
 from physworld.calibrate import CalibrationConfig, calibrate
 from physworld.calibrate.parameters import bending_ratio, parameters_of
+from physworld.materials.library import with_law
 from physworld.materials.sheet import SheetLaw
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Scene
 from physworld.twin import Twin
@@ -74,6 +75,30 @@ def test_a_homogeneous_plate_is_left_one() -> None:
     for name in ("bending_ratio", "bending_coupling"):
         assert fitted.parameters[name].value == 1.0
         assert "held at its prior" in fitted.parameters[name].note
+
+
+@pytest.mark.slow
+def test_the_weft_of_a_woven_sheet_is_found() -> None:
+    scene = two_corners()
+    known = plate(scene)
+    known = replace(known, law=with_law(known.law, "orthotropic_sheet")).with_parameters(
+        bending_weft_ratio=0.4
+    )
+    config = CalibrationConfig(damping="none", bending="declared", law="orthotropic_sheet")
+    found = calibrate(recorded_by(known, scene, SIGMA_M), config).parameters
+    assert found["youngs_modulus_pa"].value == pytest.approx(MODULUS_PA, rel=0.03)
+    weft = found["bending_weft_ratio"]
+    assert weft.identified and weft.value == pytest.approx(0.4, rel=0.1)
+
+
+def test_what_a_weave_may_change_is_searched_where_the_law_has_it() -> None:
+    twin = plate(two_corners())
+    woven = replace(twin, law=with_law(twin.law, "orthotropic_sheet"))
+    names = [{p.name for p in parameters_of(one, separate_bending=False)} for one in (twin, woven)]
+    assert names[1] - names[0] == {"weft_ratio", "shear_ratio", "bending_weft_ratio"}
+    for parameter in parameters_of(woven, separate_bending=False):
+        if parameter.name not in names[0]:
+            assert parameter.prior == 1.0 and parameter.apply(woven, 0.5).parameters[parameter.name] == 0.5
 
 
 def test_changing_the_modulus_keeps_how_a_sheet_bends() -> None:
