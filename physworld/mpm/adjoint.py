@@ -47,7 +47,9 @@ class Adjoint:
         self.problem = problem
         self.memory_mb = memory_mb
         self.recorder = _Recorder()
-        self.solver = TotalLagrangian(replace(problem, terms=(*problem.terms, self.recorder)), time_step_s)
+        self.solver = TotalLagrangian(
+            replace(problem, terms=(*problem.terms, self.recorder)), time_step_s, "explicit"
+        )
 
     @property
     def time_step_s(self) -> float:

@@ -27,6 +27,8 @@ PLAIN = (
     "twist_kernels",
     "ground_kernels",
     "energy_kernels",
+    "friction_kernels",
+    "relaxation_kernels",
 )
 
 
