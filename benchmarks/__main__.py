@@ -16,7 +16,18 @@ from pathlib import Path
 from benchmarks.harness import REPEATS, Report, read_json, write_section
 
 DOCS = Path(__file__).resolve().parents[1] / "docs" / "benchmarks.md"
-BENCHMARKS = ("mpm", "batch", "gradients", "transfers", "laws", "effects", "world_model", "factory", "video")
+BENCHMARKS = (
+    "mpm",
+    "batch",
+    "gradients",
+    "transfers",
+    "laws",
+    "effects",
+    "friction",
+    "world_model",
+    "factory",
+    "video",
+)
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 HEAD = """# Benchmarks
 

@@ -1,9 +1,10 @@
 """How much internal friction a fit can wait for.
 
-Friction that is proportional to stiffness damps the lattice's fastest motions most, and the explicit step has to
+Friction that is proportional to stiffness damps the lattice's fastest motions most, and an explicit step has to
 resolve that: beyond a point the stable time step is inversely proportional to it. A recording shows nothing of these
-motions. So the search ends where the step is ``SLOWEST`` times smaller than without friction; a value found there is
-reported to be at the bound of its search.
+motions. So the search ends where that step is ``SLOWEST`` times smaller than without friction; a value found there is
+reported to be at the bound of its search. Beyond it a run takes sub-steps of friction (:mod:`physworld.mpm.relaxation`)
+and twice the time and more, and gradients take the explicit step.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ def affordable(scene: Scene, twin: Twin, parameter: Parameter) -> Parameter:
 
     def step_s(changed: Twin) -> float:
         run = changed.integration(*controls, scene.times)
-        return float(TotalLagrangian(run.problem).time_step_s)
+        return float(TotalLagrangian(run.problem).steps.explicit_s())
 
     least_s = step_s(parameter.apply(twin, parameter.prior)) / SLOWEST
 

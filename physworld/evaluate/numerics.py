@@ -20,7 +20,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from physworld.build import build_twin
-from physworld.mpm.energy import EnergyLedger, run_with_ledger, without_friction
+from physworld.materials.laws import without_friction
+from physworld.mpm.energy import EnergyLedger, run_with_ledger
 from physworld.mpm.total_lagrangian import TotalLagrangian
 from physworld.properties import carried
 from physworld.scene import Scene

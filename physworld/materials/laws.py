@@ -12,7 +12,7 @@ from physworld.materials.rod import RodLaw
 from physworld.materials.sheet import SheetLaw
 from physworld.materials.solid import SolidLaw
 
-__all__ = ["Law", "RodLaw", "SheetLaw", "SolidLaw", "friction_law"]
+__all__ = ["Law", "RodLaw", "SheetLaw", "SolidLaw", "friction_law", "without_friction"]
 
 Law = SolidLaw | SheetLaw | RodLaw
 
@@ -31,3 +31,10 @@ def friction_law(law: Law) -> Law | None:
             law, membrane_n_m=tau * law.membrane_n_m, bending_n_m=tau * law.bending_n_m, relaxation_s=0.0
         )
     return replace(law, stretching_n=0.0, bending_n_m2=tau * law.bending_n_m2, relaxation_s=0.0)
+
+
+def without_friction(law: Law) -> Law:
+    """The law with its own friction off."""
+    if isinstance(law, SolidLaw):
+        return replace(law, viscosity_pa_s=0.0)
+    return replace(law, relaxation_s=0.0)

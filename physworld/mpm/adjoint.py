@@ -48,7 +48,9 @@ class Adjoint:
         self.problem = problem
         self.memory_mb = memory_mb
         self.recorder = _Recorder()
-        self.solver = TotalLagrangian(replace(problem, terms=(*problem.terms, self.recorder)), time_step_s)
+        self.solver = TotalLagrangian(
+            replace(problem, terms=(*problem.terms, self.recorder)), time_step_s, "explicit"
+        )
         refuse_undifferentiable(self.solver.terms)
 
     @property

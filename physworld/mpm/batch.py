@@ -191,6 +191,9 @@ class _BatchRun(Run):
             for term in terms:
                 term.launch(x, v, self.clock, self.counter, force)
 
+    def _relaxing(self) -> None:
+        return None
+
     def _launch_nodes(self) -> None:
         batch = self._solver
         wp.launch(

@@ -17,10 +17,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import warp as wp
 
-from physworld.materials.laws import Law, RodLaw, SheetLaw, SolidLaw
+from physworld.materials.laws import Law, RodLaw, SheetLaw, SolidLaw, without_friction
 from physworld.materials.rod import rod_strains
 from physworld.materials.sheet import sheet_strains
-from physworld.mpm.energy_kernels import keep_forces, sum_works
+from physworld.mpm.energy_kernels import keep_forces, sum_friction, sum_works
 from physworld.mpm.forces import InternalForces
 from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian
 from physworld.mpm.twist import Twist, TwistMeter
@@ -102,6 +102,7 @@ def run_with_ledger(
     meter = _Meter(len(times))
     metered = replace(problem, terms=(_Marker(meter), *problem.terms, meter))
     solver = TotalLagrangian(metered, time_step_s)
+    meter.watch(solver)
     after = np.append(times, times[-1] + _AFTER_S)
     longer = replace(
         held,
@@ -111,6 +112,7 @@ def run_with_ledger(
     nodes = solver.run(x, v, longer, after, progress)[:-1]
     work, velocity = meter.read()
     turning, twisted = meter.read_twist()
+    rubbed = meter.read_friction()
     velocity[:, held.nodes] = held.velocities
     mass = solver.mass
     kinetic = 0.5 * np.einsum("n,tni->tn", mass, velocity**2)
@@ -122,10 +124,12 @@ def run_with_ledger(
         kinetic=kinetic.sum(axis=1),
         gravitational=height.sum(axis=1),
         elastic=elastic_energy(problem, nodes) + twisted,
-        grip_work=(of_grips - of_grips[0]).sum(axis=1) - work[:, 2, held.nodes].sum(axis=1) + turning,
+        grip_work=(of_grips - of_grips[0]).sum(axis=1)
+        - (work[:, 2] + rubbed.sum(axis=1))[:, held.nodes].sum(axis=1)
+        + turning,
         term_work=(work[:, 2] - work[:, 1] - work[:, 3]).sum(axis=1),
-        drag=work[:, 4, free].sum(axis=1),
-        internal_friction=(work[:, 0] - work[:, 1]).sum(axis=1),
+        drag=(work[:, 4] - rubbed[:, 1])[:, free].sum(axis=1),
+        internal_friction=(work[:, 0] - work[:, 1] - rubbed[:, 0]).sum(axis=1),
     )
 
 
@@ -212,6 +216,7 @@ class _Meter:
             wp.array(problem.nodal_mass(), dtype=wp.float64, device=device),
             wp.vec3d(*problem.gravity_m_s2),
             wp.float64(problem.drag_per_s),
+            wp.float64(0.5),
         ]
         self._internal, self._elastic = zeros(3 * n), zeros(3 * n)
         self._twist = zeros(3 * n)
@@ -220,6 +225,15 @@ class _Meter:
         twists = [term.bind(problem) for term in problem.terms if isinstance(term, Twist)]
         self._twists = [(twist, TwistMeter(twist, self._frames + 1)) for twist in twists]
         return self._internal
+
+    def watch(self, solver: TotalLagrangian) -> None:
+        """Learn how the solver integrates friction; where it does so after all terms, meter that apart."""
+        self._relaxed = solver if solver.relaxed else None
+        if solver.relaxed:
+            n = len(solver.mass)
+            self._constants[2:] = [wp.float64(0.0), wp.float64(0.0)]
+            shapes = (3 * n, 3 * n, (2, n), (self._frames + 1, 2, n))
+            self._friction = [wp.zeros(shape, dtype=wp.float64, device=self._device) for shape in shapes]
 
     def bind(self, problem: Problem) -> _Meter:
         return self
@@ -238,6 +252,8 @@ class _Meter:
         for twist, turning in self._twists:
             twist.launch(x, v, clock, counter, self._twist)
             turning.add(counter)
+        if self._relaxed is not None:
+            self._add_friction(self._relaxed, x, counter)
         wp.launch(
             sum_works,
             dim=len(x) // 3,
@@ -251,15 +267,25 @@ class _Meter:
         work, velocity = (array.numpy()[: self._frames] for array in self._outputs)
         return work.copy(), velocity.reshape(self._frames, -1, 3).copy()
 
+    def _add_friction(self, solver: TotalLagrangian, x: wp.array, counter: wp.array) -> None:
+        friction, mean = self._friction[0], solver.mean_velocity
+        if solver.friction is not None:
+            solver.friction.launch(mean, friction)
+        drag = wp.float64(solver.problem.drag_per_s)
+        wp.launch(
+            sum_friction, dim=len(x) // 3,
+            inputs=[self._constants[0], drag, x, self._state[2], counter, mean], outputs=self._friction,
+            device=self._device,
+        )  # fmt: skip
+
+    def read_friction(self) -> np.ndarray:
+        """Works of sub-cycled internal friction and drag at the frames [J], (T, 2, n); 0 where they are explicit."""
+        if self._relaxed is None:
+            return np.zeros((self._frames, 2, self._outputs[0].shape[2]))
+        return self._friction[3].numpy()[: self._frames].copy()
+
     def read_twist(self) -> tuple[np.ndarray, np.ndarray]:
         """Work of grips that turn a rope's ends and energy of its twist at the frames [J], (T,) each."""
         found = [turning.read() for _, turning in self._twists]
         work, energy = (sum((f[k] for f in found), np.zeros(self._frames + 1)) for k in range(2))
         return work[: self._frames], energy[: self._frames]
-
-
-def without_friction(law: Law) -> Law:
-    """The law with its own friction off."""
-    if isinstance(law, SolidLaw):
-        return replace(law, viscosity_pa_s=0.0)
-    return replace(law, relaxation_s=0.0)

@@ -29,6 +29,7 @@ def sum_works(
     mass: wp.array(dtype=wp.float64),
     gravity: wp.vec3d,
     drag: wp.float64,
+    lag: wp.float64,
     # in
     x: wp.array(dtype=wp.float64),
     v: wp.array(dtype=wp.float64),
@@ -47,14 +48,17 @@ def sum_works(
     work_out: wp.array3d(dtype=wp.float64),
     v_out: wp.array2d(dtype=wp.float64),
 ):
-    """Add the works of the last substep at one node; at a frame, write them and the velocity at that very time."""
+    """Add the works of the last substep at one node; at a frame, write them and the velocity at that very time.
+
+    ``lag``: steps by which velocities are behind positions at the start of a run.
+    """
     node = wp.tid()
     first = counter[0] == 0 and counter[1] == 0
     frame = counter[1] == 0
-    # velocities lag by half a step: of the new length at the start, of the old one later
+    # velocities lag by half a step of the old length later
     half = wp.float64(0.5) * last_dt[node]
     if first:
-        half = wp.float64(0.5) * clock[2]
+        half = lag * clock[2]
         for column in range(5):
             work[column, node] = wp.float64(0.0)
     for axis in range(3):
@@ -76,3 +80,46 @@ def sum_works(
         for column in range(5):
             work_out[counter[0], column, node] = work[column, node]
     last_dt[node] = clock[2]
+
+
+@wp.kernel
+def sum_friction(
+    # model
+    mass: wp.array(dtype=wp.float64),
+    drag: wp.float64,
+    # in
+    x: wp.array(dtype=wp.float64),
+    last_x: wp.array(dtype=wp.float64),
+    counter: wp.array(dtype=wp.int32),
+    mean: wp.array(dtype=wp.float64),
+    # in, out
+    friction: wp.array(dtype=wp.float64),
+    last_moved: wp.array(dtype=wp.float64),
+    work: wp.array2d(dtype=wp.float64),
+    # out
+    work_out: wp.array3d(dtype=wp.float64),
+):
+    """Add the works of sub-cycled friction and drag at one node: those of the last step, over the moves around it.
+
+    At a frame the half of the last step's work is still to come, as its half of the kick is in the velocity.
+    """
+    node = wp.tid()
+    first = counter[0] == 0 and counter[1] == 0
+    if first:
+        work[0, node] = wp.float64(0.0)
+        work[1, node] = wp.float64(0.0)
+    for axis in range(3):
+        i = 3 * node + axis
+        moved = x[i] - last_x[i]
+        if first:
+            moved = wp.float64(0.0)
+            last_moved[i] = wp.float64(0.0)
+        else:
+            way = wp.float64(0.5) * (last_moved[i] + moved)
+            work[0, node] += friction[i] * way
+            work[1, node] -= mass[node] * drag * mean[i] * way
+        last_moved[i] = moved
+        friction[i] = wp.float64(0.0)
+    if counter[1] == 0:
+        work_out[counter[0], 0, node] = work[0, node]
+        work_out[counter[0], 1, node] = work[1, node]

@@ -56,7 +56,7 @@ def sensitivities(
     """
     tangents = {name: _Tangent(setting, direction, times) for name, direction in directions.items()}
     problem = replace(setting.problem, terms=(*setting.problem.terms, *tangents.values()))
-    nodes = TotalLagrangian(problem, time_step_s).run(x, setting.velocity, setting.held, times)
+    nodes = TotalLagrangian(problem, time_step_s, "explicit").run(x, setting.velocity, setting.held, times)
     return nodes, {name: np.array(tangent.recorded) for name, tangent in tangents.items()}
 
 

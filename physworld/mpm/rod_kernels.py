@@ -28,13 +28,19 @@ _LOAD = r"""
         }
 """
 
-MODULI = r"""
+PRODUCTS = r"""
         #define PW_DOT(u, w) ((u)[0] * (w)[0] + (u)[1] * (w)[1] + (u)[2] * (w)[2])
         #define PW_CROSS(out, u, w) S out[3] = {(u)[1] * (w)[2] - (u)[2] * (w)[1], \
             (u)[2] * (w)[0] - (u)[0] * (w)[2], (u)[0] * (w)[1] - (u)[1] * (w)[0]}
+"""
+
+MODULI = (
+    PRODUCTS
+    + r"""
         const V EA = *(const V*)&stretching.data[cell * 2 + q];
         const V B = *(const V*)&bending.data[cell * 2 + q];
 """
+)
 
 ELASTIC = r"""
         const S a2 = PW_DOT(t, t) + 1e-24;

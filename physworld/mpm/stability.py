@@ -12,6 +12,8 @@ is stable while
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import warp as wp
 
@@ -20,6 +22,10 @@ from physworld.mpm.forces import InternalForces
 SAFETY = 0.6  # share of the limit that is used: large strains stiffen a body
 _ITERATIONS = 40
 _MARGIN = 1.05  # power iteration approaches omega from below
+EXPLICIT_SHRINK = (
+    8.0  # explicit friction may cost this factor of the step: sub-steps of the same cost as much
+)
+DRAG_SHRINK = 1.05  # and drag this one: its sub-steps need no cells
 
 
 def fastest_frequency(forces: InternalForces, rest: np.ndarray, mass: np.ndarray, spacing: float) -> float:
@@ -66,6 +72,40 @@ def stable_time_step(frequency_rad_s: float, friction_per_s: float, safety: floa
     """Largest time step [s] times ``safety``, for the fastest frequency [rad/s] and friction rate [1/s]."""
     root = np.sqrt(friction_per_s**2 + 4 * frequency_rad_s**2)
     return float(safety * (root - friction_per_s) / frequency_rad_s**2)
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Time steps that a body allows, by how its own friction is integrated.
+
+    Attributes:
+        frequency_rad_s: fastest mode.
+        internal_per_s, drag_per_s: fastest rates of the law's friction and of drag.
+        terms_per_s: of everything else that acts.
+    """
+
+    frequency_rad_s: float
+    internal_per_s: float
+    drag_per_s: float
+    terms_per_s: tuple[float, ...]
+
+    def explicit_s(self, safety: float = SAFETY) -> float:
+        """With explicit friction [s]."""
+        rate = self.drag_per_s + self.internal_per_s
+        for term in self.terms_per_s:
+            rate += term
+        return stable_time_step(self.frequency_rad_s, rate, safety)
+
+    def relaxed_s(self, safety: float = SAFETY) -> float:
+        """With friction in sub-steps of its own [s]."""
+        return stable_time_step(self.frequency_rad_s, sum(self.terms_per_s), safety)
+
+    @property
+    def relax(self) -> bool:
+        """Whether sub-steps are worth their work: see :data:`EXPLICIT_SHRINK` and :data:`DRAG_SHRINK`."""
+        shrink = self.relaxed_s() / self.explicit_s()
+        internal = stable_time_step(self.frequency_rad_s, self.internal_per_s + sum(self.terms_per_s))
+        return shrink > EXPLICIT_SHRINK or internal / self.explicit_s() > DRAG_SHRINK
 
 
 def _forces_at(forces: InternalForces, x: np.ndarray, clock: wp.array) -> np.ndarray:

@@ -15,17 +15,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import warp as wp
 
 from physworld.errors import BlewUp, CFLViolation, ParticlesLeftTheGrid, UnstableSimulation
-from physworld.materials.laws import Law, friction_law
+from physworld.materials.laws import Law, friction_law, without_friction
 from physworld.mpm.forces import InternalForces
+from physworld.mpm.friction import FrictionForces
 from physworld.mpm.lattice import Lattice
 from physworld.mpm.node_kernels import advance_counter, advance_nodes
-from physworld.mpm.stability import fastest_frequency, stable_time_step
+from physworld.mpm.relaxation import Relaxation
+from physworld.mpm.stability import Steps, fastest_frequency
 from physworld.mpm.terms import Term
 
 _CHUNK = 8  # substeps in one captured graph
@@ -97,12 +99,27 @@ class TotalLagrangian:
     Args:
         problem: the body and what acts on it.
         time_step_s: forced time step [s], or None for the stable one.
+        friction: "auto": in sub-steps of its own where explicit friction would shrink the time step more than
+            :data:`physworld.mpm.stability.EXPLICIT_SHRINK` times (drag: ``DRAG_SHRINK``), or a forced step asks for
+            it; "explicit": never, which is what gradients differentiate. With a term that multiplies the internal
+            forces it is explicit.
+
+    Attributes:
+        relaxed: whether friction is sub-cycled (:mod:`physworld.mpm.relaxation`).
+        steps: the time steps that either way allows.
+        friction: the law's, where it is sub-cycled; None otherwise.
+        mean_velocity: at which the last step took its friction, (3n,) [m/s], where it is sub-cycled.
 
     Raises:
         CFLViolation: the forced time step exceeds the stable limit.
     """
 
-    def __init__(self, problem: Problem, time_step_s: float | None = None) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        time_step_s: float | None = None,
+        friction: Literal["auto", "explicit"] = "auto",
+    ) -> None:
         lattice, law, device = problem.lattice, problem.law, problem.device
         particles = lattice.fill.size
         stiffness = np.ones(particles) if problem.stiffness_factor is None else problem.stiffness_factor
@@ -111,21 +128,35 @@ class TotalLagrangian:
         self.forces = InternalForces(lattice, law, stiffness, problem.rest, device)
         cell = float(lattice.spacing.min())
         frequency = fastest_frequency(self.forces, problem.rest, self.mass, cell)
-        friction, rate = friction_law(law), problem.drag_per_s
-        if friction is not None:
-            damper = InternalForces(lattice, friction, stiffness, problem.rest, device)
-            rate += fastest_frequency(damper, problem.rest, self.mass, cell) ** 2
+        rubbing, internal = friction_law(law), 0.0
+        if rubbing is not None:
+            damper = InternalForces(lattice, rubbing, stiffness, problem.rest, device)
+            internal = fastest_frequency(damper, problem.rest, self.mass, cell) ** 2
         self.terms = tuple(term.bind(problem) for term in problem.terms)
         for term in self.terms:
             frequency = float(np.hypot(frequency, term.frequency_rad_s))
-            rate += term.friction_per_s
-        limit = stable_time_step(frequency, rate, safety=1.0)
+        rates = tuple(float(term.friction_per_s) for term in self.terms)
+        steps = Steps(frequency, internal, float(problem.drag_per_s), rates)
+        multiplied = any(getattr(term, "multiplies", False) for term in self.terms)
+        allowed = friction == "auto" and not multiplied
+        if time_step_s is None:
+            relax = allowed and steps.relax
+        else:
+            relax = allowed and time_step_s > steps.explicit_s(1.0)
+        limit = steps.relaxed_s(1.0) if relax else steps.explicit_s(1.0)
         if time_step_s is not None and time_step_s > limit:
             raise CFLViolation(
                 f"time step {time_step_s:.3g} s exceeds the stable {limit:.3g} s of a body whose fastest mode has "
                 f"{frequency:.4g} rad/s (wave speed {law.wave_speed_m_s:.4g} m/s, cell {lattice.spacing.min():.3g} m)"
             )
-        self.time_step_s = time_step_s or stable_time_step(frequency, rate)
+        self.steps = steps
+        self.time_step_s = time_step_s or (steps.relaxed_s() if relax else steps.explicit_s())
+        self.relaxed, self.friction = relax, None
+        if relax:
+            self.forces = InternalForces(lattice, without_friction(law), stiffness, problem.rest, device)
+            if rubbing is not None:
+                self.friction = FrictionForces(lattice, law, stiffness, problem.rest, device)
+            self.mean_velocity = wp.zeros(3 * len(self.mass), dtype=wp.float64, device=device)
         self.substeps = 0
 
     def run(
@@ -196,16 +227,14 @@ class Run:
         paths[0, :, : 3 * len(held.nodes)] = held.positions.reshape(frames, -1)
         paths[1, :, : 3 * len(held.nodes)] = held.velocities.reshape(frames, -1)
         self._nodes = [upload(solver.mass), upload(slot, wp.int32), upload(paths[0]), upload(paths[1])]
+        self._relaxation = self._relaxing()
         self._begin()
         forces = solver.forces
         forces.inverted.zero_()
         forces.launch(self.x, self.clock, self.force)  # remembers the first strains: no friction acts yet
         self.v.assign(self._half_a_step_back(v, times[1] - times[0]).reshape(-1))
         self.force.zero_()
-        with wp.ScopedCapture(device=device) as capture:
-            for _ in range(_CHUNK):
-                self._substep()
-        self._graph = capture.graph
+        self._graphs: dict[int, Any] = {}
 
     def advance(self, frame: int) -> np.ndarray:
         """Integrate from ``times[frame]`` to the next; positions there, (n, 3) [m].
@@ -216,12 +245,29 @@ class Run:
             ContactFailed: material came too deep into a collider.
         """
         substeps = self._set_clock(frame)
+        graph = self._graph()
         for _ in range(substeps // _CHUNK):
-            wp.capture_launch(self._graph)
+            wp.capture_launch(graph)
         self._solver.substeps += substeps
         now = self.x.numpy().reshape(-1, 3).copy()
         self._check(now, self._times[frame + 1])
         return now
+
+    def _graph(self) -> Any:
+        """A chunk of substeps, captured once for every number of stages that friction takes."""
+        relaxation = self._relaxation
+        stages = 0 if relaxation is None else relaxation.tune(self.x, float(self._clocks[0].numpy()[2]))
+        if stages not in self._graphs:
+            with wp.ScopedCapture(device=self._solver.device) as capture:
+                for _ in range(_CHUNK):
+                    self._substep()
+            self._graphs[stages] = capture.graph
+        return self._graphs[stages]
+
+    @property
+    def stages(self) -> int:
+        """Stages of friction in a substep of the last frame; 0 where it is explicit."""
+        return 0 if self._relaxation is None else self._relaxation.stages
 
     def _begin(self) -> None:
         for term in self._solver.terms:
@@ -238,6 +284,9 @@ class Run:
             term.launch(self.x, self.v, self.clock, self.counter, self.force)
 
     def _launch_nodes(self) -> None:
+        if self._relaxation is not None:
+            self._relaxation.launch(self.x, self.v, self.force, self.clock, self.counter)
+            return
         problem = self._solver.problem
         gravity, drag = wp.vec3d(*problem.gravity_m_s2), wp.float64(problem.drag_per_s)
         wp.launch(
@@ -272,6 +321,8 @@ class Run:
         solver = self._solver
         dt = interval / self._set_clock(0)
         self._launch_terms()
+        if self._relaxation is not None:
+            return v  # its first step is half a step
         pull = self.force.numpy().reshape(-1, 3) / solver.mass[:, None]
         gravity, drag = self._fall()
         return v - 0.5 * dt * (pull + gravity - drag * v)
@@ -279,6 +330,13 @@ class Run:
     def _fall(self) -> tuple[np.ndarray, np.ndarray | float]:
         """Gravity [m/s^2] and drag rate [1/s]; they fit velocities (n, 3)."""
         return self._solver.problem.gravity_m_s2, self._solver.problem.drag_per_s
+
+    def _relaxing(self) -> Relaxation | None:
+        solver = self._solver
+        if not solver.relaxed:
+            return None
+        gravity, drag = self._fall()
+        return Relaxation(self._nodes, solver.friction, gravity, float(drag), solver.mean_velocity)
 
     def _check(self, now: np.ndarray, time: float) -> None:
         solver, dt = self._solver, float(self._clocks[0].numpy()[2])

@@ -32,7 +32,7 @@ class Job:
         twin: what moves.
         frames: from the first frame to before this one.
         step_share: time step over the stable one.
-        least_step_s: a twin whose stable time step is smaller is not run: nothing waits for it.
+        least_step_s: a twin whose stable time step with explicit friction is smaller is not run.
     """
 
     twin: Twin
@@ -72,9 +72,11 @@ def nodes_of(job: Job, drive: Drive, poll: Callable[[int, int], None] | None = N
     """Nodes (frames, n, 3) [m] of a job. Raises SimulationError."""
     run = job.twin.integration(drive.control_times, drive.control_points, drive.times[: job.frames])
     solver = TotalLagrangian(run.problem)
-    if solver.time_step_s < job.least_step_s:
+    step = solver.steps.explicit_s()
+    if step < job.least_step_s:
         raise CFLViolation(
-            f"a time step of {solver.time_step_s:.3g} s is below {job.least_step_s:.3g} s, which a trace waits for"
+            f"a time step of {step:.3g} s with explicit friction is below "
+            f"{job.least_step_s:.3g} s, which a trace waits for"
         )
     if job.step_share != 1.0:
         solver = TotalLagrangian(run.problem, job.step_share * solver.time_step_s)
@@ -83,9 +85,9 @@ def nodes_of(job: Job, drive: Drive, poll: Callable[[int, int], None] | None = N
 
 
 def stable_step_s(twin: Twin, drive: Drive) -> float:
-    """Stable time step of a twin [s]."""
+    """Stable time step of a twin with explicit friction [s]."""
     run = twin.integration(drive.control_times, drive.control_points, drive.times[:2])
-    return TotalLagrangian(run.problem).time_step_s
+    return TotalLagrangian(run.problem).steps.explicit_s()
 
 
 def tracks_of(job: Job, drive: Drive, poll: Callable[[int, int], None] | None = None) -> np.ndarray | None:

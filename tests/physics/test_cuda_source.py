@@ -28,6 +28,8 @@ PLAIN = (
     "ground_kernels",
     "energy_kernels",
     "self_contact_kernels",
+    "friction_kernels",
+    "relaxation_kernels",
 )
 
 

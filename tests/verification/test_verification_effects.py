@@ -23,6 +23,11 @@ def test_internal_friction_damps_as_kelvin_and_voigt_say() -> None:
     assert abs(effects.rod_friction(10)) < 0.015
 
 
+def test_strong_friction_in_stages_follows_the_damped_oscillator() -> None:
+    assert effects.strong_viscosity(20) < 4e-3
+    assert effects.creeping_viscosity(10) < 1.2e-2
+
+
 def test_a_fall_under_tilted_gravity_is_exact() -> None:
     assert abs(effects.tilt(64)) < 1e-12
 

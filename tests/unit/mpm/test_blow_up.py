@@ -9,7 +9,7 @@ from made_scene import box_body, made_scene
 from physworld.build import build_twin
 from physworld.errors import BlewUp, SimulationError
 from physworld.integration import Integration
-from physworld.mpm import total_lagrangian
+from physworld.mpm import stability
 from physworld.mpm.stability import SAFETY, stable_time_step
 from physworld.mpm.total_lagrangian import TotalLagrangian, run_again_if_blown_up
 from physworld.scene import UNDEFORMED_AT_REST
@@ -34,7 +34,7 @@ def swing(monkeypatch: pytest.MonkeyPatch) -> tuple[Integration, np.ndarray]:
     def too_long(frequency: float, rate: float, safety: float = SAFETY) -> float:
         return stable_time_step(frequency, rate, 1.5 if safety == SAFETY else safety)
 
-    monkeypatch.setattr(total_lagrangian, "stable_time_step", too_long)
+    monkeypatch.setattr(stability, "stable_time_step", too_long)
     return twin.integration(*scene.control_track(), scene.times), twin.body.start
 
 
