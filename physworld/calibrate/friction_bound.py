@@ -18,7 +18,7 @@ from physworld.mpm.total_lagrangian import TotalLagrangian
 from physworld.scene import Scene
 from physworld.twin import Twin
 
-SLOWEST = 8.0  # as for a trace
+SLOWEST = 8.0  # times
 _NAMES = ("relaxation_s", "viscosity_pa_s")
 _CLOSE = 0.05  # in the logarithm
 

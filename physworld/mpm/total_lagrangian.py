@@ -26,7 +26,7 @@ from physworld.mpm.forces import InternalForces
 from physworld.mpm.friction import FrictionForces
 from physworld.mpm.lattice import Lattice
 from physworld.mpm.node_kernels import advance_counter, advance_nodes
-from physworld.mpm.relaxation import Relaxation
+from physworld.mpm.relaxation import MARGIN, Relaxation, stages_for
 from physworld.mpm.stability import Steps, fastest_frequency
 from physworld.mpm.terms import Term
 
@@ -158,6 +158,14 @@ class TotalLagrangian:
                 self.friction = FrictionForces(lattice, law, stiffness, problem.rest, device)
             self.mean_velocity = wp.zeros(3 * len(self.mass), dtype=wp.float64, device=device)
         self.substeps = 0
+
+    @property
+    def stage_s(self) -> float:
+        """Time that one evaluation of its forces brings the body on [s]: the step, or a stage of its friction."""
+        if not self.relaxed:
+            return self.time_step_s
+        rate = self.steps.internal_per_s + self.steps.drag_per_s
+        return self.time_step_s / stages_for(MARGIN * self.time_step_s * rate)
 
     def run(
         self,

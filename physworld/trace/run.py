@@ -55,7 +55,7 @@ from physworld.trace.simulations import (
     Progress,
     Runner,
     in_turn,
-    stable_step_s,
+    stage_s,
 )
 from physworld.trace.start_pose import turned_starts
 from physworld.trace.unknowns import Unknown, clamp_reach, grip_softness, of_parameter
@@ -76,7 +76,7 @@ _OTHER_STIFFNESSES = tuple(0.12 * k for k in (-6, -5, -4, -3, -2, -1, 1, 2, 3, 4
 """Logarithms: a phase that has slipped by a period is a local minimum, so others are looked at before a descent."""
 _OTHER_TWIST = float(np.log(2.0))
 _NEAR = (-0.12, 0.12)  # on finer cells, where the coarser ones have looked farther
-_SLOWEST = 8.0  # times the cost of the declared physics that a run may take: explicit friction is dear
+_SLOWEST = 12.0  # times the cost of the declared physics that a run may take: strong friction is dear
 
 
 def trace(
@@ -162,7 +162,7 @@ class _Trace:
         level = 1.0
         while True:
             simulations.stage = "declared physics"
-            simulations.least_step_s = stable_step_s(self.twin, simulations.drive) / _SLOWEST
+            simulations.least_step_s = stage_s(self.twin, simulations.drive) / _SLOWEST
             tracks, answers = simulations.first_look(Job(self.twin, self.frames))
             sigma = noise_sigma(self.scene, self.split, tracks)
             scale = sigma or float(np.sqrt(np.mean((tracks - self.scene.points[: self.frames]) ** 2))) or 1e-3
@@ -239,7 +239,7 @@ class _Trace:
         if len(self.recordings.fitted) > 1 or self.recordings.held_out:
             return False  # their other twins stay on the cells that were asked for
         drive = self.simulations.drive
-        steps = float(drive.times[self.frames - 1] - drive.times[0]) / stable_step_s(finer, drive)
+        steps = float(drive.times[self.frames - 1] - drive.times[0]) / stage_s(finer, drive)
         cost = finer.lattice.fill.size * steps
         return numerics.get("finer cells", 0.0) > self.config.resolved and cost <= self.config.affordable
 

@@ -32,7 +32,7 @@ class Job:
         twin: what moves.
         frames: from the first frame to before this one.
         step_share: time step over the stable one.
-        least_step_s: a twin whose stable time step with explicit friction is smaller is not run.
+        least_step_s: a twin that gets less far by one evaluation of its forces is not run.
     """
 
     twin: Twin
@@ -72,11 +72,10 @@ def nodes_of(job: Job, drive: Drive, poll: Callable[[int, int], None] | None = N
     """Nodes (frames, n, 3) [m] of a job. Raises SimulationError."""
     run = job.twin.integration(drive.control_times, drive.control_points, drive.times[: job.frames])
     solver = TotalLagrangian(run.problem)
-    step = solver.steps.explicit_s()
-    if step < job.least_step_s:
+    if solver.stage_s < job.least_step_s:
         raise CFLViolation(
-            f"a time step of {step:.3g} s with explicit friction is below "
-            f"{job.least_step_s:.3g} s, which a trace waits for"
+            f"{solver.stage_s:.3g} s for an evaluation of the forces is below {job.least_step_s:.3g} s, which a "
+            "trace waits for"
         )
     if job.step_share != 1.0:
         solver = TotalLagrangian(run.problem, job.step_share * solver.time_step_s)
@@ -84,10 +83,10 @@ def nodes_of(job: Job, drive: Drive, poll: Callable[[int, int], None] | None = N
     return run.at_frames(job.twin.body.start, nodes)
 
 
-def stable_step_s(twin: Twin, drive: Drive) -> float:
-    """Stable time step of a twin with explicit friction [s]."""
+def stage_s(twin: Twin, drive: Drive) -> float:
+    """How far one evaluation of its forces brings a twin [s]: its stable time step, or a stage of its friction."""
     run = twin.integration(drive.control_times, drive.control_points, drive.times[:2])
-    return TotalLagrangian(run.problem).steps.explicit_s()
+    return TotalLagrangian(run.problem).stage_s
 
 
 def tracks_of(job: Job, drive: Drive, poll: Callable[[int, int], None] | None = None) -> np.ndarray | None:
