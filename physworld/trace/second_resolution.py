@@ -48,8 +48,8 @@ class SecondResolution:
             return values, agreement
         best = simplest(real, declared)
         self.simulations.stage = "second resolution"
-        # a viscous time step shrinks with the square of the cells, and such a run is no reason to doubt the effect
-        self.simulations.least_step_s /= self.config.refinement**2
+        # a rod's stages of friction shrink with its cells' cube, and such a run is no reason to doubt the effect
+        self.simulations.least_step_s /= self.config.refinement**3
         twin = refinement_of(best.fitted.twin, self.finer)
         found = refit(
             self.simulations, self.white, twin, best.fitted.unknowns, self.frames, _FINER_STEPS,
