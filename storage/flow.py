@@ -2,8 +2,8 @@
 
 ::
 
-    fit        stage 0  one `fit` shard
-    trace      stage 0  one `trace` shard, which puts up `simulation` helpers (``storage.helpers``)
+    fit        stage 0  one `fit` shard, which may put up `simulation` helpers (``storage.helpers``)
+    trace      stage 0  one `trace` shard, which puts them up too
     dataset    stage 0  one `dataset_plan` shard, whose result says how many episodes follow
                stage 1  one `episode` shard each
                stage 2  one `dataset_seal` shard
@@ -158,6 +158,7 @@ def settle_cancel(session: Session, job: JobRow, now: datetime) -> None:
 def _apply(session: Session, job: JobRow, shard: ShardRow, result: ShardResult) -> None:
     payload = shard.payload
     if isinstance(result, FitResult):
+        helpers.call_off(session, job.id)
         fit_id = payload["fit_id"]
         resources.mark_fit_ready(
             session, fit_id, result.parameters, result.metrics, result.artifacts, result.lineage

@@ -1,8 +1,9 @@
 """Helper shards: pieces of work that a running shard puts up for whoever is free, and takes itself otherwise.
 
-A trace is one long shard that decides, and many simulations that are independent of each other. The shard that decides
-(the *driver*) adds the simulations to its own job as helper shards and then works on them like any other worker. So one
-worker alone finishes a trace, several share it, and none sits idle holding a lease while another's queue is full.
+A trace, or a fit, is one long shard that decides, and many simulations that are independent of each other. The shard
+that decides (the *driver*) adds the simulations to its own job as helper shards and then works on them like any other
+worker. So one worker alone finishes a trace, several share it, and none sits idle holding a lease while another's queue
+is full.
 
 A helper shard is under the same leases, caps and cancellation as every other one. It neither counts for its job's stage
 nor opens the next one; those of a driver that was lost are called off by its next attempt.

@@ -41,7 +41,7 @@ class TraceResult(ShardResult):
 
 
 class SimulationResult(ShardResult):
-    """Of a ``simulation`` shard, a trace's helper: whether the run can be trusted; its tracks are in the scratch."""
+    """Of a ``simulation`` shard: whether the run can be trusted; its tracks are in the scratch."""
 
     trusted: bool
 

@@ -32,7 +32,7 @@ Handler = Callable[["TaskContext", "Stores"], HandlerResult]
 _HANDLERS: dict[str, str] = {
     "fit": "workers.tasks.fit:run",
     "trace": "workers.tasks.trace:run",
-    "simulation": "workers.tasks.trace:simulate",
+    "simulation": "workers.tasks.shared_runs:simulate",
     "dataset_plan": "workers.tasks.dataset:plan",
     "episode": "workers.tasks.dataset:episode",
     "dataset_seal": "workers.tasks.dataset:seal",

@@ -10,12 +10,11 @@ are no fibres, as their prior says.
 from __future__ import annotations
 
 from itertools import product
-from typing import Any
 
 import numpy as np
 
 from physworld.calibrate.parameters import Parameter
-from physworld.calibrate.search import Optimum, Search
+from physworld.calibrate.search import Descent, Optimum, Search, cost_of
 
 _RATIOS = (1.0, 4.0)  # of the fibres' modulus to the matrix's, where a descent may start
 _TRIED, _TURNED, _FOLLOWED = (
@@ -55,22 +54,18 @@ def free_fibres(
         return kept, optimum, {}
     modulus, together, window = fibres[0], [*kept, *fibres], search.first_window()
     starts = _starts(kept, optimum, fibres)
-
-    def costs() -> dict[str, Any]:
-        return {"costs": [float(np.mean(search.residual(together, t, window) ** 2)) for t in starts]}
-
-    found = search.step("scan " + " ".join(p.name for p in fibres), costs)["costs"]
+    costs = search.costs("scan " + " ".join(p.name for p in fibres), together, starts, window)
     usable = sorted(
-        (cost, tuple(start)) for cost, start in zip(found, starts, strict=True) if cost is not None
+        (cost, tuple(start)) for cost, start in zip(costs, starts, strict=True) if cost is not None
     )
     straight = [_along(search, kept, fibres, np.array(start), window) for _, start in usable[:_TRIED]]
-    straight.sort(key=_cost)
-    turned = [search.solve(together, one.theta, 4, window) for one in straight[:_TURNED]]
-    turned.sort(key=_cost)
-    late = [search.solve(together, one.theta, 3) for one in turned[:_FOLLOWED]]
+    straight.sort(key=cost_of)
+    turned = search.solve_each([Descent(together, one.theta, 4, window) for one in straight[:_TURNED]])
+    turned.sort(key=cost_of)
+    late = search.solve_each([Descent(together, one.theta, 3) for one in turned[:_FOLLOWED]])
     if not late:
         return kept, optimum, {modulus.name: float("nan")}
-    best = min(late, key=_cost)
+    best = min(late, key=cost_of)
     best = search.solve(together, best.theta, 5)
     gain = 1.0 - best.cost / optimum.cost
     if not gain > modulus.least_gain:  # also where the budget ended
@@ -107,7 +102,3 @@ def _along(
     found = search.solve([*kept, modulus], theta[: -len(angles)], 3, window)
     search.twin = before
     return Optimum(np.concatenate([found.theta, theta[-len(angles) :]]), found.cost)
-
-
-def _cost(optimum: Optimum) -> float:
-    return optimum.cost if np.isfinite(optimum.cost) else float("inf")

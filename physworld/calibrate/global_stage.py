@@ -42,9 +42,10 @@ from physworld.calibrate.least_squares import Solution
 from physworld.calibrate.local_stage import LocalResult
 from physworld.calibrate.losses import training_losses
 from physworld.calibrate.parameters import Parameter, flow_law, parameters_of
-from physworld.calibrate.search import Optimum, Progress, Search
+from physworld.calibrate.search import Descent, Optimum, Progress, Search
 from physworld.materials.library import with_law
 from physworld.scene import Scene
+from physworld.simulations import Runner, in_turn
 from physworld.twin import Twin
 
 _LEAST_SCREENED = (
@@ -126,6 +127,7 @@ def calibrate(
     progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
     journal: Journal | None = None,
+    runner: Runner = in_turn,
 ) -> FitResult:
     """Fit a twin to the training frames of ``scene``.
 
@@ -135,6 +137,7 @@ def calibrate(
         progress: called with (runs done, runs at most, message).
         cancelled: polled every frame of every run.
         journal: finished steps of an earlier attempt, which are not simulated again.
+        runner: where simulations run that do not depend on each other.
 
     Raises:
         CalibrationError: no start gave a usable simulation.
@@ -144,7 +147,9 @@ def calibrate(
     """
     config = config or CalibrationConfig()
     started = time.perf_counter()
-    search = Search(scene, prior_twin(scene, config), config.max_simulations, progress, cancelled, journal)
+    search = Search(
+        scene, prior_twin(scene, config), config.max_simulations, progress, cancelled, journal, runner
+    )
     parameters = searched_parameters(scene, search.twin, config)
     search.limit = config.max_simulations - min(_KEPT_BACK, config.max_simulations // 4)
     kept, optimum, rejected = select(search, parameters)
@@ -239,9 +244,9 @@ def free_optional(
     while candidates:
         screened = search.screen(kept, optimum, candidates)
         hopeful = [c for c in candidates if screened[c.name] >= _LEAST_SCREENED * c.least_gain]
-        trials = [
-            search.solve([*kept, c], np.append(optimum.theta, c.searched(c.start[0])), 4) for c in hopeful
-        ]
+        trials = search.solve_each(
+            [Descent([*kept, c], np.append(optimum.theta, c.searched(c.start[0])), 4) for c in hopeful]
+        )
         gains = dict(screened)
         gains.update({c.name: 1.0 - t.cost / optimum.cost for c, t in zip(hopeful, trials, strict=True)})
         # not a number: the budget ended

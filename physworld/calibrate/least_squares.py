@@ -8,7 +8,7 @@ With few clusters a sandwich may come out too small by chance; the variances are
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,6 +39,9 @@ class Solution:
     jacobian: np.ndarray
 
 
+Descent = Generator[list[np.ndarray], list[np.ndarray], Solution]
+
+
 def gauss_newton(
     residual: Residual,
     theta: np.ndarray,
@@ -52,20 +55,36 @@ def gauss_newton(
     A residual that is not finite is a failed simulation: the step is shortened. One run per parameter and Jacobian,
     one per trial step; ``max_iterations`` Jacobians at most.
     """
+    asking = descent(theta, low, high, steps, max_iterations)
+    asked = next(asking)
+    while True:
+        try:
+            asked = asking.send([residual(one) for one in asked])
+        except StopIteration as ended:
+            found: Solution = ended.value
+            return found
+
+
+def descent(
+    theta: np.ndarray, low: np.ndarray, high: np.ndarray, steps: np.ndarray, max_iterations: int = 6
+) -> Descent:
+    """:func:`gauss_newton` for whoever runs its simulations: yields places that do not depend on each other, is sent
+    the residuals there, in their order, and returns the solution."""
     theta = np.clip(theta, low, high)
-    now = residual(theta)
+    (now,) = yield [theta]
     cost = float(np.mean(now**2))
     damping = 1e-3
     jacobian = np.zeros((len(now), len(theta)))
     for _ in range(max_iterations):
-        jacobian = finite_differences(residual, theta, now, high, steps)
+        probes = probes_of(theta, high, steps)
+        jacobian = differences(theta, now, steps, probes, (yield probes))
         normal, gradient = jacobian.T @ jacobian, jacobian.T @ now
         improved = False
         for _ in range(5):
             scaled = normal + damping * np.diag(np.diag(normal) + 1e-12 * np.trace(normal) + 1e-30)
             step = np.clip(np.linalg.solve(scaled, -gradient), -_MAX_STEP, _MAX_STEP)
             trial = np.clip(theta + step, low, high)
-            trial_residual = residual(trial)
+            (trial_residual,) = yield [trial]
             trial_cost = float(np.mean(trial_residual**2))
             if np.isfinite(trial_cost) and trial_cost < cost:
                 improved = True
@@ -80,16 +99,32 @@ def gauss_newton(
     return Solution(theta, cost, now, jacobian)
 
 
-def finite_differences(
-    residual: Residual, theta: np.ndarray, now: np.ndarray, high: np.ndarray, steps: np.ndarray
+def most_runs(parameters: int, max_iterations: int) -> int:
+    """Runs that a descent takes at most."""
+    return 1 + max_iterations * (parameters + 5)
+
+
+def probes_of(theta: np.ndarray, high: np.ndarray, steps: np.ndarray) -> list[np.ndarray]:
+    """Places beside ``theta`` (p,) that finite differences need, one a parameter, below it at its upper bound."""
+    found = []
+    for k in range(len(theta)):
+        probe = theta.copy()
+        probe[k] += -steps[k] if theta[k] + steps[k] > high[k] else steps[k]
+        found.append(probe)
+    return found
+
+
+def differences(
+    theta: np.ndarray,
+    now: np.ndarray,
+    steps: np.ndarray,
+    probes: list[np.ndarray],
+    residuals: list[np.ndarray],
 ) -> np.ndarray:
     """Jacobian (m, p) at ``theta``, whose residual is ``now``; a column that blew up is zero."""
     jacobian = np.zeros((len(now), len(theta)))
-    for k in range(len(theta)):
-        probe = theta.copy()
-        sign = -1.0 if theta[k] + steps[k] > high[k] else 1.0
-        probe[k] += sign * steps[k]
-        jacobian[:, k] = sign * (residual(probe) - now) / steps[k]
+    for k, (probe, there) in enumerate(zip(probes, residuals, strict=True)):
+        jacobian[:, k] = np.sign(probe[k] - theta[k]) * (there - now) / steps[k]
     return np.nan_to_num(jacobian, nan=0.0, posinf=0.0, neginf=0.0)
 
 

@@ -2,11 +2,14 @@
 
 Steps of the search (a scan, an optimum, a screening, a shift of the points) go through a journal, so that a search
 that was killed goes on where it was.
+
+Simulations that do not depend on each other (starts of a scan, columns of a Jacobian, descents side by side) go to a
+runner together: in this process one after the other, elsewhere at once. What is found is the same under every runner.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
@@ -14,10 +17,13 @@ from typing import Any
 import numpy as np
 
 from physworld.calibrate.journal import Journal
-from physworld.calibrate.least_squares import Solution, finite_differences, gauss_newton
+from physworld.calibrate.least_squares import Descent as LeastSquares
+from physworld.calibrate.least_squares import Solution, descent, differences, most_runs, probes_of
+from physworld.calibrate.material_frames import material_frames
 from physworld.calibrate.parameters import Parameter
 from physworld.errors import CalibrationError, Cancelled, SimulationError
 from physworld.scene import UNDEFORMED_AT_REST, Scene
+from physworld.simulations import Drive, Job, Runner, in_turn
 from physworld.twin import Twin
 
 Progress = Callable[[int, int, str], None]
@@ -25,7 +31,6 @@ Progress = Callable[[int, int, str], None]
 _OFFSET_CLIP_SIGMAS = 3.0
 _FIRST_WINDOW = 0.33  # share of the training path that the first search sees
 _FIRST_WINDOW_FRAMES = 10
-_BESIDE = 0.1  # of a cell: how far beside a point its neighbours are followed
 _DISTINCT = 0.05  # starts that end closer than this in the logarithm are one
 
 
@@ -35,6 +40,25 @@ class Optimum:
 
     theta: np.ndarray
     cost: float
+
+
+@dataclass(frozen=True)
+class Descent:
+    """A descent that is asked for: what it searches, from where, in how many iterations, over frames up to ``end``."""
+
+    parameters: list[Parameter]
+    theta: np.ndarray
+    iterations: int
+    end: int | None = None
+
+
+@dataclass(frozen=True)
+class _Descended:
+    """A descent that was done beside others: what it found, its runs, and the losses [m] over all training frames."""
+
+    optimum: Optimum
+    runs: int
+    losses: list[float]
 
 
 class Search:
@@ -48,7 +72,9 @@ class Search:
         progress: Progress | None,
         cancelled: Callable[[], bool] | None,
         journal: Journal | None = None,
+        runner: Runner = in_turn,
     ) -> None:
+        self.runner = runner
         self.scene, self.twin, self.max_simulations = scene, twin, max_simulations
         self.journal = journal or Journal()
         self.progress, self.cancelled = progress, cancelled
@@ -93,29 +119,19 @@ class Search:
 
         NaN where the run blew up or the budget (``limit``) is spent.
         """
-        end = self.end if end is None else end
-        visible = self.scene.visible[self.begin : end]
-        target = self.scene.points[self.begin : end][visible]
-        bad = np.full(target.size, np.nan)
-        if self.simulations >= self.limit:
-            return bad
-        self.simulations += 1
-        times, controls = self.scene.control_track()
-        try:
-            twin = self.twin_at(parameters, theta)
-            nodes = twin.simulate_nodes(times, controls, self.scene.times[:end], progress=self._poll)
-        except SimulationError:
-            return bad
-        observed = twin.observe(nodes, self.scene.times[:end])
-        residual = (observed[self.begin :][visible] - target).reshape(-1)
-        loss = float(np.sqrt(np.mean(residual**2)))
-        if end == self.end:
-            self.history.append(min(loss, self.history[-1]) if self.history else loss)
-        if self.progress is not None:
-            pairs = zip(parameters, theta, strict=True)
-            values = ", ".join(f"{p.name} {p.value(float(t)):.3g}" for p, t in pairs)
-            self.progress(self.simulations, self.max_simulations, f"{loss * 1e3:.2f} mm at {values}")
-        return residual
+        return self.residuals([(parameters, theta, end)])[0]
+
+    def residuals(self, places: list[tuple[list[Parameter], np.ndarray, int | None]]) -> list[np.ndarray]:
+        """:meth:`residual` at places (parameters, theta, end) that do not depend on each other."""
+        allowed = max(0, self.limit - self.simulations)
+        found = []
+        for place, (residual, loss) in zip(places, self._measured(places[:allowed]), strict=False):
+            self.simulations += 1
+            if loss is not None:
+                self._remember(loss, place[2])
+                self._tell(self.simulations, loss, place)
+            found.append(residual)
+        return [*found, *(self._nothing(end) for _, _, end in places[allowed:])]
 
     def scan(self, parameters: list[Parameter]) -> Optimum:
         """Multi-start over the starts of the first parameter and of a flow law's, then on all training frames."""
@@ -125,10 +141,7 @@ class Search:
             np.array([p.searched(value) for p, value in zip(parameters, values, strict=True)])
             for values in product(*tried)
         ]
-        costs = self.step(
-            "scan",
-            lambda: {"costs": [float(np.mean(self.residual(parameters, t, window) ** 2)) for t in starts]},
-        )["costs"]
+        costs = self.costs("scan", parameters, starts, window)
         usable = sorted(
             (cost, tuple(theta)) for cost, theta in zip(costs, starts, strict=True) if cost is not None
         )
@@ -137,47 +150,108 @@ class Search:
                 f"none of {len(costs)} starts with {parameters[0].name} from {parameters[0].start[0]:.3g} to "
                 f"{parameters[0].start[-1]:.3g} {parameters[0].unit} gave a usable simulation"
             )
-        early = [self.solve(parameters, np.array(theta), 3, window) for _, theta in usable[:3]]
-        early.sort(key=_cost)
+        early = self.solve_each([Descent(parameters, np.array(theta), 3, window) for _, theta in usable[:3]])
+        early.sort(key=cost_of)
         distinct = [
             s for k, s in enumerate(early) if k == 0 or np.abs(s.theta - early[0].theta).max() > _DISTINCT
         ]
-        return min((self.solve(parameters, s.theta, 5) for s in distinct[:2]), key=_cost)
+        return min(self.solve_each([Descent(parameters, s.theta, 5) for s in distinct[:2]]), key=cost_of)
+
+    def costs(
+        self, name: str, parameters: list[Parameter], starts: list[np.ndarray], end: int
+    ) -> list[float | None]:
+        """Mean squared residual [m^2] at every start over the frames up to ``end``; None where the run failed."""
+
+        def measure() -> dict[str, Any]:
+            found = self.residuals([(parameters, theta, end) for theta in starts])
+            return {"costs": [float(np.mean(residual**2)) for residual in found]}
+
+        costs: list[float | None] = self.step(name, measure)["costs"]
+        return costs
 
     def solve(
         self, parameters: list[Parameter], theta: np.ndarray, iterations: int, end: int | None = None
     ) -> Optimum:
         """Gauss-Newton over the frames up to ``end`` (all training frames by default)."""
+        return self.solve_each([Descent(parameters, theta, iterations, end)])[0]
 
-        def descend() -> dict[str, Any]:
-            found = gauss_newton(
-                lambda t: self.residual(parameters, t, end),
-                theta,
-                np.array([p.searched(p.low) for p in parameters]),
-                self._high(parameters),
-                np.array([p.step for p in parameters]),
-                iterations,
-            )
-            return {"theta": found.theta.tolist(), "cost": found.cost}
+    def solve_each(self, asked: list[Descent]) -> list[Optimum]:
+        """Optima of descents that do not depend on each other, side by side where the runner shares its simulations.
 
-        found = self.step("solve " + " ".join(p.name for p in parameters), descend)
-        cost = float("nan") if found["cost"] is None else found["cost"]
-        return Optimum(np.array(found["theta"]), cost)
+        They are counted one after the other in any case; where the budget might end within them they are also done so.
+        """
+        worst = sum(most_runs(len(one.parameters), one.iterations) for one in asked)
+        together = len(asked) > 1 and self.runner is not in_turn and self.simulations + worst <= self.limit
+        made: dict[int, _Descended] = {}
+        found = []
+        for k, one in enumerate(asked):
+
+            def descend(k: int = k, one: Descent = one) -> dict[str, Any]:
+                if not together:
+                    ended = self._alone(one)
+                else:
+                    if not made:  # those before it are in the journal
+                        made.update(enumerate(self._side_by_side(asked[k:]), k))
+                    ended = made[k].optimum
+                    self.simulations += made[k].runs
+                    for loss in made[k].losses:
+                        self._remember(loss, None)
+                return {"theta": ended.theta.tolist(), "cost": ended.cost}
+
+            kept = self.step("solve " + " ".join(p.name for p in one.parameters), descend)
+            cost = float("nan") if kept["cost"] is None else kept["cost"]
+            found.append(Optimum(np.array(kept["theta"]), cost))
+        return found
+
+    def _alone(self, one: Descent) -> Optimum:
+        """A descent whose runs count at once."""
+        asking = self._descent(one)
+        asked = next(asking)
+        while True:
+            try:
+                asked = asking.send(self.residuals([(one.parameters, theta, one.end) for theta in asked]))
+            except StopIteration as ended:
+                return Optimum(ended.value.theta, ended.value.cost)
+
+    def _side_by_side(self, several: list[Descent]) -> list[_Descended]:
+        """Descents in step with each other: what all of them ask for next is run together."""
+        asking = [self._descent(one) for one in several]
+        asked = {k: next(one) for k, one in enumerate(asking)}
+        runs, losses = [0] * len(several), [[] for _ in several]  # type: ignore[var-annotated]
+        found: dict[int, Optimum] = {}
+        while asked:
+            places = [(several[k].parameters, theta, several[k].end) for k in asked for theta in asked[k]]
+            measured = self._measured(places)
+            for k in list(asked):
+                residuals = []
+                for theta in asked[k]:
+                    residual, loss = next(measured)
+                    runs[k] += 1
+                    if loss is not None:
+                        if several[k].end in (None, self.end):
+                            losses[k].append(loss)
+                        self._tell(self.simulations + sum(runs), loss, (several[k].parameters, theta, None))
+                    residuals.append(residual)
+                try:
+                    asked[k] = asking[k].send(residuals)
+                except StopIteration as ended:
+                    found[k] = Optimum(ended.value.theta, ended.value.cost)
+                    del asked[k]
+        return [_Descended(found[k], runs[k], losses[k]) for k in range(len(several))]
+
+    def _descent(self, one: Descent) -> LeastSquares:
+        low = np.array([p.searched(p.low) for p in one.parameters])
+        return descent(one.theta, low, self._high(one.parameters), _steps(one.parameters), one.iterations)
 
     def linearise(self, parameters: list[Parameter], optimum: Optimum) -> Solution | None:
         """Residual and sensitivities at an optimum; None where the budget does not reach."""
         if self.simulations + 1 + len(parameters) > self.limit:
             return None
-        now = self.residual(parameters, optimum.theta)
+        probes = probes_of(optimum.theta, self._high(parameters), _steps(parameters))
+        now, *there = self.residuals([(parameters, theta, None) for theta in (optimum.theta, *probes)])
         if not np.isfinite(now).all():
             return None
-        jacobian = finite_differences(
-            lambda t: self.residual(parameters, t),
-            optimum.theta,
-            now,
-            self._high(parameters),
-            np.array([p.step for p in parameters]),
-        )
+        jacobian = differences(optimum.theta, now, _steps(parameters), probes, there)
         return Solution(optimum.theta, float(np.mean(now**2)), now, jacobian)
 
     def screen(
@@ -196,9 +270,11 @@ class Search:
             basis = np.linalg.qr(solution.jacobian)[0]
             left = solution.residual - basis @ (basis.T @ solution.residual)
             gains = {}
-            for candidate in candidates:
-                theta = np.append(optimum.theta, _probe(candidate))
-                effect = self.residual([*parameters, candidate], theta) - solution.residual
+            probed = self.residuals(
+                [([*parameters, c], np.append(optimum.theta, _probe(c)), None) for c in candidates]
+            )
+            for candidate, there in zip(candidates, probed, strict=True):
+                effect = there - solution.residual
                 effect = effect - basis @ (basis.T @ effect)
                 along = float(effect @ left)
                 helps = candidate.prior != 0.0 or along < 0.0  # drag and friction push one way only
@@ -241,7 +317,7 @@ class Search:
         frames = slice(self.begin, self.end)
         mask = self.scene.visible[frames]
         error = np.where(mask[..., None], self.scene.points[frames] - twin.track_nodes(nodes)[frames], 0.0)
-        gradient = _deformation(twin, nodes)[frames]
+        gradient = material_frames(twin, nodes)[frames]
         local = np.linalg.solve(gradient, error[..., None])[..., 0]
         seen = np.maximum(mask.sum(axis=0), 1)[:, None]
         limit = _OFFSET_CLIP_SIGMAS * sigma
@@ -258,39 +334,49 @@ class Search:
         self.simulations, self.history = found["simulations"], list(found["history"])
         return found
 
+    def _measured(
+        self, places: list[tuple[list[Parameter], np.ndarray, int | None]]
+    ) -> Iterator[tuple[np.ndarray, float | None]]:
+        """Residuals at places and their root mean squares [m], None where the run failed; nothing is counted."""
+        times, controls = self.scene.control_track()
+        drive = Drive(times, controls, self.scene.times)
+        jobs = [
+            Job(self.twin_at(parameters, theta), self.end if end is None else end)
+            for parameters, theta, end in places
+        ]
+        made = self.runner(jobs, drive, self._poll) if jobs else iter(())
+        for job, tracks in zip(jobs, made, strict=True):
+            if tracks is None:
+                yield self._nothing(job.frames), None
+                continue
+            visible = self.scene.visible[self.begin : job.frames]
+            target = self.scene.points[self.begin : job.frames]
+            residual = (tracks[self.begin :][visible] - target[visible]).reshape(-1)
+            yield residual, float(np.sqrt(np.mean(residual**2)))
+
+    def _nothing(self, end: int | None) -> np.ndarray:
+        """The residual of a run that failed."""
+        visible = self.scene.visible[self.begin : self.end if end is None else end]
+        return np.full(3 * int(visible.sum()), np.nan)
+
+    def _remember(self, loss: float, end: int | None) -> None:
+        if end in (None, self.end):
+            self.history.append(min(loss, self.history[-1]) if self.history else loss)
+
+    def _tell(self, done: int, loss: float, place: tuple[list[Parameter], np.ndarray, int | None]) -> None:
+        if self.progress is not None:
+            pairs = zip(*place[:2], strict=True)
+            values = ", ".join(f"{p.name} {p.value(float(t)):.3g}" for p, t in pairs)
+            self.progress(done, self.max_simulations, f"{loss * 1e3:.2f} mm at {values}")
+
     @staticmethod
     def _high(parameters: list[Parameter]) -> np.ndarray:
         return np.array([p.searched(p.high) for p in parameters])
 
-    def _poll(self, done: int, total: int) -> None:
+    def _poll(self, *frames: int) -> None:
         if self.cancelled is not None and self.cancelled():
-            raise Cancelled(f"calibration cancelled in run {self.simulations} at frame {done} of {total}")
-
-
-def _deformation(twin: Twin, carriers: np.ndarray) -> np.ndarray:
-    """Where material directions point, (T, N, 3, 3): columns of the deformation gradient; a sheet's normal last.
-
-    Carriers that are particles have no shape functions that last: neighbours of a point are followed instead.
-    """
-    lattice, points = twin.lattice, twin.body.points
-    columns = []
-    for axis in range(lattice.dim):
-        if twin.formulation == "updated_lagrangian":
-            step = np.zeros(lattice.dim)
-            step[axis] = _BESIDE * lattice.spacing[axis]
-            ends = [
-                replace(twin, body=replace(twin.body, points=points + sign * step)).track_nodes(carriers)
-                for sign in (-1.0, 1.0)
-            ]
-            columns.append((ends[1] - ends[0]) / (2.0 * step[axis]))
-        else:
-            slope = lattice.interpolation(points, tuple(int(a == axis) for a in range(lattice.dim)))
-            flat = carriers.transpose(1, 0, 2).reshape(carriers.shape[1], -1)
-            columns.append((slope @ flat).reshape(len(points), len(carriers), 3).transpose(1, 0, 2))
-    if lattice.dim == 2:
-        normal = np.cross(*columns)
-        columns.append(normal / np.linalg.norm(normal, axis=-1, keepdims=True))
-    return np.stack(columns, axis=-1)
+            where = "" if not frames else f" at frame {frames[0]} of {frames[1]}"
+            raise Cancelled(f"calibration cancelled after {self.simulations} runs{where}")
 
 
 def _probe(candidate: Parameter) -> float:
@@ -299,5 +385,10 @@ def _probe(candidate: Parameter) -> float:
     return searched if candidate.prior == 0.0 else searched + 2 * candidate.step
 
 
-def _cost(optimum: Optimum) -> float:
+def _steps(parameters: list[Parameter]) -> np.ndarray:
+    return np.array([p.step for p in parameters])
+
+
+def cost_of(optimum: Optimum) -> float:
+    """Its cost, infinite where it is not a number: a key to sort by."""
     return optimum.cost if np.isfinite(optimum.cost) else float("inf")

@@ -21,6 +21,7 @@ from physworld.calibrate.losses import training_losses
 from physworld.calibrate.search import Progress
 from physworld.errors import CalibrationError, NotDifferentiable, SceneUnsupported
 from physworld.scene import Scene
+from physworld.simulations import Runner, in_turn
 
 Stages = Literal["global", "global+local"]
 GLOBAL: Stages = "global"
@@ -34,6 +35,7 @@ def calibrate_in_stages(
     progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
     journal: Journal | None = None,
+    runner: Runner = in_turn,
 ) -> FitResult:
     """Fit a twin to the training frames of ``scene``, and a field over its body where that is asked for.
 
@@ -44,6 +46,7 @@ def calibrate_in_stages(
         local: settings of the local stage; None for the defaults.
         progress: called with (runs done, runs at most, message).
         cancelled: polled every frame of every run.
+        runner: where simulations of the global stage run that do not depend on each other.
         journal: finished steps of an earlier attempt; one of the global stage alone is gone on from.
 
     Raises:
@@ -61,7 +64,7 @@ def calibrate_in_stages(
                 f"the local stage needs the total Lagrangian form, whose runs have a gradient; this body is of the "
                 f"{form.replace('_', ' ')} one"
             )
-    fitted = calibrate(scene, config, progress, cancelled, journal)
+    fitted = calibrate(scene, config, progress, cancelled, journal, runner)
     if stages == GLOBAL:
         return fitted
 

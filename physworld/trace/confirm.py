@@ -11,12 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physworld.simulations import Job
 from physworld.trace.candidates import Candidate
 from physworld.trace.comparison import CrossValidation, better_beyond_chance, cross_validated
 from physworld.trace.holds import held_otherwise
 from physworld.trace.refit import Refit, refit
 from physworld.trace.score import Score, orthonormal, project
-from physworld.trace.simulations import Job, Simulations
+from physworld.trace.simulations import Simulations
 from physworld.trace.unknowns import CLAMP, Unknown, at
 from physworld.trace.whitening import Whitener
 

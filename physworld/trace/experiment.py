@@ -24,9 +24,10 @@ from typing import Any
 import numpy as np
 
 from physworld.scene import Scene
+from physworld.simulations import Drive
 from physworld.trace.experiment_search import ExperimentConfig, Search, Tried
 from physworld.trace.rivals import Rival, rival_of
-from physworld.trace.simulations import Drive, Simulations
+from physworld.trace.simulations import Simulations
 from physworld.twin import Twin
 
 __all__ = ["Experiment", "ExperimentConfig", "Rival", "propose", "rival_of"]

@@ -21,7 +21,8 @@ from physworld.build import build_twin
 from physworld.errors import SceneUnsupported
 from physworld.evaluate.numerics import refined
 from physworld.scene import Scene
-from physworld.trace.simulations import Drive, Job, Memory, Progress, Runner, Simulations, in_turn, nodes_of
+from physworld.simulations import Drive, Job, Runner, in_turn, nodes_of
+from physworld.trace.simulations import Memory, Progress, Simulations
 from physworld.trace.split import Split, freeze
 from physworld.trace.whitening import moved, responses
 from physworld.twin import Twin

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physworld.simulations import Job
 from physworld.trace.sensitivity import sensitivities
-from physworld.trace.simulations import Job, Simulations
+from physworld.trace.simulations import Simulations
 from physworld.trace.unknowns import Unknown, at
 from physworld.trace.whitening import Whitener
 from physworld.twin import Twin

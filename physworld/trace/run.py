@@ -21,6 +21,7 @@ from physworld.calibrate.parameters import BENDING_COUPLING, BENDING_RATIO, TWIS
 from physworld.errors import SceneUnsupported
 from physworld.grips import softly_held
 from physworld.scene import Scene
+from physworld.simulations import Job, Runner, in_turn, stage_s
 from physworld.trace.candidates import Candidate, candidates
 from physworld.trace.comparison import cross_validated
 from physworld.trace.config import TraceConfig
@@ -49,14 +50,7 @@ from physworld.trace.sensitivity import (
     numerical_directions,
     refinement_of,
 )
-from physworld.trace.simulations import (
-    Job,
-    Memory,
-    Progress,
-    Runner,
-    in_turn,
-    stage_s,
-)
+from physworld.trace.simulations import Memory, Progress
 from physworld.trace.start_pose import turned_starts
 from physworld.trace.unknowns import Unknown, clamp_reach, grip_softness, of_parameter
 from physworld.trace.verdict import (

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physworld.simulations import Job
 from physworld.trace.candidates import Candidate
 from physworld.trace.comparison import better_beyond_chance, cross_validated
 from physworld.trace.config import TraceConfig
@@ -17,7 +18,7 @@ from physworld.trace.intervals import numbers
 from physworld.trace.refit import Refit, refit
 from physworld.trace.result import Number
 from physworld.trace.sensitivity import refinement_of
-from physworld.trace.simulations import Job, Simulations
+from physworld.trace.simulations import Simulations
 from physworld.trace.unknowns import with_strengths
 from physworld.trace.verdict import accounts, simplest
 from physworld.trace.whitening import Whitener

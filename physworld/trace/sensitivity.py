@@ -8,8 +8,9 @@ import numpy as np
 
 from physworld.evaluate.numerics import refined
 from physworld.scene import Scene
+from physworld.simulations import Job
 from physworld.trace.candidates import Candidate
-from physworld.trace.simulations import Job, Simulations
+from physworld.trace.simulations import Simulations
 from physworld.trace.unknowns import Unknown, at
 from physworld.trace.whitening import Whitener
 from physworld.twin import Twin

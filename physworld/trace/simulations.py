@@ -1,157 +1,21 @@
-"""Simulations of a trace: jobs that are independent of each other, counted, remembered, and run wherever there is room.
+"""Simulations of a trace, counted and remembered.
 
-A job says what to simulate; a *runner* maps jobs to tracks, in this process or in others. What was run is remembered
-under the job's fingerprint, so a trace that was cut off and starts again with the same memory goes on where it was.
+What was run is remembered under the job's fingerprint, so a trace that was cut off and starts again with the same
+memory goes on where it was.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
-from multiprocessing import get_context
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
-from physworld.errors import Cancelled, CFLViolation, SimulationError
-from physworld.mpm.total_lagrangian import TotalLagrangian, run_again_if_blown_up
-from physworld.twin import Twin
+from physworld.errors import Cancelled
+from physworld.simulations import Drive, Job, Runner, in_turn
 
 Progress = Callable[[int, int, str], None]
-
-
-@dataclass(frozen=True)
-class Job:
-    """One simulation.
-
-    Attributes:
-        twin: what moves.
-        frames: from the first frame to before this one.
-        step_share: time step over the stable one.
-        least_step_s: a twin that gets less far by one evaluation of its forces is not run.
-    """
-
-    twin: Twin
-    frames: int
-    step_share: float = 1.0
-    least_step_s: float = 0.0
-
-    def fingerprint(self, drive: bytes) -> str:
-        """Digest of everything that the result depends on; ``drive`` stands for times and controls."""
-        digest = hashlib.sha256(drive)
-        arrays = self.twin.to_arrays()
-        for name in sorted(arrays):
-            value = np.ascontiguousarray(arrays[name])
-            digest.update(f"{name} {value.dtype} {value.shape}".encode())
-            digest.update(value.tobytes())
-        digest.update(json.dumps([self.frames, self.step_share]).encode())
-        return digest.hexdigest()
-
-
-@dataclass(frozen=True)
-class Drive:
-    """What drives every simulation of a scene: control track (Tc,), (Tc, K, 3) and frame times (T,)."""
-
-    control_times: np.ndarray
-    control_points: np.ndarray
-    times: np.ndarray
-
-    def digest(self) -> bytes:
-        """Fingerprint."""
-        digest = hashlib.sha256()
-        for value in (self.control_times, self.control_points, self.times):
-            digest.update(np.ascontiguousarray(value, dtype=float).tobytes())
-        return digest.digest()
-
-
-def nodes_of(job: Job, drive: Drive, poll: Callable[[int, int], None] | None = None) -> np.ndarray:
-    """Nodes (frames, n, 3) [m] of a job. Raises SimulationError."""
-    run = job.twin.integration(drive.control_times, drive.control_points, drive.times[: job.frames])
-    solver = TotalLagrangian(run.problem)
-    if solver.stage_s < job.least_step_s:
-        raise CFLViolation(
-            f"{solver.stage_s:.3g} s for an evaluation of the forces is below {job.least_step_s:.3g} s, which a "
-            "trace waits for"
-        )
-    if job.step_share != 1.0:
-        solver = TotalLagrangian(run.problem, job.step_share * solver.time_step_s)
-    nodes = run_again_if_blown_up(solver, job.twin.body.start, run.velocity, run.held, run.knots, poll)
-    return run.at_frames(job.twin.body.start, nodes)
-
-
-def stage_s(twin: Twin, drive: Drive) -> float:
-    """How far one evaluation of its forces brings a twin [s]: its stable time step, or a stage of its friction."""
-    run = twin.integration(drive.control_times, drive.control_points, drive.times[:2])
-    return TotalLagrangian(run.problem).stage_s
-
-
-def tracks_of(job: Job, drive: Drive, poll: Callable[[int, int], None] | None = None) -> np.ndarray | None:
-    """Observed points (frames, N, 3) [m] of a job; None where the run cannot be trusted."""
-    try:
-        nodes = nodes_of(job, drive, poll)
-    except SimulationError:
-        return None
-    tracks = job.twin.observe(nodes, drive.times[: job.frames])
-    return tracks if np.isfinite(tracks).all() else None
-
-
-class Runner(Protocol):
-    """Yields the tracks of jobs in their order; None for a run that cannot be trusted. ``poll`` may raise to stop."""
-
-    def __call__(
-        self, jobs: Sequence[Job], drive: Drive, poll: Callable[[], None]
-    ) -> Iterator[np.ndarray | None]: ...
-
-
-def in_turn(jobs: Sequence[Job], drive: Drive, poll: Callable[[], None]) -> Iterator[np.ndarray | None]:
-    """The runner of this process."""
-    for job in jobs:
-        yield tracks_of(job, drive, lambda done, total: poll())
-
-
-class Workers:
-    """A runner over processes of its own, which share Warp's cache of kernels; a context manager."""
-
-    def __init__(self, processes: int = 2) -> None:
-        self._pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=_quiet)
-
-    def __enter__(self) -> Workers:
-        return self
-
-    def __exit__(self, *failure: object) -> None:
-        self._pool.shutdown(wait=True, cancel_futures=True)
-
-    def __call__(
-        self, jobs: Sequence[Job], drive: Drive, poll: Callable[[], None]
-    ) -> Iterator[np.ndarray | None]:
-        """Every job in a process; ``poll`` is called before each is waited for."""
-        futures = [
-            self._pool.submit(_work, job.twin.to_arrays(), job.twin.device, _facts(job), drive)
-            for job in jobs
-        ]
-        for future in futures:
-            poll()
-            yield future.result()
-
-
-def _quiet() -> None:
-    import warp as wp
-
-    wp.config.quiet = True
-
-
-def _facts(job: Job) -> tuple[int, float, float]:
-    return job.frames, job.step_share, job.least_step_s
-
-
-def _work(
-    arrays: dict[str, np.ndarray], device: str, facts: tuple[int, float, float], drive: Drive
-) -> np.ndarray | None:
-    return tracks_of(Job(Twin.from_arrays(arrays, device), *facts), drive)
 
 
 class Memory:

@@ -14,12 +14,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from physworld.simulations import Job
 from physworld.trace.candidates import Candidate
 from physworld.trace.confirm import Confirmation, Model
 from physworld.trace.refit import Refit
 from physworld.trace.score import Scores
 from physworld.trace.sensitivity import sensitivities
-from physworld.trace.simulations import Job, Simulations
+from physworld.trace.simulations import Simulations
 from physworld.trace.unknowns import at
 from physworld.trace.whitening import Whitener
 

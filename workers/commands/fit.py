@@ -47,6 +47,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--stages", default="global", help="global, or global+local: a field on top if it holds"
     )
+    parser.add_argument("--processes", type=_count, default=1, help="processes that share the simulations")
     parser.add_argument(
         "--resume",
         type=Path,
@@ -71,6 +72,7 @@ def _fit(given: argparse.Namespace) -> None:
 
     wp.config.quiet = True  # before the first import that starts it
     from physworld.calibrate import CalibrationConfig, calibrate_in_stages
+    from physworld.simulations import Workers, in_turn
     from workers.commands.terminal import progress_bar, read_scene
     from workers.law_choice import AUTO, chosen_laws
     from workers.tasks.fit_accuracy import fit_accuracy, not_measured
@@ -87,8 +89,11 @@ def _fit(given: argparse.Namespace) -> None:
     journal = None if given.resume is None else _journal(given.resume, scene, f"{given.law} {config}")
     with progress_bar(f"law {scene.name}") if given.law == AUTO else nullcontext() as shown:
         config, choice = chosen_laws(given.law, scene, config, shown, journal=journal)
-    with progress_bar(f"fit {scene.name}") as shown:
-        fitted = calibrate_in_stages(scene, config, given.stages, progress=shown, journal=journal)
+    pool = Workers(given.processes) if given.processes > 1 else nullcontext(in_turn)
+    with progress_bar(f"fit {scene.name}") as shown, pool as runner:
+        fitted = calibrate_in_stages(
+            scene, config, given.stages, progress=shown, journal=journal, runner=runner
+        )
     accuracy = not_measured("left out by --quick")
     if not given.quick:
         with progress_bar(f"numerics {scene.name}") as shown:

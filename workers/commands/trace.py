@@ -73,9 +73,9 @@ def _trace(given: argparse.Namespace) -> None:
     import numpy as np
 
     from physworld.calibrate import CalibrationConfig, Journal
+    from physworld.simulations import in_turn
     from physworld.trace import Memory, TraceConfig, Workers, document, trace
     from physworld.trace.html import render
-    from physworld.trace.simulations import in_turn
     from workers.commands.terminal import progress_bar, read_scene
 
     scenes = [read_scene(path) for path in given.scenes]

@@ -1,7 +1,8 @@
 """Calibrates a twin on a scene's training frames and measures it on the frames that were held out.
 
 Artifacts: ``twin.npz``, ``prediction.npz`` and ``report.json``, see :mod:`workers.tasks.fit_report`. The journal of
-the search lies in the data folder until the fit is stored: a killed worker's fit goes on where it was.
+the search lies in the data folder until the fit is stored: a killed worker's fit goes on where it was. Simulations that
+do not depend on each other are shared with whatever worker is free (:mod:`workers.tasks.shared_runs`).
 """
 
 from __future__ import annotations
@@ -13,8 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from physworld.calibrate import CalibrationConfig, Journal, calibrate_in_stages
+from physworld.errors import PhysworldError
 from schemas.fit import FitConfig
+from storage import helpers
 from workers.context import TaskContext
+from workers.errors import Cancelled
 from workers.law_choice import chosen_laws
 from workers.lineage import lineage_of
 from workers.registry import HandlerResult
@@ -22,12 +26,27 @@ from workers.stores import Stores
 from workers.tasks.fit_accuracy import fit_accuracy, not_measured
 from workers.tasks.fit_report import MEDIA_TYPES, fit_files, fit_report
 from workers.tasks.inputs import scene_of, scene_reference
+from workers.tasks.shared_runs import SharedRunner
 
 JOURNAL = "fit.json"
+WORTH_SHARING_S = 0.3  # to hand a simulation to another worker takes some hundredths of a second
 
 
 def run(context: TaskContext, stores: Stores) -> HandlerResult:
-    """Fit, measure, store."""
+    """Fit, measure, store; what the job's simulations leave in the scratch goes with it."""
+    with stores.database.session() as session:
+        helpers.call_off(session, context.lease.job_id)  # those of an attempt that was lost
+    try:
+        made = _fitted(context, stores)
+        context.check()
+    except (PhysworldError, Cancelled):
+        stores.scratch.remove(context.lease.job_id)
+        raise
+    stores.scratch.remove(context.lease.job_id)
+    return made
+
+
+def _fitted(context: TaskContext, stores: Stores) -> HandlerResult:
     payload = context.lease.payload
     config = FitConfig.model_validate(payload["config"])
     scene = scene_of(stores, payload["scene_id"])
@@ -48,7 +67,13 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     journal = stored_journal(folder / JOURNAL, payload)
     calibration, law = chosen_laws(config.law, scene, calibration, progress, context.cancelled, journal)
     fitted = calibrate_in_stages(
-        scene, calibration, config.stages, progress=progress, cancelled=context.cancelled, journal=journal
+        scene,
+        calibration,
+        config.stages,
+        progress=progress,
+        cancelled=context.cancelled,
+        journal=journal,
+        runner=SharedRunner(context, stores, WORTH_SHARING_S),
     )
     accuracy = not_measured("left out by the request")
     if config.numerics:

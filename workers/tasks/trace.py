@@ -8,42 +8,32 @@ calibration's journal: a trace whose worker was killed goes on where it was, on 
 
 from __future__ import annotations
 
-import io
 import json
 import re
-import time
-from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from physworld.calibrate import CalibrationConfig, Journal
 from physworld.errors import PhysworldError
-from physworld.trace import Memory, TraceConfig, trace
-from physworld.trace.simulations import Drive, Job, tracks_of
+from physworld.trace import TraceConfig, trace
 from physworld.twin import Twin
 from schemas.base import Reference
 from schemas.fit import FitConfig
 from schemas.trace import TraceConfig as WireConfig
 from storage import helpers, resources
-from storage.errors import NotFound
-from storage.opening import DONE, QUEUED
 from workers.context import TaskContext
 from workers.errors import Cancelled
-from workers.execute import Runtime, run_shard
 from workers.lineage import lineage_of
-from workers.owner import process_owner
 from workers.registry import HandlerResult
 from workers.stores import Stores
-from workers.tasks.inputs import fit_reference, npz_arrays, npz_bytes, scene_of, scene_reference, twin_of
+from workers.tasks.inputs import fit_reference, scene_of, scene_reference, twin_of
+from workers.tasks.shared_runs import SharedMemory, SharedRunner
 from workers.tasks.trace_report import trace_files, trace_report
 
 if TYPE_CHECKING:
     from physworld.scene import Scene
 
 JOURNAL = "calibration.json"
-LOOK_S = 0.1
 _STAGES = (  # of a trace, with the share of its work that is done when one begins
     ("declared physics", 0.35),
     ("numerics", 0.45),
@@ -86,103 +76,6 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     context.check()
     stores.scratch.remove(context.lease.job_id)
     return HandlerResult(found, artifacts[0].sha256)
-
-
-def simulate(context: TaskContext, stores: Stores) -> HandlerResult:
-    """One simulation of a trace: from the scratch, to the scratch."""
-    job_id, payload = context.lease.job_id, context.lease.payload
-    drive = stores.cached(
-        ("drive", job_id, payload["drive"]), lambda: _read_drive(stores, job_id, payload["drive"])
-    )
-    twin = Twin.from_arrays(_read(stores, job_id, payload["twin"]), stores.settings.device)
-    tracks = tracks_of(Job(twin, **payload["job"]), drive, lambda done, total: context.check())
-    context.check()
-    SharedMemory(stores, job_id).put(payload["key"], tracks)
-    return HandlerResult({"trusted": tracks is not None})
-
-
-class SharedMemory(Memory):
-    """Tracks by fingerprint in the job's scratch folder; a run that cannot be trusted is an empty array."""
-
-    def __init__(self, stores: Stores, job_id: str) -> None:
-        super().__init__()
-        self._stores, self._job_id = stores, job_id
-
-    def get(self, key: str) -> tuple[bool, np.ndarray | None]:
-        """Whether the run is known, and its tracks."""
-        data = self._stores.scratch.get(self._job_id, f"{key}.npy")
-        if data is None:
-            return False, None
-        tracks = np.load(io.BytesIO(data), allow_pickle=False)
-        return True, tracks if tracks.size else None
-
-    def put(self, key: str, tracks: np.ndarray | None) -> None:
-        """Remember a run, unless it is known."""
-        if self._stores.scratch.has(self._job_id, f"{key}.npy"):
-            return
-        buffer = io.BytesIO()
-        np.save(buffer, np.empty(0) if tracks is None else tracks, allow_pickle=False)
-        self._stores.scratch.put(self._job_id, f"{key}.npy", buffer.getvalue())
-
-
-class SharedRunner:
-    """A runner over helper shards; a single simulation is run here at once."""
-
-    def __init__(self, context: TaskContext, stores: Stores) -> None:
-        self._context, self._stores = context, stores
-        self._job_id = context.lease.job_id
-        self._memory = SharedMemory(stores, self._job_id)
-        self._runtime = Runtime(stores.settings, stores.database, stores, process_owner())
-        self._count = 0
-
-    def __call__(
-        self, jobs: Sequence[Job], drive: Drive, poll: Callable[[], None]
-    ) -> Iterator[np.ndarray | None]:
-        """Tracks of the jobs in their order; None for a run that cannot be trusted."""
-        if len(jobs) == 1:
-            yield tracks_of(jobs[0], drive, lambda done, total: poll())
-            return
-        keys = [job.fingerprint(drive.digest()) for job in jobs]
-        shards = self._put_up(jobs, keys, drive)
-        for shard, key in zip(shards, keys, strict=True):
-            while not self._done(shard, shards, poll):
-                time.sleep(LOOK_S)
-            known, tracks = self._memory.get(key)
-            if not known:
-                raise NotFound("scratch file", f"{key}.npy of {self._job_id}")
-            yield tracks
-
-    def _put_up(self, jobs: Sequence[Job], keys: Sequence[str], drive: Drive) -> list[str]:
-        """Write what the simulations read, then announce them. Raises LeaseLost, Cancelled."""
-        scratch, place = self._stores.scratch, f"drive-{drive.digest().hex()[:32]}.npz"
-        if not scratch.has(self._job_id, place):
-            scratch.put(self._job_id, place, npz_bytes(vars(drive)))
-        payloads = []
-        for job, key in zip(jobs, keys, strict=True):
-            scratch.put(self._job_id, f"{key}.twin.npz", npz_bytes(job.twin.to_arrays()))
-            facts = {name: value for name, value in vars(job).items() if name != "twin"}
-            payloads.append({"key": key, "twin": f"{key}.twin.npz", "drive": place, "job": facts})
-        with self._stores.database.session() as session:
-            shards = helpers.put_up(session, self._context.lease, self._count, payloads)
-        self._count += len(payloads)
-        if len(shards) != len(payloads):
-            self._context.check()
-            raise Cancelled(f"job {self._job_id} goes on elsewhere")
-        return shards
-
-    def _done(self, shard: str, shards: Sequence[str], poll: Callable[[], None]) -> bool:
-        """Whether a shard is done, after doing one of those that nobody has taken, the last one first."""
-        poll()
-        with self._stores.database.reading() as session:
-            states = helpers.states_of(session, shards)
-        if states[shard] == DONE:
-            return True
-        waiting = [known for known in reversed(shards) if states[known] == QUEUED]
-        for known in waiting:
-            if run_shard(self._runtime, known) != "not claimed":
-                break
-        self._context.check()
-        return False
 
 
 def _traced(context: TaskContext, stores: Stores, scene: Scene) -> Any:
@@ -257,14 +150,3 @@ def _journal(stores: Stores, job_id: str, payload: dict[str, Any]) -> Journal:
         None if stored is None else stored.decode(),
         lambda text: stores.scratch.put(job_id, JOURNAL, text.encode()),
     )
-
-
-def _read_drive(stores: Stores, job_id: str, name: str) -> Drive:
-    return Drive(**_read(stores, job_id, name))
-
-
-def _read(stores: Stores, job_id: str, name: str) -> dict[str, np.ndarray]:
-    data = stores.scratch.get(job_id, name)
-    if data is None:
-        raise NotFound("scratch file", f"{name} of {job_id}")
-    return npz_arrays(data)

@@ -86,7 +86,7 @@ def test_the_weft_of_a_woven_sheet_is_found() -> None:
     )
     config = CalibrationConfig(damping="none", bending="declared", law="orthotropic_sheet")
     found = calibrate(recorded_by(known, scene, SIGMA_M), config).parameters
-    assert found["youngs_modulus_pa"].value == pytest.approx(MODULUS_PA, rel=0.03)
+    assert found["youngs_modulus_pa"].value == pytest.approx(MODULUS_PA, rel=0.05)
     weft = found["bending_weft_ratio"]
     assert weft.identified and weft.value == pytest.approx(0.4, rel=0.1)
 

@@ -164,6 +164,8 @@ def test_a_fit_that_was_ended_goes_on_from_its_file(bundle: Path, tmp_path: Path
     journal.write_text(json.dumps(ended))
     assert fitted("again.json") == whole
     assert json.loads(journal.read_text()) == stored
+    again = fitted("shared.json", "--processes", "2")  # shares them, and takes the same steps
+    assert again == whole and json.loads(journal.read_text()) == stored
     fitted("other.json", "--simulations", "40")  # other settings: none of those steps is read
     assert json.loads(journal.read_text())["key"] != stored["key"]
 

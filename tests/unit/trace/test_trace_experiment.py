@@ -16,6 +16,7 @@ from physworld.demonstrate.limits import limits_of
 from physworld.demonstrate.motion import broken_limit
 from physworld.effects.registry import effect
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
+from physworld.simulations import Drive, Job, nodes_of
 from physworld.trace import TraceConfig, document, trace
 from physworld.trace.experiment import Experiment, ExperimentConfig, Rival, propose
 from physworld.trace.experiment_search import clock_of
@@ -23,7 +24,7 @@ from physworld.trace.html import render
 from physworld.trace.probing import COORDINATES, motion_of, nudged, random_probe
 from physworld.trace.refit import Refit, refit
 from physworld.trace.rivals import reconciled, refit_of
-from physworld.trace.simulations import Drive, Job, Simulations, nodes_of
+from physworld.trace.simulations import Simulations
 from physworld.trace.split import Split
 from physworld.trace.unknowns import Unknown, of_parameter, of_strength
 from physworld.trace.whitening import responses, whitener

@@ -13,11 +13,11 @@ from physworld.calibrate.parameters import parameters_of
 from physworld.grips import softly_held
 from physworld.mpm.soft_grips import AS_HELD
 from physworld.scene import UNDEFORMED_AT_REST, Grip
+from physworld.simulations import Job
 from physworld.trace.holds import held_otherwise
 from physworld.trace.recordings import JointSimulations, Recordings
 from physworld.trace.refit import Refit
 from physworld.trace.sensitivity import sensitivities
-from physworld.trace.simulations import Job
 from physworld.trace.unknowns import SOFTNESS, grip_softness, of_parameter
 from physworld.trace.whitening import whitener
 

@@ -13,9 +13,10 @@ from physworld.calibrate import CalibrationConfig
 from physworld.effects.registry import effect
 from physworld.errors import SceneUnsupported
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
+from physworld.simulations import Job
 from physworld.trace import TraceConfig, document, trace
 from physworld.trace.recordings import FITTED, HELD_OUT, JointSimulations, Recordings, side_by_side
-from physworld.trace.simulations import Job, Simulations
+from physworld.trace.simulations import Simulations
 
 LOW, HIGH = np.array([0.0, -0.015, -0.015]), np.array([0.16, 0.015, 0.015])
 SIGMA, YOUNGS_MODULUS_PA, BUDGET = 5e-4, 1.5e5, 120

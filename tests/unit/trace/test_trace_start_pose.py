@@ -10,7 +10,7 @@ from made_scene import box_body, made_scene
 
 from physworld.build import build_twin
 from physworld.scene import AS_MEASURED, UNDEFORMED_AT_REST, Body, Scene
-from physworld.trace.simulations import Drive, Job, nodes_of
+from physworld.simulations import Drive, Job, nodes_of
 from physworld.trace.split import freeze
 from physworld.trace.start_pose import turned_starts
 from physworld.trace.whitening import responses, whitener

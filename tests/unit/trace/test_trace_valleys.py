@@ -12,11 +12,11 @@ from physworld.build import build_twin
 from physworld.calibrate.parameters import parameters_of
 from physworld.effects.registry import effect
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
+from physworld.simulations import Job
 from physworld.trace.candidates import candidates
 from physworld.trace.recordings import JointSimulations, Recordings
 from physworld.trace.refit import Refit
 from physworld.trace.sensitivity import sensitivities
-from physworld.trace.simulations import Job
 from physworld.trace.unknowns import of_parameter
 from physworld.trace.valleys import valleys
 from physworld.trace.whitening import whitener

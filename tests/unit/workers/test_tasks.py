@@ -13,11 +13,12 @@ from physworld.twin import Twin
 from schemas.dataset import Dataset, DatasetConfig
 from schemas.fit import Fit, FitConfig
 from schemas.job import Job
-from storage import jobs, leases, resources
-from storage.tables import EpisodeRow
+from storage import helpers, jobs, leases, resources
+from storage.tables import EpisodeRow, ShardRow
 from workers.execute import Runtime, run_shard
 from workers.stores import Stores
 from workers.tasks import dataset as dataset_task
+from workers.tasks import fit as fit_task
 from workers.tasks.fit import stored_journal
 from workers.tasks.inputs import named, npz_arrays, npz_bytes
 
@@ -33,6 +34,11 @@ def _drain(runtime: Runtime) -> list[str]:
         if not waiting:
             return outcomes
         outcomes += [run_shard(runtime, publication.shard_id) for publication in waiting]
+
+
+def _waiting(stores: Stores) -> list[str]:
+    with stores.database.reading() as session:
+        return [found.shard_id for found in leases.publishable(session, datetime.now(UTC))]
 
 
 def _job(stores: Stores, job: Job) -> Job:
@@ -234,3 +240,44 @@ def test_arrays_survive_the_npz_and_the_same_arrays_give_the_same_bytes() -> Non
     data = npz_bytes(arrays)
     assert data == npz_bytes(arrays)
     assert str(npz_arrays(data)["b"]) == "text"
+
+
+def test_a_fit_shares_its_simulations_and_finds_the_same(
+    runtime_with, stores: Stores, scene_id: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = FitConfig(particle_budget=60, max_simulations=40, damping="none", numerics=False)
+    fits, helped = [], []
+    for worth_s in (0.0, 1e9):
+        monkeypatch.setattr(fit_task, "WORTH_SHARING_S", worth_s)
+        with stores.database.session() as session:
+            job = jobs.create_fit(session, scene_id, config)
+        assert _drain(runtime_with()) == ["done"]
+        with stores.database.reading() as session:
+            fits.append(resources.get_fit(session, job.outputs[0].id))
+            shards = session.query(ShardRow).where(ShardRow.job_id == job.id).all()
+        helped.append([shard for shard in shards if shard.kind == helpers.SIMULATION])
+    assert len(helped[0]) > 10 and {shard.state for shard in helped[0]} == {"DONE"} and helped[1] == []
+    assert fits[0].parameters == fits[1].parameters
+    assert fits[0].metrics["simulations"] == fits[1].metrics["simulations"]
+    assert fits[0].metrics["training_loss_m"] == fits[1].metrics["training_loss_m"]
+    assert stores.scratch.jobs() == []
+
+
+def test_a_cancelled_fit_leaves_nothing_in_the_scratch(
+    runtime_with, stores: Stores, scene_id: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fit_task, "WORTH_SHARING_S", 0.0)
+    with stores.database.session() as session:
+        job = jobs.create_fit(session, scene_id, FitConfig(particle_budget=60, max_simulations=40))
+    put = stores.scratch.put
+
+    def cancelled_by_then(job_id: str, name: str, data: bytes) -> None:
+        put(job_id, name, data)
+        with stores.database.session() as session:
+            jobs.cancel_job(session, job_id)
+
+    monkeypatch.setattr(stores.scratch, "put", cancelled_by_then)
+    (driver,) = _waiting(stores)
+    assert run_shard(runtime_with(), driver) == "cancelled"
+    assert _job(stores, job).state == "cancelled"
+    assert stores.scratch.jobs() == []

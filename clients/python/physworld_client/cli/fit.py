@@ -40,6 +40,9 @@ def fit(
     stages: Annotated[
         str | None, typer.Option(help="global, or global+local: a field over the body on top, if it holds.")
     ] = None,
+    processes: Annotated[
+        int | None, typer.Option(min=1, help="Processes that share the simulations [1].")
+    ] = None,
     resume: Annotated[
         Path | None, typer.Option(help="File of finished steps: a fit that was ended goes on from it.")
     ] = None,
@@ -58,6 +61,7 @@ def fit(
         "--formulation": formulation,
         "--transfer": transfer,
         "--stages": stages,
+        "--processes": processes,
         "--resume": resume,
     }
     options = [text for name, value in given.items() if value is not None for text in (name, str(value))]
