@@ -7,8 +7,12 @@ manifest: an artifact that lists (path, digest) of every episode.
 
 Arrays (T frames, P particles, K controllers): ``times`` (T,) f8 [s]; ``particles`` (T, P, 3) f4 [m];
 ``controllers`` (T, K, 3) f4 [m]; ``properties`` (P, 2 or 3) f4, log(E/E_fit), log(rho/rho_fit) and, where the
-ground's friction is perturbed, log(mu/mu_fit).
+ground's friction is perturbed, log(mu/mu_fit); ``vertices`` (T, M, 3) f4 [m] and ``vertex_index`` (M,) i4: some of
+the particles again, those that a world model takes for its vertices, so that a training need not read the others.
 Chunks lie along the first axis inside a shard, so a window of frames can be read without the rest.
+
+The digest of an episode is over the digests of its arrays, so that a part can be read and verified alone. Episodes of
+the first format have one digest over all bytes and are read whole.
 """
 
 from __future__ import annotations
@@ -17,7 +21,7 @@ import asyncio
 import hashlib
 import json
 import re
-from collections.abc import Coroutine, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Coroutine, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
@@ -45,7 +49,7 @@ Arrays = dict[str, NDArray[Any]]
 CHUNK_BYTES = 1 << 20
 PACKED_BYTES = 1 << 14
 """Smaller arrays are not compressed: it would save less than a block of the disk."""
-FORMAT = "physworld-episode/1"
+FORMAT, FIRST_FORMAT = "physworld-episode/2", "physworld-episode/1"
 MANIFEST_NAME = "manifest.json"
 MANIFEST_TYPE = "application/json"
 DATASET_ID = re.compile(r"[A-Za-z0-9_-]+")
@@ -95,17 +99,22 @@ class EpisodeStore:
         path = episode_path(dataset_id, index, epoch)
         plain = {name: _plain(name, array) for name, array in arrays.items()}
         size = sum(array.nbytes for array in plain.values())
-        header = {"format": FORMAT, "arrays": sorted(plain), "attributes": dict(attributes)}
+        parts = {name: _part(array) for name, array in plain.items()}
+        header = {"format": FORMAT, "arrays": parts, "attributes": dict(attributes)}
         try:
             with writing(f"episode {path}", size, self._settings):
                 _finish(_write_group(self._zarr(path), header, plain))
         except StoreError:
             self._remove_quietly(path)
             raise
-        return path, arrays_digest(plain)
+        return path, _digest_of(parts)
 
-    def read(self, path: str, digest: str | None = None) -> tuple[Arrays, dict[str, Any]]:
+    def read(
+        self, path: str, digest: str | None = None, names: Collection[str] | None = None
+    ) -> tuple[Arrays, dict[str, Any]]:
         """Arrays and attributes of an episode, checked against ``digest`` where it is given.
+
+        ``names``: the arrays to read, those of them that there are; all without it.
 
         Raises NotFound, or EpisodeCorrupt when it cannot be decoded or is not what was committed.
         """
@@ -115,18 +124,41 @@ class EpisodeStore:
             group = zarr.open_group(self._zarr(path), mode="r", zarr_format=3, use_consolidated=False)
             header = dict(group.attrs)
         with _decoding(path), reading("array of episode", path, self._settings):
-            if header.get("format") != FORMAT:
-                raise EpisodeCorrupt(f"{path} has format {header.get('format')!r}, known is {FORMAT!r}")
-            arrays = {str(name): _read_array(group, str(name)) for name in _list(header, "arrays")}
-        if digest is not None and (found := arrays_digest(arrays)) != digest:
-            raise EpisodeCorrupt(f"{path} has the digest {found}, committed was {digest}")
+            layout = header.get("format")
+            if layout not in (FORMAT, FIRST_FORMAT):
+                raise EpisodeCorrupt(f"{path} has format {layout!r}, known is {FORMAT!r}")
+            kept: Any = header["arrays"]
+            wanted = [name for name in kept if names is None or layout == FIRST_FORMAT or name in names]
+            arrays = {str(name): _read_array(group, str(name)) for name in wanted}
+        if digest is not None:
+            self._check(path, digest, arrays, kept)
+        if names is not None:
+            arrays = {name: array for name, array in arrays.items() if name in names}
         attributes = header.get("attributes")
         return arrays, dict(attributes) if isinstance(attributes, dict) else {}
 
-    def verified(self, path: str, digest: str) -> tuple[Arrays, dict[str, Any]]:
+    @staticmethod
+    def _check(path: str, digest: str, arrays: Arrays, kept: Any) -> None:
+        """Raise EpisodeCorrupt unless the arrays that were read are of the episode with this digest."""
+        if isinstance(kept, dict):
+            with _decoding(path):
+                found = _digest_of(kept)
+                changed = [name for name, array in arrays.items() if _part(_plain(name, array)) != kept[name]]
+            if changed:
+                raise EpisodeCorrupt(
+                    f"{path}: {', '.join(changed)} do not have the digest they were written with"
+                )
+        else:
+            found = _first_digest(arrays)
+        if found != digest:
+            raise EpisodeCorrupt(f"{path} has the digest {found}, committed was {digest}")
+
+    def verified(
+        self, path: str, digest: str, names: Collection[str] | None = None
+    ) -> tuple[Arrays, dict[str, Any]]:
         """What :meth:`read` gives of a committed episode. Raises EpisodeCorrupt, also where it is gone."""
         try:
-            return self.read(path, digest)
+            return self.read(path, digest, names)
         except NotFound as error:
             raise EpisodeCorrupt(f"{path} was committed and is gone") from error
 
@@ -199,7 +231,24 @@ def episode_path(dataset_id: str, index: int, epoch: int) -> str:
 
 
 def arrays_digest(arrays: Mapping[str, NDArray[Any]]) -> str:
-    """SHA-256 over name, dtype, shape and little-endian bytes of every array, by name."""
+    """SHA-256 over names and digests of the arrays, by name; an array's is over dtype, shape, little-endian bytes."""
+    return _digest_of({name: _part(_plain(name, array)) for name, array in arrays.items()})
+
+
+def _part(array: NDArray[Any]) -> str:
+    """Digest of one plain array."""
+    digest = hashlib.sha256(json.dumps([array.dtype.str, array.shape]).encode())
+    digest.update(array.data if array.size else b"")
+    return digest.hexdigest()
+
+
+def _digest_of(parts: Mapping[str, str]) -> str:
+    """Digest of an episode from those of its arrays."""
+    return hashlib.sha256(json.dumps(sorted(parts.items())).encode()).hexdigest()
+
+
+def _first_digest(arrays: Mapping[str, NDArray[Any]]) -> str:
+    """Digest of an episode of the first format: over name, dtype, shape and bytes of every array, by name."""
     digest = hashlib.sha256()
     for name in sorted(arrays):
         array = _plain(name, arrays[name])
@@ -265,11 +314,6 @@ def _read_array(group: zarr.Group, name: str) -> NDArray[Any]:
     if not isinstance(stored, zarr.Array):
         raise EpisodeCorrupt(f"{group.path}/{name} is not an array")
     return np.asarray(stored[...])
-
-
-def _list(header: Mapping[str, Any], name: str) -> Sequence[Any]:
-    value = header.get(name)
-    return value if isinstance(value, list) else []
 
 
 def _checked(dataset_id: str) -> str:

@@ -2,7 +2,8 @@
 
 An episode's arrays: ``times`` (T,) [s], ``particles`` (T, P, 3) [m], ``controllers`` (T, K, 3) [m],
 ``properties`` (P, 2) = log(E/E_fit), log(ρ/ρ_fit), and log(μ/μ_fit) as a third where the ground's friction was
-perturbed. Everything random comes from the ``torch.Generator``
+perturbed. A stored episode may keep ``vertices`` (T, M, 3), the particles ``vertex_index`` (M,), beside or
+instead of the particles. Everything random comes from the ``torch.Generator``
 that is passed in.
 """
 
@@ -23,6 +24,7 @@ from physworld.worldmodel.nearest import cut_rest_length, cut_strain, near_ends
 SCALE_FLOOR_M = 1e-7
 PROPERTY_FLOOR = 0.05
 CLOCK_TOLERANCE = 1e-3
+VERTEX_ARRAYS = ("times", "controllers", "properties", "vertex_index", "vertices")
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,7 @@ def read_track(
 
     Raises DatasetUnusable with the numbers.
     """
-    times, particles, controllers = arrays["times"], arrays["particles"], arrays["controllers"]
+    times, controllers = arrays["times"], arrays["controllers"]
     frames = len(times)
     if frames < history + 2:
         raise DatasetUnusable(f"an episode of {frames} frames is shorter than history {history} + 2")
@@ -67,11 +69,16 @@ def read_track(
         raise DatasetUnusable(
             f"an episode's frames are {step:.6g} s apart, the model's clock is {spec.dt_s:.6g} s"
         )
-    if particles.shape[1] <= int(spec.particle_index.max()):
-        raise DatasetUnusable(f"an episode of {particles.shape[1]} particles is of another body")
-    vertices = np.concatenate(
-        [particles[:, spec.particle_index], controllers[:, spec.control_index]], axis=1, dtype=np.float64
-    )
+    if has_vertices(spec, arrays):
+        body = arrays["vertices"][:, : spec.object_count]
+    elif "particles" not in arrays or arrays["particles"].shape[1] <= int(spec.particle_index.max()):
+        raise DatasetUnusable(
+            f"an episode of {len(arrays['properties'])} particles is of another body: the graph has particle "
+            f"{int(spec.particle_index.max())}"
+        )
+    else:
+        body = arrays["particles"][:, spec.particle_index]
+    vertices = np.concatenate([body, controllers[:, spec.control_index]], axis=1, dtype=np.float64)
     phi = np.asarray(arrays["properties"], dtype=np.float64)[spec.particle_index]
     if strengths is not None:
         phi = np.concatenate([phi, np.broadcast_to(strengths, (len(phi), len(strengths)))], axis=1)
@@ -79,6 +86,12 @@ def read_track(
         raise DatasetUnusable("an episode holds values that are not finite")
     vertices -= graph_origin(spec, vertices[0, : spec.object_count])
     return Track(torch.as_tensor(vertices, dtype=torch.float32), torch.as_tensor(phi, dtype=torch.float32))
+
+
+def has_vertices(spec: GraphSpec, arrays: dict[str, np.ndarray]) -> bool:
+    """Whether an episode keeps the graph's vertices apart from its other particles (``VERTEX_ARRAYS``)."""
+    kept = arrays.get("vertex_index")
+    return kept is not None and np.array_equal(kept[: spec.object_count], spec.particle_index)
 
 
 def split_tracks(tracks: list[Track], fraction: float, seed: int) -> tuple[list[Track], list[Track]]:

@@ -2,7 +2,7 @@
 
 It is the function of ``rollout.unroll`` in single precision, several times faster: nothing is allocated and nothing
 returns to Python between steps. A candidate of a batch is rolled out exactly as it would be alone. The kernel releases
-the interpreter's lock, so threads share a batch.
+the interpreter's lock, so threads share a batch. A model on another device is copied: the engine is the CPU's.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ class RolloutEngine:
                 "prior_response": _floats(model.prior.response),
             }
         modal = model.prior if isinstance(model.prior, PriorStep) else None
-        self._placing = None if modal is None else modal.placing.numpy().astype(np.float64)
+        self._placing = None if modal is None else modal.placing.numpy(force=True).astype(np.float64)
         self._span = (0.0, 0.0) if modal is None else tuple(modal.span.tolist())
-        self._property_scale = norm.properties.numpy()
+        self._property_scale = norm.properties.numpy(force=True)
         change, velocity, length = (float(x) for x in (norm.change, norm.velocity, norm.length))
         scalars = [1.0 / velocity, change, 1.0 / length, spec.edge_radius_m, REST_RADII * spec.edge_radius_m]
         self._scalars = np.array(scalars, dtype=np.float32)
@@ -238,13 +238,13 @@ def _pack_weights(model: WorldModel, hidden: int) -> dict[str, np.ndarray]:
 def _padded(values: torch.Tensor, rows: int, columns: int) -> np.ndarray:
     """As float32 (rows, columns), filled up with zeros."""
     out = np.zeros((rows, columns), dtype=np.float32)
-    out[: values.shape[0], : values.shape[1]] = values.detach().numpy()
+    out[: values.shape[0], : values.shape[1]] = values.numpy(force=True)
     return out
 
 
 def _floats(values: torch.Tensor) -> np.ndarray:
-    return np.ascontiguousarray(values.detach().numpy(), dtype=np.float32)
+    return np.ascontiguousarray(values.numpy(force=True), dtype=np.float32)
 
 
 def _integers(values: torch.Tensor) -> np.ndarray:
-    return np.ascontiguousarray(values.numpy(), dtype=np.int32)
+    return np.ascontiguousarray(values.numpy(force=True), dtype=np.int32)

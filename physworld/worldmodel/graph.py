@@ -31,6 +31,7 @@ from physworld.worldmodel.errors import GraphInvalid
 
 NEAR, COARSE, GRIP = 0, 1, 2
 EDGE_KINDS = 3
+MOST_KEPT = 150
 
 
 @dataclass(frozen=True)
@@ -100,6 +101,14 @@ def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
         chosen.append(farthest)
         distance = np.minimum(distance, ((points - points[farthest]) ** 2).sum(axis=1))
     return np.asarray(chosen, dtype=np.int64)
+
+
+def kept_vertices(particles_rest: np.ndarray) -> np.ndarray:
+    """Particles (M,) that a store keeps beside all of them: the vertices of every graph with at most ``MOST_KEPT``.
+
+    A farthest-point sampling of fewer points is the beginning of one of more.
+    """
+    return farthest_points(particles_rest, MOST_KEPT)
 
 
 def choose_control_vertices(

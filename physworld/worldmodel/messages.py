@@ -64,11 +64,12 @@ def mean_messages_torch(
     edges: EdgeList, heard: Tensor, sent: Tensor, bias: Tensor, length: Tensor, weight: Tensor
 ) -> Tensor:
     """The same in plain torch, on any device and in any precision."""
-    along = sent.flatten(0, 1)[edges.senders] + heard.flatten(0, 1)[edges.receivers]
-    weights = weight[edges.receivers // heard.shape[1]]
+    senders, receivers = edges.senders.to(heard.device), edges.receivers.to(heard.device)
+    along = sent.flatten(0, 1)[senders] + heard.flatten(0, 1)[receivers]
+    weights = weight[receivers // heard.shape[1]]
     messages = torch.relu(along + bias[:, None] + length[..., None] * weights[:, None])
-    total = torch.zeros_like(heard).flatten(0, 1).index_add(0, edges.receivers, messages)
-    degree = torch.bincount(edges.receivers, minlength=len(total)).clamp(min=1)
+    total = torch.zeros_like(heard).flatten(0, 1).index_add(0, receivers, messages)
+    degree = edges.offsets.diff().clamp(min=1).to(heard.device)
     return (total / degree[:, None, None]).view_as(heard)
 
 

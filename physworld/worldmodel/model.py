@@ -196,7 +196,7 @@ class WorldModel(nn.Module):
         self.register_buffer("_receivers", receivers, persistent=False)
         kind_of_edge = self.edges.receivers // spec.vertex_count
         self._edges_by_kind = torch.bincount(kind_of_edge, minlength=EDGE_KINDS).tolist()
-        self._copies: dict[int, KeptEdges] = {}
+        self._copies: dict[tuple[int, torch.device], KeptEdges] = {}
 
     def forward(
         self, window: Tensor, ahead: Tensor, phi: Tensor, constants: EdgeConstants | None = None
@@ -243,10 +243,11 @@ class WorldModel(nn.Module):
     def _current_means(self, now: Tensor, shifted: Tensor, constants: EdgeConstants) -> Means:
         """The same with the NEAR edges of where the vertices are now."""
         batch, spec = shifted.shape[1], self.spec
-        if batch not in self._copies:
-            self._copies[batch] = KeptEdges(self.edges, spec.vertex_count, batch)
+        key = batch, now.device
+        if key not in self._copies:
+            self._copies[key] = KeptEdges(self.edges, spec.vertex_count, *key)
         found = CurrentEdges(
-            self._copies[batch],
+            self._copies[key],
             now[: spec.object_count],
             shifted,
             self._reference,

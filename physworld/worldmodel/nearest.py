@@ -68,13 +68,14 @@ def cut_rest_length(rest_length: Tensor, radius: float | Tensor) -> Tensor:
 class KeptEdges:
     """The COARSE and GRIP edges of B copies of a graph, side by side: vertex v of copy b is v B + b."""
 
-    def __init__(self, edges: EdgeList, vertices: int, batch: int) -> None:
-        element = torch.arange(batch)
-        receivers = (edges.receivers.long()[:, None] * batch + element).flatten()
+    def __init__(self, edges: EdgeList, vertices: int, batch: int, device: torch.device) -> None:
+        element = torch.arange(batch, device=device)
+        senders, receivers = (ends.to(device).long() for ends in (edges.senders, edges.receivers))
+        receivers = (receivers[:, None] * batch + element).flatten()
         order = torch.argsort(receivers, stable=True)
         self.rows = order // batch
         self.receivers = receivers[order].int()
-        self.senders = (edges.senders.long()[:, None] * batch + element).flatten()[order].int()
+        self.senders = (senders[:, None] * batch + element).flatten()[order].int()
         self.degree = torch.bincount(receivers, minlength=EDGE_KINDS * vertices * batch)
 
 
@@ -105,7 +106,8 @@ class CurrentEdges:
         """
         objects, batch = now.shape[:2]
         own = now.detach().permute(1, 0, 2).numpy(force=True)
-        senders, counts = (torch.from_numpy(found) for found in find_nearest(own, neighbours, radius_m))
+        searched = find_nearest(own, neighbours, radius_m)
+        senders, counts = (torch.from_numpy(found).to(now.device) for found in searched)
         by_receiver = senders.permute(1, 0, 2).long()  # (n, B, k)
         here = by_receiver >= 0
         vertex, element, _ = torch.nonzero(here, as_tuple=True)

@@ -1,8 +1,8 @@
 """The native search for the nearest vertices: all pairs, for graphs of a hundred or a few hundred vertices.
 
-At 146 vertices all pairs are 21,000 distances, which the vector units take in less time than a table of cells takes to
-be filled. ``NEAREST`` is a lambda that the rollout engine (``engine_kernels``) holds too: the same places give the same
-neighbours in training and in a rollout. CPU only.
+At 146 vertices all pairs are 21,000 distances, little beside the network's products; a table of cells would pay for
+thousands of vertices. ``NEAREST`` is a lambda that the rollout engine (``engine_kernels``) holds too: the same places
+give the same neighbours in training and in a rollout. CPU only.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ import numpy as np
 
 from physworld.demonstrate.config import StrengthRange
 from physworld.demonstrate.perturbation import BOUND_SIGMAS
-from physworld.worldmodel.dataset import Track, read_track
+from physworld.worldmodel.dataset import VERTEX_ARRAYS, Track, has_vertices, read_track
 from physworld.worldmodel.graph import GraphSpec
 from physworld.worldmodel.model import PROPERTY_COUNT
 from schemas.base import Reference
@@ -76,7 +76,10 @@ class Episodes:
                 )
             self._wait(f"waiting for episode {index} of {self.total}")
         self._context.check()
-        arrays, attributes = self._stores.episodes.verified(episode.path, episode.digest)
+        read = self._stores.episodes.verified
+        arrays, attributes = read(episode.path, episode.digest, VERTEX_ARRAYS)
+        if not has_vertices(self._spec, arrays):  # of an older release, or more vertices than were kept
+            arrays, attributes = read(episode.path, episode.digest)
         drawn = attributes.get("effect_strengths", {})
         own = [
             (drawn.get(f"{one.effect}.{one.name}", one.value) - one.value) / half(one)

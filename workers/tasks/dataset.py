@@ -34,6 +34,7 @@ from physworld.demonstrate.side_by_side import make_episodes
 from physworld.errors import SimulationError
 from physworld.scene import Scene
 from physworld.twin import Twin
+from physworld.worldmodel.graph import MOST_KEPT, kept_vertices
 from schemas.dataset import DatasetConfig, Episode
 from schemas.trace import FoundEffect
 from storage import resources, traces
@@ -64,7 +65,7 @@ def plan(context: TaskContext, stores: Stores) -> HandlerResult:
     with suppress(SimulationError):  # what the settings and the scene refuse is said before the first episode
         plan_episode(scene, twin, demonstration, derived_seed(config.seed % 2**63, 0))
     particles, controllers = len(twin.particles_rest), scene.controllers.shape[1]
-    per_frame = 3 * FLOAT_BYTES * (particles + controllers) + 8
+    per_frame = 3 * FLOAT_BYTES * (particles + min(MOST_KEPT, particles) + controllers) + 8
     need = round(STORE_OVERHEAD * config.episodes * (frames * per_frame + 2 * FLOAT_BYTES * particles))
     _check_disk(stores, need, f"{config.episodes} episodes of {frames} frames x {particles} particles")
     return HandlerResult(
@@ -91,6 +92,7 @@ def episode(context: TaskContext, stores: Stores) -> HandlerResult:
     )
     simulated = time.perf_counter()
     context.check()
+    arrays = arrays | _vertices(stores, payload["dataset_id"], twin, arrays["particles"])
     attributes |= {"index": index, "scene_id": payload["scene_id"], "fit_id": payload["fit_id"]}
     path, digest = stores.episodes.write(payload["dataset_id"], index, lease.epoch, arrays, attributes)
     written = time.perf_counter()
@@ -167,6 +169,12 @@ def _made(
         raise made
     arrays, attributes = made
     return arrays, dict(attributes)
+
+
+def _vertices(stores: Stores, dataset_id: str, twin: Twin, particles: np.ndarray) -> dict[str, np.ndarray]:
+    """The particles that world models take for their vertices, kept apart: the same in every episode of a dataset."""
+    chosen = stores.cached(("vertices", dataset_id), lambda: kept_vertices(twin.particles_rest))
+    return {"vertices": particles[:, chosen], "vertex_index": chosen.astype(np.int32)}
 
 
 def demonstration_of(config: DatasetConfig, strengths: tuple[StrengthRange, ...] = ()) -> DemonstrationConfig:

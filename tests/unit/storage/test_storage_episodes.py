@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
+import json
 import resource
 import signal
 import subprocess
@@ -11,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import zarr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays_of
@@ -54,6 +57,54 @@ def test_what_was_written_is_read_again(episodes: EpisodeStore) -> None:
     for name, array in wanted.items():
         assert found[name].dtype == array.dtype
         np.testing.assert_array_equal(found[name], array)
+
+
+def test_a_part_is_read_and_verified_alone(local: EpisodeStore, tmp_path: Path) -> None:
+    wanted = episode()
+    path, digest = local.write(DATASET, 0, 1, wanted, {"seed": 7})
+    found, attributes = local.verified(path, digest, ("times", "controllers", "vertices"))
+    assert set(found) == {"times", "controllers"} and attributes == {"seed": 7}
+    np.testing.assert_array_equal(found["controllers"], wanted["controllers"])
+    (tmp_path / "store" / path / "particles" / "c" / "0" / "0" / "0").write_bytes(b"damaged")
+    assert set(local.verified(path, digest, ("times",))[0]) == {"times"}
+    with pytest.raises(EpisodeCorrupt):
+        local.verified(path, digest)
+    header = tmp_path / "store" / path / "zarr.json"
+    other = local.write(DATASET, 0, 2, episode(seed=1), {})[0]
+    header.write_text(
+        (tmp_path / "store" / other / "zarr.json").read_text()
+    )  # its parts are another episode's
+    with pytest.raises(EpisodeCorrupt, match="committed was"):
+        local.verified(path, digest, ("times",))
+
+
+def test_a_part_that_was_changed_is_noticed(local: EpisodeStore, tmp_path: Path) -> None:
+    path, digest = local.write(DATASET, 0, 1, episode(), {})
+    group = zarr.open_group(tmp_path / "store" / path, mode="r+")
+    stored = group["controllers"]
+    assert isinstance(stored, zarr.Array)
+    stored[0] = 3.0
+    with pytest.raises(EpisodeCorrupt, match="controllers do not have the digest"):
+        local.verified(path, digest, ("controllers",))
+    assert set(local.verified(path, digest, ("times",))[0]) == {"times"}
+
+
+def test_an_episode_of_the_first_format_is_read_whole(local: EpisodeStore, tmp_path: Path) -> None:
+    """One digest over name, type, shape and bytes of every array, and a list of names in the header."""
+    wanted = episode()
+    path = episode_path(DATASET, 0, 1)
+    header = {"format": "physworld-episode/1", "arrays": sorted(wanted), "attributes": {"seed": 7}}
+    group = zarr.create_group(tmp_path / "store" / path, attributes=header)
+    digest = hashlib.sha256()
+    for name in sorted(wanted):
+        group.create_array(name, data=wanted[name])
+        digest.update(json.dumps([name, wanted[name].dtype.str, wanted[name].shape]).encode())
+        digest.update(wanted[name].tobytes())
+    found, attributes = local.verified(path, digest.hexdigest())
+    assert set(found) == set(wanted) and attributes == {"seed": 7}
+    assert set(local.verified(path, digest.hexdigest(), ("times", "vertices"))[0]) == {"times"}
+    with pytest.raises(EpisodeCorrupt, match="committed was"):
+        local.verified(path, arrays_digest(wanted))
 
 
 def test_an_episode_without_controllers_is_kept(episodes: EpisodeStore) -> None:

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import hashlib
 import json
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from safetensors.numpy import load
 from tiny_scene import register, tiny_scene
@@ -21,6 +22,9 @@ from tiny_scene import register, tiny_scene
 from physworld.build import build_twin
 from physworld.scene import Ground
 from physworld.worldmodel import PublishedModel
+from physworld.worldmodel.dataset import VERTEX_ARRAYS, has_vertices, read_track
+from physworld.worldmodel.errors import DatasetUnusable
+from physworld.worldmodel.scene_view import view_scene
 from schemas.dataset import DatasetConfig
 from schemas.fit import FitConfig
 from schemas.job import Job
@@ -37,8 +41,10 @@ from workers.execute import Runtime, run_shard
 from workers.owner import process_owner
 from workers.registry import register as register_handler
 from workers.stores import Stores
+from workers.tasks.inputs import scene_of, twin_of
 
 FRAMES = 24
+FORMER_ARRAYS = ("times", "particles", "controllers", "properties")
 SMALL = TrainingConfig(
     hidden=16,
     message_passing_steps=2,
@@ -135,7 +141,7 @@ def test_a_training_publishes_a_version_that_rolls_out(runtime: Runtime, dataset
 
 
 def test_a_field_of_friction_is_stored_learned_and_tuned_as_one_number(runtime: Runtime) -> None:
-    scene = replace(tiny_scene(FRAMES), ground=Ground(-0.01))
+    scene = dataclasses.replace(tiny_scene(FRAMES), ground=Ground(-0.01))
     scene_id = register(scene, runtime.database, runtime.stores.artifacts)
     with runtime.database.session() as session:
         fit = jobs.create_fit(session, scene_id, FitConfig(particle_budget=60, max_simulations=4))
@@ -158,6 +164,29 @@ def test_a_field_of_friction_is_stored_learned_and_tuned_as_one_number(runtime: 
     assert tuned["bounds"][1] == pytest.approx(tuned["calibrated"] * np.exp(0.6))
     weights = load(_files(runtime, version)["model.safetensors"])
     assert weights["norm.properties"].shape == (2,)  # it stands at the tuned friction
+
+
+def test_a_training_reads_the_vertices_alone_and_learns_the_same(runtime: Runtime, dataset_id: str) -> None:
+    with runtime.database.reading() as session:
+        stored = resources.all_episodes(session, dataset_id)
+        scene_id = resources.get_dataset(session, dataset_id).scene_id
+        fit_id = resources.get_dataset(session, dataset_id).fit_id
+    architecture = translate(SMALL)[0]
+    view = view_scene(scene_of(runtime.stores, scene_id), twin_of(runtime.stores, fit_id), architecture)
+    for one in stored:
+        whole = runtime.stores.episodes.verified(one.path, one.digest)[0]
+        part = runtime.stores.episodes.verified(one.path, one.digest, VERTEX_ARRAYS)[0]
+        assert "particles" not in part and has_vertices(view.spec, part)
+        former = {name: array for name, array in whole.items() if name in FORMER_ARRAYS}
+        assert not has_vertices(view.spec, former)
+        tracks = [read_track(view.spec, arrays, architecture.history) for arrays in (part, whole, former)]
+        assert torch.equal(tracks[0].positions, tracks[2].positions)
+        assert torch.equal(tracks[1].positions, tracks[2].positions)
+        assert torch.equal(tracks[0].phi, tracks[2].phi)
+        other = dataclasses.replace(view.spec, particle_index=view.spec.particle_index[::-1].copy())
+        assert not has_vertices(other, part)
+        with pytest.raises(DatasetUnusable, match="is of another body"):
+            read_track(other, part, architecture.history)
 
 
 def test_the_metrics_have_every_row_of_the_table(runtime: Runtime, dataset_id: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import onnxruntime
 import pytest
 import torch
 from held_bar import SMALL, graph
@@ -13,7 +14,7 @@ from scipy.spatial import cKDTree
 from physworld.worldmodel.config import TrainingConfig, WorldModelConfig
 from physworld.worldmodel.dataset import Track, measure_scales, read_track
 from physworld.worldmodel.engine import RolloutEngine
-from physworld.worldmodel.export import INPUTS, StepProgram, edge_list
+from physworld.worldmodel.export import INPUTS, StepProgram, edge_list, onnx_program
 from physworld.worldmodel.graph import NEAR, GraphSpec
 from physworld.worldmodel.model import Normalisation, WorldModel
 from physworld.worldmodel.naive import NaiveWorldModel
@@ -195,6 +196,9 @@ def test_a_step_program_is_given_the_edges_of_the_moment() -> None:
         moved = StepProgram(model)(*(inputs[name] for name in INPUTS))
         expected = model.step(window, control_next, phi)[:, 0]
     assert torch.allclose(moved, expected, atol=1e-5)
+    session = onnxruntime.InferenceSession(onnx_program(model), providers=["CPUExecutionProvider"])
+    (following,) = session.run(None, {name: values.numpy() for name, values in inputs.items()})
+    assert following == pytest.approx(expected.numpy(), abs=1e-5)
 
 
 def test_scales_are_those_of_the_edges_that_there_are(tracks: list[Track]) -> None:
