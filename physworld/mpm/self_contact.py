@@ -28,11 +28,9 @@ from physworld.errors import ContactFailed, SceneUnsupported
 from physworld.mpm.contact import contact_surface
 from physworld.mpm.lattice import Lattice
 from physworld.mpm.self_contact_kernels import (
-    NEIGHBOURS,
     Points,
     Slots,
-    clear_grid,
-    keep_nodes,
+    end_search,
     place_cells,
     seek_pairs,
     touch_itself,
@@ -46,11 +44,13 @@ if TYPE_CHECKING:
 
 THINNEST = 0.01  # of a cell: the splines' own waves are larger
 COARSE = 0.04  # of a cell: thinner layers may cross where they are bent within a cell
-_APART = 2.0  # thicknesses, and cells, along the body below which no two places touch
+_APART = 2.0  # thicknesses along the body below which no two places touch
+_APART_CELLS = {1: 4.0, 2: 2.0}  # and cells: a rope's windows reach a cell to either side
 _SKIN = 0.5  # of a cell
 _STRETCH = 1.25  # up to which pairs are found
 _CROSSED = 1.5  # thicknesses of depth: half of one on the wrong side
-_LANES = 16  # of a search on a CPU, where they run one after another
+_SLOTS = {1: 40, 2: 8}  # the nearest pairs that a contact point keeps
+_LANES = 1  # of a search on a CPU, where they run one after another
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +102,7 @@ def refuse_thickness(lattice: Lattice, thickness_m: float) -> None:
 
 def apart_m(lattice: Lattice, thickness_m: float) -> float:
     """Distance along the undeformed body below which no two places touch [m]."""
-    return _APART * max(thickness_m, float(lattice.spacing.max()))
+    return max(_APART * thickness_m, _APART_CELLS[lattice.dim] * float(lattice.spacing.max()))
 
 
 class BoundSelfContact(BoundTerm):
@@ -132,6 +132,9 @@ class BoundSelfContact(BoundTerm):
         def array(values: np.ndarray, dtype: type) -> wp.array:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
 
+        most = _SLOTS[lattice.dim]
+        if lattice.dim == 1:  # those of a strand that bends around another
+            most += int(np.ceil(8 * np.pi * contact.thickness_m / lattice.spacing[0]))
         count, points, nodes = len(lattice.cells), len(coordinates), len(lattice.nodes)
         corner = lattice.cells.min(axis=0)
         box = np.ones(2, dtype=int)
@@ -151,10 +154,11 @@ class BoundSelfContact(BoundTerm):
         ends = in_cells(np.stack([low, high]))
         cell = float(lattice.spacing.max())
         self._skin = _SKIN * cell
-        self._around = 0.5 * _STRETCH * float(np.linalg.norm(lattice.spacing))
-        reach = contact.thickness_m + self._skin
-        own = self._around if lattice.dim == 2 else 2.5 * self._around  # a rope's point acts beyond its cell
-        self._width = wp.float64(reach + self._around + own)
+        half = 0.5 * _STRETCH * float(np.linalg.norm(lattice.spacing))
+        self._around = (
+            half if lattice.dim == 2 else 5 * half
+        )  # a rope's windows reach a cell beyond its points
+        self._width = wp.float64(contact.thickness_m + self._skin + half + self._around)
         self._body, self._points, self._slots = Body(), Points(), Slots()
         body = self._body
         body.dim = lattice.dim
@@ -172,12 +176,15 @@ class BoundSelfContact(BoundTerm):
         self._points.measure = array(measures, wp.float64)
         self._points.first = array(np.searchsorted(cells, np.arange(count + 1)), wp.int32)
         slots = self._slots
+        slots.most = most
         slots.counts = wp.zeros(points, dtype=wp.int32, device=device)
-        slots.own = wp.zeros(points * NEIGHBOURS, dtype=wp.vec2d, device=device)
+        slots.own = wp.zeros(points * most, dtype=wp.vec2d, device=device)
         slots.other = wp.zeros_like(slots.own)
-        slots.slip = wp.zeros(points * NEIGHBOURS, dtype=wp.vec3d, device=device)
+        slots.middles = wp.zeros_like(slots.own)
+        slots.slip = wp.zeros(points * most, dtype=wp.vec3d, device=device)
         slots.side = wp.zeros_like(slots.slip)
-        slots.reach = wp.zeros(points * NEIGHBOURS, dtype=wp.float64, device=device)
+        slots.reach = wp.zeros(points * most, dtype=wp.float64, device=device)
+        slots.gap = wp.zeros_like(slots.reach)
         slots.active = wp.zeros(points, dtype=wp.int32, device=device)
         slots.actives = wp.zeros(1, dtype=wp.int32, device=device)
         self._lanes = _LANES if wp.get_device(device).is_cpu else count
@@ -190,7 +197,7 @@ class BoundSelfContact(BoundTerm):
         self._moved = wp.zeros(3, dtype=wp.int32, device=device)
         self._centres = wp.zeros(count, dtype=wp.vec3d, device=device)
         self._nexts = wp.zeros(count, dtype=wp.int32, device=device)
-        self._heads = wp.zeros(1 << int(np.ceil(np.log2(2 * count + 1))), dtype=wp.int32, device=device)
+        self._heads = wp.full(1 << int(np.ceil(np.log2(2 * count + 1))), -1, dtype=wp.int32, device=device)
         self._deepest = wp.zeros(1, dtype=wp.float64, device=device)
 
     @property
@@ -226,15 +233,15 @@ class BoundSelfContact(BoundTerm):
         """Add contact forces [N] at nodal positions and velocities (3n,) to ``force``."""
         lanes, moved, slots = self._lanes, self._moved, self._slots
         launches = (
-            (watch_nodes, len(x) // 3,
-             [self._middle, wp.float64(0.25 * self._skin**2), x, self._built, counter, moved]),
-            (clear_grid, lanes, [lanes, counter, moved, self._heads, slots, self._deepest]),
+            (watch_nodes, lanes,
+             [lanes, self._middle, wp.float64(0.25 * self._skin**2), x, self._built, counter, moved]),
             (place_cells, lanes,
-             [lanes, self._body, self._width, x, moved, self._centres, self._heads, self._nexts]),
+             [lanes, self._body, self._width, x, counter, moved, self._heads, self._centres, self._nexts, slots,
+              self._deepest]),
             (seek_pairs, lanes,
              [lanes, self._body, self._points, self._width, wp.float64(self._around), self._cells, x, moved,
               self._centres, self._heads, self._nexts, slots]),
-            (keep_nodes, lanes, [lanes, x, moved, self._built]),
+            (end_search, lanes, [lanes, x, moved, self._built, self._heads]),
             (touch_itself, lanes,
              [lanes, self._body, self._points, *self._law, self._held, x, v, clock, moved, slots, force,
               self._deepest]),

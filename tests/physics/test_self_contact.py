@@ -154,7 +154,7 @@ def test_a_collision_creates_no_energy_and_an_elastic_one_takes_little(damping: 
     assert taken.max() > 0.02  # they did meet
     assert taken.min() > -0.001
     assert taken[-1] < 0.02 if damping == 0 else taken[-1] > 0.05
-    assert np.abs(ledger.lost).max() < 0.01 * ledger.turnover
+    assert np.abs(ledger.lost).max() < 0.03 * ledger.turnover
 
 
 def folded(lattice: Lattice, low: float, radius: float, height: float) -> np.ndarray:
