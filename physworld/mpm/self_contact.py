@@ -12,7 +12,7 @@ what a section would take up by turning about its axis, which neither form has.
 A pair that is first seen nearer than the thickness touches where it is and farther out as it opens, never farther than
 the thickness. Each remembers from which side it came, so that what passed through within a substep is pushed back.
 
-Pairs are sought on a grid in space (:mod:`physworld.mpm.self_contact_kernels`), out to a skin beyond the thickness, and
+Pairs are sought on a grid in space (:mod:`physworld.mpm.self_contact_search`), out to a skin beyond the thickness, and
 again when the body has moved by half the skin, the common motion of all of it aside.
 """
 
@@ -27,16 +27,9 @@ import warp as wp
 from physworld.errors import ContactFailed, SceneUnsupported
 from physworld.mpm.contact import contact_surface
 from physworld.mpm.lattice import Lattice
-from physworld.mpm.self_contact_kernels import (
-    Points,
-    Slots,
-    end_search,
-    place_cells,
-    seek_pairs,
-    touch_itself,
-    watch_nodes,
-)
+from physworld.mpm.self_contact_kernels import touch_itself
 from physworld.mpm.self_contact_places import Body
+from physworld.mpm.self_contact_search import Points, Slots, end_search, place_cells, seek_pairs, watch_nodes
 from physworld.mpm.terms import BoundTerm
 
 if TYPE_CHECKING:
@@ -171,7 +164,6 @@ class BoundSelfContact(BoundTerm):
         body.spacing = wp.vec2d(*spacing)
         body.thickness, body.skin = wp.float64(contact.thickness_m), wp.float64(self._skin)
         body.apart = wp.float64(apart_m(lattice, contact.thickness_m))
-        self._points.cell = array(cells, wp.int32)
         self._points.place = array(in_cells(coordinates), wp.vec2d)
         self._points.measure = array(measures, wp.float64)
         self._points.first = array(np.searchsorted(cells, np.arange(count + 1)), wp.int32)
@@ -194,7 +186,8 @@ class BoundSelfContact(BoundTerm):
         held[contact.held] = 1.0
         self._held = array(held, wp.float64)
         self._built = wp.zeros(3 * nodes, dtype=wp.float64, device=device)
-        self._moved = wp.zeros(3, dtype=wp.int32, device=device)
+        self._moved = wp.zeros(5, dtype=wp.int32, device=device)
+        self._ways = wp.zeros(4, dtype=wp.float64, device=device)
         self._centres = wp.zeros(count, dtype=wp.vec3d, device=device)
         self._nexts = wp.zeros(count, dtype=wp.int32, device=device)
         self._heads = wp.full(1 << int(np.ceil(np.log2(2 * count + 1))), -1, dtype=wp.int32, device=device)
@@ -208,7 +201,7 @@ class BoundSelfContact(BoundTerm):
     @property
     def searches(self) -> int:
         """How often pairs were sought in the last run."""
-        return int(self._moved.numpy()[2])
+        return int(self._moved.numpy()[4])
 
     @property
     def pairs(self) -> int:
@@ -231,23 +224,22 @@ class BoundSelfContact(BoundTerm):
 
     def launch(self, x: wp.array, v: wp.array, clock: wp.array, counter: wp.array, force: wp.array) -> None:
         """Add contact forces [N] at nodal positions and velocities (3n,) to ``force``."""
-        lanes, moved, slots = self._lanes, self._moved, self._slots
+        lanes, moved, slots, heads = self._lanes, self._moved, self._slots, self._heads
+        most = wp.float64(0.25 * self._skin**2)
         launches = (
-            (watch_nodes, lanes,
-             [lanes, self._middle, wp.float64(0.25 * self._skin**2), x, self._built, counter, moved]),
-            (place_cells, lanes,
-             [lanes, self._body, self._width, x, counter, moved, self._heads, self._centres, self._nexts, slots,
-              self._deepest]),
-            (seek_pairs, lanes,
-             [lanes, self._body, self._points, self._width, wp.float64(self._around), self._cells, x, moved,
-              self._centres, self._heads, self._nexts, slots]),
-            (end_search, lanes, [lanes, x, moved, self._built, self._heads]),
-            (touch_itself, lanes,
-             [lanes, self._body, self._points, *self._law, self._held, x, v, clock, moved, slots, force,
+            (watch_nodes, [self._middle, most, x, self._built, counter, moved, self._ways]),
+            (place_cells,
+             [self._body, self._width, x, counter, moved, heads, self._centres, self._nexts, slots, self._deepest]),
+            (seek_pairs,
+             [self._body, self._points, self._width, wp.float64(self._around), self._cells, x, counter, moved,
+              self._centres, heads, self._nexts, slots]),
+            (end_search, [x, counter, moved, self._built, heads]),
+            (touch_itself,
+             [self._body, self._points, *self._law, self._held, x, v, clock, counter, self._ways, moved, slots, force,
               self._deepest]),
         )  # fmt: skip
-        for kernel, dim, inputs in launches:
-            wp.launch(kernel, dim=dim, inputs=inputs, device=self.device)
+        for kernel, inputs in launches:
+            wp.launch(kernel, dim=lanes, inputs=[lanes, *inputs], device=self.device)
 
 
 def self_points(lattice: Lattice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
