@@ -24,6 +24,7 @@ BENCHMARKS = (
     "laws",
     "effects",
     "friction",
+    "self_contact",
     "world_model",
     "factory",
     "video",

@@ -19,6 +19,7 @@ from pathlib import Path
 import warp as wp
 
 from benchmarks import (
+    verification_contact,
     verification_effects,
     verification_peers,
     verification_solids,
@@ -32,6 +33,7 @@ CASES: tuple[Case, ...] = (
     *verification_solids.CASES,
     *verification_thin.CASES,
     *verification_twist.CASES,
+    *verification_contact.CASES,
     *verification_effects.CASES,
     *verification_peers.CASES,
 )

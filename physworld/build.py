@@ -76,7 +76,7 @@ def build_twin(
         held.append(nodes)
         taken = np.concatenate([taken, nodes])
     turning, notes = _turning(scene, body, controls[0], groups, held)
-    self_friction, touching = _touching_itself(scene, body)
+    self_friction, touching = _touching_itself(scene, body, choice.formulation)
     body = replace(body, notes=(*body.notes, *notes, *touching))
     friction = scene.ground.friction if scene.ground is not None else None
     return Twin(
@@ -125,15 +125,23 @@ def _turning(
     return turning, tuple(notes)
 
 
-def _touching_itself(scene: Scene, body: ReferenceBody) -> tuple[float | None, tuple[str, ...]]:
+def _touching_itself(
+    scene: Scene, body: ReferenceBody, formulation: str
+) -> tuple[float | None, tuple[str, ...]]:
     """Friction of a rope or sheet against itself where its scene declares that it touches itself, and notes on that.
 
     Raises:
         SceneUnsupported: the friction is no number of 0 or more, or the body is too thin for its cells.
     """
     declared = scene.declared.get("body") or {}
-    if body.lattice.dim == 3 or not declared.get("self_contact"):
+    if not declared.get("self_contact"):
         return None, ()
+    if body.lattice.dim == 3:
+        if formulation == "updated_lagrangian":
+            return None, ()
+        return None, (
+            "it is declared to touch itself, and passes through itself: a solid in the total Lagrangian form",
+        )
     friction = declared.get("self_friction")
     said = "declared"
     if friction is None:

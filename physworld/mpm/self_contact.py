@@ -12,7 +12,7 @@ what a section would take up by turning about its axis, which neither form has.
 A pair that is first seen nearer than the thickness touches where it is and farther out as it opens, never farther than
 the thickness. Each remembers from which side it came, so that what passed through within a substep is pushed back.
 
-Pairs are sought on a grid in space (:mod:`physworld.mpm.self_contact_kernels`), out to a skin beyond the thickness, and
+Pairs are sought on a grid in space (:mod:`physworld.mpm.self_contact_search`), out to a skin beyond the thickness, and
 again when the body has moved by half the skin, the common motion of all of it aside.
 """
 
@@ -27,18 +27,9 @@ import warp as wp
 from physworld.errors import ContactFailed, SceneUnsupported
 from physworld.mpm.contact import contact_surface
 from physworld.mpm.lattice import Lattice
-from physworld.mpm.self_contact_kernels import (
-    NEIGHBOURS,
-    Points,
-    Slots,
-    clear_grid,
-    keep_nodes,
-    place_cells,
-    seek_pairs,
-    touch_itself,
-    watch_nodes,
-)
+from physworld.mpm.self_contact_kernels import touch_itself
 from physworld.mpm.self_contact_places import Body
+from physworld.mpm.self_contact_search import Points, Slots, end_search, place_cells, seek_pairs, watch_nodes
 from physworld.mpm.terms import BoundTerm
 
 if TYPE_CHECKING:
@@ -46,11 +37,13 @@ if TYPE_CHECKING:
 
 THINNEST = 0.01  # of a cell: the splines' own waves are larger
 COARSE = 0.04  # of a cell: thinner layers may cross where they are bent within a cell
-_APART = 2.0  # thicknesses, and cells, along the body below which no two places touch
+_APART = 2.0  # thicknesses along the body below which no two places touch
+_APART_CELLS = {1: 4.0, 2: 2.0}  # and cells: a rope's windows reach a cell to either side
 _SKIN = 0.5  # of a cell
 _STRETCH = 1.25  # up to which pairs are found
 _CROSSED = 1.5  # thicknesses of depth: half of one on the wrong side
-_LANES = 16  # of a search on a CPU, where they run one after another
+_SLOTS = {1: 40, 2: 8}  # the nearest pairs that a contact point keeps
+_LANES = 1  # of a search on a CPU, where they run one after another
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +95,7 @@ def refuse_thickness(lattice: Lattice, thickness_m: float) -> None:
 
 def apart_m(lattice: Lattice, thickness_m: float) -> float:
     """Distance along the undeformed body below which no two places touch [m]."""
-    return _APART * max(thickness_m, float(lattice.spacing.max()))
+    return max(_APART * thickness_m, _APART_CELLS[lattice.dim] * float(lattice.spacing.max()))
 
 
 class BoundSelfContact(BoundTerm):
@@ -132,6 +125,9 @@ class BoundSelfContact(BoundTerm):
         def array(values: np.ndarray, dtype: type) -> wp.array:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
 
+        most = _SLOTS[lattice.dim]
+        if lattice.dim == 1:  # those of a strand that bends around another
+            most += int(np.ceil(8 * np.pi * contact.thickness_m / lattice.spacing[0]))
         count, points, nodes = len(lattice.cells), len(coordinates), len(lattice.nodes)
         corner = lattice.cells.min(axis=0)
         box = np.ones(2, dtype=int)
@@ -151,10 +147,11 @@ class BoundSelfContact(BoundTerm):
         ends = in_cells(np.stack([low, high]))
         cell = float(lattice.spacing.max())
         self._skin = _SKIN * cell
-        self._around = 0.5 * _STRETCH * float(np.linalg.norm(lattice.spacing))
-        reach = contact.thickness_m + self._skin
-        own = self._around if lattice.dim == 2 else 2.5 * self._around  # a rope's point acts beyond its cell
-        self._width = wp.float64(reach + self._around + own)
+        half = 0.5 * _STRETCH * float(np.linalg.norm(lattice.spacing))
+        self._around = (
+            half if lattice.dim == 2 else 5 * half
+        )  # a rope's windows reach a cell beyond its points
+        self._width = wp.float64(contact.thickness_m + self._skin + half + self._around)
         self._body, self._points, self._slots = Body(), Points(), Slots()
         body = self._body
         body.dim = lattice.dim
@@ -167,17 +164,19 @@ class BoundSelfContact(BoundTerm):
         body.spacing = wp.vec2d(*spacing)
         body.thickness, body.skin = wp.float64(contact.thickness_m), wp.float64(self._skin)
         body.apart = wp.float64(apart_m(lattice, contact.thickness_m))
-        self._points.cell = array(cells, wp.int32)
         self._points.place = array(in_cells(coordinates), wp.vec2d)
         self._points.measure = array(measures, wp.float64)
         self._points.first = array(np.searchsorted(cells, np.arange(count + 1)), wp.int32)
         slots = self._slots
+        slots.most = most
         slots.counts = wp.zeros(points, dtype=wp.int32, device=device)
-        slots.own = wp.zeros(points * NEIGHBOURS, dtype=wp.vec2d, device=device)
+        slots.own = wp.zeros(points * most, dtype=wp.vec2d, device=device)
         slots.other = wp.zeros_like(slots.own)
-        slots.slip = wp.zeros(points * NEIGHBOURS, dtype=wp.vec3d, device=device)
+        slots.middles = wp.zeros_like(slots.own)
+        slots.slip = wp.zeros(points * most, dtype=wp.vec3d, device=device)
         slots.side = wp.zeros_like(slots.slip)
-        slots.reach = wp.zeros(points * NEIGHBOURS, dtype=wp.float64, device=device)
+        slots.reach = wp.zeros(points * most, dtype=wp.float64, device=device)
+        slots.gap = wp.zeros_like(slots.reach)
         slots.active = wp.zeros(points, dtype=wp.int32, device=device)
         slots.actives = wp.zeros(1, dtype=wp.int32, device=device)
         self._lanes = _LANES if wp.get_device(device).is_cpu else count
@@ -187,10 +186,11 @@ class BoundSelfContact(BoundTerm):
         held[contact.held] = 1.0
         self._held = array(held, wp.float64)
         self._built = wp.zeros(3 * nodes, dtype=wp.float64, device=device)
-        self._moved = wp.zeros(3, dtype=wp.int32, device=device)
+        self._moved = wp.zeros(5, dtype=wp.int32, device=device)
+        self._ways = wp.zeros(4, dtype=wp.float64, device=device)
         self._centres = wp.zeros(count, dtype=wp.vec3d, device=device)
         self._nexts = wp.zeros(count, dtype=wp.int32, device=device)
-        self._heads = wp.zeros(1 << int(np.ceil(np.log2(2 * count + 1))), dtype=wp.int32, device=device)
+        self._heads = wp.full(1 << int(np.ceil(np.log2(2 * count + 1))), -1, dtype=wp.int32, device=device)
         self._deepest = wp.zeros(1, dtype=wp.float64, device=device)
 
     @property
@@ -201,7 +201,7 @@ class BoundSelfContact(BoundTerm):
     @property
     def searches(self) -> int:
         """How often pairs were sought in the last run."""
-        return int(self._moved.numpy()[2])
+        return int(self._moved.numpy()[4])
 
     @property
     def pairs(self) -> int:
@@ -224,23 +224,22 @@ class BoundSelfContact(BoundTerm):
 
     def launch(self, x: wp.array, v: wp.array, clock: wp.array, counter: wp.array, force: wp.array) -> None:
         """Add contact forces [N] at nodal positions and velocities (3n,) to ``force``."""
-        lanes, moved, slots = self._lanes, self._moved, self._slots
+        lanes, moved, slots, heads = self._lanes, self._moved, self._slots, self._heads
+        most = wp.float64(0.25 * self._skin**2)
         launches = (
-            (watch_nodes, len(x) // 3,
-             [self._middle, wp.float64(0.25 * self._skin**2), x, self._built, counter, moved]),
-            (clear_grid, lanes, [lanes, counter, moved, self._heads, slots, self._deepest]),
-            (place_cells, lanes,
-             [lanes, self._body, self._width, x, moved, self._centres, self._heads, self._nexts]),
-            (seek_pairs, lanes,
-             [lanes, self._body, self._points, self._width, wp.float64(self._around), self._cells, x, moved,
-              self._centres, self._heads, self._nexts, slots]),
-            (keep_nodes, lanes, [lanes, x, moved, self._built]),
-            (touch_itself, lanes,
-             [lanes, self._body, self._points, *self._law, self._held, x, v, clock, moved, slots, force,
+            (watch_nodes, [self._middle, most, x, self._built, counter, moved, self._ways]),
+            (place_cells,
+             [self._body, self._width, x, counter, moved, heads, self._centres, self._nexts, slots, self._deepest]),
+            (seek_pairs,
+             [self._body, self._points, self._width, wp.float64(self._around), self._cells, x, counter, moved,
+              self._centres, heads, self._nexts, slots]),
+            (end_search, [x, counter, moved, self._built, heads]),
+            (touch_itself,
+             [self._body, self._points, *self._law, self._held, x, v, clock, counter, self._ways, moved, slots, force,
               self._deepest]),
         )  # fmt: skip
-        for kernel, dim, inputs in launches:
-            wp.launch(kernel, dim=dim, inputs=inputs, device=self.device)
+        for kernel, inputs in launches:
+            wp.launch(kernel, dim=lanes, inputs=[lanes, *inputs], device=self.device)
 
 
 def self_points(lattice: Lattice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -1,10 +1,12 @@
 """Device side of a rope's middle line and a sheet's middle surface: places on them, and the nearest places.
 
     sheet    min over r of |x(q_i) - x(r)|^2
-    rope     min over q, r of |x(q) - x(r)|^2 + eps |x'|^2 (q - q_i)^2        q within W of q_i
+    rope     min over q, r of |x(q) - x(r)|^2 + e |x'|^2 (q - q_i)^2 + f |x'|^2 (r - q_j)^2
 
-by Newton's method without the curvatures that would make it turn back: it goes downhill to a minimum. Places are in
-cells from the lattice's lowest corner; a rope's second coordinate is 1/2.
+with q and r within W of q_i and q_j. e and f are small where two strands cross, so that their shortest way counts, and
+hold the points at their own places along directions in which the distance does not tell: strands side by side, and a
+strand that bends around another. Minima are found by Newton's method without the curvatures that would turn it back: it
+goes downhill. Places are in cells from the lattice's lowest corner; a rope's second coordinate is 1/2.
 """
 
 from __future__ import annotations
@@ -14,7 +16,8 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 WINDOW = wp.constant(wp.float64(1.0))  # W: cells along a rope on either side of a point in which it acts
-_WEAK = wp.constant(wp.float64(0.005))  # eps: keeps a rope's point at its place beside a parallel strand
+_WEAK = wp.constant(wp.float64(0.005))  # e of straight strands
+_WEAKER = wp.constant(wp.float64(0.0005))  # f
 _HALF = wp.constant(wp.float64(0.5))
 
 
@@ -169,6 +172,11 @@ def _bounded(step: wp.float64):
 
 
 @wp.func
+def _in_window(body: Body, middle: wp.float64, q: wp.float64):
+    return wp.clamp(q, wp.max(middle - WINDOW, body.low[0]), wp.min(middle + WINDOW, body.high[0]))
+
+
+@wp.func
 def _step_of_sheet(body: Body, x: wp.array(dtype=wp.float64), here: wp.vec3d, r: wp.vec2d):
     """One step towards the place nearest to ``here``."""
     zero = wp.float64(0.0)
@@ -193,28 +201,27 @@ def _step_of_sheet(body: Body, x: wp.array(dtype=wp.float64), here: wp.vec3d, r:
 
 
 @wp.func
-def _step_of_rope(
-    body: Body, x: wp.array(dtype=wp.float64), centre: wp.float64, q: wp.float64, r: wp.float64
-):
-    """One step towards the shortest way between the window around ``centre`` and the rest."""
+def _step_of_rope(body: Body, x: wp.array(dtype=wp.float64), middles: wp.vec2d, q: wp.float64, r: wp.float64):
+    """One step towards the shortest way between the windows around two points of a rope."""
     zero = wp.float64(0.0)
     here = place_at(body, x, wp.vec2d(q, _HALF))
     there = place_at(body, x, wp.vec2d(r, _HALF))
     d = here.x - there.x
-    size = wp.dot(here.d1, here.d1)
-    h11 = size * (wp.float64(1.0) + _WEAK) + wp.max(zero, wp.dot(d, here.d11))
-    h22 = wp.dot(there.d1, there.d1) + wp.max(zero, -wp.dot(d, there.d11))
+    first_size = wp.dot(here.d1, here.d1)
+    second_size = wp.dot(there.d1, there.d1)
+    first_bend = wp.dot(d, here.d11)
+    second_bend = -wp.dot(d, there.d11)
+    h11 = first_size * (wp.float64(1.0) + _WEAK) + wp.max(zero, first_bend)
+    h22 = second_size * (wp.float64(1.0) + _WEAKER) + wp.max(zero, second_bend)
     h12 = -wp.dot(here.d1, there.d1)
-    g1 = wp.dot(d, here.d1) + _WEAK * size * (q - centre)
-    g2 = -wp.dot(d, there.d1)
+    g1 = wp.dot(d, here.d1) + (_WEAK * first_size + wp.max(zero, -first_bend)) * (q - middles[0])
+    g2 = -wp.dot(d, there.d1) + (_WEAKER * second_size + wp.max(zero, -second_bend)) * (r - middles[1])
     det = h11 * h22 - h12 * h12
     if det <= wp.float64(1.0e-12) * h11 * h22:
         return wp.vec2d(q, r)
-    low = wp.max(centre - WINDOW, body.low[0])
-    high = wp.min(centre + WINDOW, body.high[0])
-    own = wp.clamp(q + _bounded((h12 * g2 - h22 * g1) / det), low, high)
-    other = wp.clamp(r + _bounded((-g2 - h12 * (own - q)) / h22), body.low[0], body.high[0])
-    own = wp.clamp(q + _bounded((-g1 - h12 * (other - r)) / h11), low, high)
+    own = _in_window(body, middles[0], q + _bounded((h12 * g2 - h22 * g1) / det))
+    other = _in_window(body, middles[1], r + _bounded((-g2 - h12 * (own - q)) / h22))
+    own = _in_window(body, middles[0], q + _bounded((-g1 - h12 * (other - r)) / h11))
     own_cell, _u = cell_at(body, wp.vec2d(own, _HALF))
     other_cell, _u = cell_at(body, wp.vec2d(other, _HALF))
     if own_cell < 0:
@@ -226,14 +233,19 @@ def _step_of_rope(
 
 @wp.func
 def refined(
-    body: Body, x: wp.array(dtype=wp.float64), centre: wp.vec2d, own: wp.vec2d, other: wp.vec2d, steps: int
+    body: Body,
+    x: wp.array(dtype=wp.float64),
+    middles: wp.vec2d,
+    own: wp.vec2d,
+    other: wp.vec2d,
+    steps: int,
 ):
-    """Places of a pair after some steps."""
+    """Places of a pair after some steps; ``middles`` are those of a rope's windows."""
     q = own
     r = other
     if body.dim == 1:
         for _step in range(steps):
-            pair = _step_of_rope(body, x, centre[0], q[0], r[0])
+            pair = _step_of_rope(body, x, middles, q[0], r[0])
             q = wp.vec2d(pair[0], _HALF)
             r = wp.vec2d(pair[1], _HALF)
     else:

@@ -28,6 +28,7 @@ PLAIN = (
     "ground_kernels",
     "energy_kernels",
     "self_contact_kernels",
+    "self_contact_search",
     "friction_kernels",
     "relaxation_kernels",
 )

@@ -143,18 +143,18 @@ def test_two_ends_of_a_free_strip_that_meet_keep_its_momentum(friction: float, o
         assert np.ptp(angular, axis=0).max() < DIAMETER * scale
 
 
-@pytest.mark.parametrize("damping", [0.0, 1.0])
-def test_a_collision_creates_no_energy_and_an_elastic_one_takes_little(damping: float) -> None:
-    lattice, nodes, velocity = closing(offset=0.005)
+@pytest.mark.parametrize(("damping", "offset"), [(0.0, 0.005), (0.0, 0.04), (1.0, 0.005)])
+def test_a_collision_creates_no_energy_and_an_elastic_one_takes_little(damping: float, offset: float) -> None:
+    lattice, nodes, velocity = closing(offset=offset)
     contact = SelfContact(DIAMETER, 0.0, damping=damping)
     problem = Problem(lattice, STRIP, rest_nodes(lattice), np.zeros(3), terms=(contact,))
     times = np.linspace(0, 0.2, 51)
     _, ledger = run_with_ledger(problem, nodes, velocity, still(NOBODY, nodes, 51), times)
     taken = -ledger.term_work / ledger.turnover
-    assert taken.max() > 0.02  # they did meet
-    assert taken.min() > -0.001
-    assert taken[-1] < 0.02 if damping == 0 else taken[-1] > 0.05
-    assert np.abs(ledger.lost).max() < 0.01 * ledger.turnover
+    assert taken.max() > (0.02 if offset < 0.01 else 1e-3)  # they did meet; at the larger offset they graze
+    assert taken.min() > -0.002
+    assert taken[-1] < 0.01 if damping == 0 else taken[-1] > 0.05
+    assert np.abs(ledger.lost).max() < 0.03 * ledger.turnover
 
 
 def folded(lattice: Lattice, low: float, radius: float, height: float) -> np.ndarray:

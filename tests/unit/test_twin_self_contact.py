@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_scene import GRAVITY, made_scene, recorded_by
+from made_scene import GRAVITY, box_body, made_scene, recorded_by
 
 from physworld.batch import Episode, simulate_batch
 from physworld.build import PRIOR_FRICTION, build_twin
@@ -121,3 +121,19 @@ def test_what_makes_no_sense_is_refused(body: dict, radius: float, why: str) -> 
     scene = hairpin(**body)
     with pytest.raises(SceneUnsupported, match=why):
         build_twin(replace(scene, body=replace(scene.body, radius_m=radius)))
+
+
+def test_a_solid_that_cannot_touch_itself_says_so() -> None:
+    corners = np.stack(np.meshgrid(*[[0.0, 0.1]] * 3), axis=-1).reshape(-1, 3)
+    scene = made_scene(
+        corners,
+        "block",
+        corners[:4],
+        body=box_body((0, 0, 0), (0.1, 0.1, 0.1)),
+        declared={"body": {"self_contact": True}},
+    )
+    said = "passes through itself"
+    total = build_twin(scene, 200, formulation="total_lagrangian")
+    assert total.self_friction is None
+    assert any(said in note for note in total.body.notes)
+    assert not any(said in note for note in build_twin(scene, 200).body.notes)
