@@ -30,6 +30,7 @@ PLAIN = (
     "self_contact_kernels",
     "friction_kernels",
     "relaxation_kernels",
+    "particle_energy_kernels",
 )
 
 
