@@ -40,6 +40,7 @@ class Case:
         least_order: smallest order that is right; None where the error is rounding.
         exact: False where the closed form idealises.
         quick: how many resolutions a quick run takes.
+        no_order: why none is stated, where ``least_order`` is None.
     """
 
     name: str
@@ -53,6 +54,7 @@ class Case:
     exact: bool = True
     size: Callable[[float], float] | None = None
     quick: int = 2
+    no_order: str = "rounding"
 
 
 @dataclass(frozen=True)

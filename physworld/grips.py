@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from physworld.errors import SceneUnsupported
 from physworld.geometry.reference import ReferenceBody
 from physworld.geometry.rigid import rigid_motion
 from physworld.materials.rod import RodLaw
@@ -29,14 +30,24 @@ _LEVER_SIGMAS = 10.0  # of the tracking noise that control points must stand off
 
 
 def gripped_nodes(body: ReferenceBody, controllers: np.ndarray, grip: Grip | None) -> np.ndarray:
-    """Every node that gripped material touches: all nodes of cells most of whose material is in the grip."""
+    """Every node that gripped material touches: all nodes of cells most of whose material is in the grip.
+
+    In the grip is what lies in its declared box, or within its radius of any of its controllers; without either, what
+    is nearest to them.
+
+    Raises:
+        SceneUnsupported: no material lies within the radius.
+    """
     lattice = body.lattice
     particles = lattice.interpolation(lattice.particle_coordinates) @ body.start
     slack, tie = 1e-6, 1e-9
+    radius = None if grip is None else grip.radius_m
     declared = grip is not None and grip.region_min_m is not None
     if declared and lattice.dim == 3 and np.any(grip.region_max_m <= grip.region_min_m):
         return _bonded_nodes(body, grip)
-    if declared:
+    if radius is not None:
+        inside = _within(body, particles, controllers, radius)
+    elif declared:
         low, high = np.asarray(grip.region_min_m) - slack, np.asarray(grip.region_max_m) + slack
         margin = 0.5 * body.thickness_m if lattice.dim < 3 else 0.0
         inside = np.all((particles >= low - margin) & (particles <= high + margin), axis=1)
@@ -50,12 +61,32 @@ def gripped_nodes(body: ReferenceBody, controllers: np.ndarray, grip: Grip | Non
     share = (inside.reshape(lattice.fill.shape) * lattice.fill).sum(axis=1) / np.where(
         material > 0, material, 1.0
     )
-    most = share > 0.5 + tie if declared else share >= 0.5 - tie
+    most = share > 0.5 + tie if declared or radius is not None else share >= 0.5 - tie
     cells = most if np.any(most) else share > 0
     if not np.any(cells):
         cells = np.zeros(len(lattice.cells), dtype=bool)
         cells[np.unique(_nearest(particles, controllers) // lattice.fill.shape[1])] = True
     return np.unique(lattice.cell_nodes[cells])
+
+
+def _within(
+    body: ReferenceBody, particles: np.ndarray, controllers: np.ndarray, radius_m: float
+) -> np.ndarray:
+    """Which particles (P, 3) with material lie within a radius of any controller (k, 3), (P,) bool.
+
+    Particles stand for an eighth of a cell, or a quarter or a half: one that is as near as its own size counts where no
+    other lies within.
+    """
+    lattice = body.lattice
+    distance = np.linalg.norm(particles[:, None] - controllers, axis=2).min(axis=1)
+    distance[lattice.fill.reshape(-1) <= 0] = np.inf
+    nearest, own = float(distance.min()), 0.25 * float(np.linalg.norm(lattice.spacing))
+    if nearest > radius_m + own:
+        raise SceneUnsupported(
+            f"a grip holds material within {radius_m:.4g} m of its {len(controllers)} controllers; the nearest is "
+            f"{nearest:.4g} m away"
+        )
+    return distance <= max(radius_m, nearest)
 
 
 def declared_region(grip: Grip | None, dim: int) -> np.ndarray | None:

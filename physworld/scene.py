@@ -59,12 +59,21 @@ class Ground:
 
 @dataclass(frozen=True)
 class Grip:
-    """A rigid gripper: its controllers, the box of undeformed material that it holds, tracked points in it."""
+    """A rigid gripper.
+
+    Attributes:
+        controllers: those that move as it does.
+        region_min_m, region_max_m: box of undeformed material that it holds, (3,) [m], or None.
+        points: tracked points inside it.
+        radius_m: instead of a box: it holds the material within this distance [m] of any of its controllers at the
+            first frame.
+    """
 
     controllers: tuple[int, ...]
     region_min_m: np.ndarray | None = None
     region_max_m: np.ndarray | None = None
     points: tuple[int, ...] = ()
+    radius_m: float | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -227,14 +227,26 @@ class Twin:
             solver = TotalLagrangian(run.problem)
             nodes = run_again_if_blown_up(solver, start, run.velocity, run.held, run.knots, progress)
             return run.at_frames(start, nodes)
-        form = UpdatedLagrangian(run.problem, transfer=TRANSFERS[self.transfer](), plasticity=self.plasticity)
+        form = self.flowing_form(run.problem)
         solid = form.run_particles(start, run.velocity, run.held, run.knots, progress)
+        return run.at_frames(self.particles_start, self.with_empty_particles(form.solid, solid))
+
+    def flowing_form(self, problem: Problem, time_step_s: float | None = None) -> UpdatedLagrangian:
+        """The updated Lagrangian form of a problem with the twin's transfer and flow law; see there for errors."""
+        transfer = TRANSFERS[self.transfer]()
+        return UpdatedLagrangian(problem, time_step_s, transfer=transfer, plasticity=self.plasticity)
+
+    def with_empty_particles(self, numbers: np.ndarray, solid: np.ndarray) -> np.ndarray:
+        """All particles (T, P, 3) from those with material, their ``numbers`` and paths (T, len(numbers), 3).
+
+        Where there is no material they go along with what is near.
+        """
         particles = np.empty((len(solid), len(self.particles_start), 3))
-        particles[:, form.solid] = solid
-        empty = np.setdiff1d(np.arange(particles.shape[1]), form.solid)  # no material there; they go along
+        particles[:, numbers] = solid
+        empty = np.setdiff1d(np.arange(particles.shape[1]), numbers)
         if len(empty):
             particles[:, empty] = follow(self.particles_start[empty], solid)
-        return run.at_frames(self.particles_start, particles)
+        return particles
 
     def integration(
         self,

@@ -310,6 +310,7 @@ def _grip(facts: dict[str, Any]) -> Grip:
         region_min_m=None if low is None else _float64(low),
         region_max_m=None if high is None else _float64(high),
         points=tuple(facts.get("points") or ()),
+        radius_m=None if facts.get("radius_m") is None else float(facts["radius_m"]),
     )
 
 
@@ -324,6 +325,7 @@ def _grip_facts(grips: tuple[Grip, ...], declared: list[Any] | None) -> list[dic
             "region_min_m": _list(grip.region_min_m),
             "region_max_m": _list(grip.region_max_m),
             "points": list(grip.points),
+            **({} if grip.radius_m is None else {"radius_m": grip.radius_m}),
         }
         for facts, grip in zip(same, grips, strict=True)
     ]

@@ -149,6 +149,8 @@ def check_grips(
             if owner.setdefault(i, g) != g:
                 findings.fault([*where, "controllers"], f"names controller {i}, which grip {owner[i]} holds")
         _check_region(grip, declaration, arrays, measured, [*where, "region_min_m"], findings)
+        if grip.radius_m is not None and all(i < controllers for i in grip.controllers):
+            _check_radius(grip, grip.radius_m, declaration, measured, [*where, "radius_m"], findings)
 
 
 def check_ground(ground: GroundForm, noise_sigma_m: float, measured: Measured, findings: Findings) -> None:
@@ -305,3 +307,32 @@ def _check_region(
             where,
             f"the region {list(grip.region_min_m)} to {list(grip.region_max_m)} holds none of the {what}",
         )
+
+
+def _check_radius(
+    grip: GripForm,
+    radius_m: float,
+    declaration: Declaration,
+    measured: Measured,
+    where: list[str | int],
+    findings: Findings,
+) -> None:
+    """No box beside it; and some material lies within it at the first frame, as far as the scene shows that."""
+    if grip.region_min_m is not None or grip.region_max_m is not None:
+        findings.fault(where, "a grip holds what is in its region or within its radius, not both")
+        return
+    if not grip.controllers:
+        return
+    at = measured.controllers[0, grip.controllers]
+    first, body = measured.first_frame, declaration.body
+    points = measured.points[first, measured.seen[first]]
+    nearest, what = float(np.linalg.norm(at[:, None] - points, axis=2).min()), "visible point"
+    if declaration.initial_state.startswith("undeformed") and None not in (body.box_min_m, body.box_max_m):
+        inside = np.clip(at, body.box_min_m, body.box_max_m)
+        nearest, what = float(np.linalg.norm(at - inside, axis=1).min()), "place in the declared body's box"
+        if nearest > radius_m + REGION_TOLERANCE_SIZES * measured.size_m:
+            findings.fault(
+                where, f"is {radius_m:.4g} m, the nearest {what} is {nearest:.4g} m from a controller"
+            )
+    elif nearest > radius_m:
+        findings.warn(where, f"is {radius_m:.4g} m, the nearest {what} is {nearest:.4g} m from a controller")

@@ -88,6 +88,7 @@ class GripForm(Form):
     region_min_m: Vector | None = None
     region_max_m: Vector | None = None
     points: list[Index] = Field(default_factory=list)
+    radius_m: Positive | None = None
 
 
 class ColliderForm(Form):

@@ -2,9 +2,10 @@
 
 Three suspects are measured on the scene at hand, since no scheme is innocent in general:
 
-- *Damping*. The body swings freely: grips stand still, drag, friction and effects are off. The energy that the run
-  loses is stated as the linear drag c that would take as much, lost = 2 c * integral of the kinetic energy [1/s], and
-  as the damping ratio c / (2 omega) of the dominant mode, the tracked points' strongest frequency.
+- *Damping*. The body swings freely: grips stand still, drag, friction, flow and effects are off. The energy that the
+  run loses (in the updated Lagrangian form nearly all of it in the transfers) is stated as the linear drag c that would
+  take as much, lost = 2 c * integral of the kinetic energy [1/s], and as the damping ratio c / (2 omega) of the
+  dominant mode, the tracked points' strongest frequency.
 - *Time step*. The recording is predicted with half the time step.
 - *Lattice*. The recording is predicted with finer cells.
 
@@ -20,8 +21,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from physworld.build import build_twin
+from physworld.integration import Integration
 from physworld.materials.laws import without_friction
 from physworld.mpm.energy import EnergyLedger, run_with_ledger
+from physworld.mpm.particle_energy import ParticleLedger, run_particles_with_ledger
 from physworld.mpm.total_lagrangian import TotalLagrangian
 from physworld.properties import carried
 from physworld.scene import Scene
@@ -31,6 +34,8 @@ REFINEMENT = 1.5  # cells of the finer lattice are this many times smaller
 _STILL = 1e-3  # a free run whose points move less than this share of the body's size is kicked
 _KICK_PER_S = 0.05  # speed of the kick, body sizes a second
 _LEAST_PERIODS = 1.5  # of the dominant mode, to tell its frequency
+
+Poll = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -82,7 +87,7 @@ def measure_numerics(
 
     Args:
         scene: the recording; only its controls, times and declared facts are used.
-        twin: calibrated, total Lagrangian.
+        twin: calibrated, of either form.
         particle_budget: the one that the twin was built with.
         refinement: cells of the finer lattice are this many times smaller.
         progress: called with (runs done, runs in all, what comes next); may raise to stop.
@@ -98,15 +103,10 @@ def measure_numerics(
     tell(1, 4, "prediction with its energy ledger")
     control_times, controls = scene.control_track()
     run = twin.integration(control_times, controls, scene.times)
-    nodes, ledger = run_with_ledger(
-        run.problem, twin.body.start, run.velocity, run.held, run.knots, progress=poll
-    )
-    track = twin.observe(run.at_frames(twin.body.start, nodes), scene.times)
-    step = TotalLagrangian(run.problem).time_step_s
+    carriers, ledger, step = _run_with_ledger(twin, run, run.velocity, poll=poll)
+    track = twin.observe(carriers, scene.times)
     tell(2, 4, "half the time step")
-    halved = TotalLagrangian(run.problem, 0.5 * step)
-    nodes = halved.run(twin.body.start, run.velocity, run.held, run.knots, poll)
-    half_track = twin.observe(run.at_frames(twin.body.start, nodes), scene.times)
+    half_track = twin.observe(_run_at(twin, run, 0.5 * step, poll), scene.times)
     tell(3, 4, "finer cells")
     finer = refined(scene, twin, particle_budget, refinement)
     finer_nodes = finer.simulate_nodes(control_times, controls, scene.times, progress=poll)
@@ -130,7 +130,9 @@ def measure_numerics(
 
 def refined(scene: Scene, twin: Twin, particle_budget: int, refinement: float = REFINEMENT) -> Twin:
     """The same twin on a lattice whose cells are ``refinement`` times smaller, with the same material points."""
-    finer = build_twin(scene, particle_budget, twin.device, refinement)
+    finer = build_twin(
+        scene, particle_budget, twin.device, refinement, twin.plasticity, twin.formulation, twin.transfer
+    )
     body = replace(finer.body, points=twin.body.points, offsets=twin.body.offsets)
     return replace(
         finer,
@@ -158,7 +160,7 @@ class FreeSwing:
 
     equivalent_drag_per_s: float
     mode_hz: float | None
-    ledger: EnergyLedger
+    ledger: EnergyLedger | ParticleLedger
 
     @property
     def damping_ratio(self) -> float | None:
@@ -187,6 +189,7 @@ def free_swing(
         ground_friction=0.0,
         self_friction=None if twin.self_friction is None else 0.0,
         effects=(),
+        plasticity=None,
         release_s=0.0,
     )
     control_times, controls = scene.control_track()
@@ -195,18 +198,15 @@ def free_swing(
     start, velocity = twin.body.start, run.velocity.copy()
     size = float(np.ptp(start, axis=0).max())
     held = np.unique(run.held.nodes)
-    nodes, ledger = run_with_ledger(
-        run.problem, start, velocity, run.held, run.knots, time_step_s=time_step_s, progress=poll
-    )
+    nodes, ledger, _ = _run_with_ledger(silent, run, velocity, time_step_s, poll)
     if np.linalg.norm(nodes - nodes[0], axis=2).max() < _STILL * size:
         free = np.setdiff1d(np.arange(len(start)), held)
         velocity[free] += _KICK_PER_S * size * _across(start, twin.gravity_m_s2)
-        nodes, ledger = run_with_ledger(
-            run.problem, start, velocity, run.held, run.knots, time_step_s=time_step_s, progress=poll
-        )
+        nodes, ledger, _ = _run_with_ledger(silent, run, velocity, time_step_s, poll)
     spent = float(np.trapezoid(ledger.kinetic - ledger.kinetic.min(), ledger.times))
-    drag = 0.0 if spent == 0 else float(ledger.lost[-1]) / (2 * spent)
-    tracks = silent.track_nodes(run.at_frames(start, nodes))
+    lost = ledger.lost + ledger.dissipated if isinstance(ledger, ParticleLedger) else ledger.lost
+    drag = 0.0 if spent == 0 else float(lost[-1]) / (2 * spent)
+    tracks = silent.track_nodes(nodes)
     return FreeSwing(drag, dominant_frequency(scene.times, tracks), ledger)
 
 
@@ -234,6 +234,38 @@ def dominant_frequency(times: np.ndarray, tracks: np.ndarray) -> float | None:
     left, middle, right = np.log(power[peak - 1 : peak + 2])
     shift = 0.5 * (left - right) / (left - 2 * middle + right)
     return float((peak + shift) * frequency[1])
+
+
+def _run_with_ledger(
+    twin: Twin,
+    run: Integration,
+    velocity: np.ndarray,
+    time_step_s: float | None = None,
+    poll: Poll | None = None,
+) -> tuple[np.ndarray, EnergyLedger | ParticleLedger, float]:
+    """Carriers at the frames (T, n, 3), the ledger at the knots, and the largest time step [s]."""
+    start = twin.body.start
+    if twin.formulation == "total_lagrangian":
+        step = time_step_s or TotalLagrangian(run.problem).time_step_s
+        nodes, ledger = run_with_ledger(
+            run.problem, start, velocity, run.held, run.knots, time_step_s=time_step_s, progress=poll
+        )
+        return run.at_frames(start, nodes), ledger, step
+    form = twin.flowing_form(run.problem, time_step_s)
+    solid, account = run_particles_with_ledger(form, start, velocity, run.held, run.knots, poll)
+    carriers = run.at_frames(twin.particles_start, twin.with_empty_particles(form.solid, solid))
+    return carriers, account, form.time_step_s
+
+
+def _run_at(twin: Twin, run: Integration, time_step_s: float, poll: Poll | None = None) -> np.ndarray:
+    """Carriers at the frames (T, n, 3) at a forced time step [s]."""
+    start = twin.body.start
+    if twin.formulation == "total_lagrangian":
+        nodes = TotalLagrangian(run.problem, time_step_s).run(start, run.velocity, run.held, run.knots, poll)
+        return run.at_frames(start, nodes)
+    form = twin.flowing_form(run.problem, time_step_s)
+    solid = form.run_particles(start, run.velocity, run.held, run.knots, poll)
+    return run.at_frames(twin.particles_start, twin.with_empty_particles(form.solid, solid))
 
 
 def _across(start: np.ndarray, gravity: np.ndarray) -> np.ndarray:

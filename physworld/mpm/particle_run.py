@@ -27,6 +27,7 @@ from physworld.mpm.transfer_kernels import (
 )
 
 if TYPE_CHECKING:
+    from physworld.mpm.particle_energy import ParticleMeter
     from physworld.mpm.updated_lagrangian import UpdatedLagrangian
 
 _CHUNK = 8  # substeps in one captured graph
@@ -68,6 +69,7 @@ class ParticleRun:
         self.extremes = wp.zeros(1, dtype=wp.float32, device=device)
         self.crossing = 0.0
         self.graph = None
+        self.meter: ParticleMeter | None = None
         instant = wp.array([_INSTANT, 1.0 / _INSTANT, _INSTANT], dtype=wp.float64, device=device)
         stress.launch(particles.F, particles.C, particles.stress, instant, self.flags)
 
@@ -78,6 +80,8 @@ class ParticleRun:
         recorded[0] = self._positions()
         engine.terms.begin(times, recorded[0])
         self.graph = None  # the terms have new arrays
+        if self.meter is not None:
+            self.meter.frame()
         for frame in range(frames - 1):
             interval = float(times[frame + 1] - times[frame])
             chunks = max(1, int(np.ceil(interval / (self._time_step(times[frame], interval) * _CHUNK))))
@@ -90,6 +94,8 @@ class ParticleRun:
                 engine.substeps += _CHUNK
                 self._check(times[frame] + (chunk + 1) * _CHUNK * dt, dt)
             recorded[frame + 1] = self._positions()
+            if self.meter is not None:
+                self.meter.frame()
             if progress is not None:
                 progress(frame + 1, frames - 1)
         return recorded
@@ -157,7 +163,7 @@ class ParticleRun:
 
     def _capture(self) -> None:
         nodes, device = self.box.nodes, self.device
-        split, gripped = self.engine.transfer.split, self.gripped > 0
+        split, gripped = self.engine.transfer.split or self.meter is not None, self.gripped > 0
 
         def nodal(used: bool) -> wp.array:
             return wp.zeros(
@@ -166,6 +172,8 @@ class ParticleRun:
 
         self.momentum, self.impulse, self.grip = nodal(True), nodal(split), nodal(gripped)
         self.velocity, self.velocity_old = nodal(True), nodal(split)
+        if self.meter is not None:
+            self.meter.enclose(nodes)
         self.seen = nodal(any(contact.at_once for contact in self.engine.terms.contacts))
         with wp.ScopedCapture(device=device) as capture:
             for _ in range(_CHUNK):
@@ -175,7 +183,8 @@ class ParticleRun:
     def _substep(self) -> None:
         engine, q, box = self.engine, self.particles, self.box.device_box
         problem, transfer, grid = engine.problem, engine.transfer, engine.grid
-        terms, count, split = engine.terms, len(engine.solid), int(transfer.split)
+        terms, count, meter, split = engine.terms, len(engine.solid), self.meter, int(transfer.split)
+        apart = 1 if meter is not None else split
         group = 1 if wp.get_device(self.device).is_cuda else _GROUP
         groups = -(-count // group)
         origin, inverse = wp.vec3d(*grid.origin), 1.0 / grid.spacing
@@ -185,10 +194,14 @@ class ParticleRun:
         def launch(kernel: object, dim: int, inputs: list, outputs: list) -> None:
             wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
+        if meter is not None:
+            meter.begin()
         terms.launch(q.x, q.v, q.F, q.stress, self.clock, self.counter)
+        if meter is not None:
+            meter.kicked()
         launch(
             particles_to_grid, groups,
-            [group, count, self.mass, origin, *space, split, self.clock, box, q.x, q.v, q.C, q.stress],
+            [group, count, self.mass, origin, *space, apart, self.clock, box, q.x, q.v, q.C, q.stress],
             [self.momentum, self.impulse, self.flags],
         )  # fmt: skip
         if self.gripped:
@@ -201,11 +214,13 @@ class ParticleRun:
             )  # fmt: skip
         for contact in terms.contacts:
             contact.find(q.x, self.clock, self.counter)
+        if meter is not None:
+            meter.scattered(self.momentum, self.impulse)
         launch(
             advance_grid, self.box.nodes,
             [wp.vec3f(*problem.gravity_m_s2), problem.drag_per_s, int(self.gripped > 0), self.clock, box,
              self.momentum, self.impulse, self.grip],
-            [self.velocity, self.velocity_old, split],
+            [self.velocity, self.velocity_old, apart],
         )  # fmt: skip
         press_all(terms.contacts, q.x, box, self.velocity, self.seen)
         sharing = [split, engine.velocity_share, engine.separating_volume, wp.float64(clear)]
@@ -215,6 +230,8 @@ class ParticleRun:
              self.stress.ratio, q.x, q.v, q.C],
             [self.flags, self.extremes],
         )  # fmt: skip
+        if meter is not None:
+            meter.returned(self.velocity)
         if self.gripped:
             launch(
                 place_grips,
@@ -222,5 +239,7 @@ class ParticleRun:
                 [numbers, path_gradient, path_v, self.counter, self.goal],
                 [q.x, q.v, q.C],
             )
+        if meter is not None:
+            meter.ended()
         self.stress.launch(q.F, q.C, q.stress, self.clock, self.flags)
         launch(advance_counter, 1, [self.counter], [])

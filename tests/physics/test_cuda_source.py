@@ -31,6 +31,7 @@ PLAIN = (
     "self_contact_search",
     "friction_kernels",
     "relaxation_kernels",
+    "particle_energy_kernels",
 )
 
 

@@ -29,7 +29,7 @@ def fit_accuracy(
     cancelled: Callable[[], bool] | None = None,
     journal: Journal | None = None,
 ) -> dict[str, Any]:
-    """``numerics``, ``converged`` and ``not_measured`` (why they are null, else empty), as plain JSON.
+    """``numerics``, ``converged`` and ``not_measured`` (why one is null, else empty), as plain JSON.
 
     Args:
         scene: the recording.
@@ -59,8 +59,6 @@ def _measured(
     progress: Progress | None,
     cancelled: Callable[[], bool] | None,
 ) -> dict[str, Any]:
-    if fitted.twin.formulation != "total_lagrangian":
-        return not_measured("the updated Lagrangian form has no measure of its own damping")
     total = MEASURED_RUNS + 1 + len(fitted.searched)
 
     def poll(done: int, frames: int) -> None:
@@ -73,6 +71,9 @@ def _measured(
 
     try:
         numerics = measure_numerics(scene, fitted.twin, particle_budget=budget, progress=tell, poll=poll)
+        if fitted.twin.formulation != "total_lagrangian":
+            reason = "converged: numbers with cells of no size are found in the total Lagrangian form"
+            return {**not_measured(reason), "numerics": json_safe(asdict(numerics))}
         converged = converged_parameters(scene, fitted, budget, poll=poll)
     except SimulationError as error:
         return not_measured(f"{type(error).__name__}: {error}")

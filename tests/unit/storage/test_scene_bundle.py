@@ -137,6 +137,16 @@ def test_the_round_trip_is_exact_and_loses_nothing() -> None:
     assert kept["body"]["mass_kg"] is None
 
 
+def test_the_radius_of_a_grip_survives_the_round_trip() -> None:
+    declared, arrays = sound_parts()
+    declared["grips"][0] = {"controllers": [0, 1, 2, 3], "radius_m": 0.03}
+    scene = scene_from_parts(declared, arrays)
+    assert scene.grips[0].radius_m == 0.03 and scene.grips[0].region_min_m is None
+    again, _ = bundle_from_bytes(canonical_archive(scene))
+    assert again.grips[0].radius_m == 0.03
+    assert "radius_m" not in parts_of(sound_scene())[0]["grips"][0]
+
+
 def test_the_digest_depends_on_the_content_alone(tmp_path: Path) -> None:
     files = files_of(*sound_parts())
     wide, arrays = sound_parts()

@@ -170,6 +170,17 @@ FAULTS: list[tuple[str, Break, str, str]] = [
     ),
     ("grip inverted", grip(region_min_m=[0.1, 0, 0.5]), "region_min_m", "in x"),
     ("grip half", grip(region_max_m=None), "region_min_m", "together"),
+    ("grip by both", grip(radius_m=0.03), "radius_m", "not both"),
+    ("grip by nothing", grip(radius_m=0.0), "radius_m", "greater than 0"),
+    (
+        "grip out of reach",
+        lambda d, a: (
+            grip(radius_m=0.001, region_min_m=None, region_max_m=None)(d, a),
+            set_body(box_min_m=[0.0, 0.0, 5.0], box_max_m=[0.3, 0.04, 5.04])(d, a),
+        ),
+        "radius_m",
+        "the nearest place in the declared body's box",
+    ),
     (
         "two owners",
         lambda d, a: d["grips"].append({"controllers": [3]}),
@@ -237,6 +248,11 @@ def test_a_fault_is_named_with_its_numbers(change: Break, where: str, says: str)
 
 
 WARNINGS: list[tuple[str, Break, str]] = [
+    (
+        "short reach",
+        grip(radius_m=1e-4, region_min_m=None, region_max_m=None),
+        "is 0.0001 m, the nearest visible point is",
+    ),
     ("tilted gravity", declare(gravity_m_s2=[0.5, 0, -9.8]), "2.9 degrees away from -z"),
     ("no gravity", declare(gravity_m_s2=[0, 0, 0]), "nothing falls"),
     ("moon", declare(gravity_m_s2=[0, 0, -1.62]), "1.62"),
