@@ -2,7 +2,7 @@
 
 The total Lagrangian form does not damp, so it is taken wherever it can describe the motion. The updated Lagrangian
 form is taken where material flows, parts, or touches itself: a flow law says so, or the scene does. A sheet or rod has
-only the total form.
+only the total form, and touches itself there (:mod:`physworld.mpm.self_contact`).
 """
 
 from __future__ import annotations

@@ -4,16 +4,17 @@
     pressure, friction                    those of the contact with the ground, two in series: half of its k, k_t, c
 
 Distances are those of the spline itself, curve to curve for a rope and point to surface for a sheet, so that the cells
-may be larger than the thickness. Every contact point looks from its own side, and each side has half of the pressure.
-Forces act along the line between the two places, equal and opposite: they conserve linear and angular momentum.
-Friction is equal and opposite too, and acts on middle lines a thickness apart: its couple, thickness times force, is
-what a section would take up by turning about its axis, which neither form has.
+may be larger than the thickness. A sheet's contact points look from both of two layers, and each has half of the
+pressure; a rope's pairs share what acts where strands cross (:mod:`physworld.mpm.self_contact_search`). Forces act
+along the line between the two places, equal and opposite: they conserve linear and angular momentum. Friction is equal
+and opposite too, and acts on middle lines a thickness apart: its couple, thickness times force, is what a section would
+take up by turning about its axis, which neither form has.
 
 A pair that is first seen nearer than the thickness touches where it is and farther out as it opens, never farther than
 the thickness. Each remembers from which side it came, so that what passed through within a substep is pushed back.
 
-Pairs are sought on a grid in space (:mod:`physworld.mpm.self_contact_search`), out to a skin beyond the thickness, and
-again when the body has moved by half the skin, the common motion of all of it aside.
+Pairs are sought on a grid in space, out to a skin beyond the thickness, and again when the body has moved by half the
+skin, the common motion of all of it aside.
 """
 
 from __future__ import annotations

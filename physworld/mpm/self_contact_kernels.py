@@ -81,7 +81,7 @@ def touch_itself(
             normal = side
             if distance > wp.float64(1.0e-6) * body.thickness:
                 normal = way / distance
-                if wp.dot(normal, side) < zero:
+                if distance < body.thickness and wp.dot(normal, side) < zero:
                     normal = -normal
                     distance = -distance
             slots.side[slot] = normal

@@ -5,8 +5,8 @@
 Velocities live half a substep before the positions, which makes the scheme second order in dt.
 
 Weights live in the reference configuration, so nothing is ever transferred between particles and grid and nothing is
-damped by transfers (de Vaucorbeil, Nguyen, Hutchinson 2020). It cannot tear or flow: plastic flow and self-contact
-belong to the updated Lagrangian form, which joins behind the same :class:`Formulation`.
+damped by transfers (de Vaucorbeil, Nguyen, Hutchinson 2020). It cannot tear or flow: plastic flow, and solids that
+touch themselves, belong to the updated Lagrangian form, which joins behind the same :class:`Formulation`.
 
 Substeps run in a captured graph; the host returns once a frame to record, to check and to report.
 """

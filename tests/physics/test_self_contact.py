@@ -210,6 +210,35 @@ def test_a_coil_of_rope_falls_on_itself_and_rests_a_diameter_apart() -> None:
     assert solver.terms[1].pairs > 20
 
 
+@pytest.mark.parametrize("touching", [True, False])
+def test_an_overhand_knot_tightens_and_does_not_come_undone(touching: bool) -> None:
+    diameter, cells, pull = 0.012, 48, 0.15
+    t = np.linspace(-2.35, 2.35, 4001)
+    curve = np.stack([t**3 - 3 * t, t**4 - 4 * t**2, 0.2 * t**5 - 2 * t], axis=1) * [0.035, 0.025, 0.03]
+    along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
+    lattice = box_lattice(np.zeros(1), along[-1:], (cells,))
+    places = lattice.node_coordinates[:, 0]
+    start = np.stack([np.interp(places, along, curve[:, k]) for k in range(3)], axis=1)
+    start[0], start[-1] = 2 * start[1] - start[2], 2 * start[-2] - start[-3]
+    terms = (SelfContact(diameter, 0.3),) if touching else ()
+    problem = Problem(lattice, ROPE, rest_nodes(lattice), np.zeros(3), drag_per_s=3.0, terms=terms)
+    times = np.linspace(0, 1.2, 13)
+    held = still(np.r_[0:3, len(start) - 3 : len(start)], start, 13)
+    axis = (start[-2] - start[1]) / np.linalg.norm(start[-2] - start[1])
+    for ends, sign in ((slice(0, 3), -1.0), (slice(3, 6), 1.0)):
+        held.positions[:, ends] += sign * pull * times[:, None, None] * axis
+        held.velocities[:, ends] = sign * pull * axis
+    nodes = TotalLagrangian(problem).run(start, 0 * start, held, times)
+    fine = np.linspace(0, along[-1], 601)
+    row, far = lattice.interpolation(fine[:, None]), np.abs(fine[:, None] - fine) > 4 * along[-1] / cells
+    nearest = [np.linalg.norm((c := row @ x)[:, None] - c, axis=-1)[far].min() for x in nodes]
+    if touching:
+        assert min(nearest[1:]) > 0.97 * diameter
+        assert nearest[-1] < 1.03 * diameter
+    else:
+        assert min(nearest) < 0.5 * diameter
+
+
 def test_a_stack_of_sheets_is_stable_and_comes_to_rest() -> None:
     thickness, dx, layers = 0.003, 0.02, 5
     lattice, own = in_pieces(((5, 4),) * layers, dx)
