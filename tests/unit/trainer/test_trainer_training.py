@@ -92,9 +92,9 @@ def _drain(runtime: Runtime) -> set[str]:
         outcomes |= {run_shard(runtime, publication.shard_id) for publication in waiting}
 
 
-def _train(runtime: Runtime, dataset_id: str) -> tuple[Job, ModelVersion]:
+def _train(runtime: Runtime, dataset_id: str, config: TrainingConfig = SMALL) -> tuple[Job, ModelVersion]:
     with runtime.database.session() as session:
-        job = jobs.create_training(session, TrainingCreate(name="bar", dataset_id=dataset_id, config=SMALL))
+        job = jobs.create_training(session, TrainingCreate(name="bar", dataset_id=dataset_id, config=config))
     _drain(runtime)
     with runtime.database.reading() as session:
         version = registry.list_versions(session, "bar").data[0]
@@ -187,6 +187,22 @@ def test_a_training_reads_the_vertices_alone_and_learns_the_same(runtime: Runtim
         assert not has_vertices(other, part)
         with pytest.raises(DatasetUnusable, match="is of another body"):
             read_track(other, part, architecture.history)
+
+
+def test_a_version_with_current_neighbours_and_no_prior_rolls_out(runtime: Runtime, dataset_id: str) -> None:
+    asked = SMALL.model_copy(update={"near_edges": "current", "prior": "none", "formats": ["onnx"]})
+    job, version = _train(runtime, dataset_id, asked)
+    assert (job.state, version.state) == ("succeeded", "ready"), job.error
+    files = _files(runtime, version)
+    card, tensors = json.loads(files["card.json"]), load(files["model.safetensors"])
+    assert card["architecture"]["near_edges"] == "current" and "step.onnx" in files
+    assert card["metrics"]["validation"]["prior"] == "none"
+    assert "contact of the object with itself what the demonstrations showed" in card["limits"]
+    assert "graph.kept_neighbours" in tensors and "graph.neighbours" not in tensors
+    published = PublishedModel.from_card(tensors, card)
+    assert published.spec.current_neighbours > 0
+    controllers = np.repeat(published.start_controllers[-1:], 10, axis=0)
+    assert np.isfinite(published.rollout(controllers)).all()
 
 
 def test_the_metrics_have_every_row_of_the_table(runtime: Runtime, dataset_id: str) -> None:
