@@ -16,12 +16,13 @@ from pathlib import Path
 
 import warp as wp
 
-from benchmarks import calibration_known, calibration_measured, calibration_sheets
+from benchmarks import calibration_descent, calibration_known, calibration_measured, calibration_sheets
 from benchmarks.harness import Report
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 PARTS: dict[str, Callable[..., Report]] = {
     "recovery": calibration_known.recovery,
+    "descent": calibration_descent.descent,
     "coverage": calibration_known.coverage,
     "identifiability": calibration_known.identifiability,
     "sheets": calibration_sheets.sheets,
