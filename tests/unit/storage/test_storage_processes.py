@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from conftest import Work
 
 SPAWN = multiprocessing.get_context("spawn")
-EPISODES = 40
+EPISODES = 100
 LEASE_SECONDS = 0.6
 DEADLINE_SECONDS = 120.0
 
