@@ -38,7 +38,7 @@ class ViscosityKelvinVoigt(Effect):
         """The one that the body has; a solid's goes by its weight, rho g L [Pa], times a second."""
         if twin.lattice.dim == 3:
             scale = twin.density * gravity_size(twin) * body_size(twin)
-            return (Strength("viscosity_pa_s", "Pa s", 0.0, 0.2 * scale, 1e-3 * scale),)
+            return (Strength("viscosity_pa_s", "Pa s", 0.0, scale, 1e-3 * scale),)
         return (Strength("relaxation_s", "s", 0.0, 0.2, 1e-3),)
 
     @classmethod

@@ -30,6 +30,10 @@ _FURTHER = (3.0, 9.0)  # times the linear estimate of a strength, which is low w
 _AROUND = (-0.48, -0.24, 0.24, 0.48)  # logarithms of the stiffness where a strength without shapes starts too
 _HELD = (-2.0, 2.0)  # places of the clamp's reach, in its steps
 _TRIED = 2  # starts elsewhere that are followed
+_MULTIPLES = tuple(
+    2.0**k for k in range(-5, 3)
+)  # of a strength, tried beside another model's calibrated numbers
+_WORTH_A_LOOK = 4.0  # times a model's squared residual up to which it is searched from there
 _NUDGE = 0.1  # of a probe: where a search starts if the linear estimate says none, so that shapes can show
 
 
@@ -157,6 +161,32 @@ class Confirmation:
         place = [known.get(u.name, t) for u, t in zip(fitted.unknowns, fitted.theta, strict=True)]
         place = np.clip(place, low, high)
         unknowns = [u.starting(t) for u, t in zip(fitted.unknowns, place, strict=True)]
+        again = refit(self.simulations, self.whitener, fitted.twin, unknowns, self.frames, self.iterations)
+        if again is None or again.misfit >= fitted.misfit:
+            return model
+        return Model(model.members, again, cross_validated(again, self.block_of_row))
+
+    def beside(self, model: Model, other: Model) -> Model:
+        """The model refitted from another one's calibrated numbers and what strength of its one gate does best there.
+
+        A body that rings down may be fitted by a drag at one stiffness and by a viscosity at another; that one search
+        has found the better valley is no reason to prefer its effect.
+        """
+        fitted, gate = model.fitted, model.members[-1].unknowns()[0]
+        names = [unknown.name for unknown in fitted.unknowns]
+        known = dict(zip([u.name for u in other.fitted.unknowns], other.fitted.theta, strict=True))
+        gates = {unknown.name for member in model.members for unknown in member.unknowns()}
+        low, high = _bounds(fitted)
+        place = [t if n in gates else known.get(n, t) for n, t in zip(names, fitted.theta, strict=True)]
+        own = names.index(gate.name)
+        places = np.tile(np.clip(place, low, high), (len(_MULTIPLES), 1))
+        places[:, own] = np.clip(np.multiply(_MULTIPLES, place[own]), low[own], high[own])
+        costs = self._costs(fitted, list(places))
+        if min(costs) > _WORTH_A_LOOK * float(np.sum(fitted.residual**2)):
+            return model
+        unknowns = [
+            u.starting(t) for u, t in zip(fitted.unknowns, places[int(np.argmin(costs))], strict=True)
+        ]
         again = refit(self.simulations, self.whitener, fitted.twin, unknowns, self.frames, self.iterations)
         if again is None or again.misfit >= fitted.misfit:
             return model

@@ -20,7 +20,7 @@ from physworld.trace.result import Number
 from physworld.trace.sensitivity import refinement_of
 from physworld.trace.simulations import Simulations
 from physworld.trace.unknowns import with_strengths
-from physworld.trace.verdict import accounts, simplest
+from physworld.trace.verdict import accounts, in_turn
 from physworld.trace.whitening import Whitener
 from physworld.twin import Twin
 
@@ -42,32 +42,40 @@ class SecondResolution:
     finer: Twin
 
     def check(self, declared: Model, real: list[Model]) -> tuple[Values, dict[tuple[str, ...], bool]]:
-        """Values of the best of the models that may be claimed, on the finer cells, and whether they agree."""
+        """Values of the best of the models that may be claimed, on the finer cells, and whether they agree.
+
+        Where the best one does not, those that do as well are asked in turn until one agrees, if the declared physics
+        leaves so much that something has to be there.
+        """
         values: Values = {}
         agreement: dict[tuple[str, ...], bool] = {}
-        if not real or not accounts(simplest(real, declared), declared, self.config):
-            return values, agreement
-        best = simplest(real, declared)
         self.simulations.stage = "second resolution"
         # a rod's stages of friction shrink with its cells' cube, and such a run is no reason to doubt the effect
         self.simulations.least_step_s /= self.config.refinement**3
-        twin = refinement_of(best.fitted.twin, self.finer)
+        for model in in_turn(real, declared):
+            if not accounts(model, declared, self.config):
+                break
+            agreement[model.names] = self._agrees(declared, model, values)
+            if agreement[model.names] or declared.fitted.misfit <= self.config.acceptable:
+                break
+        return values, agreement
+
+    def _agrees(self, declared: Model, model: Model, values: Values) -> bool:
+        """Whether a model does the same on the finer cells; its numbers there go into ``values``."""
+        twin = refinement_of(model.fitted.twin, self.finer)
         found = refit(
-            self.simulations, self.white, twin, best.fitted.unknowns, self.frames, _FINER_STEPS,
-            jacobian=best.fitted.jacobian,
+            self.simulations, self.white, twin, model.fitted.unknowns, self.frames, _FINER_STEPS,
+            jacobian=model.fitted.jacobian,
         )  # fmt: skip
         if found is None:
-            agreement[best.names] = False
-            return values, agreement
-        names = [u.name for u in found.unknowns]
-        values[best.names] = {name: found.value(name) for name in names}
-        intervals = numbers(best.fitted, self.block_of_row, {}, self.config.bootstraps, self.config.seed)
-        agreement[best.names] = self._still_helps(declared, found) and all(
-            self._alike(best.fitted, found, member)
-            or _within(best.fitted, values[best.names], intervals, member)
-            for member in best.members
+            return False
+        values[model.names] = {unknown.name: found.value(unknown.name) for unknown in found.unknowns}
+        intervals = numbers(model.fitted, self.block_of_row, {}, self.config.bootstraps, self.config.seed)
+        return self._still_helps(declared, found) and all(
+            self._alike(model.fitted, found, member)
+            or _within(model.fitted, values[model.names], intervals, member)
+            for member in model.members
         )
-        return values, agreement
 
     def _still_helps(self, declared: Model, fine: Refit) -> bool:
         """Whether the effect predicts better on finer cells too, beside the declared physics refitted there."""

@@ -62,6 +62,7 @@ class Selection:
                 tried = with_valleys(confirmation, base, ranked, columns, tried, config.near_floor)
             tried = self._again(confirmation, base, tried, ranked)
             tried = self._alike(confirmation, base, self._held_otherwise(confirmation, tried), columns)
+            tried = self._beside_the_best(confirmation, tried)
             tried = self._as_plates(base, tried)
             good = [m for m in tried if helps(m, base, config)]
             kept = simplest(good, base) if good else None
@@ -164,6 +165,19 @@ class Selection:
                 model = confirmation.from_place_of(model, best, strength)
             found.append(model)
         return found
+
+    def _beside_the_best(self, confirmation: Confirmation, tried: list[Model]) -> list[Model]:
+        """Models of one strength; those clearly worse than one near the noise are refitted from where that fits."""
+        self.simulations.stage = "refit beside the best"
+        best = min(tried, key=lambda m: m.fitted.misfit, default=None)
+        if best is None or best.fitted.misfit > self.config.acceptable:
+            return tried
+        return [
+            confirmation.beside(m, best)
+            if len(m.members[-1].gates) == 1 and m.fitted.misfit > _CLEARLY * best.fitted.misfit
+            else m
+            for m in tried
+        ]
 
     def _scores(self, base: Model, usable: list[Response]) -> Scores:
         config, white = self.config, self.white

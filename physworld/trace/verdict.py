@@ -27,6 +27,7 @@ FASTEST_WIND_M_S = 20.0
 LARGEST_TILT_RAD = 0.2
 LARGEST_MAGNITUDE = 0.01  # over the Earth gravity's strength differs by half as much
 _DISCREPANCY = 0.05
+_BELOW_NOISE = 0.9
 _NOISE_KNOWN = 0.05  # share to which the variance of the noise is known
 
 
@@ -93,7 +94,8 @@ def decide(
             return Verdict(NUMERICAL, declared, (), reason)
         reason = f"misfit {before:.2f} of the noise; none of {tried} effects accounts for it"
         return Verdict(UNEXPLAINED, declared, (), reason)
-    best = simplest(real, declared)
+    ordered = in_turn(real, declared)
+    best = next((m for m in ordered if agreement.get(m.names)), ordered[0])
     after = best.fitted.misfit
     what = " and ".join(best.names)
     figures = f"misfit {before:.2f} to {after:.2f} of the noise"
@@ -109,7 +111,11 @@ def decide(
         reason = f"the strength of {what} moves with the resolution: {figures}"
         return Verdict(NUMERICAL, declared, (), reason)
     same = tuple(
-        m for m in real if m is not best and indistinguishable(m, best, basis, declared, config.alike)
+        m
+        for m in real
+        if m is not best
+        and agreement.get(m.names) is not False
+        and indistinguishable(m, best, basis, declared, config.alike)
     )
     family = (best, *same)
     measured = [all(member.kind == "measurement" for member in model.members) for model in family]
@@ -207,16 +213,39 @@ def simplest(models: list[Model], declared: Model) -> Model:
     return min(near, key=lambda m: (len(m.members), len(m.fitted.unknowns), m.validated.mean))
 
 
+def in_turn(models: list[Model], declared: Model) -> list[Model]:
+    """The simplest of those that are as good as the best, then the others of them, the next simplest first."""
+    if not models:
+        return []
+    best = min(models, key=lambda m: m.validated.mean)
+    left, found = [m for m in models if as_good(m, best, declared)], []
+    while left:
+        found.append(simplest(left, declared))
+        left = [m for m in left if m is not found[-1]]
+    return found
+
+
 def as_good(model: Model, best: Model, declared: Model) -> bool:
     """Whether a model's errors on left-out blocks are within one standard error of the best model's.
 
     A model of the body's numerics is never exact, and one more number absorbs some of that: a difference below both
     ``_DISCREPANCY`` of what the best model explains and what it leaves above the noise does not count either.
     """
+    if within_noise(model, best):
+        return True
     gap, spread = difference(model.validated, best.validated)
     explained = max(declared.validated.mean - best.validated.mean, 0.0)
     remainder = max(best.validated.mean - 1.0, 0.0) + _NOISE_KNOWN
     return gap <= max(spread, min(_DISCREPANCY * explained, remainder))
+
+
+def within_noise(model: Model, best: Model) -> bool:
+    """Whether a model predicts left-out blocks within the noise, where the best one errs clearly less than that.
+
+    Then the noise is declared too large, or it is no noise at all but how well an experiment repeats; what lies below
+    it tells no model from another.
+    """
+    return best.validated.mean < _BELOW_NOISE and model.validated.mean <= 1.0
 
 
 def indistinguishable(model: Model, best: Model, basis: np.ndarray, declared: Model, alike: float) -> bool:
@@ -228,5 +257,7 @@ def indistinguishable(model: Model, best: Model, basis: np.ndarray, declared: Mo
     if len(model.members) != len(best.members) or len(model.fitted.unknowns) > len(best.fitted.unknowns):
         return False
     same = alikeness(explained_direction(model, declared, basis), explained_direction(best, declared, basis))
+    if within_noise(model, best):
+        return same > alike
     gap, spread = difference(model.validated, best.validated)
     return same > alike and gap <= max(spread, 0.5 * max(best.fitted.misfit**2 - 1.0, 0.0))

@@ -87,9 +87,25 @@ def test_a_twin_carries_what_is_named_or_the_best_of_a_set_but_no_fault_of_the_d
     assert Verdict(verdict, best).added is (best if added else None)
 
 
+@pytest.mark.parametrize(("left", "verdict"), [(0.9, "equivalent_set"), (1.1, "named")])
+def test_what_lies_below_a_noise_that_is_declared_too_large_tells_no_models_apart(
+    left: float, verdict: str
+) -> None:
+    rivals = [model(0.5 * NOISE, "viscosity"), model(left * NOISE, "drag")]
+    assert answer(rivals, NOISE + 20 * DRAG)[0] == verdict
+
+
 def test_a_strength_that_moves_with_the_resolution_is_numerical() -> None:
     assert answer([model(NOISE, "drag")], NOISE + 2 * DRAG, agree=False)[0] == "numerical_issue"
     assert answer([model(NOISE, "drag")], NOISE + 0.5 * DRAG, agree=False)[0] == "nothing_to_explain"
+
+
+def test_an_effect_that_goes_on_finer_cells_gives_way_to_one_that_does_as_well() -> None:
+    models = [model(NOISE, "slip"), model(NOISE + 1e-3 * OTHER, "drag")]
+    agreement = {("slip",): False, ("drag",): True}
+    facts = (np.zeros((ROWS, 0)), BLOCK_OF_ROW, lambda m: False)
+    found = decide(model(NOISE + 2 * DRAG), models, np.zeros((ROWS, 0)), agreement, 9.0, CONFIG, 20, *facts)
+    assert (found.name, found.model.names) == ("named", ("drag",))
 
 
 def test_a_misfit_that_other_cells_explain_is_numerical() -> None:
