@@ -20,7 +20,7 @@ from physworld.trace.result import Number
 from physworld.trace.sensitivity import refinement_of
 from physworld.trace.simulations import Simulations
 from physworld.trace.unknowns import with_strengths
-from physworld.trace.verdict import accounts, in_turn
+from physworld.trace.verdict import accounts, simplest_first
 from physworld.trace.whitening import Whitener
 from physworld.twin import Twin
 
@@ -52,7 +52,7 @@ class SecondResolution:
         self.simulations.stage = "second resolution"
         # a rod's stages of friction shrink with its cells' cube, and such a run is no reason to doubt the effect
         self.simulations.least_step_s /= self.config.refinement**3
-        for model in in_turn(real, declared):
+        for model in simplest_first(real, declared):
             if not accounts(model, declared, self.config):
                 break
             agreement[model.names] = self._agrees(declared, model, values)

@@ -94,7 +94,7 @@ def decide(
             return Verdict(NUMERICAL, declared, (), reason)
         reason = f"misfit {before:.2f} of the noise; none of {tried} effects accounts for it"
         return Verdict(UNEXPLAINED, declared, (), reason)
-    ordered = in_turn(real, declared)
+    ordered = simplest_first(real, declared)
     best = next((m for m in ordered if agreement.get(m.names)), ordered[0])
     after = best.fitted.misfit
     what = " and ".join(best.names)
@@ -213,7 +213,7 @@ def simplest(models: list[Model], declared: Model) -> Model:
     return min(near, key=lambda m: (len(m.members), len(m.fitted.unknowns), m.validated.mean))
 
 
-def in_turn(models: list[Model], declared: Model) -> list[Model]:
+def simplest_first(models: list[Model], declared: Model) -> list[Model]:
     """The simplest of those that are as good as the best, then the others of them, the next simplest first."""
     if not models:
         return []
