@@ -1,0 +1,78 @@
+"""Refits: a rival is searched where the best model fits, and one that fits nowhere near it is left as it is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from sagging_bar import BUDGET, SIGMA, TRUE_PA, sagging
+
+from physworld.build import build_twin
+from physworld.calibrate.parameters import parameters_of
+from physworld.effects.registry import effect
+from physworld.simulations import Job
+from physworld.trace.candidates import candidates
+from physworld.trace.comparison import cross_validated
+from physworld.trace.confirm import Confirmation, Model
+from physworld.trace.recordings import JointSimulations, Recordings
+from physworld.trace.refit import Refit
+from physworld.trace.sensitivity import sensitivities
+from physworld.trace.unknowns import of_parameter
+from physworld.trace.whitening import whitener
+
+VISCOSITY_PA_S, FAR_PA = 120.0, 1.2e5
+
+
+class Bar:
+    """A viscous bar, and models of it at places where a search may have left them."""
+
+    def __init__(self) -> None:
+        scene = sagging(effect("viscosity_kelvin_voigt", viscosity_pa_s=VISCOSITY_PA_S))
+        self.plain = build_twin(scene, BUDGET).with_parameters(youngs_modulus_pa=TRUE_PA)
+        recordings = Recordings([scene], (), 12, 3)
+        self.frames = recordings.split.train[1]
+        self.simulations = JointSimulations(recordings, self.plain, BUDGET, 1.25)
+        _, answers = self.simulations.first_look(Job(self.plain, self.frames))
+        self.white = whitener(recordings.scene, recordings.split, SIGMA, answers)
+        rows = len(self.white.residual(self.simulations.run([Job(self.plain, self.frames)])[0]))
+        self.blocks = np.arange(rows) * 4 // rows
+        self.confirmation = Confirmation(self.simulations, self.white, self.blocks, self.frames, 8)
+
+    def model(self, name: str, youngs_modulus_pa: float, **strength: float) -> Model:
+        """A model with one effect, not searched any further."""
+        twin = self.plain.with_parameters(youngs_modulus_pa=youngs_modulus_pa).with_effect(
+            effect(name, **strength)
+        )
+        member = candidates(self.plain, (name,))[0][0]
+        known = parameters_of(twin, separate_bending=False, damping=False)
+        stiffness = [of_parameter(p, twin, None) for p in known if p.name == "youngs_modulus_pa"]
+        gate = member.unknowns()[0]
+        unknowns = [*stiffness, gate.starting(next(iter(strength.values())) / gate.value(1.0))]
+        tracks = self.simulations.run([Job(twin, self.frames)])[0]
+        slope, _ = sensitivities(self.simulations, self.white, twin, tracks, unknowns, self.frames)
+        place = np.array([u.start for u in unknowns])
+        fitted = Refit(unknowns, twin, place, tracks, self.white.residual(tracks), slope)
+        return Model((member,), fitted, cross_validated(fitted, self.blocks))
+
+
+@pytest.fixture(scope="module")
+def bar() -> Bar:
+    return Bar()
+
+
+def test_a_rival_is_searched_where_the_best_model_fits(bar: Bar) -> None:
+    best = bar.model("viscosity_kelvin_voigt", TRUE_PA, viscosity_pa_s=VISCOSITY_PA_S)
+    lost = bar.model("air_drag_linear", FAR_PA, rate_per_s=8.0)
+    assert best.fitted.misfit < 1.1 and lost.fitted.misfit > 5.0
+    found = bar.confirmation.beside(lost, best)
+    assert found.names == ("air_drag_linear",)
+    assert found.fitted.misfit < 0.4 * lost.fitted.misfit
+    assert found.fitted.value("youngs_modulus_pa") == pytest.approx(TRUE_PA, rel=0.1)
+    assert 1.0 < found.fitted.value("air_drag_linear.rate_per_s") < 3.0
+
+
+def test_a_rival_that_fits_nowhere_near_the_best_model_is_left_as_it_is(bar: Bar) -> None:
+    good = bar.model("air_drag_linear", 0.97 * TRUE_PA, rate_per_s=8.0)
+    elsewhere = bar.model("viscosity_kelvin_voigt", 4 * TRUE_PA, viscosity_pa_s=VISCOSITY_PA_S)
+    runs = bar.simulations.count
+    assert bar.confirmation.beside(good, elsewhere) is good
+    assert bar.simulations.count == runs + 8  # a look at eight strengths, and no search
