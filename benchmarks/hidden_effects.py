@@ -1,0 +1,331 @@
+"""``python -m benchmarks.hidden_effects --json FILE``: trace what finite elements recorded of bodies with a secret.
+
+Beams, a soft blob held at its end and a slab that hangs by two corners are recorded by an engine that is not ours
+(:mod:`benchmarks.finite_elements`), undamped, with noise and points that go out of sight; what acts is drawn by a seed,
+one or two effects, none, one that no library has (a gust of a tenth of a second), or a camera whose clock is off. The
+trace sees scene and recording only, as one of ``benchmarks.trace``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from benchmarks.finite_elements import Acting, Elements, Floats, Place, record
+from benchmarks.harness import Report, write_section
+from benchmarks.trace import CLAIMS, PRIMARY, score, traced
+from physworld.geometry.reference import SHEET_KINDS
+from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Scene
+from storage.scene_bundle import write_bundle
+
+FPS, FRAMES, TRAIN_SHARE, SIGMA_M = 30.0, 60, 0.7, 1e-3
+POISSON, TRACKED, UNSEEN = 0.35, 120, 0.05
+CLEAR = 4.0  # displacement by the effect over the noise, on the test frames
+GRAVITY = np.array([0.0, 0.0, -9.81])
+_TOP_M = 0.5
+_RAMP_S = 0.15
+
+
+@dataclass(frozen=True)
+class Object:
+    """A body to record.
+
+    Attributes:
+        kind: of the scene.
+        size_m: (3,), of the box around it.
+        counts: elements.
+        young_pa, density_kg_m3: of the material; density is declared.
+        held: boxes of the unit cube that grips hold, (2, 3) each.
+        stroke_m, turn_rad: how far grips go and turn.
+        round: the section across the first axis shrinks towards the ends, as an ellipsoid's with blunt ends does.
+    """
+
+    kind: str
+    size_m: tuple[float, float, float]
+    counts: tuple[int, int, int]
+    young_pa: float
+    density_kg_m3: float
+    held: tuple[tuple[tuple[float, float, float], tuple[float, float, float]], ...]
+    stroke_m: float
+    turn_rad: float = 0.0
+    round: bool = False
+
+    def shape(self, unit: Floats) -> Floats:
+        """Places at rest [m] of points (N, 3) of the unit cube."""
+        centred = unit - 0.5
+        if self.round:
+            width = np.sqrt(1.0 - (1.8 * centred[:, :1]) ** 2 * 0.9)
+            centred = np.hstack([centred[:, :1], centred[:, 1:] * width])
+        return centred * self.size_m + [0.0, 0.0, _TOP_M]
+
+
+_END = (((0.0, 0.0, 0.0), (1.0 / 12, 1.0, 1.0)),)
+OBJECTS = {
+    "beam": Object("beam", (0.26, 0.038, 0.036), (12, 2, 2), 7e5, 600.0, _END, 0.03, 0.15),
+    "blob": Object("blob", (0.2, 0.1, 0.09), (8, 4, 4), 5e4, 540.0, (((0.0, 0.25, 0.25), (0.125, 0.75, 0.75)),), 0.02,
+                   round=True),
+    "slab": Object("sheet", (0.22, 0.015, 0.2), (10, 1, 9), 2.6e5, 350.0,
+                   (((0.0, 0.0, 8 / 9), (0.1, 1.0, 1.0)), ((0.9, 0.0, 8 / 9), (1.0, 1.0, 1.0))), 0.03),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Case:
+    """One recording: ``acts`` in the terms of the truth's file, ``answers`` the verdicts that are right."""
+
+    name: str
+    object: str
+    seed: int
+    acts: dict[str, dict[str, Any]] = field(default_factory=dict)
+    answers: tuple[str, ...] = CLAIMS
+
+
+def cases() -> tuple[Case, ...]:
+    """Every recording; strengths are drawn by the number of the case."""
+
+    def drawn(number: int, low: float, high: float) -> float:
+        return float(np.random.default_rng(7000 + number).uniform(low, high))
+
+    nothing = ("nothing_to_explain",)
+    tether = {"k": 6.0, "anchor": [0.05, -0.25, 0.4], "attach": [0.11, 0.0, _TOP_M], "radius": 0.025,
+              "rest_length": 0.25}  # fmt: skip
+    return (
+        Case("e01", "beam", 1, answers=nothing),
+        Case("e02", "beam", 2, {"quadratic_drag": {"k": drawn(2, 0.8, 2.5)}}),
+        Case("e03", "beam", 3, {"control_lag": {"seconds": drawn(3, 0.02, 0.05)}}),
+        Case("e04", "beam", 4, {"tether": tether}),
+        Case("e05", "beam", 5, {"linear_drag": {"c": drawn(5, 1.0, 2.5)},
+             "gravity_tilt": {"degrees": drawn(50, 2.5, 5.0), "axis": [1.0, 0.4, 0.0]}}),
+        Case("e06", "beam", 6, {"gust": {"m_s2": 12.0, "from_s": 0.7, "to_s": 0.8}}, ("unexplained",)),
+        Case("e07", "beam", 7, {"clock": {"offset_s": drawn(7, 0.02, 0.04)}}, ("data_issue", *CLAIMS)),
+        Case("e08", "blob", 8, {"gravity_tilt": {"degrees": drawn(8, 3.0, 6.0), "axis": [0.3, 1.0, 0.0]}}),
+        Case("e09", "blob", 9, {"internal_viscosity": {"eta": drawn(9, 30.0, 70.0)}}),
+        Case("e10", "blob", 10, answers=nothing),
+        Case("e11", "slab", 11, {"fibre": {"modulus": drawn(11, 4e5, 7e5), "axis": [1.0, 0.0, 0.6]}}),
+        Case("e12", "slab", 12, {"linear_drag": {"c": drawn(12, 1.5, 3.0)}}),
+    )  # fmt: skip
+
+
+class _Motion:
+    """Ways of a grip from rest: two sines along every axis, and a turn about the second one."""
+
+    def __init__(self, seed: int, stroke_m: float, turn_rad: float) -> None:
+        rng = np.random.default_rng(seed)
+        self.size = rng.uniform(0.3, 1.0, (2, 3)) * stroke_m
+        self.pace = rng.uniform(((3.0,), (8.0,)), ((7.0,), (13.0,)), (2, 3))  # rad/s
+        self.phase = rng.uniform(0.0, 2 * np.pi, (2, 3))
+        self.turn, self.turning = turn_rad * rng.uniform(0.5, 1.0), rng.uniform(3.0, 6.0)
+
+    def place(self, late_s: float, time: float) -> tuple[Floats, Floats]:
+        """Rotation (3, 3) and shift (3,) [m] of what follows the controllers so late."""
+        since = max(time - late_s, 0.0)
+        gain = 1.0 - np.exp(-((since / _RAMP_S) ** 2))
+        shift = gain * np.sum(self.size * np.sin(self.pace * since + self.phase), axis=0)
+        turn = Rotation.from_rotvec([0.0, gain * self.turn * np.sin(self.turning * since), 0.0])
+        return turn.as_matrix(), shift
+
+
+def _acting(acts: dict[str, dict[str, Any]]) -> Acting:
+    found = Acting(gravity_m_s2=GRAVITY)
+    for name, law in acts.items():
+        if name == "linear_drag":
+            found = replace(found, linear_drag_per_s=law["c"])
+        elif name == "quadratic_drag":
+            found = replace(found, quadratic_drag_per_m=law["k"])
+        elif name == "internal_viscosity":
+            found = replace(found, viscosity_pa_s=law["eta"])
+        elif name == "gravity_tilt":
+            axis = np.array(law["axis"]) / np.linalg.norm(law["axis"])
+            found = replace(
+                found, gravity_m_s2=Rotation.from_rotvec(np.radians(law["degrees"]) * axis).apply(GRAVITY)
+            )
+        elif name == "fibre":
+            found = replace(found, fibre_pa=law["modulus"], fibre_axis=np.array(law["axis"]))
+        elif name == "tether":
+            found = replace(found, tether_n_m=law["k"], tether_rest_m=law["rest_length"], tether_radius_m=law["radius"],
+                            anchor=np.array(law["anchor"]), attach=np.array(law["attach"]))  # fmt: skip
+        elif name == "gust":
+            found = replace(found, push=partial(_gust, law))
+    return found
+
+
+def _gust(law: dict[str, float], time: float) -> Floats:
+    return np.array([0.0, law["m_s2"] if law["from_s"] <= time < law["to_s"] else 0.0, 0.0])
+
+
+def recording(case: Case) -> tuple[Scene, dict[str, Any]]:
+    """What a camera saw, and the truth: what acts and how much it shows on the test frames, over the noise."""
+    known = OBJECTS[case.object]
+    rng = np.random.default_rng(900 + case.seed)
+    body = Elements(known.counts, known.shape, known.young_pa, POISSON, known.density_kg_m3)
+    units = rng.uniform(0.0, 1.0, (TRACKED, 3))
+    if known.kind not in SHEET_KINDS:  # cameras see surfaces
+        side = rng.integers(1, 3, TRACKED)
+        units[np.arange(TRACKED), side] = rng.integers(0, 2, TRACKED)
+    nodes, weights = body.weights(np.clip(units, 1e-6, 1 - 1e-6))
+    times = np.arange(FRAMES) / FPS
+    motions = [_Motion(10 * case.seed + g, known.stroke_m, known.turn_rad) for g in range(len(known.held))]
+    boxes = [known.shape(np.array(box)) for box in known.held]
+    held = [
+        np.flatnonzero(np.all((body.nodes >= b[0] - 1e-9) & (body.nodes <= b[1] + 1e-9), axis=1))
+        for b in boxes
+    ]
+
+    def tracks(acting: Acting, late_s: float = 0.0, at: Floats = times) -> Floats:
+        grips: list[tuple[Any, Place]] = [
+            (h, partial(m.place, late_s)) for h, m in zip(held, motions, strict=True)
+        ]
+        return np.einsum("pk,tpki->tpi", weights, record(body, acting, grips, at)[:, nodes])
+
+    plain = tracks(Acting(gravity_m_s2=GRAVITY))
+    clean = plain
+    if case.acts:
+        clean = tracks(_acting(case.acts), case.acts.get("control_lag", {}).get("seconds", 0.0))
+    if "clock" in case.acts:  # the camera's frames are later than it says
+        late = times + case.acts["clock"]["offset_s"]
+        clean = np.stack(
+            [[np.interp(late, times, one) for one in point.T] for point in plain.transpose(1, 0, 2)]
+        )
+        clean = clean.transpose(2, 0, 1)
+    begun = round(TRAIN_SHARE * FRAMES)
+    shown = float(np.sqrt(np.mean((clean - plain)[begun:] ** 2)) / SIGMA_M)
+    visible = rng.uniform(size=clean.shape[:2]) > UNSEEN
+    visible[0] = True
+    points = clean + rng.normal(0.0, SIGMA_M, clean.shape)
+    controllers, velocities, grips, first = [], [], [], 0
+    for box, motion in zip(boxes, motions, strict=True):
+        handle = np.array([[x, y, z] for x in box[:, 0] for y in box[:, 1] for z in box[:, 2]])
+        centre = body.nodes[held[len(grips)]].mean(axis=0)
+
+        def moved(
+            t: float, handle: Floats = handle, centre: Floats = centre, motion: _Motion = motion
+        ) -> Floats:
+            turn, shift = motion.place(0.0, t)
+            return (handle - centre) @ turn.T + centre + shift
+
+        controllers.append(np.stack([moved(t) for t in times]))
+        velocities.append(np.stack([(moved(t + 1e-5) - moved(t - 1e-5)) / 2e-5 for t in times]))
+        seen = np.all((clean[0] >= box[0] - 1e-9) & (clean[0] <= box[1] + 1e-9), axis=1)
+        grips.append(
+            Grip(tuple(range(first, first + 8)), box[0], box[1], tuple(np.flatnonzero(seen).tolist()))
+        )
+        first += 8
+    inside = known.shape(rng.uniform(0.0, 1.0, (3000, 3)))
+    thin = known.kind in SHEET_KINDS
+    scene = Scene(
+        name=case.name, kind=known.kind, description=f"{case.object} recorded by finite elements", points=points,
+        visible=visible, controllers=np.concatenate(controllers, axis=1),
+        controller_velocities=np.concatenate(velocities, axis=1), times=times, rest_volume_points=inside,
+        gravity_m_s2=GRAVITY, noise_sigma_m=SIGMA_M, train=(0, begun), test=(begun, FRAMES),
+        initial_state=UNDEFORMED_AT_REST, fps=FPS, grips=tuple(grips), declared={},
+        body=Body(size_m=np.array(known.size_m), thickness_m=min(known.size_m) if thin else None,
+                  density_kg_m3=known.density_kg_m3),
+    )  # fmt: skip
+    strength = "none" if not case.acts else "clear" if shown >= CLEAR else "weak"
+    return scene, {"parameters": case.acts, "strength": strength, "signature_sigmas_test": shown}
+
+
+def _made(case: Case, folder: Path) -> Path:
+    """The scene's folder with its truth; made if it is not there."""
+    scene = folder / case.name
+    if not (scene / "truth.json").exists():
+        found, truth = recording(case)
+        write_bundle(found, scene)
+        (scene / "truth.json").write_text(json.dumps(truth, indent=2) + "\n")
+    return scene
+
+
+def scored(case: Case, scene: Path, report: dict[str, Any]) -> dict[str, Any]:
+    """What the answer is worth: as ``benchmarks.trace`` scores it, and beside effects of the library by its verdict."""
+    truth = json.loads((scene / "truth.json").read_text())
+    library = all(name in PRIMARY for name in truth["parameters"])
+    thin = OBJECTS[case.object].kind in SHEET_KINDS
+    row = score(report, truth if library else {**truth, "parameters": {}}, thin)
+    if not library:
+        names = {*row["named"], *row["equivalent"]}
+        clock = "clock" in case.acts and "measurement_clock" in names
+        row["right"] = row["verdict"] in case.answers and (clock or not names)
+        row["wrong_name"] = bool(row["verdict"] in CLAIMS and not clock)
+    row["truth"] = " + ".join(case.acts) or "none"
+    row["object"], row["shown"] = case.object, truth["signature_sigmas_test"]
+    return row
+
+
+def page(rows: list[dict[str, Any]]) -> Report:
+    """The table of the rows that there are."""
+    header = ("scene", "object", "acts", "shows", "verdict", "named (or)", "right", "strength", "misfit", "before",
+              "after", "removed", "seconds")  # fmt: skip
+    table = []
+    for row in rows:
+        names = " + ".join(row["named"]) + (f" ({', '.join(row['equivalent'])})" if row["equivalent"] else "")
+        table.append(
+            (row["scene"], row["object"], row["truth"], f"{row['shown']:.1f}", row["verdict"], names or "-",
+             "yes" if row["right"] else "no", ", ".join(f"{r:.2f}" for r in row["strength_ratio"].values()) or "-",
+             f"{row['misfit_before']:.2f} to {row['misfit_after']:.2f}", f"{row['before_mm']:.2f}",
+             f"{row['after_mm']:.2f}", "-" if row["removed"] is None else f"{row['removed']:.0%}",
+             f"{row['seconds']:.0f}")
+        )  # fmt: skip
+    acting = [row for row in rows if row["truth"] != "none"]
+    silent = [row for row in rows if row["truth"] == "none"]
+    ratios = [r for row in acting if row["right"] for r in row["strength_ratio"].values()]
+    missing = sorted({case.name for case in cases()} - {row["scene"] for row in rows})
+    notes = (
+        f"{sum(row['right'] for row in acting)} of {len(acting)} with something in them right, "
+        f"{sum(row['verdict'] in CLAIMS for row in silent)} of {len(silent)} without falsely named, "
+        f"{sum(row['wrong_name'] for row in rows)} wrong names; {sum(abs(r - 1) <= 0.25 for r in ratios)} of "
+        f"{len(ratios)} strengths of right answers within 25 %.",
+        "Shows: displacement by the effect on the test frames, root mean square per axis, over the noise of 1 mm; "
+        "errors in mm; strength is found over true.",
+        f"Not traced: {', '.join(missing) or 'none'}.",
+    )
+    return Report(name="hidden_effects", title="Recordings by finite elements", figures={"scenes": rows}, header=header,
+                  rows=tuple(table), notes=notes, seed=0)  # fmt: skip
+
+
+def main() -> int:
+    """Record, trace and score; 0 where every scene gave an answer."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.hidden_effects", description=__doc__)
+    parser.add_argument(
+        "--json", type=Path, required=True, help="figures; rows of scenes not asked for stay in it"
+    )
+    parser.add_argument("--scenes", type=Path, default=None, help="folder that keeps the recordings")
+    parser.add_argument("--only", nargs="*", default=[], help="names of scenes; none given: all")
+    parser.add_argument("--resume", type=Path, default=None, help="folder that remembers simulations")
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--docs", type=Path, default=None, help="Markdown file whose section is replaced")
+    given = parser.parse_args()
+    rows = (
+        {row["scene"]: row for row in json.loads(given.json.read_text())["scenes"]}
+        if given.json.exists()
+        else {}
+    )
+    failed = False
+    with tempfile.TemporaryDirectory() as folder:
+        for case in cases():
+            if given.only and case.name not in given.only:
+                continue
+            scene = _made(case, given.scenes or Path(folder, "made"))
+            report = traced(scene, Path(folder), given.resume, given.processes)
+            failed |= report is None
+            if report is not None:
+                rows[case.name] = scored(case, scene, report)
+                print(json.dumps(rows[case.name]), flush=True)
+            given.json.write_text(
+                json.dumps({"scenes": [rows[name] for name in sorted(rows)]}, indent=2) + "\n"
+            )
+    if given.docs is not None:
+        write_section(page([rows[name] for name in sorted(rows)]), given.docs)
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
