@@ -17,6 +17,7 @@ from physworld.trace.confirm import Model
 from physworld.trace.intervals import numbers
 from physworld.trace.refit import Refit, refit
 from physworld.trace.result import Number
+from physworld.trace.score import orthonormal, project
 from physworld.trace.sensitivity import refinement_of
 from physworld.trace.simulations import Simulations
 from physworld.trace.unknowns import with_strengths
@@ -94,8 +95,11 @@ class SecondResolution:
         """Whether an effect does the same to the prediction at both resolutions, whatever its numbers.
 
         Two numbers of one effect may make up for each other (a tether's stiffness and its anchor); what they do
-        together is what the data see.
+        together is what the data see. Nor do they see what the other unknowns absorb of it: a load along a beam is a
+        little stiffness and reach of its clamp, and goes from one to the other with the cells.
         """
+        others = [k for k, u in enumerate(coarse.unknowns) if u.name.split(".")[0] != member.effect]
+        absorbed = orthonormal(coarse.jacobian[:, others])
         silent = {gate.name: 0.0 for gate in member.gates}
         changes = []
         for fitted in (coarse, fine):
@@ -103,7 +107,7 @@ class SecondResolution:
             tracks = self.simulations.run([Job(without, self.frames)])[0]
             if tracks is None:
                 return False
-            changes.append(self.white.change(fitted.tracks - tracks))
+            changes.append(project(absorbed, self.white.change(fitted.tracks - tracks)))
         moved_by = float(np.linalg.norm(changes[1] - changes[0]))
         return moved_by <= _AGREEMENT * float(np.linalg.norm(changes[0]))
 

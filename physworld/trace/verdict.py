@@ -115,7 +115,10 @@ def decide(
         for m in real
         if m is not best
         and agreement.get(m.names) is not False
-        and indistinguishable(m, best, basis, declared, config.alike)
+        and (
+            indistinguishable(m, best, basis, declared, config.alike)
+            or (m in ordered and richer_and_better(m, best))
+        )
     )
     family = (best, *same)
     measured = [all(member.kind == "measurement" for member in model.members) for model in family]
@@ -246,6 +249,16 @@ def within_noise(model: Model, best: Model) -> bool:
     it tells no model from another.
     """
     return best.validated.mean < _BELOW_NOISE and model.validated.mean <= 1.0
+
+
+def richer_and_better(model: Model, best: Model) -> bool:
+    """Whether a model of as many effects predicts left-out blocks better than the simplest one of those as good.
+
+    By more than a standard error, and more than the noise is known: then it is the discrepancy allowed to a twin that
+    calls them as good, not the data, and one number less is no reason to prefer another effect.
+    """
+    gap, spread = difference(best.validated, model.validated)
+    return len(model.members) == len(best.members) and gap > max(spread, _NOISE_KNOWN)
 
 
 def indistinguishable(model: Model, best: Model, basis: np.ndarray, declared: Model, alike: float) -> bool:

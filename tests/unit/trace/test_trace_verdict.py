@@ -119,6 +119,15 @@ def test_the_simpler_of_two_that_do_as_well_is_named() -> None:
     assert answer([rich, model(NOISE, "tilt")], NOISE + 2 * DRAG) == ("named", ("tilt",))
 
 
+@pytest.mark.parametrize(("left", "verdict"), [(0.3, "equivalent_set"), (0.1, "named")])
+def test_one_number_less_is_no_reason_to_prefer_an_effect_that_predicts_worse(
+    left: float, verdict: str
+) -> None:
+    rich = model(1.08 * NOISE, "tether", unknowns=4)
+    plain = model(1.08 * NOISE + left * OTHER, "fibres")
+    assert answer([rich, plain], NOISE + 2 * DRAG) == (verdict, ("fibres",))
+
+
 def test_two_effects_are_named_only_where_one_leaves_too_much() -> None:
     before = NOISE + 2 * DRAG + 2 * OTHER
     both = model(NOISE, "drag", "viscosity", unknowns=2)
