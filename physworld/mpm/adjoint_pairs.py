@@ -16,6 +16,7 @@ import warp as wp
 from physworld.mpm.adjoint_kernels import add_memory_work, add_work, load_row
 from physworld.mpm.adjoint_terms import Memory, Reverse, flat
 from physworld.mpm.forces import InternalForces
+from physworld.mpm.soft_grips_derivatives import SoftGripsChange
 from physworld.mpm.terms import BoundTerm
 
 
@@ -33,10 +34,13 @@ class ForceSide:
 
 
 class ForcePair:
-    """High and low side; ``work`` is the derivative of L along high - low after a reverse pass."""
+    """High and low side; ``work`` is the derivative of L along high - low after a reverse pass.
 
-    def __init__(self, high: ForceSide, low: ForceSide) -> None:
-        self._sides = (high, low)
+    ``springs`` is the change of the stiffness of grips that hold softly.
+    """
+
+    def __init__(self, high: ForceSide, low: ForceSide, springs: SoftGripsChange | None = None) -> None:
+        self._sides, self._springs = (high, low), springs
 
     def prepare(
         self, now: Reverse, x_previous: wp.array, times: np.ndarray, memories: list[list[Memory]]
@@ -74,6 +78,8 @@ class ForcePair:
                             outputs=[array], device=array.device,
                         )  # fmt: skip
                 term.launch(now.x, now.v, now.clock, now.counter, force)
+        if self._springs is not None:
+            self._springs.add(now, self._forces[0])
         wp.launch(
             add_work, dim=len(self._total), inputs=[now.force_bar],
             outputs=[*self._forces, self._total], device=now.x.device,

@@ -25,6 +25,8 @@ from physworld.mpm.adjoint_pairs import ForcePair
 from physworld.mpm.adjoint_terms import Memory, RecordedAdjoint, Reverse, StressAdjoint, TermAdjoint
 from physworld.mpm.adjoint_twist import TwistAdjoint
 from physworld.mpm.ground import BoundGround
+from physworld.mpm.soft_grips import BoundSoftGrips
+from physworld.mpm.soft_grips_derivatives import SoftGripsAdjoint, SoftGripsGradient
 from physworld.mpm.stress import BoundStress
 from physworld.mpm.tangent import InternalTangent
 from physworld.mpm.terms import BoundTerm
@@ -52,6 +54,7 @@ class Gradient:
         drag: by the drag rate.
         x, v: by the initial state, (n, 3).
         held_positions, held_velocities: by the prescribed paths, (T, H, 3).
+        soft_grips: by grips that hold softly; None in a run without any.
         stresses: by numbers (k,) and fields (layers, P) of every stress beside the law, in the order of the terms;
             None for another term.
         works: of the force pairs that were given.
@@ -70,6 +73,7 @@ class Gradient:
     v: np.ndarray
     held_positions: np.ndarray
     held_velocities: np.ndarray
+    soft_grips: SoftGripsGradient | None
     stresses: tuple[tuple[np.ndarray, np.ndarray] | None, ...]
     works: tuple[float, ...]
 
@@ -89,11 +93,12 @@ class ReversePass:
         size = 3 * nodes
         self._now = Reverse(
             x=zeros(size), v=zeros(size), clock=zeros(3), counter=zeros(3, wp.int32), offset=run.offset,
-            force_bar=zeros(size), x_bar=zeros(size), v_bar=zeros(size), mass_bar=zeros(nodes),
+            pull=zeros(size), force_bar=zeros(size), x_bar=zeros(size), v_bar=zeros(size),
+            mass_bar=zeros(nodes), drag_bar=zeros(nodes), gravity_bar=zeros(size),
         )  # fmt: skip
         self._x_previous, self._previous_bar, self._pending = zeros(size), zeros(size), zeros(size)
         self._earlier_dt = zeros(1)
-        self._gravity_bar, self._drag_bar, self._scaled = zeros(size), zeros(nodes), zeros(size)
+        self._scaled = zeros(size)
         held = run.held
         width = max(3 * len(held.nodes), 1)
         self._path_bars = zeros((frames, width)), zeros((frames, width))
@@ -112,8 +117,12 @@ class ReversePass:
         self._viscous = friction_law(problem.law) is not None
         terms = solver.terms[:-1]
         self._multiplier = terms[0] if terms and getattr(terms[0], "multiplies", False) else None
+        soft = terms[-1] if terms and isinstance(terms[-1], BoundSoftGrips) else None
+        self._soft = None if soft is None else SoftGripsAdjoint(soft, frames)
         self._terms = [
-            None if term is self._multiplier else adjoint_of(term, problem, self._now, memories)
+            None
+            if term is self._multiplier or term is soft
+            else adjoint_of(term, problem, self._now, memories)
             for term, memories in zip(terms, run.memories, strict=True)
         ]
         for pair in pairs:
@@ -141,6 +150,8 @@ class ReversePass:
         now.clock.assign(np.array([interval, 1.0 / dt, dt]))
         now.counter.assign(np.array([frame, substeps - 1, substeps], dtype=np.int32))
         self._earlier_dt.assign(np.array([steps[frame - 1] if frame else 0.0]))
+        for term in self._solver.terms:
+            term.pace(dt)
         now.x_bar.assign(now.x_bar.numpy() + self._seed[frame + 1].reshape(-1))
         start = wp.array(run.nodes[frame].reshape(-1), dtype=wp.float64, device=self._problem.device)
         first = int(run.offset.numpy()[frame])
@@ -153,10 +164,12 @@ class ReversePass:
         now, device = self._now, self._problem.device
         wp.launch(
             take_nodes_back, dim=len(self._mass), inputs=self._node_inputs,
-            outputs=[now.x_bar, now.v_bar, now.mass_bar, self._gravity_bar, self._drag_bar, *self._path_bars, now.v,
-                     self._x_previous, now.force_bar],
+            outputs=[now.x_bar, now.v_bar, now.mass_bar, now.gravity_bar, now.drag_bar, *self._path_bars, now.v,
+                     self._x_previous, now.pull, now.force_bar],
             device=device,
         )  # fmt: skip
+        if self._soft is not None:
+            self._soft.take_back(now)
         direction = self._internal_direction()
         if self._viscous:
             self._tangent.apply_with_friction(
@@ -200,8 +213,11 @@ class ReversePass:
         dt = wp.float64(now.clock.numpy()[2])
         wp.launch(
             take_start_back, dim=len(self._mass), inputs=[self._mass, *self._physics, dt, now.v, half],
-            outputs=[now.v_bar, now.mass_bar, self._gravity_bar, self._drag_bar, now.force_bar], device=device,
+            outputs=[now.v_bar, now.mass_bar, now.gravity_bar, now.drag_bar, now.pull, now.force_bar],
+            device=device,
         )  # fmt: skip
+        if self._soft is not None:
+            self._soft.take_back(now)
         self._tangent.apply(now.x, self._internal_direction(), now.x_bar, self._law_bar)
         self._take_terms_back()
 
@@ -239,12 +255,13 @@ class ReversePass:
             law=law,
             columns=columns,
             mass=mass,
-            gravity=self._gravity_bar.numpy().reshape(-1, 3).sum(axis=0),
-            drag=float(self._drag_bar.numpy().sum()),
+            gravity=now.gravity_bar.numpy().reshape(-1, 3).sum(axis=0),
+            drag=float(now.drag_bar.numpy().sum()),
             x=now.x_bar.numpy().reshape(-1, 3).copy(),
             v=now.v_bar.numpy().reshape(-1, 3).copy(),
             held_positions=paths[0],
             held_velocities=paths[1],
+            soft_grips=None if self._soft is None else self._soft.collected(),
             stresses=stresses,
             works=tuple(pair.work for pair in self._pairs),
         )

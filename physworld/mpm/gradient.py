@@ -24,6 +24,8 @@ from physworld.mpm.adjoint import RecordedRun
 from physworld.mpm.adjoint_pairs import ForcePair, ForceSide
 from physworld.mpm.adjoint_reverse import Gradient
 from physworld.mpm.forces import InternalForces
+from physworld.mpm.soft_grips import BoundSoftGrips, SoftGrips
+from physworld.mpm.soft_grips_derivatives import SoftGripsChange, same_soft_grips
 from physworld.mpm.stress import BoundStress
 from physworld.mpm.terms import BoundTerm
 from physworld.mpm.total_lagrangian import HeldNodes, Problem
@@ -82,6 +84,7 @@ class _Comparison:
                 f"{len(direction.high.held.nodes)} nodes are held on one side and {len(direction.low.held.nodes)} on "
                 "the other: holding nodes is not smooth"
             )
+        self._soft = same_soft_grips((base, high, low))[1:]
         self._by_columns = _moduli_alone_differ(base, high, low)
         self._stresses: list[tuple[int, np.ndarray, np.ndarray]] = []
         sides = self._matched(terms, high, low)
@@ -94,9 +97,18 @@ class _Comparison:
                 ((0, p.terms[0].bind(p)), *side) for p, side in zip((high, low), sides, strict=True)
             )
         self.pair = None
-        if launched or any(sides):
+        springs = self._springs(terms)
+        if launched or any(sides) or springs is not None:
             internal = [internal_forces(p) if launched else None for p in (high, low)]
-            self.pair = ForcePair(ForceSide(internal[0], sides[0]), ForceSide(internal[1], sides[1]))
+            self.pair = ForcePair(ForceSide(internal[0], sides[0]), ForceSide(internal[1], sides[1]), springs)
+
+    def _springs(self, terms: tuple[BoundTerm, ...]) -> SoftGripsChange | None:
+        """How the stiffness of soft grips differs."""
+        if not self._soft:
+            return None
+        change = self._soft[0].stiffness - self._soft[1].stiffness
+        own = next(term for term in terms if isinstance(term, BoundSoftGrips))
+        return SoftGripsChange(own, change) if np.any(change) else None
 
     def host_share(self, g: Gradient) -> float:
         """Derivatives by arrays times the arrays' differences."""
@@ -108,6 +120,8 @@ class _Comparison:
         total += float(np.sum(g.held_positions * (high.held.positions - low.held.positions)))
         total += float(np.sum(g.held_velocities * (high.held.velocities - low.held.velocities)))
         total += float(g.mass @ (p.nodal_mass() - q.nodal_mass()))
+        if g.soft_grips is not None:
+            total += g.soft_grips.along(*(grips.held for grips in self._soft))
         if self._by_columns:
             base = _numbers(self._base.law)
             change = np.array(_numbers(p.law)) - np.array(_numbers(q.law))
@@ -129,7 +143,8 @@ class _Comparison:
         self, terms: tuple[BoundTerm, ...], high: Problem, low: Problem
     ) -> tuple[tuple[tuple[int | None, BoundTerm], ...], tuple[tuple[int | None, BoundTerm], ...]]:
         """Terms whose forces differ, each with its place in the run; stresses go by their numbers where they can."""
-        bound = ([t.bind(high) for t in high.terms], [t.bind(low) for t in low.terms])
+        terms = tuple(t for t in terms if not isinstance(t, BoundSoftGrips))  # last; by their own gradient
+        bound = tuple([t.bind(p) for t in p.terms if not isinstance(t, SoftGrips)] for p in (high, low))
         kinds = [[_kind(t) for t in side] for side in (terms, *bound)]
         lists: tuple[list[tuple[int | None, BoundTerm]], ...] = ([], [])
         if kinds[0] == kinds[1] == kinds[2]:
