@@ -21,17 +21,17 @@ import warp as wp
 
 
 @wp.kernel(enable_backward=False)
-def keep_velocities(
+def keep_row(
     # in
     offset: wp.array(dtype=wp.int32),
     counter: wp.array(dtype=wp.int32),
-    v: wp.array(dtype=wp.float64),
+    values: wp.array(dtype=wp.float64),
     # out
     history: wp.array2d(dtype=Any),
 ):
     """Write one component into the row of this substep."""
     k = wp.tid()
-    history[offset[counter[0]] + counter[1], k] = history.dtype(v[k])
+    history[offset[counter[0]] + counter[1], k] = history.dtype(values[k])
 
 
 @wp.kernel(enable_backward=False)

@@ -16,6 +16,7 @@ import warp as wp
 from physworld.mpm.adjoint_kernels import add_memory_work, add_work, load_row
 from physworld.mpm.adjoint_terms import Memory, Reverse, flat
 from physworld.mpm.forces import InternalForces
+from physworld.mpm.friction import FrictionForces
 from physworld.mpm.soft_grips_derivatives import SoftGripsChange
 from physworld.mpm.terms import BoundTerm
 
@@ -26,11 +27,13 @@ class ForceSide:
 
     Attributes:
         internal: internal forces, or None where they do not change.
+        friction: that part of them which the run takes in stages, likewise; ``internal`` is without it then.
         terms: those that change, each with its place among the terms of the run (None: the run has none like it).
     """
 
     internal: InternalForces | None
     terms: tuple[tuple[int | None, BoundTerm], ...]
+    friction: FrictionForces | None = None
 
 
 class ForcePair:
@@ -62,6 +65,22 @@ class ForcePair:
     def work(self) -> float:
         """Sum over the substeps that were taken back."""
         return float(self._total.numpy().sum())
+
+    def prepare_friction(self) -> None:
+        """Friction is that at the positions of this substep from now on."""
+        for side in self._sides:
+            if side.friction is not None:
+                side.friction.prepare(self._now.x)
+
+    def add_friction_work(self, y: wp.array, u: wp.array) -> None:
+        """One stage: friction at the velocities ``y`` (3n,) [m/s], with ``u`` (3n,) the derivatives by its forces."""
+        if all(side.friction is None for side in self._sides):
+            return
+        for side, force in zip(self._sides, self._forces, strict=True):
+            if side.friction is not None:
+                side.friction.launch(y, force)
+        outputs = [*self._forces, self._total]
+        wp.launch(add_work, dim=len(self._total), inputs=[u], outputs=outputs, device=y.device)
 
     def add_work(self) -> None:
         """One substep; part of the captured graph, before the derivatives by memories are taken back."""

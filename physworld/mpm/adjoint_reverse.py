@@ -18,10 +18,12 @@ from physworld.mpm.adjoint_kernels import (
     count_back,
     last_positions,
     step_back,
+    take_away,
     take_nodes_back,
     take_start_back,
 )
 from physworld.mpm.adjoint_pairs import ForcePair
+from physworld.mpm.adjoint_stages import StagesBack
 from physworld.mpm.adjoint_terms import Memory, RecordedAdjoint, Reverse, StressAdjoint, TermAdjoint
 from physworld.mpm.adjoint_twist import TwistAdjoint
 from physworld.mpm.ground import BoundGround
@@ -125,19 +127,29 @@ class ReversePass:
             else adjoint_of(term, problem, self._now, memories)
             for term, memories in zip(terms, run.memories, strict=True)
         ]
+        self._stages = None
+        if run.forces is not None:
+            self._stages = StagesBack(
+                problem, solver.friction, self._node_inputs[:2], (run.history, run.forces), self._now,
+                self._earlier_dt, self._x_previous, self._path_bars, self._tangent, self._law_bar, pairs,
+            )  # fmt: skip
         for pair in pairs:
             pair.prepare(self._now, self._x_previous, run.times, run.memories)
 
     def result(self) -> Gradient:
         """Go back over all frames, then over the half step of the start."""
         run, now, device = self._run, self._now, self._problem.device
-        with wp.ScopedCapture(device=device) as capture:
-            for _ in range(_CHUNK):
-                self._substep()
+        graphs: dict[int, Any] = {}
         for frame in reversed(range(len(run.times) - 1)):
             self._enter(frame)
+            stages = int(run.stages[frame])
+            if stages not in graphs:
+                with wp.ScopedCapture(device=device) as capture:
+                    for _ in range(_CHUNK):
+                        self._substep(stages)
+                graphs[stages] = capture.graph
             for _ in range(int(run.substeps[frame]) // _CHUNK):
-                wp.capture_launch(capture.graph)
+                wp.capture_launch(graphs[stages])
         self._start()
         return self._collected(now)
 
@@ -152,6 +164,8 @@ class ReversePass:
         self._earlier_dt.assign(np.array([steps[frame - 1] if frame else 0.0]))
         for term in self._solver.terms:
             term.pace(dt)
+        if self._stages is not None:
+            self._stages.enter(dt, int(run.stages[frame]))
         now.x_bar.assign(now.x_bar.numpy() + self._seed[frame + 1].reshape(-1))
         start = wp.array(run.nodes[frame].reshape(-1), dtype=wp.float64, device=self._problem.device)
         first = int(run.offset.numpy()[frame])
@@ -160,7 +174,36 @@ class ReversePass:
             outputs=[now.x], device=self._problem.device,
         )  # fmt: skip
 
-    def _substep(self) -> None:
+    def _substep(self, stages: int) -> None:
+        now, device = self._now, self._problem.device
+        if self._stages is None:
+            self._take_nodes_back()
+        else:
+            self._take_stages_back(self._stages, stages)
+        self._take_terms_back()
+        wp.launch(
+            step_back, dim=len(now.x), inputs=[self._x_previous],
+            outputs=[self._previous_bar, self._pending, now.x, now.x_bar], device=device,
+        )  # fmt: skip
+        wp.launch(count_back, dim=1, inputs=[now.counter], device=device)
+
+    def _take_stages_back(self, taken: StagesBack, stages: int) -> None:
+        """Nodes, grips that hold softly, and internal forces where friction has stages of its own."""
+        now = self._now
+        taken.take_back(stages)
+        if self._viscous and self._soft is None:
+            return
+        self._scaled.zero_()
+        if self._viscous:  # the elastic forces were taken along all of it, and owe what the grips change
+            wp.copy(self._scaled, now.force_bar)
+        if self._soft is not None:
+            self._soft.take_back(now)
+        inputs = [now.force_bar]
+        wp.launch(take_away, dim=len(now.x), inputs=inputs, outputs=[self._scaled], device=now.x.device)
+        self._tangent.apply(now.x, self._scaled, now.x_bar, self._law_bar)
+
+    def _take_nodes_back(self) -> None:
+        """The same with explicit friction."""
         now, device = self._now, self._problem.device
         wp.launch(
             take_nodes_back, dim=len(self._mass), inputs=self._node_inputs,
@@ -177,12 +220,6 @@ class ReversePass:
             )
         else:
             self._tangent.apply(now.x, direction, now.x_bar, self._law_bar)
-        self._take_terms_back()
-        wp.launch(
-            step_back, dim=len(now.x), inputs=[self._x_previous],
-            outputs=[self._previous_bar, self._pending, now.x, now.x_bar], device=device,
-        )  # fmt: skip
-        wp.launch(count_back, dim=1, inputs=[now.counter], device=device)
 
     def _internal_direction(self) -> wp.array:
         """w as the internal forces see it."""
@@ -201,9 +238,14 @@ class ReversePass:
                 term.take_back(self._now)
 
     def _start(self) -> None:
-        """The half step back with which a run starts; then the state is the one that was given."""
+        """The half step back with which a run starts; then the state is the one that was given.
+
+        With stages of friction there is none: the first stages are half a step.
+        """
         run, now, device = self._run, self._now, self._problem.device
         now.x_bar.assign(now.x_bar.numpy() + self._pending.numpy() + self._seed[0].reshape(-1))
+        if self._stages is not None:
+            return
         now.counter.assign(np.array([0, 0, run.substeps[0]], dtype=np.int32))
         for memory in (m for part in run.memories for m in part):
             memory.bar.zero_()

@@ -12,18 +12,19 @@ The time step is that of the run: it is not differentiated.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
 import warp as wp
 
 from physworld.errors import NotDifferentiable
-from physworld.materials.laws import Law, SheetLaw, SolidLaw
+from physworld.materials.laws import Law, SheetLaw, SolidLaw, friction_law, without_friction
 from physworld.mpm.adjoint import RecordedRun
 from physworld.mpm.adjoint_pairs import ForcePair, ForceSide
 from physworld.mpm.adjoint_reverse import Gradient
 from physworld.mpm.forces import InternalForces
+from physworld.mpm.friction import FrictionForces
 from physworld.mpm.soft_grips import BoundSoftGrips, SoftGrips
 from physworld.mpm.soft_grips_derivatives import SoftGripsChange, same_soft_grips
 from physworld.mpm.stress import BoundStress
@@ -62,7 +63,9 @@ def gradients(
         NotDifferentiable: a scalar changes what nodes are held, or has memory that the run does not have.
     """
     bound = run.bound_terms
-    compared = {name: _Comparison(run.problem, bound, d) for name, d in directions.items()}
+    compared = {
+        name: _Comparison(run.problem, bound, d, run.solver.relaxed) for name, d in directions.items()
+    }
     pairs = [comparison.pair for comparison in compared.values() if comparison.pair is not None]
     gradient = run.gradient(seed, pairs)
     works = iter(gradient.works)
@@ -76,7 +79,9 @@ def gradients(
 class _Comparison:
     """One scalar's two neighbours, told apart by where they differ."""
 
-    def __init__(self, base: Problem, terms: tuple[BoundTerm, ...], direction: Direction) -> None:
+    def __init__(
+        self, base: Problem, terms: tuple[BoundTerm, ...], direction: Direction, relaxed: bool
+    ) -> None:
         self._base, self._d = base, direction
         high, low = direction.high.problem, direction.low.problem
         if not np.array_equal(direction.high.held.nodes, direction.low.held.nodes):
@@ -99,8 +104,10 @@ class _Comparison:
         self.pair = None
         springs = self._springs(terms)
         if launched or any(sides) or springs is not None:
-            internal = [internal_forces(p) if launched else None for p in (high, low)]
-            self.pair = ForcePair(ForceSide(internal[0], sides[0]), ForceSide(internal[1], sides[1]), springs)
+            self.pair = ForcePair(
+                *(_side(p, own, launched, relaxed) for p, own in zip((high, low), sides, strict=True)),
+                springs,
+            )
 
     def _springs(self, terms: tuple[BoundTerm, ...]) -> SoftGripsChange | None:
         """How the stiffness of soft grips differs."""
@@ -204,11 +211,25 @@ def _same(a: Any, b: Any) -> bool:
     return bool(np.all(a == b))
 
 
+def _side(
+    problem: Problem, terms: tuple[tuple[int | None, BoundTerm], ...], launched: bool, relaxed: bool
+) -> ForceSide:
+    """One side of a pair: with internal forces if they are ``launched``, their friction apart if it is ``relaxed``."""
+    if not launched:
+        return ForceSide(None, terms)
+    if not relaxed:
+        return ForceSide(internal_forces(problem), terms)
+    calm = replace(problem, law=without_friction(problem.law))
+    friction = None
+    if friction_law(problem.law) is not None:
+        factor = _factor(problem)
+        friction = FrictionForces(problem.lattice, problem.law, factor, problem.rest, problem.device)
+    return ForceSide(internal_forces(calm), terms, friction)
+
+
 def internal_forces(problem: Problem) -> InternalForces:
     """Internal forces of a problem, with a memory of their own."""
-    factor = problem.stiffness_factor
-    factor = np.ones(problem.lattice.fill.size) if factor is None else factor
-    return InternalForces(problem.lattice, problem.law, factor, problem.rest, problem.device)
+    return InternalForces(problem.lattice, problem.law, _factor(problem), problem.rest, problem.device)
 
 
 def _numbers(law: Law) -> tuple[float, ...]:

@@ -11,7 +11,8 @@ memory, the scalar itself) is the difference of two neighbours that stand beside
 v +- w dv / 2 and theta +- w / 2 with the memory that belongs there: they are put back beside the state in every
 substep, so that their distance never leaves the linear range.
 
-The tangents ride on a run as its last term, so the state is that of the engine to the last bit.
+The tangents ride on a run as its last term, so the state is that of the engine to the last bit. Friction is explicit,
+however strong.
 """
 
 from __future__ import annotations
