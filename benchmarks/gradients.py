@@ -1,8 +1,9 @@
 """Gradients through the engine: what one costs, what it keeps in memory, and how well it agrees with differences.
 
 Cost: a clamped bar of 2000 particles under gravity for 100 frames; one gradient (its own forward pass included) over
-one run without a gradient, by processor time. Agreement: 400 substeps of a bar, a sheet and a rope that are held at one
-end and shaken; random weights on the tracked points; central differences of whole runs at the same time step.
+one run without a gradient, by processor time; the same with friction in stages. Agreement: 400 substeps of a bar, a
+sheet and a rope that are held at one end and shaken; random weights on the tracked points; central differences of whole
+runs at the same time step.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import warp as wp
 from benchmarks.harness import Report, run_alone
 from physworld.build import build_twin
 from physworld.effects.registry import EFFECTS, effect
+from physworld.grips import softly_held
 from physworld.materials.laws import SolidLaw
 from physworld.mpm.adjoint import Adjoint
 from physworld.mpm.gradient_twin import TwinRun, strength
@@ -27,6 +29,8 @@ from physworld.twin import Twin
 
 FRAMES, FPS = 100, 30.0
 SUBSTEPS = 400
+STRONG_PA_S = 3000.0
+SHAPES, SOFTLY = ("solid", "sheet", "rope"), "softly held solid"  # whose grip holds a part of its section
 SHOWN, SHOWN_FPS = 5, 60.0  # frames of the shaken bodies
 NOT_SMOOTH = {
     ("clamp_offset", "reach_m"): "it changes which nodes are held",
@@ -35,22 +39,32 @@ NOT_SMOOTH = {
 }
 LARGE = {"air_drag_quadratic", "air_drag_linear", "wind", "viscosity_kelvin_voigt"}  # small in 0.13 s
 GOAL, FRICTION_GOAL = 0.01, 0.03
+_THIN = (("viscosity_kelvin_voigt", "relaxation_s", 0.1), ("viscoelastic_maxwell", "share", 0.3))
+IN_STAGES = {
+    "solid": (
+        ("viscosity_kelvin_voigt", "viscosity_pa_s", 500.0),
+        ("viscoelastic_maxwell", "shear_modulus_pa", 3e3),
+    ),
+    "sheet": _THIN,
+    "rope": _THIN,
+}
 ON_THE_GROUND = (("adhesion", "traction_pa", 50.0), ("ground_friction", "height_m", 2e-4))
 
 
 def measure(repeats: int, seed: int) -> Report:
     """Cost and agreement."""
     wp.config.quiet = True
-    figures: dict[str, object] = dict(cost(repeats))
+    figures: dict[str, object] = {**cost(repeats), **cost_in_stages(repeats)}
     errors = agreement(seed)
     figures["errors"] = errors
     rows = [
         ["one gradient, in forward runs", f"{figures['gradient_in_forwards']:.2f}", "6"],
         ["... with every frame run twice", f"{figures['gradient_in_forwards_twice']:.2f}", "6"],
+        ["... through friction in stages", f"{figures['gradient_in_forwards_stages']:.2f}", "6"],
         ["memory for 100 frames [MB]", f"{figures['gradient_memory_mb']:.0f}", "100"],
         ["... with every frame run twice", f"{figures['gradient_memory_twice_mb']:.0f}", "100"],
     ]
-    for shape in ("solid", "sheet", "rope"):
+    for shape in (*SHAPES, SOFTLY):
         found = {name: error for name, error in errors.items() if name.startswith(f"{shape} ")}
         for name in ("log stiffness field", "log density field"):
             rows.append([f"{shape}: {name}", f"{found[f'{shape} {name}']:.1e}", f"{GOAL:.0e}"])
@@ -66,7 +80,15 @@ def measure(repeats: int, seed: int) -> Report:
         rows.append(
             [f"... the worst: {worst.removeprefix(shape + ' ')}", f"{effects[worst]:.1e}", f"{GOAL:.0e}"]
         )
-    for shape in ("solid", "sheet", "rope"):
+    for shape in SHAPES:
+        for name in (
+            "log stiffness field",
+            "log density field",
+            *(" ".join(known[:2]) for known in IN_STAGES[shape]),
+        ):
+            error = errors[f"stages: {shape} {name}"]
+            rows.append([f"{shape}, friction in stages: {name}", f"{error:.1e}", f"{GOAL:.0e}"])
+    for shape in SHAPES:
         name = f"{shape} on the ground: log friction"
         rows.append([name, f"{errors[name]:.1e}", f"{FRICTION_GOAL:.0e}"])
     for known, which, _ in ON_THE_GROUND:
@@ -114,11 +136,29 @@ def cost(repeats: int) -> dict[str, float]:
     return found
 
 
+def cost_in_stages(repeats: int) -> dict[str, float]:
+    """``gradient_in_forwards_stages``: the bar with a viscosity that is taken in stages, forward and back."""
+    problem, held, times = _bar()
+    problem = replace(problem, law=replace(problem.law, viscosity_pa_s=STRONG_PA_S))
+    x, v = problem.rest, np.zeros_like(problem.rest)
+    plain, adjoint = TotalLagrangian(problem), Adjoint(problem)
+
+    def gradient() -> None:
+        run = adjoint.run(x, v, held, times)
+        assert np.all(run.stages)
+        run.gradient(run.nodes - run.nodes[:1])
+
+    gradient()  # compiles
+    seconds = [(_seconds(gradient), _seconds(lambda: plain.run(x, v, held, times))) for _ in range(repeats)]
+    back, forward = np.median(seconds, axis=0)
+    return {"gradient_in_forwards_stages": float(back / forward)}
+
+
 def agreement(seed: int) -> dict[str, float]:
     """Relative errors by name."""
     errors: dict[str, float] = {}
     for shape, scene in _scenes().items():
-        twin = replace(build_twin(scene, 300), ground_height_m=None)
+        twin = softly_held(replace(build_twin(scene, 300), ground_height_m=None))
         errors.update(_fields(shape, twin, scene, seed))
         for name, kind in EFFECTS.items():
             if kind.refuses(twin) is not None:
@@ -129,9 +169,12 @@ def agreement(seed: int) -> dict[str, float]:
                     if twin.lattice.dim == 3 and name in LARGE:
                         value, step = 10 * known.probe, 5 * known.probe
                     errors[f"{shape} {name} {known.name}"] = _strength(
-                        twin, scene, name, known.name, value, step, seed
+                        twin, scene, name, known.name, value, step, seed, float(shape == SOFTLY)
                     )
-    for shape, scene in _scenes().items():
+    for shape in SHAPES:
+        errors.update(_in_stages(shape, seed))
+    for shape in SHAPES:
+        scene = _scenes()[shape]
         errors[f"{shape} on the ground: log friction"] = _friction_field(build_twin(scene, 300), scene, seed)
     scene = _scenes()["solid"]
     for name, which, value in ON_THE_GROUND:
@@ -164,6 +207,20 @@ def _fields(shape: str, twin: Twin, scene: Scene, seed: int) -> dict[str, float]
             cancelled = np.linalg.norm(along_log)  # a direction on which everything cancels tests nothing
             worst = max(worst, abs(along_log @ along - expected) / max(abs(expected), 0.3 * cancelled))
         found[f"{shape} {name}"] = float(worst)
+    return found
+
+
+def _in_stages(shape: str, seed: int) -> dict[str, float]:
+    """Errors of a body whose friction is taken in stages."""
+    scene = _scenes()[shape]
+    twin = replace(build_twin(scene, 300), ground_height_m=None)
+    for name, which, value in IN_STAGES[shape]:
+        twin = twin.with_effect(effect(name, **{which: value}))
+    assert np.all(_run(twin, scene, _step()).recorded.stages)
+    found = _fields(f"stages: {shape}", twin, scene, seed)
+    for name, which, value in IN_STAGES[shape]:
+        step = 0.02 * value if twin.lattice.dim == 3 else 1e-3 * value
+        found[f"stages: {shape} {name} {which}"] = _strength(twin, scene, name, which, value, step, seed, 1.0)
     return found
 
 
@@ -201,13 +258,17 @@ def _sliding(twin: Twin) -> Twin:
     )
 
 
-def _strength(twin: Twin, scene: Scene, name: str, which: str, value: float, step: float, seed: int) -> float:
+def _strength(
+    twin: Twin, scene: Scene, name: str, which: str, value: float, step: float, seed: int, mean: float = 0.0
+) -> float:
+    """Error of the gradient by a strength; ``mean`` of the random weights, where without one they would cancel."""
+
     def changed(strength: float) -> Twin:
         return twin.with_effect(effect(name, **{which: strength}))
 
     dt = min(_step(), 0.8 * TwinRun(changed(value), *scene.control_track(), scene.times[:2]).time_step_s)
     run = _run(changed(value), scene, dt)
-    weights = np.random.default_rng(seed).normal(size=run.tracks.shape)
+    weights = mean + np.random.default_rng(seed).normal(size=run.tracks.shape)
     _, found = run.gradient(weights, {"s": strength(changed(value), name, which)})
     ends = [_loss(changed(value + sign * step), scene, weights, dt) for sign in (1, -1)]
     expected = (ends[0] - ends[1]) / (2 * step)
@@ -254,12 +315,14 @@ def _scenes() -> dict[str, Scene]:
     plane = np.stack(np.meshgrid(*[np.linspace(0, 0.2, 3)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
     bar = Body(size_m=size, box_min_m=np.zeros(3), box_max_m=size, density_kg_m3=500.0)
     grip = Grip((0, 1, 2), np.zeros(3), np.array([0.032, 0.04, 0.04]))
+    corner = Grip((0, 1, 2), np.zeros(3), np.array([0.032, 0.02, 0.02]))
     return {
         "solid": _scene("beam", line, plate, bar, (grip,), Ground(-0.003, 0.4)),
         "sheet": _scene(
             "sheet", np.concatenate([plane, np.zeros((9, 1))], axis=1), plate, Body(thickness_m=2e-3)
         ),
         "rope": _scene("rope", np.linspace([0, 0, 0], [0.3, 0, 0], 5), plate[:1], Body(radius_m=0.004)),
+        SOFTLY: _scene("beam", line, plate, bar, (corner,), Ground(-0.003, 0.4)),
     }
 
 

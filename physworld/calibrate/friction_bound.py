@@ -4,7 +4,7 @@ Friction that is proportional to stiffness damps the lattice's fastest motions m
 resolve that: beyond a point the stable time step is inversely proportional to it. A recording shows nothing of these
 motions. So the search ends where that step is ``SLOWEST`` times smaller than without friction; a value found there is
 reported to be at the bound of its search. Beyond it a run takes sub-steps of friction (:mod:`physworld.mpm.relaxation`)
-and twice the time and more, and gradients take the explicit step.
+and twice the time and more.
 """
 
 from __future__ import annotations

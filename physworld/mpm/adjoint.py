@@ -7,8 +7,9 @@ fits the memory that may be used, else in single; where even that is too much it
 and runs every frame a second time when the reverse pass comes to it. The reverse pass takes the substeps back one by
 one (:mod:`physworld.mpm.adjoint_kernels`), in a captured graph like the forward one.
 
-Internal forces: :class:`physworld.mpm.tangent.InternalTangent`. Terms: :mod:`physworld.mpm.adjoint_terms`. Scalars that
-change many things at once: :mod:`physworld.mpm.gradient`.
+Internal forces: :class:`physworld.mpm.tangent.InternalTangent`. Strong friction, which a run takes in stages, is taken
+back through them, with the forces of every substep kept too: :mod:`physworld.mpm.adjoint_stages`. Terms:
+:mod:`physworld.mpm.adjoint_terms`. Scalars that change many things at once: :mod:`physworld.mpm.gradient`.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from dataclasses import replace
 import numpy as np
 import warp as wp
 
-from physworld.mpm.adjoint_kernels import keep_velocities
+from physworld.mpm.adjoint_kernels import keep_row
 from physworld.mpm.adjoint_pairs import ForcePair
 from physworld.mpm.adjoint_reverse import Gradient, ReversePass
 from physworld.mpm.adjoint_terms import Memory, memories_of
@@ -48,9 +49,7 @@ class Adjoint:
         self.problem = problem
         self.memory_mb = memory_mb
         self.recorder = _Recorder()
-        self.solver = TotalLagrangian(
-            replace(problem, terms=(*problem.terms, self.recorder)), time_step_s, "explicit"
-        )
+        self.solver = TotalLagrangian(replace(problem, terms=(*problem.terms, self.recorder)), time_step_s)
         refuse_undifferentiable(self.solver.terms)
 
     @property
@@ -78,7 +77,9 @@ class RecordedRun:
         problem, solver: what was integrated, and the solver that did it.
         held, times, velocity: its arguments.
         substeps: of every frame, (T - 1,).
+        stages: of friction in the substeps of every frame, (T - 1,); 0 where it is explicit.
         history: velocities before every substep, one a row; offset: first row of every frame.
+        forces: those beside friction in every substep, likewise, where friction is taken in stages; else None.
         memories: of every term.
         twice: whether the gradient runs every frame again.
         nbytes: memory kept for the gradient.
@@ -100,30 +101,35 @@ class RecordedRun:
         terms = solver.terms[:-1]
         per_row = 8 * sum(a.numpy().size for term in terms for a in getattr(term, "memory", ()))
         rows, width = int(self.substeps.sum()) + 1, 3 * len(solver.mass)
+        kept = width * (2 if solver.relaxed else 1)
         budget = adjoint.memory_mb * 1e6
-        self.twice = rows * (4 * width + per_row) > budget
-        double = self.twice or rows * (8 * width + per_row) <= budget
+        self.twice = rows * (4 * kept + per_row) > budget
+        double = self.twice or rows * (8 * kept + per_row) <= budget
         if self.twice:
             rows = int(self.substeps.max()) + 1
         first = np.concatenate([[0], np.cumsum(self.substeps)])[:-1] * (not self.twice)
         self.offset = wp.array(first, dtype=wp.int32, device=device)
         self.memories = [memories_of(term, rows) for term in terms]
         flat_memories = [memory for part in self.memories for memory in part]
-        self.history = wp.zeros((rows, width), dtype=wp.float64 if double else wp.float32, device=device)
-        adjoint.recorder.prepare(self.history, self.offset, flat_memories)
+        dtype = wp.float64 if double else wp.float32
+        self.history = wp.zeros((rows, width), dtype=dtype, device=device)
+        self.forces = wp.zeros((rows, width), dtype=dtype, device=device) if solver.relaxed else None
+        adjoint.recorder.prepare(self.history, self.forces, self.offset, flat_memories)
         self._run = Run(solver, x, v, held, times)
         self._checkpoints: list[_Checkpoint] = []
         self.nodes = np.empty((frames, *x.shape))
         self.nodes[0] = x
+        self.stages = np.zeros(frames - 1, dtype=int)
         for frame in range(frames - 1):
             if self.twice:
                 self._checkpoints.append(_Checkpoint(self._run, solver, flat_memories))
             self.nodes[frame + 1] = self._run.advance(frame)
+            self.stages[frame] = self._run.stages
             if progress is not None:
                 progress(frame + 1, frames - 1)
         self._keep_last(rows - 1)
         self.nbytes = (
-            self.history.size * (8 if double else 4)
+            rows * kept * (8 if double else 4)
             + sum(memory.nbytes for memory in flat_memories)
             + self.nodes.nbytes
             + sum(point.nbytes for point in self._checkpoints)
@@ -152,7 +158,7 @@ class RecordedRun:
         """Run a frame again from its checkpoint: the history holds its substeps then."""
         memories = [memory for part in self.memories for memory in part]
         self._checkpoints[frame].put_back(self._run, self.solver, memories)
-        self._run.advance(frame)
+        self._run.advance(frame, int(self.stages[frame]))
         self._keep_last(int(self.substeps[frame]))
 
     def _keep_last(self, row: int) -> None:
@@ -161,7 +167,7 @@ class RecordedRun:
 
 
 class _Recorder:
-    """The last of the terms: adds no force, keeps velocities and memories."""
+    """The last of the terms: adds no force, keeps velocities, memories and, where friction has stages, forces."""
 
     frequency_rad_s = 0.0
     friction_per_s = 0.0
@@ -178,15 +184,17 @@ class _Recorder:
     def check(self, time_s: float) -> None:
         return None
 
-    def prepare(self, history: wp.array, offset: wp.array, memories: list[Memory]) -> None:
+    def prepare(
+        self, history: wp.array, forces: wp.array | None, offset: wp.array, memories: list[Memory]
+    ) -> None:
         """Where the next run goes."""
-        self._history, self._offset, self._memories = history, offset, memories
+        self._rows, self._offset, self._memories = (history, forces), offset, memories
 
     def launch(self, x: wp.array, v: wp.array, clock: wp.array, counter: wp.array, force: wp.array) -> None:
-        wp.launch(
-            keep_velocities, dim=len(v), inputs=[self._offset, counter, v], outputs=[self._history],
-            device=v.device,
-        )  # fmt: skip
+        for values, rows in zip((v, force), self._rows, strict=True):
+            if rows is not None:
+                inputs = [self._offset, counter, values]
+                wp.launch(keep_row, dim=len(v), inputs=inputs, outputs=[rows], device=v.device)
         for memory in self._memories:
             memory.keep(self._offset, counter)
 

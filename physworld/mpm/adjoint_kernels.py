@@ -21,17 +21,17 @@ import warp as wp
 
 
 @wp.kernel(enable_backward=False)
-def keep_velocities(
+def keep_row(
     # in
     offset: wp.array(dtype=wp.int32),
     counter: wp.array(dtype=wp.int32),
-    v: wp.array(dtype=wp.float64),
+    values: wp.array(dtype=wp.float64),
     # out
     history: wp.array2d(dtype=Any),
 ):
     """Write one component into the row of this substep."""
     k = wp.tid()
-    history[offset[counter[0]] + counter[1], k] = history.dtype(v[k])
+    history[offset[counter[0]] + counter[1], k] = history.dtype(values[k])
 
 
 @wp.kernel(enable_backward=False)
@@ -118,6 +118,7 @@ def take_nodes_back(
     # out
     v: wp.array(dtype=wp.float64),
     x_previous: wp.array(dtype=wp.float64),
+    pull: wp.array(dtype=wp.float64),
     force_bar: wp.array(dtype=wp.float64),
 ):
     """One node: from the derivatives after a substep to those of its forces, and to what is known before them."""
@@ -137,11 +138,11 @@ def take_nodes_back(
             force_bar[k] = wp.float64(0.0)
         else:
             after = wp.float64(history[row + 1, k])
-            pull = (after - now) / dt - gravity[i] + drag * now
+            pull[k] = (after - now) / dt - gravity[i] + drag * now
             a = v_bar[k] + dt * x_bar[k]
             f_bar = dt * a / mass[node]
             force_bar[k] = f_bar
-            mass_bar[node] -= f_bar * pull
+            mass_bar[node] -= f_bar * pull[k]
             gravity_bar[k] += dt * a
             drag_bar[node] -= dt * a * now
             v_bar[k] = (wp.float64(1.0) - dt * drag) * a
@@ -207,6 +208,7 @@ def take_start_back(
     gravity_bar: wp.array(dtype=wp.float64),
     drag_bar: wp.array(dtype=wp.float64),
     # out
+    pull: wp.array(dtype=wp.float64),
     force_bar: wp.array(dtype=wp.float64),
 ):
     """The first half step, v_half = v - dt/2 (f / m + g - c v), taken back at one node."""
@@ -214,10 +216,10 @@ def take_start_back(
     half = wp.float64(0.5) * dt
     for i in range(3):
         k = 3 * node + i
-        pull = (v[k] - v_half[k]) / half - gravity[i] + drag * v[k]
+        pull[k] = (v[k] - v_half[k]) / half - gravity[i] + drag * v[k]
         f_bar = -half * v_bar[k] / mass[node]
         force_bar[k] = f_bar
-        mass_bar[node] -= f_bar * pull
+        mass_bar[node] -= f_bar * pull[k]
         gravity_bar[k] -= half * v_bar[k]
         drag_bar[node] += half * v_bar[k] * v[k]
         v_bar[k] = (wp.float64(1.0) + half * drag) * v_bar[k]

@@ -16,6 +16,8 @@ import warp as wp
 from physworld.mpm.adjoint_kernels import add_memory_work, add_work, load_row
 from physworld.mpm.adjoint_terms import Memory, Reverse, flat
 from physworld.mpm.forces import InternalForces
+from physworld.mpm.friction import FrictionForces
+from physworld.mpm.soft_grips_derivatives import SoftGripsChange
 from physworld.mpm.terms import BoundTerm
 
 
@@ -25,18 +27,23 @@ class ForceSide:
 
     Attributes:
         internal: internal forces, or None where they do not change.
+        friction: that part of them which the run takes in stages, likewise; ``internal`` is without it then.
         terms: those that change, each with its place among the terms of the run (None: the run has none like it).
     """
 
     internal: InternalForces | None
     terms: tuple[tuple[int | None, BoundTerm], ...]
+    friction: FrictionForces | None = None
 
 
 class ForcePair:
-    """High and low side; ``work`` is the derivative of L along high - low after a reverse pass."""
+    """High and low side; ``work`` is the derivative of L along high - low after a reverse pass.
 
-    def __init__(self, high: ForceSide, low: ForceSide) -> None:
-        self._sides = (high, low)
+    ``springs`` is the change of the stiffness of grips that hold softly.
+    """
+
+    def __init__(self, high: ForceSide, low: ForceSide, springs: SoftGripsChange | None = None) -> None:
+        self._sides, self._springs = (high, low), springs
 
     def prepare(
         self, now: Reverse, x_previous: wp.array, times: np.ndarray, memories: list[list[Memory]]
@@ -59,6 +66,22 @@ class ForcePair:
         """Sum over the substeps that were taken back."""
         return float(self._total.numpy().sum())
 
+    def prepare_friction(self) -> None:
+        """Friction is that at the positions of this substep from now on."""
+        for side in self._sides:
+            if side.friction is not None:
+                side.friction.prepare(self._now.x)
+
+    def add_friction_work(self, y: wp.array, u: wp.array) -> None:
+        """One stage: friction at the velocities ``y`` (3n,) [m/s], with ``u`` (3n,) the derivatives by its forces."""
+        if all(side.friction is None for side in self._sides):
+            return
+        for side, force in zip(self._sides, self._forces, strict=True):
+            if side.friction is not None:
+                side.friction.launch(y, force)
+        outputs = [*self._forces, self._total]
+        wp.launch(add_work, dim=len(self._total), inputs=[u], outputs=outputs, device=y.device)
+
     def add_work(self) -> None:
         """One substep; part of the captured graph, before the derivatives by memories are taken back."""
         now = self._now
@@ -74,6 +97,8 @@ class ForcePair:
                             outputs=[array], device=array.device,
                         )  # fmt: skip
                 term.launch(now.x, now.v, now.clock, now.counter, force)
+        if self._springs is not None:
+            self._springs.add(now, self._forces[0])
         wp.launch(
             add_work, dim=len(self._total), inputs=[now.force_bar],
             outputs=[*self._forces, self._total], device=now.x.device,

@@ -18,13 +18,17 @@ from physworld.mpm.adjoint_kernels import (
     count_back,
     last_positions,
     step_back,
+    take_away,
     take_nodes_back,
     take_start_back,
 )
 from physworld.mpm.adjoint_pairs import ForcePair
+from physworld.mpm.adjoint_stages import StagesBack
 from physworld.mpm.adjoint_terms import Memory, RecordedAdjoint, Reverse, StressAdjoint, TermAdjoint
 from physworld.mpm.adjoint_twist import TwistAdjoint
 from physworld.mpm.ground import BoundGround
+from physworld.mpm.soft_grips import BoundSoftGrips
+from physworld.mpm.soft_grips_derivatives import SoftGripsAdjoint, SoftGripsGradient
 from physworld.mpm.stress import BoundStress
 from physworld.mpm.tangent import InternalTangent
 from physworld.mpm.terms import BoundTerm
@@ -52,6 +56,7 @@ class Gradient:
         drag: by the drag rate.
         x, v: by the initial state, (n, 3).
         held_positions, held_velocities: by the prescribed paths, (T, H, 3).
+        soft_grips: by grips that hold softly; None in a run without any.
         stresses: by numbers (k,) and fields (layers, P) of every stress beside the law, in the order of the terms;
             None for another term.
         works: of the force pairs that were given.
@@ -70,6 +75,7 @@ class Gradient:
     v: np.ndarray
     held_positions: np.ndarray
     held_velocities: np.ndarray
+    soft_grips: SoftGripsGradient | None
     stresses: tuple[tuple[np.ndarray, np.ndarray] | None, ...]
     works: tuple[float, ...]
 
@@ -89,11 +95,12 @@ class ReversePass:
         size = 3 * nodes
         self._now = Reverse(
             x=zeros(size), v=zeros(size), clock=zeros(3), counter=zeros(3, wp.int32), offset=run.offset,
-            force_bar=zeros(size), x_bar=zeros(size), v_bar=zeros(size), mass_bar=zeros(nodes),
+            pull=zeros(size), force_bar=zeros(size), x_bar=zeros(size), v_bar=zeros(size),
+            mass_bar=zeros(nodes), drag_bar=zeros(nodes), gravity_bar=zeros(size),
         )  # fmt: skip
         self._x_previous, self._previous_bar, self._pending = zeros(size), zeros(size), zeros(size)
         self._earlier_dt = zeros(1)
-        self._gravity_bar, self._drag_bar, self._scaled = zeros(size), zeros(nodes), zeros(size)
+        self._scaled = zeros(size)
         held = run.held
         width = max(3 * len(held.nodes), 1)
         self._path_bars = zeros((frames, width)), zeros((frames, width))
@@ -112,23 +119,37 @@ class ReversePass:
         self._viscous = friction_law(problem.law) is not None
         terms = solver.terms[:-1]
         self._multiplier = terms[0] if terms and getattr(terms[0], "multiplies", False) else None
+        soft = terms[-1] if terms and isinstance(terms[-1], BoundSoftGrips) else None
+        self._soft = None if soft is None else SoftGripsAdjoint(soft, frames)
         self._terms = [
-            None if term is self._multiplier else adjoint_of(term, problem, self._now, memories)
+            None
+            if term is self._multiplier or term is soft
+            else adjoint_of(term, problem, self._now, memories)
             for term, memories in zip(terms, run.memories, strict=True)
         ]
+        self._stages = None
+        if run.forces is not None:
+            self._stages = StagesBack(
+                problem, solver.friction, self._node_inputs[:2], (run.history, run.forces), self._now,
+                self._earlier_dt, self._x_previous, self._path_bars, self._tangent, self._law_bar, pairs,
+            )  # fmt: skip
         for pair in pairs:
             pair.prepare(self._now, self._x_previous, run.times, run.memories)
 
     def result(self) -> Gradient:
         """Go back over all frames, then over the half step of the start."""
         run, now, device = self._run, self._now, self._problem.device
-        with wp.ScopedCapture(device=device) as capture:
-            for _ in range(_CHUNK):
-                self._substep()
+        graphs: dict[int, Any] = {}
         for frame in reversed(range(len(run.times) - 1)):
             self._enter(frame)
+            stages = int(run.stages[frame])
+            if stages not in graphs:
+                with wp.ScopedCapture(device=device) as capture:
+                    for _ in range(_CHUNK):
+                        self._substep(stages)
+                graphs[stages] = capture.graph
             for _ in range(int(run.substeps[frame]) // _CHUNK):
-                wp.capture_launch(capture.graph)
+                wp.capture_launch(graphs[stages])
         self._start()
         return self._collected(now)
 
@@ -141,6 +162,10 @@ class ReversePass:
         now.clock.assign(np.array([interval, 1.0 / dt, dt]))
         now.counter.assign(np.array([frame, substeps - 1, substeps], dtype=np.int32))
         self._earlier_dt.assign(np.array([steps[frame - 1] if frame else 0.0]))
+        for term in self._solver.terms:
+            term.pace(dt)
+        if self._stages is not None:
+            self._stages.enter(dt, int(run.stages[frame]))
         now.x_bar.assign(now.x_bar.numpy() + self._seed[frame + 1].reshape(-1))
         start = wp.array(run.nodes[frame].reshape(-1), dtype=wp.float64, device=self._problem.device)
         first = int(run.offset.numpy()[frame])
@@ -149,14 +174,45 @@ class ReversePass:
             outputs=[now.x], device=self._problem.device,
         )  # fmt: skip
 
-    def _substep(self) -> None:
+    def _substep(self, stages: int) -> None:
+        now, device = self._now, self._problem.device
+        if self._stages is None:
+            self._take_nodes_back()
+        else:
+            self._take_stages_back(self._stages, stages)
+        self._take_terms_back()
+        wp.launch(
+            step_back, dim=len(now.x), inputs=[self._x_previous],
+            outputs=[self._previous_bar, self._pending, now.x, now.x_bar], device=device,
+        )  # fmt: skip
+        wp.launch(count_back, dim=1, inputs=[now.counter], device=device)
+
+    def _take_stages_back(self, taken: StagesBack, stages: int) -> None:
+        """Nodes, grips that hold softly, and internal forces where friction has stages of its own."""
+        now = self._now
+        taken.take_back(stages)
+        if self._viscous and self._soft is None:
+            return
+        self._scaled.zero_()
+        if self._viscous:  # the elastic forces were taken along all of it, and owe what the grips change
+            wp.copy(self._scaled, now.force_bar)
+        if self._soft is not None:
+            self._soft.take_back(now)
+        inputs = [now.force_bar]
+        wp.launch(take_away, dim=len(now.x), inputs=inputs, outputs=[self._scaled], device=now.x.device)
+        self._tangent.apply(now.x, self._scaled, now.x_bar, self._law_bar)
+
+    def _take_nodes_back(self) -> None:
+        """The same with explicit friction."""
         now, device = self._now, self._problem.device
         wp.launch(
             take_nodes_back, dim=len(self._mass), inputs=self._node_inputs,
-            outputs=[now.x_bar, now.v_bar, now.mass_bar, self._gravity_bar, self._drag_bar, *self._path_bars, now.v,
-                     self._x_previous, now.force_bar],
+            outputs=[now.x_bar, now.v_bar, now.mass_bar, now.gravity_bar, now.drag_bar, *self._path_bars, now.v,
+                     self._x_previous, now.pull, now.force_bar],
             device=device,
         )  # fmt: skip
+        if self._soft is not None:
+            self._soft.take_back(now)
         direction = self._internal_direction()
         if self._viscous:
             self._tangent.apply_with_friction(
@@ -164,12 +220,6 @@ class ReversePass:
             )
         else:
             self._tangent.apply(now.x, direction, now.x_bar, self._law_bar)
-        self._take_terms_back()
-        wp.launch(
-            step_back, dim=len(now.x), inputs=[self._x_previous],
-            outputs=[self._previous_bar, self._pending, now.x, now.x_bar], device=device,
-        )  # fmt: skip
-        wp.launch(count_back, dim=1, inputs=[now.counter], device=device)
 
     def _internal_direction(self) -> wp.array:
         """w as the internal forces see it."""
@@ -188,9 +238,14 @@ class ReversePass:
                 term.take_back(self._now)
 
     def _start(self) -> None:
-        """The half step back with which a run starts; then the state is the one that was given."""
+        """The half step back with which a run starts; then the state is the one that was given.
+
+        With stages of friction there is none: the first stages are half a step.
+        """
         run, now, device = self._run, self._now, self._problem.device
         now.x_bar.assign(now.x_bar.numpy() + self._pending.numpy() + self._seed[0].reshape(-1))
+        if self._stages is not None:
+            return
         now.counter.assign(np.array([0, 0, run.substeps[0]], dtype=np.int32))
         for memory in (m for part in run.memories for m in part):
             memory.bar.zero_()
@@ -200,8 +255,11 @@ class ReversePass:
         dt = wp.float64(now.clock.numpy()[2])
         wp.launch(
             take_start_back, dim=len(self._mass), inputs=[self._mass, *self._physics, dt, now.v, half],
-            outputs=[now.v_bar, now.mass_bar, self._gravity_bar, self._drag_bar, now.force_bar], device=device,
+            outputs=[now.v_bar, now.mass_bar, now.gravity_bar, now.drag_bar, now.pull, now.force_bar],
+            device=device,
         )  # fmt: skip
+        if self._soft is not None:
+            self._soft.take_back(now)
         self._tangent.apply(now.x, self._internal_direction(), now.x_bar, self._law_bar)
         self._take_terms_back()
 
@@ -239,12 +297,13 @@ class ReversePass:
             law=law,
             columns=columns,
             mass=mass,
-            gravity=self._gravity_bar.numpy().reshape(-1, 3).sum(axis=0),
-            drag=float(self._drag_bar.numpy().sum()),
+            gravity=now.gravity_bar.numpy().reshape(-1, 3).sum(axis=0),
+            drag=float(now.drag_bar.numpy().sum()),
             x=now.x_bar.numpy().reshape(-1, 3).copy(),
             v=now.v_bar.numpy().reshape(-1, 3).copy(),
             held_positions=paths[0],
             held_velocities=paths[1],
+            soft_grips=None if self._soft is None else self._soft.collected(),
             stresses=stresses,
             works=tuple(pair.work for pair in self._pairs),
         )

@@ -41,9 +41,11 @@ class Reverse:
         x, v: state before the substep, (3n,) float64.
         clock, counter: as in a run.
         offset: first row of every frame in the histories.
+        pull: all forces over the masses, of free nodes [m/s^2], (3n,).
         force_bar: w, derivatives by the forces (3n,).
         x_bar, v_bar: derivatives by the state, to be added to.
-        mass_bar: derivatives by the nodal masses, (n,), to be added to.
+        mass_bar, drag_bar: derivatives by the nodal masses and by the nodes' drag rates, (n,), to be added to.
+        gravity_bar: by the gravity of every node, (3n,), to be added to.
     """
 
     x: wp.array
@@ -51,10 +53,13 @@ class Reverse:
     clock: wp.array
     counter: wp.array
     offset: wp.array
+    pull: wp.array
     force_bar: wp.array
     x_bar: wp.array
     v_bar: wp.array
     mass_bar: wp.array
+    drag_bar: wp.array
+    gravity_bar: wp.array
 
 
 class Memory:

@@ -12,18 +12,21 @@ The time step is that of the run: it is not differentiated.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
 import warp as wp
 
 from physworld.errors import NotDifferentiable
-from physworld.materials.laws import Law, SheetLaw, SolidLaw
+from physworld.materials.laws import Law, SheetLaw, SolidLaw, friction_law, without_friction
 from physworld.mpm.adjoint import RecordedRun
 from physworld.mpm.adjoint_pairs import ForcePair, ForceSide
 from physworld.mpm.adjoint_reverse import Gradient
 from physworld.mpm.forces import InternalForces
+from physworld.mpm.friction import FrictionForces
+from physworld.mpm.soft_grips import BoundSoftGrips, SoftGrips
+from physworld.mpm.soft_grips_derivatives import SoftGripsChange, same_soft_grips
 from physworld.mpm.stress import BoundStress
 from physworld.mpm.terms import BoundTerm
 from physworld.mpm.total_lagrangian import HeldNodes, Problem
@@ -60,7 +63,9 @@ def gradients(
         NotDifferentiable: a scalar changes what nodes are held, or has memory that the run does not have.
     """
     bound = run.bound_terms
-    compared = {name: _Comparison(run.problem, bound, d) for name, d in directions.items()}
+    compared = {
+        name: _Comparison(run.problem, bound, d, run.solver.relaxed) for name, d in directions.items()
+    }
     pairs = [comparison.pair for comparison in compared.values() if comparison.pair is not None]
     gradient = run.gradient(seed, pairs)
     works = iter(gradient.works)
@@ -74,7 +79,9 @@ def gradients(
 class _Comparison:
     """One scalar's two neighbours, told apart by where they differ."""
 
-    def __init__(self, base: Problem, terms: tuple[BoundTerm, ...], direction: Direction) -> None:
+    def __init__(
+        self, base: Problem, terms: tuple[BoundTerm, ...], direction: Direction, relaxed: bool
+    ) -> None:
         self._base, self._d = base, direction
         high, low = direction.high.problem, direction.low.problem
         if not np.array_equal(direction.high.held.nodes, direction.low.held.nodes):
@@ -82,6 +89,7 @@ class _Comparison:
                 f"{len(direction.high.held.nodes)} nodes are held on one side and {len(direction.low.held.nodes)} on "
                 "the other: holding nodes is not smooth"
             )
+        self._soft = same_soft_grips((base, high, low))[1:]
         self._by_columns = _moduli_alone_differ(base, high, low)
         self._stresses: list[tuple[int, np.ndarray, np.ndarray]] = []
         sides = self._matched(terms, high, low)
@@ -94,9 +102,20 @@ class _Comparison:
                 ((0, p.terms[0].bind(p)), *side) for p, side in zip((high, low), sides, strict=True)
             )
         self.pair = None
-        if launched or any(sides):
-            internal = [internal_forces(p) if launched else None for p in (high, low)]
-            self.pair = ForcePair(ForceSide(internal[0], sides[0]), ForceSide(internal[1], sides[1]))
+        springs = self._springs(terms)
+        if launched or any(sides) or springs is not None:
+            self.pair = ForcePair(
+                *(_side(p, own, launched, relaxed) for p, own in zip((high, low), sides, strict=True)),
+                springs,
+            )
+
+    def _springs(self, terms: tuple[BoundTerm, ...]) -> SoftGripsChange | None:
+        """How the stiffness of soft grips differs."""
+        if not self._soft:
+            return None
+        change = self._soft[0].stiffness - self._soft[1].stiffness
+        own = next(term for term in terms if isinstance(term, BoundSoftGrips))
+        return SoftGripsChange(own, change) if np.any(change) else None
 
     def host_share(self, g: Gradient) -> float:
         """Derivatives by arrays times the arrays' differences."""
@@ -108,6 +127,8 @@ class _Comparison:
         total += float(np.sum(g.held_positions * (high.held.positions - low.held.positions)))
         total += float(np.sum(g.held_velocities * (high.held.velocities - low.held.velocities)))
         total += float(g.mass @ (p.nodal_mass() - q.nodal_mass()))
+        if g.soft_grips is not None:
+            total += g.soft_grips.along(*(grips.held for grips in self._soft))
         if self._by_columns:
             base = _numbers(self._base.law)
             change = np.array(_numbers(p.law)) - np.array(_numbers(q.law))
@@ -129,7 +150,8 @@ class _Comparison:
         self, terms: tuple[BoundTerm, ...], high: Problem, low: Problem
     ) -> tuple[tuple[tuple[int | None, BoundTerm], ...], tuple[tuple[int | None, BoundTerm], ...]]:
         """Terms whose forces differ, each with its place in the run; stresses go by their numbers where they can."""
-        bound = ([t.bind(high) for t in high.terms], [t.bind(low) for t in low.terms])
+        terms = tuple(t for t in terms if not isinstance(t, BoundSoftGrips))  # last; by their own gradient
+        bound = tuple([t.bind(p) for t in p.terms if not isinstance(t, SoftGrips)] for p in (high, low))
         kinds = [[_kind(t) for t in side] for side in (terms, *bound)]
         lists: tuple[list[tuple[int | None, BoundTerm]], ...] = ([], [])
         if kinds[0] == kinds[1] == kinds[2]:
@@ -189,11 +211,25 @@ def _same(a: Any, b: Any) -> bool:
     return bool(np.all(a == b))
 
 
+def _side(
+    problem: Problem, terms: tuple[tuple[int | None, BoundTerm], ...], launched: bool, relaxed: bool
+) -> ForceSide:
+    """One side of a pair: with internal forces if they are ``launched``, their friction apart if it is ``relaxed``."""
+    if not launched:
+        return ForceSide(None, terms)
+    if not relaxed:
+        return ForceSide(internal_forces(problem), terms)
+    calm = replace(problem, law=without_friction(problem.law))
+    friction = None
+    if friction_law(problem.law) is not None:
+        factor = _factor(problem)
+        friction = FrictionForces(problem.lattice, problem.law, factor, problem.rest, problem.device)
+    return ForceSide(internal_forces(calm), terms, friction)
+
+
 def internal_forces(problem: Problem) -> InternalForces:
     """Internal forces of a problem, with a memory of their own."""
-    factor = problem.stiffness_factor
-    factor = np.ones(problem.lattice.fill.size) if factor is None else factor
-    return InternalForces(problem.lattice, problem.law, factor, problem.rest, problem.device)
+    return InternalForces(problem.lattice, problem.law, _factor(problem), problem.rest, problem.device)
 
 
 def _numbers(law: Law) -> tuple[float, ...]:

@@ -11,7 +11,8 @@ memory, the scalar itself) is the difference of two neighbours that stand beside
 v +- w dv / 2 and theta +- w / 2 with the memory that belongs there: they are put back beside the state in every
 substep, so that their distance never leaves the linear range.
 
-The tangents ride on a run as its last term, so the state is that of the engine to the last bit.
+The tangents ride on a run as its last term, so the state is that of the engine to the last bit. Friction is explicit,
+however strong.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ from physworld.errors import NotDifferentiable
 from physworld.materials.laws import friction_law
 from physworld.mpm.gradient import Direction, Setting, internal_forces, same_internal_forces
 from physworld.mpm.gradient_forward_kernels import add_slope, advance_tangent, set_sides
+from physworld.mpm.soft_grips import SoftGrips
+from physworld.mpm.soft_grips_derivatives import SoftGripsTangent, same_soft_grips
 from physworld.mpm.tangent import InternalTangent
 from physworld.mpm.terms import refuse_undifferentiable
 from physworld.mpm.total_lagrangian import Problem, TotalLagrangian
@@ -110,7 +113,13 @@ class _Tangent:
         factor = np.ones(own.lattice.fill.size) if own.stiffness_factor is None else own.stiffness_factor
         self._elastic = InternalTangent(own.lattice, own.law, factor, own.rest, device)
         self._viscous = any(friction_law(s.problem.law) is not None for s in (setting, high, low))
-        self._terms = [[t.bind(s.problem) for t in s.problem.terms] for s in (high, low)]
+        self._soft = None
+        if same_soft_grips((own, high.problem, low.problem)):
+            slopes = (self._inputs[1], self._inputs[5], self._inputs[7])
+            self._soft = SoftGripsTangent(own, high.problem, low.problem, width, slopes)
+        self._terms = [
+            [t.bind(s.problem) for t in s.problem.terms if not isinstance(t, SoftGrips)] for s in (high, low)
+        ]
         refuse_undifferentiable(self._terms[0])
         by_difference = self._viscous or any(getattr(t, "multiplies", False) for t in self._terms[0])
         self._launched = by_difference or not same_internal_forces(high.problem, low.problem)
@@ -121,6 +130,8 @@ class _Tangent:
 
     def pace(self, time_step_s: float) -> None:
         """Substeps have this length [s] from now on."""
+        if self._soft is not None:
+            self._soft.pace(time_step_s)
         for side in self._terms:
             for term in side:
                 term.pace(time_step_s)
@@ -161,6 +172,8 @@ class _Tangent:
         width = wp.float64(self._d.width)
         wp.launch(add_slope, dim=len(x), inputs=[width], outputs=[*self._forces, self._slope], device=device)
         wp.copy(self._x_previous, x)
+        if self._soft is not None:
+            self._soft.add(x, v, self._dx, self._dv, clock, counter, force, self._slope)
         wp.launch(
             advance_tangent, dim=len(x) // 3,
             inputs=[*self._inputs, int(starting), clock, counter, force, v],

@@ -101,8 +101,7 @@ class TotalLagrangian:
         time_step_s: forced time step [s], or None for the stable one.
         friction: "auto": in sub-steps of its own where explicit friction would shrink the time step more than
             :data:`physworld.mpm.stability.EXPLICIT_SHRINK` times (drag: ``DRAG_SHRINK``), or a forced step asks for
-            it; "explicit": never, which is what gradients differentiate. With a term that multiplies the internal
-            forces it is explicit.
+            it; "explicit": never. With a term that multiplies the internal forces it is explicit.
 
     Attributes:
         relaxed: whether friction is sub-cycled (:mod:`physworld.mpm.relaxation`).
@@ -244,8 +243,12 @@ class Run:
         self.force.zero_()
         self._graphs: dict[int, Any] = {}
 
-    def advance(self, frame: int) -> np.ndarray:
+    def advance(self, frame: int, stages: int | None = None) -> np.ndarray:
         """Integrate from ``times[frame]`` to the next; positions there, (n, 3) [m].
+
+        Args:
+            frame: the frame's number.
+            stages: of friction, where it is not explicit; None for as many as the body's shape asks for.
 
         Raises:
             UnstableSimulation: a cell inverted or a state is not finite.
@@ -253,7 +256,7 @@ class Run:
             ContactFailed: material came too deep into a collider.
         """
         substeps = self._set_clock(frame)
-        graph = self._graph()
+        graph = self._graph(stages)
         for _ in range(substeps // _CHUNK):
             wp.capture_launch(graph)
         self._solver.substeps += substeps
@@ -261,10 +264,15 @@ class Run:
         self._check(now, self._times[frame + 1])
         return now
 
-    def _graph(self) -> Any:
+    def _graph(self, asked: int | None) -> Any:
         """A chunk of substeps, captured once for every number of stages that friction takes."""
-        relaxation = self._relaxation
-        stages = 0 if relaxation is None else relaxation.tune(self.x, float(self._clocks[0].numpy()[2]))
+        stages, relaxation = 0, self._relaxation
+        if relaxation is not None:
+            if asked is None:
+                relaxation.tune(self.x, float(self._clocks[0].numpy()[2]))
+            else:
+                relaxation.stages = asked
+            stages = relaxation.stages
         if stages not in self._graphs:
             with wp.ScopedCapture(device=self._solver.device) as capture:
                 for _ in range(_CHUNK):

@@ -19,7 +19,7 @@ from warp._src import context
 
 import physworld
 from physworld.materials.plastic import PLASTICITIES
-from physworld.mpm import adjoint_kernels
+from physworld.mpm import adjoint_kernels, adjoint_stages_kernels
 from physworld.mpm.adjoint_stress_kernels import stress_adjoint
 from physworld.mpm.stress_kernels import StressModel
 from physworld.worldmodel.messages import EdgeList, mean_messages, mean_messages_torch
@@ -81,7 +81,7 @@ def models() -> dict[str, StressModel]:
 @pytest.mark.parametrize("name", [name for name in with_kernels() if name not in CPU_ONLY])
 def test_a_module_of_kernels_compiles_for_cuda(name: str, tmp_path: Path) -> None:
     module = import_module(name)
-    if module is adjoint_kernels:
+    if module in (adjoint_kernels, adjoint_stages_kernels):
         _overload_generic_kernels()
     assert compiles(module, tmp_path)
 
@@ -90,11 +90,15 @@ def _overload_generic_kernels() -> None:
     """Histories of the adjoint are kept in double or single precision, memories too."""
     for real in (wp.float32, wp.float64):
         for kernel, generic in (
-            (adjoint_kernels.keep_velocities, {"history": wp.array2d(dtype=real)}),
+            (adjoint_kernels.keep_row, {"history": wp.array2d(dtype=real)}),
             (adjoint_kernels.keep_rows, {"memory": wp.array(dtype=real)}),
             (adjoint_kernels.load_row, {"memory": wp.array(dtype=real)}),
             (adjoint_kernels.last_positions, {"history": wp.array2d(dtype=real)}),
             (adjoint_kernels.take_nodes_back, {"history": wp.array2d(dtype=real)}),
+            (
+                adjoint_stages_kernels.enter_stages_back,
+                {"history": wp.array2d(dtype=real), "forces": wp.array2d(dtype=real)},
+            ),
             (
                 adjoint_kernels.add_memory_work,
                 {"high": wp.array(dtype=real), "low": wp.array(dtype=real)},

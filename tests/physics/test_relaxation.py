@@ -223,7 +223,7 @@ def test_the_stages_follow_a_body_that_is_pressed_flat() -> None:
     assert np.isfinite(nodes).all() and stages[-1] > stages[0]
 
 
-def test_weak_friction_stays_explicit_and_gradients_always() -> None:
+def test_weak_friction_stays_explicit_and_gradients_follow_the_engine() -> None:
     lattice, law = BODIES["solid"]
     rest = rest_nodes(lattice)
     weak = TotalLagrangian(Problem(lattice, replace(law, viscosity_pa_s=30.0), rest, GRAVITY))
@@ -233,11 +233,12 @@ def test_weak_friction_stays_explicit_and_gradients_always() -> None:
     solver = TotalLagrangian(strong)
     assert not TotalLagrangian(strong, 0.5 * solver.steps.explicit_s()).relaxed
     assert TotalLagrangian(strong, 0.5 * solver.time_step_s).relaxed
-    assert Adjoint(strong).time_step_s == solver.steps.explicit_s()
+    assert Adjoint(strong).time_step_s == solver.time_step_s
+    for always in (TotalLagrangian, Adjoint):
+        with pytest.raises(CFLViolation, match="exceeds the stable"):
+            always(strong, 2.1 * solver.time_step_s)
     with pytest.raises(CFLViolation, match="exceeds the stable"):
-        Adjoint(strong, time_step_s=solver.time_step_s)
-    with pytest.raises(CFLViolation, match="exceeds the stable"):
-        TotalLagrangian(strong, 2.1 * solver.time_step_s)
+        TotalLagrangian(strong, solver.time_step_s, "explicit")
 
 
 @pytest.mark.parametrize("rate", [3e2, 1e4])

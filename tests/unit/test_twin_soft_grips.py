@@ -1,4 +1,4 @@
-"""A twin whose grip takes hold softly: the same to the last bit at softness 0, stored, and refused by gradients."""
+"""A twin whose grip takes hold softly: the same to the last bit at softness 0, and stored."""
 
 from __future__ import annotations
 
@@ -9,9 +9,7 @@ import pytest
 from made_scene import box_body, made_scene
 
 from physworld.build import build_twin
-from physworld.errors import NotDifferentiable
 from physworld.grips import soft_regions, softly_held
-from physworld.mpm.gradient_twin import TwinRun
 from physworld.mpm.soft_grips import AS_HELD
 from physworld.scene import Grip
 from physworld.trace.candidates import candidates
@@ -70,10 +68,3 @@ def test_only_a_grip_that_holds_a_part_of_a_section_holds_softly_and_has_its_sof
     assert "reach_m" not in {gate.name for c in candidates(soft)[0] for gate in c.gates}
     assert "reach_m" in {gate.name for c in candidates(whole)[0] for gate in c.gates}
     assert "0.16 cells" in candidates(soft, ("grip_slip",))[1]["grip_slip"]
-
-
-def test_gradients_refuse_a_soft_grip() -> None:
-    twin, times, controls = twin_held_by(CORNER)
-    run = TwinRun(replace(twin, grip_softness=0.05), times, controls, times)
-    with pytest.raises(NotDifferentiable, match="BoundSoftGrips"):
-        run.gradient(np.ones_like(run.tracks))

@@ -12,6 +12,8 @@ from physworld.build import build_twin
 from physworld.calibrate.local_search import LocalConfig, field_modes
 from physworld.calibrate.local_stage import fit_fields
 from physworld.errors import CalibrationError, Cancelled
+from physworld.mpm.soft_grips import AS_HELD
+from physworld.mpm.soft_grips_derivatives import same_soft_grips
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
 from physworld.twin import Twin
 
@@ -21,7 +23,7 @@ FRAMES = 24
 QUICK = LocalConfig(modes=3, strengths=(0.001, 0.0001), iterations=8)
 
 
-def recorded(slope: float) -> tuple[Scene, Twin]:
+def recorded(slope: float, softness: float = 0.0) -> tuple[Scene, Twin]:
     """A shaken bar whose log stiffness falls by ``slope`` from the middle to the end, and its homogeneous twin."""
     points = np.linspace([0.05, 0.01, 0.02], [0.16, 0.01, 0.02], 6)
     plate = np.array([[0.0, 0.0, 0.0], [0.0, 0.02, 0.0], [0.0, 0.0, 0.02]])
@@ -33,6 +35,7 @@ def recorded(slope: float) -> tuple[Scene, Twin]:
     shake = 0.004 * np.sin(9.0 * scene.times)[:, None, None] * np.array([0.0, 0.5, 1.0])
     scene = replace(scene, controllers=scene.controllers + shake)
     twin = build_twin(scene, 100).with_parameters(youngs_modulus_pa=MODULUS_PA)
+    twin = replace(twin, grip_softness=softness)
     properties = np.zeros((twin.lattice.fill.size, 2))
     properties[:, 0] = slope * along(twin)
     nodes = twin.simulate_nodes(*scene.control_track(), scene.times, properties=properties)
@@ -44,8 +47,11 @@ def along(twin: Twin) -> np.ndarray:
     return 2.0 * twin.particles_rest[:, 0] / SIZE[0] - 1.0
 
 
-def test_a_field_is_found() -> None:
-    scene, twin = recorded(-0.6)
+@pytest.mark.parametrize("softness", [0.0, AS_HELD])
+def test_a_field_is_found(softness: float) -> None:
+    scene, twin = recorded(-0.6, softness)
+    setting = twin.integration(*scene.control_track(), scene.times)
+    assert bool(same_soft_grips([setting.problem])) == (softness > 0)
     found = fit_fields(scene, twin, QUICK)
     assert found.kept and found.strength in QUICK.strengths
     free = along(twin) > 2.0 * 0.032 / 0.16 - 1.0  # nothing is known of what the grip holds
