@@ -1,8 +1,9 @@
 """``python -m benchmarks.paper_tables --json FILE``: the paper's tables as relations, with their spread over seeds.
 
-On scenes with known truth, made by engines that are not ours, and on a real recording:
+On scenes with known truth, made by engines that are not ours, and on real recordings:
 
 * the world model against the twin that taught it, and against the same network trained on the recording alone;
+* the network alone, as in the paper without a closed-form prior under it;
 * with and without fine-tuning of Φ;
 * VMP-Gen against uniform linear motion, both without replays of the recording;
 * P3-Pert against none, uniform and random perturbation of the properties;
@@ -10,9 +11,10 @@ On scenes with known truth, made by engines that are not ours, and on a real rec
 * motions of a kind that the training did not see (``benchmarks.unseen_motion``).
 
 Every row stands beside the do-nothing baselines of its scene. Each cell (scene, condition, seed) is kept in
-``--cells`` as soon as it is done: a run that was ended goes on where it stopped, and a report says how many cells
-it has. ``--minutes`` ends a run before the next cell; ``--workers`` processes share the cells. Networks, episodes and
-optimiser steps are those of ``benchmarks.paper_models``, smaller than the service's.
+``--cells`` as soon as it is done: a run that was ended goes on where it stopped, and a report says which cells were
+not run. ``--minutes`` ends a run before the next cell; ``--conditions`` and ``--seeds`` run those alone (``--seeds``
+with nothing after it: none) and report all; ``--workers`` processes share the cells. Networks, episodes and optimiser
+steps are those of ``benchmarks.paper_models``, smaller than the service's.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ import json
 import multiprocessing
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,6 +42,8 @@ from benchmarks.paper_models import (
     METRICS,
     ORIGIN,
     SCENES,
+    TRAINING,
+    WITHOUT_PRIOR,
     Case,
     case_of,
     demonstrations,
@@ -60,9 +64,13 @@ CONDITIONS = {
     "none": DemonstrationConfig(perturbation="none"),
     "uniform": DemonstrationConfig(perturbation="uniform"),
     "random": DemonstrationConfig(perturbation="random"),
+    "no_prior": DemonstrationConfig(),
 }
+TRAININGS = {"no_prior": WITHOUT_PRIOR}
+"""Of conditions that are trained in another way than ``TRAINING``."""
 ALONE = "recording_alone"
 UNSEEN = "unseen_motion"
+KINDS = (*CONDITIONS, ALONE, UNSEEN)
 BASELINES = ("static", "rigid_follow", "constant_velocity")
 LABELS = {
     "static": "static",
@@ -77,6 +85,7 @@ LABELS = {
     "none": "… no perturbation instead of P3-Pert",
     "uniform": "… uniform perturbation",
     "random": "… random perturbation",
+    "no_prior": f"… the network alone, no prior ({WITHOUT_PRIOR.steps} steps)",
 }
 
 
@@ -98,6 +107,9 @@ RELATIONS = (
     Relation("p3_against_none", "world_model_finetuned", "none", "below 1"),
     Relation("p3_against_uniform", "world_model_finetuned", "uniform", "below 1"),
     Relation("p3_against_random", "world_model_finetuned", "random", "below 1"),
+    Relation("finetuned_against_network_alone", "world_model_finetuned", "no_prior", "has no prior"),
+    Relation("network_alone_against_twin", "no_prior", "twin", "0.91 (CD), 1.0 (track)"),
+    Relation("network_alone_against_recording_alone", "no_prior", ALONE, "1/3 to 1/5"),
 )
 
 
@@ -109,6 +121,16 @@ def main() -> int:
     parser.add_argument("--cells", type=Path, default=CELLS, help="folder of finished cells")
     parser.add_argument("--minutes", type=float, default=None, help="begin no cell after that long")
     parser.add_argument("--scenes", nargs="*", choices=sorted(SCENES), default=list(SCENES))
+    parser.add_argument(
+        "--conditions",
+        nargs="*",
+        choices=KINDS,
+        default=KINDS,
+        help="run no cells but these; all are reported",
+    )
+    parser.add_argument(
+        "--seeds", nargs="*", type=int, choices=SEEDS, default=SEEDS, help="the same of seeds"
+    )
     parser.add_argument("--workers", type=int, default=2, help="processes, one core each")
     given = parser.parse_args()
     wp.config.quiet = True
@@ -117,20 +139,20 @@ def main() -> int:
     for name in sorted(set(given.scenes) - set(scenes)):
         print(f"{name}: left out, {SCENES[name]} is not on this machine", file=sys.stderr)
     cells = Cells(given.cells, given.minutes)
-    for name in scenes:
+    keys = [key for key, _ in plan(scenes) if _wanted(key, given.conditions, given.seeds)]
+    missing = [key for key in keys if cells.get(key) is None]
+    for name in dict.fromkeys(key.split("/")[0] for key in missing):
         cells.case(name)  # calibrated once, before processes could do it twice
-    keys = [key for key, _ in plan(scenes)]
     settled = (given.cells, given.minutes, scenes)
-    if given.workers > 1:
+    if given.workers > 1 and missing:
         context = multiprocessing.get_context("spawn")
         with ProcessPoolExecutor(given.workers, context, _begin, settled) as pool:
-            list(pool.map(_fill, keys))
+            list(pool.map(_fill, missing))
     else:
         _begin(*settled)
-        for key in keys:
+        for key in missing:
             _fill(key)
-    held = {key: cells.get(key) for key in keys}
-    report = summarise(scenes, held)
+    report = summarise(given.scenes, {key: cells.get(key) for key, _ in plan(given.scenes)})
     print(report.markdown())
     if given.json is not None:
         write_json(report, given.json)
@@ -141,6 +163,11 @@ def main() -> int:
 
 _own: list[tuple[Cells, dict[str, Callable[[Case], dict[str, Any]]]]] = []
 """Of a process that fills cells: where they are, and what each one takes."""
+
+
+def _wanted(key: str, conditions: Sequence[str], seeds: Sequence[int]) -> bool:
+    _, condition, seed = key.split("/")
+    return condition in conditions and int(seed) in seeds
 
 
 def _begin(folder: Path, minutes: float | None, scenes: list[str]) -> None:
@@ -158,8 +185,7 @@ class Cells:
     """Finished cells as JSON files; one of other settings counts as absent."""
 
     def __init__(self, folder: Path, minutes: float | None) -> None:
-        digest = hashlib.sha256(json.dumps(settings(), sort_keys=True).encode()).hexdigest()[:12]
-        self.folder = folder / digest
+        self._root, self.folder = folder, folder / _digest(settings())
         self.folder.mkdir(parents=True, exist_ok=True)
         self._until = None if minutes is None else time.monotonic() + 60.0 * minutes
         self._cases: dict[str, Case] = {}
@@ -189,7 +215,14 @@ class Cells:
         return self._cases[name]
 
     def _path(self, key: str) -> Path:
-        return self.folder / f"{key.replace('/', '-')}.json"
+        training = TRAININGS.get(key.split("/")[1])
+        folder = self.folder if training is None else self._root / _digest(settings(training))
+        folder.mkdir(exist_ok=True)
+        return folder / f"{key.replace('/', '-')}.json"
+
+
+def _digest(settled: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(settled, sort_keys=True).encode()).hexdigest()[:12]
 
 
 def plan(scenes: list[str]) -> Iterator[tuple[str, Callable[[Case], dict[str, Any]]]]:
@@ -208,7 +241,7 @@ def conditioned(case: Case, condition: str, seed: int) -> dict[str, Any]:
     begun = time.perf_counter()
     episodes, rejected = demonstrations(case, CONDITIONS[condition], EPISODES, seed)
     simulated = time.perf_counter()
-    trained = learn(case.view.spec, episodes, seed)
+    trained = learn(case.view.spec, episodes, seed, TRAININGS.get(condition, TRAINING))
     return {
         **score(case, trained),
         "rejected": rejected,
@@ -225,12 +258,18 @@ def summarise(scenes: list[str], held: dict[str, dict[str, Any] | None]) -> Repo
     speeds = {name: speed(name, held) for name in scenes}
     rows = []
     for name in scenes:
+        if not any(by_metric["track_m"] for by_metric in errors[name].values()):
+            continue
         for prediction, by_metric in errors[name].items():
-            if not any(by_metric.values()):
-                continue
-            cells = [in_millimetres(by_metric[metric]) for metric in METRICS]
+            run = [cell for seed in SEEDS if (cell := held.get(f"{name}/{_source(prediction)}/{seed}"))]
+            cells = [in_millimetres(by_metric[metric], len(run)) for metric in METRICS]
             rows.append([f"{name} ({ORIGIN[name]})", LABELS[prediction], *cells])
-    notes = [f"{done} of {len(held)} cells are done; mean ± standard deviation over the seeds that are."]
+    notes = [
+        f"{done} of {len(held)} cells are done; mean ± standard deviation over the seeds that are ({len(SEEDS)} where "
+        f"nothing else is said). {not_run(held)}",
+        f"The network alone is trained for {WITHOUT_PRIOR.steps} steps at {WITHOUT_PRIOR.learning_rate:g}, all others "
+        f"for {TRAINING.steps} at {TRAINING.learning_rate:g}.",
+    ]
     notes += [in_words(relation, relations[relation.key]) for relation in RELATIONS]
     notes += [
         f"{name}: world model {found['world_model']:.0f}, twin {found['twin']:.0f} steps/s ({found['ratio']:.0f} x)."
@@ -259,7 +298,7 @@ def summarise(scenes: list[str], held: dict[str, dict[str, Any] | None]) -> Repo
             "steps_per_second": speeds,
             "priors": priors,
             "unseen_motion": unseen,
-            "settings": settings(),
+            "settings": settings() | {"without_prior": settings(WITHOUT_PRIOR)},
         },
         header=["scene", "prediction", "track, mm", "Chamfer PhysTwin, mm", "Chamfer L2, mm"],
         rows=rows,
@@ -290,6 +329,25 @@ def errors_by_prediction(name: str, held: dict[str, dict[str, Any] | None]) -> d
     return found
 
 
+def _source(prediction: str) -> str:
+    """The condition whose cells hold a prediction."""
+    return prediction if prediction in CONDITIONS or prediction == ALONE else "full"
+
+
+def not_run(held: dict[str, dict[str, Any] | None]) -> str:
+    """Which cells there are not, by scene and condition."""
+    seeds: dict[str, list[str]] = {}
+    for key in (key for key, cell in held.items() if cell is None):
+        what, seed = key.rsplit("/", 1)
+        seeds.setdefault(what, []).append(seed)
+    if not seeds:
+        return "All were run."
+    parts = [
+        what if len(own) == len(SEEDS) else f"{what} (seed {', '.join(own)})" for what, own in seeds.items()
+    ]
+    return f"Not run: {'; '.join(parts)}."
+
+
 def hold(relation: Relation, errors: dict[str, Any]) -> dict[str, Any]:
     """Ratios better/worse of the track error by scene and seed, and in how many the relation holds."""
     ratios = {}
@@ -306,6 +364,7 @@ def hold(relation: Relation, errors: dict[str, Any]) -> dict[str, Any]:
     every = [ratio for found in ratios.values() for ratio in found["by_seed"].values()]
     return {
         "by_scene": ratios,
+        "without": [name for name in errors if name not in ratios],
         "pairs": len(every),
         "holds_in": sum(ratio < 1.0 for ratio in every),
         "mean_ratio": float(np.exp(np.mean(np.log(every)))) if every else None,
@@ -319,6 +378,7 @@ def in_words(relation: Relation, found: dict[str, Any]) -> str:
     if not found["pairs"]:
         return f"{left} / {right}: not measured yet."
     scenes = ", ".join(f"{name} {entry['mean']:.2f}" for name, entry in found["by_scene"].items())
+    scenes += "".join(f", {name} not run" for name in found["without"])
     return (
         f"{left} / {right}: track error ratio {found['mean_ratio']:.2f} ({scenes}); below 1 in {found['holds_in']} of "
         f"{found['pairs']} pairs of scene and seed; the paper: {relation.paper}."
@@ -331,6 +391,7 @@ def speed(name: str, held: dict[str, dict[str, Any] | None]) -> dict[str, float]
         cell["steps_per_second"]
         for key, cell in held.items()
         if cell is not None and key.startswith(f"{name}/") and "steps_per_second" in cell
+        if key.split("/")[1] not in TRAININGS
     ]
     if not found:
         return None
@@ -344,7 +405,7 @@ def priors_by_condition(name: str, held: dict[str, dict[str, Any] | None]) -> di
     ``untouched`` counts the cells in which the network brought no better validation error than its prior.
     """
     found = {}
-    for condition in CONDITIONS:
+    for condition in (one for one in CONDITIONS if one not in TRAININGS):
         cells = [held.get(f"{name}/{condition}/{seed}") for seed in SEEDS]
         own = [cell for cell in cells if cell is not None and "validation_prior_m" in cell]
         if own:
@@ -366,13 +427,16 @@ def prior_in_words(name: str, found: dict[str, dict[str, float]]) -> str:
     )
 
 
-def in_millimetres(by_seed: dict[str, float]) -> str:
-    """``1.76 ± 0.12``."""
+def in_millimetres(by_seed: dict[str, float], run: int) -> str:
+    """``1.76 ± 0.12`` of ``run`` seeds, and how many of them left the numbers; ``not run``."""
+    if not run:
+        return "not run"
     values = 1e3 * np.array(list(by_seed.values()))
-    if not len(values):
-        return "–"
     spread = f" ± {values.std(ddof=1):.2g}" if len(values) > 1 and np.ptp(values) > 0 else ""
-    return f"{values.mean():.3g}{spread}"
+    text = f"{values.mean():.3g}{spread}" if len(values) else ""
+    seeds = f" ({run} of {len(SEEDS)} seeds)" if run < len(SEEDS) else ""
+    lost = f" ({run - len(values)} of {run} left the numbers)" if len(values) < run else ""
+    return f"{text}{seeds}{lost}".strip()
 
 
 if __name__ == "__main__":
