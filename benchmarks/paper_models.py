@@ -65,6 +65,8 @@ WITHOUT_PRIOR = replace(
 TUNING = FineTuneConfig(steps=40)
 EPISODES = 48
 FIT = CalibrationConfig(particle_budget=500, max_simulations=40)
+FITS = {"rope_a_ring": CalibrationConfig()}
+"""Of scenes whose twin gets the service's budget: one real recording that the twin follows as well as it can."""
 SKIN_STATES = 24
 
 
@@ -77,9 +79,9 @@ class Case:
     view: SceneView
 
 
-def settings(training: TrainingConfig = TRAINING) -> dict[str, Any]:
+def settings(training: TrainingConfig = TRAINING, fit: CalibrationConfig = FIT) -> dict[str, Any]:
     """What a cell's figures depend on beside its own key and the defaults; a change makes cells anew."""
-    parts = {"model": SMALL, "training": training, "tuning": TUNING, "fit": FIT}
+    parts = {"model": SMALL, "training": training, "tuning": TUNING, "fit": fit}
     chosen = {
         f"{name}.{item.name}": getattr(part, item.name)
         for name, part in parts.items()
@@ -105,7 +107,7 @@ def case_of(name: str, folder: Path) -> Case | None:
         with np.load(path, allow_pickle=False) as held:
             twin = Twin.from_arrays({key: held[key] for key in held.files})
     else:
-        twin = calibrate(scene, FIT).twin
+        twin = calibrate(scene, FITS.get(name, FIT)).twin
         folder.mkdir(parents=True, exist_ok=True)
         partial = path.with_suffix(".part.npz")
         np.savez(partial, allow_pickle=False, **twin.to_arrays())

@@ -9,17 +9,8 @@ from typing import Any
 import pytest
 
 from benchmarks import paper_tables, unseen_motion
-from benchmarks.paper_tables import (
-    ALONE,
-    CONDITIONS,
-    RELATIONS,
-    SEEDS,
-    Cells,
-    Relation,
-    hold,
-    plan,
-    summarise,
-)
+from benchmarks.paper_relations import ALONE, CONDITIONS, RELATIONS, SEEDS, Relation, hold
+from benchmarks.paper_tables import Cells, plan, summarise
 
 
 def cell(model: float, tuned: float, twin: float = 0.002) -> dict[str, Any]:
@@ -162,3 +153,24 @@ def test_unseen_motions_are_pooled_over_seeds() -> None:
     assert found["unseen"]["at_frame_m"]["100"] == pytest.approx(0.004)
     assert "trained without it 2.00" in unseen_motion.in_words("twist", found)
     assert unseen_motion.pooled([None]) is None
+
+
+def test_the_twin_and_the_baselines_stand_in_the_cells_of_every_condition() -> None:
+    some = {key: None for key, _ in plan(["soft_beam"])} | {"soft_beam/no_prior/1": cell(0.02, 0.02)}
+    report = summarise(["soft_beam"], some)
+    rows = {row[1]: row[2] for row in report.rows}
+    assert rows["twin"] == "2 (1 of 3 seeds)" and rows["rigid follow"] == "20 (1 of 3 seeds)"
+    assert rows["world model, fine-tuned"] == "not run"
+    assert report.figures["relations"]["network_alone_against_twin"]["by_scene"]["soft_beam"]["by_seed"] == {
+        "1": pytest.approx(10.0)
+    }
+
+
+def test_a_scene_whose_twin_is_fitted_in_another_way_has_cells_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Cells, "case", lambda self, name: name)
+    [scene] = paper_tables.FITS
+    Cells(tmp_path, None).fill(f"{scene}/full/0", lambda case: {})
+    monkeypatch.delitem(paper_tables.FITS, scene)
+    assert Cells(tmp_path, None).get(f"{scene}/full/0") is None
