@@ -19,7 +19,7 @@ import torch
 
 from benchmarks import hairpin
 from benchmarks.harness import Report, run_alone
-from benchmarks.paper_models import SMALL, TRAINING, case_of, demonstrations
+from benchmarks.paper_models import SMALL, TRAINING, WITHOUT_PRIOR, case_of, demonstrations
 from physworld.demonstrate import DemonstrationConfig
 from physworld.worldmodel.config import WorldModelConfig
 from physworld.worldmodel.dataset import read_track
@@ -28,12 +28,7 @@ from physworld.worldmodel.training import open_loop_error, train
 
 BEAM, HAIRPIN = "soft_beam", "hairpin"
 EPISODES, UNSEEN, SEEDS = {BEAM: 32, HAIRPIN: 24}, 12, 2
-SETTINGS = {
-    "auto": TRAINING,
-    "none": replace(
-        TRAINING, prior="none", steps=5 * TRAINING.steps, learning_rate=5e-3, validation_every=40
-    ),
-}
+SETTINGS = {"auto": TRAINING, "none": WITHOUT_PRIOR}
 CASES = [(BEAM, prior, edges) for prior in SETTINGS for edges in ("material", "current")] + [
     (HAIRPIN, "auto", edges) for edges in ("material", "current")
 ]

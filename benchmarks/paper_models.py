@@ -39,11 +39,13 @@ SCENES = {
     "soft_beam": REPOSITORY / "sample" / "soft_beam",
     "d02": SHARED / "undeclared" / "d02",
     "rope_b_shake": SHARED / "real" / "rope_b_shake",
+    "rope_a_ring": SHARED / "real" / "rope_a_ring",
 }
 ORIGIN = {
     "soft_beam": "MuJoCo, known truth",
     "d02": "independent engine, known truth",
     "rope_b_shake": "real recording",
+    "rope_a_ring": "real recording",
 }
 METRICS = ("track_m", "chamfer_phystwin_m", "chamfer_l2_m")
 
@@ -56,9 +58,15 @@ TRAINING = TrainingConfig(
     validation_every=20,
     checkpoint_every=10_000,
 )
+WITHOUT_PRIOR = replace(
+    TRAINING, prior="none", steps=5 * TRAINING.steps, learning_rate=5e-3, validation_every=40
+)
+"""Of the network alone: all of the motion is its to learn."""
 TUNING = FineTuneConfig(steps=40)
 EPISODES = 48
 FIT = CalibrationConfig(particle_budget=500, max_simulations=40)
+FITS = {"rope_a_ring": CalibrationConfig()}
+"""Of scenes whose twin gets the service's budget: one real recording that the twin follows as well as it can."""
 SKIN_STATES = 24
 
 
@@ -71,9 +79,9 @@ class Case:
     view: SceneView
 
 
-def settings() -> dict[str, Any]:
+def settings(training: TrainingConfig = TRAINING, fit: CalibrationConfig = FIT) -> dict[str, Any]:
     """What a cell's figures depend on beside its own key and the defaults; a change makes cells anew."""
-    parts = {"model": SMALL, "training": TRAINING, "tuning": TUNING, "fit": FIT}
+    parts = {"model": SMALL, "training": training, "tuning": TUNING, "fit": fit}
     chosen = {
         f"{name}.{item.name}": getattr(part, item.name)
         for name, part in parts.items()
@@ -99,7 +107,7 @@ def case_of(name: str, folder: Path) -> Case | None:
         with np.load(path, allow_pickle=False) as held:
             twin = Twin.from_arrays({key: held[key] for key in held.files})
     else:
-        twin = calibrate(scene, FIT).twin
+        twin = calibrate(scene, FITS.get(name, FIT)).twin
         folder.mkdir(parents=True, exist_ok=True)
         partial = path.with_suffix(".part.npz")
         np.savez(partial, allow_pickle=False, **twin.to_arrays())
@@ -127,10 +135,15 @@ def demonstrations(
     return episodes, rejected
 
 
-def learn(spec: GraphSpec, episodes: Sequence[dict[str, np.ndarray]], seed: int) -> TrainingResult:
+def learn(
+    spec: GraphSpec,
+    episodes: Sequence[dict[str, np.ndarray]],
+    seed: int,
+    training: TrainingConfig = TRAINING,
+) -> TrainingResult:
     """A small model of these episodes."""
     tracks = [read_track(spec, arrays, SMALL.history) for arrays in episodes]
-    return train(tracks, spec, SMALL, replace(TRAINING, seed=seed))
+    return train(tracks, spec, SMALL, replace(training, seed=seed))
 
 
 def score(case: Case, trained: TrainingResult) -> dict[str, Any]:

@@ -1,8 +1,9 @@
 """``python -m benchmarks.paper_tables --json FILE``: the paper's tables as relations, with their spread over seeds.
 
-On scenes with known truth, made by engines that are not ours, and on a real recording:
+On scenes with known truth, made by engines that are not ours, and on real recordings:
 
 * the world model against the twin that taught it, and against the same network trained on the recording alone;
+* the network alone, as in the paper without a closed-form prior under it;
 * with and without fine-tuning of Φ;
 * VMP-Gen against uniform linear motion, both without replays of the recording;
 * P3-Pert against none, uniform and random perturbation of the properties;
@@ -10,9 +11,10 @@ On scenes with known truth, made by engines that are not ours, and on a real rec
 * motions of a kind that the training did not see (``benchmarks.unseen_motion``).
 
 Every row stands beside the do-nothing baselines of its scene. Each cell (scene, condition, seed) is kept in
-``--cells`` as soon as it is done: a run that was ended goes on where it stopped, and a report says how many cells
-it has. ``--minutes`` ends a run before the next cell; ``--workers`` processes share the cells. Networks, episodes and
-optimiser steps are those of ``benchmarks.paper_models``, smaller than the service's.
+``--cells`` as soon as it is done: a run that was ended goes on where it stopped, and a report says which cells were
+not run. ``--minutes`` ends a run before the next cell; ``--conditions`` and ``--seeds`` run those alone (``--seeds``
+with nothing after it: none) and report all; ``--workers`` processes share the cells. Networks, episodes and optimiser
+steps are those of ``benchmarks.paper_models``, smaller than the service's.
 """
 
 from __future__ import annotations
@@ -23,13 +25,11 @@ import json
 import multiprocessing
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 import warp as wp
 
@@ -37,9 +37,13 @@ from benchmarks import unseen_motion
 from benchmarks.harness import Report, write_json, write_section
 from benchmarks.paper_models import (
     EPISODES,
+    FIT,
+    FITS,
     METRICS,
     ORIGIN,
     SCENES,
+    TRAINING,
+    WITHOUT_PRIOR,
     Case,
     case_of,
     demonstrations,
@@ -49,56 +53,28 @@ from benchmarks.paper_models import (
     score,
     settings,
 )
-from physworld.demonstrate import DemonstrationConfig
-
-SEEDS = (0, 1, 2)
-CELLS = Path(".bench") / "paper_tables"
-CONDITIONS = {
-    "full": DemonstrationConfig(),
-    "vmp": DemonstrationConfig(replay_share=0.0),
-    "linear": DemonstrationConfig(motion="linear", replay_share=0.0),
-    "none": DemonstrationConfig(perturbation="none"),
-    "uniform": DemonstrationConfig(perturbation="uniform"),
-    "random": DemonstrationConfig(perturbation="random"),
-}
-ALONE = "recording_alone"
-UNSEEN = "unseen_motion"
-BASELINES = ("static", "rigid_follow", "constant_velocity")
-LABELS = {
-    "static": "static",
-    "rigid_follow": "rigid follow",
-    "constant_velocity": "constant velocity",
-    "twin": "twin",
-    "recording_alone": "GNN on the recording alone",
-    "world_model": "world model, no fine-tuning",
-    "world_model_finetuned": "world model, fine-tuned",
-    "vmp": "… VMP-Gen alone, no replays",
-    "linear": "… linear motion alone, no replays",
-    "none": "… no perturbation instead of P3-Pert",
-    "uniform": "… uniform perturbation",
-    "random": "… random perturbation",
-}
-
-
-@dataclass(frozen=True)
-class Relation:
-    """An inequality of the paper: ``better`` errs less than ``worse``; ``paper``: the ratio of its headline table."""
-
-    key: str
-    better: str
-    worse: str
-    paper: str
-
-
-RELATIONS = (
-    Relation("finetuned_against_twin", "world_model_finetuned", "twin", "0.91 (CD), 1.0 (track)"),
-    Relation("finetuned_against_recording_alone", "world_model_finetuned", ALONE, "1/3 to 1/5"),
-    Relation("fine_tuning", "world_model_finetuned", "world_model", "0.84"),
-    Relation("vmp_against_linear", "vmp", "linear", "below 1"),
-    Relation("p3_against_none", "world_model_finetuned", "none", "below 1"),
-    Relation("p3_against_uniform", "world_model_finetuned", "uniform", "below 1"),
-    Relation("p3_against_random", "world_model_finetuned", "random", "below 1"),
+from benchmarks.paper_relations import (
+    ALONE,
+    CONDITIONS,
+    KINDS,
+    LABELS,
+    RELATIONS,
+    SEEDS,
+    TRAININGS,
+    UNSEEN,
+    cells_with,
+    errors_by_prediction,
+    hold,
+    in_millimetres,
+    in_words,
+    learned_alone,
+    not_run,
+    prior_in_words,
+    priors_by_condition,
+    speed,
 )
+
+CELLS = Path(".bench") / "paper_tables"
 
 
 def main() -> int:
@@ -109,6 +85,16 @@ def main() -> int:
     parser.add_argument("--cells", type=Path, default=CELLS, help="folder of finished cells")
     parser.add_argument("--minutes", type=float, default=None, help="begin no cell after that long")
     parser.add_argument("--scenes", nargs="*", choices=sorted(SCENES), default=list(SCENES))
+    parser.add_argument(
+        "--conditions",
+        nargs="*",
+        choices=KINDS,
+        default=KINDS,
+        help="run no cells but these; all are reported",
+    )
+    parser.add_argument(
+        "--seeds", nargs="*", type=int, choices=SEEDS, default=SEEDS, help="the same of seeds"
+    )
     parser.add_argument("--workers", type=int, default=2, help="processes, one core each")
     given = parser.parse_args()
     wp.config.quiet = True
@@ -117,20 +103,20 @@ def main() -> int:
     for name in sorted(set(given.scenes) - set(scenes)):
         print(f"{name}: left out, {SCENES[name]} is not on this machine", file=sys.stderr)
     cells = Cells(given.cells, given.minutes)
-    for name in scenes:
+    keys = [key for key, _ in plan(scenes) if _wanted(key, given.conditions, given.seeds)]
+    missing = [key for key in keys if cells.get(key) is None]
+    for name in dict.fromkeys(key.split("/")[0] for key in missing):
         cells.case(name)  # calibrated once, before processes could do it twice
-    keys = [key for key, _ in plan(scenes)]
     settled = (given.cells, given.minutes, scenes)
-    if given.workers > 1:
+    if given.workers > 1 and missing:
         context = multiprocessing.get_context("spawn")
         with ProcessPoolExecutor(given.workers, context, _begin, settled) as pool:
-            list(pool.map(_fill, keys))
+            list(pool.map(_fill, missing))
     else:
         _begin(*settled)
-        for key in keys:
+        for key in missing:
             _fill(key)
-    held = {key: cells.get(key) for key in keys}
-    report = summarise(scenes, held)
+    report = summarise(given.scenes, {key: cells.get(key) for key, _ in plan(given.scenes)})
     print(report.markdown())
     if given.json is not None:
         write_json(report, given.json)
@@ -141,6 +127,11 @@ def main() -> int:
 
 _own: list[tuple[Cells, dict[str, Callable[[Case], dict[str, Any]]]]] = []
 """Of a process that fills cells: where they are, and what each one takes."""
+
+
+def _wanted(key: str, conditions: Sequence[str], seeds: Sequence[int]) -> bool:
+    _, condition, seed = key.split("/")
+    return condition in conditions and int(seed) in seeds
 
 
 def _begin(folder: Path, minutes: float | None, scenes: list[str]) -> None:
@@ -158,9 +149,7 @@ class Cells:
     """Finished cells as JSON files; one of other settings counts as absent."""
 
     def __init__(self, folder: Path, minutes: float | None) -> None:
-        digest = hashlib.sha256(json.dumps(settings(), sort_keys=True).encode()).hexdigest()[:12]
-        self.folder = folder / digest
-        self.folder.mkdir(parents=True, exist_ok=True)
+        self._root = folder
         self._until = None if minutes is None else time.monotonic() + 60.0 * minutes
         self._cases: dict[str, Case] = {}
 
@@ -183,13 +172,26 @@ class Cells:
     def case(self, name: str) -> Case:
         """The scene with its twin."""
         if name not in self._cases:
-            case = case_of(name, self.folder)
+            case = case_of(name, self._folder(name, "full"))
             assert case is not None, "plan() leaves out scenes that are not here"
             self._cases[name] = case
         return self._cases[name]
 
     def _path(self, key: str) -> Path:
-        return self.folder / f"{key.replace('/', '-')}.json"
+        return self._folder(*key.split("/")[:2]) / f"{key.replace('/', '-')}.json"
+
+    def _folder(self, scene: str, condition: str) -> Path:
+        """One for each set of settings; it is made."""
+        text = json.dumps(settings(**_own_settings(scene, condition)), sort_keys=True)
+        folder = self._root / hashlib.sha256(text.encode()).hexdigest()[:12]
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder
+
+
+def _own_settings(scene: str, condition: str) -> dict[str, Any]:
+    """What differs from all others: how the condition is trained, how the scene's twin is fitted."""
+    training = {"training": TRAININGS[condition]} if condition in TRAININGS else {}
+    return training | ({"fit": FITS[scene]} if scene in FITS else {})
 
 
 def plan(scenes: list[str]) -> Iterator[tuple[str, Callable[[Case], dict[str, Any]]]]:
@@ -208,7 +210,7 @@ def conditioned(case: Case, condition: str, seed: int) -> dict[str, Any]:
     begun = time.perf_counter()
     episodes, rejected = demonstrations(case, CONDITIONS[condition], EPISODES, seed)
     simulated = time.perf_counter()
-    trained = learn(case.view.spec, episodes, seed)
+    trained = learn(case.view.spec, episodes, seed, TRAININGS.get(condition, TRAINING))
     return {
         **score(case, trained),
         "rejected": rejected,
@@ -225,12 +227,20 @@ def summarise(scenes: list[str], held: dict[str, dict[str, Any] | None]) -> Repo
     speeds = {name: speed(name, held) for name in scenes}
     rows = []
     for name in scenes:
+        if not any(by_metric["track_m"] for by_metric in errors[name].values()):
+            continue
         for prediction, by_metric in errors[name].items():
-            if not any(by_metric.values()):
-                continue
-            cells = [in_millimetres(by_metric[metric]) for metric in METRICS]
+            run = len(cells_with(name, prediction, held))
+            cells = [in_millimetres(by_metric[metric], run) for metric in METRICS]
             rows.append([f"{name} ({ORIGIN[name]})", LABELS[prediction], *cells])
-    notes = [f"{done} of {len(held)} cells are done; mean ± standard deviation over the seeds that are."]
+    notes = [
+        f"{done} of {len(held)} cells are done; mean ± standard deviation over the seeds that are ({len(SEEDS)} where "
+        f"nothing else is said). {not_run(held)}",
+        f"The network alone is trained for {WITHOUT_PRIOR.steps} steps at {WITHOUT_PRIOR.learning_rate:g}, all others "
+        f"for {TRAINING.steps} at {TRAINING.learning_rate:g}. {learned_alone(held)}",
+        f"Twins are fitted with {FIT.max_simulations} simulations at {FIT.particle_budget} particles, but with the "
+        f"service's settings for {', '.join(FITS)}.",
+    ]
     notes += [in_words(relation, relations[relation.key]) for relation in RELATIONS]
     notes += [
         f"{name}: world model {found['world_model']:.0f}, twin {found['twin']:.0f} steps/s ({found['ratio']:.0f} x)."
@@ -259,120 +269,12 @@ def summarise(scenes: list[str], held: dict[str, dict[str, Any] | None]) -> Repo
             "steps_per_second": speeds,
             "priors": priors,
             "unseen_motion": unseen,
-            "settings": settings(),
+            "settings": settings() | {"without_prior": settings(WITHOUT_PRIOR), "fitted_in_full": list(FITS)},
         },
         header=["scene", "prediction", "track, mm", "Chamfer PhysTwin, mm", "Chamfer L2, mm"],
         rows=rows,
         notes=notes,
     )
-
-
-def errors_by_prediction(name: str, held: dict[str, dict[str, Any] | None]) -> dict[str, Any]:
-    """Prediction → metric → {seed: error [m]}; conditions other than full are fine-tuned models."""
-    found: dict[str, dict[str, dict[str, float]]] = {
-        label: {metric: {} for metric in METRICS} for label in LABELS
-    }
-    for seed in SEEDS:
-        for condition in (*CONDITIONS, ALONE):
-            cell = held.get(f"{name}/{condition}/{seed}")
-            if cell is None:
-                continue
-            sources = {condition: "world_model_finetuned"}
-            if condition == "full":
-                sources = {key: key for key in (*BASELINES, "twin", "world_model", "world_model_finetuned")}
-            elif condition == ALONE:
-                sources = {ALONE: ALONE}
-            for label, source in sources.items():
-                for metric in METRICS:
-                    error = cell[metric].get(source)
-                    if error is not None:
-                        found[label][metric][str(seed)] = error
-    return found
-
-
-def hold(relation: Relation, errors: dict[str, Any]) -> dict[str, Any]:
-    """Ratios better/worse of the track error by scene and seed, and in how many the relation holds."""
-    ratios = {}
-    for name, by_prediction in errors.items():
-        better, worse = (by_prediction[side]["track_m"] for side in (relation.better, relation.worse))
-        own = {seed: better[seed] / worse[seed] for seed in better if seed in worse}
-        if own:
-            logs = np.log(list(own.values()))
-            ratios[name] = {
-                "by_seed": own,
-                "mean": float(np.exp(logs.mean())),
-                "holds": bool((logs < 0.0).all()),
-            }
-    every = [ratio for found in ratios.values() for ratio in found["by_seed"].values()]
-    return {
-        "by_scene": ratios,
-        "pairs": len(every),
-        "holds_in": sum(ratio < 1.0 for ratio in every),
-        "mean_ratio": float(np.exp(np.mean(np.log(every)))) if every else None,
-        "paper": relation.paper,
-    }
-
-
-def in_words(relation: Relation, found: dict[str, Any]) -> str:
-    """One line: the ratio here, the paper's, where it holds."""
-    left, right = (LABELS[side].removeprefix("… ") for side in (relation.better, relation.worse))
-    if not found["pairs"]:
-        return f"{left} / {right}: not measured yet."
-    scenes = ", ".join(f"{name} {entry['mean']:.2f}" for name, entry in found["by_scene"].items())
-    return (
-        f"{left} / {right}: track error ratio {found['mean_ratio']:.2f} ({scenes}); below 1 in {found['holds_in']} of "
-        f"{found['pairs']} pairs of scene and seed; the paper: {relation.paper}."
-    )
-
-
-def speed(name: str, held: dict[str, dict[str, Any] | None]) -> dict[str, float] | None:
-    """Medians over the scene's cells; None without one."""
-    found = [
-        cell["steps_per_second"]
-        for key, cell in held.items()
-        if cell is not None and key.startswith(f"{name}/") and "steps_per_second" in cell
-    ]
-    if not found:
-        return None
-    medians = {side: float(np.median([cell[side] for cell in found])) for side in ("world_model", "twin")}
-    return medians | {"ratio": medians["world_model"] / medians["twin"]}
-
-
-def priors_by_condition(name: str, held: dict[str, dict[str, Any] | None]) -> dict[str, dict[str, float]]:
-    """Condition → mean error [m] of the closed-form prior alone on left-out episodes of that condition, and cells.
-
-    ``untouched`` counts the cells in which the network brought no better validation error than its prior.
-    """
-    found = {}
-    for condition in CONDITIONS:
-        cells = [held.get(f"{name}/{condition}/{seed}") for seed in SEEDS]
-        own = [cell for cell in cells if cell is not None and "validation_prior_m" in cell]
-        if own:
-            found[condition] = {
-                "validation_prior_m": float(np.mean([cell["validation_prior_m"] for cell in own])),
-                "cells": len(own),
-                "untouched": sum(cell["best_step"] == 0 for cell in own),
-            }
-    return found
-
-
-def prior_in_words(name: str, found: dict[str, dict[str, float]]) -> str:
-    """One line."""
-    errors = ", ".join(f"{key} {1e3 * entry['validation_prior_m']:.1f}" for key, entry in found.items())
-    untouched, cells = (sum(entry[key] for entry in found.values()) for key in ("untouched", "cells"))
-    return (
-        f"{name}: the closed-form prior alone on left-out episodes of each condition, mm: {errors}; in {untouched} of "
-        f"{cells} cells the network brought nothing beyond it."
-    )
-
-
-def in_millimetres(by_seed: dict[str, float]) -> str:
-    """``1.76 ± 0.12``."""
-    values = 1e3 * np.array(list(by_seed.values()))
-    if not len(values):
-        return "–"
-    spread = f" ± {values.std(ddof=1):.2g}" if len(values) > 1 and np.ptp(values) > 0 else ""
-    return f"{values.mean():.3g}{spread}"
 
 
 if __name__ == "__main__":

@@ -51,6 +51,22 @@ CANDIDATES, BATCH_STEPS = 32, 30
 BAR_M = np.array([0.4, 0.08, 0.08])
 MODULUS_PA, POISSON, DENSITY_KG_M3, PARTICLES = 1e5, 0.35, 1000.0, 2000
 TWIN_FRAMES = 10
+LABELS = {
+    "ours": "rollout: ours",
+    "ours_rebuilt": "rollout: ours, near edges of the current shape",
+    "pyg": "rollout: PyTorch Geometric, eager",
+    "pytorch_naive": "rollout: our function the plain way, eager torch",
+    "train ours": "training: ours",
+    "train ours_rebuilt": "training: ours, near edges of the current shape",
+    "train naive": "training: our function the plain way",
+    "batch ours": "batch: ours, one thread",
+    "batch ours_all_cores": "batch: ours, all cores",
+    "batch one_by_one": "batch: ours, one call each",
+    "batch torch": "batch: our network in torch",
+    "twin": "simulator: our twin",
+    "spring_mass": "simulator: springs",
+}
+"""What each case is called in the printed table; its figures keep the short names."""
 
 
 class _Interaction(MessagePassing):
@@ -109,20 +125,7 @@ def measure(repeats: int, seed: int) -> Report:
     rows = []
     spec = None
     for hidden in HIDDEN:
-        model, spec = _model(hidden, seed)
-        rebuilt, _ = _model(hidden, seed, "current")
-        naive = NaiveWorldModel(model)
-        start, driven, phi = _sequence(spec, seed)
-        cases = {
-            "ours": _engine_case(model, start, driven, phi),
-            "ours_rebuilt": _engine_case(rebuilt, start, driven, phi),
-            "pyg": _torch_case(model, _PygNetwork(naive), start, driven, phi),
-            "pytorch_naive": _torch_case(model, naive, start, driven, phi),
-            "train ours": _training_case(model, model, start, driven, phi),
-            "train ours_rebuilt": _training_case(rebuilt, rebuilt, start, driven, phi),
-            "train naive": _training_case(model, naive, start, driven, phi),
-            **_batch_cases(model, start, driven, phi),
-        }
+        cases, spec = cases_of(hidden, seed)
         for case in cases.values():
             case()
         timings = interleave(cases, repeats)
@@ -152,7 +155,8 @@ def measure(repeats: int, seed: int) -> Report:
         rows=rows,
         notes=(
             f"{spec.vertex_count} vertices, {spec.edge_count} edges, 7 message passing steps, history 3; the graph "
-            "is material and kept, but for ours_rebuilt, which finds its near edges (7 a vertex) at every step.",
+            "is material and kept, but for the rows of the current shape, which find their near edges (7 a vertex) at "
+            "every step (`near_edges: current`).",
             "The peer of rollouts is PyG eager, of training our function written the plain way.",
             f"Batches: {CANDIDATES} candidates of {BATCH_STEPS} steps from one start; the peer is torch, where the "
             "whole batch is one tensor.",
@@ -163,6 +167,25 @@ def measure(repeats: int, seed: int) -> Report:
         ),
         seed=seed,
     )
+
+
+def cases_of(hidden: int, seed: int) -> tuple[dict[str, Callable[[], float]], GraphSpec]:
+    """What is measured of the model at one width, by name, each of ``LABELS``; the graph."""
+    model, spec = _model(hidden, seed)
+    rebuilt, _ = _model(hidden, seed, "current")
+    naive = NaiveWorldModel(model)
+    start, driven, phi = _sequence(spec, seed)
+    cases = {
+        "ours": _engine_case(model, start, driven, phi),
+        "ours_rebuilt": _engine_case(rebuilt, start, driven, phi),
+        "pyg": _torch_case(model, _PygNetwork(naive), start, driven, phi),
+        "pytorch_naive": _torch_case(model, naive, start, driven, phi),
+        "train ours": _training_case(model, model, start, driven, phi),
+        "train ours_rebuilt": _training_case(rebuilt, rebuilt, start, driven, phi),
+        "train naive": _training_case(model, naive, start, driven, phi),
+        **_batch_cases(model, start, driven, phi),
+    }
+    return cases, spec
 
 
 def _model(hidden: int, seed: int, near_edges: str = "material") -> tuple[WorldModel, GraphSpec]:
@@ -276,7 +299,12 @@ def _simulators(
         },
     }
     rows = [
-        ["", name, f"{value.median:.4g} ± {value.spread:.2g} steps/s", f"{speeds['64'] / value.median:.0f}"]
+        [
+            "",
+            LABELS[name],
+            f"{value.median:.4g} ± {value.spread:.2g} steps/s",
+            f"{speeds['64'] / value.median:.0f}",
+        ]
         for name, value in timings.items()
     ]
     return figures, rows
@@ -323,7 +351,7 @@ def _row(hidden: str, name: str, value: Timing, timings: dict[str, Timing]) -> l
     unit = {"train": "ms a sample", "batch": "rollouts/s"}.get(kind, "steps/s")
     peer = timings[{"train": "train naive", "batch": "batch torch"}.get(kind, "pyg")].median
     ratio = peer / value.median if kind == "train" else value.median / peer
-    return [hidden, name, f"{value.median:.4g} ± {value.spread:.2g} {unit}", f"{ratio:.2f}"]
+    return [hidden, LABELS[name], f"{value.median:.4g} ± {value.spread:.2g} {unit}", f"{ratio:.2f}"]
 
 
 def _threads() -> int:

@@ -1,4 +1,4 @@
-"""Live sessions: tickets. The messages of a session are told in docs/rollouts.md."""
+"""Live sessions: tickets, and why a session is refused. Its messages are told in docs/rollouts.md."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from datetime import datetime
 
 from schemas.base import Request, Resource
 from schemas.rollout import ModelName, Version
+
+MOST_REASON_BYTES = 123  # RFC 6455, section 5.5: a control frame has 125, two of them the code's
 
 
 class LiveTicketCreate(Request):
@@ -23,3 +25,9 @@ class LiveTicket(Resource):
     version: int
     expires_at: datetime
     path: str
+
+
+def close_reason(code: str, detail: str) -> str:
+    """A problem's code and detail as the reason of a closed WebSocket, cut to what fits."""
+    text = f"{code}: {detail}"
+    return text.encode()[:MOST_REASON_BYTES].decode(errors="ignore")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from collections.abc import Callable
 from functools import cache
 from typing import Any
 
@@ -51,12 +52,16 @@ def publish_tiny(
     database: Database,
     artifacts: ArtifactStore,
     *,
+    name: str = NAME,
     lacking: str | None = None,
     card: dict[str, Any] | None = None,
+    changed: dict[str, Callable[[np.ndarray], np.ndarray]] | None = None,
+    weights: bytes | None = None,
 ) -> tuple[str, int]:
     """Register scene, fit and model; the model's name and version.
 
-    ``lacking``: a tensor that is left out, as in a version of an older layout; ``card``: more of its card.
+    ``lacking``: a tensor that is left out, as in a version of an older layout; ``card``: more of its card;
+    ``changed``: what becomes of tensors, by name; ``weights``: a file in the place of them all.
     """
     scene, twin, model = tiny_model()
     scene_id = register(scene, database, artifacts)
@@ -73,24 +78,25 @@ def publish_tiny(
         result = {"parameters": {}, "metrics": {}, "artifacts": [file.model_dump()]}
         assert leases.complete(session, lease, result, None)
     text = json.dumps({"architecture": model.facts()} | (card or {})).encode()
-    tensors = {name: values for name, values in model.to_tensors().items() if name != lacking}
+    tensors = {part: values for part, values in model.to_tensors().items() if part != lacking}
+    tensors |= {part: np.ascontiguousarray(change(tensors[part])) for part, change in (changed or {}).items()}
     files = [
-        artifacts.put_bytes(save_tensors(tensors, {}), "model.safetensors"),
+        artifacts.put_bytes(weights or save_tensors(tensors, {}), "model.safetensors"),
         artifacts.put_bytes(text, "card.json", "application/json"),
     ]
     config = WireConfig(hidden=16, message_passing_steps=2, history=2, vertices=20)
     with database.session() as session:
         row = registry.allot_version(
-            session, NAME, config=config, scene_id=scene_id, fit_id=job.outputs[0].id
+            session, name, config=config, scene_id=scene_id, fit_id=job.outputs[0].id
         )
-        manifest = artifacts.put_bytes(f"{NAME} {row.version}".encode(), "manifest.json")
+        manifest = artifacts.put_bytes(f"{name} {row.version}".encode(), "manifest.json")
         registry.publish(
             session,
-            NAME,
+            name,
             row.version,
             artifacts=[*files, manifest],
             sha256=manifest.sha256,
             metrics={},
             lineage=Lineage(),
         )
-        return NAME, row.version
+        return name, row.version

@@ -69,12 +69,20 @@ class ModalPrior:
     def __post_init__(self) -> None:
         """The rollout engine reads these arrays by their sizes. Raises ValueError for others."""
         modes, n = self.basis.shape[:2]
-        found = (len(self.weight), *self.response.shape[:2], *self.placing.shape, *self.span.shape)
-        if found != (modes, POWERS, modes, n, 2, 2):
-            raise ValueError(
-                f"{modes} modes of {n} vertices, but weight {self.weight.shape}, response {self.response.shape}, "
-                f"placing {self.placing.shape}, span {self.span.shape}"
-            )
+        controls, rows = len(self.shape), max(modes, 1)
+        lags = max(([0, *self.response.shape][-1] - 1) // rows, 1)
+        expected = {
+            "mean": (n, 3),
+            "basis": (modes, n, 3),
+            "shape": (controls, 3),
+            "weight": (modes, regressor_count(modes, controls, lags - 1)),
+            "response": (POWERS, modes, lags * modes + 1),
+            "placing": (n, 2),
+            "span": (2,),
+        }
+        found = {name: getattr(self, name).shape for name in expected}
+        if wrong := [f"{name} {found[name]}" for name, shape in expected.items() if found[name] != shape]:
+            raise ValueError(f"{modes} modes of {n} vertices, but the prior has {', '.join(wrong)}")
 
 
 def regressor_count(modes: int, controls: int, history: int) -> int:

@@ -143,7 +143,7 @@ class PublishedModel:
             return cls._read(tensors, _FACTS_BEFORE | facts)
         except KeyError as error:
             raise VersionUnreadable(f"it lacks {error}") from error
-        except (TypeError, ValueError, RuntimeError, WorldModelError) as error:
+        except (TypeError, ValueError, IndexError, RuntimeError, WorldModelError) as error:
             raise VersionUnreadable(f"its parts do not fit together: {error}") from error
 
     @classmethod
@@ -160,8 +160,8 @@ class PublishedModel:
             return cls.from_tensors(tensors, card.get("architecture", {}))
         except VersionUnreadable as error:
             raise VersionUnreadable(
-                f"the version was published by {writer or 'an unknown version of physworld'} with a card of layout "
-                f"{layout}; {error}. Train it anew from its dataset ({card.get('dataset_id') or 'POST /v1/models'})"
+                f"{error} (published by {writer or 'an unknown version of physworld'} with a card of layout "
+                f"{layout}). Train it anew from its dataset ({card.get('dataset_id') or 'POST /v1/models'})"
             ) from error
 
     @classmethod
@@ -182,7 +182,9 @@ class PublishedModel:
             ground_height_m=facts["ground_height_m"],
             current_neighbours=current,
         )
-        model = WorldModel(config, spec, prior=_prior_of(tensors))
+        prior = _prior_of(tensors)
+        _refuse_other_sizes(tensors, prior, config, spec)
+        model = WorldModel(config, spec, prior=prior)
         network = {name: value for name, value in tensors.items() if not name.startswith(_OWN)}
         model.load_state_dict({name: torch.as_tensor(value) for name, value in network.items()})
         return cls(
@@ -213,3 +215,27 @@ def _prior_of(tensors: dict[str, np.ndarray]) -> ModalPrior | ChainPrior | Inert
         return ModalPrior(**{part: tensors[f"prior.{part}"] for part in ModalPrior.__dataclass_fields__})
     parts = {part: tensors[f"prior.{part}"] for part in ChainPrior.__dataclass_fields__}
     return ChainPrior(**(parts | {"substeps": int(parts["substeps"][0])}))
+
+
+def _refuse_other_sizes(
+    tensors: dict[str, np.ndarray],
+    prior: ModalPrior | ChainPrior | InertialPrior,
+    config: WorldModelConfig,
+    spec: GraphSpec,
+) -> None:
+    """Raises ValueError where arrays are not of the graph's sizes: what rolls out reads them by these."""
+    n, frames = spec.object_count, config.history + 1
+    expected = {"phi": (n, 2), "phi.calibrated": (n, 2), "start.history": (frames, n, 3)}
+    expected["start.controllers"] = (frames, tensors["start.controllers"].shape[1], 3)
+    expected["skin.index"] = tensors["skin.weight"].shape
+    if isinstance(prior, ModalPrior):
+        modes = len(prior.basis)
+        expected["prior.mean"] = (n, 3)
+        expected["prior.shape"] = (spec.control_count, 3)
+        expected["prior.response"] = (2, modes, frames * modes + 1)
+    for name, shape in expected.items():
+        if tensors[name].shape != shape:
+            raise ValueError(f"{name} {tensors[name].shape}, not {shape}")
+    for name, most in (("skin.index", n), ("control.index", tensors["start.controllers"].shape[1])):
+        if tensors[name].max(initial=0) >= most:
+            raise ValueError(f"{name} {tensors[name].max()}, of {most}")

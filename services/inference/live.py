@@ -7,7 +7,9 @@ silent stops its grips.
 
 The model is stepped in a thread, never on the event loop. A slow reader gets fewer frames, the newest each time:
 nothing queues up. A session ends after ``IDLE_S`` without a message (4408), at a message that cannot be read (1007),
-when the client does not take a frame within ``SEND_S`` (4409); a process holds ``MOST_SESSIONS`` of them (1013).
+when the client does not take a frame within ``SEND_S`` (4409); a process holds ``MOST_SESSIONS`` of them (1013). One
+that is refused (1008) says why by a problem's code: ``unauthenticated``, ``not_found``, ``conflict``,
+``model_unreadable``.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from physworld.worldmodel.errors import VersionUnreadable
+from schemas.live import close_reason
 from services.inference.models import Models
 from services.inference.session import Control, ControlRefused, LiveSession
 from storage import tickets
@@ -54,7 +57,8 @@ class LiveSessions:
         frames = min(max(int(query["frames"]), 1), MOST_FRAMES) if query.get("frames", "").isdecimal() else 1
         await socket.accept()
         if await run_in_threadpool(self._key_of, ticket, f"live:{model}:{version}") is None:
-            await socket.close(POLICY, "the ticket is unknown, over or for something else")
+            why = close_reason("unauthenticated", "the ticket is unknown, over or for something else")
+            await socket.close(POLICY, why)
             return
         if self._open >= self._most:
             await socket.close(TRY_LATER, f"{self._open} sessions are open, the most of this process")
@@ -66,7 +70,8 @@ class LiveSessions:
             session = await run_in_threadpool(LiveSession, published, vertices=vertices)
             await _Connection(socket, session, self._pool, frames, self._idle_s).run()
         except (StorageError, VersionUnreadable) as error:
-            await socket.close(POLICY, str(error)[:120])
+            log.warning("live_session_refused", model=model, version=version, error=str(error))
+            await socket.close(POLICY, close_reason(error.code, str(error)))
         except WebSocketDisconnect:
             pass
         finally:

@@ -6,8 +6,10 @@ import json
 import threading
 from collections import OrderedDict
 
+from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 
+from physworld.worldmodel.errors import VersionUnreadable
 from physworld.worldmodel.published import PublishedModel
 from schemas.model import ModelVersion
 from storage import registry
@@ -51,6 +53,9 @@ class Models:
         for name in ("card.json", "model.safetensors"):
             if name not in files:
                 raise NotFound("artifact", f"{name} of {version.name}:{version.version}")
-        card = json.loads(self._artifacts.read_bytes(files["card.json"]))
-        tensors = load_tensors(self._artifacts.read_bytes(files["model.safetensors"]))
+        try:
+            card = json.loads(self._artifacts.read_bytes(files["card.json"]))
+            tensors = load_tensors(self._artifacts.read_bytes(files["model.safetensors"]))
+        except (ValueError, SafetensorError) as error:  # as they were published: their digests are theirs
+            raise VersionUnreadable(f"its files are of another format: {error}") from error
         return PublishedModel.from_card(tensors, card)

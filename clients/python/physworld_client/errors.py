@@ -136,7 +136,10 @@ class WaitTimedOut(PhysWorldError):
 
 
 class LiveSessionEnded(PhysWorldError):
-    """A live session is over. ``code`` 1000: the client left; 1013: all sessions are taken; 4408: it was silent."""
+    """A live session is over. ``code`` 1000: the client left; 1013: all sessions are taken; 4408: it was silent.
+
+    1008: it was refused, and ``reason`` begins with a problem's code, e.g. ``model_unreadable``.
+    """
 
     def __init__(self, code: int, reason: str) -> None:
         self.code, self.reason = code, reason

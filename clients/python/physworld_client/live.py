@@ -93,7 +93,8 @@ class Live(Resource):
 
         Raises:
             NotFound: no such model or version.
-            LiveSessionEnded: all sessions of the service are taken (``code`` 1013).
+            LiveSessionEnded: all sessions of the service are taken (``code`` 1013), or the version is of a layout that
+                it does not read (1008).
             ConnectionFailed: no WebSocket could be opened.
         """
         ticket = self._client.send(live_frames.ticket_create(model, version))

@@ -116,7 +116,8 @@ class Datasets(Resource):
         """The arrays of one committed episode.
 
         ``times`` (T,) [s], ``particles`` (T, P, 3) [m], ``controllers`` (T, K, 3) [m], ``properties`` (P, 2): log
-        factors of stiffness and density; ``attributes``: JSON text.
+        factors of stiffness and density, (P, 3) with the ground's friction where it was perturbed as a field;
+        ``attributes``: JSON text.
 
         Raises:
             NotFound: no such episode is committed.

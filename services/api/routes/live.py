@@ -18,7 +18,7 @@ from starlette.websockets import WebSocketState
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, WebSocketException
 
-from schemas.live import LiveTicket, LiveTicketCreate
+from schemas.live import LiveTicket, LiveTicketCreate, close_reason
 from services.api.dependencies import DatabaseDep, PrincipalDep, SettingsDep
 from services.api.errors import documented
 from services.api.idempotency import IdempotencyDep, answer_of
@@ -88,10 +88,11 @@ async def live(socket: WebSocket) -> None:
     try:
         entry = await run_in_threadpool(_enter, database, model, version, ticket, header)
     except StorageError as error:
-        await socket.close(POLICY, str(error)[:120])
+        await socket.close(POLICY, close_reason(error.code, str(error)))
         return
     if entry is None:
-        await socket.close(POLICY, "a ticket of POST /v1/live/tickets, or a key that may write, is needed")
+        needed = "a ticket of POST /v1/live/tickets, or a key that may write, is needed"
+        await socket.close(POLICY, close_reason("unauthenticated", needed))
         return
     inner_query = {**entry, "frames": query.get("frames", "1")[:2], "part": query.get("part", "points")[:10]}
     address = f"{settings.inference_url.replace('http', 'ws', 1)}/live?{urlencode(inner_query)}"

@@ -12,7 +12,7 @@ from urllib.parse import urlencode
 import numpy as np
 import pytest
 from inference_serving import Served, serve_inference
-from published_tiny import tiny_model
+from published_tiny import publish_tiny, tiny_model
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 
@@ -156,6 +156,84 @@ def test_a_message_that_cannot_be_meant_ends_the_session(served: Served, message
         assert words in ended.value.rcvd.reason
 
     run(served, work)
+
+
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [
+        ({"lacking": "prior.placing"}, "it lacks 'prior.placing'"),
+        ({"changed": {"prior.response": lambda values: values[0]}}, "the prior has response (6, 19)"),
+        ({"changed": {"prior.weight": lambda values: values[:, 1:]}}, "the prior has weight (6, "),
+        ({"changed": {"phi": lambda values: np.pad(values, ((0, 0), (0, 1)))}}, "phi (20, 3), not (20, 2)"),
+        (
+            {"changed": {"start.history": lambda values: values[1:]}},
+            "start.history (2, 20, 3), not (3, 20, 3)",
+        ),
+        ({"card": {"schema_version": 7}}, "with a card of layout 7"),
+    ],
+)
+def test_a_version_that_cannot_be_read_is_refused_by_its_code(served: Served, told: dict, words: str) -> None:
+    """Not a broken line: a client learns what it is that cannot be read, and others go on."""
+    written = {"versions": {"physworld": "physworld 0.0.7"}}
+    told = told | {"card": written | told.get("card", {})}
+    name, version = publish_tiny(served.database, served.stores.artifacts, name="tiny-old", **told)
+    plain = f"/v1/live?{urlencode({'model': name, 'version': version})}"
+
+    async def refused() -> None:
+        key = {"Authorization": f"Bearer {served.token}"}
+        async with connect(address(served, plain), proxy=None, additional_headers=key) as socket:
+            with pytest.raises(ConnectionClosed) as ended:
+                await asyncio.wait_for(socket.recv(), WITHIN_S)
+        assert ended.value.rcvd is not None
+        assert ended.value.rcvd.code == 1008
+        assert ended.value.rcvd.reason.startswith("model_unreadable: ")
+        assert words in ended.value.rcvd.reason
+
+    for _ in range(live.MOST_SESSIONS + 1):  # a refused session takes no place
+        asyncio.run(refused())
+    with served.client() as client:
+        asked = {"model": name, "version": version, "controllers": tiny_model()[2].start_controllers.tolist()}
+        whole = client.post("/v1/rollouts", json=asked)
+    assert (whole.status_code, whole.json()["code"]) == (409, "model_unreadable")
+    assert words in whole.json()["detail"] and "Train it anew" in whole.json()["detail"]
+
+    async def work(socket: ClientConnection, ready: dict) -> None:
+        assert ready["type"] == "ready"
+
+    run(served, work)
+
+
+def test_files_of_another_format_are_no_broken_line_either(served: Served) -> None:
+    name, version = publish_tiny(
+        served.database, served.stores.artifacts, name="tiny-old", weights=b"no tensors"
+    )
+
+    async def refused() -> str:
+        with served.client() as client:
+            path = client.post("/v1/live/tickets", json={"model": name, "version": version}).json()["path"]
+        async with connect(address(served, path), proxy=None) as socket:
+            with pytest.raises(ConnectionClosed) as ended:
+                await asyncio.wait_for(socket.recv(), WITHIN_S)
+        assert ended.value.rcvd is not None
+        return ended.value.rcvd.reason
+
+    assert asyncio.run(refused()).startswith("model_unreadable: its files are of another format")
+
+
+def test_the_reason_of_a_refusal_fits_a_frame(served: Served) -> None:
+    """123 bytes of UTF-8, whatever the client called the model."""
+    plain = f"/v1/live?{urlencode({'model': 'ä' * 200, 'version': 1, 'ticket': 'x'})}"
+
+    async def refused() -> tuple[int, str]:
+        async with connect(address(served, plain), proxy=None) as socket:
+            with pytest.raises(ConnectionClosed) as ended:
+                await asyncio.wait_for(socket.recv(), WITHIN_S)
+        assert ended.value.rcvd is not None
+        return ended.value.rcvd.code, ended.value.rcvd.reason
+
+    code, reason = asyncio.run(refused())
+    assert code == 1008
+    assert reason.startswith("not_found: ") and 120 <= len(reason.encode()) <= 123
 
 
 def test_a_ticket_is_good_once_and_for_its_model_only(served: Served) -> None:

@@ -19,6 +19,7 @@ from physworld_client import (
     RequestTimedOut,
 )
 from physworld_client.live import LiveSession
+from published_tiny import publish_tiny
 
 from services.inference import live
 
@@ -97,6 +98,10 @@ def test_what_cannot_be_opened_is_a_typed_error(
         with pytest.raises(LiveSessionEnded, match=f"{live.MOST_SESSIONS} sessions are open") as refused:
             opened(client.live.open(served.model))
         assert refused.value.code == 1013
+    old = {"name": "tiny-old", "lacking": "prior.placing"}
+    name, version = publish_tiny(served.database, served.stores.artifacts, **old)
+    with pytest.raises(LiveSessionEnded, match=r"\(1008\): model_unreadable: it lacks 'prior.placing'"):
+        opened(client.live.open(name, version))
     elsewhere = served.url.replace("http", "ws") + "/no"
     monkeypatch.setattr("physworld_client.live.live_frames.address", lambda *_: elsewhere)
     with pytest.raises(ConnectionFailed, match=r"no live session at http://127.*rejected"):

@@ -2,23 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from benchmarks import paper_tables, unseen_motion
-from benchmarks.paper_tables import (
-    ALONE,
-    CONDITIONS,
-    RELATIONS,
-    SEEDS,
-    Cells,
-    Relation,
-    hold,
-    plan,
-    summarise,
-)
+from benchmarks.paper_relations import ALONE, CONDITIONS, RELATIONS, SEEDS, Relation, hold
+from benchmarks.paper_tables import Cells, plan, summarise
 
 
 def cell(model: float, tuned: float, twin: float = 0.002) -> dict[str, Any]:
@@ -71,6 +63,58 @@ def test_a_report_without_a_cell_says_that_nothing_was_measured() -> None:
     assert empty["pairs"] == 0 and empty["mean_ratio"] is None
 
 
+def test_a_section_of_some_cells_says_what_was_not_run() -> None:
+    """Rows and relations of what is there, beside the names of what is not."""
+    some = held(["soft_beam", "d02"])
+    some |= {key: None for key in some if key.startswith("d02/")}
+    report = summarise(["soft_beam", "d02"], some)
+    text = report.markdown()
+    assert [row[2:] for row in report.rows if "no prior" in row[1]] == [["not run"] * 3]
+    assert not any("d02" in row[0] for row in report.rows)
+    assert "(2 of 3 seeds)" in next(row[2] for row in report.rows if row[1] == "twin")
+    for words in (
+        "Not run: soft_beam/unseen_motion; soft_beam/no_prior; d02/full;",
+        "; soft_beam/full (seed 2); ",
+        "d02/full;",
+        "d02/recording_alone;",
+        "the network alone, no prior (400 steps): not measured yet.",
+        "track error ratio 0.50 (soft_beam 0.50, d02 not run)",
+    ):
+        assert words in text
+    whole = {key: cell(0.005, 0.004) for key in some if "unseen" not in key}
+    assert paper_tables.not_run(whole) == "All were run."
+
+
+def test_a_model_that_left_the_numbers_is_counted_and_not_averaged() -> None:
+    some = held(["soft_beam"])
+    lost = cell(0.005, 0.004)
+    for metric in paper_tables.METRICS:
+        del lost[metric]["world_model_finetuned"]
+    some |= {"soft_beam/no_prior/0": cell(0.02, 0.02), "soft_beam/no_prior/1": lost}
+    report = summarise(["soft_beam"], some)
+    row = next(row for row in report.rows if "no prior" in row[1])
+    assert row[2] == "20 (2 of 3 seeds) (1 of 2 left the numbers)"
+    alone = report.figures["relations"]["network_alone_against_twin"]
+    assert alone["pairs"] == 1 and alone["mean_ratio"] == pytest.approx(10.0)
+    assert report.figures["steps_per_second"]["soft_beam"] == {
+        "world_model": 800.0,
+        "twin": 20.0,
+        "ratio": 40.0,
+    }
+
+
+def test_cells_of_the_network_alone_depend_on_its_own_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Cells, "case", lambda self, name: name)
+    for key in ("soft_beam/full/0", "soft_beam/no_prior/0"):
+        Cells(tmp_path, None).fill(key, lambda case: {})
+    longer = dataclasses.replace(paper_tables.WITHOUT_PRIOR, steps=7)
+    monkeypatch.setitem(paper_tables.TRAININGS, "no_prior", longer)
+    assert Cells(tmp_path, None).get("soft_beam/no_prior/0") is None
+    assert Cells(tmp_path, None).get("soft_beam/full/0") is not None
+
+
 def test_a_finished_cell_is_not_done_again_and_no_cell_begins_after_the_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -109,3 +153,24 @@ def test_unseen_motions_are_pooled_over_seeds() -> None:
     assert found["unseen"]["at_frame_m"]["100"] == pytest.approx(0.004)
     assert "trained without it 2.00" in unseen_motion.in_words("twist", found)
     assert unseen_motion.pooled([None]) is None
+
+
+def test_the_twin_and_the_baselines_stand_in_the_cells_of_every_condition() -> None:
+    some = {key: None for key, _ in plan(["soft_beam"])} | {"soft_beam/no_prior/1": cell(0.02, 0.02)}
+    report = summarise(["soft_beam"], some)
+    rows = {row[1]: row[2] for row in report.rows}
+    assert rows["twin"] == "2 (1 of 3 seeds)" and rows["rigid follow"] == "20 (1 of 3 seeds)"
+    assert rows["world model, fine-tuned"] == "not run"
+    assert report.figures["relations"]["network_alone_against_twin"]["by_scene"]["soft_beam"]["by_seed"] == {
+        "1": pytest.approx(10.0)
+    }
+
+
+def test_a_scene_whose_twin_is_fitted_in_another_way_has_cells_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Cells, "case", lambda self, name: name)
+    [scene] = paper_tables.FITS
+    Cells(tmp_path, None).fill(f"{scene}/full/0", lambda case: {})
+    monkeypatch.delitem(paper_tables.FITS, scene)
+    assert Cells(tmp_path, None).get(f"{scene}/full/0") is None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -48,8 +49,24 @@ def episode(seed: int, frames: int = FRAMES, step_s: float = STEP_S) -> dict[str
     }
 
 
-def exported(format: str, folder: Path, points: int | None = None) -> list[dict[str, np.ndarray]]:
-    episodes = [episode(seed, FRAMES + seed) for seed in range(EPISODES)]
+def rubbing(seed: int, frames: int = FRAMES, **more: dict[str, float]) -> dict[str, np.ndarray]:
+    """An episode with a field of friction under the particles, and ``more`` attributes."""
+    plain = episode(seed, frames)
+    attributes = json.loads(str(plain["attributes"])) | more
+    friction = np.random.default_rng(100 + seed).standard_normal((PARTICLES, 1)).astype(np.float32)
+    return plain | {
+        "properties": np.concatenate([plain["properties"], friction], axis=1),
+        "attributes": np.array(json.dumps(attributes)),
+    }
+
+
+def exported(
+    format: str,
+    folder: Path,
+    points: int | None = None,
+    made: Callable[[int, int], dict[str, np.ndarray]] = episode,
+) -> list[dict[str, np.ndarray]]:
+    episodes = [made(seed, FRAMES + seed) for seed in range(EPISODES)]
     writer = open_export(format, folder, dataset(), points)
     for index, arrays in enumerate(episodes):
         writer.add(index, arrays)
@@ -87,6 +104,84 @@ def test_a_ply_of_fewer_points_has_those_spread_over_the_body(tmp_path: Path) ->
     cloud = trimesh.load(tmp_path / "out" / "episode-00000" / "frame-00003.ply")
     chosen = spread_points(first["particles"][0], 8)
     np.testing.assert_array_equal(np.asarray(cloud.vertices[:8], np.float32), first["particles"][3, chosen])
+
+
+def test_a_ply_holds_the_friction_of_an_episode_that_has_it(tmp_path: Path) -> None:
+    strengths = {"air_drag_linear.rate_per_s": 0.4}
+    made = exported("ply", tmp_path / "out", 8, lambda *given: rubbing(*given, effect_strengths=strengths))
+    for index, arrays in enumerate(made):
+        folder = tmp_path / "out" / f"episode-{index:05d}"
+        data = trimesh.load(folder / "frame-00002.ply").metadata["_ply_raw"]["vertex"]["data"]
+        chosen = spread_points(arrays["particles"][0], 8)
+        for column, name in enumerate(("log_modulus", "log_density", "log_friction")):
+            np.testing.assert_array_equal(
+                data[name], [*arrays["properties"][chosen, column], *[0] * CONTROLS]
+            )
+        assert json.loads((folder / "attributes.json").read_text())["effect_strengths"] == strengths
+    exported("ply", tmp_path / "without")
+    plain = trimesh.load(tmp_path / "without/episode-00000/frame-00002.ply").metadata["_ply_raw"]["vertex"]
+    assert "log_friction" not in plain["data"].dtype.names
+
+
+def test_lerobot_holds_the_friction_and_strengths_that_episodes_were_made_with(tmp_path: Path) -> None:
+    def drawn(seed: int, frames: int) -> dict[str, np.ndarray]:
+        strengths = {"viscosity.time_s": 0.01 * seed, "air_drag_linear.rate_per_s": 0.5 + seed}
+        return rubbing(seed, frames, effect_strengths=strengths)
+
+    episodes = exported("lerobot", tmp_path / "out", 10, drawn)
+    info = json.loads((tmp_path / "out/meta/info.json").read_text())
+    own = json.loads((tmp_path / "out/meta/physworld.json").read_text())
+    whole = parquet.read_table(tmp_path / "out/data/chunk-000/file-000.parquet").to_pydict()
+    of_episode = np.array(whole["episode_index"])
+    factors = info["features"]["observation.properties"]
+    assert factors["shape"] == [30]
+    first = own["particles"][0]
+    assert factors["names"][:3] == [
+        f"particle_{first}.log_{name}" for name in ("modulus", "density", "friction")
+    ]
+    names = info["features"]["observation.parameters"]["names"]
+    assert names == ["air_drag_linear.rate_per_s", "viscosity.time_s"]
+    for number, arrays in enumerate(episodes):
+        properties = np.array(whole["observation.properties"], np.float32)[of_episode == number]
+        expected = arrays["properties"][own["particles"]].ravel()
+        np.testing.assert_array_equal(properties, np.tile(expected, (FRAMES + number, 1)))
+        strengths = own["episodes"][str(number)]["effect_strengths"]
+        parameters = np.array(whole["observation.parameters"])[of_episode == number]
+        np.testing.assert_allclose(
+            parameters, np.tile([strengths[name] for name in names], (FRAMES + number, 1)), rtol=1e-6
+        )
+
+
+def test_lerobot_holds_one_coefficient_as_a_plain_value(tmp_path: Path) -> None:
+    """As the format does with features of one number; episodes that drew none have no such feature."""
+
+    def drawn(seed: int, frames: int) -> dict[str, np.ndarray]:
+        return rubbing(seed, frames, parameters={"ground_friction": 0.3 + seed})
+
+    exported("lerobot", tmp_path / "out", 10, drawn)
+    feature = json.loads((tmp_path / "out/meta/info.json").read_text())["features"]["observation.parameters"]
+    assert feature == {"dtype": "float32", "shape": [1], "names": ["ground_friction"]}
+    whole = parquet.read_table(tmp_path / "out/data/chunk-000/file-000.parquet")
+    assert str(whole.schema.field("observation.parameters").type) == "float"
+    expected = 0.3 + np.array(whole["episode_index"])
+    np.testing.assert_allclose(np.array(whole["observation.parameters"]), expected, rtol=1e-6)
+    stats = json.loads((tmp_path / "out/meta/stats.json").read_text())["observation.parameters"]
+    assert stats["max"] == pytest.approx([0.3 + EPISODES - 1], rel=1e-6)
+    exported("lerobot", tmp_path / "none", 10)
+    assert (
+        "observation.parameters" not in json.loads((tmp_path / "none/meta/info.json").read_text())["features"]
+    )
+
+
+def test_an_episode_made_with_something_else_is_refused(tmp_path: Path) -> None:
+    writer = open_export("lerobot", tmp_path / "out", dataset())
+    writer.add(0, episode(0))
+    with pytest.raises(ExportRefused, match="episode 1 was made with log_modulus, log_density, log_friction"):
+        writer.add(1, rubbing(1))
+    with pytest.raises(
+        ExportRefused, match=r"with .*drag.rate; the first one with log_modulus, log_density$"
+    ):
+        writer.add(1, rubbing(1, effect_strengths={"drag.rate": 1.0}))
 
 
 def test_lerobot_has_the_documented_layout(tmp_path: Path) -> None:

@@ -10,8 +10,10 @@
     data/chunk-000/file-000.parquet             frames, one row group an episode, at most about 100 MB a file
 
 Features: ``observation.state``, the control points [m]; ``observation.environment_state``, particles [m];
-``observation.properties``, their log factors of stiffness and density; ``action``, the control points' velocities
-until the next frame [m/s], zero in the last one. A task is the pattern of the motion.
+``observation.properties``, their log factors of stiffness and density, and of the ground's friction under them where
+it was perturbed as a field; ``observation.parameters``, where the episodes differ in them, the strengths of effects
+and the ground's one coefficient, in their units; ``action``, the control points' velocities until the next frame [m/s],
+zero in the last one. A task is the pattern of the motion.
 
 The format counts in whole frames a second. Where the clock's rate is no whole number ``fps`` is written as it is, and
 readers that expect an integer refuse it or need a larger tolerance.
@@ -27,6 +29,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from physworld_client.errors import ExportRefused
+from physworld_client.export.properties import attributes_of, property_names, scalars_of
 from physworld_client.export.sampling import spread_points
 
 if TYPE_CHECKING:
@@ -38,10 +41,11 @@ DATA_FILE_MB, VIDEO_FILE_MB = 100, 200
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 DATA_PATH = f"data/{FILE}"
 EPISODES_PATH = f"meta/episodes/{FILE}"
-STATE, SURROUNDINGS, PROPERTIES, ACTION = (
+STATE, SURROUNDINGS, PROPERTIES, PARAMETERS, ACTION = (
     "observation.state",
     "observation.environment_state",
     "observation.properties",
+    "observation.parameters",
     "action",
 )
 INDICES = ("frame_index", "episode_index", "index", "task_index")
@@ -61,6 +65,8 @@ class LeRobotWriter:
         self._points = DEFAULT_POINTS if points is None else points
         self._chosen = np.empty(0, dtype=np.int64)
         self._shape: tuple[int, int] | None = None
+        self._properties: tuple[str, ...] = ()
+        self._parameters: tuple[str, ...] = ()
         self._step_s = 0.0
         self._tasks: dict[str, int] = {}
         self._episodes: list[dict[str, Any]] = []
@@ -73,11 +79,11 @@ class LeRobotWriter:
 
     def add(self, index: int, arrays: Mapping[str, np.ndarray]) -> None:
         """Write one episode's frames; ``index`` is kept in ``meta/physworld.json``, the format counts on its own."""
-        self._check(index, arrays)
-        attributes = json.loads(str(arrays["attributes"])) if "attributes" in arrays else {}
+        attributes = attributes_of(arrays)
+        self._check(index, arrays, attributes)
         task = str(attributes.get("motion") or "demonstration").replace("_", " ")
         number = len(self._episodes)
-        columns = self._columns(arrays, number, self._tasks.setdefault(task, len(self._tasks)))
+        columns = self._columns(arrays, attributes, number, self._tasks.setdefault(task, len(self._tasks)))
         table = _table(columns)
         if self._writer is not None and self._written_bytes + table.nbytes > DATA_FILE_MB * 2**20:
             self._close()
@@ -123,34 +129,45 @@ class LeRobotWriter:
         for name, content in (("info", self._info()), ("stats", stats), ("physworld", own)):
             (self._folder / f"meta/{name}.json").write_text(json.dumps(content, indent=4, ensure_ascii=False))
 
-    def _check(self, index: int, arrays: Mapping[str, np.ndarray]) -> None:
-        """Take the first episode's size and clock, and refuse another one's that differ."""
+    def _check(self, index: int, arrays: Mapping[str, np.ndarray], attributes: Mapping[str, Any]) -> None:
+        """Take the first episode's size, clock and what it was made with, and refuse another one's that differ."""
         times, particles, controllers = arrays["times"], arrays["particles"], arrays["controllers"]
         step = float(times[-1] - times[0]) / max(len(times) - 1, 1)
         shape = (particles.shape[1], controllers.shape[1])
+        made = property_names(arrays), tuple(scalars_of(attributes))
         if self._shape is None:
             self._shape, self._step_s = shape, step
+            self._properties, self._parameters = made
             self._chosen = spread_points(particles[0], self._points)
         if shape != self._shape or abs(step - self._step_s) > 1e-6:
             raise ExportRefused(
                 f"episode {index} has {shape[0]} particles, {shape[1]} control points and {step:.6f} s a frame; the "
                 f"first one had {self._shape[0]}, {self._shape[1]} and {self._step_s:.6f} s"
             )
+        if made != (self._properties, self._parameters):
+            known = ", ".join((*self._properties, *self._parameters))
+            raise ExportRefused(
+                f"episode {index} was made with {', '.join((*made[0], *made[1]))}; the first one with {known}"
+            )
 
-    def _columns(self, arrays: Mapping[str, np.ndarray], number: int, task: int) -> dict[str, np.ndarray]:
-        """Features of one episode by name, each (T, …)."""
+    def _columns(
+        self, arrays: Mapping[str, np.ndarray], attributes: Mapping[str, Any], number: int, task: int
+    ) -> dict[str, np.ndarray]:
+        """Features of one episode by name, each (T, …), (T,) where there is one number."""
         times, controllers = arrays["times"], arrays["controllers"]
         frames = len(times)
         velocity = np.zeros(controllers.shape)
         velocity[:-1] = np.diff(controllers.astype(np.float64), axis=0) / np.diff(times)[:, None, None]
-        properties = np.broadcast_to(
-            arrays["properties"][self._chosen, :2].ravel(), (frames, 2 * len(self._chosen))
-        )
+        properties = np.tile(arrays["properties"][self._chosen].ravel(), (frames, 1))
+        parameters = np.tile(list(scalars_of(attributes).values()), (frames, 1)).astype(np.float32)
+        if len(self._parameters) == 1:  # the format holds features of one number as plain values
+            parameters = parameters[:, 0]
         counted = np.arange(frames)
         return {
             STATE: controllers.reshape(frames, -1).astype(np.float32),
             SURROUNDINGS: arrays["particles"][:, self._chosen].reshape(frames, -1).astype(np.float32),
             PROPERTIES: properties.astype(np.float32),
+            **({PARAMETERS: parameters} if self._parameters else {}),
             ACTION: velocity.reshape(frames, -1).astype(np.float32),
             "timestamp": (times - times[0]).astype(np.float32),
             "frame_index": counted,
@@ -191,7 +208,8 @@ class LeRobotWriter:
         return {
             STATE: feature(each(controls, *"xyz")),
             SURROUNDINGS: feature(each(points, *"xyz")),
-            PROPERTIES: feature(each(points, "log_modulus", "log_density")),
+            PROPERTIES: feature(each(points, *self._properties)),
+            **({PARAMETERS: feature(list(self._parameters))} if self._parameters else {}),
             ACTION: feature(each(controls, "vx", "vy", "vz")),
             "timestamp": {"dtype": "float32", "shape": [1], "names": None},
             **{name: {"dtype": "int64", "shape": [1], "names": None} for name in INDICES},

@@ -1,30 +1,24 @@
 """A PLY file a frame: binary, little-endian, as MeshLab, Blender, Open3D and trimesh read point clouds.
 
 ``episode-00000/frame-00000.ply``. Vertices are the particles, then the control points; beside x, y, z [m] each has
-``kind`` (0 particle, 1 control point) and the particle's log factors of stiffness and density. ``times.txt`` has the
-frames' times [s].
+``kind`` (0 particle, 1 control point) and the particle's log factors of stiffness and density, and of the ground's
+friction under it where the episode has them. ``times.txt`` has the frames' times [s], ``attributes.json`` what else is
+known of the episode, the strengths of its effects among it.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from physworld_client.errors import ExportRefused
+from physworld_client.export.properties import attributes_of, property_names
 from physworld_client.export.sampling import spread_points
 
-VERTEX = np.dtype(
-    [
-        ("x", "<f4"),
-        ("y", "<f4"),
-        ("z", "<f4"),
-        ("kind", "u1"),
-        ("log_modulus", "<f4"),
-        ("log_density", "<f4"),
-    ]
-)
+PLACE = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("kind", "u1")]
 PLY_TYPES = {"<f4": "float", "|u1": "uchar"}
 
 
@@ -39,10 +33,13 @@ class PlyWriter:
         """Write one episode's frames."""
         particles, controllers = arrays["particles"], arrays["controllers"]
         chosen = spread_points(particles[0], self._points)
-        vertices = np.zeros(len(chosen) + controllers.shape[1], dtype=VERTEX)
+        names = property_names(arrays)
+        vertices = np.zeros(
+            len(chosen) + controllers.shape[1], dtype=[*PLACE, *((name, "<f4") for name in names)]
+        )
         vertices["kind"][len(chosen) :] = 1
-        vertices["log_modulus"][: len(chosen)] = arrays["properties"][chosen, 0]
-        vertices["log_density"][: len(chosen)] = arrays["properties"][chosen, 1]
+        for column, name in enumerate(names):
+            vertices[name][: len(chosen)] = arrays["properties"][chosen, column]
         folder = self._folder / f"episode-{index:05d}"
         folder.mkdir()
         for frame in range(len(particles)):
@@ -50,6 +47,7 @@ class PlyWriter:
             for axis, name in enumerate("xyz"):
                 vertices[name] = places[:, axis]
             (folder / f"frame-{frame:05d}.ply").write_bytes(ply_bytes(vertices))
+        (folder / "attributes.json").write_text(json.dumps(attributes_of(arrays), indent=1))
         (folder / "times.txt").write_text("".join(f"{t!r}\n" for t in arrays["times"].tolist()))
         self._count += 1
 
@@ -60,7 +58,7 @@ class PlyWriter:
 
 
 def ply_bytes(vertices: np.ndarray) -> bytes:
-    """A binary PLY of one element, ``vertex``, with the fields of a structured array (n,) of ``VERTEX``."""
+    """A binary PLY of one element, ``vertex``, with the fields of a structured array (n,), ``PLACE`` and more."""
     names = vertices.dtype.names or ()
     lines = [f"property {PLY_TYPES[vertices.dtype[name].str]} {name}" for name in names]
     header = [
