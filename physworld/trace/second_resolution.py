@@ -96,10 +96,9 @@ class SecondResolution:
 
         Two numbers of one effect may make up for each other (a tether's stiffness and its anchor); what they do
         together is what the data see. Nor do they see what the other unknowns absorb of it: a load along a beam is a
-        little stiffness and reach of its clamp, and goes from one to the other with the cells.
+        little stiffness and reach of its clamp, and goes from one to the other with the cells. So it is enough that
+        what those leave of it is the same.
         """
-        others = [k for k, u in enumerate(coarse.unknowns) if u.name.split(".")[0] != member.effect]
-        absorbed = orthonormal(coarse.jacobian[:, others])
         silent = {gate.name: 0.0 for gate in member.gates}
         changes = []
         for fitted in (coarse, fine):
@@ -107,9 +106,17 @@ class SecondResolution:
             tracks = self.simulations.run([Job(without, self.frames)])[0]
             if tracks is None:
                 return False
-            changes.append(project(absorbed, self.white.change(fitted.tracks - tracks)))
-        moved_by = float(np.linalg.norm(changes[1] - changes[0]))
-        return moved_by <= _AGREEMENT * float(np.linalg.norm(changes[0]))
+            changes.append(self.white.change(fitted.tracks - tracks))
+        others = [k for k, u in enumerate(coarse.unknowns) if u.name.split(".")[0] != member.effect]
+        absorbed = orthonormal(coarse.jacobian[:, others])
+        return (
+            _moved(*changes) <= _AGREEMENT or _moved(*(project(absorbed, c) for c in changes)) <= _AGREEMENT
+        )
+
+
+def _moved(coarse: np.ndarray, fine: np.ndarray) -> float:
+    """Change of what an effect does, over what it does, both whitened (M,)."""
+    return float(np.linalg.norm(fine - coarse) / max(float(np.linalg.norm(coarse)), np.finfo(float).tiny))
 
 
 def _within(coarse: Refit, finer: dict[str, float], intervals: dict[str, Number], member: Candidate) -> bool:

@@ -117,7 +117,7 @@ def decide(
         and agreement.get(m.names) is not False
         and (
             indistinguishable(m, best, basis, declared, config.alike)
-            or (m in ordered and richer_and_better(m, best))
+            or (m in ordered and richer_and_better(m, best, basis, declared, config.alike))
         )
     )
     family = (best, *same)
@@ -251,14 +251,16 @@ def within_noise(model: Model, best: Model) -> bool:
     return best.validated.mean < _BELOW_NOISE and model.validated.mean <= 1.0
 
 
-def richer_and_better(model: Model, best: Model) -> bool:
-    """Whether a model of as many effects predicts left-out blocks better than the simplest one of those as good.
+def richer_and_better(model: Model, best: Model, basis: np.ndarray, declared: Model, alike: float) -> bool:
+    """Whether another explanation by as many effects predicts better than the simplest of those that are as good.
 
     By more than a standard error, and more than the noise is known: then it is the discrepancy allowed to a twin that
-    calls them as good, not the data, and one number less is no reason to prefer another effect.
+    calls them as good, not the data, and one number less is no reason to prefer an effect. One that explains the same
+    and a little more (a wind beside a drag) is another matter: of the twin's discrepancy more numbers absorb more.
     """
     gap, spread = difference(best.validated, model.validated)
-    return len(model.members) == len(best.members) and gap > max(spread, _NOISE_KNOWN)
+    same = alikeness(explained_direction(model, declared, basis), explained_direction(best, declared, basis))
+    return len(model.members) == len(best.members) and gap > max(spread, _NOISE_KNOWN) and same <= alike
 
 
 def indistinguishable(model: Model, best: Model, basis: np.ndarray, declared: Model, alike: float) -> bool:

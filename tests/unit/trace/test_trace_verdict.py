@@ -20,7 +20,7 @@ from physworld.trace.verdict import Verdict, decide, implausible
 BLOCKS, ROWS = 10, 2000
 BLOCK_OF_ROW = np.repeat(np.arange(BLOCKS), ROWS // BLOCKS)
 RNG = np.random.default_rng(5)
-NOISE, DRAG, OTHER = RNG.normal(size=(3, ROWS))
+NOISE, DRAG, OTHER, THIRD = RNG.normal(size=(4, ROWS))
 CONFIG = TraceConfig()
 
 
@@ -119,12 +119,19 @@ def test_the_simpler_of_two_that_do_as_well_is_named() -> None:
     assert answer([rich, model(NOISE, "tilt")], NOISE + 2 * DRAG) == ("named", ("tilt",))
 
 
-@pytest.mark.parametrize(("left", "verdict"), [(0.3, "equivalent_set"), (0.1, "named")])
-def test_one_number_less_is_no_reason_to_prefer_an_effect_that_predicts_worse(
-    left: float, verdict: str
+@pytest.mark.parametrize(
+    ("left", "verdict"),
+    [
+        (0.45 * OTHER, "equivalent_set"),
+        (0.53 * OTHER, "named"),  # hardly better
+        (0.45 * THIRD, "named"),  # the same explanation
+    ],
+)
+def test_one_number_less_is_no_reason_to_prefer_another_explanation_that_predicts_worse(
+    left: np.ndarray, verdict: str
 ) -> None:
-    rich = model(1.08 * NOISE, "tether", unknowns=4)
-    plain = model(1.08 * NOISE + left * OTHER, "fibres")
+    rich = model(1.08 * NOISE + left, "tether", unknowns=4)
+    plain = model(1.08 * NOISE + 0.54 * THIRD, "fibres")
     assert answer([rich, plain], NOISE + 2 * DRAG) == (verdict, ("fibres",))
 
 
