@@ -71,7 +71,7 @@ class Object:
 _END = (((0.0, 0.0, 0.0), (1.0 / 12, 1.0, 1.0)),)
 OBJECTS = {
     "beam": Object("beam", (0.26, 0.038, 0.036), (12, 2, 2), 7e5, 600.0, _END, 0.03, 0.15),
-    "blob": Object("blob", (0.2, 0.1, 0.09), (8, 4, 4), 5e4, 540.0, (((0.0, 0.25, 0.25), (0.125, 0.75, 0.75)),), 0.02,
+    "blob": Object("blob", (0.2, 0.1, 0.09), (6, 3, 3), 5e4, 540.0, (((0.0, 1 / 3, 1 / 3), (1 / 6, 2 / 3, 2 / 3)),), 0.02,
                    round=True),
     "slab": Object("sheet", (0.22, 0.015, 0.2), (10, 1, 9), 2.6e5, 350.0,
                    (((0.0, 0.0, 8 / 9), (0.1, 1.0, 1.0)), ((0.9, 0.0, 8 / 9), (1.0, 1.0, 1.0))), 0.03),
@@ -108,7 +108,7 @@ def cases() -> tuple[Case, ...]:
         Case("e06", "beam", 6, {"gust": {"m_s2": 12.0, "from_s": 0.7, "to_s": 0.8}}, ("unexplained",)),
         Case("e07", "beam", 7, {"clock": {"offset_s": drawn(7, 0.02, 0.04)}}, ("data_issue", *CLAIMS)),
         Case("e08", "blob", 8, {"gravity_tilt": {"degrees": drawn(8, 3.0, 6.0), "axis": [0.3, 1.0, 0.0]}}),
-        Case("e09", "blob", 9, {"internal_viscosity": {"eta": drawn(9, 30.0, 70.0)}}),
+        Case("e09", "blob", 9, {"internal_viscosity": {"eta": drawn(9, 20.0, 40.0)}}),
         Case("e10", "blob", 10, answers=nothing),
         Case("e11", "slab", 11, {"fibre": {"modulus": drawn(11, 4e5, 7e5), "axis": [1.0, 0.0, 0.6]}}),
         Case("e12", "slab", 12, {"linear_drag": {"c": drawn(12, 1.5, 3.0)}}),
