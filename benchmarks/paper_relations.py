@@ -152,12 +152,17 @@ def in_words(relation: Relation, found: dict[str, Any]) -> str:
     left, right = (LABELS[side].removeprefix("… ") for side in (relation.better, relation.worse))
     if not found["pairs"]:
         return f"{left} / {right}: not measured yet."
-    scenes = ", ".join(f"{name} {entry['mean']:.2f}" for name, entry in found["by_scene"].items())
+    scenes = ", ".join(f"{name} {_ratio(entry['mean'])}" for name, entry in found["by_scene"].items())
     scenes += "".join(f", {name} not run" for name in found["without"])
     return (
-        f"{left} / {right}: track error ratio {found['mean_ratio']:.2f} ({scenes}); below 1 in {found['holds_in']} of "
-        f"{found['pairs']} pairs of scene and seed; the paper: {relation.paper}."
+        f"{left} / {right}: track error ratio {_ratio(found['mean_ratio'])} ({scenes}); below 1 in "
+        f"{found['holds_in']} of {found['pairs']} pairs of scene and seed; the paper: {relation.paper}."
     )
+
+
+def _ratio(value: float) -> str:
+    """Two decimals, or one figure of what is less."""
+    return f"{value:.2f}" if value >= 0.095 else f"{value:.1g}"
 
 
 def speed(name: str, held: dict[str, dict[str, Any] | None]) -> dict[str, float] | None:

@@ -174,3 +174,9 @@ def test_a_scene_whose_twin_is_fitted_in_another_way_has_cells_of_its_own(
     Cells(tmp_path, None).fill(f"{scene}/full/0", lambda case: {})
     monkeypatch.delitem(paper_tables.FITS, scene)
     assert Cells(tmp_path, None).get(f"{scene}/full/0") is None
+
+
+def test_a_small_ratio_is_not_printed_as_nothing() -> None:
+    some = held(["soft_beam"]) | {"soft_beam/no_prior/0": cell(2.0, 2.0)}
+    text = summarise(["soft_beam"], some).markdown()
+    assert "no prior (400 steps): track error ratio 0.002 (soft_beam 0.002); below 1 in 1 of 1 pairs" in text
