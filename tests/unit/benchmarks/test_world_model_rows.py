@@ -15,6 +15,9 @@ pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated
 
 @pytest.fixture
 def world_model() -> ModuleType:
+    pytest.importorskip(
+        "torch_geometric", reason="PyTorch Geometric, the peer of this benchmark, is not installed"
+    )
     from benchmarks import world_model
 
     return world_model
