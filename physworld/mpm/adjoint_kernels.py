@@ -19,6 +19,8 @@ from typing import Any
 
 import warp as wp
 
+from physworld.mpm.node_kernels import hermite
+
 
 @wp.kernel(enable_backward=False)
 def keep_row(
@@ -150,21 +152,17 @@ def take_nodes_back(
         frame = counter[0]
         span = clock[0]
         s = wp.float64(counter[1] + 1) / wp.float64(counter[2])
-        s2 = s * s
-        s3 = s2 * s
-        h01 = wp.float64(3.0) * s2 - wp.float64(2.0) * s3
-        h10 = s3 - wp.float64(2.0) * s2 + s
-        h11 = s3 - s2
+        h = hermite(s)
         for i in range(3):
             k = 3 * node + i
             p = 3 * held + i
             goal_bar = x_bar[k] + v_bar[k] / dt
             x_bar[k] = -v_bar[k] / dt
             v_bar[k] = wp.float64(0.0)
-            path_x_bar[frame, p] += (wp.float64(1.0) - h01) * goal_bar
-            path_x_bar[frame + 1, p] += h01 * goal_bar
-            path_v_bar[frame, p] += span * h10 * goal_bar
-            path_v_bar[frame + 1, p] += span * h11 * goal_bar
+            path_x_bar[frame, p] += (wp.float64(1.0) - h[0]) * goal_bar
+            path_x_bar[frame + 1, p] += h[0] * goal_bar
+            path_v_bar[frame, p] += span * h[1] * goal_bar
+            path_v_bar[frame + 1, p] += span * h[2] * goal_bar
 
 
 @wp.kernel(enable_backward=False)

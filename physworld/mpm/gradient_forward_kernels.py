@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import warp as wp
 
+from physworld.mpm.node_kernels import on_path
+
 
 @wp.kernel(enable_backward=False)
 def set_sides(
@@ -85,18 +87,9 @@ def advance_tangent(
                 dx[k] = dx[k] + dt * dv[k]
         force_slope[k] = wp.float64(0.0)
     if held >= 0 and starting == 0:
-        frame = counter[0]
-        span = clock[0]
         s = wp.float64(counter[1] + 1) / wp.float64(counter[2])
-        s2 = s * s
-        s3 = s2 * s
-        h01 = wp.float64(3.0) * s2 - wp.float64(2.0) * s3
-        h10 = s3 - wp.float64(2.0) * s2 + s
-        h11 = s3 - s2
         for i in range(3):
             k = 3 * node + i
-            p = 3 * held + i
-            goal = path_x_slope[frame, p] + h01 * (path_x_slope[frame + 1, p] - path_x_slope[frame, p])
-            goal += span * (h10 * path_v_slope[frame, p] + h11 * path_v_slope[frame + 1, p])
+            goal = on_path(path_x_slope, path_v_slope, counter[0], 3 * held + i, s, clock[0])
             dv[k] = (goal - dx[k]) / dt
             dx[k] = goal

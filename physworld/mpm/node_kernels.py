@@ -31,18 +31,23 @@ def weighted_sum(
 
 
 @wp.func
+def hermite(s: wp.float64):
+    """Weights of the second place and of the two velocities times the interval, at the share ``s`` of it."""
+    s2 = s * s
+    s3 = s2 * s
+    return wp.vec3d(wp.float64(3.0) * s2 - wp.float64(2.0) * s3, s3 - wp.float64(2.0) * s2 + s, s3 - s2)
+
+
+@wp.func
 def on_path(
     path_x: wp.array2d(dtype=wp.float64), path_v: wp.array2d(dtype=wp.float64), frame: int, k: int,
     s: wp.float64, span: wp.float64,
 ):  # fmt: skip
     """Cubic Hermite between two frames at the share ``s`` of their interval ``span`` [s]."""
-    s2 = s * s
-    s3 = s2 * s
-    h01 = wp.float64(3.0) * s2 - wp.float64(2.0) * s3
+    h = hermite(s)
     start = path_x[frame, k]
-    goal = start + h01 * (path_x[frame + 1, k] - start)
-    goal += span * (s3 - wp.float64(2.0) * s2 + s) * path_v[frame, k]
-    return goal + span * (s3 - s2) * path_v[frame + 1, k]
+    goal = start + h[0] * (path_x[frame + 1, k] - start)
+    return goal + span * (h[1] * path_v[frame, k] + h[2] * path_v[frame + 1, k])
 
 
 @wp.func
@@ -64,19 +69,9 @@ def advance(
     dt = clock[2]
     held = slot[node]
     if held >= 0:
-        frame = counter[0]
-        span = clock[0]
         s = wp.float64(counter[1] + 1) / wp.float64(counter[2])
-        s2 = s * s
-        s3 = s2 * s
-        h01 = wp.float64(3.0) * s2 - wp.float64(2.0) * s3
-        h10 = s3 - wp.float64(2.0) * s2 + s
-        h11 = s3 - s2
         for i in range(3):
-            k = 3 * held + i
-            start = path_x[frame, k]
-            goal = start + h01 * (path_x[frame + 1, k] - start)
-            goal += span * (h10 * path_v[frame, k] + h11 * path_v[frame + 1, k])
+            goal = on_path(path_x, path_v, counter[0], 3 * held + i, s, clock[0])
             v[3 * node + i] = (goal - x[3 * node + i]) / dt
             x[3 * node + i] = goal
             force[3 * node + i] = wp.float64(0.0)

@@ -234,7 +234,10 @@ def distance_from_path(
     # out
     gap: wp.array(dtype=wp.float64),
 ):
-    """Where a node would be after this substep without the springs, minus where its grip takes it [m]."""
+    """Where a node would be after this substep, minus where its grip takes it [m].
+
+    ``force`` is that of everything but the springs, or of all [N]; or an acceleration where ``mass`` is 1.
+    """
     held = wp.tid()
     dt = clock[2]
     share = wp.float64(counter[1] + 1) / wp.float64(counter[2])

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from physworld.mpm.node_kernels import on_path
+from physworld.mpm.node_kernels import hermite, on_path
 
 
 @wp.kernel(enable_backward=False)
@@ -65,11 +65,7 @@ def take_grips_back(
     dt = clock[2]
     frame = counter[0]
     s = wp.float64(counter[1] + 1) / wp.float64(counter[2])
-    s2 = s * s
-    s3 = s2 * s
-    h01 = wp.float64(3.0) * s2 - wp.float64(2.0) * s3
-    h10 = s3 - wp.float64(2.0) * s2 + s
-    h11 = s3 - s2
+    h = hermite(s)
     for i in range(3):
         k = 3 * node + i
         p = 3 * held + i
@@ -82,41 +78,10 @@ def take_grips_back(
         drag_bar[node] += late * v[k]
         x_bar[k] -= q
         v_bar[k] -= dt * (wp.float64(1.0) - dt * drag) * q
-        path_x_bar[frame, p] += (wp.float64(1.0) - h01) * q
-        path_x_bar[frame + 1, p] += h01 * q
-        path_v_bar[frame, p] += clock[0] * h10 * q
-        path_v_bar[frame + 1, p] += clock[0] * h11 * q
-
-
-@wp.kernel(enable_backward=False)
-def distance_after(
-    # model
-    nodes: wp.array(dtype=wp.int32),
-    mass: wp.array(dtype=wp.float64),
-    path_x: wp.array2d(dtype=wp.float64),
-    path_v: wp.array2d(dtype=wp.float64),
-    gravity: wp.vec3d,
-    drag: wp.float64,
-    width: int,
-    clock: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
-    # in
-    x: wp.array(dtype=wp.float64),
-    v: wp.array(dtype=wp.float64),
-    force: wp.array(dtype=wp.float64),
-    # out
-    gap: wp.array(dtype=wp.float64),
-):
-    """r of one held node [m]; ``force`` is f' [N], or f' / m where ``mass`` is 1."""
-    held = wp.tid()
-    dt = clock[2]
-    s = wp.float64(counter[1] + 1) / wp.float64(counter[2])
-    for i in range(3):
-        k = 3 * nodes[held] + i
-        goal = on_path(path_x, path_v, counter[0], 3 * held + i, s, clock[0])
-        gap[i * width + held] = (
-            x[k] + dt * (v[k] + dt * (force[k] / mass[held] + gravity[i] - drag * v[k])) - goal
-        )
+        path_x_bar[frame, p] += (wp.float64(1.0) - h[0]) * q
+        path_x_bar[frame + 1, p] += h[0] * q
+        path_v_bar[frame, p] += clock[0] * h[1] * q
+        path_v_bar[frame + 1, p] += clock[0] * h[2] * q
 
 
 @wp.kernel(enable_backward=False)

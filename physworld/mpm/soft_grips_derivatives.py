@@ -15,9 +15,8 @@ import warp as wp
 
 from physworld.errors import NotDifferentiable
 from physworld.mpm.adjoint_terms import Reverse
-from physworld.mpm.soft_grips import BoundSoftGrips, SoftGrips, pull_to_path
+from physworld.mpm.soft_grips import BoundSoftGrips, SoftGrips, distance_from_path, pull_to_path
 from physworld.mpm.soft_grips_derivative_kernels import (
-    distance_after,
     distance_slope,
     gather_nodes,
     take_grips_back,
@@ -88,7 +87,7 @@ class SoftGripsChange:
         """Add -dK r to ``force`` (3n,) [N], with ``now.force_bar`` the derivatives by the others' forces."""
         term, count = self._term, self._term.pull.shape[0]
         inputs = [*self._model, now.clock, now.counter, now.x, now.v, now.pull]
-        wp.launch(distance_after, dim=count, inputs=inputs, outputs=[term.gap], device=term.device)
+        wp.launch(distance_from_path, dim=count, inputs=inputs, outputs=[term.gap], device=term.device)
         inputs = [term.model[0], self._change, term.gap]
         wp.launch(pull_to_path, dim=count, inputs=inputs, outputs=[force], device=term.device)
 
@@ -139,7 +138,7 @@ class SoftGripsTangent:
         nodes, count = term.model[0], term.pull.shape[0]
         if self._stiffens:
             inputs = [*term.model, clock, counter, x, v, force]
-            wp.launch(distance_after, dim=count, inputs=inputs, outputs=[term.gap], device=term.device)
+            wp.launch(distance_from_path, dim=count, inputs=inputs, outputs=[term.gap], device=term.device)
             inputs = [nodes, self._stiffness_slope, term.gap]
             wp.launch(pull_to_path, dim=count, inputs=inputs, outputs=[slope], device=term.device)
         inputs = [*self._slopes, clock, counter, v, dx, dv, force, slope]
