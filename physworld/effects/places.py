@@ -26,10 +26,21 @@ def gravity_size(twin: Twin) -> float:
 def free_end(twin: Twin) -> np.ndarray:
     """Start of the material that lies farthest from what is held [m], (3,); of nothing is held, from the middle."""
     particles = twin.particles_start[twin.particle_mass > 0]
+    return particles[int(np.argmax(_from_held(twin, particles)))]
+
+
+def middle_of_free_end(twin: Twin) -> np.ndarray:
+    """Centre of the particles that lie as far from what is held as :func:`free_end` within half a cell [m], (3,)."""
+    places = twin.particles_start[twin.particle_mass > 0]
+    gap = _from_held(twin, places)
+    return places[gap >= gap.max() - 0.5 * float(twin.lattice.spacing.max())].mean(axis=0)
+
+
+def _from_held(twin: Twin, places: np.ndarray) -> np.ndarray:
+    """Distance of places (P, 3) from what is held, or from their middle, (P,) [m]."""
     held = np.concatenate([np.empty(0, dtype=int), *twin.held_nodes]).astype(int)
-    places = twin.body.start[held] if len(held) else particles.mean(axis=0, keepdims=True)
-    gap = np.linalg.norm(particles[:, None] - places[None], axis=2).min(axis=1)
-    return particles[int(np.argmax(gap))]
+    known = twin.body.start[held] if len(held) else places.mean(axis=0, keepdims=True)
+    return np.linalg.norm(places[:, None] - known[None], axis=2).min(axis=1)
 
 
 def region_weights(twin: Twin, centre: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:

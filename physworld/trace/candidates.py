@@ -13,15 +13,17 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from physworld.effects.base import Strength
-from physworld.effects.places import body_size, free_end
+from physworld.effects.places import body_size, middle_of_free_end
 from physworld.effects.registry import EFFECTS
 from physworld.trace.unknowns import Unknown, of_strength, with_strengths
 from physworld.twin import Twin
 
 Shape = dict[str, float]
+Mirror = Callable[[Shape], Shape]
 _SHAPE_STEP = 0.01  # difference step of a shape, of its range
 _RELAXATIONS_S = (0.02, 0.1, 0.5)
 _DIAGONAL = 0.25 * np.pi
+_SHORTEST = 0.05  # length of a tether on its other side over the one at rest
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,7 @@ class Candidate:
         fixed: shapes, as the variant has them.
         shapes: which of them a refit frees.
         kind: where the effect enters.
+        mirror: from a shape to another one that to first order does the same; None where there is none.
     """
 
     effect: str
@@ -43,6 +46,7 @@ class Candidate:
     fixed: Shape = field(default_factory=dict)
     shapes: tuple[Strength, ...] = ()
     kind: str = "force"
+    mirror: Mirror | None = None
 
     @property
     def label(self) -> str:
@@ -80,7 +84,9 @@ def candidates(twin: Twin, names: tuple[str, ...] = ()) -> tuple[list[Candidate]
         for variant in _VARIANTS.get(name, _plain)(twin, known):
             gates = tuple(known[gate] for gate in variant.gates)
             shapes = tuple(known[shape] for shape in variant.shapes)
-            found.append(Candidate(name, variant.label, gates, variant.fixed, shapes, effect.kind))
+            found.append(
+                Candidate(name, variant.label, gates, variant.fixed, shapes, effect.kind, _MIRRORS.get(name))
+            )
     return found, refused
 
 
@@ -136,8 +142,8 @@ def _fibres(twin: Twin, known: Known) -> list[_Variant]:
 
 
 def _tethers(twin: Twin, known: Known) -> list[_Variant]:
-    """Relaxed springs from the free end in every direction: axes, and the diagonals between them."""
-    end, reach = free_end(twin), body_size(twin)
+    """Relaxed springs from the middle of the free end in every direction: axes, and the diagonals between them."""
+    end, reach = middle_of_free_end(twin), body_size(twin)
     axes = np.eye(3)
     ways = [*axes]
     for i, j in ((0, 1), (0, 2), (1, 2)):
@@ -153,6 +159,18 @@ def _tethers(twin: Twin, known: Known) -> list[_Variant]:
         shapes = tuple(f"anchor_{a}_m" for a in "xyz")
         variants.append(_Variant(("stiffness_n_m",), label, fixed, shapes))
     return variants
+
+
+def _other_side(shape: Shape) -> Shape:
+    """The tether that pushes from the other side with the force of one that pulls, or pulls with one's that pushes.
+
+    What tells the two apart is how a spring's force turns with it, which is of second order.
+    """
+    anchor, attach = (np.array([shape[f"{end}_{a}_m"] for a in "xyz"]) for end in ("anchor", "attach"))
+    way, rest = anchor - attach, shape["rest_length_m"]
+    length = max(float(np.linalg.norm(way)), 1e-9)
+    other = attach - way / length * max(2.0 * rest - length, _SHORTEST * rest)
+    return shape | {f"anchor_{a}_m": float(p) for a, p in zip("xyz", other, strict=True)}
 
 
 def _fields(twin: Twin, known: Known) -> list[_Variant]:
@@ -187,3 +205,5 @@ _VARIANTS: dict[str, Callable[[Twin, Known], list[_Variant]]] = {
     "ground_friction": _one_by_one(("change",), ("height_m",)),
     "clamp_offset": _clamps,
 }
+
+_MIRRORS: dict[str, Mirror] = {"tether": _other_side}

@@ -34,6 +34,7 @@ _MULTIPLES = tuple(
     2.0**k for k in range(-5, 3)
 )  # of a strength, tried beside another model's calibrated numbers
 _WORTH_A_LOOK = 4.0  # times a model's squared residual up to which it is searched from there
+_MIRRORED = 2  # times the iterations of a refit: a mirror image is a guess
 _NUDGE = 0.1  # of a probe: where a search starts if the linear estimate says none, so that shapes can show
 
 
@@ -144,6 +145,27 @@ class Confirmation:
             if other is not None and other.misfit < best.fitted.misfit:
                 best = Model(model.members, other, cross_validated(other, self.block_of_row))
         return best
+
+    def mirrored(self, model: Model) -> Model:
+        """The model refitted from the mirror image of its last effect's shape, if that is better; else itself.
+
+        The sensitivities of the two are the same, so the one from which the search began is as likely the wrong one.
+        """
+        member, fitted = model.members[-1], model.fitted
+        if member.mirror is None:
+            return model
+        own = next(known.values for known in fitted.twin.effects if known.name == member.effect)
+        image = member.mirror({name: float(own[name] or 0.0) for name in own})
+        shapes = {u.name: image[s.name] for u, s in zip(member.shape_unknowns(), member.shapes, strict=True)}
+        unknowns = [
+            u.starting(shapes[u.name] / u.value(1.0) if u.name in shapes else t)
+            for u, t in zip(fitted.unknowns, fitted.theta, strict=True)
+        ]
+        iterations = _MIRRORED * self.iterations
+        other = refit(self.simulations, self.whitener, fitted.twin, unknowns, self.frames, iterations)
+        if other is None or other.misfit >= fitted.misfit:
+            return model
+        return Model(model.members, other, cross_validated(other, self.block_of_row))
 
     def held_otherwise(self, model: Model) -> Model:
         """The model refitted from grips that hold harder and softer, if that is better; else itself."""

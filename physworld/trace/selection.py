@@ -60,7 +60,7 @@ class Selection:
             if number == 0:
                 self.simulations.stage = "refit from other valleys"
                 tried = with_valleys(confirmation, base, ranked, columns, tried, config.near_floor)
-            tried = self._again(confirmation, base, tried, ranked)
+            tried = self._again(confirmation, base, self._mirrored(confirmation, base, tried), ranked)
             tried = self._alike(confirmation, base, self._held_otherwise(confirmation, tried), columns)
             tried = self._beside_the_best(confirmation, tried)
             tried = self._as_plates(base, tried)
@@ -92,6 +92,12 @@ class Selection:
             return False
         own = max(s.family for s in ranked.ranked if s.candidate.effect == best.names[-1])
         return score.family < _OUTDONE * own
+
+    def _mirrored(self, confirmation: Confirmation, base: Model, tried: list[Model]) -> list[Model]:
+        """Models, those that explain most of what there is refitted from the mirror images of their shapes."""
+        self.simulations.stage = "refit of mirror images"
+        worth = max(_OUTDONE * base.explained, _NEAR * min((model.explained for model in tried), default=0.0))
+        return [confirmation.mirrored(m) if m.explained <= worth else m for m in tried]
 
     def _again(
         self, confirmation: Confirmation, base: Model, tried: list[Model], ranked: Scores

@@ -1,6 +1,8 @@
-"""Refits: a rival is searched where the best model fits, and one that fits nowhere near it is left as it is."""
+"""Refits: a rival is searched where the best model fits; a tether also from where it does the same to first order."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from sagging_bar import BUDGET, SIGMA, TRUE_PA, sagging
 
 from physworld.build import build_twin
 from physworld.calibrate.parameters import parameters_of
+from physworld.effects.base import Effect
 from physworld.effects.registry import effect
 from physworld.simulations import Job
 from physworld.trace.candidates import candidates
@@ -19,14 +22,14 @@ from physworld.trace.sensitivity import sensitivities
 from physworld.trace.unknowns import of_parameter
 from physworld.trace.whitening import whitener
 
-VISCOSITY_PA_S, FAR_PA = 120.0, 1.2e5
+VISCOSITY_PA_S, FAR_PA, STIFF_N_M = 120.0, 1.2e5, 3.0
 
 
 class Bar:
-    """A viscous bar, and models of it at places where a search may have left them."""
+    """A bar with an effect, and models of it at places where a search may have left them."""
 
-    def __init__(self) -> None:
-        scene = sagging(effect("viscosity_kelvin_voigt", viscosity_pa_s=VISCOSITY_PA_S))
+    def __init__(self, acts: Effect) -> None:
+        scene = sagging(acts)
         self.plain = build_twin(scene, BUDGET).with_parameters(youngs_modulus_pa=TRUE_PA)
         recordings = Recordings([scene], (), 12, 3)
         self.frames = recordings.split.train[1]
@@ -37,16 +40,21 @@ class Bar:
         self.blocks = np.arange(rows) * 4 // rows
         self.confirmation = Confirmation(self.simulations, self.white, self.blocks, self.frames, 8)
 
-    def model(self, name: str, youngs_modulus_pa: float, **strength: float) -> Model:
-        """A model with one effect, not searched any further."""
+    def model(
+        self, name: str, youngs_modulus_pa: float, shape: dict[str, float] | None = None, **strength: float
+    ) -> Model:
+        """A model with one effect, not searched any further; with a shape, of which a search is free to change some."""
         twin = self.plain.with_parameters(youngs_modulus_pa=youngs_modulus_pa).with_effect(
-            effect(name, **strength)
+            effect(name, **strength, **(shape or {}))
         )
         member = candidates(self.plain, (name,))[0][0]
+        if shape is not None:
+            member = replace(member, fixed=shape)
         known = parameters_of(twin, separate_bending=False, damping=False)
         stiffness = [of_parameter(p, twin, None) for p in known if p.name == "youngs_modulus_pa"]
         gate = member.unknowns()[0]
         unknowns = [*stiffness, gate.starting(next(iter(strength.values())) / gate.value(1.0))]
+        unknowns += member.shape_unknowns() if shape is not None else []
         tracks = self.simulations.run([Job(twin, self.frames)])[0]
         slope, _ = sensitivities(self.simulations, self.white, twin, tracks, unknowns, self.frames)
         place = np.array([u.start for u in unknowns])
@@ -56,7 +64,7 @@ class Bar:
 
 @pytest.fixture(scope="module")
 def bar() -> Bar:
-    return Bar()
+    return Bar(effect("viscosity_kelvin_voigt", viscosity_pa_s=VISCOSITY_PA_S))
 
 
 def test_a_rival_is_searched_where_the_best_model_fits(bar: Bar) -> None:
@@ -76,3 +84,32 @@ def test_a_rival_that_fits_nowhere_near_the_best_model_is_left_as_it_is(bar: Bar
     runs = bar.simulations.count
     assert bar.confirmation.beside(good, elsewhere) is good
     assert bar.simulations.count == runs + 8  # a look at eight strengths, and no search
+
+
+def test_a_tether_is_also_searched_on_the_other_side() -> None:
+    rest, pulled = 0.1, 0.02
+    end = candidates(build_twin(sagging(), BUDGET), ("tether",))[0][0].fixed
+    attach = np.array([end[f"attach_{a}_m"] for a in "xyz"])
+
+    def shape(gap: float) -> dict[str, float]:
+        """An anchor this far along y."""
+        anchor = dict(
+            zip(("anchor_x_m", "anchor_y_m", "anchor_z_m"), attach + np.array([0.0, gap, 0.0]), strict=True)
+        )
+        return end | {"rest_length_m": rest} | anchor
+
+    tied = Bar(effect("tether", stiffness_n_m=STIFF_N_M, **shape(-rest - pulled)))
+    lost = tied.model("tether", TRUE_PA, shape(rest - pulled), stiffness_n_m=STIFF_N_M)
+    assert lost.members[0].mirror(shape(rest - pulled)) == pytest.approx(shape(-rest - pulled))
+    found = tied.confirmation.mirrored(lost)
+    assert lost.fitted.misfit > 2.0 and found.fitted.misfit < 1.2
+    way = [found.fitted.value(f"tether.anchor_{a}_m") for a in "xyz"] - attach
+    tension = found.fitted.value("tether.stiffness_n_m") * (np.linalg.norm(way) - rest)
+    assert way[1] < -0.8 * np.linalg.norm(way)
+    assert tension == pytest.approx(STIFF_N_M * pulled, rel=0.1)
+
+
+def test_an_effect_without_a_mirror_image_is_left_as_it_is(bar: Bar) -> None:
+    drag = bar.model("air_drag_linear", FAR_PA, rate_per_s=8.0)
+    runs = bar.simulations.count
+    assert bar.confirmation.mirrored(drag) is drag and bar.simulations.count == runs
