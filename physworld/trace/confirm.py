@@ -188,6 +188,28 @@ class Confirmation:
             return model
         return Model(model.members, again, cross_validated(again, self.block_of_row))
 
+    def together(
+        self, base: Model, members: tuple[Candidate, ...], strengths: list[float], other: Model
+    ) -> Model | None:
+        """``base`` with several effects, from these strengths of their gates and another model's calibrated numbers.
+
+        None where no run was usable.
+        """
+        known = dict(zip([u.name for u in other.fitted.unknowns], other.fitted.theta, strict=True))
+        calibrated = [
+            u.starting(known.get(u.name, t))
+            for u, t in zip(base.fitted.unknowns, base.fitted.theta, strict=True)
+        ]
+        gates = [gate for member in members for gate in member.unknowns()]
+        unknowns = [
+            *calibrated,
+            *(gate.starting(s / gate.value(1.0)) for gate, s in zip(gates, strengths, strict=True)),
+        ]
+        found = refit(
+            self.simulations, self.whitener, base.fitted.twin, unknowns, self.frames, self.iterations
+        )
+        return None if found is None else Model(members, found, cross_validated(found, self.block_of_row))
+
     def beside(self, model: Model, other: Model) -> Model:
         """The model refitted from another one's calibrated numbers and what strength of its one gate does best there.
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from physworld.trace.comparison import alikeness, cross_validated
+from physworld.trace.compound import WHOLE, in_parts
 from physworld.trace.config import TraceConfig
 from physworld.trace.confirm import Confirmation, Model, best_variants
 from physworld.trace.plates import as_a_plate
@@ -63,7 +64,7 @@ class Selection:
             tried = self._again(confirmation, base, self._mirrored(confirmation, base, tried), ranked)
             tried = self._alike(confirmation, base, self._held_otherwise(confirmation, tried), columns)
             tried = self._beside_the_best(confirmation, tried)
-            tried = self._as_plates(base, tried)
+            tried = self._as_plates(base, [*tried, *self._in_parts(confirmation, base, tried, usable)])
             good = [m for m in tried if helps(m, base, config)]
             kept = simplest(good, base) if good else None
             path.append(Step(base, ranked, tuple(tried), kept))
@@ -132,6 +133,20 @@ class Selection:
         self.simulations.stage = "refit of the grips"
         least = min((model.explained for model in tried), default=0.0)
         return [confirmation.held_otherwise(m) if m.explained <= _NEAR * least else m for m in tried]
+
+    def _in_parts(
+        self, confirmation: Confirmation, base: Model, tried: list[Model], usable: list[Response]
+    ) -> list[Model]:
+        """The two effects that a wind may be as well, where it leaves little."""
+        self.simulations.stage = "refit in parts"
+        found = [
+            in_parts(confirmation, base, m, [response.candidate for response in usable])
+            for m in tried
+            if m.names == (WHOLE,)
+            and m.fitted.misfit <= self.config.acceptable
+            and helps(m, base, self.config)
+        ]
+        return [model for model in found if model is not None]
 
     def _as_plates(self, base: Model, tried: list[Model]) -> list[Model]:
         """Models of sheets, those that are near the best without numbers of their own for bending where that does."""

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from physworld.trace.comparison import alikeness, better_beyond_chance, difference, seen_through
+from physworld.trace.compound import count_of_effects, other_names
 from physworld.trace.config import TraceConfig
 from physworld.trace.confirm import Model, beats, explained_direction
 
@@ -210,10 +211,10 @@ def accounts(model: Model, declared: Model, config: TraceConfig) -> bool:
 
 
 def simplest(models: list[Model], declared: Model) -> Model:
-    """The model with fewest members, then fewest unknowns, among those that are as good as the best."""
+    """The model with fewest effects, then fewest unknowns, among those that are as good as the best."""
     best = min(models, key=lambda m: m.validated.mean)
     near = [m for m in models if as_good(m, best, declared)]
-    return min(near, key=lambda m: (len(m.members), len(m.fitted.unknowns), m.validated.mean))
+    return min(near, key=lambda m: (count_of_effects(m), len(m.fitted.unknowns), m.validated.mean))
 
 
 def simplest_first(models: list[Model], declared: Model) -> list[Model]:
@@ -267,8 +268,10 @@ def indistinguishable(model: Model, best: Model, basis: np.ndarray, declared: Mo
     """Whether another model that is no less simple does as well, and by explaining the same.
 
     As well: within one standard error, or within half of what the better one leaves above the noise, which may as well
-    lie between the two as elsewhere.
+    lie between the two as elsewhere. A wind and the drag and tilt that it may be as well differ by one number only.
     """
+    if other_names(model, best):
+        return as_good(model, best, declared)
     if len(model.members) != len(best.members) or len(model.fitted.unknowns) > len(best.fitted.unknowns):
         return False
     same = alikeness(explained_direction(model, declared, basis), explained_direction(best, declared, basis))

@@ -13,14 +13,16 @@ from physworld.calibrate.parameters import parameters_of
 from physworld.effects.base import Effect
 from physworld.effects.registry import effect
 from physworld.simulations import Job
-from physworld.trace.candidates import candidates
+from physworld.trace.candidates import Candidate, candidates
 from physworld.trace.comparison import cross_validated
+from physworld.trace.compound import in_parts
 from physworld.trace.confirm import Confirmation, Model
 from physworld.trace.recordings import JointSimulations, Recordings
 from physworld.trace.refit import Refit
 from physworld.trace.sensitivity import sensitivities
-from physworld.trace.unknowns import of_parameter
+from physworld.trace.unknowns import Unknown, of_parameter
 from physworld.trace.whitening import whitener
+from physworld.twin import Twin
 
 VISCOSITY_PA_S, FAR_PA, STIFF_N_M = 120.0, 1.2e5, 3.0
 
@@ -50,16 +52,24 @@ class Bar:
         member = candidates(self.plain, (name,))[0][0]
         if shape is not None:
             member = replace(member, fixed=shape)
+        gates = [
+            g.starting(value / g.value(1.0))
+            for g, value in zip(member.unknowns(), strength.values(), strict=True)
+        ]
+        return self._at(twin, gates + (member.shape_unknowns() if shape is not None else []), (member,))
+
+    def declared(self, youngs_modulus_pa: float) -> Model:
+        """The declared physics, not searched any further."""
+        return self._at(self.plain.with_parameters(youngs_modulus_pa=youngs_modulus_pa), [], ())
+
+    def _at(self, twin: Twin, own: list[Unknown], members: tuple[Candidate, ...]) -> Model:
         known = parameters_of(twin, separate_bending=False, damping=False)
-        stiffness = [of_parameter(p, twin, None) for p in known if p.name == "youngs_modulus_pa"]
-        gate = member.unknowns()[0]
-        unknowns = [*stiffness, gate.starting(next(iter(strength.values())) / gate.value(1.0))]
-        unknowns += member.shape_unknowns() if shape is not None else []
+        unknowns = [of_parameter(p, twin, None) for p in known if p.name == "youngs_modulus_pa"] + own
         tracks = self.simulations.run([Job(twin, self.frames)])[0]
         slope, _ = sensitivities(self.simulations, self.white, twin, tracks, unknowns, self.frames)
         place = np.array([u.start for u in unknowns])
         fitted = Refit(unknowns, twin, place, tracks, self.white.residual(tracks), slope)
-        return Model((member,), fitted, cross_validated(fitted, self.blocks))
+        return Model(members, fitted, cross_validated(fitted, self.blocks))
 
 
 @pytest.fixture(scope="module")
@@ -113,3 +123,16 @@ def test_an_effect_without_a_mirror_image_is_left_as_it_is(bar: Bar) -> None:
     drag = bar.model("air_drag_linear", FAR_PA, rate_per_s=8.0)
     runs = bar.simulations.count
     assert bar.confirmation.mirrored(drag) is drag and bar.simulations.count == runs
+
+
+def test_a_wind_is_taken_apart_into_a_drag_and_a_tilt_of_gravity() -> None:
+    wind = {"push_x_m_s2": 0.0, "push_y_m_s2": 0.6, "push_z_m_s2": 0.0, "rate_per_s": 3.0}
+    blown = Bar(effect("wind", **wind))
+    whole, base = blown.model("wind", TRUE_PA, **wind), blown.declared(TRUE_PA)
+    parts = in_parts(blown.confirmation, base, whole, candidates(blown.plain)[0])
+    assert parts is not None and parts.names == ("air_drag_linear", "gravity_tilt")
+    assert parts.fitted.misfit == pytest.approx(whole.fitted.misfit, rel=0.03) and base.fitted.misfit > 3.0
+    assert parts.fitted.value("air_drag_linear.rate_per_s") == pytest.approx(3.0, rel=0.1)
+    tilt = parts.fitted.value("gravity_tilt.tilt_x_rad")
+    assert np.cross([np.sin(tilt), 0.0, 0.0], blown.plain.gravity_m_s2)[1] == pytest.approx(0.6, rel=0.1)
+    assert in_parts(blown.confirmation, base, whole, candidates(blown.plain, ("air_drag_linear",))[0]) is None

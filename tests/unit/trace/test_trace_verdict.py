@@ -142,6 +142,17 @@ def test_two_effects_are_named_only_where_one_leaves_too_much() -> None:
     assert answer([model(NOISE + 0.1 * OTHER, "drag"), both], before) == ("named", ("drag",))
 
 
+def test_a_wind_may_as_well_be_a_drag_where_gravity_is_tilted() -> None:
+    before = NOISE + 2 * DRAG
+    parts = model(NOISE, "air_drag_linear", "gravity_tilt", unknowns=3)
+    wind = model(0.9999 * NOISE, "wind", unknowns=4)
+    assert answer([wind, parts], before) == ("equivalent_set", ("air_drag_linear", "gravity_tilt"))
+    upwards = model(1.1 * NOISE + OTHER, "air_drag_linear", "gravity_tilt", unknowns=3)
+    assert answer([wind, upwards], before) == ("named", ("wind",))
+    drag = model(NOISE, "air_drag_linear")
+    assert answer([wind, parts, drag], before) == ("named", ("air_drag_linear",))
+
+
 def test_what_other_cells_would_change_is_no_effect() -> None:
     along = (DRAG / np.linalg.norm(DRAG))[:, None]
     assert answer([model(NOISE, "drag")], NOISE + DRAG, solver=along)[0] == "unexplained"
