@@ -38,6 +38,7 @@ _FLAT = 0.08  # a sheet's points lie within this share of its width of their pla
 _TIGHTER = 0.97  # a sheet is turned in its plane if that shrinks its bounding rectangle below this share
 _CLAMP_REACH = 0.5 / np.sqrt(3.0)  # cells by which a held layer of splines acts beyond its face
 _THIN = 1e-4  # points whose extent falls below this share of their largest one span a dimension less
+_NEIGHBOURS = 6  # points that tell where another one was before it was seen
 _BOX_FILL = 0.93  # a cloud that fills this share of its bounding box is a box, whatever its kind
 
 
@@ -104,10 +105,23 @@ def reference_body(scene: Scene, particle_budget: int, refinement: float = 1.0) 
 
 
 def _first_points(scene: Scene) -> np.ndarray:
-    """Tracked points at the first frame; a point not seen then takes its first sight, one never seen another's."""
-    seen = np.argmax(scene.visible, axis=0)
-    points = scene.points[seen, np.arange(scene.points.shape[1])]
-    sighted = scene.visible.any(axis=0)
+    """Tracked points at the first frame, (N, 3) [m].
+
+    A point that was not seen then is where its first sight was, less what its neighbours have moved until then.
+    Held-out frames are not looked at; a point that was never seen takes another's place.
+    """
+    end = scene.train[1] or scene.frame_count
+    visible = scene.visible[:end] if scene.visible[:end].any() else scene.visible
+    points = scene.points[0].astype(float)
+    for n in np.flatnonzero(~visible[0] & visible.any(axis=0)):
+        first = int(np.argmax(visible[:, n]))
+        points[n] = scene.points[first, n]
+        known = np.flatnonzero(visible[0] & visible[first])
+        gap = np.linalg.norm(scene.points[first, known] - points[n], axis=1)
+        near = known[np.argsort(gap)[:_NEIGHBOURS]]
+        if len(near):
+            points[n] -= (scene.points[first, near] - scene.points[0, near]).mean(axis=0)
+    sighted = visible.any(axis=0)
     points[~sighted] = points[np.argmax(sighted)]
     return points
 

@@ -16,18 +16,19 @@ from dataclasses import replace
 
 import numpy as np
 
-from physworld.calibrate import Journal, calibrate
+from physworld.calibrate import Journal
 from physworld.calibrate.parameters import BENDING_COUPLING, BENDING_RATIO, TWIST_RATIO, parameters_of
 from physworld.errors import SceneUnsupported
-from physworld.grips import softly_held
 from physworld.scene import Scene
 from physworld.simulations import Job, Runner, in_turn, stage_s
+from physworld.trace.beginning import Beginning
 from physworld.trace.candidates import Candidate, candidates
 from physworld.trace.comparison import cross_validated
 from physworld.trace.config import TraceConfig
 from physworld.trace.confirm import Model
 from physworld.trace.describe import describe
 from physworld.trace.experiment import Experiment, propose, rival_of
+from physworld.trace.faults import Faults, without_faults
 from physworld.trace.held_out import HeldOut, Unseen, measure, measure_all
 from physworld.trace.holds import held_otherwise
 from physworld.trace.intervals import calibrated, named, numbers
@@ -54,6 +55,7 @@ from physworld.trace.simulations import Memory, Progress
 from physworld.trace.start_pose import turned_starts
 from physworld.trace.unknowns import Unknown, clamp_reach, grip_softness, of_parameter
 from physworld.trace.verdict import (
+    DATA,
     NOTHING,
     UNEXPLAINED,
     Verdict,
@@ -114,42 +116,37 @@ def trace(
     begun = time.perf_counter()
     scenes = [scene] if isinstance(scene, Scene) else list(scene)
     recordings = Recordings(scenes, held_out, config.blocks, config.shortest_block)
-    calibrated_runs = 0
-    if calibrated_twin is None:
-        # fibres would go into a free shape of bending
-        declared = replace(config.calibration, bending="declared")
-        fitted = calibrate(recordings.lead.scene, declared, progress, cancelled, journal)
-        calibrated_twin, calibrated_runs = fitted.twin, fitted.simulations
-    calibrated_twin = softly_held(calibrated_twin)
-    simulations = JointSimulations(
-        recordings,
-        calibrated_twin,
-        config.calibration.particle_budget,
-        config.refinement,
-        runner,
-        memory,
-        progress,
-        cancelled,
-    )
-    work = _Trace(recordings, config, simulations, calibrated_twin)
-    result = work.run()
-    return replace(
-        result, simulations=simulations.count + calibrated_runs, seconds=time.perf_counter() - begun
-    )
+    begin = Beginning(config, runner, memory, progress, cancelled)
+    simulations, twin, runs = begin.calibrated(recordings, calibrated_twin, journal)
+    faults = begin.faults(simulations, twin)
+    if any(faults):
+        scenes = [without_faults(s, known) for s, known in zip(scenes, faults, strict=True)]
+        recordings = Recordings(scenes, held_out, config.blocks, config.shortest_block)
+        looked = runs + simulations.count
+        simulations, twin, runs = begin.calibrated(recordings, None, None)
+        runs += looked
+    result = _Trace(recordings, config, simulations, twin, faults).run()
+    return replace(result, simulations=simulations.count + runs, seconds=time.perf_counter() - begun)
 
 
 class _Trace:
     """State of one trace."""
 
     def __init__(
-        self, recordings: Recordings, config: TraceConfig, simulations: JointSimulations, twin: Twin
+        self,
+        recordings: Recordings,
+        config: TraceConfig,
+        simulations: JointSimulations,
+        twin: Twin,
+        faults: tuple[Faults, ...],
     ) -> None:
         self.recordings, self.lead = recordings, recordings.lead.scene
         self.scene, self.split = recordings.scene, recordings.split
         self.config, self.simulations = config, simulations
         self.frames = self.split.train[1]
         self.twin = twin
-        self.notes: list[str] = []
+        self.faults = "; ".join(known.words for known in faults if known)
+        self.notes = [f"left out as faulty sightings: {self.faults}"] if self.faults else []
 
     def run(self) -> TraceResult:
         config, simulations = self.config, self.simulations
@@ -159,7 +156,7 @@ class _Trace:
             simulations.least_step_s = stage_s(self.twin, simulations.drive) / _SLOWEST
             tracks, answers = simulations.first_look(Job(self.twin, self.frames))
             sigma = noise_sigma(self.scene, self.split, tracks)
-            scale = sigma or float(np.sqrt(np.mean((tracks - self.scene.points[: self.frames]) ** 2))) or 1e-3
+            scale = sigma or self._rms(tracks) or 1e-3
             white = whitener(self.scene, self.split, scale, answers)
             white = white.knowing(self._turns(tracks, scale))
             simulations.stage = "numerics"
@@ -199,12 +196,20 @@ class _Trace:
         finer_values, agreement = SecondResolution(*setting, finer).check(declared, real)
         tried = len({c.effect for c in chosen})
         verdict = decide(declared, models, basis, agreement, resolved, config, tried, *facts)
-        if sigma is None and verdict.name not in (NOTHING, UNEXPLAINED):
+        if sigma is None:
             verdict = Verdict(UNEXPLAINED, declared, (), "no noise estimate, no claim: " + verdict.reason)
+        if self.faults and verdict.name == NOTHING:
+            reason = f"faulty sightings ({self.faults}); of the others {verdict.reason}"
+            verdict = Verdict(DATA, declared, (), reason)
         found = self._result(
             verdict, declared, white, block_of_row, sigma, path, chosen, refused, numerics, finer_values
         )
         return replace(found, experiment=self._experiment(verdict, white, finer))
+
+    def _rms(self, tracks: np.ndarray) -> float:
+        """Root mean squared residual of the sightings per axis [m]."""
+        seen = self.scene.visible[: self.frames]
+        return float(np.sqrt(np.mean((tracks - self.scene.points[: self.frames])[seen] ** 2)))
 
     def _experiment(self, verdict: Verdict, white: Whitener, finer: Twin) -> Experiment | None:
         """What would tell the models of an equivalent set apart."""

@@ -102,7 +102,7 @@ class Whitener:
 
 
 def whitener(scene: Scene, split: Split, sigma: float, responses: np.ndarray) -> Whitener:
-    """The whitener of the training frames.
+    """The whitener of the training frames; a point that frame 0 does not show has no place of its own and is left out.
 
     Args:
         scene, split: what was measured, and which of it counts.
@@ -110,12 +110,12 @@ def whitener(scene: Scene, split: Split, sigma: float, responses: np.ndarray) ->
         responses: of every tracked point to its own place, (frames, N, 3, r), from :func:`responses`.
     """
     first, end = split.train
-    visible = scene.visible[first:end]
+    visible = scene.visible[first:end] & scene.visible[0]
     frames, points = np.nonzero(visible)
     places = []
     for point in range(visible.shape[1]):
         rows = np.nonzero(points == point)[0]
-        response = responses[first:end][visible[:, point], point].reshape(3 * len(rows), -1)
+        response = responses[first:end][visible[:, point], point].reshape(3 * len(rows), responses.shape[-1])
         u, s, _ = np.linalg.svd(response, full_matrices=False)
         places.append(Place(rows, response, u, 1.0 - 1.0 / np.sqrt(1.0 + s**2)))
     measured = scene.points[first:end][visible]

@@ -89,6 +89,8 @@ def headline(report: dict[str, Any]) -> str:
         return f"Best supported {among}: {effects}."
     if kind == "equivalent_set":
         return f"Best supported {among}: {effects}, or as well {others}; these data cannot tell them apart."
+    if kind == "data_issue" and not effects:
+        return "The recording has faulty sightings; without them the declared physics is within the noise."
     if kind == "data_issue":
         also = f" (or as well {others})" if others else ""
         return f"Best supported {among}: a fault of the measurement, not of the physics: {effects}{also}."

@@ -63,6 +63,41 @@ def test_where_nothing_acts_nothing_is_named() -> None:
     assert found.verdict.name == "nothing_to_explain" and not found.effects
 
 
+def test_a_faulty_frame_and_a_marker_that_slips_are_left_out_and_told() -> None:
+    scene = recorded(beam(0.03), effect("air_drag_linear", rate_per_s=6.0))
+    scene.points[12] += [0.03, 0.0, 0.02]
+    scene.points[9:, 5] += [0.0, 0.02, 0.0]
+    report = document(trace(scene, CONFIG))
+    assert [e["name"] for e in report["effects"]] == ["air_drag_linear"]
+    assert "all points in frame 12, point 5 in" in report["notes"][0]
+
+
+def test_where_nothing_acts_faulty_sightings_are_an_issue_of_the_data() -> None:
+    scene = recorded(beam(0.015), sigma=2 * SIGMA)
+    scene.points[12] += [0.05, 0.0, 0.04]
+    report = document(trace(scene, CONFIG))
+    assert report["verdict"] == "data_issue" and not report["effects"]
+    assert "all points in frame 12" in report["reason"]
+
+
+def test_points_that_training_frames_do_not_show_and_that_come_late() -> None:
+    scene = recorded(beam(0.015), sigma=2 * SIGMA)
+    scene.visible[: scene.train[1], 3] = False
+    scene.visible[:8, 10] = False
+    scene.points[~scene.visible] = 9.9
+    found = trace(scene, CONFIG)
+    assert found.verdict.name == "nothing_to_explain"
+    assert found.declared.fitted.misfit < 1.2
+
+
+def test_without_a_noise_there_is_no_claim() -> None:
+    scene = recorded(beam(0.03), effect("air_drag_linear", rate_per_s=6.0))
+    few = replace(scene, noise_sigma_m=None, points=scene.points[:, :3], visible=scene.visible[:, :3])
+    found = trace(replace(few, train=(0, 6), test=(6, FRAMES)), CONFIG)
+    assert found.sigma is None and found.verdict.name == "unexplained"
+    assert "no claim" in found.verdict.reason
+
+
 def test_a_drag_is_named_with_its_strength_and_the_held_out_error_falls() -> None:
     report = document(traced(effect("air_drag_linear", rate_per_s=6.0), stroke=0.03))
     assert report["verdict"] == "named" and [e["name"] for e in report["effects"]] == ["air_drag_linear"]

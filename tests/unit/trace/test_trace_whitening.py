@@ -20,6 +20,7 @@ def parts() -> tuple:
     rng = np.random.default_rng(1)
     scene = made_scene(rng.normal(size=(POINTS, 3)), "blob", frames=FRAMES)
     visible = rng.uniform(size=(FRAMES, POINTS)) < 0.7
+    visible[0] = True
     scene = replace(scene, visible=visible, points=scene.points + rng.normal(size=scene.points.shape))
     responses = rng.normal(size=(FRAMES, POINTS, 3, 3))
     return scene, freeze(scene, 4, 1), responses, rng.normal(size=scene.points.shape)

@@ -1,0 +1,62 @@
+"""What a trace begins with: the declared physics calibrated, and sightings that are faulty found."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from physworld.calibrate import Journal, calibrate
+from physworld.grips import softly_held
+from physworld.simulations import Job, Runner
+from physworld.trace.config import TraceConfig
+from physworld.trace.faults import Faults, find_faults
+from physworld.trace.noise import noise_sigma
+from physworld.trace.recordings import JointSimulations, Recordings
+from physworld.trace.simulations import Memory, Progress
+from physworld.twin import Twin
+
+
+@dataclass(frozen=True)
+class Beginning:
+    """Settings and means of a trace, as :func:`physworld.trace.trace` was given them."""
+
+    config: TraceConfig
+    runner: Runner
+    memory: Memory | None
+    progress: Progress | None
+    cancelled: Callable[[], bool] | None
+
+    def calibrated(
+        self, recordings: Recordings, twin: Twin | None, journal: Journal | None
+    ) -> tuple[JointSimulations, Twin, int]:
+        """The simulations, the declared physics calibrated on the training frames, and the runs that this took."""
+        config, runs = self.config, 0
+        if twin is None:
+            # fibres would go into a free shape of bending
+            declared = replace(config.calibration, bending="declared")
+            fitted = calibrate(
+                recordings.lead.scene, declared, self.progress, self.cancelled, journal, runner=self.runner
+            )
+            twin, runs = fitted.twin, fitted.simulations
+        twin = softly_held(twin)
+        simulations = JointSimulations(
+            recordings, twin, config.calibration.particle_budget, config.refinement, self.runner, self.memory,
+            self.progress, self.cancelled,
+        )  # fmt: skip
+        return simulations, twin, runs
+
+    def faults(self, simulations: JointSimulations, twin: Twin) -> tuple[Faults, ...]:
+        """Faulty sightings of every recording that is fitted; none where the noise is not known."""
+        recordings = simulations.recordings
+        simulations.stage = "sightings"
+        tracks = simulations.run([Job(twin, recordings.split.train[1])])[0]
+        sigma = None if tracks is None else noise_sigma(recordings.scene, recordings.split, tracks)
+        if tracks is None or sigma is None:
+            return ()
+        return tuple(
+            find_faults(
+                known.scene.points, known.scene.visible, tracks[:, known.points], known.split,
+                known.scene.noise_sigma_m or sigma,
+            )
+            for known in recordings.fitted
+        )  # fmt: skip
