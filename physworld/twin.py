@@ -327,8 +327,11 @@ class Twin:
             nodes: the carriers' trajectories, (T, n, 3) [m].
             times: their frames, (T,) [s].
         """
-        tracks = self.track_nodes(nodes)
-        for known in in_order(self.effects):
+        active, followed = in_order(self.effects), self
+        for known in active:
+            followed = known.followed(followed)
+        tracks = followed.track_nodes(nodes)
+        for known in active:
             tracks = known.measured(times, tracks, self)
         return tracks
 
