@@ -277,6 +277,7 @@ class Twin:
             friction_factor=self._friction_factor(properties),
             added_mass=self.body.added_mass,
             terms=(*self.contacts, *self._pushes(control_times, control_points)),
+            span_s=(float(knots[0]), float(knots[-1])),
             device=self.device,
         )
         for known in active:
