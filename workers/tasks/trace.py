@@ -19,6 +19,7 @@ from physworld.calibrate import CalibrationConfig, Journal
 from physworld.calibrate.parameters import bending_ratio
 from physworld.errors import PhysworldError
 from physworld.materials.laws import SheetLaw
+from physworld.simulations import engine
 from physworld.trace import TraceConfig, trace
 from physworld.twin import Twin
 from schemas.base import Reference
@@ -159,7 +160,7 @@ def _undamped_twin(stores: Stores, fit_id: str | None, budget: int) -> Twin | No
 def _journal(stores: Stores, job_id: str, payload: dict[str, Any]) -> Journal:
     stored = stores.scratch.get(job_id, JOURNAL)
     return Journal(
-        json.dumps(payload, sort_keys=True),
+        f"{engine()} {json.dumps(payload, sort_keys=True)}",
         None if stored is None else stored.decode(),
         lambda text: stores.scratch.put(job_id, JOURNAL, text.encode()),
     )
