@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.trace_power_objects import SIGMA_M, Object, observed
-from physworld.effects.places import body_size, free_end
+from physworld.effects.places import body_size, middle_of_free_end
 from physworld.effects.registry import EFFECTS, effect
 from physworld.errors import EffectRefused, SimulationError
 from physworld.twin import Twin
@@ -135,7 +135,7 @@ def _direction(name: str, twin: Twin) -> tuple[dict[str, float], dict[str, float
 def _shapes(name: str, twin: Twin, known: dict) -> dict[str, float]:
     """Numbers that only shape the effect, away from those of the variants that a trace tries."""
     if name == "tether":
-        end, reach = free_end(twin), body_size(twin)
+        end, reach = middle_of_free_end(twin), body_size(twin)
         way = np.array([0.3, 0.9, 0.32])
         anchor = end + 0.7 * reach * way / np.linalg.norm(way)
         return {

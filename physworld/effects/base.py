@@ -90,6 +90,10 @@ class Effect:
         """Why the effect makes no sense for this twin; None where it does."""
         return None
 
+    def placed(self, twin: Twin) -> Effect:
+        """The same with the places that ``None`` leaves to the twin."""
+        return self
+
     def controls(self, times: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The control track (Tc,) [s], (Tc, K, 3) [m] that the body really followed."""
         return times, points

@@ -53,7 +53,7 @@ def named(model: Model, estimated: dict[str, Number]) -> tuple[Named, ...]:
     effects = {known.name: known for known in model.fitted.twin.effects}
     for name in model.names:
         own = {k.split(".", 1)[1]: n for k, n in estimated.items() if k.startswith(f"{name}.")}
-        shown = effects.get(name, EFFECTS[name]())
+        shown = effects.get(name, EFFECTS[name]()).placed(model.fitted.twin)
         for key, value in shown.values.items():
             if key not in own and value is not None and key not in shown.gates and value != 0.0:
                 unit = next((s.unit for s in shown.strengths(model.fitted.twin) if s.name == key), "m")
