@@ -255,6 +255,31 @@ def test_a_grip_that_gives_sinks_under_the_weight_by_its_compliance(name: str) -
     assert sunk[2] == pytest.approx(-0.002, rel=0.05)
 
 
+def test_every_grip_has_the_compliance_whatever_it_holds() -> None:
+    first, last = np.arange(3), np.arange(len(TWINS["rope"].body.start))[-8:]
+    twin = replace(
+        TWINS["rope"],
+        held_nodes=(first, last),
+        controller_groups=(np.array([0]), np.array([1])),
+        controllers_start=TWINS["rope"].body.start[[1, -4]],
+        grip_regions=(None, None),
+        ground_height_m=None,
+    )
+    soft = twin.with_effect(effect("grip_slip", compliance_m_n=2e-3, damping_ratio=0.5))
+    times = np.linspace(0.0, 1.0, 3)
+    still = np.repeat(twin.controllers_start[None], 2, axis=0)
+    run = soft.integration(times[[0, -1]], still, times)
+    bound = run.problem.terms[-1].bind(run.problem)
+    stiffness, friction = (bound.inputs[k].numpy() for k in (1, 2))
+    mass = run.problem.nodal_mass()
+    for nodes, own in ((first, slice(0, 3)), (last, slice(3, 11))):
+        held = mass[nodes].sum()
+        assert stiffness[own].sum() == pytest.approx(1.0 / 2e-3)
+        assert friction[own].sum() == pytest.approx(np.sqrt(held / 2e-3))
+        np.testing.assert_allclose(stiffness[own] / stiffness[own].sum(), mass[nodes] / held)
+    assert bound.frequency_rad_s == pytest.approx(1.0 / np.sqrt(2e-3 * mass[first].sum()))
+
+
 def test_a_grip_that_gives_follows_a_slow_gripper() -> None:
     twin = replace(TWINS["rope"], gravity_m_s2=np.zeros(3), ground_height_m=None)
     soft = twin.with_effect(effect("grip_slip", compliance_m_n=2e-3))
