@@ -3,7 +3,8 @@
 A *level* says how far an effect moves the tracked points from where they would have been, root mean square per axis
 over the training frames, in units of the tracking noise. The strength that does it is found by simulation; bounds of
 the registry clip it. Shapes (fibre directions, places, relaxation times) lie between the variants that a trace tries,
-and where an effect has a group of components all of them act.
+and where an effect has a group of components all of them act. A camera whose scale is off scales every frame, frame 0
+too, which is where a trace learns the points' places from; displacement counts from there.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.trace_power_objects import SIGMA_M, Object, observed
-from physworld.effects.places import body_size, free_end
+from physworld.effects.places import body_size, middle_of_free_end
 from physworld.effects.registry import EFFECTS, effect
 from physworld.errors import EffectRefused, SimulationError
 from physworld.twin import Twin
@@ -23,6 +24,7 @@ _CLOSE = 0.15  # relative difference to the wanted displacement that ends the se
 _TRIALS = 8
 _FACTOR = 30.0  # of one step of the search
 _FAILED = 0.3  # factor after a run that cannot be trusted
+_SCALE = "measurement_scale"
 
 _DIRECTIONS: dict[str, dict[str, float]] = {
     "rest_shape": {"curvature_1_per_m": 1.0},
@@ -80,11 +82,12 @@ def inject(name: str, known: Object, without: np.ndarray, level: float) -> Injec
         strengths = {gate: scale * part for gate, part in direction.items()}
         try:
             changed = twin.with_effect(effect(name, **shapes, **strengths))
-            tracks = observed(changed, known.scene)
+            tracks = observed(changed, known.scene) if name != _SCALE else _scaled(twin, without, strengths)
         except (SimulationError, EffectRefused):
             scale *= _FAILED
             continue
-        moved = float(np.sqrt(np.mean((tracks - without)[window] ** 2))) / SIGMA_M
+        shift = (tracks - tracks[0]) - (without - without[0])
+        moved = float(np.sqrt(np.mean(shift[window] ** 2))) / SIGMA_M
         size = float(np.linalg.norm(list(strengths.values())[: _alike(name)]))
         at_bound = scale >= most * (1 - 1e-9)
         found = Injection(
@@ -96,6 +99,12 @@ def inject(name: str, known: Object, without: np.ndarray, level: float) -> Injec
             break
         scale = min(scale * float(np.clip(level / max(moved, 1e-12), 1 / _FACTOR, _FACTOR)), most)
     return best
+
+
+def _scaled(twin: Twin, without: np.ndarray, strengths: dict[str, float]) -> np.ndarray:
+    """What a camera shows of true tracks whose scale is off, about the grip."""
+    centre = twin.controllers_start.mean(axis=0)
+    return centre + (1.0 + strengths["scale"]) * (without - centre)
 
 
 def _off(found: Injection, level: float) -> float:
@@ -126,7 +135,7 @@ def _direction(name: str, twin: Twin) -> tuple[dict[str, float], dict[str, float
 def _shapes(name: str, twin: Twin, known: dict) -> dict[str, float]:
     """Numbers that only shape the effect, away from those of the variants that a trace tries."""
     if name == "tether":
-        end, reach = free_end(twin), body_size(twin)
+        end, reach = middle_of_free_end(twin), body_size(twin)
         way = np.array([0.3, 0.9, 0.32])
         anchor = end + 0.7 * reach * way / np.linalg.norm(way)
         return {

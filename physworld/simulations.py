@@ -11,7 +11,9 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import cache
 from multiprocessing import get_context
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -19,6 +21,8 @@ import numpy as np
 from physworld.errors import CFLViolation, SimulationError
 from physworld.mpm.total_lagrangian import TotalLagrangian, run_again_if_blown_up
 from physworld.twin import Twin
+
+_ENGINE = ("effects", "geometry", "materials", "mpm")  # beside the modules next to this one
 
 
 @dataclass(frozen=True)
@@ -38,8 +42,11 @@ class Job:
     least_step_s: float = 0.0
 
     def fingerprint(self, drive: bytes) -> str:
-        """Digest of everything that the result depends on; ``drive`` stands for times and controls."""
-        digest = hashlib.sha256(drive)
+        """Digest of everything that the result depends on; ``drive`` stands for times and controls.
+
+        Also on the engine: a memory that is kept over a change of it starts afresh.
+        """
+        digest = hashlib.sha256(drive + engine().encode())
         arrays = self.twin.to_arrays()
         for name in sorted(arrays):
             value = np.ascontiguousarray(arrays[name])
@@ -47,6 +54,18 @@ class Job:
             digest.update(value.tobytes())
         digest.update(json.dumps([self.frames, self.step_share]).encode())
         return digest.hexdigest()
+
+
+@cache
+def engine() -> str:
+    """Digest of the sources that decide what a simulation gives; read once in a process."""
+    home = Path(__file__).parent
+    sources = [*home.glob("*.py"), *(source for room in _ENGINE for source in (home / room).rglob("*.py"))]
+    digest = hashlib.sha256()
+    for source in sorted(sources):
+        content = source.read_bytes()
+        digest.update(f"{source.relative_to(home).as_posix()} {len(content)}\n".encode() + content)
+    return digest.hexdigest()
 
 
 @dataclass(frozen=True)

@@ -277,6 +277,7 @@ class Twin:
             friction_factor=self._friction_factor(properties),
             added_mass=self.body.added_mass,
             terms=(*self.contacts, *self._pushes(control_times, control_points)),
+            span_s=(float(knots[0]), float(knots[-1])),
             device=self.device,
         )
         for known in active:
@@ -327,8 +328,11 @@ class Twin:
             nodes: the carriers' trajectories, (T, n, 3) [m].
             times: their frames, (T,) [s].
         """
-        tracks = self.track_nodes(nodes)
-        for known in in_order(self.effects):
+        active, followed = in_order(self.effects), self
+        for known in active:
+            followed = known.followed(followed)
+        tracks = followed.track_nodes(nodes)
+        for known in active:
             tracks = known.measured(times, tracks, self)
         return tracks
 

@@ -45,7 +45,8 @@ class TraceCreate(Request):
     """Body of POST /v1/traces.
 
     A trace calibrates the declared physics itself, with ``fit``'s budgets and never with damping. ``fit_id`` names a
-    ready fit of the scene: its twin is taken instead where it holds no damping and has ``fit``'s number of particles.
+    ready fit of the scene: its twin is taken instead where its physics is the declared one (no damping, the usual law,
+    a sheet that bends as a plate) and it has ``fit``'s number of particles.
 
     ``scene_ids`` are further recordings of the same object, fitted together with ``scene_id``;
     ``held_out_scene_ids`` are recordings that only the report sees.

@@ -31,6 +31,7 @@ from schemas.base import Problem, Reference
 from schemas.dataset import Episode
 from schemas.fit import FitConfig
 from schemas.job import TERMINAL_STATES, Progress
+from schemas.trace import TRACE_PARTICLES
 from storage import helpers, registry, resources, runs, traces
 from storage.chain import dataset_planned, open_next, share_done
 from storage.errors import Conflict, NotFound
@@ -214,7 +215,8 @@ def _apply_assessment(session: Session, job: JobRow, assessment_id: str, result:
     request = AssessmentCreate.model_validate(job.config)
     if result.outcome != "worse_than_expected" or not request.open_trace:
         return
-    opened = open_trace(session, row.scene_id, FitConfig(damping="none"), request.trace)
+    declared = FitConfig(damping="none", particle_budget=TRACE_PARTICLES)
+    opened = open_trace(session, row.scene_id, declared, request.trace)
     row.trace_id = opened.outputs[0]["id"]
     job.outputs = [*job.outputs, *opened.outputs]
     append_event(session, job.id, "log", {"message": "trace queued", "child": opened.id, "kind": "trace"})

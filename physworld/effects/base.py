@@ -6,8 +6,8 @@ strengths (a relaxation time, a place) only shape what an open gate lets in; ``N
 from the twin.
 
 The hooks run in this order: :meth:`~Effect.controls`, :meth:`~Effect.problem`, :meth:`~Effect.grips`,
-:meth:`~Effect.attach`, then the integration, then :meth:`~Effect.measured`; in each the effects take their turn in the
-order of the registry. A hook leaves what it does not change.
+:meth:`~Effect.attach`, then the integration, then :meth:`~Effect.followed` and :meth:`~Effect.measured`; in each the
+effects take their turn in the order of the registry. A hook leaves what it does not change.
 """
 
 from __future__ import annotations
@@ -90,6 +90,10 @@ class Effect:
         """Why the effect makes no sense for this twin; None where it does."""
         return None
 
+    def placed(self, twin: Twin) -> Effect:
+        """The same with the places that ``None`` leaves to the twin."""
+        return self
+
     def controls(self, times: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The control track (Tc,) [s], (Tc, K, 3) [m] that the body really followed."""
         return times, points
@@ -105,6 +109,10 @@ class Effect:
     def attach(self, problem: Problem, held: HeldNodes, twin: Twin) -> tuple[Problem, HeldNodes]:
         """For a grip that pulls instead of prescribing: takes nodes out of ``held`` and adds a term."""
         return problem, held
+
+    def followed(self, twin: Twin) -> Twin:
+        """The twin whose tracked points are followed: other ones where the first frame shows them wrongly."""
+        return twin
 
     def measured(self, times: np.ndarray, tracks: np.ndarray, twin: Twin) -> np.ndarray:
         """What the camera reports at ``times`` (T,) [s] of true ``tracks`` (T, N, 3) [m]."""

@@ -1,10 +1,10 @@
 """A grip that gives: held material hangs on a damped spring instead of being prescribed.
 
-    F = (path - x) / C + 2 zeta sqrt(M / C) (dpath/dt - v)        C compliance [m/N], M the held mass
+    F = (path - x) / C + 2 zeta sqrt(M / C) (dpath/dt - v)        C compliance [m/N], M the mass that the grip holds
 
-The spring is spread over the held nodes by their mass, so all of them have one frequency 1/sqrt(C M) and a pad of
-rubber turns as well as shifts. With several grips every one has the compliance C. The smaller C, the smaller the time
-step: below the probe the grip is stiffer than the body's own fastest mode and shows nothing.
+The spring is spread over the held nodes by their mass, so all of a grip have one frequency 1/sqrt(C M) and a pad of
+rubber turns as well as shifts. With several grips every one has the compliance C, whatever it holds. The smaller C, the
+smaller the time step: below the probe the grip is stiffer than the body's own fastest mode and shows nothing.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
+from scipy.spatial import cKDTree
 
 from physworld.effects.base import Effect, Strength
 from physworld.effects.places import gravity_size, held_count
@@ -62,10 +63,14 @@ def pull_of_grip(
 
 @dataclass(frozen=True)
 class GripSprings:
-    """Term of :class:`GripSlip`: the nodes that were held, and their paths."""
+    """Term of :class:`GripSlip`: the nodes that were held, and their paths; what each grip holds at the start.
+
+    ``grips``: places of their nodes [m], (n, 3) each: what is held belongs to the grip that has the nearest.
+    """
 
     held: HeldNodes
-    stiffness_n_m: float
+    grips: tuple[np.ndarray, ...]
+    compliance_m_n: float
     damping_ratio: float
 
     def bind(self, problem: Problem) -> BoundGripSprings:
@@ -82,7 +87,10 @@ class GripSprings:
     def _bound(self, problem: Problem, masses: np.ndarray, held: HeldNodes) -> BoundGripSprings:
         device, frames = problem.device, len(held.positions)
         mass = masses[held.nodes]
-        frequency = float(np.sqrt(self.stiffness_n_m / mass.sum()))
+        gaps = np.stack([cKDTree(places).query(held.positions[0])[0] for places in self.grips])
+        owner = np.argmin(gaps, axis=0)
+        of_grip = np.bincount(owner, weights=mass, minlength=len(self.grips))[owner]
+        frequency = 1.0 / np.sqrt(self.compliance_m_n * of_grip)
         rate = 2 * self.damping_ratio * frequency
         inputs = [
             wp.array(held.nodes, dtype=wp.int32, device=device),
@@ -91,7 +99,7 @@ class GripSprings:
             wp.array(held.positions.reshape(frames, -1), dtype=wp.float64, device=device),
             wp.array(held.velocities.reshape(frames, -1), dtype=wp.float64, device=device),
         ]
-        return BoundGripSprings(inputs, device, frequency, rate)
+        return BoundGripSprings(inputs, device, float(frequency.max()), float(rate.max()))
 
 
 @dataclass(frozen=True)
@@ -127,9 +135,9 @@ class GripSlip(Effect):
         """Up to giving way a tenth of the size under the weight; the probe is a spring as fast as a cell."""
         weight = float(twin.particle_mass.sum()) * gravity_size(twin)
         mass = nodal_mass(twin.lattice, twin.law, None)
-        held = np.concatenate([np.empty(0, dtype=int), *twin.held_nodes]).astype(int)
+        lightest = min((float(mass[nodes].sum()) for nodes in twin.held_nodes if len(nodes)), default=0.0)
         rate = twin.law.wave_speed_m_s / float(twin.lattice.spacing.min())
-        probe = 4.0 / (rate**2 * max(float(mass[held].sum()), 1e-12))
+        probe = 4.0 / (rate**2 * max(lightest, 1e-12))
         high = max(0.1 * float(np.ptp(twin.particles_start, axis=0).max()) / weight, 10.0 * probe)
         return (
             Strength("compliance_m_n", "m/N", 0.0, high, probe),
@@ -148,8 +156,8 @@ class GripSlip(Effect):
 
     def attach(self, problem: Problem, held: HeldNodes, twin: Twin) -> tuple[Problem, HeldNodes]:
         """Frees the held nodes and pulls them instead."""
-        grips = sum(len(nodes) > 0 for nodes in twin.held_nodes)
-        term = GripSprings(held, grips / self.compliance_m_n, self.damping_ratio)
+        grips = tuple(twin.body.start[nodes] for nodes in twin.held_nodes if len(nodes))
+        term = GripSprings(held, grips, self.compliance_m_n, self.damping_ratio)
         empty = np.empty((len(held.positions), 0, 3))
         free = HeldNodes(np.empty(0, dtype=int), empty, empty)
         return replace(problem, terms=(*problem.terms, term)), free

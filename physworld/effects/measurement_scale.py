@@ -3,11 +3,15 @@
     measured = c + (1 + s) (true - c)        c: middle of the controllers at the start
 
 The controllers are taken as right (they are commanded, or seen by something else). Looks like a wrong stiffness.
+
+Frame 0, which places the tracked points on the body, comes from the same camera. A solid's box or volume is declared:
+its points sit at c + (p - c) / (1 + s) where p was measured. A sheet or rod is as long as its points show it, so they
+keep their places on it, and c is each point's own start. Either way frame 0 is predicted as it was measured.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -35,8 +39,25 @@ class MeasurementScale(Effect):
         """A fifth either way."""
         return (Strength("scale", "1", -0.2, 0.2, 0.005),)
 
+    def followed(self, twin: Twin) -> Twin:
+        """A solid with its tracked points where they are, not where frame 0 shows them."""
+        if twin.lattice.dim < 3:
+            return twin
+        centre = _centre(twin)
+        points = centre + (twin.body.points - centre) / (
+            1.0 + self.scale
+        )  # material coordinates are the start's
+        return replace(twin, body=replace(twin.body, points=points))
+
     def measured(self, times: np.ndarray, tracks: np.ndarray, twin: Twin) -> np.ndarray:
-        """Stretched about the grip, or about the body's middle where nobody holds it."""
-        start = twin.controllers_start if len(twin.controllers_start) else twin.particles_start
-        centre = start.mean(axis=0)
+        """Stretched about the centre."""
+        centre = _centre(twin)
         return centre + (1.0 + self.scale) * (tracks - centre)
+
+
+def _centre(twin: Twin) -> np.ndarray:
+    """What the camera shows in its true place [m], (3,) or (N, 3): see the module's text; unheld solids' middle."""
+    if twin.lattice.dim < 3:
+        return twin.track_nodes(twin.body.start[None])[0]
+    start = twin.controllers_start if len(twin.controllers_start) else twin.particles_start
+    return start.mean(axis=0)

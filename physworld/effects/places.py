@@ -30,16 +30,21 @@ def free_end(twin: Twin) -> np.ndarray:
 
 
 def middle_of_free_end(twin: Twin) -> np.ndarray:
-    """Centre of the particles that lie as far from what is held as :func:`free_end` within half a cell [m], (3,)."""
+    """Centre of the particles that lie as far from what is held as :func:`free_end` within half a cell [m], (3,).
+
+    Where those are ends apart, with their centre less than half as far, it is :func:`free_end` alone.
+    """
     places = twin.particles_start[twin.particle_mass > 0]
     gap = _from_held(twin, places)
-    return places[gap >= gap.max() - 0.5 * float(twin.lattice.spacing.max())].mean(axis=0)
+    middle = places[gap >= gap.max() - 0.5 * float(twin.lattice.spacing.max())].mean(axis=0)
+    return middle if _from_held(twin, middle[None])[0] >= 0.5 * gap.max() else free_end(twin)
 
 
 def _from_held(twin: Twin, places: np.ndarray) -> np.ndarray:
-    """Distance of places (P, 3) from what is held, or from their middle, (P,) [m]."""
+    """Distance of places (P, 3) from what is held, or from the body's middle, (P,) [m]."""
     held = np.concatenate([np.empty(0, dtype=int), *twin.held_nodes]).astype(int)
-    known = twin.body.start[held] if len(held) else places.mean(axis=0, keepdims=True)
+    middle = twin.particles_start[twin.particle_mass > 0].mean(axis=0, keepdims=True)
+    known = twin.body.start[held] if len(held) else middle
     return np.linalg.norm(places[:, None] - known[None], axis=2).min(axis=1)
 
 

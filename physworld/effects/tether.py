@@ -3,7 +3,8 @@
     F = -k (1 - l / |d|) d        d = centroid - anchor, l rest length; pulls and pushes
 
 The force is spread over the material as the centroid's weights, so it does the work of the spring. Where nothing is
-given the tether holds the end that is farthest from the grips, the anchor is where that end started, and l is 0.
+given the tether holds the middle of the end that is farthest from the grips, wherever the twin has it; the anchor is
+where that started, and l is 0.
 """
 
 from __future__ import annotations
@@ -15,7 +16,13 @@ import numpy as np
 import warp as wp
 
 from physworld.effects.base import Effect, Strength
-from physworld.effects.places import body_size, free_end, gravity_size, region_shares, region_weights
+from physworld.effects.places import (
+    body_size,
+    gravity_size,
+    middle_of_free_end,
+    region_shares,
+    region_weights,
+)
 from physworld.mpm.node_kernels import weighted_sum
 from physworld.mpm.particle_terms import ParticleBody
 from physworld.mpm.terms import BoundTerm
@@ -117,7 +124,7 @@ class Tether(Effect):
     @classmethod
     def strengths(cls, twin: Twin) -> tuple[Strength, ...]:
         """Up to a thousand times the weight over the size; the anchor within three sizes of the free end."""
-        size, end = body_size(twin), free_end(twin)
+        size, end = body_size(twin), middle_of_free_end(twin)
         scale = float(twin.particle_mass.sum()) * gravity_size(twin) / size
         return (
             Strength("stiffness_n_m", "N/m", 0.0, 1e3 * scale, 0.02 * scale),
@@ -130,12 +137,19 @@ class Tether(Effect):
 
     def places(self, twin: Twin) -> tuple[np.ndarray, np.ndarray]:
         """Anchor and centre of the material at the start [m], (3,) each."""
-        end = free_end(twin)
+        end = middle_of_free_end(twin)
         given = [(self.attach_x_m, self.attach_y_m, self.attach_z_m)]
         given.append((self.anchor_x_m, self.anchor_y_m, self.anchor_z_m))
         attach = np.array([c if value is None else value for value, c in zip(given[0], end, strict=True)])
         anchor = np.array([c if value is None else value for value, c in zip(given[1], attach, strict=True)])
         return anchor, attach
+
+    def placed(self, twin: Twin) -> Tether:
+        """With the places of anchor and material on this twin."""
+        ends = zip(("anchor", "attach"), self.places(twin), strict=True)
+        return replace(
+            self, **{f"{e}_{a}_m": float(c) for e, end in ends for a, c in zip("xyz", end, strict=True)}
+        )
 
     def problem(self, problem: Problem, twin: Twin) -> Problem:
         """Adds the term."""

@@ -2,7 +2,8 @@
 
     stiffness(t) = exp(a t) stiffness(0)        t from the first frame of the recording
 
-It multiplies the law's own forces, its friction with them, before any other term acts.
+It multiplies the law's own forces, its friction with them, before any other term acts. The time step is that of the
+stiffest moment of the run.
 """
 
 from __future__ import annotations
@@ -15,15 +16,18 @@ import warp as wp
 
 from physworld.effects.base import Effect, Strength
 from physworld.errors import CFLViolation
+from physworld.materials.laws import friction_law
+from physworld.mpm.forces import InternalForces
 from physworld.mpm.particle_stress_kernels import grow_stress
 from physworld.mpm.particle_terms import BoundParticleStress, ParticleBody
+from physworld.mpm.stability import fastest_frequency
 from physworld.mpm.terms import BoundTerm
 from physworld.mpm.total_lagrangian import Problem
 
 if TYPE_CHECKING:
     from physworld.twin import Twin
 
-_MOST = 2.0  # growth of the stiffness that the stable time step's own margin covers
+_COVERED = 2.0  # growth of the stiffness that the stable time step's own margin covers
 
 
 @wp.kernel
@@ -49,12 +53,14 @@ class GrowingStiffness:
     rate_per_s: float
 
     def bind(self, problem: Problem) -> BoundGrowth:
-        """Room for the times comes with the run."""
-        return BoundGrowth(self.rate_per_s, problem.device)
+        """Room for the times comes with the run; the time step is told what the stiffness grows to."""
+        return BoundGrowth(self.rate_per_s, problem.device, *_faster(problem, self.rate_per_s))
 
     def on_particles(self, body: ParticleBody) -> BoundStressGrowth:
         """The same on particles' stresses."""
-        return BoundStressGrowth(self.rate_per_s, body.problem.device)
+        return BoundStressGrowth(
+            self.rate_per_s, body.problem.device, *_faster(body.problem, self.rate_per_s)
+        )
 
 
 @dataclass
@@ -63,12 +69,16 @@ class BoundGrowth(BoundTerm):
 
     rate_per_s: float
     device: str
+    covered: float
+    frequency_rad_s: float
+    friction_per_s: float
     times: wp.array | None = None
     multiplies: bool = True
 
     def begin(self, times: np.ndarray) -> None:
-        """Take the times. Raises CFLViolation where the stiffness would outgrow the time step's margin."""
-        self.times = wp.array(_within_margin(times, self.rate_per_s), dtype=wp.float64, device=self.device)
+        """Take the times. Raises CFLViolation where the stiffness would outgrow the time step."""
+        _check(times, self.rate_per_s, self.covered)
+        self.times = wp.array(times, dtype=wp.float64, device=self.device)
 
     def launch(self, x: wp.array, v: wp.array, clock: wp.array, counter: wp.array, force: wp.array) -> None:
         """Multiply the forces that are there."""
@@ -79,13 +89,17 @@ class BoundGrowth(BoundTerm):
 class BoundStressGrowth(BoundParticleStress):
     """The rate on particles: each stress is multiplied in the substep that uses it."""
 
-    def __init__(self, rate_per_s: float, device: str) -> None:
-        self._rate, self._device = rate_per_s, device
+    def __init__(
+        self, rate_per_s: float, device: str, covered: float, frequency_rad_s: float, friction_per_s: float
+    ) -> None:
+        self._rate, self._device, self._covered = rate_per_s, device, covered
+        self.frequency_rad_s, self.friction_per_s = frequency_rad_s, friction_per_s
         self._times = wp.zeros(1, dtype=wp.float64, device=device)
 
     def begin(self, times: np.ndarray) -> None:
-        """Take the times. Raises CFLViolation where the stiffness would outgrow the time step's margin."""
-        self._times = wp.array(_within_margin(times, self._rate), dtype=wp.float64, device=self._device)
+        """Take the times. Raises CFLViolation where the stiffness would outgrow the time step."""
+        _check(times, self._rate, self._covered)
+        self._times = wp.array(times, dtype=wp.float64, device=self._device)
 
     def launch(self, F: wp.array, stress: wp.array, clock: wp.array, counter: wp.array) -> None:
         """Multiply the stresses that are there."""
@@ -93,14 +107,34 @@ class BoundStressGrowth(BoundParticleStress):
         wp.launch(grow_stress, dim=len(stress), inputs=inputs, outputs=[stress], device=self._device)
 
 
-def _within_margin(times: np.ndarray, rate_per_s: float) -> np.ndarray:
-    growth = float(np.exp(rate_per_s * np.array([times[0], times[-1]])).max())
-    if growth > _MOST:
+def _growth(rate_per_s: float, times: np.ndarray) -> float:
+    """Largest stiffness over the first frame's, at ``times``."""
+    return float(np.exp(rate_per_s * times).max())
+
+
+def _faster(problem: Problem, rate_per_s: float) -> tuple[float, float, float]:
+    """Growth that the time step has to cover, and what it adds to the fastest mode and to the fastest friction."""
+    growth = 1.0 if problem.span_s is None else _growth(rate_per_s, np.array(problem.span_s))
+    if growth <= _COVERED:
+        return _COVERED, 0.0, 0.0
+    lattice, mass, cell = problem.lattice, problem.nodal_mass(), float(problem.lattice.spacing.min())
+    stiffness = np.ones(lattice.fill.size) if problem.stiffness_factor is None else problem.stiffness_factor
+    squares = [0.0, 0.0]  # of the fastest modes of the law and of its friction alone
+    for k, law in enumerate((problem.law, friction_law(problem.law))):
+        if law is not None:
+            forces = InternalForces(lattice, law, stiffness, problem.rest, problem.device)
+            squares[k] = fastest_frequency(forces, problem.rest, mass, cell) ** 2
+    more = growth - _COVERED
+    return growth, float(np.sqrt(more * squares[0])), more * squares[1]
+
+
+def _check(times: np.ndarray, rate_per_s: float, covered: float) -> None:
+    growth = _growth(rate_per_s, times)
+    if growth > covered * (1 + 1e-9):
         raise CFLViolation(
             f"the stiffness grows {growth:.3g} times by a rate of {rate_per_s:.3g} 1/s until {times[-1]:.3g} s; the "
-            f"time step's margin covers {_MOST:g}"
+            f"time step covers {covered:.3g}"
         )
-    return times
 
 
 @dataclass(frozen=True)

@@ -56,6 +56,7 @@ class Problem:
         friction_factor: of the ground under them, likewise.
         added_mass: lumped masses that hang from the nodes [kg], (n,), or None.
         terms: what else acts on the nodes, contacts and effects, in the order of their launches.
+        span_s: first and last time of the run, for terms that change in time; None where nobody says.
     """
 
     lattice: Lattice
@@ -68,6 +69,7 @@ class Problem:
     added_mass: np.ndarray | None = None
     terms: tuple[Term, ...] = ()
     friction_factor: np.ndarray | None = None
+    span_s: tuple[float, float] | None = None
     device: str = field(default="cpu")
 
     def nodal_mass(self) -> np.ndarray:

@@ -81,12 +81,11 @@ def candidates(twin: Twin, names: tuple[str, ...] = ()) -> tuple[list[Candidate]
             refused[name] = reason
             continue
         known = {s.name: s for s in effect.strengths(twin)}
+        mirror = _MIRRORS[name](twin) if name in _MIRRORS else None
         for variant in _VARIANTS.get(name, _plain)(twin, known):
             gates = tuple(known[gate] for gate in variant.gates)
             shapes = tuple(known[shape] for shape in variant.shapes)
-            found.append(
-                Candidate(name, variant.label, gates, variant.fixed, shapes, effect.kind, _MIRRORS.get(name))
-            )
+            found.append(Candidate(name, variant.label, gates, variant.fixed, shapes, effect.kind, mirror))
     return found, refused
 
 
@@ -142,7 +141,10 @@ def _fibres(twin: Twin, known: Known) -> list[_Variant]:
 
 
 def _tethers(twin: Twin, known: Known) -> list[_Variant]:
-    """Relaxed springs from the middle of the free end in every direction: axes, and the diagonals between them."""
+    """Relaxed springs from the middle of the free end in every direction: axes, and the diagonals between them.
+
+    The anchor stands in the room; which material is tied is left to each recording's twin.
+    """
     end, reach = middle_of_free_end(twin), body_size(twin)
     axes = np.eye(3)
     ways = [*axes]
@@ -153,7 +155,6 @@ def _tethers(twin: Twin, known: Known) -> list[_Variant]:
         unit = way / np.linalg.norm(way)
         anchor = end + reach * unit
         fixed = {f"anchor_{a}_m": float(p) for a, p in zip("xyz", anchor, strict=True)}
-        fixed |= {f"attach_{a}_m": float(p) for a, p in zip("xyz", end, strict=True)}
         fixed["rest_length_m"] = reach
         label = "towards " + " ".join(f"{p:+.0f}" for p in np.sign(np.round(way, 6)))
         shapes = tuple(f"anchor_{a}_m" for a in "xyz")
@@ -161,16 +162,20 @@ def _tethers(twin: Twin, known: Known) -> list[_Variant]:
     return variants
 
 
-def _other_side(shape: Shape) -> Shape:
-    """The tether that pushes from the other side with the force of one that pulls, or pulls with one's that pushes.
+def _other_side(twin: Twin) -> Mirror:
+    """To the tether that pushes from the other side with the force of one that pulls, or pulls with one's that pushes.
 
     What tells the two apart is how a spring's force turns with it, which is of second order.
     """
-    anchor, attach = (np.array([shape[f"{end}_{a}_m"] for a in "xyz"]) for end in ("anchor", "attach"))
-    way, rest = anchor - attach, shape["rest_length_m"]
-    length = max(float(np.linalg.norm(way)), 1e-9)
-    other = attach - way / length * max(2.0 * rest - length, _SHORTEST * rest)
-    return shape | {f"anchor_{a}_m": float(p) for a, p in zip("xyz", other, strict=True)}
+    end = middle_of_free_end(twin)
+
+    def mirror(shape: Shape) -> Shape:
+        way, rest = np.array([shape[f"anchor_{a}_m"] for a in "xyz"]) - end, shape["rest_length_m"]
+        length = max(float(np.linalg.norm(way)), 1e-9)
+        other = end - way / length * max(2.0 * rest - length, _SHORTEST * rest)
+        return shape | {f"anchor_{a}_m": float(p) for a, p in zip("xyz", other, strict=True)}
+
+    return mirror
 
 
 def _fields(twin: Twin, known: Known) -> list[_Variant]:
@@ -206,4 +211,4 @@ _VARIANTS: dict[str, Callable[[Twin, Known], list[_Variant]]] = {
     "clamp_offset": _clamps,
 }
 
-_MIRRORS: dict[str, Mirror] = {"tether": _other_side}
+_MIRRORS: dict[str, Callable[[Twin], Mirror]] = {"tether": _other_side}

@@ -11,16 +11,11 @@ the service's fit. Ctrl-C cancels; nothing is written before the end but the fin
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 import sys
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from physworld.calibrate import Journal
-    from physworld.scene import Scene
+from typing import Any
 
 SCHEMA_VERSION = 1
 
@@ -73,6 +68,7 @@ def _fit(given: argparse.Namespace) -> None:
     wp.config.quiet = True  # before the first import that starts it
     from physworld.calibrate import CalibrationConfig, calibrate_in_stages
     from physworld.simulations import Workers, in_turn
+    from workers.commands.steps import journal_in
     from workers.commands.terminal import progress_bar, read_scene
     from workers.law_choice import AUTO, chosen_laws
     from workers.tasks.fit_accuracy import fit_accuracy, not_measured
@@ -86,7 +82,7 @@ def _fit(given: argparse.Namespace) -> None:
         transfer=given.transfer,
         plasticity=given.plasticity,
     )
-    journal = None if given.resume is None else _journal(given.resume, scene, f"{given.law} {config}")
+    journal = None if given.resume is None else journal_in(given.resume, scene, f"{given.law} {config}")
     with progress_bar(f"law {scene.name}") if given.law == AUTO else nullcontext() as shown:
         config, choice = chosen_laws(given.law, scene, config, shown, journal=journal)
     pool = Workers(given.processes) if given.processes > 1 else nullcontext(in_turn)
@@ -117,21 +113,6 @@ def _kept(path: Path | None) -> str:
     if path is None or not path.exists():
         return NOTHING_WRITTEN
     return f"no figures were written; the steps in {path} are kept, and the same command goes on from them"
-
-
-def _journal(path: Path, scene: Scene, settings: str) -> Journal:
-    """Finished steps of this scene under these settings, kept in ``path``."""
-    from physworld.calibrate import Journal
-    from storage.scene_bundle import canonical_archive
-
-    def save(text: str) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(f"{path.name}.part")
-        partial.write_text(text)
-        partial.replace(path)
-
-    key = f"{hashlib.sha256(canonical_archive(scene)).hexdigest()} {settings}"
-    return Journal(key, path.read_text() if path.exists() else None, save)
 
 
 def fit_document(scene_name: str, report: dict[str, Any]) -> dict[str, Any]:

@@ -13,7 +13,6 @@ so that the same command goes on where an earlier one was cut off. Ctrl-C cancel
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 import sys
 from contextlib import nullcontext
@@ -72,10 +71,11 @@ def _trace(given: argparse.Namespace) -> None:
     wp.config.quiet = True  # before the first import that starts it
     import numpy as np
 
-    from physworld.calibrate import CalibrationConfig, Journal
+    from physworld.calibrate import CalibrationConfig
     from physworld.simulations import in_turn
     from physworld.trace import Memory, TraceConfig, Workers, document, trace
     from physworld.trace.html import render
+    from workers.commands.steps import journal_in
     from workers.commands.terminal import progress_bar, read_scene
 
     scenes = [read_scene(path) for path in given.scenes]
@@ -87,9 +87,7 @@ def _trace(given: argparse.Namespace) -> None:
     memory = journal = None
     if given.resume is not None:
         memory = Memory(given.resume / "simulations")
-        stored = given.resume / "calibration.json"
-        key = hashlib.sha256(scene.points.tobytes() + repr(config.calibration).encode()).hexdigest()
-        journal = Journal(key, stored.read_text() if stored.exists() else None, stored.write_text)
+        journal = journal_in(given.resume / "calibration.json", scene, f"{config.calibration}")
     pool = Workers(given.processes) if given.processes > 1 else nullcontext(in_turn)
     with progress_bar(f"trace {scene.name}") as shown, pool as runner:
         result = trace(

@@ -13,8 +13,13 @@ import re
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from physworld.calibrate import CalibrationConfig, Journal
+from physworld.calibrate.parameters import bending_ratio
 from physworld.errors import PhysworldError
+from physworld.materials.laws import SheetLaw
+from physworld.simulations import engine
 from physworld.trace import TraceConfig, trace
 from physworld.twin import Twin
 from schemas.base import Reference
@@ -34,6 +39,7 @@ if TYPE_CHECKING:
     from physworld.scene import Scene
 
 JOURNAL = "calibration.json"
+_PLATE = 1e-6  # relative difference to a homogeneous plate of the declared thickness that is rounding
 _STAGES = (  # of a trace, with the share of its work that is done when one begins
     ("declared physics", 0.35),
     ("numerics", 0.45),
@@ -132,13 +138,21 @@ class _Progress:
 
 
 def _undamped_twin(stores: Stores, fit_id: str | None, budget: int) -> Twin | None:
-    """The fit's twin where its physics is the declared one and its cells are of this budget; else None."""
+    """The fit's twin where its physics is the declared one and its cells are of this budget; else None.
+
+    A sheet whose bending has a shape of its own is none: an effect such as fibres may have gone into it.
+    """
     if fit_id is None:
         return None
     with stores.database.reading() as session:
-        if resources.get_fit(session, fit_id).config.particle_budget != budget:
-            return None
+        config = resources.get_fit(session, fit_id).config
+    if config.particle_budget != budget or not config.usual_physics:
+        return None
     twin = twin_of(stores, fit_id)
+    if isinstance(twin.law, SheetLaw):
+        shape = (twin.law.bending_coupling, bending_ratio(twin))
+        if not np.allclose(shape, 1.0, rtol=_PLATE):
+            return None
     damped = re.compile("drag|viscosity|relaxation")
     return None if any(value for name, value in twin.parameters.items() if damped.search(name)) else twin
 
@@ -146,7 +160,7 @@ def _undamped_twin(stores: Stores, fit_id: str | None, budget: int) -> Twin | No
 def _journal(stores: Stores, job_id: str, payload: dict[str, Any]) -> Journal:
     stored = stores.scratch.get(job_id, JOURNAL)
     return Journal(
-        json.dumps(payload, sort_keys=True),
+        f"{engine()} {json.dumps(payload, sort_keys=True)}",
         None if stored is None else stored.decode(),
         lambda text: stores.scratch.put(job_id, JOURNAL, text.encode()),
     )

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from api_service import REPORT, TRACKS, Service, assert_problem, scene_id
 
+from schemas.trace import TraceCreate
+
 
 @pytest.fixture(autouse=True)
 def usual_answers(service: Service) -> Iterator[None]:
@@ -184,6 +186,7 @@ def test_an_assessment_opens_a_trace_where_the_model_has_become_worse(
     if traced:
         trace = client.get(answer["links"]["trace"]).json()
         assert (trace["scene_id"], trace["config"]["iterations"]) == (scene, 3)
+        assert trace["fit"] == TraceCreate(scene_id=scene).fit.model_dump(mode="json")
         done = client.get(f"/v1/jobs/{job['id']}").json()
         assert done["links"]["trace"] == answer["links"]["trace"]
         service.work()

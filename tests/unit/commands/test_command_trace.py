@@ -14,9 +14,12 @@ from physworld_client.cli.app import app
 from typer.testing import CliRunner
 
 from physworld.build import build_twin
+from physworld.calibrate import Journal
+from physworld.errors import Cancelled
 from physworld.scene import UNDEFORMED_AT_REST, Grip
-from storage.scene_bundle import write_bundle
+from storage.scene_bundle import read_bundle, write_bundle
 from workers.commands import trace
+from workers.commands.terminal import INTERRUPTED
 
 BUDGET, FRAMES = 60, 10
 
@@ -88,3 +91,23 @@ def test_what_follows_held_out_is_held_out(
 
 def test_a_held_out_without_a_scene_is_refused() -> None:
     assert CliRunner().invoke(app, ["trace", "a", "--held-out"]).exit_code == 2
+
+
+def test_steps_of_a_calibration_belong_to_everything_that_the_scene_declares(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found: list[int] = []
+
+    def watched(*arguments: object, journal: Journal, **more: object) -> None:
+        found.append(journal.step("a step", lambda: {"command": len(found)})["command"])
+        raise Cancelled("seen")
+
+    monkeypatch.setattr("physworld.trace.trace", watched)
+    known = read_bundle(bundle(tmp_path / "a", 0.004, 0))
+    heavy = replace(known, body=replace(known.body, density_kg_m3=500.0))
+    light = replace(known, gravity_m_s2=np.array([0.0, 0.0, -3.7]))
+    for k, scene in enumerate((known, known, heavy, light, replace(light, train=(0, 5)))):
+        write_bundle(scene, tmp_path / str(k))
+        given = [str(tmp_path / str(k)), "--resume", str(tmp_path / "kept"), "--processes", "1"]
+        assert trace.main(given) == INTERRUPTED
+    assert found == [0, 0, 2, 3, 4]

@@ -11,8 +11,9 @@ from effect_twins import SCENES, TWINS, centroid, loose, moved
 from scipy.optimize import brentq
 
 from physworld.effects.registry import effect
+from physworld.effects.time_varying_stiffness import GrowingStiffness
 from physworld.errors import CFLViolation
-from physworld.mpm.total_lagrangian import Problem, nodal_mass
+from physworld.mpm.total_lagrangian import Problem, TotalLagrangian, nodal_mass
 from physworld.twin import Twin
 
 FIRST_ROOT = 1.8751  # of cos x cosh x = -1, the clamped-free beam
@@ -254,6 +255,31 @@ def test_a_grip_that_gives_sinks_under_the_weight_by_its_compliance(name: str) -
     assert sunk[2] == pytest.approx(-0.002, rel=0.05)
 
 
+def test_every_grip_has_the_compliance_whatever_it_holds() -> None:
+    first, last = np.arange(3), np.arange(len(TWINS["rope"].body.start))[-8:]
+    twin = replace(
+        TWINS["rope"],
+        held_nodes=(first, last),
+        controller_groups=(np.array([0]), np.array([1])),
+        controllers_start=TWINS["rope"].body.start[[1, -4]],
+        grip_regions=(None, None),
+        ground_height_m=None,
+    )
+    soft = twin.with_effect(effect("grip_slip", compliance_m_n=2e-3, damping_ratio=0.5))
+    times = np.linspace(0.0, 1.0, 3)
+    still = np.repeat(twin.controllers_start[None], 2, axis=0)
+    run = soft.integration(times[[0, -1]], still, times)
+    bound = run.problem.terms[-1].bind(run.problem)
+    stiffness, friction = (bound.inputs[k].numpy() for k in (1, 2))
+    mass = run.problem.nodal_mass()
+    for nodes, own in ((first, slice(0, 3)), (last, slice(3, 11))):
+        held = mass[nodes].sum()
+        assert stiffness[own].sum() == pytest.approx(1.0 / 2e-3)
+        assert friction[own].sum() == pytest.approx(np.sqrt(held / 2e-3))
+        np.testing.assert_allclose(stiffness[own] / stiffness[own].sum(), mass[nodes] / held)
+    assert bound.frequency_rad_s == pytest.approx(1.0 / np.sqrt(2e-3 * mass[first].sum()))
+
+
 def test_a_grip_that_gives_follows_a_slow_gripper() -> None:
     twin = replace(TWINS["rope"], gravity_m_s2=np.zeros(3), ground_height_m=None)
     soft = twin.with_effect(effect("grip_slip", compliance_m_n=2e-3))
@@ -275,8 +301,32 @@ def test_stiffness_grows_as_the_exponential_of_time() -> None:
     clock = wp.array([0.5, 20.0, 0.05], dtype=wp.float64)
     bound.launch(force, force, clock, wp.array([1, 4, 10], dtype=wp.int32), force)
     np.testing.assert_allclose(force.numpy(), np.arange(6.0) * np.exp(-0.4 * 0.7), rtol=1e-12)
-    with pytest.raises(CFLViolation, match="grows"):
-        moved(twin.with_effect(effect("time_varying_stiffness", log_rate_per_s=0.5)), np.array([0.0, 2.0]))
+    with pytest.raises(CFLViolation, match="grows"):  # nobody said how long the run is
+        GrowingStiffness(0.5).bind(problem).begin(np.array([0.0, 2.0]))
+
+
+@pytest.mark.parametrize("name", TWINS)
+def test_a_stiffness_that_grows_far_runs_at_the_time_step_of_its_stiffest_moment(name: str) -> None:
+    twin = replace(TWINS[name], ground_height_m=None)
+    grown = twin.with_effect(effect("time_varying_stiffness", log_rate_per_s=10.0))
+    times = np.linspace(0.0, 0.3, 7)
+    still = np.repeat(twin.controllers_start[None], 2, axis=0)
+    plain, run = (known.integration(times[[0, -1]], still, times) for known in (twin, grown))
+    ratio = TotalLagrangian(plain.problem).time_step_s / TotalLagrangian(run.problem).time_step_s
+    assert ratio == pytest.approx(np.sqrt(1.0 + np.exp(3.0) - 2.0), rel=0.05)
+    nodes = grown.simulate_nodes(times[[0, -1]], still, times)
+    size = np.ptp(moved(twin, times), axis=0).max()
+    assert np.ptp(nodes, axis=0).max() < 2 * size
+    first = grown.simulate_nodes(times[[0, -1]], still, times[:3])  # fewer frames of the same motion
+    np.testing.assert_allclose(first, nodes[:3], atol=1e-3 * size)
+
+
+def test_a_stiffness_that_grows_far_runs_on_particles() -> None:
+    twin = replace(TWINS["solid"], ground_height_m=None, formulation="updated_lagrangian")
+    grown = twin.with_effect(effect("time_varying_stiffness", log_rate_per_s=25.0))
+    times = np.linspace(0.0, 0.12, 7)
+    droop = [np.abs(moved(known, times) - known.particles_start).max() for known in (twin, grown)]
+    assert 1e-3 < droop[1] < droop[0]
 
 
 def test_a_cantilever_that_softens_rings_slower_in_the_end() -> None:

@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from effect_twins import SCENES, TWINS
+from effect_twins import SCENES, TWINS, simulated
 
+from physworld.build import build_twin
 from physworld.effects.registry import effect
 
 TIMES = np.linspace(0.0, 2.0, 41)
@@ -20,15 +21,45 @@ def line(velocity: tuple[float, float, float] = (1.0, -2.0, 0.5)) -> np.ndarray:
     return start + TIMES[:, None, None] * np.array(velocity)
 
 
-def test_scale_stretches_about_the_controllers() -> None:
-    tracks = line()
-    seen = effect("measurement_scale", scale=0.1).measured(TIMES, tracks, TWIN)
-    centre = TWIN.controllers_start.mean(axis=0)
+def test_scale_stretches_solids_about_the_controllers_and_thin_bodies_about_every_points_start() -> None:
+    tracks, solid = line(), TWINS["solid"]
+    seen = effect("measurement_scale", scale=0.1).measured(TIMES, tracks, solid)
+    centre = solid.controllers_start.mean(axis=0)
     np.testing.assert_allclose(seen, centre + 1.1 * (tracks - centre), atol=1e-15)
     middle = np.array([[1.0, 2.0, 3.0], [3.0, 2.0, 1.0]])
-    other = replace(TWIN, controllers_start=middle)
+    other = replace(solid, controllers_start=middle)
     fixed = effect("measurement_scale", scale=-0.2).measured(TIMES, np.full((41, 1, 3), 2.0), other)
     np.testing.assert_allclose(fixed, 2.0, atol=1e-15)
+    start = TWIN.track_nodes(TWIN.body.start[None])
+    moved = start + 0.3 * TIMES[:, None, None]
+    seen = effect("measurement_scale", scale=0.1).measured(TIMES, moved, TWIN)
+    np.testing.assert_allclose(seen, start + 0.33 * TIMES[:, None, None], atol=1e-14)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_scale_that_is_off_leaves_the_first_frame_as_it_was_measured(name: str) -> None:
+    twin = TWINS[name]
+    nodes = twin.body.start[None]
+    seen = twin.with_effect(effect("measurement_scale", scale=0.1)).observe(nodes, TIMES[:1])
+    np.testing.assert_allclose(seen, twin.track_nodes(nodes), atol=1e-12)
+
+
+@pytest.mark.parametrize("share", [0.05, -0.08])
+def test_a_recording_that_is_scaled_in_every_frame_is_what_the_effect_predicts(share: float) -> None:
+    scene = SCENES["solid"]()
+    truth = replace(TWINS["solid"], gravity_m_s2=np.array([0.0, -4.0, -9.81]), ground_height_m=None)
+    truth = truth.with_parameters(youngs_modulus_pa=2e4)
+    tracks = truth.observe(simulated(truth, scene), scene.times)
+    grip = truth.controllers_start.mean(axis=0)
+    camera = grip + (1.0 + share) * (tracks - grip)
+    body = build_twin(replace(scene, points=camera), 300).body
+    twin = replace(truth, body=replace(body, start_velocity=truth.body.start_velocity))
+    nodes = simulated(twin, scene)
+    error = np.abs(
+        twin.with_effect(effect("measurement_scale", scale=share)).observe(nodes, scene.times) - camera
+    )
+    assert np.abs(twin.observe(nodes, scene.times) - camera).max() > 5e-4
+    assert error.max() < 1e-9
 
 
 def test_a_late_clock_shows_the_past_and_an_early_one_the_future() -> None:
@@ -59,7 +90,7 @@ def test_smoothing_follows_a_ramp_a_time_constant_late() -> None:
     assert settled[-1, 0, 0] == pytest.approx(1.0, abs=1e-3) and settled[1, 0, 0] < 0.3
 
 
-def test_one_frame_is_measured_as_it_is_but_for_the_scale() -> None:
+def test_one_frame_is_measured_as_it_is() -> None:
     first = line()[:1]
     for name in ("measurement_clock", "measurement_drift", "measurement_smoothing"):
         added = effect(name)
@@ -69,12 +100,12 @@ def test_one_frame_is_measured_as_it_is_but_for_the_scale() -> None:
 
 def test_the_camera_scales_before_it_drifts_whatever_came_first() -> None:
     scale, drift = effect("measurement_scale", scale=0.1), effect("measurement_drift", x_m_s=0.3)
-    nodes = np.repeat(TWIN.body.start[None], 41, axis=0)
+    nodes = TWIN.body.start + 0.05 * TIMES[:, None, None]
     one = TWIN.with_effect(scale).with_effect(drift).observe(nodes, TIMES)
     other = TWIN.with_effect(drift).with_effect(scale).observe(nodes, TIMES)
     np.testing.assert_array_equal(one, other)
-    centre = TWIN.controllers_start.mean(axis=0)
-    expected = centre + 1.1 * (TWIN.track_nodes(nodes) - centre)
+    start = TWIN.track_nodes(nodes)[:1]
+    expected = start + 1.1 * (TWIN.track_nodes(nodes) - start)
     expected[..., 0] += 0.3 * TIMES[:, None]
     np.testing.assert_allclose(one, expected, atol=1e-14)
     assert np.array_equal(TWIN.with_effect(scale).track_nodes(nodes), TWIN.track_nodes(nodes))

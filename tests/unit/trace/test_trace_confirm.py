@@ -11,6 +11,7 @@ from sagging_bar import BUDGET, SIGMA, TRUE_PA, sagging
 from physworld.build import build_twin
 from physworld.calibrate.parameters import parameters_of
 from physworld.effects.base import Effect
+from physworld.effects.places import middle_of_free_end
 from physworld.effects.registry import effect
 from physworld.simulations import Job
 from physworld.trace.candidates import Candidate, candidates
@@ -98,15 +99,14 @@ def test_a_rival_that_fits_nowhere_near_the_best_model_is_left_as_it_is(bar: Bar
 
 def test_a_tether_is_also_searched_on_the_other_side() -> None:
     rest, pulled = 0.1, 0.02
-    end = candidates(build_twin(sagging(), BUDGET), ("tether",))[0][0].fixed
-    attach = np.array([end[f"attach_{a}_m"] for a in "xyz"])
+    attach = middle_of_free_end(build_twin(sagging(), BUDGET))
 
     def shape(gap: float) -> dict[str, float]:
         """An anchor this far along y."""
         anchor = dict(
             zip(("anchor_x_m", "anchor_y_m", "anchor_z_m"), attach + np.array([0.0, gap, 0.0]), strict=True)
         )
-        return end | {"rest_length_m": rest} | anchor
+        return {"rest_length_m": rest} | anchor
 
     tied = Bar(effect("tether", stiffness_n_m=STIFF_N_M, **shape(-rest - pulled)))
     lost = tied.model("tether", TRUE_PA, shape(rest - pulled), stiffness_n_m=STIFF_N_M)

@@ -15,8 +15,17 @@ from physworld.errors import SceneUnsupported
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
 from physworld.simulations import Job
 from physworld.trace import TraceConfig, document, trace
-from physworld.trace.recordings import FITTED, HELD_OUT, JointSimulations, Recordings, side_by_side
+from physworld.trace.candidates import candidates
+from physworld.trace.recordings import (
+    FITTED,
+    HELD_OUT,
+    JointSimulations,
+    Recordings,
+    side_by_side,
+    taken_over,
+)
 from physworld.trace.simulations import Simulations
+from physworld.trace.unknowns import with_strengths
 
 LOW, HIGH = np.array([0.0, -0.015, -0.015]), np.array([0.16, 0.015, 0.015])
 SIGMA, YOUNGS_MODULUS_PA, BUDGET = 5e-4, 1.5e5, 120
@@ -109,6 +118,27 @@ def test_tracks_of_recordings_stand_side_by_side_each_under_its_own_drive() -> N
     assert not recordings.scene.visible[11:, :12].any() and recordings.scene.visible[1:, 12:].all()
     with pytest.raises(ValueError, match="no twin of recording 1"):
         joint.run([Job(build_twin(scenes[0], BUDGET, refinement=2.0), frames)])
+
+
+def test_a_tether_holds_the_same_material_of_a_body_that_starts_elsewhere() -> None:
+    here = swung(16, 9.0)
+    aside = np.array([0.0, 0.41, 0.0])
+    body = replace(here.body, box_min_m=LOW + aside, box_max_m=HIGH + aside)
+    grips = (replace(here.grips[0], region_min_m=LOW + aside, region_max_m=LOW + aside + [0.02, 0.03, 0.03]),)
+    there = replace(
+        here, points=here.points + aside, controllers=here.controllers + aside, body=body, grips=grips
+    )
+    lead, other = (build_twin(scene, BUDGET) for scene in (here, there))
+    tied = candidates(lead, ("tether",))[0][3].prepared(lead)
+    tied = with_strengths(tied, "tether", {"stiffness_n_m": 5.0})
+    carried = taken_over(tied, other)
+    (one, second) = (known.effects[0].places(known) for known in (tied, carried))
+    np.testing.assert_allclose(second[1], one[1] + aside, atol=1e-9)
+    np.testing.assert_allclose(second[0], one[0], atol=1e-12)  # the anchor stands in the room
+    shown = tied.effects[0].placed(carried).values
+    assert shown["attach_y_m"] == pytest.approx(0.41, abs=1e-9) and shown["attach_x_m"] > 0.14
+    explicit = tied.effects[0].placed(tied)
+    assert replace(carried, effects=(explicit,)).effects[0].places(carried)[1] == pytest.approx(one[1])
 
 
 def test_a_recording_that_ended_repeats_its_last_frame() -> None:

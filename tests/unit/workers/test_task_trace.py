@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from tiny_scene import register, tiny_scene
 
+from physworld.build import build_twin
+from physworld.scene import Body
 from physworld.trace import Memory
 from physworld.trace import TraceConfig as LibraryConfig
 from physworld.twin import Twin
@@ -194,3 +196,34 @@ def test_a_dataset_comes_from_the_twin_with_the_added_effect(
 def test_a_service_traces_as_the_library_does_unless_it_is_told_otherwise() -> None:
     asked = TraceCreate(scene_id="scn_a")
     assert task.translate(asked.fit, asked.config, "cpu") == LibraryConfig()
+
+
+@pytest.mark.parametrize(
+    ("changed", "law", "taken"),
+    [
+        ({"law": "hencky"}, {}, False),
+        ({"plasticity": "von_mises"}, {}, False),
+        ({}, {}, True),
+        ({}, {"membrane_n_m": 3e3, "bending_n_m": 3e3 * 4e-4**2 / 12, "bending_twist_ratio": 2.0}, True),
+        ({}, {"bending_coupling": 0.5}, False),
+        ({}, {"bending_n_m": 1e-3}, False),
+    ],
+)
+def test_a_fit_whose_physics_is_not_the_declared_one_is_calibrated_anew(
+    stores: Stores, scene_id: str, monkeypatch: pytest.MonkeyPatch, changed: dict, law: dict, taken: bool
+) -> None:
+    config = FIT.model_copy(update=changed)
+    with stores.database.session() as session:
+        fit_id = jobs.create_fit(session, scene_id, config).outputs[0].id
+    scene = tiny_scene()
+    if law:
+        plane = np.stack(np.meshgrid(*[np.linspace(0, 0.2, 3)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
+        still = np.repeat(np.concatenate([plane, np.zeros((9, 1))], axis=1)[None], len(scene.times), axis=0)
+        body = Body(thickness_m=4e-4)
+        scene = replace(
+            scene, kind="sheet", points=still, visible=np.ones(still.shape[:2], dtype=bool), body=body
+        )
+        scene = replace(scene, grips=())
+    twin = build_twin(scene, FIT.particle_budget).with_parameters(**law)
+    monkeypatch.setattr(task, "twin_of", lambda stores, fit_id: twin)
+    assert (task._undamped_twin(stores, fit_id, FIT.particle_budget) is twin) is taken

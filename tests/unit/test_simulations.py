@@ -1,0 +1,33 @@
+"""What a remembered simulation belongs to: the twin, its drive and the engine."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+from tiny_scene import tiny_scene
+
+from physworld import simulations
+from physworld.build import build_twin
+from physworld.simulations import Drive, Job, engine
+
+
+def test_the_fingerprint_of_a_job_changes_with_the_engine(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = tiny_scene()
+    drive = Drive(*scene.control_track(), scene.times).digest()
+    job = Job(build_twin(scene, 60), 3)
+    known = job.fingerprint(drive)
+    assert known == Job(build_twin(scene, 60), 3).fingerprint(drive)
+    monkeypatch.setattr(simulations, "engine", lambda: "another")
+    assert job.fingerprint(drive) != known
+
+
+def test_the_engine_is_the_same_each_time_and_quick_to_read() -> None:
+    taken = []
+    for _ in range(3):
+        engine.cache_clear()
+        begun = time.perf_counter()
+        found = engine()
+        taken.append(time.perf_counter() - begun)
+        assert found == engine()
+    assert min(taken) < 0.1, f"{taken} s"

@@ -1,0 +1,47 @@
+"""Intervals of refitted numbers against those of a straight line through noisy points."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from sagging_bar import BUDGET, sagging
+
+from physworld.build import build_twin
+from physworld.trace.intervals import numbers
+from physworld.trace.refit import Refit
+from physworld.trace.unknowns import Unknown
+
+ROWS = 60
+TIMES = np.linspace(0.0, 1.0, ROWS)
+
+
+def line(noise: float = 1.0) -> Refit:
+    """Least squares of intercept and slope, whitened; the optimum is at (0.3, 2)."""
+    slopes = np.stack([np.ones(ROWS), 10 * TIMES], axis=1)
+    left = noise * np.random.default_rng(0).normal(size=ROWS)
+    left -= slopes @ np.linalg.lstsq(slopes, left, rcond=None)[0]
+    unknowns = [
+        Unknown(name, "1", -50.0, 50.0, start, 1.0, lambda v: v, lambda twin, v: twin)
+        for name, start in (("offset", 0.3), ("slope", 2.0))
+    ]
+    return Refit(unknowns, build_twin(sagging(), BUDGET), np.array([0.3, 2.0]), np.empty(0), left, slopes)
+
+
+@pytest.mark.parametrize("blocks", [1, 2, 12])
+@pytest.mark.parametrize("noise", [0.5, 3.0])
+def test_an_interval_is_as_wide_as_the_noise_leaves_it_however_few_the_blocks(
+    blocks: int, noise: float
+) -> None:
+    fitted = line(noise)
+    deviation = np.sqrt(np.diag(np.linalg.inv(fitted.jacobian.T @ fitted.jacobian))) * max(1.0, fitted.misfit)
+    found = numbers(fitted, np.arange(ROWS) * blocks // ROWS, {}, 500, 0)
+    for name, value, spread in zip(("offset", "slope"), (0.3, 2.0), deviation, strict=True):
+        low, high = found[name].ci95
+        assert low <= value - 1.95 * spread and high >= value + 1.95 * spread
+        assert high - low < 8 * spread
+
+
+def test_a_number_that_the_data_do_not_see_may_be_anything_within_its_bounds() -> None:
+    fitted = line()
+    fitted.jacobian[:, 1] = 0.0
+    assert numbers(fitted, np.zeros(ROWS, dtype=int), {}, 100, 0)["slope"].ci95 == (-50.0, 50.0)

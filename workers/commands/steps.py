@@ -1,0 +1,24 @@
+"""The file of ``--resume``: finished steps of a calibration, which the same command goes on from."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+from physworld.calibrate import Journal
+from physworld.scene import Scene
+from physworld.simulations import engine
+from storage.scene_bundle import canonical_archive
+
+
+def journal_in(path: Path, scene: Scene, settings: str) -> Journal:
+    """Finished steps of this scene under these settings by this engine, kept in ``path``."""
+
+    def save(text: str) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_name(f"{path.name}.part")
+        partial.write_text(text)
+        partial.replace(path)
+
+    key = f"{hashlib.sha256(canonical_archive(scene)).hexdigest()} {engine()} {settings}"
+    return Journal(key, path.read_text() if path.exists() else None, save)
