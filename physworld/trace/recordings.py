@@ -201,7 +201,9 @@ def _joined(fitted: Sequence[Recording]) -> Scene:
     visible = []
     for recording in fitted:
         seen = recording.scene.visible.copy()
-        seen[: recording.split.train[0]] = seen[recording.split.train[1] :] = False
+        seen[1 : recording.split.train[0]] = seen[recording.split.train[1] :] = (
+            False  # frame 0 places the points
+        )
         missing = max(frames - len(seen), 0)
         visible.append(np.concatenate([seen[:frames], np.zeros((missing, seen.shape[1]), dtype=bool)]))
     noises = [recording.scene.noise_sigma_m for recording in fitted]
