@@ -13,6 +13,8 @@ import pytest
 import structlog
 from api_service import Service, ask, assert_problem, scene_id
 
+from schemas.base import FieldError
+from services.api.errors import problem_response
 from services.api.logs import configure_logs
 from services.web import create_app
 from storage.database import open_database
@@ -30,6 +32,13 @@ def test_the_framework_answers_in_the_same_form(client: httpx.Client) -> None:
         422,
         "invalid_request",
     )
+
+
+def test_a_problem_can_be_sent_whatever_text_it_quotes() -> None:
+    fault = FieldError(loc=["caf\udce9"], msg="\ud800")
+    problem = json.loads(problem_response(422, "x", "caf\udce9 é", request_id=None, errors=[fault]).body)
+    assert problem["detail"] == "caf\\udce9 é"
+    assert problem["errors"] == [{"loc": ["caf\\udce9"], "msg": "\\ud800"}]
 
 
 def test_every_field_at_fault_is_named(client: httpx.Client) -> None:
