@@ -52,6 +52,13 @@ def test_every_field_at_fault_is_named(client: httpx.Client) -> None:
     assert "scene_id" in problem["detail"]
 
 
+@pytest.mark.parametrize("depth", [50, 600, 900, 20_000])
+def test_a_body_nested_deep_is_refused(client: httpx.Client, depth: int) -> None:
+    text = '{"scene_id": "scn_a", "config": ' + "[" * depth + "]" * depth + "}"
+    answer = client.post("/v1/fits", content=text, headers={"Content-Type": "application/json"})
+    assert answer.status_code in {400, 422} and answer.json()["code"] in {"bad_request", "invalid_request"}
+
+
 def test_a_large_body_is_refused_with_both_numbers(client: httpx.Client) -> None:
     body = {"scene_id": "x" * 2_000_000}
     problem = assert_problem(client.post("/v1/fits", json=body), 413, "content_too_large")
