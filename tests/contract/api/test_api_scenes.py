@@ -153,7 +153,9 @@ def _bomb() -> bytes:
 def _tar_named(name: str) -> bytes:
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w") as archive:
-        archive.addfile(tarfile.TarInfo(name))
+        member = tarfile.TarInfo(name)
+        member.type, member.linkname = tarfile.SYMTYPE, "/etc/passwd"  # refused with its name
+        archive.addfile(member)
     return buffer.getvalue()
 
 
