@@ -34,7 +34,7 @@ def put_up(
 ) -> list[str]:
     """Add one simulation to the driver's job for each payload; the shards' ids.
 
-    None when the lease is lost or the job no longer runs: nobody would call off what a cancelled job is given.
+    None when the lease is lost or the job no longer runs (nobody would call off what a cancelled job is given).
     The driver's epoch is the stage, so two attempts never share one; ``first_index`` counts on within an attempt.
     """
     if lock_job(session, driver.job_id).state != "running":
