@@ -92,12 +92,22 @@ class Problem(Resource):
     hint: str | None = None
 
 
+def holds_unstorable_characters(text: str) -> bool:
+    """Whether Postgres would refuse the text."""
+    return _UNSTORABLE.search(text) is not None
+
+
 def _holds_unstorable(value: Any) -> bool:
-    if isinstance(value, str):
-        return _UNSTORABLE.search(value) is not None
-    if isinstance(value, dict):
-        return any(_holds_unstorable(part) for pair in value.items() for part in pair)
-    return isinstance(value, list) and any(map(_holds_unstorable, value))
+    waiting = [value]  # not by recursion: a body may be nested as deep as its reader allows
+    while waiting:
+        part = waiting.pop()
+        if isinstance(part, str) and holds_unstorable_characters(part):
+            return True
+        if isinstance(part, dict):
+            waiting += [*part.keys(), *part.values()]
+        elif isinstance(part, list):
+            waiting += part
+    return False
 
 
 class Figures(Resource):

@@ -1,8 +1,8 @@
 """Reading of archives that strangers send: in memory, by name, within limits, never unpacked to disk.
 
 A zip or a tar (plain, gzip) is read member by member. Refused, each with its name and numbers: a path that
-climbs out of the archive, is absolute or names a drive; a link, a device, a sparse or an encrypted member;
-two members of one name; more members or bytes than the limits, whether declared or met while inflating; a
+climbs out of the archive, is absolute, names a drive or is not UTF-8; a link, a device, a sparse or an encrypted
+member; two members of one name; more members or bytes than the limits, whether declared or met while inflating; a
 compression ratio that only a bomb has; a truncated or damaged archive.
 
 ``read_arrays`` reads an ``npz`` the same way. It parses the array headers itself: numpy would allocate what
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 import stat
 import struct
 import tarfile
@@ -35,6 +36,7 @@ GZIP_MAGIC = b"\x1f\x8b"
 TAR_MAGIC_AT = 257
 TAR_MAGIC = b"ustar"
 
+_SURROGATE = re.compile("[\ud800-\udfff]")
 NUMERIC_KINDS = "biuf"
 NPY_HEADER_LIMIT = 10_000
 
@@ -263,6 +265,8 @@ def _is_wanted(name: str, wanted: frozenset[str] | None) -> bool:
 
 def _checked_name(raw: str, seen: set[str]) -> str:
     """The member's path without ``./``; refuses what points outside or comes twice."""
+    if _SURROGATE.search(raw):  # how tarfile keeps bytes that are not UTF-8
+        raise ArchiveRefused(f"the member name {raw!r} is not UTF-8")
     if "\x00" in raw or "\\" in raw:
         raise ArchiveRefused(f"the member name {raw!r} has a backslash or a NUL")
     if raw.startswith("/") or (len(raw) > 1 and raw[1] == ":"):

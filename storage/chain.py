@@ -37,22 +37,22 @@ def open_next(session: Session, parent: JobRow, children: Sequence[JobRow]) -> b
         return True  # a training runs beside its dataset; the end of the later one decides
     request = PipelineCreate.model_validate(parent.config)
     outputs = {job.kind: str(job.outputs[0]["id"]) for job in children}
-    last = children[-1]
-    if last.kind == "fit" and request.close_the_loop:
+    last = children[-1].kind
+    if last == "dataset" and _has_training(children, outputs["dataset"]):
+        last = "training"  # it ran beside its dataset: the two were made at once, by clocks that may differ
+    if last == "fit" and request.close_the_loop:
         particles = min(request.fit.particle_budget, TRACE_PARTICLES)
         declared = request.fit.model_copy(update={"damping": "none", "particle_budget": particles})
         open_trace(session, request.scene_id, declared, request.trace, outputs["fit"], parent=parent)
-    elif last.kind == "dataset":
+    elif last == "dataset":
         name = request.model_name or ""
         training = TrainingCreate(name=name, dataset_id=outputs["dataset"], config=request.training)
         open_training(session, training, parent=parent)
-    elif last.kind == "training" and not _is_comparison(session, children):
+    elif last == "training" and not _is_comparison(session, children):
         return False
     else:
         trace = trace_row(session, outputs["trace"]) if "trace" in outputs else None
-        own = (
-            last.kind == "trace" and trace is not None and _wants_comparison(session, request, trace, outputs)
-        )
+        own = last == "trace" and trace is not None and _wants_comparison(session, request, trace, outputs)
         trace_id = None if trace is None or own else trace.id
         open_dataset(session, outputs["fit"], request.dataset, trace_id, parent=parent)
     return True
@@ -87,6 +87,11 @@ def _wants_comparison(
     dataset = request.dataset.model_dump(mode="json")
     name = request.model_name or ""
     return find_baseline(session, name, outputs["fit"], dataset, request.training) is None
+
+
+def _has_training(children: Sequence[JobRow], dataset_id: str) -> bool:
+    """Whether one of the jobs is a training on this dataset."""
+    return any(job.kind == "training" and job.inputs[0]["id"] == dataset_id for job in children)
 
 
 def _is_comparison(session: Session, children: Sequence[JobRow]) -> bool:

@@ -1,6 +1,6 @@
 """The event log: every change of a job, appended in the same transaction as the change.
 
-Writers of one job hold its lock (``storage.flow.lock_job``), so within a job ``seq`` grows in the order in
+Writers of one job hold its lock (``storage.locks.lock_job``), so within a job ``seq`` grows in the order in
 which the changes became visible, and a reader that remembers the last ``seq`` misses nothing.
 """
 

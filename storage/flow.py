@@ -14,7 +14,7 @@
     pipeline   child jobs, each opened by the success of the one before (``storage.chain``)
 
 Everything here runs in the transaction that changes the shard, under the lock of the job and, before it, of
-the job's parent (``lock_job``). Rows below a job are touched only under that lock, so two workers that finish
+the job's parent (``storage.locks``). Rows below a job are touched only under that lock, so two workers that finish
 the last two episodes at the same moment start the next stage once.
 """
 
@@ -34,7 +34,7 @@ from schemas.job import TERMINAL_STATES, Progress
 from schemas.trace import TRACE_PARTICLES
 from storage import helpers, registry, resources, runs, traces
 from storage.chain import dataset_planned, open_next, share_done
-from storage.errors import Conflict, NotFound
+from storage.errors import Conflict
 from storage.events import append_event
 from storage.opening import (
     CANCELLED,
@@ -59,14 +59,6 @@ from storage.tables import FitRow, JobRow, ShardRow
 
 # Alone in their stage: their own progress is the job's.
 LONG_SHARDS = frozenset({"fit", "trace", "training", "assessment", "rollout", "plan"})
-
-
-def lock_job(session: Session, job_id: str) -> JobRow:
-    """The job, locked until the transaction ends; its parent is locked first. Raises NotFound."""
-    parent_id = session.scalar(select(JobRow.parent_id).where(JobRow.id == job_id))
-    if parent_id is not None:
-        _lock(session, parent_id)
-    return _lock(session, job_id)
 
 
 def shard_started(session: Session, job: JobRow, attempt: int, now: datetime) -> None:
@@ -144,7 +136,10 @@ def request_cancel(session: Session, job: JobRow, now: datetime) -> None:
 
 def settle_cancel(session: Session, job: JobRow, now: datetime) -> None:
     """A cancelling job with nothing running any more is cancelled; then its parent is asked the same."""
-    if job.state != "cancelling" or _has_running(session, job):
+    if job.state != "cancelling":
+        return
+    _stop_shards(session, job, (QUEUED,), now)
+    if _has_running(session, job):
         return
     if any(child.state not in TERMINAL_STATES for child in _children(session, job)):
         return
@@ -322,16 +317,8 @@ def _has_running(session: Session, job: JobRow) -> bool:
     return bool(session.scalar(select(running)))
 
 
-def _lock(session: Session, job_id: str) -> JobRow:
-    statement = select(JobRow).where(JobRow.id == job_id).with_for_update(key_share=True)
-    row = session.scalars(statement.execution_options(populate_existing=True)).one_or_none()
-    if row is None:
-        raise NotFound("job", job_id)
-    return row
-
-
 def _parent(session: Session, job: JobRow) -> JobRow | None:
-    """The parent, which ``lock_job`` has locked and loaded."""
+    """The parent, which ``storage.locks.lock_job`` has locked and loaded."""
     return None if job.parent_id is None else session.get_one(JobRow, job.parent_id)
 
 

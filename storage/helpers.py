@@ -19,6 +19,7 @@ from sqlalchemy.orm import Session
 
 from schemas.ids import new_id
 from storage.database import DEFAULT_MAX_ATTEMPTS, MAX_ATTEMPTS
+from storage.locks import lock_job
 from storage.opening import CANCELLED, QUEUED, RUNNING
 from storage.tables import ShardRow, utc_now
 
@@ -31,10 +32,13 @@ SIMULATION = "simulation"
 def put_up(
     session: Session, driver: Lease, first_index: int, payloads: Iterable[dict[str, Any]]
 ) -> list[str]:
-    """Add one simulation to the driver's job for each payload; the shards' ids, none when the lease is lost.
+    """Add one simulation to the driver's job for each payload; the shards' ids.
 
+    None when the lease is lost or the job no longer runs (nobody would call off what a cancelled job is given).
     The driver's epoch is the stage, so two attempts never share one; ``first_index`` counts on within an attempt.
     """
+    if lock_job(session, driver.job_id).state != "running":
+        return []
     held = select(ShardRow.id).where(
         ShardRow.id == driver.shard_id, ShardRow.epoch == driver.epoch, ShardRow.state == RUNNING
     )

@@ -20,7 +20,8 @@ from schemas.pipeline import PipelineCreate
 from schemas.trace import TraceCreate
 from storage.errors import NotFound
 from storage.events import append_event, events_after
-from storage.flow import lock_job, request_cancel
+from storage.flow import request_cancel
+from storage.locks import lock_job
 from storage.opening import (
     open_assessment,
     open_dataset,

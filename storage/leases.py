@@ -31,12 +31,12 @@ from storage.errors import NotFound
 from storage.flow import (
     LONG_SHARDS,
     fail_job,
-    lock_job,
     report_progress,
     settle_cancel,
     shard_started,
     shard_succeeded,
 )
+from storage.locks import lock_job
 from storage.opening import CANCELLED, DONE, FAILED, QUEUED, RUNNING
 from storage.results import parse_result
 from storage.tables import JobRow, ShardRow, utc_now
@@ -44,6 +44,7 @@ from storage.tables import JobRow, ShardRow, utc_now
 BACKOFF_SECONDS = 1.0  # before the second attempt; doubles with each further one
 BACKOFF_LIMIT_SECONDS = 60.0
 REPUBLISH_SECONDS = 60.0
+OPEN_STATES = ("queued", "running")  # of a job whose shards may be claimed
 WINDOW = 256  # messages of one queue in the broker at a time; more would only be duplicates after a loss
 
 LeaseState = Literal["held", "lost", "cancel"]
@@ -80,7 +81,7 @@ def claim(session: Session, shard_id: str, owner: str, now: datetime, lease_seco
     if seen is None or seen.state != QUEUED:
         return None
     job = lock_job(session, seen.job_id)
-    if job.state not in {"queued", "running"}:
+    if job.state not in OPEN_STATES:
         return None
     taken = _changed(
         session,
@@ -211,7 +212,7 @@ def publishable(
     republish_seconds: float = REPUBLISH_SECONDS,
     window: int = WINDOW,
 ) -> list[Publication]:
-    """Queued shards that the broker does not know, or was told of so long ago that it may have lost them.
+    """Queued shards of open jobs that the broker does not know, or was told of so long ago that it may have lost them.
 
     At most ``limit`` for each queue, oldest first, and so that at most ``window`` are announced at a time.
     A message too many is harmless: its ``claim`` finds nothing to take.
@@ -219,8 +220,12 @@ def publishable(
     stale = now - timedelta(seconds=republish_seconds)
     fresh = func.sum(case((ShardRow.published_at > stale, 1), else_=0))
     queued, announced = Counter[str](), Counter[str]()
+    claimable = (ShardRow.state == QUEUED, JobRow.state.in_(OPEN_STATES))
     counts = (
-        select(ShardRow.kind, func.count(), fresh).where(ShardRow.state == QUEUED).group_by(ShardRow.kind)
+        select(ShardRow.kind, func.count(), fresh)
+        .join(JobRow, JobRow.id == ShardRow.job_id)
+        .where(*claimable)
+        .group_by(ShardRow.kind)
     )
     for kind, count, told in session.execute(counts):
         if kind in QUEUE_OF_SHARD:
@@ -234,8 +239,9 @@ def publishable(
         kinds = [kind for kind, name in QUEUE_OF_SHARD.items() if name == queue]
         rows = session.execute(
             select(ShardRow.id, ShardRow.kind, ShardRow.epoch)
+            .join(JobRow, JobRow.id == ShardRow.job_id)
             .where(
-                ShardRow.state == QUEUED,
+                *claimable,
                 ShardRow.kind.in_(kinds),
                 or_(ShardRow.published_at.is_(None), ShardRow.published_at <= stale),
                 or_(ShardRow.not_before.is_(None), ShardRow.not_before <= now),

@@ -6,17 +6,18 @@ import base64
 import binascii
 import json
 from collections.abc import Callable, Sequence
-from datetime import datetime
+from datetime import UTC, datetime
 from typing import Any, TypeVar
 
 from sqlalchemy import Select, tuple_
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
-from schemas.base import Page
+from schemas.base import Page, holds_unstorable_characters
 from storage.errors import InvalidCursor
 from storage.tables import Base
 
 MAX_LIMIT = 1000
+LARGEST_KEY = 2**31 - 1
 Row = TypeVar("Row", bound=Base)
 Item = TypeVar("Item")
 
@@ -60,7 +61,7 @@ def _decode(cursor: str, keys: Sequence[InstrumentedAttribute[Any]]) -> list[Any
     try:
         plain = json.loads(base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)))
         return [_typed(value, key) for value, key in zip(plain, keys, strict=True)]
-    except (binascii.Error, ValueError, TypeError) as error:
+    except (binascii.Error, ValueError, TypeError, OverflowError) as error:
         raise InvalidCursor(f"cursor {cursor[:64]!r} does not come from this list") from error
 
 
@@ -70,7 +71,11 @@ def _typed(value: Any, key: InstrumentedAttribute[Any]) -> Any:
         moment = datetime.fromisoformat(value)
         if moment.tzinfo is None:
             raise ValueError("a cursor's time without a zone")
-        return moment
+        return moment.astimezone(UTC)
     if type(value) is not wanted:
         raise TypeError(f"{key.key} is not a {wanted.__name__}")
+    if isinstance(value, int) and abs(value) > LARGEST_KEY:
+        raise ValueError(f"{key.key} is larger than any")
+    if isinstance(value, str) and holds_unstorable_characters(value):
+        raise ValueError(f"{key.key} holds what no text here does")
     return value

@@ -30,6 +30,7 @@ from storage.tables import (
 from storage.traces import adds_effects, fit_digest
 
 LATEST = "latest"
+MOST_DIGITS = 9  # of a version's number: the column holds no more
 ALIAS_PATTERN = re.compile(r"[a-z][a-z0-9_-]{0,31}")
 
 
@@ -158,7 +159,11 @@ def list_versions(
 
 def resolve(session: Session, name: str, version: int | str) -> int:
     """The number behind a number, an alias or ``latest``. Raises NotFound."""
-    if isinstance(version, int) or version.isdecimal():
+    if isinstance(version, int):
+        return version
+    if version.isdecimal():
+        if len(version) > MOST_DIGITS:
+            raise NotFound("model version", f"{name}:{version[:MOST_DIGITS]}…")
         return int(version)
     _model_row(session, name)
     if version == LATEST:

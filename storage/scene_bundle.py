@@ -103,7 +103,10 @@ def bundle_from_bytes(data: bytes, limits: ArchiveLimits = DEFAULT_LIMITS) -> tu
         raise _refused("archive", str(error)) from error
 
     def fetch(name: str) -> bytes | None:
-        named = read_archive(data, frozenset({name.rpartition("/")[2]}), limits)
+        try:
+            named = read_archive(data, frozenset({name.rpartition("/")[2]}), limits)
+        except ArchiveRefused as error:
+            raise _refused(name, str(error)) from error
         return named.get(f"{folder}/{name}".lstrip("/"))
 
     return scene_from_files(files[f"{folder}/{JSON_NAME}".lstrip("/")], files[arrays_path], limits, fetch)

@@ -110,7 +110,7 @@ def check_body(declaration: Declaration, measured: Measured, findings: Findings)
         findings.fault([*where, "mass_kg"], f"is {body.mass_kg:g} kg, more than {MASS_ALLOWED:g} kg")
     if body.mass_kg is not None and body.density_kg_m3 is not None and body.size_m is not None:
         full = body.density_kg_m3 * math.prod(body.size_m)
-        factor = body.mass_kg / full
+        factor = body.mass_kg / full if full > 0.0 else math.inf  # sizes multiply to less than a float holds
         if not 1.0 / (2.0 * MASS_FACTOR_WARNING) <= factor <= MASS_FACTOR_WARNING:
             findings.warn(
                 [*where, "mass_kg"],

@@ -50,6 +50,7 @@ ARRAY_SHAPES = {
     "surface_points": ("S", 3),
 }
 REQUIRED = ("points", "visible", "controllers", "times")
+NEVER_EMPTY = ("rest_volume_points", "ctrl_times", "ctrl_points")
 
 
 @dataclass
@@ -319,7 +320,7 @@ def _check_shape(
                     where, f"has shape {array.shape}: {letter} is {length} here and {known} in {owner}"
                 )
                 agrees = False
-    if name == "rest_volume_points" and not len(array):
+    if name in NEVER_EMPTY and not len(array):
         findings.fault(where, "is empty")
     return agrees
 

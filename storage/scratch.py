@@ -1,7 +1,7 @@
 """What a job needs while it runs and nobody afterwards: ``scratch/{job}/{name}`` in the object store.
 
 Every worker of an installation sees it, so a job that a killed worker began goes on elsewhere. A write is atomic; two
-writers of one name write the same content. The job's last attempt removes the folder.
+writers of one name write the same content. The folder goes with the job's end, never before its result is committed.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""An application on a real server, in a thread of the test."""
+"""An application on a real server, in a thread of the test, and the way into its dashboard."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import httpx
 import uvicorn
 from fastapi import FastAPI
 
@@ -26,3 +27,11 @@ def serve(app: FastAPI) -> Iterator[str]:
         yield f"http://127.0.0.1:{listening.getsockname()[1]}"
         server.should_exit = True
         thread.join(timeout=30)
+
+
+def log_in(url: str, token: str) -> dict[str, str]:
+    """What a page of the dashboard sends with every request, once somebody has logged in with this key."""
+    origin = {"Origin": url}
+    answer = httpx.post(f"{url}/dashboard/login", data={"key": token}, headers=origin, trust_env=False)
+    assert answer.status_code == 303
+    return {"Cookie": answer.headers["Set-Cookie"].partition(";")[0], **origin}

@@ -64,13 +64,18 @@ class TaskContext:
 
     def cancelled(self) -> bool:
         """Whether the job was cancelled. Raises LeaseLost when the shard is no longer ours."""
-        late_s = time.monotonic() - self._renewed_at
-        if self._lost or late_s > self.settings.lease_seconds:
+        left_s = self.seconds_left()
+        if self._lost or left_s < 0:
+            late_s = self.settings.lease_seconds - left_s
             raise LeaseLost(
                 f"lease on shard {self.lease.shard_id} epoch {self.lease.epoch} lost, "
                 f"{late_s:.1f} s after its last renewal (lease {self.settings.lease_seconds} s)"
             )
         return self._cancelled
+
+    def seconds_left(self) -> float:
+        """How long the lease lasts unless it is renewed, by this process's own clock."""
+        return self.settings.lease_seconds - (time.monotonic() - self._renewed_at)
 
     def check(self) -> None:
         """Raise Cancelled or LeaseLost if the handler must stop; call it every frame."""

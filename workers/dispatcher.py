@@ -26,6 +26,7 @@ from types import FrameType
 
 from celery import Celery
 from kombu.exceptions import OperationalError as BrokerError
+from redis.exceptions import RedisError
 
 from schemas.job import TERMINAL_STATES
 from schemas.queues import INFERENCE, SIMULATION, TASK_NAME, TRAINING
@@ -64,12 +65,12 @@ class Dispatcher:
         self._forget_due = 0.0
 
     def run(self, stop: threading.Event) -> None:
-        """Tick until told to stop; a broker or database that is away is waited for."""
+        """Tick until told to stop; a broker or database that is away, or takes nothing, is waited for."""
         while not stop.is_set():
             try:
                 self.tick()
-            except (BrokerError, *self._connection.connection_errors) as error:
-                logger.warning("broker away: %s", error)
+            except (BrokerError, RedisError, *self._connection.connection_errors) as error:
+                logger.warning("broker away or full: %s", error)
                 self._connection.close()
                 self._connection = self._app.connection_for_write()
                 stop.wait(PAUSE_AFTER_ERROR_S)

@@ -2,7 +2,8 @@
 
 A handler's failure becomes a problem document with the exception's own numbers. Physics, faulty input and
 bugs fail the shard at once: they would fail again. Storage, network and memory are tried again with the
-attempts capped in the database.
+attempts capped in the database. What a job kept in the scratch is removed once the job has ended, never before: an
+attempt whose result could not be committed is gone on with.
 """
 
 from __future__ import annotations
@@ -22,10 +23,12 @@ from physworld.errors import Cancelled as LibraryCancelled
 from physworld.errors import PhysworldError
 from physworld.worldmodel.errors import WorldModelError
 from schemas.base import Problem
+from schemas.job import TERMINAL_STATES
 from storage import leases
 from storage.database import Database, open_database
 from storage.errors import DatabaseUnavailable, StorageError, StoreReadFailed, StoreWriteFailed
 from storage.settings import Settings, get_settings
+from storage.tables import JobRow
 from workers.context import TaskContext
 from workers.errors import Cancelled, LeaseLost, UnknownShardKind, WorkerError
 from workers.owner import process_owner
@@ -35,6 +38,8 @@ from workers.stores import Stores
 logger = logging.getLogger(__name__)
 
 Outcome = Literal["done", "failed", "retried", "cancelled", "not committed", "not claimed"]
+COMMIT_PAUSE_S = 1.0
+KEEPS_SCRATCH = frozenset({"fit", "trace", "simulation", "training"})
 WORTH_A_RETRY = (
     OSError,
     MemoryError,
@@ -84,6 +89,8 @@ def run_shard(runtime: Runtime, shard_id: str) -> Outcome:
     logger.info("shard %s: %s %d, attempt %d", shard_id, lease.kind, lease.index, lease.attempt)
     started = time.monotonic()
     outcome = _run_claimed(runtime, lease)
+    if lease.kind in KEEPS_SCRATCH:
+        _tidy(runtime, lease.job_id)
     logger.info("shard %s: %s after %.2f s", shard_id, outcome, time.monotonic() - started)
     return outcome
 
@@ -92,14 +99,14 @@ def _run_claimed(runtime: Runtime, lease: leases.Lease) -> Outcome:
     try:
         with TaskContext(lease, runtime.database, runtime.settings) as context:
             made = runtime.handler_of(lease.kind)(context, runtime.stores)
-        return _commit(runtime, lease, made)
+        return _commit(runtime, context, made)
     except LeaseLost as error:
         logger.warning("shard %s: %s", lease.shard_id, error)
         return "not committed"
     except (Cancelled, LibraryCancelled):
         with runtime.database.session() as session:
-            leases.mark_cancelled(session, lease)
-        return "cancelled"
+            ours = leases.mark_cancelled(session, lease)
+        return "cancelled" if ours else "not committed"
     except SystemExit:  # SIGTERM in a pool process: the worker is being stopped
         logger.info("shard %s: given back, the worker is stopping", lease.shard_id)
         with runtime.database.session() as session:
@@ -116,10 +123,29 @@ def _run_claimed(runtime: Runtime, lease: leases.Lease) -> Outcome:
         raise
 
 
-def _commit(runtime: Runtime, lease: leases.Lease, made: HandlerResult) -> Outcome:
-    with runtime.database.session() as session:
-        committed = leases.complete(session, lease, made.result, made.digest)
-    return "done" if committed else "not committed"
+def _commit(runtime: Runtime, context: TaskContext, made: HandlerResult) -> Outcome:
+    """Commit the result; a database that is away is asked again while the lease lasts."""
+    while True:
+        try:
+            with runtime.database.session() as session:
+                committed = leases.complete(session, context.lease, made.result, made.digest)
+            return "done" if committed else "not committed"
+        except DatabaseUnavailable as error:
+            if context.seconds_left() < COMMIT_PAUSE_S:
+                raise
+            logger.warning("shard %s: not committed yet: %s", context.lease.shard_id, error)
+            time.sleep(COMMIT_PAUSE_S)
+
+
+def _tidy(runtime: Runtime, job_id: str) -> None:
+    """Empty the scratch of a job that has ended; where that fails the dispatcher does it later."""
+    try:
+        with runtime.database.reading() as session:
+            ended = session.get_one(JobRow, job_id).state in TERMINAL_STATES
+        if ended:
+            runtime.stores.scratch.remove(job_id)
+    except StorageError as error:
+        logger.warning("job %s: its scratch stays for now: %s", job_id, error)
 
 
 def _record_failure(runtime: Runtime, lease: leases.Lease, error: BaseException, *, retry: bool) -> Outcome:

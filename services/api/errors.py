@@ -104,14 +104,24 @@ def problem_response(
         title=HTTPStatus(status).phrase,
         status=status,
         code=code,
-        detail=detail,
+        detail=_printable(detail),
         request_id=request_id,
-        errors=list(errors),
+        errors=[_printable_fault(fault) for fault in errors],
         hint=hint,
     )
     return JSONResponse(
         problem.model_dump(mode="json"), status, headers=dict(headers or {}), media_type=PROBLEM_MEDIA_TYPE
     )
+
+
+def _printable(text: str) -> str:
+    """The text with halves of surrogate pairs written out: UTF-8 has none, and what a client sent may hold them."""
+    return text.encode("utf-8", "backslashreplace").decode()
+
+
+def _printable_fault(fault: FieldError) -> FieldError:
+    loc = [_printable(part) if isinstance(part, str) else part for part in fault.loc]
+    return FieldError(loc=loc, msg=_printable(fault.msg))
 
 
 def answer(problem: ApiProblem, scope: Mapping[str, Any]) -> JSONResponse:

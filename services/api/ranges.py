@@ -7,14 +7,14 @@ import re
 
 from services.api.errors import ApiProblem
 
-_RANGE = re.compile(r"bytes=(\d*)-(\d*)", re.ASCII)
+_RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})", re.ASCII)  # more digits than any file has bytes
 
 
 def parse_range(header: str | None, size: int) -> tuple[int, int] | None:
     """The half-open byte range [start, end) that the client asks of a file of ``size`` bytes.
 
     None: send the whole file, because no range was asked, or one of a form that a server may ignore (another
-    unit, several ranges, digits missing). Raises the 416 problem for a range that starts past the end.
+    unit, several ranges, digits missing or too many). Raises the 416 problem for a range that starts past the end.
     """
     match = _RANGE.fullmatch(header.strip()) if header else None
     if match is None or match.group(1) == match.group(2) == "":

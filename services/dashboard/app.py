@@ -30,7 +30,15 @@ from services.dashboard import (
 from services.dashboard.site import BASE, STATIC, Site
 from services.stores import Stores
 from storage.database import Database
-from storage.errors import Conflict, DatabaseUnavailable, InvalidCursor, NotFound, StoreError
+from storage.errors import (
+    ArtifactCorrupt,
+    Conflict,
+    DatabaseUnavailable,
+    EpisodeCorrupt,
+    InvalidCursor,
+    NotFound,
+    StoreError,
+)
 from storage.settings import Settings
 
 POLICY = (
@@ -134,6 +142,11 @@ def _install_errors(app: FastAPI, site: Site) -> None:
     @app.exception_handler(StoreError)
     def unavailable(request: Request, error: Exception) -> Response:
         return answer(request, 503, f"{error}. Nothing was changed; try again in a moment.")
+
+    @app.exception_handler(ArtifactCorrupt)
+    @app.exception_handler(EpisodeCorrupt)
+    def corrupt(request: Request, error: Exception) -> Response:
+        return answer(request, 500, f"{error}.")
 
     @app.exception_handler(HTTPException)
     def refused(request: Request, error: HTTPException) -> Response:

@@ -111,7 +111,7 @@ def _rejections(site: Site, files: dict[str, str]) -> dict[str, Any] | None:
 def _cloud(site: Site, dataset_id: str, index: int) -> Cloud:
     with site.database.reading() as session:
         episode = resources.get_episode(session, dataset_id, index)
-    arrays, _attributes = site.episodes.read(episode.path)
+    arrays, _attributes = site.episodes.verified(episode.path, episode.digest)
     layers = [thinned(Layer("particles", "Particles", "predicted", np.asarray(arrays["particles"])))]
     if arrays["controllers"].shape[1]:
         controllers = np.asarray(arrays["controllers"])

@@ -11,7 +11,7 @@ from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import HTMLResponse, JSONResponse, Response
 
 from schemas.model import Model, ModelComparison, ModelVersion
-from services.dashboard.access import require_same_origin
+from services.dashboard.access import require_same_origin, require_writer
 from services.dashboard.clouds import Cloud, Layer, measured_layers, resampled, scene_cloud, thinned
 from services.dashboard.curves import chart, comparison_chart, given_curves
 from services.dashboard.pages_scenes import PREDICTION, layer_response, recording_of
@@ -21,6 +21,7 @@ from storage import registry, resources, tickets
 from storage.api_keys import ApiKey
 from storage.comparison import compare_versions
 from storage.errors import NotFound
+from storage.opening_runs import ready_version
 
 PAGE_SIZE = 50
 
@@ -105,15 +106,18 @@ def router(site: Site) -> APIRouter:
             has_cloud=version.scene_id is not None and site.arrays(version.artifacts, PREDICTION) is not None,
         )
 
-    @routes.get("/models/{name}/{number}/playground")
+    @routes.get("/models/{name}/{number}/playground", dependencies=[Depends(require_writer)])
     def playground(request: Request, name: str, number: str) -> HTMLResponse:
         return site.page(request, "playground.html", version=_version(site, name, number))
 
-    @routes.post("/models/{name}/{number}/live", dependencies=[Depends(require_same_origin)])
+    @routes.post(
+        "/models/{name}/{number}/live", dependencies=[Depends(require_same_origin), Depends(require_writer)]
+    )
     def live_ticket(request: Request, name: str, number: str) -> Response:
         viewer: ApiKey = request.state.viewer
         version = _version(site, name, number).version
         with site.database.session() as session:
+            ready_version(session, name, version)
             ticket, _ = tickets.issue(session, viewer.id, f"session:{name}:{version}")
         return JSONResponse({"path": f"/v1/live?{urlencode(_session(name, version, ticket))}"})
 

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -62,16 +63,21 @@ class Child:
         return self.process.pid if self.process is not None else None
 
     def watch(self) -> bool:
-        """Notice an exit, start when due; True if the set of processes changed."""
+        """Notice an exit, start when due; True if the set of processes changed.
+
+        Raises OSError for a start that failed; the next one is due after the longest pause.
+        """
         changed = self._reap()
         if self.process is None and time.monotonic() >= self._due_at:
+            self._due_at = time.monotonic() + LONGEST_PAUSE_S
             self.start()
             changed = True
         return changed
 
     def start(self) -> None:
         """Start it now."""
-        logs.rotate(self.log)
+        with suppress(OSError):  # of a full disk: a log that is too long keeps nobody from running
+            logs.rotate(self.log)
         if self.program.ready_file is not None:
             self.program.ready_file.unlink(missing_ok=True)
         with self.log.open("ab") as output:

@@ -16,14 +16,23 @@ TAIL_BYTES = 4000
 
 
 def rotate(path: Path, max_bytes: int = MAX_BYTES) -> bool:
-    """Cut ``path`` if it is longer than ``max_bytes``; True if it was."""
+    """Cut ``path`` if it is longer than ``max_bytes``; True if it was.
+
+    Raises OSError where there is no room for the copy; nothing is lost then.
+    """
     if not path.exists() or path.stat().st_size <= max_bytes:
         return False
+    copy = path.with_suffix(".log.0")
+    try:
+        shutil.copyfile(path, copy)
+    except OSError:
+        copy.unlink(missing_ok=True)
+        raise
     for age in range(KEPT, 1, -1):
         older = path.with_suffix(f".log.{age - 1}")
         if older.exists():
             older.replace(path.with_suffix(f".log.{age}"))
-    shutil.copyfile(path, path.with_suffix(".log.1"))
+    copy.replace(path.with_suffix(".log.1"))
     with path.open("r+b") as file:
         file.truncate(0)
     return True

@@ -16,8 +16,8 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -237,15 +237,31 @@ class Supervisor:
         return False
 
     def _watch(self) -> None:
+        """Keep the children running; what a full disk refuses is tried again, and ends nothing."""
         logs_at = time.monotonic() + LOGS_S
         while not self._stop.wait(WATCH_S):
-            changed = [child for child in self._children if child.watch()]
-            if changed:
-                self._write_state(ready=True)
-            if time.monotonic() > logs_at:
+            changed = False
+            for child in self._children:
+                with self._going_on(f"{child.program.name} is not started yet"):
+                    changed |= child.watch()
+            due = time.monotonic() > logs_at
+            if changed or due:
+                with self._going_on("run/state.json is not up to date"):
+                    self._write_state(ready=True)
+            if due:
                 logs_at = time.monotonic() + LOGS_S
                 for child in self._children:
-                    logs.rotate(child.log)
+                    with self._going_on(f"{child.log.name} is not cut"):
+                        logs.rotate(child.log)
+
+    @contextmanager
+    def _going_on(self, what: str) -> Iterator[None]:
+        """An OSError of the block is said and no more."""
+        try:
+            yield
+        except OSError as error:
+            with suppress(OSError):  # what is said may go to a file on the same disk
+                self._say(f"PhysWorld goes on, but {what}: {error}")
 
     def _end(self) -> None:
         """Everything but the broker at once, then the broker, so that workers can give messages back."""

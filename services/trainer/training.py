@@ -102,7 +102,6 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     artifacts = store_version(stores, payload, published, view, measured, card)
     manifest = next(artifact for artifact in artifacts if artifact.name == MANIFEST_NAME)
     context.check()
-    stores.scratch.remove(context.lease.job_id)
     result = {
         "artifacts": [artifact.model_dump(mode="json") for artifact in artifacts],
         "sha256": manifest.sha256,

@@ -136,6 +136,12 @@ def test_workers_scale(services: dict[str, Any]) -> None:
     assert services["worker"]["deploy"]["replicas"] == "${PHYSWORLD_WORKERS:-2}"
 
 
+def test_the_threads_of_a_training_reach_the_trainer(services: dict[str, Any]) -> None:
+    given = services["trainer"]["environment"]
+    assert given["PHYSWORLD_TRAINER_THREADS"] == "${PHYSWORLD_TRAINER_THREADS:-2}"
+    assert "OMP_NUM_THREADS" not in given  # it follows from the other
+
+
 def test_commands_exist_in_their_image(services: dict[str, Any], repository: Path) -> None:
     for name in OURS:
         command, target = services[name]["command"], services[name]["build"]["target"]

@@ -1,24 +1,16 @@
 """Calibrates a twin on a scene's training frames and measures it on the frames that were held out.
 
 Artifacts: ``twin.npz``, ``prediction.npz`` and ``report.json``, see :mod:`workers.tasks.fit_report`. The journal of
-the search lies in the data folder until the fit is stored: a killed worker's fit goes on where it was. Simulations that
+the search lies in the job's scratch folder: a killed worker's fit goes on where it was, on any host. Simulations that
 do not depend on each other are shared with whatever worker is free (:mod:`workers.tasks.shared_runs`).
 """
 
 from __future__ import annotations
 
-import json
-import os
-import shutil
-from pathlib import Path
-from typing import Any
-
-from physworld.calibrate import CalibrationConfig, Journal, calibrate_in_stages
-from physworld.errors import PhysworldError
+from physworld.calibrate import CalibrationConfig, calibrate_in_stages
 from schemas.fit import FitConfig
 from storage import helpers
 from workers.context import TaskContext
-from workers.errors import Cancelled
 from workers.law_choice import chosen_laws
 from workers.lineage import lineage_of
 from workers.registry import HandlerResult
@@ -26,27 +18,15 @@ from workers.stores import Stores
 from workers.tasks.fit_accuracy import fit_accuracy, not_measured
 from workers.tasks.fit_report import MEDIA_TYPES, fit_files, fit_report
 from workers.tasks.inputs import scene_of, scene_reference
-from workers.tasks.shared_runs import SharedRunner
+from workers.tasks.shared_runs import SharedRunner, stored_journal
 
-JOURNAL = "fit.json"
 WORTH_SHARING_S = 0.3  # to hand a simulation to another worker takes some hundredths of a second
 
 
 def run(context: TaskContext, stores: Stores) -> HandlerResult:
-    """Fit, measure, store; what the job's simulations leave in the scratch goes with it."""
+    """Fit, measure, store."""
     with stores.database.session() as session:
         helpers.call_off(session, context.lease.job_id)  # those of an attempt that was lost
-    try:
-        made = _fitted(context, stores)
-        context.check()
-    except (PhysworldError, Cancelled):
-        stores.scratch.remove(context.lease.job_id)
-        raise
-    stores.scratch.remove(context.lease.job_id)
-    return made
-
-
-def _fitted(context: TaskContext, stores: Stores) -> HandlerResult:
     payload = context.lease.payload
     config = FitConfig.model_validate(payload["config"])
     scene = scene_of(stores, payload["scene_id"])
@@ -63,8 +43,7 @@ def _fitted(context: TaskContext, stores: Stores) -> HandlerResult:
         formulation=config.formulation,
         transfer=config.transfer,
     )
-    folder = Path(stores.settings.data_dir) / "checkpoints" / context.lease.job_id
-    journal = stored_journal(folder / JOURNAL, payload)
+    journal = stored_journal(stores, context.lease.job_id, payload)
     calibration, law = chosen_laws(config.law, scene, calibration, progress, context.cancelled, journal)
     fitted = calibrate_in_stages(
         scene,
@@ -99,18 +78,5 @@ def _fitted(context: TaskContext, stores: Stores) -> HandlerResult:
         "seconds": fitted.seconds,
         "lineage": lineage_of([scene_reference(stores, payload["scene_id"])], payload["config"], {}),
     }
-    shutil.rmtree(folder, ignore_errors=True)
+    context.check()
     return HandlerResult(result, artifacts[0].sha256)
-
-
-def stored_journal(path: Path, payload: dict[str, Any]) -> Journal:
-    """The journal of an earlier attempt at the same payload, or an empty one; written at ``path`` after every step."""
-
-    def save(text: str) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_suffix(f".{os.getpid()}")
-        partial.write_text(text)
-        partial.replace(path)
-
-    stored = path.read_text() if path.exists() else None
-    return Journal(json.dumps(payload, sort_keys=True), stored, save)

@@ -2,18 +2,22 @@
 
 The shard that decides (the driver: a trace, a fit) puts simulations that do not depend on each other up as
 ``simulation`` shards of its own job, which other workers take from the queue and the driver takes itself
-(``storage.helpers``). Every simulation is kept in the job's scratch folder under its fingerprint.
+(``storage.helpers``). Every simulation is kept in the job's scratch folder under its fingerprint, and so is the
+journal of the driver's calibration.
 """
 
 from __future__ import annotations
 
 import io
+import json
 import time
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
-from physworld.simulations import Drive, Job, tracks_of
+from physworld.calibrate import Journal
+from physworld.simulations import Drive, Job, engine, tracks_of
 from physworld.trace import Memory
 from physworld.twin import Twin
 from storage import helpers
@@ -27,6 +31,7 @@ from workers.registry import HandlerResult
 from workers.stores import Stores
 from workers.tasks.inputs import npz_arrays, npz_bytes
 
+JOURNAL = "calibration.json"
 LOOK_S = 0.1
 _TIMED = 2  # simulations by whose times a driver tells whether sharing is worth it
 
@@ -42,6 +47,16 @@ def simulate(context: TaskContext, stores: Stores) -> HandlerResult:
     context.check()
     SharedMemory(stores, job_id).put(payload["key"], tracks)
     return HandlerResult({"trusted": tracks is not None})
+
+
+def stored_journal(stores: Stores, job_id: str, payload: dict[str, Any]) -> Journal:
+    """The journal of an earlier attempt at the same payload by the same engine, or an empty one; stored after every step."""
+    stored = stores.scratch.get(job_id, JOURNAL)
+    return Journal(
+        f"{engine()} {json.dumps(payload, sort_keys=True)}",
+        None if stored is None else stored.decode(),
+        lambda text: stores.scratch.put(job_id, JOURNAL, text.encode()),
+    )
 
 
 class SharedMemory(Memory):

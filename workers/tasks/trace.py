@@ -8,18 +8,15 @@ calibration's journal: a trace whose worker was killed goes on where it was, on 
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from physworld.calibrate import CalibrationConfig, Journal
+from physworld.calibrate import CalibrationConfig
 from physworld.calibrate.parameters import bending_ratio
-from physworld.errors import PhysworldError
 from physworld.materials.laws import SheetLaw
-from physworld.simulations import engine
 from physworld.trace import TraceConfig, trace
 from physworld.twin import Twin
 from schemas.base import Reference
@@ -27,18 +24,16 @@ from schemas.fit import FitConfig
 from schemas.trace import TraceConfig as WireConfig
 from storage import helpers, resources
 from workers.context import TaskContext
-from workers.errors import Cancelled
 from workers.lineage import lineage_of
 from workers.registry import HandlerResult
 from workers.stores import Stores
 from workers.tasks.inputs import fit_reference, scene_of, scene_reference, twin_of
-from workers.tasks.shared_runs import SharedMemory, SharedRunner
+from workers.tasks.shared_runs import SharedMemory, SharedRunner, stored_journal
 from workers.tasks.trace_report import trace_files, trace_report
 
 if TYPE_CHECKING:
     from physworld.scene import Scene
 
-JOURNAL = "calibration.json"
 _PLATE = 1e-6  # relative difference to a homogeneous plate of the declared thickness that is rounding
 _STAGES = (  # of a trace, with the share of its work that is done when one begins
     ("declared physics", 0.35),
@@ -58,12 +53,8 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     others = [*payload.get("scene_ids", ()), *payload.get("held_out_scene_ids", ())]
     with stores.database.session() as session:
         helpers.call_off(session, context.lease.job_id)  # those of an attempt that was lost
-    try:
-        result = _traced(context, stores, scene)
-        context.check()
-    except (PhysworldError, Cancelled):
-        stores.scratch.remove(context.lease.job_id)
-        raise
+    result = _traced(context, stores, scene)
+    context.check()
     report = trace_report(result)
     artifacts = [
         stores.artifacts.put_bytes(content, name, media_type)
@@ -80,7 +71,6 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
         "lineage": lineage_of(inputs, settings, {"trace": payload["trace"]["seed"]}),
     }
     context.check()
-    stores.scratch.remove(context.lease.job_id)
     return HandlerResult(found, artifacts[0].sha256)
 
 
@@ -94,7 +84,7 @@ def _traced(context: TaskContext, stores: Stores, scene: Scene) -> Any:
         held_out=[scene_of(stores, known) for known in payload.get("held_out_scene_ids", ())],
         runner=SharedRunner(context, stores),
         memory=SharedMemory(stores, context.lease.job_id),
-        journal=_journal(stores, context.lease.job_id, payload),
+        journal=stored_journal(stores, context.lease.job_id, payload),
         calibrated_twin=_undamped_twin(stores, payload["fit_id"], fit.particle_budget),
         progress=shown,
         cancelled=context.cancelled,
@@ -155,12 +145,3 @@ def _undamped_twin(stores: Stores, fit_id: str | None, budget: int) -> Twin | No
             return None
     damped = re.compile("drag|viscosity|relaxation")
     return None if any(value for name, value in twin.parameters.items() if damped.search(name)) else twin
-
-
-def _journal(stores: Stores, job_id: str, payload: dict[str, Any]) -> Journal:
-    stored = stores.scratch.get(job_id, JOURNAL)
-    return Journal(
-        f"{engine()} {json.dumps(payload, sort_keys=True)}",
-        None if stored is None else stored.decode(),
-        lambda text: stores.scratch.put(job_id, JOURNAL, text.encode()),
-    )

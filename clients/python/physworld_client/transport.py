@@ -27,7 +27,7 @@ from physworld_client.errors import (
     error_from_response,
 )
 
-RETRIED_STATUSES = frozenset({408, 425, 429, 500, 502, 503, 504})
+RETRIED_STATUSES = frozenset({408, 425, 429, 500, 502, 503, 504})  # not 507: a store that is full stays so
 RETRY_BASE_S = 0.25
 RETRY_LIMIT_S = 8.0
 RETRY_AFTER_LIMIT_S = 60.0

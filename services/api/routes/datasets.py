@@ -70,16 +70,16 @@ def list_episodes(dataset_id: ObjectId, database: DatabaseDep, page: PageDep) ->
             "`attributes` holds the episode's attributes as JSON text",
             "content": {NPZ: {"schema": {"type": "string", "format": "binary"}}},
         },
-        **documented(401, 403, 404, 422, 503),
+        **documented(401, 403, 404, 422, 500, 503),
     },
 )
 def get_episode(
     dataset_id: ObjectId, index: EpisodeIndex, database: DatabaseDep, stores: StoresDep
 ) -> Response:
-    """The arrays of one episode as npz (no pickles)."""
+    """The arrays of one episode as npz (no pickles), checked against the digest that was committed."""
     with database.reading() as session:
         episode = resources.get_episode(session, dataset_id, index)
-    arrays, attributes = stores.episodes.read(episode.path)
+    arrays, attributes = stores.episodes.verified(episode.path, episode.digest)
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, attributes=np.array(json.dumps(attributes)), **arrays)
     name = f"{dataset_id}-{index:05d}.npz"

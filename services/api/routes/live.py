@@ -27,7 +27,7 @@ from services.api.routes.rollouts import ready_version
 from storage import api_keys, registry, tickets
 from storage.api_keys import ApiKey
 from storage.database import Database
-from storage.errors import StorageError
+from storage.errors import NotFound, StorageError
 from storage.idempotency import Answer
 from storage.settings import Settings
 
@@ -117,15 +117,22 @@ def _subject(model: str, version: int) -> str:
 
 
 def _enter(database: Database, model: str, version: str, ticket: str, header: str) -> dict[str, Any] | None:
-    """The inner connection's query for whoever may open a session, else None. Raises NotFound."""
+    """The inner connection's query for whoever may open a session, else None, whether there is such a model or not.
+
+    Raises NotFound, but only for the holder of a key.
+    """
     with database.session() as session:
-        number = registry.get_version(session, model, version).version if ticket or header else 0
         key: ApiKey | None = None
+        number = 0
         if ticket:
-            key = tickets.redeem(session, ticket, _subject(model, number))
+            with suppress(NotFound):
+                number = registry.get_version(session, model, version).version
+                key = tickets.redeem(session, ticket, _subject(model, number))
         elif header.lower().startswith("bearer "):
             key = api_keys.verify(session, header[7:].strip())
             key = key if key is not None and key.allows("write") else None
+            if key is not None:
+                number = registry.get_version(session, model, version).version
         if key is None:
             return None
         inner, _ = tickets.issue(session, key.id, f"live:{model}:{number}")

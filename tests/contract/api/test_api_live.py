@@ -13,12 +13,14 @@ import numpy as np
 import pytest
 from inference_serving import Served, serve_inference
 from published_tiny import publish_tiny, tiny_model
+from serving import log_in
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 
+from schemas.model import TrainingConfig
 from services.inference import live
 from services.inference.session import HEAD
-from storage import api_keys
+from storage import api_keys, registry
 
 WITHIN_S = 20.0
 SINGLE_PRECISION_M = 2e-6
@@ -222,18 +224,62 @@ def test_files_of_another_format_are_no_broken_line_either(served: Served) -> No
 
 def test_the_reason_of_a_refusal_fits_a_frame(served: Served) -> None:
     """123 bytes of UTF-8, whatever the client called the model."""
-    plain = f"/v1/live?{urlencode({'model': 'ä' * 200, 'version': 1, 'ticket': 'x'})}"
+    plain = f"/v1/live?{urlencode({'model': 'ä' * 200, 'version': 1})}"
+    code, reason = refusal(served, plain, {"Authorization": f"Bearer {served.token}"})
+    assert code == 1008
+    assert reason.startswith("not_found: ") and 120 <= len(reason.encode()) <= 123
+
+
+def refusal(served: Served, path: str, headers: dict[str, str] | None = None) -> tuple[int, str]:
+    """Code and reason with which the session is refused."""
 
     async def refused() -> tuple[int, str]:
-        async with connect(address(served, plain), proxy=None) as socket:
+        async with connect(address(served, path), proxy=None, additional_headers=headers) as socket:
             with pytest.raises(ConnectionClosed) as ended:
                 await asyncio.wait_for(socket.recv(), WITHIN_S)
         assert ended.value.rcvd is not None
         return ended.value.rcvd.code, ended.value.rcvd.reason
 
-    code, reason = asyncio.run(refused())
-    assert code == 1008
-    assert reason.startswith("not_found: ") and 120 <= len(reason.encode()) <= 123
+    return asyncio.run(refused())
+
+
+def test_a_stranger_does_not_learn_which_models_exist(served: Served) -> None:
+    strangers = ({"Authorization": "Bearer x"}, {"Authorization": "Basic x"}, None)
+    answers = {
+        refusal(served, f"/v1/live?{urlencode({'model': model, 'version': version, **ticket})}", headers)
+        for model, version in ((served.model, served.version), (served.model, 7), ("nobody", 1))
+        for ticket, headers in (*(({}, header) for header in strangers), ({"ticket": "x"}, None))
+    }
+    ((code, reason),) = answers
+    assert code == 1008 and reason.startswith("unauthenticated: ")
+
+
+def test_a_version_of_too_many_digits_is_not_found(served: Served) -> None:
+    digits = "9" * 5000
+    path = f"/v1/live?{urlencode({'model': served.model, 'version': digits})}"
+    code, reason = refusal(served, path, {"Authorization": f"Bearer {served.token}"})
+    assert code == 1008 and reason.startswith("not_found: ")
+    with served.client() as client:
+        page = client.get(
+            f"/dashboard/models/{served.model}/{digits}", headers=log_in(served.url, served.token)
+        )
+    assert page.status_code == 404
+
+
+def test_the_playground_is_for_whoever_may_write_and_of_a_ready_version(served: Served) -> None:
+    with served.database.session() as session:
+        _, reader = api_keys.create_key(session, "reader", "read")
+        pending = registry.allot_version(session, served.model, config=TrainingConfig()).version
+    here = f"/dashboard/models/{served.model}/{served.version}"
+    with served.client() as client:
+        for token, allowed in ((served.token, True), (reader, False)):
+            headers = log_in(served.url, token)
+            assert ("/playground" in client.get(here, headers=headers).text) == allowed
+            assert client.get(f"{here}/playground", headers=headers).status_code == (200 if allowed else 403)
+            assert client.post(f"{here}/live", headers=headers).status_code == (200 if allowed else 403)
+        not_yet = f"/dashboard/models/{served.model}/{pending}/live"
+        refused = client.post(not_yet, headers=log_in(served.url, served.token))
+    assert refused.status_code == 409 and "pending" in refused.text
 
 
 def test_a_ticket_is_good_once_and_for_its_model_only(served: Served) -> None:

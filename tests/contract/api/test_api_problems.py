@@ -13,6 +13,8 @@ import pytest
 import structlog
 from api_service import Service, ask, assert_problem, scene_id
 
+from schemas.base import FieldError
+from services.api.errors import problem_response
 from services.api.logs import configure_logs
 from services.web import create_app
 from storage.database import open_database
@@ -32,6 +34,13 @@ def test_the_framework_answers_in_the_same_form(client: httpx.Client) -> None:
     )
 
 
+def test_a_problem_can_be_sent_whatever_text_it_quotes() -> None:
+    fault = FieldError(loc=["caf\udce9"], msg="\ud800")
+    problem = json.loads(problem_response(422, "x", "caf\udce9 é", request_id=None, errors=[fault]).body)
+    assert problem["detail"] == "caf\\udce9 é"
+    assert problem["errors"] == [{"loc": ["caf\\udce9"], "msg": "\\ud800"}]
+
+
 def test_every_field_at_fault_is_named(client: httpx.Client) -> None:
     body = {"scene_id": 5, "config": {"max_simulations": 0, "sead": 1}}
     problem = assert_problem(client.post("/v1/fits", json=body), 422, "invalid_request")
@@ -41,6 +50,13 @@ def test_every_field_at_fault_is_named(client: httpx.Client) -> None:
         ("body", "config", "sead"),
     }
     assert "scene_id" in problem["detail"]
+
+
+@pytest.mark.parametrize("depth", [50, 600, 900, 20_000])
+def test_a_body_nested_deep_is_refused(client: httpx.Client, depth: int) -> None:
+    text = '{"scene_id": "scn_a", "config": ' + "[" * depth + "]" * depth + "}"
+    answer = client.post("/v1/fits", content=text, headers={"Content-Type": "application/json"})
+    assert answer.status_code in {400, 422} and answer.json()["code"] in {"bad_request", "invalid_request"}
 
 
 def test_a_large_body_is_refused_with_both_numbers(client: httpx.Client) -> None:

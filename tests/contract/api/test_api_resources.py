@@ -11,6 +11,9 @@ import httpx
 import numpy as np
 import pytest
 from api_service import EPISODE, Service, assert_problem, scene_id, sha256
+from serving import log_in
+
+from storage import resources
 
 CONTENT = bytes(range(256)) * 40
 
@@ -145,7 +148,8 @@ def test_ranges_past_the_end(client: httpx.Client, digest: str, header: str) -> 
 
 
 @pytest.mark.parametrize(
-    "header", ["bytes=9-5", "bytes=0-1,3-4", "lines=0-1", "bytes=-", "bytes=a-b", "bytes"]
+    "header",
+    ["bytes=9-5", "bytes=0-1,3-4", "lines=0-1", "bytes=-", "bytes=a-b", "bytes", f"bytes=0-{'9' * 5000}"],
 )
 def test_ranges_that_a_server_may_ignore(client: httpx.Client, digest: str, header: str) -> None:
     response = client.get(f"/v1/artifacts/{digest}", headers={"Range": header})
@@ -171,3 +175,25 @@ def test_an_empty_file(client: httpx.Client, service: Service) -> None:
     response = client.get(f"/v1/artifacts/{empty}")
     assert (response.status_code, response.content) == (200, b"")
     assert client.get(f"/v1/artifacts/{empty}", headers={"Range": "bytes=0-"}).status_code == 416
+
+
+def test_an_episode_that_lost_a_chunk_is_not_given_out(service: Service) -> None:
+    with service.client() as client:
+        body = {"scene_id": scene_id(client, "damaged"), "dataset": {"episodes": 1}}
+        job = client.post("/v1/pipelines", json=body).json()
+        service.work()
+        outputs = client.get(f"/v1/jobs/{job['id']}").json()["outputs"]
+        dataset = next(output["id"] for output in outputs if output["kind"] == "dataset")
+        address = f"datasets/{dataset}/episodes/0"
+        cookie = log_in(service.url, service.token("admin"))
+        assert client.get(f"/v1/{address}").status_code == 200
+        assert client.get(f"/dashboard/{address}/cloud", headers=cookie).status_code == 200
+        with service.database.reading() as session:
+            path = resources.get_episode(session, dataset, 0).path
+        assert service.settings.store_folder is not None
+        chunks = list((service.settings.store_folder / path / "particles" / "c").rglob("*"))
+        next(chunk for chunk in chunks if chunk.is_file()).unlink()
+        problem = assert_problem(client.get(f"/v1/{address}"), 500, "episode_corrupt")
+        assert "particles do not have the digest" in problem["detail"]
+        shown = client.get(f"/dashboard/{address}/cloud", headers=cookie)
+        assert shown.status_code == 500 and "particles do not have the digest" in shown.text

@@ -124,6 +124,7 @@ def test_hostile_files_are_refused(client: httpx.Client) -> None:
         "archive without a scene": archive({"readme.txt": b"hello"}),
         "bomb": _bomb(),
         "link": _linked_tar(),
+        "name of no UTF-8": _tar_named("caf\udce9/scene.json"),
         "object array": bundle(arrays={"points": np.array([Calls()], dtype=object)}),
         "damaged zip": bundle()[:-200],
         "huge header": _huge_npy(),
@@ -146,6 +147,15 @@ def _bomb() -> bytes:
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as file:
         file.writestr("scene.json", b"{}")
         file.writestr("scene.npz", b"\0" * 100_000_000)
+    return buffer.getvalue()
+
+
+def _tar_named(name: str) -> bytes:
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w") as archive:
+        member = tarfile.TarInfo(name)
+        member.type, member.linkname = tarfile.SYMTYPE, "/etc/passwd"  # refused with its name
+        archive.addfile(member)
     return buffer.getvalue()
 
 

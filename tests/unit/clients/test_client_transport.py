@@ -5,8 +5,10 @@ from __future__ import annotations
 import inspect
 import json
 import random
+import re
 from datetime import UTC, datetime, timedelta
 from email.utils import format_datetime
+from pathlib import Path
 
 import httpx
 import pytest
@@ -25,7 +27,14 @@ from physworld_client import (
 )
 from physworld_client.errors import PhysWorldError, SceneInvalid, error_from_response
 from physworld_client.stream import EventDecoder, ends_job
-from physworld_client.transport import RETRY_LIMIT_S, Retry, client_options, is_loopback, retry_after_s
+from physworld_client.transport import (
+    RETRIED_STATUSES,
+    RETRY_LIMIT_S,
+    Retry,
+    client_options,
+    is_loopback,
+    retry_after_s,
+)
 
 
 @pytest.mark.parametrize(
@@ -61,6 +70,13 @@ def test_delays_grow_with_jitter_up_to_a_limit() -> None:
     assert max(delays) <= RETRY_LIMIT_S
     assert len(set(delays)) == 20
     assert delays[0] < delays[3] < delays[5]
+
+
+def test_the_documentation_names_the_statuses_that_are_tried_again(repository: Path) -> None:
+    text = (repository / "docs" / "sdk.md").read_text()
+    (sentence,) = re.findall(r"Connection errors, timeouts and ([^.(]*) are tried again", text)
+    assert {int(status) for status in re.findall(r"\d+", sentence)} == RETRIED_STATUSES
+    assert "5xx" not in sentence and 507 not in RETRIED_STATUSES
 
 
 def test_retry_after_is_honoured_within_reason() -> None:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import errno
+import shutil
 from pathlib import Path
+
+import pytest
 
 from services.embedded.logs import rotate, tail
 
@@ -33,6 +37,24 @@ def test_three_older_files_are_kept(tmp_path: Path) -> None:
     kept = sorted(path.name for path in tmp_path.iterdir())
     assert kept == ["worker.log", "worker.log.1", "worker.log.2", "worker.log.3"]
     assert (tmp_path / "worker.log.3").read_text() == "3" * 60
+
+
+def test_a_log_that_cannot_be_copied_keeps_all_it_had(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = tmp_path / "worker.log"
+    older = {"worker.log.1": "1", "worker.log.2": "2", "worker.log": "0" * 60}
+    for name, text in older.items():
+        (tmp_path / name).write_text(text)
+
+    def full(source: Path, target: Path) -> None:
+        target.write_text("0")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(shutil, "copyfile", full)
+    with pytest.raises(OSError, match="No space"):
+        rotate(log, max_bytes=50)
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == older
 
 
 def test_the_tail_of_a_log_is_its_last_lines(tmp_path: Path) -> None:

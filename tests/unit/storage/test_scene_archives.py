@@ -72,6 +72,16 @@ def test_a_member_that_leaves_the_archive_is_refused(name: str, reason: str) -> 
             bundle_from_bytes(archive)
 
 
+@pytest.mark.parametrize("form", [tarfile.USTAR_FORMAT, tarfile.GNU_FORMAT, tarfile.PAX_FORMAT])
+def test_a_member_whose_name_is_no_utf8_is_refused_in_words_that_can_be_sent(form: int) -> None:
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w", format=form, encoding="utf-8") as archive:
+        archive.addfile(tarfile.TarInfo("caf\udce9/scene.json"))
+    with pytest.raises(ArchiveRefused, match="is not UTF-8") as caught:
+        read_archive(buffer.getvalue(), WANTED)
+    assert str(caught.value).isascii()
+
+
 @pytest.mark.parametrize(
     "kind", [tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.CHRTYPE, tarfile.BLKTYPE, tarfile.FIFOTYPE]
 )

@@ -152,6 +152,15 @@ def test_a_mesh_outside_of_a_folder_is_not_followed(tmp_path: Path) -> None:
         read_bundle(bundle)
 
 
+def test_a_mesh_whose_member_is_damaged_is_a_fault_of_the_bundle() -> None:
+    declared, arrays, files = push_parts()
+    data, content = bytearray(archive(declared, arrays, files)), files["tools/peg.stl"]
+    data[data.index(content) + len(content) // 2] ^= 1
+    with pytest.raises(SceneInvalid, match="Bad CRC-32") as caught:
+        bundle_from_bytes(bytes(data))
+    assert [fault.loc for fault in caught.value.faults] == [["tools/peg.stl"]]
+
+
 @pytest.mark.parametrize("suffix", ["stl", "obj", "ply", "off"])
 def test_a_mesh_is_the_same_from_every_format_and_off_loses_nothing(suffix: str) -> None:
     exported = PEG.export(file_type=suffix)

@@ -228,6 +228,18 @@ FAULTS: list[tuple[str, Break, str, str]] = [
         "for 25 or 200 points",
     ),
     ("words kept", lambda d, a: a.update(labels=np.array(["a"])), "labels", "holds <U1"),
+    (
+        "clock without samples",
+        lambda d, a: a.update(ctrl_times=np.zeros(0), ctrl_points=a["controllers"][:0]),
+        "ctrl_times",
+        "is empty",
+    ),
+    (
+        "size of next to nothing",
+        set_body(size_m=[1e-308, 1e-308, 1e-308], mass_kg=0.5),
+        "size_m",
+        "declares 1.732e-308 m",
+    ),
     ("clock alone", lambda d, a: a.update(ctrl_times=np.arange(5.0)), "ctrl_times", "together"),
     (
         "short clock",

@@ -37,6 +37,24 @@ def put_up(database: Database, driver: leases.Lease, count: int, first: int = 0)
         return helpers.put_up(session, driver, first, [{"key": f"k{n}"} for n in range(count)])
 
 
+def orphan(database: Database, job: Job, index: int = 0) -> None:
+    """A helper that a driver put up while its job was being cancelled."""
+    with database.session() as session:
+        session.add(
+            ShardRow(
+                id=f"shd_orphan{index}",
+                job_id=job.id,
+                stage=9,
+                index=index,
+                kind=helpers.SIMULATION,
+                state="QUEUED",
+                max_attempts=5,
+                created_at=job.created_at,
+                payload={},
+            )
+        )
+
+
 def states(database: Database, job: Job) -> list[str]:
     with database.reading() as session:
         rows = session.query(ShardRow).where(ShardRow.job_id == job.id, ShardRow.kind == helpers.SIMULATION)
@@ -86,6 +104,38 @@ def test_a_helper_that_fails_fails_the_trace(work: Work, database: Database) -> 
         assert not leases.complete(session, driver, REPORT)
         assert traces.get_trace(session, job.outputs[0].id).state == "failed"
     assert states(database, job) == ["CANCELLED", "FAILED"]
+
+
+def test_a_cancelled_job_is_given_no_helpers(work: Work, database: Database) -> None:
+    job = trace_job(work, database)
+    driver = work.claim()
+    work.cancel(job)
+    assert put_up(database, driver, 2) == []
+    with database.session() as session:
+        leases.mark_cancelled(session, driver)
+    assert work.job(job).state == "cancelled" and states(database, job) == []
+
+
+def test_what_still_waits_when_a_cancel_settles_is_called_off(work: Work, database: Database) -> None:
+    job = trace_job(work, database)
+    driver = work.claim()
+    work.cancel(job)
+    orphan(database, job)
+    with database.session() as session:
+        leases.mark_cancelled(session, driver)
+    assert work.job(job).state == "cancelled" and states(database, job) == ["CANCELLED"]
+
+
+def test_shards_of_ended_jobs_take_no_place_in_the_queue(work: Work, database: Database) -> None:
+    ended = trace_job(work, database)
+    work.cancel(ended)
+    for index in range(3):
+        orphan(database, ended, index)
+    waiting = trace_job(work, database)
+    with database.reading() as session:
+        found = leases.publishable(session, utc_now(), limit=1, window=1)
+        (wanted,) = session.query(ShardRow.id).where(ShardRow.job_id == waiting.id).one()
+    assert [publication.shard_id for publication in found] == [wanted]
 
 
 def test_a_cancel_waits_for_helpers_that_run(work: Work, database: Database) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import json
 import threading
 from typing import TYPE_CHECKING
 
@@ -119,6 +121,31 @@ def test_models_and_versions_come_in_pages_newest_first(database: Database) -> N
 def test_a_cursor_from_elsewhere_is_refused(work: Work, cursor: str) -> None:
     with work.database.reading() as session, pytest.raises(InvalidCursor):
         resources.list_scenes(session, cursor=cursor)
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [
+        ["2026-01-01T00:00:00+00:00", "\ud800"],
+        ["0001-01-01T00:00:00+23:59", "scn_a"],
+        ["2026-01-01", "scn_a"],
+    ],
+)
+def test_a_cursor_that_no_database_compares_is_refused(work: Work, keys: list[str]) -> None:
+    with work.database.reading() as session, pytest.raises(InvalidCursor):
+        resources.list_scenes(session, cursor=base64.urlsafe_b64encode(json.dumps(keys).encode()).decode())
+
+
+def test_a_number_too_large_for_its_column_is_no_cursor_and_no_version(work: Work) -> None:
+    publish(work.database, "beam")
+    with work.database.reading() as session:
+        for number in (2**31, -(2**31), 2**70):
+            cursor = base64.urlsafe_b64encode(f"[{number}]".encode()).decode()
+            with pytest.raises(InvalidCursor):
+                registry.list_versions(session, "beam", cursor=cursor)
+        for digits in ("9" * 10, "9" * 5000):
+            with pytest.raises(NotFound, match="beam:999999999"):
+                registry.get_version(session, "beam", digits)
 
 
 def test_a_page_does_not_shift_under_writers(work: Work) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import timedelta
 from typing import TYPE_CHECKING
 
 import pytest
@@ -13,7 +14,7 @@ from schemas.model import TrainingConfig, TrainingCreate
 from schemas.pipeline import PipelineCreate
 from storage import jobs, leases, registry
 from storage.errors import Conflict
-from storage.tables import ShardRow
+from storage.tables import JobRow, ShardRow
 
 if TYPE_CHECKING:
     from conftest import Work
@@ -57,6 +58,17 @@ def test_the_training_opens_with_the_plan_and_the_pipeline_waits_for_both(work: 
     done = work.job(job)
     assert done.state == "succeeded"
     assert [output.kind for output in done.outputs] == ["fit", "dataset", "model"]
+
+
+def test_a_host_whose_clock_is_behind_opens_no_second_training(work: Work) -> None:
+    job = pipeline(work)
+    with work.database.session() as session:
+        beside = session.query(JobRow).where(JobRow.parent_id == job.id, JobRow.kind == "training").one()
+        beside.created_at -= timedelta(seconds=2)  # as if made before its dataset was
+    done = work.finish(job)
+    assert done.state == "succeeded"
+    assert [work.job(child).kind for child in done.children].count("training") == 1
+    assert [output.kind for output in done.outputs].count("model") == 1
 
 
 def test_without_a_share_the_training_waits_for_the_seal(work: Work) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+from pydantic import SecretStr
 from safetensors.numpy import load
 from tiny_scene import register, tiny_scene
 
@@ -60,8 +61,15 @@ SMALL = TrainingConfig(
 
 @pytest.fixture
 def runtime(tmp_path: Path) -> Iterator[Runtime]:
-    """One process that knows every kind of shard, on a folder of its own."""
-    settings = Settings(data_dir=tmp_path / "data", lease_seconds=20.0)
+    """One process that knows every kind of shard, on stores of its own; it can write nothing in its data folder."""
+    (tmp_path / "file").write_text("")
+    settings = Settings(
+        data_dir=tmp_path / "file" / "data",
+        database_url=f"sqlite:///{tmp_path / 'physworld.db'}",
+        store_url=(tmp_path / "store").as_uri(),
+        signing_key=SecretStr(base64.b64encode(bytes(32)).decode()),
+        lease_seconds=20.0,
+    )
     database = open_database(settings)
     database.upgrade()
     register_handler("training", "services.trainer.training:run")

@@ -26,7 +26,14 @@ RuntimeOf = Callable[..., Runtime]
 
 @pytest.fixture
 def settings(tmp_path: Path) -> Settings:
-    return Settings(data_dir=tmp_path / "data", lease_seconds=5.0)
+    """A worker's container is read-only: whatever a task writes below its data folder fails."""
+    (tmp_path / "file").write_text("")
+    return Settings(
+        data_dir=tmp_path / "file" / "data",
+        database_url=f"sqlite:///{tmp_path / 'physworld.db'}",
+        store_url=(tmp_path / "store").as_uri(),
+        lease_seconds=5.0,
+    )
 
 
 @pytest.fixture

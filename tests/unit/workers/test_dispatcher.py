@@ -89,6 +89,17 @@ def test_messages_that_the_broker_lost_are_published_again(
     _until(lambda: broker.llen(SIMULATION) == 3)
 
 
+@pytest.mark.usefixtures("dispatching")
+def test_a_broker_that_takes_nothing_is_waited_for(
+    stores: Stores, scene_id: str, broker: redis.Redis, caplog: pytest.LogCaptureFixture
+) -> None:
+    broker.config_set("maxmemory", 1)  # as a disk that is full, it makes writing commands fail and no others
+    _create_fits(stores, scene_id, 1)
+    _until(lambda: "broker away or full" in caplog.text)
+    broker.config_set("maxmemory", 0)
+    _until(lambda: broker.llen(SIMULATION) == 1)
+
+
 def test_idempotency_keys_of_more_than_a_day_ago_are_forgotten_once_an_hour(
     settings: Settings, stores: Stores, monkeypatch: pytest.MonkeyPatch
 ) -> None:

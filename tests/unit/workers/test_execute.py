@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
+from typing import Any
 
 import pytest
 
@@ -11,7 +13,9 @@ from physworld.errors import CFLViolation, UnstableSimulation
 from schemas.fit import FitConfig
 from schemas.job import Job
 from storage import jobs, leases
+from storage.errors import DatabaseUnavailable, StoreReadFailed, StoreWriteFailed
 from storage.tables import ShardRow
+from workers import execute
 from workers.context import TaskContext
 from workers.errors import Cancelled
 from workers.execute import Runtime, problem_of, run_shard
@@ -139,6 +143,72 @@ def test_an_overtaken_worker_commits_nothing(runtime_with, stores: Stores, job: 
 
     assert run_shard(runtime_with(fit=be_overtaken), _shard(stores).id) == "not committed"
     assert (_shard(stores).state, _shard(stores).lease_owner) == ("RUNNING", "another")
+
+
+def test_the_scratch_of_a_job_stays_until_its_result_is_committed(
+    runtime_with, stores: Stores, job: Job, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def keep(context: TaskContext, stores: Stores) -> HandlerResult:
+        stores.scratch.put(job.id, "calibration.json", b"{}")
+        return HandlerResult(FIT_RESULT)
+
+    def away(*arguments: object) -> bool:
+        raise StoreReadFailed("the store is away")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(leases, "complete", away)
+        assert run_shard(runtime_with(fit=keep), _shard(stores).id) == "retried"
+    assert stores.scratch.has(job.id, "calibration.json")
+    with stores.database.session() as session:
+        session.query(ShardRow).one().not_before = None
+    assert run_shard(runtime_with(fit=keep), _shard(stores).id) == "done"
+    assert stores.scratch.jobs() == []
+
+
+def test_a_scratch_that_cannot_be_removed_does_not_undo_the_commit(
+    runtime_with, stores: Stores, job: Job, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def away(job_id: str) -> int:
+        raise StoreWriteFailed("the store is away")
+
+    monkeypatch.setattr(stores.scratch, "remove", away)
+    assert run_shard(runtime_with(fit=_succeed), _shard(stores).id) == "done"
+
+
+def test_an_overtaken_worker_leaves_the_scratch_to_its_successor(
+    runtime_with, stores: Stores, job: Job
+) -> None:
+    def be_overtaken(context: TaskContext, stores: Stores) -> HandlerResult:
+        stores.scratch.put(job.id, "calibration.json", b"{}")
+        with stores.database.session() as session:
+            leases.recover(session, datetime.now(UTC))
+            leases.reap(session, datetime.now(UTC))
+            leases.claim(session, context.lease.shard_id, "another", datetime.now(UTC), 60.0)
+        raise Cancelled(f"job {job.id} goes on elsewhere")
+
+    assert run_shard(runtime_with(fit=be_overtaken), _shard(stores).id) == "not committed"
+    assert stores.scratch.has(job.id, "calibration.json")
+
+
+@pytest.mark.parametrize("refusals", [2, 1000])
+def test_a_commit_waits_for_a_database_that_is_away_while_the_lease_lasts(
+    runtime_with, stores: Stores, job: Job, monkeypatch: pytest.MonkeyPatch, refusals: int
+) -> None:
+    complete, asked = leases.complete, []
+
+    def away(*arguments: Any) -> bool:
+        asked.append(arguments)
+        if len(asked) <= refusals:
+            raise DatabaseUnavailable("the server closed the connection")
+        return complete(*arguments)
+
+    monkeypatch.setattr(leases, "complete", away)
+    monkeypatch.setattr(execute, "COMMIT_PAUSE_S", 0.2)
+    runtime: Runtime = runtime_with(fit=_succeed)
+    runtime = replace(runtime, settings=runtime.settings.model_copy(update={"lease_seconds": 2.0}))
+    outcome = run_shard(runtime, _shard(stores).id)
+    assert outcome == ("done" if refusals == 2 else "retried")
+    assert _job(stores, job).state == ("succeeded" if refusals == 2 else "running")
 
 
 def test_a_worker_that_is_stopped_gives_its_shard_back_untried(

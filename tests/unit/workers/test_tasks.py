@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,8 @@ from workers.execute import Runtime, run_shard
 from workers.stores import Stores
 from workers.tasks import dataset as dataset_task
 from workers.tasks import fit as fit_task
-from workers.tasks.fit import stored_journal
 from workers.tasks.inputs import named, npz_arrays, npz_bytes
+from workers.tasks.shared_runs import JOURNAL, stored_journal
 
 EPISODES = 3
 
@@ -117,16 +118,47 @@ def test_a_fit_without_damping_keeps_the_declared_physics(
     assert not {"air_drag_per_s", "viscosity_pa_s"} & set(fit.parameters)
 
 
-def test_the_journal_of_a_fit_outlives_its_worker_and_not_the_fit(
-    fit: Fit, stores: Stores, tmp_path: Path
-) -> None:
-    path = tmp_path / "job" / "fit.json"
-    first = stored_journal(path, {"scene_id": "a"})
+def test_a_journal_in_the_scratch_belongs_to_its_payload(stores: Stores) -> None:
+    first = stored_journal(stores, "job_a", {"scene_id": "a"})
     assert first.step("scan", lambda: {"cost": 1.0}) == {"cost": 1.0}
-    assert stored_journal(path, {"scene_id": "a"}).step("scan", lambda: {"cost": 2.0}) == {"cost": 1.0}
-    assert stored_journal(path, {"scene_id": "b"}).step("scan", lambda: {"cost": 2.0}) == {"cost": 2.0}
-    checkpoints = stores.settings.data_dir / "checkpoints"
-    assert not (checkpoints / fit.job_id).exists()
+    for scene_id, cost in (("a", 1.0), ("b", 2.0)):
+        again = stored_journal(stores, "job_a", {"scene_id": scene_id})
+        assert again.step("scan", lambda: {"cost": 2.0}) == {"cost": cost}
+
+
+def test_the_journal_of_a_fit_outlives_its_worker_and_not_the_fit(
+    runtime_with, stores: Stores, scene_id: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with stores.database.session() as session:
+        job = jobs.create_fit(session, scene_id, FitConfig(particle_budget=60, max_simulations=6))
+    (driver,) = _waiting(stores)
+
+    class Killed(BaseException):
+        pass
+
+    def dying(*arguments: object) -> None:
+        raise Killed
+
+    with monkeypatch.context() as patch:
+        patch.setattr(fit_task, "fit_report", dying)
+        with pytest.raises(Killed):
+            run_shard(runtime_with(), driver)
+    assert stores.scratch.has(job.id, JOURNAL)
+    with stores.database.session() as session:
+        leases.reap(session, datetime.now(UTC) + timedelta(minutes=5))
+    simulated: list[object] = []
+    monkeypatch.setattr(fit_task.SharedRunner, "__call__", lambda self, *given: simulated.append(given))
+    elsewhere = Stores(stores.settings, stores.database)
+    assert run_shard(replace(runtime_with(), stores=elsewhere), driver) == "done"
+    assert simulated == [], "a simulation of the search was run again"
+    assert stores.scratch.jobs() == []
+
+
+def test_no_task_writes_below_the_data_folder(runtime_with, fit: Fit, stores: Stores) -> None:
+    with pytest.raises(OSError):
+        stores.settings.data_dir.mkdir(parents=True)
+    job, dataset = _make_dataset(runtime_with(), fit, episodes=2, frames=8)
+    assert (job.state, dataset.state) == ("succeeded", "sealed")
 
 
 def test_a_dataset_is_sealed_under_the_digest_of_its_manifest(runtime_with, fit: Fit, stores: Stores) -> None:

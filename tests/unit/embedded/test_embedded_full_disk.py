@@ -1,0 +1,82 @@
+"""A full disk: the supervisor goes on with what it has, and its children are started again."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from services.embedded import child as child_module
+from services.embedded import logs, supervisor
+from services.embedded.child import Child, Program
+from services.embedded.supervisor import Options, Supervisor
+
+WITHIN_S = 20.0
+
+
+def _full(*arguments: object, **named: object) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def _child(tmp_path: Path) -> Child:
+    code = "import time; time.sleep(600)"
+    program = Program("sleeper", (sys.executable, "-c", code), dict(os.environ))
+    return Child(program, tmp_path / "sleeper.log", os.open(tmp_path / "family", os.O_CREAT | os.O_RDWR))
+
+
+def _until(condition) -> None:
+    deadline = time.monotonic() + WITHIN_S
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def test_a_child_whose_log_cannot_be_cut_is_started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    child = _child(tmp_path)
+    monkeypatch.setattr(logs, "rotate", _full)
+    child.start()
+    assert child.pid is not None
+    child.wait_or_kill(time.monotonic())
+    os.close(child.family_descriptor)
+
+
+def test_the_supervisor_outlives_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+
+    def say(text: str) -> None:
+        said.append(text)
+        _full()
+
+    watched = Supervisor(Options(tmp_path), say)
+    child = _child(tmp_path)
+    watched._children.append(child)
+    watched._url = "http://127.0.0.1:1"
+    child.start()
+    monkeypatch.setattr(logs, "rotate", _full)
+    monkeypatch.setattr(watched._folder.__class__, "write_state", _full)
+    monkeypatch.setattr(supervisor, "LOGS_S", 0.5)
+    monkeypatch.setattr(child_module, "LONGEST_PAUSE_S", 0.5)
+    thread = threading.Thread(target=watched._watch)
+    thread.start()
+    try:
+        _until(lambda: any("sleeper.log is not cut" in text for text in said))
+        first = child.pid
+        assert first is not None
+        with monkeypatch.context() as patch:
+            patch.setattr(Child, "start", _full)
+            os.kill(first, signal.SIGKILL)
+            _until(lambda: any("sleeper is not started yet: [Errno 28]" in text for text in said))
+        _until(lambda: child.pid not in (None, first))
+        _until(lambda: any("state.json is not up to date" in text for text in said))
+        assert thread.is_alive()
+    finally:
+        watched._stop.set()
+        thread.join()
+        child.wait_or_kill(time.monotonic())
+        os.close(child.family_descriptor)
