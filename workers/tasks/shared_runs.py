@@ -50,7 +50,7 @@ def simulate(context: TaskContext, stores: Stores) -> HandlerResult:
 
 
 def stored_journal(stores: Stores, job_id: str, payload: dict[str, Any]) -> Journal:
-    """The journal of an earlier attempt at the same payload by the same engine, or an empty one; stored after every step."""
+    """The journal of an earlier attempt at the same payload by this engine, or an empty one; kept after every step."""
     stored = stores.scratch.get(job_id, JOURNAL)
     return Journal(
         f"{engine()} {json.dumps(payload, sort_keys=True)}",
