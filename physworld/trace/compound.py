@@ -20,9 +20,14 @@ WHOLE = "wind"
 PARTS = ("air_drag_linear", "gravity_tilt")
 
 
+def is_in_parts(model: Model) -> bool:
+    """Whether a model's effects are the parts of one."""
+    return set(model.names) == set(PARTS)
+
+
 def count_of_effects(model: Model) -> int:
     """Effects in a model; the parts of one count as that one."""
-    return 1 if set(model.names) == set(PARTS) else len(model.members)
+    return 1 if is_in_parts(model) else len(model.members)
 
 
 def other_names(model: Model, other: Model) -> bool:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from physworld.trace.comparison import alikeness, cross_validated
-from physworld.trace.compound import WHOLE, in_parts
+from physworld.trace.compound import WHOLE, in_parts, is_in_parts
 from physworld.trace.config import TraceConfig
 from physworld.trace.confirm import Confirmation, Model, best_variants
 from physworld.trace.plates import as_a_plate
@@ -219,6 +219,7 @@ def _strengths(model: Model) -> np.ndarray:
 
 
 def by_chance(model: Model, scores: Scores) -> bool:
-    """Whether random signs reach the score of every effect of a model, in its best variant."""
-    own = [s.share for s in scores.ranked if s.candidate.effect in model.names]
+    """Whether random signs reach the score of every effect of a model, in its best variant; the whole's for parts."""
+    names = (*model.names, WHOLE) if is_in_parts(model) else model.names
+    own = [s.share for s in scores.ranked if s.candidate.effect in names]
     return max(own, default=0.0) < scores.threshold

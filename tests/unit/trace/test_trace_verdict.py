@@ -14,6 +14,8 @@ from physworld.trace.comparison import cross_validated
 from physworld.trace.config import TraceConfig
 from physworld.trace.confirm import Model
 from physworld.trace.refit import Refit
+from physworld.trace.score import Score, Scores
+from physworld.trace.selection import by_chance
 from physworld.trace.unknowns import Unknown
 from physworld.trace.verdict import Verdict, decide, implausible
 
@@ -151,6 +153,17 @@ def test_a_wind_may_as_well_be_a_drag_where_gravity_is_tilted() -> None:
     assert answer([wind, upwards], before) == ("named", ("wind",))
     drag = model(NOISE, "air_drag_linear")
     assert answer([wind, parts, drag], before) == ("named", ("air_drag_linear",))
+
+
+def test_the_parts_of_a_wind_score_as_the_wind_does() -> None:
+    def score(name: str, share: float) -> Score:
+        return Score(Candidate(name, "", ()), share, np.ones(1), np.ones(1), 0.0, share)
+
+    known = Scores([score("wind", 0.3), score("air_drag_linear", 0.1), score("gravity_tilt", 0.1)], 0.2, [])
+    assert not by_chance(model(NOISE, "air_drag_linear", "gravity_tilt"), known)
+    assert not by_chance(model(NOISE, "wind"), known)
+    assert by_chance(model(NOISE, "air_drag_linear"), known)
+    assert by_chance(model(NOISE, "gravity_tilt", "rest_shape"), known)
 
 
 def test_what_other_cells_would_change_is_no_effect() -> None:
