@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from physworld.trace.comparison import alikeness, better_beyond_chance, difference, seen_through
-from physworld.trace.compound import count_of_effects, other_names
+from physworld.trace.compound import count_of_effects, is_in_parts, other_names
 from physworld.trace.config import TraceConfig
 from physworld.trace.confirm import Model, beats, explained_direction
 
@@ -268,10 +268,10 @@ def indistinguishable(model: Model, best: Model, basis: np.ndarray, declared: Mo
     """Whether another model that is no less simple does as well, and by explaining the same.
 
     As well: within one standard error, or within half of what the better one leaves above the noise, which may as well
-    lie between the two as elsewhere. A wind and the drag and tilt that it may be as well differ by one number only.
+    lie between the two as elsewhere. A wind does all that a drag and a tilt do, with a number more.
     """
     if other_names(model, best):
-        return as_good(model, best, declared)
+        return is_in_parts(best) or as_good(model, best, declared)
     if len(model.members) != len(best.members) or len(model.fitted.unknowns) > len(best.fitted.unknowns):
         return False
     same = alikeness(explained_direction(model, declared, basis), explained_direction(best, declared, basis))

@@ -149,6 +149,8 @@ def test_a_wind_may_as_well_be_a_drag_where_gravity_is_tilted() -> None:
     parts = model(NOISE, "air_drag_linear", "gravity_tilt", unknowns=3)
     wind = model(0.9999 * NOISE, "wind", unknowns=4)
     assert answer([wind, parts], before) == ("equivalent_set", ("air_drag_linear", "gravity_tilt"))
+    looser = model(1.05 * NOISE, "wind", unknowns=4)  # one number more absorbs some noise, and predicts worse
+    assert answer([looser, parts], before)[0] == "equivalent_set"
     upwards = model(1.1 * NOISE + OTHER, "air_drag_linear", "gravity_tilt", unknowns=3)
     assert answer([wind, upwards], before) == ("named", ("wind",))
     drag = model(NOISE, "air_drag_linear")
