@@ -104,13 +104,16 @@ class Whitener:
 def whitener(scene: Scene, split: Split, sigma: float, responses: np.ndarray) -> Whitener:
     """The whitener of the training frames; a point that frame 0 does not show has no place of its own and is left out.
 
+    Where frame 0 shows none, all are kept.
+
     Args:
         scene, split: what was measured, and which of it counts.
         sigma: tracking noise [m].
         responses: of every tracked point to its own place, (frames, N, 3, r), from :func:`responses`.
     """
     first, end = split.train
-    visible = scene.visible[first:end] & scene.visible[0]
+    placed = scene.visible[0] if scene.visible[0].any() else np.ones(scene.visible.shape[1], dtype=bool)
+    visible = scene.visible[first:end] & placed
     frames, points = np.nonzero(visible)
     places = []
     for point in range(visible.shape[1]):

@@ -66,3 +66,12 @@ def test_the_place_of_a_point_is_found_and_clipped(parts: tuple) -> None:
     found = white.place_errors(scene.points - shift)
     expected = shift * (sightings / (1 + sightings))[:, None]
     assert found == pytest.approx(np.clip(expected, -3 * SIGMA, 3 * SIGMA), rel=1e-9, abs=1e-12)
+
+
+def test_a_point_without_a_place_is_left_out_unless_none_has_one(parts: tuple) -> None:
+    scene, split, responses, _ = parts
+    scene.visible[:] = True
+    scene.visible[0, 1] = False
+    assert set(whitener(scene, split, SIGMA, responses).points) == {0, 2}
+    scene.visible[0] = False
+    assert set(whitener(scene, split, SIGMA, responses).points) == {0, 1, 2}
