@@ -1,4 +1,7 @@
-"""How hard grips hold: a refit started again from other softnesses, for stiffness and softness trade along a valley."""
+"""How hard grips hold: a refit started again from other softnesses, for stiffness and softness trade along a valley.
+
+Scouts go first, without a Jacobian of their own; the best is refitted from where it ends, if it comes near.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,9 @@ from physworld.trace.unknowns import SOFTNESS
 from physworld.trace.whitening import Whitener
 
 _SHARES = (0.15, 0.4, 1.0)  # of ``AS_HELD``
+_SCOUTED = 2  # times the iterations of a refit: a scout's steps are cheap
+_POLISHED = 1  # iterations of the best scout's refit: it has come to the optimum already
+_PROMISING = 1.5  # times the squared residual of what there is up to which the best scout is followed
 _STIFFNESSES = (-0.3, -0.15, 0.0, 0.15)  # logarithms of the stiffness that may go with them
 
 
@@ -21,16 +27,20 @@ def held_otherwise(
     names = [unknown.name for unknown in fitted.unknowns]
     if SOFTNESS not in names:
         return fitted
-    k, best = names.index(SOFTNESS), fitted
+    k, scouts = names.index(SOFTNESS), []
+    limit = _PROMISING * float(np.sum(fitted.residual**2))
     for share in _SHARES:
         places = [fitted.theta + shift * np.eye(len(names))[0] for shift in _STIFFNESSES]
         for place in places:
             place[k] = np.log(share * AS_HELD)
         unknowns = [u.starting(t) for u, t in zip(fitted.unknowns, places[0], strict=True)]
-        other = refit(
-            simulations, whitener, fitted.twin, unknowns, frames, iterations, places[1:],
-            hopeless=2.0 * float(np.sum(best.residual**2)),
+        scout = refit(
+            simulations, whitener, fitted.twin, unknowns, frames, _SCOUTED * iterations, places[1:],
+            hopeless=limit, jacobian=fitted.jacobian,
         )  # fmt: skip
-        if other is not None and other.misfit < best.misfit:
-            best = other
-    return best
+        scouts += [] if scout is None else [scout]
+    scout = min(scouts, key=lambda s: s.misfit, default=None)
+    if scout is None or float(np.sum(scout.residual**2)) > limit:
+        return fitted
+    other = refit(simulations, whitener, fitted.twin, scout.unknowns, frames, _POLISHED)
+    return fitted if other is None or other.misfit >= fitted.misfit else other

@@ -82,7 +82,8 @@ def refit(
         hopeless: squared residual (sum) above which the search is left after two iterations: what it is compared with
             does far better.
         brief: leave the Jacobian one step behind the optimum.
-        jacobian: sensitivities to use throughout, (M, p): another resolution's, which hardly differ, save most runs.
+        jacobian: sensitivities to begin with, (M, p), such as another resolution's, which hardly differ. None are
+            simulated then; the steps themselves tell how they change (Broyden, Math. Comp. 19, 1965, 577-593).
 
     Returns:
         The optimum; None where no start gave a usable run.
@@ -90,7 +91,8 @@ def refit(
     own = np.array([unknown.start for unknown in unknowns])
     low, high = np.array([u.low for u in unknowns]), np.array([u.high for u in unknowns])
     places = [own, *(np.clip(start, low, high) for start in starts or [])]
-    best = _best_of(simulations, whitener, twin, unknowns, places, frames)
+    looked = _looked(simulations, whitener, twin, unknowns, places, frames)
+    best = min(looked, key=_cost, default=None)
     if best is None:
         return None
     theta, tracks, residual, cost = best
@@ -104,7 +106,10 @@ def refit(
             known = slope
         step = _step(unknowns, theta, residual, slope, damping, low, high)
         trials = [np.clip(theta + scale * step, low, high) for scale in _SCALES]
-        found = _best_of(simulations, whitener, twin, unknowns, trials, frames)
+        looked = _looked(simulations, whitener, twin, unknowns, trials, frames)
+        if jacobian is not None:
+            slope = _secant(slope, theta, residual, looked)
+        found = min(looked, key=_cost, default=None)
         if found is None or not found[3] < cost:
             if damping > 1.0:
                 break
@@ -115,7 +120,8 @@ def refit(
         damping = max(damping / 10.0, 1e-6)
         if gain < _TOLERANCE:
             break
-        slope = jacobian
+        if jacobian is None:
+            slope = None
     if slope is None and known is not None and (brief or cost > hopeless):
         slope = known
     if slope is None:
@@ -128,21 +134,40 @@ def refit(
 Found = tuple[np.ndarray, np.ndarray, np.ndarray, float]
 
 
-def _best_of(
+def _cost(found: Found) -> float:
+    return found[3]
+
+
+def _looked(
     simulations: Simulations,
     whitener: Whitener,
     twin: Twin,
     unknowns: list[Unknown],
     places: list[np.ndarray],
     frames: int,
-) -> Found | None:
+) -> list[Found]:
+    """What the places (p,) give; those whose run cannot be trusted are left out."""
     runs = simulations.run([Job(at(twin, unknowns, place), frames) for place in places])
     found: list[Found] = []
     for place, tracks in zip(places, runs, strict=True):
         if tracks is not None:
             residual = whitener.residual(tracks)
             found.append((place, tracks, residual, float(residual @ residual) + _prior_cost(unknowns, place)))
-    return min(found, key=lambda f: f[3]) if found else None
+    return found
+
+
+def _secant(slope: np.ndarray, theta: np.ndarray, residual: np.ndarray, looked: list[Found]) -> np.ndarray:
+    """Sensitivities (M, p) that agree with the runs of a line search from ``theta``, with the best one exactly.
+
+    Steps are measured by what each unknown does, so that units do not count.
+    """
+    weight = np.maximum(np.sum(slope**2, axis=0), np.finfo(float).tiny)
+    for place, _, there, _ in sorted(looked, key=_cost, reverse=True):
+        step = place - theta
+        size = float(step @ (weight * step))
+        if size > 0.0:
+            slope = slope + np.outer(residual - there - slope @ step, weight * step) / size
+    return slope
 
 
 def prior_rows(unknowns: list[Unknown], theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
