@@ -73,7 +73,7 @@ class SecondResolution:
         values[model.names] = {unknown.name: found.value(unknown.name) for unknown in found.unknowns}
         intervals = numbers(model.fitted, self.block_of_row, {}, self.config.bootstraps, self.config.seed)
         return self._still_helps(declared, found) and all(
-            self._alike(model.fitted, found, member)
+            self.does_the_same(model.fitted, found, member)
             or _within(model.fitted, values[model.names], intervals, member)
             for member in model.members
         )
@@ -91,7 +91,7 @@ class SecondResolution:
         share = 1.0 - after.mean / before.mean
         return better_beyond_chance(after, before) and share >= self.config.material_share
 
-    def _alike(self, coarse: Refit, fine: Refit, member: Candidate) -> bool:
+    def does_the_same(self, coarse: Refit, fine: Refit, member: Candidate) -> bool:
         """Whether an effect does the same to the prediction at both resolutions, whatever its numbers.
 
         Two numbers of one effect may make up for each other (a tether's stiffness and its anchor); what they do
