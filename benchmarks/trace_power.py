@@ -31,6 +31,7 @@ from benchmarks.trace_power_report import page, summary
 from physworld.build import build_twin
 from physworld.effects.registry import EFFECTS
 from physworld.errors import PhysworldError
+from physworld.scene import Scene
 from physworld.trace import TraceResult, document, trace
 
 NULLS = 36
@@ -86,7 +87,7 @@ def run(task: Task) -> dict[str, Any]:
     line: dict[str, Any] = asdict(task)
     without = observed(known.truth, known.scene)
     if task.effect is None:
-        return line | _traced(known, recorded(known.scene, without, task.seed))
+        return line | traced(known, recorded(known.scene, without, task.seed))
     reason = refusal(task.effect, known)
     if reason is not None:
         return line | {"outcome": "refused", "reason": reason}
@@ -96,10 +97,11 @@ def run(task: Task) -> dict[str, Any]:
     line |= {"strengths": made.strengths, "size": made.size, "unit": made.unit, "clipped": made.clipped}
     line |= {"displacement": made.displacement}
     noise_seed = 1000 + sorted(EFFECTS).index(task.effect)
-    return line | _traced(known, recorded(known.scene, made.tracks, noise_seed))
+    return line | traced(known, recorded(known.scene, made.tracks, noise_seed))
 
 
-def _traced(known: Object, scene: Any) -> dict[str, Any]:
+def traced(known: Object, scene: Scene) -> dict[str, Any]:
+    """What a trace says of a recording, and its seconds."""
     start = build_twin(scene, known.budget)
     true = known.truth.parameters
     start = start.with_parameters(**{n: _OFF * true[n] for n in _STIFFNESS if n in true})
@@ -134,7 +136,7 @@ def _answer(found: TraceResult) -> dict[str, Any]:
     }
 
 
-def _commit() -> dict[str, Any]:
+def commit() -> dict[str, Any]:
     """Commit of the method, and whether its files differ from it."""
     root = Path(__file__).resolve().parents[1]
     try:
@@ -147,7 +149,7 @@ def _commit() -> dict[str, Any]:
     return {"commit": head.stdout.strip(), "changed": same.returncode != 0}
 
 
-def _stored(folder: Path | None) -> dict[str, dict[str, Any]]:
+def stored(folder: Path | None) -> dict[str, dict[str, Any]]:
     """Lines by key; a line that was cut off is left out."""
     if folder is None or not (folder / "results.jsonl").exists():
         return {}
@@ -182,14 +184,14 @@ def main() -> int:
     )
     given = parser.parse_args()
     every = tasks(given.nulls)
-    lines = _stored(given.resume)
+    lines = stored(given.resume)
     missing = [task for task in _wanted(every, given.only) if task.key not in lines]
-    commit = _commit()
+    method = commit()
     import warp as wp
 
     wp.config.quiet = True
     for task in missing[: given.at_most]:
-        line = {"key": task.key, **run(task), **commit}
+        line = {"key": task.key, **run(task), **method}
         line = json.loads(json.dumps(line, default=float))
         lines[task.key] = line
         if given.resume is not None:
