@@ -248,8 +248,7 @@ def scored(case: Case, scene: Path, report: dict[str, Any]) -> dict[str, Any]:
     """What the answer is worth: as ``benchmarks.trace`` scores it, and beside effects of the library by its verdict."""
     truth = json.loads((scene / "truth.json").read_text())
     library = all(name in PRIMARY for name in truth["parameters"])
-    thin = OBJECTS[case.object].kind in SHEET_KINDS
-    row = score(report, truth if library else {**truth, "parameters": {}}, thin)
+    row = score(report, truth if library else {**truth, "parameters": {}})
     if not library:
         names = {*row["named"], *row["equivalent"]}
         clock = "clock" in case.acts and "measurement_clock" in names

@@ -22,10 +22,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from benchmarks.harness import Report, write_section
-from physworld.geometry.reference import SHEET_KINDS
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 CLAIMS = ("named", "equivalent_set")
@@ -45,33 +42,23 @@ PRIMARY = {"linear_drag": "c", "quadratic_drag": "k", "internal_viscosity": "eta
            "control_lag": "seconds", "tether": "k"}  # fmt: skip
 
 
-def strength(effect: dict[str, Any], report: dict[str, Any], sheet: bool) -> float:
+def strength(effect: dict[str, Any]) -> float:
     """The primary strength of a found effect in the units of the truth."""
     values = {name: number["value"] for name, number in effect["parameters"].items()}
-    known = {name: number["value"] for name, number in report["calibrated"].items()}
-    name = effect["name"]
-    if name == "gravity_tilt":
-        return float(np.degrees(np.hypot(values.get("tilt_x_rad", 0.0), values.get("tilt_y_rad", 0.0))))
-    if name == "anisotropy":
-        modulus = known["youngs_modulus_pa"]
-        if sheet:  # a sheet's fibres are stiff in units of its membrane
-            modulus /= 1.0 - known.get("poissons_ratio", 0.3) ** 2
-        return values["ratio"] * modulus
-    if name == "viscosity_kelvin_voigt" and "viscosity_pa_s" not in values:
-        ratio = known.get("poissons_ratio", 0.3)
-        return values["relaxation_s"] * known["youngs_modulus_pa"] / (2 * (1 + 2 * ratio**2))
     first = {
         "air_drag_linear": "rate_per_s",
         "air_drag_quadratic": "coefficient_per_m",
+        "gravity_tilt": "tilt_deg",
+        "anisotropy": "fibre_modulus_pa",
         "viscosity_kelvin_voigt": "viscosity_pa_s",
         "actuation_lag": "lag_s",
         "measurement_clock": "offset_s",
         "tether": "stiffness_n_m",
     }
-    return values.get(first.get(name, ""), float("nan"))
+    return values.get(first.get(effect["name"], ""), float("nan"))
 
 
-def score(report: dict[str, Any], truth: dict[str, Any], sheet: bool) -> dict[str, Any]:
+def score(report: dict[str, Any], truth: dict[str, Any]) -> dict[str, Any]:
     """What the answer is worth against the truth."""
     acting = sorted(truth["parameters"])
     claimed = report["verdict"] in CLAIMS
@@ -90,9 +77,7 @@ def score(report: dict[str, Any], truth: dict[str, Any], sheet: bool) -> dict[st
     for effect in acting:
         matches = [e for e in [*found, *others] if e["name"] in REGISTRY[effect]]
         if matches:
-            ratios[effect] = (
-                strength(matches[0], report, sheet) / truth["parameters"][effect][PRIMARY[effect]]
-            )
+            ratios[effect] = strength(matches[0]) / truth["parameters"][effect][PRIMARY[effect]]
     out = report["held_out"]
     return {
         "scene": report["scene"],
@@ -173,8 +158,7 @@ def main() -> int:
             if report is None:
                 failed.append(scene.name)
                 continue
-            kind = json.loads((scene / "scene.json").read_text())["kind"]
-            row = score(report, json.loads((scene / "truth.json").read_text()), kind in SHEET_KINDS)
+            row = score(report, json.loads((scene / "truth.json").read_text()))
             row["wall_s"] = time.perf_counter() - begun
             rows.append(row)
             print(json.dumps(row), flush=True)

@@ -54,6 +54,13 @@ class Anisotropy(Effect):
     azimuth_rad: float = 0.0
     elevation_rad: float = 0.0
 
+    def derived(self, twin: Twin) -> dict[str, tuple[float, str]]:
+        """The fibres' own modulus: a sheet's over its thickness."""
+        law = twin.law
+        solid = twin.lattice.dim == 3
+        modulus = law.youngs_modulus_pa if solid else law.membrane_n_m / twin.body.thickness_m
+        return {"fibre_modulus_pa": (float(self.ratio * modulus), "Pa")}
+
     @classmethod
     def strengths(cls, twin: Twin) -> tuple[Strength, ...]:
         """Half as soft to twenty times as stiff; a direction and its opposite are the same."""

@@ -75,9 +75,8 @@ class Effect:
         """Every field by name: what :func:`physworld.effects.registry.effect` takes to make it again."""
         return asdict(self)
 
-    @property
-    def derived(self) -> dict[str, tuple[float, str]]:
-        """Numbers that people ask for and the strengths imply: name to (value, unit)."""
+    def derived(self, twin: Twin) -> dict[str, tuple[float, str]]:
+        """Numbers that people ask for and the strengths imply on this twin: name to (value, unit)."""
         return {}
 
     @classmethod

@@ -35,6 +35,10 @@ class GravityTilt(Effect):
     tilt_y_rad: float = 0.0
     magnitude: float = 0.0
 
+    def derived(self, twin: Twin) -> dict[str, tuple[float, str]]:
+        """The whole angle."""
+        return {"tilt_deg": (float(np.degrees(np.hypot(self.tilt_x_rad, self.tilt_y_rad))), "deg")}
+
     @classmethod
     def strengths(cls, twin: Twin) -> tuple[Strength, ...]:
         """Up to half a radian either way, half as much or half more."""

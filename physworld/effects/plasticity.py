@@ -136,8 +136,7 @@ class Plasticity(Effect):
     yield_radius_m: float = 0.0
     hardening: float = 0.0
 
-    @property
-    def derived(self) -> dict[str, tuple[float, str]]:
+    def derived(self, twin: Twin) -> dict[str, tuple[float, str]]:
         """The yield point itself."""
         found = {}
         if self.inverse_yield_per_pa:

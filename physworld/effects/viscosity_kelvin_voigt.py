@@ -33,6 +33,15 @@ class ViscosityKelvinVoigt(Effect):
     viscosity_pa_s: float = 0.0
     relaxation_s: float = 0.0
 
+    def derived(self, twin: Twin) -> dict[str, tuple[float, str]]:
+        """Of a sheet the viscosity of its material."""
+        if twin.lattice.dim != 2:
+            return {}
+        law = twin.law
+        nu, thickness = law.poissons_ratio, twin.body.thickness_m
+        modulus = law.membrane_n_m * (1 - nu**2) / thickness
+        return {"viscosity_pa_s": (float(self.relaxation_s * modulus / (2 * (1 + 2 * nu**2))), "Pa s")}
+
     @classmethod
     def strengths(cls, twin: Twin) -> tuple[Strength, ...]:
         """The one that the body has; a solid's goes by its weight, rho g L [Pa], times a second."""

@@ -37,8 +37,7 @@ class Wind(Effect):
     push_z_m_s2: float = 0.0
     rate_per_s: float = 0.0
 
-    @property
-    def derived(self) -> dict[str, tuple[float, str]]:
+    def derived(self, twin: Twin) -> dict[str, tuple[float, str]]:
         """The wind's velocity, where there is a drag to give it."""
         if self.rate_per_s == 0:
             return {}

@@ -2,24 +2,91 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from physworld.effects.registry import EFFECTS
 from physworld.trace.confirm import Model
 from physworld.trace.refit import Refit, prior_rows
 from physworld.trace.result import Named, Number
+from physworld.trace.unknowns import Unknown, at
+from physworld.twin import Twin
 
+_STEP = 0.01  # of an unknown's step: what it changes in a derived number
 _TWO_SIDED = 1.96  # standard deviations of a 95 % interval
 
 
-def numbers(
-    fitted: Refit, block_of_row: np.ndarray, finer: dict[str, float], resamples: int, seed: int
-) -> dict[str, Number]:
-    """Every unknown's value and interval.
+@dataclass(frozen=True)
+class Spread:
+    """How well an optimum is known.
 
-    The interval is that of the linear refit under resampled blocks of frames, but no narrower than the sensitivities
-    and the noise (the misfit, where that is larger) leave it: few blocks, or a single one, resample to much the same.
-    It is widened to hold the value that was found at the second resolution.
+    Attributes:
+        fitted: the optimum.
+        drawn: unknowns under resampled blocks of frames, (resamples, p).
+        covariance: what sensitivities and noise (the misfit, where that is larger) leave, (p, p).
+        finer: values at the second resolution, by name.
+    """
+
+    fitted: Refit
+    drawn: np.ndarray
+    covariance: np.ndarray
+    finer: dict[str, float]
+
+    def numbers(self) -> dict[str, Number]:
+        """Every unknown's value and interval.
+
+        The interval is that of the linear refit under resampled blocks of frames, but no narrower than the
+        sensitivities and the noise leave it: few blocks, or a single one, resample to much the same. It is widened to
+        hold the value that was found at the second resolution.
+        """
+        fitted, found = self.fitted, {}
+        least = _TWO_SIDED * np.sqrt(np.diag(self.covariance))
+        for k, unknown in enumerate(fitted.unknowns):
+            value = unknown.value(float(fitted.theta[k]))
+            below, above = np.quantile(self.drawn[:, k], [0.025, 0.975])
+            ends = min(below, fitted.theta[k] - least[k]), max(above, fitted.theta[k] + least[k])
+            low, high = sorted(unknown.value(float(np.clip(end, unknown.low, unknown.high))) for end in ends)
+            other = self.finer.get(unknown.name, value)
+            found[unknown.name] = Number(value, unknown.unit, (min(low, other), max(high, other)))
+        return found
+
+    def derived(self, name: str) -> dict[str, Number]:
+        """What an effect's numbers imply, with intervals to first order (the delta method)."""
+        fitted, unknowns = self.fitted, self.fitted.unknowns
+        implied = _implied(fitted.twin, name)
+        slopes: dict[str, np.ndarray] = {key: np.zeros(len(unknowns)) for key in implied}
+        for k, unknown in enumerate(unknowns):
+            step = np.zeros(len(unknowns))
+            step[k] = _STEP * unknown.step * (1.0 if fitted.theta[k] < unknown.high else -1.0)
+            there = _implied(at(fitted.twin, unknowns, fitted.theta + step), name)
+            for key, (value, _) in implied.items():
+                slopes[key][k] = (there.get(key, (value, ""))[0] - value) / step[k]
+        moved = np.array([self._to_finer(u, float(t)) for u, t in zip(unknowns, fitted.theta, strict=True)])
+        found = {}
+        for key, (value, unit) in implied.items():
+            slope = slopes[key]
+            resampled = (self.drawn - fitted.theta) @ slope
+            reach = _TWO_SIDED * float(np.sqrt(slope @ self.covariance @ slope))
+            below, above = np.quantile(resampled, [0.025, 0.975])
+            other = float(slope @ moved)
+            ends = (min(below, -reach, other), max(above, reach, other))
+            found[key] = Number(value, unit, (value + float(ends[0]), value + float(ends[1])))
+        return found
+
+    def _to_finer(self, unknown: Unknown, theta: float) -> float:
+        """How far the second resolution is away, in the scale of the search and to first order."""
+        if unknown.name not in self.finer:
+            return 0.0
+        value = unknown.value(theta)
+        slope = (unknown.value(theta + _STEP * unknown.step) - value) / (_STEP * unknown.step)
+        return (self.finer[unknown.name] - value) / slope
+
+
+def spread_of(
+    fitted: Refit, block_of_row: np.ndarray, finer: dict[str, float], resamples: int, seed: int
+) -> Spread:
+    """How well an optimum is known, by resampling blocks of training frames, and by noise and sensitivities.
 
     Args:
         finer: values at the second resolution, by name.
@@ -36,37 +103,33 @@ def numbers(
     counts = rng.multinomial(blocks, np.full(blocks, 1.0 / blocks), size=resamples)
     ridge = 1e-9 * np.diag(np.diag(normal.sum(axis=0)) + 1e-30)
     information = normal.sum(axis=0) + prior_slope.T @ prior_slope + ridge
-    least = _TWO_SIDED * max(1.0, fitted.misfit) * np.sqrt(np.diag(np.linalg.inv(information)))
+    covariance = max(1.0, fitted.misfit) ** 2 * np.linalg.inv(information)
     total = np.tensordot(counts, normal, 1) + prior_slope.T @ prior_slope + ridge
     push = np.tensordot(counts, gradient, 1) + prior_slope.T @ prior_residual
     drawn = fitted.theta + np.linalg.solve(total, push[..., None])[..., 0]
     # with few blocks the resampled optimum may miss the slope that the tolerance of the search left: centre it
     drawn += fitted.theta - np.median(drawn, axis=0)
-    found = {}
-    for k, unknown in enumerate(fitted.unknowns):
-        value = unknown.value(float(fitted.theta[k]))
-        below, above = np.quantile(drawn[:, k], [0.025, 0.975])
-        ends = min(below, fitted.theta[k] - least[k]), max(above, fitted.theta[k] + least[k])
-        low, high = sorted(unknown.value(float(np.clip(end, unknown.low, unknown.high))) for end in ends)
-        other = finer.get(unknown.name, value)
-        found[unknown.name] = Number(value, unknown.unit, (min(low, other), max(high, other)))
-    return found
+    return Spread(fitted, drawn, covariance, finer)
 
 
-def named(model: Model, estimated: dict[str, Number]) -> tuple[Named, ...]:
+def named(model: Model, spread: Spread) -> tuple[Named, ...]:
     """The effects of a model with their numbers: what was estimated, and what that implies."""
-    found = []
-    effects = {known.name: known for known in model.fitted.twin.effects}
+    found, estimated, twin = [], spread.numbers(), model.fitted.twin
+    effects = {known.name: known for known in twin.effects}
     for name in model.names:
         own = {k.split(".", 1)[1]: n for k, n in estimated.items() if k.startswith(f"{name}.")}
-        shown = effects.get(name, EFFECTS[name]()).placed(model.fitted.twin)
+        shown = effects.get(name, EFFECTS[name]()).placed(twin)
         for key, value in shown.values.items():
             if key not in own and value is not None and key not in shown.gates and value != 0.0:
-                unit = next((s.unit for s in shown.strengths(model.fitted.twin) if s.name == key), "m")
+                unit = next((s.unit for s in shown.strengths(twin) if s.name == key), "m")
                 own[key] = Number(float(value), unit)
-        own |= {key: Number(value, unit) for key, (value, unit) in shown.derived.items()}
-        found.append(Named(name, own))
+        found.append(Named(name, own | spread.derived(name)))
     return tuple(found)
+
+
+def _implied(twin: Twin, name: str) -> dict[str, tuple[float, str]]:
+    known = next((e for e in twin.effects if e.name == name), None) or EFFECTS[name]()
+    return known.placed(twin).derived(twin)
 
 
 def calibrated(estimated: dict[str, Number]) -> dict[str, Number]:

@@ -31,7 +31,7 @@ from physworld.trace.experiment import Experiment, propose, rival_of
 from physworld.trace.faults import Faults, without_faults
 from physworld.trace.held_out import HeldOut, Unseen, measure, measure_all
 from physworld.trace.holds import held_otherwise
-from physworld.trace.intervals import calibrated, named, numbers
+from physworld.trace.intervals import calibrated, named, spread_of
 from physworld.trace.noise import noise_sigma
 from physworld.trace.recordings import (
     FITTED,
@@ -300,8 +300,8 @@ class _Trace:
         config, simulations = self.config, self.simulations
         simulations.stage = "held-out frames"
         outcomes = self._outcomes(declared, verdict.model, white, sigma)
-        estimates = [
-            numbers(m.fitted, block_of_row, finer.get(m.names, {}), config.bootstraps, config.seed)
+        spreads = [
+            spread_of(m.fitted, block_of_row, finer.get(m.names, {}), config.bootstraps, config.seed)
             for m in (verdict.model, *verdict.equivalent)
         ]
         claimed = verdict.name not in (NOTHING, UNEXPLAINED)
@@ -312,9 +312,9 @@ class _Trace:
         return TraceResult(
             scene=self.lead.name,
             verdict=verdict,
-            effects=named(verdict.model, estimates[0]) if claimed else (),
-            equivalent=tuple(named(m, e) for m, e in zip(verdict.equivalent, estimates[1:], strict=True)),
-            calibrated=calibrated(estimates[0]),
+            effects=named(verdict.model, spreads[0]) if claimed else (),
+            equivalent=tuple(named(m, s) for m, s in zip(verdict.equivalent, spreads[1:], strict=True)),
+            calibrated=calibrated(spreads[0].numbers()),
             declared=declared,
             split=self.recordings.lead.split,
             sigma=sigma,

@@ -14,7 +14,7 @@ from physworld.trace.candidates import Candidate
 from physworld.trace.comparison import better_beyond_chance, cross_validated
 from physworld.trace.config import TraceConfig
 from physworld.trace.confirm import Model
-from physworld.trace.intervals import numbers
+from physworld.trace.intervals import spread_of
 from physworld.trace.refit import Refit, refit
 from physworld.trace.result import Number
 from physworld.trace.score import orthonormal, project
@@ -71,10 +71,11 @@ class SecondResolution:
         if found is None:
             return False
         values[model.names] = {unknown.name: found.value(unknown.name) for unknown in found.unknowns}
-        intervals = numbers(model.fitted, self.block_of_row, {}, self.config.bootstraps, self.config.seed)
+        config = self.config
+        known = spread_of(model.fitted, self.block_of_row, {}, config.bootstraps, config.seed).numbers()
         return self._still_helps(declared, found) and all(
             self.does_the_same(model.fitted, found, member)
-            or _within(model.fitted, values[model.names], intervals, member)
+            or _within(model.fitted, values[model.names], known, member)
             for member in model.members
         )
 

@@ -57,7 +57,9 @@ def test_wind_carries_a_body_to_its_own_velocity(name: str) -> None:
     blown = effect(
         "wind", push_x_m_s2=push[0], push_y_m_s2=push[1], push_z_m_s2=push[2], rate_per_s=rate
     )  # fmt: skip
-    assert [blown.derived[f"wind_{a}_m_s"] for a in "xyz"] == [(w, "m/s") for w in wind]
+    assert [blown.derived(loose(name, (0.0, 0.0, 0.0)))[f"wind_{a}_m_s"] for a in "xyz"] == [
+        (w, "m/s") for w in wind
+    ]
     expected = np.outer(TIMES - (1 - np.exp(-rate * TIMES)) / rate, wind)
     np.testing.assert_allclose(flown(name, blown), expected, atol=FLIGHT * np.abs(expected).max())
 

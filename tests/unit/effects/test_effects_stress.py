@@ -332,3 +332,21 @@ def test_viscosity_of_thin_bodies_adds_to_the_laws_own(body: str) -> None:
     )
     thrown = np.random.default_rng(0).normal(scale=0.05, size=law.body.start.shape)
     np.testing.assert_allclose(moved(both, times, thrown), moved(law, times, thrown), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["solid", "sheet"])
+def test_fibres_and_friction_are_told_in_pascals(name: str) -> None:
+    twin = loose(name)
+    modulus, nu = 2e5, twin.parameters["poissons_ratio"]
+    if name == "sheet":
+        thickness = twin.body.thickness_m
+        twin = twin.with_parameters(membrane_n_m=modulus * thickness / (1 - nu**2))
+        tau = effect("viscosity_kelvin_voigt", relaxation_s=0.01).derived(twin)
+        assert tau["viscosity_pa_s"] == (pytest.approx(0.01 * modulus / (2 + 4 * nu**2)), "Pa s")
+        modulus /= 1 - nu**2
+    else:
+        twin = twin.with_parameters(youngs_modulus_pa=modulus)
+        assert effect("viscosity_kelvin_voigt", viscosity_pa_s=3.0).derived(twin) == {}
+    assert effect("anisotropy", ratio=0.5).derived(twin) == {
+        "fibre_modulus_pa": (pytest.approx(0.5 * modulus), "Pa")
+    }

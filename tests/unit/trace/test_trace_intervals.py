@@ -7,7 +7,9 @@ import pytest
 from sagging_bar import BUDGET, sagging
 
 from physworld.build import build_twin
-from physworld.trace.intervals import numbers
+from physworld.effects.registry import effect
+from physworld.trace.candidates import candidates
+from physworld.trace.intervals import spread_of
 from physworld.trace.refit import Refit
 from physworld.trace.unknowns import Unknown
 
@@ -34,7 +36,7 @@ def test_an_interval_is_as_wide_as_the_noise_leaves_it_however_few_the_blocks(
 ) -> None:
     fitted = line(noise)
     deviation = np.sqrt(np.diag(np.linalg.inv(fitted.jacobian.T @ fitted.jacobian))) * max(1.0, fitted.misfit)
-    found = numbers(fitted, np.arange(ROWS) * blocks // ROWS, {}, 500, 0)
+    found = spread_of(fitted, np.arange(ROWS) * blocks // ROWS, {}, 500, 0).numbers()
     for name, value, spread in zip(("offset", "slope"), (0.3, 2.0), deviation, strict=True):
         low, high = found[name].ci95
         assert low <= value - 1.95 * spread and high >= value + 1.95 * spread
@@ -44,4 +46,26 @@ def test_an_interval_is_as_wide_as_the_noise_leaves_it_however_few_the_blocks(
 def test_a_number_that_the_data_do_not_see_may_be_anything_within_its_bounds() -> None:
     fitted = line()
     fitted.jacobian[:, 1] = 0.0
-    assert numbers(fitted, np.zeros(ROWS, dtype=int), {}, 100, 0)["slope"].ci95 == (-50.0, 50.0)
+    assert spread_of(fitted, np.zeros(ROWS, dtype=int), {}, 100, 0).numbers()["slope"].ci95 == (-50.0, 50.0)
+
+
+@pytest.mark.parametrize("finer", [{}, {"gravity_tilt.tilt_y_rad": 0.06}])
+def test_what_the_numbers_imply_has_an_interval_too(finer: dict[str, float]) -> None:
+    tilt, deviation = np.array([0.03, 0.04]), np.array([0.002, 0.004])
+    twin = build_twin(sagging(), BUDGET).with_effect(
+        effect("gravity_tilt", tilt_x_rad=tilt[0], tilt_y_rad=tilt[1])
+    )
+    gates = candidates(twin, ("gravity_tilt",))[0][0].unknowns()[:2]
+    probes = np.array([gate.value(1.0) for gate in gates])
+    rng = np.random.default_rng(0)
+    slopes = np.linalg.qr(rng.normal(size=(4000, 2)))[0] * probes / deviation
+    left = rng.normal(size=4000)
+    left -= slopes @ np.linalg.lstsq(slopes, left, rcond=None)[0]
+    fitted = Refit(gates, twin, tilt / probes, np.empty(0), left, slopes)
+    angle = spread_of(fitted, np.arange(4000) // 100, finer, 2000, 0).derived("gravity_tilt")["tilt_deg"]
+    assert angle.value == pytest.approx(np.degrees(0.05)) and angle.unit == "deg"
+    spread = np.degrees(np.linalg.norm(tilt / 0.05 * deviation))
+    low, high = angle.ci95
+    assert low == pytest.approx(angle.value - 1.96 * spread, abs=0.15 * spread)
+    there = angle.value + np.degrees(0.8 * 0.02) if finer else angle.value + 1.96 * spread
+    assert high == pytest.approx(there, abs=0.15 * spread)
