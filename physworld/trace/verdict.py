@@ -103,6 +103,11 @@ def decide(
     if not accounts(best, declared, config):
         reason = f"{what} fits best among {tried} effects but leaves too much to be named: {figures}"
         return Verdict(UNEXPLAINED, declared, (), reason)
+    unbelieved = _better_unbelieved(best, models, declared)
+    if unbelieved is not None:
+        left = f"misfit {unbelieved.fitted.misfit:.2f} of the noise for {after:.2f}"
+        reason = f"{implausible(unbelieved)}, but explains more than {what}: {left}"
+        return Verdict(UNEXPLAINED, declared, (), reason)
     if agreement.get(best.names) is False and before <= config.near_floor:
         reason = (
             f"misfit {before:.2f} of the noise, and what {what} seems to explain moves with the resolution"
@@ -196,6 +201,20 @@ def implausible(model: Model) -> str | None:
             if speed > FASTEST_WIND_M_S:
                 return f"a wind of {speed:.3g} m/s is not believed"
     return None
+
+
+def _better_unbelieved(best: Model, models: list[Model], declared: Model) -> Model | None:
+    """The model that nobody would believe and that predicts clearly better than the best of the others, if one does.
+
+    Then something is there that looks like it, and the next best name would be a wrong one.
+    """
+    found = [
+        m
+        for m in models
+        if len(m.members) == 1 and implausible(m) is not None and not as_good(best, m, declared)
+    ]
+    better = [m for m in found if m.validated.mean < best.validated.mean]
+    return min(better, key=lambda m: m.validated.mean, default=None)
 
 
 def accounts(model: Model, declared: Model, config: TraceConfig) -> bool:

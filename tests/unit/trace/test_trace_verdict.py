@@ -204,6 +204,21 @@ def test_a_body_that_weighs_less_is_not_in_other_gravity(share: float, believed:
     assert (implausible(weaker) is None) == believed
 
 
+@pytest.mark.parametrize(("tilt_rad", "left", "name"), [(0.3, 0.0, "unexplained"), (0.1, 0.0, "named"),
+                                                        (0.3, 0.6, "named")])  # fmt: skip
+def test_no_other_name_is_given_where_something_unbelievable_explains_more(
+    tilt_rad: float, left: float, name: str
+) -> None:
+    tilted = model(NOISE + left * DRAG, "gravity_tilt")
+    tilted.fitted.twin.effects = (effect("gravity_tilt", tilt_x_rad=tilt_rad),)
+    tether = model(NOISE + 0.4 * OTHER, "tether")
+    found = answer([tilted, tether], NOISE + 4 * DRAG)
+    assert found == (
+        name,
+        {"unexplained": ()}.get(name, ("tether",) if tilt_rad > 0.2 else ("gravity_tilt",)),
+    )
+
+
 @pytest.mark.parametrize(("tilt_rad", "believed"), [(0.15, True), (0.3, False)])
 def test_gravity_that_a_plumb_line_shows_to_be_off_is_not_believed(tilt_rad: float, believed: bool) -> None:
     tilted = model(NOISE, "gravity_tilt")
