@@ -165,7 +165,7 @@ class Cord:
         )  # fmt: skip
         seen = rng.uniform((0.0, 0.0), (1.0, 2.0 * np.pi), (_ROPE_TRACKED, 2))
         motion = Motion(10 * seed, self.stroke_m, self.turn_rad)
-        room = self.radius_m * np.ones(3)
+        room = self.radius_m * np.sqrt(1.0 - rope.along**2)  # of the held part, which ends across its axis
         box = np.array([rope.held.min(axis=0) - room, rope.held.max(axis=0) + room])
 
         def tracks(acting: Acting, late_s: float, at: Floats) -> Floats:

@@ -53,7 +53,7 @@ from physworld.trace.sensitivity import (
 )
 from physworld.trace.simulations import Memory, Progress
 from physworld.trace.start_pose import turned_starts
-from physworld.trace.unknowns import Unknown, clamp_reach, grip_softness, of_parameter
+from physworld.trace.unknowns import Unknown, clamp_reach, grip_compliance, grip_softness, of_parameter
 from physworld.trace.verdict import (
     DATA,
     NOTHING,
@@ -72,6 +72,7 @@ _OTHER_STIFFNESSES = tuple(0.12 * k for k in (-6, -5, -4, -3, -2, -1, 1, 2, 3, 4
 """Logarithms: a phase that has slipped by a period is a local minimum, so others are looked at before a descent."""
 _OTHER_TWIST = float(np.log(2.0))
 _NEAR = (-0.12, 0.12)  # on finer cells, where the coarser ones have looked farther
+_THOROUGH = 2  # times the iterations of other refits: everything is compared with the declared physics
 _SLOWEST = 12.0  # times the cost of the declared physics that a run may take: strong friction is dear
 
 
@@ -251,9 +252,8 @@ class _Trace:
         starts = [own + shift * axes[unknowns[0].name] for shift in shifts]
         if TWIST_RATIO in axes:  # how stiff a sheet is in twist decides in which valley its stiffness lies
             starts += [start + _OTHER_TWIST * axes[TWIST_RATIO] for start in [own, *starts]]
-        fitted = refit(
-            self.simulations, white, self.twin, unknowns, self.frames, self.config.iterations, starts
-        )
+        iterations = _THOROUGH * self.config.iterations
+        fitted = refit(self.simulations, white, self.twin, unknowns, self.frames, iterations, starts)
         if fitted is None:
             raise RuntimeError("the calibrated twin cannot be simulated again")
         fitted = held_otherwise(fitted, self.simulations, white, self.frames, self.config.iterations)
@@ -275,7 +275,8 @@ class _Trace:
         softness = grip_softness(twin)
         reach = clamp_reach(twin) if softness is None else None  # a reach within a cell is what softness is
         found = [of_parameter(p, twin, spread.get(p.name)) for p in known if p.name != BENDING_COUPLING]
-        return [*found, *(unknown for unknown in (reach, softness) if unknown is not None)]
+        own = (reach, softness, grip_compliance(twin))
+        return [*found, *(unknown for unknown in own if unknown is not None)]
 
     def _turns(self, tracks: np.ndarray, sigma: float) -> list[np.ndarray]:
         """What the uncertain pose of the start does to the prediction, (frames, N, 3) each."""

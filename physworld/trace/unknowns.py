@@ -9,12 +9,15 @@ import numpy as np
 
 from physworld.calibrate.parameters import BENDING_RATIO, Parameter, bending_ratio
 from physworld.effects.base import Strength
+from physworld.effects.places import gravity_size
 from physworld.effects.registry import EFFECTS
 from physworld.mpm.soft_grips import AS_HELD
 from physworld.twin import Twin
 
 CLAMP = "clamp_offset"
 SOFTNESS = "grip_softness"
+SLIP = "grip_slip"
+_SLIP_STEP, _SLIP_MOST = 0.25, 3.0  # of a sheared rope's compliance: difference step, and the largest
 _SOFTNESS_SHARES = (0.1, 1.5)  # of ``AS_HELD``: finite elements as large as the grip hold so much harder
 _SOFTNESS_STEP = 0.1
 _CLAMP_STEP, _CLAMP_SPREAD = 0.25, 0.5  # cells: difference step, and deviation of what is known beforehand
@@ -121,6 +124,25 @@ def grip_softness(twin: Twin) -> Unknown | None:
         SOFTNESS, "cells", low, high, start, _SOFTNESS_STEP, lambda s: float(np.exp(s)),
         lambda changed, s: replace(changed, grip_softness=float(np.exp(s))),
     )  # fmt: skip
+
+
+def grip_compliance(twin: Twin) -> Unknown | None:
+    """How far a rope's grips give, up to what its shear does there; None without a grip, a weight or a rope.
+
+    Rods here do not shear. One that does is displaced by a sideways force F next to a grip by F sqrt(B/T) / (k G A):
+    under the tension T it shears over the length sqrt(B/T) along which it bends (Timoshenko 1921; B = E I, and k G A is
+    about 0.3 E A of a round section). That is a compliance of r^2 / (1.2 sqrt(B T)), with the rope's weight for T. A
+    search starts at a quarter of it: a grip that is nearly rigid is so for every small change.
+    """
+    slip = EFFECTS[SLIP]
+    weight = float(twin.particle_mass.sum()) * gravity_size(twin)
+    if twin.lattice.dim != 1 or weight <= 0.0 or slip.refuses(twin) is not None:
+        return None
+    sheared = twin.body.thickness_m**2 / (1.2 * float(np.sqrt(twin.law.bending_n_m2 * weight)))
+    known = next(s for s in slip.strengths(twin) if s.name == "compliance_m_n")
+    scale = _SLIP_STEP * sheared
+    unknown = of_strength(SLIP, replace(known, high=_SLIP_MOST * sheared), scale)
+    return replace(unknown, start=1.0, prior=(0.0, 1.0 / _SLIP_STEP))
 
 
 def with_strengths(twin: Twin, effect: str, strengths: dict[str, float]) -> Twin:
