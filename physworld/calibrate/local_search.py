@@ -9,7 +9,7 @@ coefficients of all fields; Gauss and Newton's Hessian takes one run a coefficie
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,9 @@ from physworld.calibrate.journal import Journal
 from physworld.errors import CalibrationError, Cancelled, SimulationError
 from physworld.geometry.features import carry_features, part_features
 from physworld.mpm.gradient_twin import TwinRun
+from physworld.properties import together
 from physworld.scene import Scene
+from physworld.simulations import Drive, Job, Runner, in_turn
 from physworld.twin import Twin
 
 FIELDS = ("stiffness", "density", "friction")
@@ -117,6 +119,7 @@ class FieldSearch:
         cancelled: Callable[[], bool] | None = None,
         progress: Callable[[int, int, str], None] | None = None,
         journal: Journal | None = None,
+        runner: Runner = in_turn,
     ) -> None:
         unknown = sorted(set(config.fields) - set(FIELDS))
         if unknown or not config.fields:
@@ -131,6 +134,7 @@ class FieldSearch:
         self._basis = np.concatenate([constant, self.modes], axis=1)
         self._curvatures: dict[int, np.ndarray] = {}
         self.runs = self.simulations = 0
+        self._runner = runner
         self.stage, self._progress, self._journal = "local stage", progress, journal or Journal()
 
     @property
@@ -180,6 +184,12 @@ class FieldSearch:
             raise CalibrationError(
                 f"{self.end - self.begin} training frames leave none to validate a field on"
             )
+        for first, last in ((self.begin, split), (split, self.end)):
+            if not self.scene.visible[first:last].any():
+                what = "search" if first == self.begin else "validate"
+                raise CalibrationError(
+                    f"nothing is visible in frames {first} to {last - 1}, which {what} a field"
+                )
         return split
 
     def properties(self, z: np.ndarray) -> np.ndarray:
@@ -262,12 +272,8 @@ class FieldSearch:
         return self._curvatures[end]
 
     def _hessian(self, z: np.ndarray, end: int) -> np.ndarray:
-        here = self._tracks(z, end)
-        columns = []
-        for k in range(self.size):
-            probe = z.copy()
-            probe[k] += _PROBE
-            columns.append((self._tracks(probe, end) - here) / _PROBE)
+        here, *there = self._seen_at([z, *(z + _PROBE * one for one in np.eye(self.size))], end)
+        columns = [(tracks - here) / _PROBE for tracks in there]
         jacobian = np.nan_to_num(np.array(columns).T)
         return 2.0 * jacobian.T @ jacobian / len(here)
 
@@ -286,19 +292,28 @@ class FieldSearch:
             done = self.runs + self.simulations
             self._progress(done, max(self.most, done), self.stage)
 
-    def _tracks(self, z: np.ndarray, end: int) -> np.ndarray:
-        """Predicted coordinates that were seen in the frames up to ``end``, flat; NaN where the run fails."""
-        times, controls = self.scene.control_track()
-        self.simulations += 1
-        self._tell()
+    def _seen_at(self, places: list[np.ndarray], end: int) -> list[np.ndarray]:
+        """Predicted coordinates that were seen in the frames up to ``end``, flat, at each of several coefficients.
+
+        NaN where a run fails. The runs do not depend on each other, so they go to the runner together.
+        """
         seen = self.scene.visible[self.begin : end]
-        try:
-            nodes = self.twin.simulate_nodes(
-                times, controls, self.scene.times[:end], properties=self.properties(z), progress=self._poll
+        drive = Drive(*self.scene.control_track(), self.scene.times)
+        jobs = [
+            Job(replace(self.twin, properties=together(self.twin.properties, self.properties(z))), end)
+            for z in places
+        ]
+        found = []
+        self._tell()
+        for tracks in self._runner(jobs, drive, lambda: self._poll(0, end)):
+            self.simulations += 1
+            self._tell()
+            found.append(
+                np.full(3 * int(seen.sum()), np.nan)
+                if tracks is None
+                else tracks[self.begin :][seen].reshape(-1)
             )
-        except SimulationError:
-            return np.full(3 * int(seen.sum()), np.nan)
-        return self.twin.observe(nodes, self.scene.times[:end])[self.begin :][seen].reshape(-1)
+        return found
 
     def _value(self, z: np.ndarray, end: int) -> tuple[float, np.ndarray]:
         """Mean squared error [m^2] up to ``end`` and its gradient by the coefficients."""
