@@ -83,13 +83,13 @@ def _fit(given: argparse.Namespace) -> None:
         plasticity=given.plasticity,
     )
     journal = None if given.resume is None else journal_in(given.resume, scene, f"{given.law} {config}")
-    with progress_bar(f"law {scene.name}") if given.law == AUTO else nullcontext() as shown:
-        config, choice = chosen_laws(given.law, scene, config, shown, journal=journal)
-    pool = Workers(given.processes) if given.processes > 1 else nullcontext(in_turn)
-    with progress_bar(f"fit {scene.name}") as shown, pool as runner:
-        fitted = calibrate_in_stages(
-            scene, config, given.stages, progress=shown, journal=journal, runner=runner
-        )
+    with Workers(given.processes) if given.processes > 1 else nullcontext(in_turn) as runner:
+        with progress_bar(f"law {scene.name}") if given.law == AUTO else nullcontext() as shown:
+            config, choice = chosen_laws(given.law, scene, config, shown, journal=journal, runner=runner)
+        with progress_bar(f"fit {scene.name}") as shown:
+            fitted = calibrate_in_stages(
+                scene, config, given.stages, progress=shown, journal=journal, runner=runner
+            )
     accuracy = not_measured("left out by --quick")
     if not given.quick:
         with progress_bar(f"numerics {scene.name}") as shown:
@@ -151,9 +151,9 @@ def _print(document: dict[str, Any]) -> None:
     for name, why in document["search"]["open"].items():
         print(f"{name} is not converged: {why}")
     for name, parameter in (document["converged"] or {}).items():
-        low, high = parameter["ci95"] or (float("nan"), float("nan"))
-        value = f"{parameter['value']:.5g} {parameter['unit']} [{low:.5g}, {high:.5g}]"
-        print(f"{name} without the lattice's error: {value}")
+        interval = parameter["ci95"]
+        shown = "" if interval is None else f" [{interval[0]:.5g}, {interval[1]:.5g}]"
+        print(f"{name} without the lattice's error: {parameter['value']:.5g} {parameter['unit']}{shown}")
     print(f"{document['simulations']} simulations, {document['seconds']:.0f} s")
 
 
