@@ -28,6 +28,9 @@ FIELDS = ("stiffness", "density", "friction")
 """Columns of the properties of :meth:`physworld.twin.Twin.simulate`."""
 _INDUCING = 300  # particles that the modes are computed from
 _FAILED = 1e3  # value of a run that blew up, in units of the homogeneous fit's error
+_FARTHEST = (
+    6.0  # log factor beyond which nothing is run: a line search may ask for any, and for any time step
+)
 _PROBE = 0.02  # of a coefficient, for the first Hessian
 _FLAT = 1e-6  # gradient that ends a search
 _LEAST_FALL, _PATIENCE = 0.01, 3  # relative fall of the objective, over so many steps, that ends a search
@@ -199,11 +202,16 @@ class FieldSearch:
             found[:, FIELDS.index(name)] = self._basis @ part
         return found
 
+    def _too_far(self, z: np.ndarray) -> bool:
+        return not np.abs(self.properties(z)).max() <= _FARTHEST
+
     def errors(self, z: np.ndarray, end: int) -> np.ndarray:
         """Mean squared error [m^2] of every training frame up to ``end``; NaN where the run fails."""
         times, controls = self.scene.control_track()
         self.simulations += 1
         self._tell()
+        if self._too_far(z):
+            return np.full(end - self.begin, np.nan)
         try:
             nodes = self.twin.simulate_nodes(
                 times, controls, self.scene.times[:end], properties=self.properties(z), progress=self._poll
@@ -321,6 +329,8 @@ class FieldSearch:
         times, controls = self.scene.control_track()
         self.runs += 1
         self._tell()
+        if self._too_far(z):
+            return _FAILED, np.zeros(self.size)
         try:
             run = TwinRun(
                 self.twin, times, controls, self.scene.times[:end], properties=properties,

@@ -11,7 +11,7 @@ from made_scene import box_body, made_scene
 from test_shared_search import Together
 
 from physworld.build import build_twin
-from physworld.calibrate.local_search import LocalConfig, field_modes
+from physworld.calibrate.local_search import FieldSearch, LocalConfig, field_modes
 from physworld.calibrate.local_stage import fit_fields
 from physworld.errors import CalibrationError, Cancelled, UnstableSimulation
 from physworld.mpm.soft_grips import AS_HELD
@@ -142,3 +142,11 @@ def test_a_field_whose_run_fails_after_the_training_frames_is_thrown_away(
     found = fit_fields(scene, twin, QUICK)
     assert not found.kept and found.strength is None and not found.properties.any()
     assert "thrown away" in found.reason and "frame 20" in found.reason
+
+
+def test_a_line_search_that_goes_far_astray_simulates_nothing_there() -> None:
+    scene, twin = recorded(0.0)
+    search = FieldSearch(scene, twin, QUICK, cancelled=lambda: True)  # a run would end in Cancelled
+    far = np.zeros(search.size)
+    far[0] = 12.0  # a stiffness of 160 000 times
+    assert np.isnan(search.errors(far, search.end)).all()
