@@ -74,6 +74,7 @@ def _fit(given: argparse.Namespace) -> None:
     from workers.tasks.fit_accuracy import fit_accuracy, not_measured
     from workers.tasks.fit_report import fit_files, fit_report
 
+    _refuse_places(given)
     scene = read_scene(given.scene)
     numbers = {"particle_budget": given.particles, "max_simulations": given.simulations}
     config = CalibrationConfig(
@@ -104,6 +105,14 @@ def _fit(given: argparse.Namespace) -> None:
     if given.json is not None:
         given.json.parent.mkdir(parents=True, exist_ok=True)
         given.json.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n")
+
+
+def _refuse_places(given: argparse.Namespace) -> None:
+    """Whether the answer can be written where it is asked for, before hours are spent on it. Raises OSError."""
+    if given.out is not None and given.out.exists() and not given.out.is_dir():
+        raise NotADirectoryError(f"--out {given.out} is a file")
+    if given.json is not None and given.json.is_dir():
+        raise IsADirectoryError(f"--json {given.json} is a folder")
 
 
 def _kept(path: Path | None) -> str:

@@ -172,6 +172,17 @@ def test_a_fit_that_was_ended_goes_on_from_its_file(bundle: Path, tmp_path: Path
     assert json.loads(journal.read_text())["key"] != stored["key"]
 
 
+@pytest.mark.parametrize("option", ["--out", "--json"])
+def test_a_place_that_cannot_be_written_is_refused_before_anything_is_simulated(
+    bundle: Path, tmp_path: Path, option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    taken = tmp_path / "taken"
+    taken.write_text("a file") if option == "--out" else taken.mkdir()
+    assert fit.main(arguments(bundle, "--quick", option, str(taken))) == 2
+    shown = capsys.readouterr()
+    assert f"{option} {taken} is a" in shown.err and shown.out == ""
+
+
 def test_a_file_that_is_no_journal_is_not_overwritten(
     bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
