@@ -18,6 +18,7 @@ PhysworldError
 ├── LawAnswerRefused        a model's answer names no law of the library, or not in the asked form
 ├── LawAnswerUnavailable    the model that was asked gave no answer
 ├── Cancelled               the caller asked to stop
+├── WorkerLost              a process that shares simulations ended
 └── TrainingDiverged        a loss or a weight is not finite
 """
 
@@ -94,6 +95,10 @@ class LawAnswerUnavailable(PhysworldError):
 
 class Cancelled(PhysworldError):
     """The caller asked to stop."""
+
+
+class WorkerLost(PhysworldError):
+    """A process that shares simulations ended."""
 
 
 class TrainingDiverged(PhysworldError):

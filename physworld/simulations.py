@@ -10,6 +10,7 @@ import json
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import cache
 from multiprocessing import get_context
@@ -18,7 +19,7 @@ from typing import Protocol
 
 import numpy as np
 
-from physworld.errors import CFLViolation, SimulationError
+from physworld.errors import CFLViolation, SimulationError, WorkerLost
 from physworld.mpm.total_lagrangian import TotalLagrangian, run_again_if_blown_up
 from physworld.twin import Twin
 
@@ -140,6 +141,7 @@ class Workers:
     """A runner over processes of its own, which share Warp's cache of kernels; a context manager."""
 
     def __init__(self, processes: int = 2) -> None:
+        self._processes = processes
         self._pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=_begin)
 
     def __enter__(self) -> Workers:
@@ -151,14 +153,24 @@ class Workers:
     def __call__(
         self, jobs: Sequence[Job], drive: Drive, poll: Callable[[], None]
     ) -> Iterator[np.ndarray | None]:
-        """Every job in a process; ``poll`` is called before each is waited for."""
-        futures = [
-            self._pool.submit(_work, job.twin.to_arrays(), job.twin.device, _facts(job), drive)
-            for job in jobs
-        ]
-        for future in futures:
-            poll()
-            yield future.result()
+        """Every job in a process; ``poll`` is called before each is waited for.
+
+        Raises:
+            WorkerLost: a process ended, by the system's hand or another's.
+        """
+        try:
+            futures = [
+                self._pool.submit(_work, job.twin.to_arrays(), job.twin.device, _facts(job), drive)
+                for job in jobs
+            ]
+            for future in futures:
+                poll()
+                yield future.result()
+        except BrokenProcessPool as error:
+            raise WorkerLost(
+                f"one of {self._processes} processes that share the simulations ended ({len(jobs)} were asked for): "
+                "was it out of memory?"
+            ) from error
 
 
 def _begin() -> None:

@@ -10,6 +10,7 @@ from physworld.calibrate.global_stage import prior_twin
 from physworld.calibrate.law_choice import PURELY_ELASTIC, LawChoice, choose_law
 from physworld.calibrate.search import Progress
 from physworld.scene import Scene
+from physworld.simulations import Runner, in_turn
 from workers.law_endpoint import law_endpoint
 from workers.motion_picture import motion_pictures
 
@@ -23,6 +24,7 @@ def chosen_laws(
     progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
     journal: Journal | None = None,
+    runner: Runner = in_turn,
 ) -> tuple[CalibrationConfig, LawChoice]:
     """The configuration with its laws, and the record of who chose them.
 
@@ -32,6 +34,7 @@ def chosen_laws(
         config: the calibration's settings; its flow law, if it has one, is the caller's and stays.
         progress, cancelled: see :func:`physworld.calibrate.calibrate`.
         journal: keeps the choice for a later attempt.
+        runner: where simulations of a choice run that do not depend on each other.
 
     Raises:
         ValueError: there is no such law for the body.
@@ -40,7 +43,9 @@ def chosen_laws(
     if asked == AUTO:
         found = (journal or Journal()).step(
             "law",
-            lambda: asdict(choose_law(scene, config, law_endpoint(), motion_pictures, progress, cancelled)),
+            lambda: asdict(
+                choose_law(scene, config, law_endpoint(), motion_pictures, progress, cancelled, runner)
+            ),
         )
         choice = LawChoice(**found)
         plastic = None if choice.plastic == PURELY_ELASTIC else choice.plastic

@@ -69,7 +69,10 @@ def converged_parameters(
         estimate = fitted.parameters[parameter.name]
         interval = None
         if estimate.ci95 is not None:
-            low, high = (parameter.searched(end) if end > 0 else -np.inf for end in estimate.ci95)
+            low, high = (
+                -np.inf if parameter.scale == "log" and end <= 0 else parameter.searched(end)
+                for end in estimate.ci95
+            )
             half = float(np.hypot(0.5 * (high - low), _DOUBT * shift))
             interval = (parameter.value(now + shift - half), parameter.value(now + shift + half))
         value = float(np.clip(parameter.value(now + shift), parameter.low, parameter.high))

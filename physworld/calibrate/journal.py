@@ -13,6 +13,8 @@ from collections.abc import Callable
 from typing import Any
 
 _VERSION = 1
+JOURNAL_BEGINS = '{"version": '
+"""First characters of a stored journal."""
 
 
 class Journal:
@@ -54,7 +56,7 @@ def _entries_of(stored: str | None, key: str) -> list[dict[str, Any]]:
         journal = json.loads(stored)
     except json.JSONDecodeError:  # cut off by a kill
         return []
-    if journal.get("version") != _VERSION or journal.get("key") != key:
+    if not isinstance(journal, dict) or (journal.get("version"), journal.get("key")) != (_VERSION, key):
         return []
     return list(journal["entries"])
 

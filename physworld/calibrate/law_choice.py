@@ -20,6 +20,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from physworld.calibrate.apart import residuals_apart, solve_apart
 from physworld.calibrate.fibres import free_fibres
 from physworld.calibrate.global_stage import (
     CalibrationConfig,
@@ -29,9 +30,10 @@ from physworld.calibrate.global_stage import (
     select,
 )
 from physworld.calibrate.parameters import WEAVE, Parameter
-from physworld.calibrate.search import Optimum, Progress, Search
-from physworld.errors import LawAnswerRefused, LawAnswerUnavailable
+from physworld.calibrate.search import Descent, Optimum, Progress, Search
+from physworld.errors import LawAnswerRefused, LawAnswerUnavailable, SceneUnsupported
 from physworld.scene import Scene
+from physworld.simulations import Runner, in_turn
 
 PROMPT = """Analyze the video of object-hand interaction and recommend optimal MPM constitutive models from the following library:
 - Elastic Models: FCR, Neo-Hookean, St. Venant-Kirchhoff, Anisotropic Hyperelastic
@@ -127,6 +129,7 @@ def choose_law(
     images: Callable[[Scene], list[bytes]] | None = None,
     progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
+    runner: Runner = in_turn,
 ) -> LawChoice:
     """Choose by the model where one is given and answers, else by cross-validation.
 
@@ -136,6 +139,7 @@ def choose_law(
         ask, images: the model and how the motion is drawn for it (PNG), both or neither.
         progress: called with (runs done, runs at most, message).
         cancelled: polled every frame of every run.
+        runner: where simulations of the cross-validation run that do not depend on each other.
 
     Raises:
         CalibrationError, Cancelled, SceneUnsupported: see :func:`physworld.calibrate.calibrate`.
@@ -147,11 +151,21 @@ def choose_law(
             text = ask(PROMPT, images(_training_only(scene)))
             answered = {"asked": ask.name, "answer": text[:_LONGEST_REASON]}
             elastic, plastic, reason = parse_answer(text, dimension)
+            _refuse_unbuildable(scene, config, elastic, plastic)
             return LawChoice(elastic, plastic, f"model {ask.name}", reason, answered)
         except (LawAnswerRefused, LawAnswerUnavailable) as error:
             answered |= {"asked": ask.name, "not_used_because": str(error)}
-    choice = cross_validate(scene, config, progress=progress, cancelled=cancelled)
+    choice = cross_validate(scene, config, progress=progress, cancelled=cancelled, runner=runner)
     return replace(choice, figures={**choice.figures, **answered})
+
+
+def _refuse_unbuildable(scene: Scene, config: CalibrationConfig, elastic: str, plastic: str) -> None:
+    """Whether a body of this scene can have these laws under these settings. Raises LawAnswerRefused."""
+    flow = config.plasticity or (None if plastic == PURELY_ELASTIC else plastic)
+    try:
+        prior_twin(scene, replace(config, law=elastic, plasticity=flow))
+    except (SceneUnsupported, ValueError) as error:
+        raise LawAnswerRefused(f"{elastic} with {plastic}: {error}") from error
 
 
 def cross_validate(
@@ -160,6 +174,7 @@ def cross_validate(
     candidates: tuple[str, ...] | None = None,
     progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
+    runner: Runner = in_turn,
 ) -> LawChoice:
     """Choose among laws by their error on blocks of training frames that their fit did not see."""
     config = replace(config, law=None)
@@ -170,32 +185,45 @@ def cross_validate(
             f"the only law for a body of dimension {twin.lattice.dim} whose constants a calibration searches"
         )
         return LawChoice(names[0], reason=reason)
-    search = Search(scene, twin, config.max_simulations, progress, cancelled)
+    blocks = _blocks(scene)
+    if len(blocks) < 2:
+        reason = (
+            f"too few training frames show anything to hold some of them out: {names[0]} is the usual law"
+        )
+        return LawChoice(names[0], reason=reason)
+    search = Search(scene, twin, config.max_simulations, progress, cancelled, runner=runner)
     kept, optimum, _ = select(search, searched_parameters(scene, search.twin, config))
-    scores, needless = {}, {}
+    fits, needless = {}, {}
     for name in names:
         named = replace(config, law=name)
-        fitted, at, without = _freed(scene, named, kept, optimum, progress, cancelled)
+        fitted, at, without = _freed(scene, named, kept, optimum, progress, cancelled, runner)
         if without and len(fitted) == len(kept):
             needless[name] = without
         else:
-            scores[name] = _fold_errors(scene, named, fitted, at, progress, cancelled)
+            fits[name] = (named, fitted, at)
+    scores = _block_errors(scene, blocks, fits, progress, cancelled, runner)
     means = {name: float(np.mean(errors)) for name, errors in scores.items()}
     best = min(means, key=lambda name: means[name])
-    spread = float(np.std(scores[best], ddof=1) / np.sqrt(FOLDS))
-    chosen = next(name for name in names if name in means and means[name] <= means[best] + spread)
     figures = {
         "held_out_rms_m": {
             name: {"mean": means[name], "blocks": list(errors)} for name, errors in scores.items()
         },
-        "standard_error_m": spread,
+        "standard_error_m": None,
         "needless_constants": needless,
     }
+    if not np.isfinite(means[best]):
+        reason = (
+            f"no law's simulations hold on all {len(blocks)} blocks of training frames: it is the usual one"
+        )
+        return LawChoice(names[0], reason=reason, figures=figures)
+    spread = float(np.std(scores[best], ddof=1) / np.sqrt(len(blocks)))
+    chosen = next(name for name in names if name in means and means[name] <= means[best] + spread)
     reason = (
-        f"least error on {FOLDS} blocks of training frames that its fit did not see"
+        f"least error on {len(blocks)} blocks of training frames that its fit did not see"
         if chosen == best
         else f"the simplest within one standard error ({spread:.3g} m) of {best}: these data do not tell them apart"
     )
+    figures["standard_error_m"] = spread
     return LawChoice(chosen, decided_by="cross_validation", reason=reason, figures=figures)
 
 
@@ -206,9 +234,11 @@ def _freed(
     optimum: Optimum,
     progress: Progress | None,
     cancelled: Callable[[], bool] | None,
+    runner: Runner,
 ) -> tuple[list[Parameter], Optimum, dict[str, float]]:
     """What a law has more than the usual one, freed on all training frames, and what it has that removes too little."""
-    search = Search(scene, prior_twin(scene, config), config.max_simulations, progress, cancelled)
+    twin = prior_twin(scene, config)
+    search = Search(scene, twin, config.max_simulations, progress, cancelled, runner=runner)
     parameters = searched_parameters(scene, search.twin, config)
     fibres = [p for p in parameters if p.stage == "fibres"]
     with_fibres, at, without = free_fibres(search, kept, optimum, fibres)
@@ -217,31 +247,47 @@ def _freed(
     return found, at, {**without, **more}
 
 
-def _fold_errors(
-    scene: Scene,
-    config: CalibrationConfig,
-    kept: list[Parameter],
-    optimum: Optimum,
-    progress: Progress | None,
-    cancelled: Callable[[], bool] | None,
-) -> list[float]:
-    """Root mean squared error [m] on each block after a fit to the others; infinite where a run blew up."""
-    frames = np.array_split(np.arange(max(scene.train[0], 1), scene.train[1]), FOLDS)
-    errors = []
-    for block in frames:
+def _blocks(scene: Scene) -> list[tuple[Scene, Scene]]:
+    """What a fit sees and what it is measured on, block by block of the training frames; only where both see points."""
+    first, end = max(scene.train[0], 1), scene.train[1]
+    found = []
+    for block in np.array_split(np.arange(first, end), FOLDS):
         left_out = np.zeros(scene.frame_count, dtype=bool)
         left_out[block] = True
         seen = replace(scene, visible=scene.visible & (~left_out)[:, None])
         unseen = replace(scene, visible=scene.visible & left_out[:, None])
-        if not seen.visible[1:].any() or not unseen.visible.any():
-            continue
+        if seen.visible[first:end].any() and unseen.visible.any():
+            found.append((seen, unseen))
+    return found
+
+
+def _block_errors(
+    scene: Scene,
+    blocks: list[tuple[Scene, Scene]],
+    fits: dict[str, tuple[CalibrationConfig, list[Parameter], Optimum]],
+    progress: Progress | None,
+    cancelled: Callable[[], bool] | None,
+    runner: Runner,
+) -> dict[str, list[float]]:
+    """Error [m] (rms) of every law on each block after a fit to the others; infinite where a run blew up."""
+    asked: list[tuple[Search, Descent]] = []
+    judges: list[Search] = []
+    for config, kept, optimum in fits.values():
         twin = prior_twin(scene, config)
-        fold = Search(seen, twin, config.max_simulations, progress, cancelled)
-        found = fold.solve(kept, optimum.theta, 2)
-        judged = Search(unseen, twin, config.max_simulations, None, cancelled).residual(kept, found.theta)
-        square = float(np.mean(judged**2))
-        errors.append(float(np.sqrt(square)) if np.isfinite(square) else float("inf"))
-    return errors
+        for seen, unseen in blocks:
+            fold = Search(seen, twin, config.max_simulations, progress, cancelled, runner=runner)
+            asked.append((fold, Descent(kept, optimum.theta, 2)))
+            judges.append(Search(unseen, twin, config.max_simulations, None, cancelled, runner=runner))
+    found = solve_apart(asked)
+    judged = residuals_apart(
+        [
+            (judge, (one.parameters, optimum.theta, None))
+            for judge, (_, one), optimum in zip(judges, asked, found, strict=True)
+        ]
+    )
+    squares = [float(np.mean(residual**2)) for residual in judged]
+    errors = iter([float(np.sqrt(square)) if np.isfinite(square) else float("inf") for square in squares])
+    return {name: [next(errors) for _ in blocks] for name in fits}
 
 
 def _training_only(scene: Scene) -> Scene:

@@ -9,7 +9,7 @@ coefficients of all fields; Gauss and Newton's Hessian takes one run a coefficie
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,13 +19,18 @@ from physworld.calibrate.journal import Journal
 from physworld.errors import CalibrationError, Cancelled, SimulationError
 from physworld.geometry.features import carry_features, part_features
 from physworld.mpm.gradient_twin import TwinRun
+from physworld.properties import together
 from physworld.scene import Scene
+from physworld.simulations import Drive, Job, Runner, in_turn
 from physworld.twin import Twin
 
 FIELDS = ("stiffness", "density", "friction")
 """Columns of the properties of :meth:`physworld.twin.Twin.simulate`."""
 _INDUCING = 300  # particles that the modes are computed from
 _FAILED = 1e3  # value of a run that blew up, in units of the homogeneous fit's error
+_FARTHEST = (
+    6.0  # log factor beyond which nothing is run: a line search may ask for any, and for any time step
+)
 _PROBE = 0.02  # of a coefficient, for the first Hessian
 _FLAT = 1e-6  # gradient that ends a search
 _LEAST_FALL, _PATIENCE = 0.01, 3  # relative fall of the objective, over so many steps, that ends a search
@@ -117,6 +122,7 @@ class FieldSearch:
         cancelled: Callable[[], bool] | None = None,
         progress: Callable[[int, int, str], None] | None = None,
         journal: Journal | None = None,
+        runner: Runner = in_turn,
     ) -> None:
         unknown = sorted(set(config.fields) - set(FIELDS))
         if unknown or not config.fields:
@@ -131,6 +137,7 @@ class FieldSearch:
         self._basis = np.concatenate([constant, self.modes], axis=1)
         self._curvatures: dict[int, np.ndarray] = {}
         self.runs = self.simulations = 0
+        self._runner = runner
         self.stage, self._progress, self._journal = "local stage", progress, journal or Journal()
 
     @property
@@ -180,6 +187,12 @@ class FieldSearch:
             raise CalibrationError(
                 f"{self.end - self.begin} training frames leave none to validate a field on"
             )
+        for first, last in ((self.begin, split), (split, self.end)):
+            if not self.scene.visible[first:last].any():
+                what = "search" if first == self.begin else "validate"
+                raise CalibrationError(
+                    f"nothing is visible in frames {first} to {last - 1}, which {what} a field"
+                )
         return split
 
     def properties(self, z: np.ndarray) -> np.ndarray:
@@ -189,11 +202,16 @@ class FieldSearch:
             found[:, FIELDS.index(name)] = self._basis @ part
         return found
 
+    def _too_far(self, z: np.ndarray) -> bool:
+        return not np.abs(self.properties(z)).max() <= _FARTHEST
+
     def errors(self, z: np.ndarray, end: int) -> np.ndarray:
         """Mean squared error [m^2] of every training frame up to ``end``; NaN where the run fails."""
         times, controls = self.scene.control_track()
         self.simulations += 1
         self._tell()
+        if self._too_far(z):
+            return np.full(end - self.begin, np.nan)
         try:
             nodes = self.twin.simulate_nodes(
                 times, controls, self.scene.times[:end], properties=self.properties(z), progress=self._poll
@@ -262,12 +280,8 @@ class FieldSearch:
         return self._curvatures[end]
 
     def _hessian(self, z: np.ndarray, end: int) -> np.ndarray:
-        here = self._tracks(z, end)
-        columns = []
-        for k in range(self.size):
-            probe = z.copy()
-            probe[k] += _PROBE
-            columns.append((self._tracks(probe, end) - here) / _PROBE)
+        here, *there = self._seen_at([z, *(z + _PROBE * one for one in np.eye(self.size))], end)
+        columns = [(tracks - here) / _PROBE for tracks in there]
         jacobian = np.nan_to_num(np.array(columns).T)
         return 2.0 * jacobian.T @ jacobian / len(here)
 
@@ -286,19 +300,28 @@ class FieldSearch:
             done = self.runs + self.simulations
             self._progress(done, max(self.most, done), self.stage)
 
-    def _tracks(self, z: np.ndarray, end: int) -> np.ndarray:
-        """Predicted coordinates that were seen in the frames up to ``end``, flat; NaN where the run fails."""
-        times, controls = self.scene.control_track()
-        self.simulations += 1
-        self._tell()
+    def _seen_at(self, places: list[np.ndarray], end: int) -> list[np.ndarray]:
+        """Predicted coordinates that were seen in the frames up to ``end``, flat, at each of several coefficients.
+
+        NaN where a run fails. The runs do not depend on each other, so they go to the runner together.
+        """
         seen = self.scene.visible[self.begin : end]
-        try:
-            nodes = self.twin.simulate_nodes(
-                times, controls, self.scene.times[:end], properties=self.properties(z), progress=self._poll
+        drive = Drive(*self.scene.control_track(), self.scene.times)
+        jobs = [
+            Job(replace(self.twin, properties=together(self.twin.properties, self.properties(z))), end)
+            for z in places
+        ]
+        found = []
+        self._tell()
+        for tracks in self._runner(jobs, drive, lambda: self._poll(0, end)):
+            self.simulations += 1
+            self._tell()
+            found.append(
+                np.full(3 * int(seen.sum()), np.nan)
+                if tracks is None
+                else tracks[self.begin :][seen].reshape(-1)
             )
-        except SimulationError:
-            return np.full(3 * int(seen.sum()), np.nan)
-        return self.twin.observe(nodes, self.scene.times[:end])[self.begin :][seen].reshape(-1)
+        return found
 
     def _value(self, z: np.ndarray, end: int) -> tuple[float, np.ndarray]:
         """Mean squared error [m^2] up to ``end`` and its gradient by the coefficients."""
@@ -306,6 +329,8 @@ class FieldSearch:
         times, controls = self.scene.control_track()
         self.runs += 1
         self._tell()
+        if self._too_far(z):
+            return _FAILED, np.zeros(self.size)
         try:
             run = TwinRun(
                 self.twin, times, controls, self.scene.times[:end], properties=properties,

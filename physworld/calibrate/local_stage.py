@@ -28,8 +28,9 @@ import numpy as np
 
 from physworld.calibrate.journal import Journal
 from physworld.calibrate.local_search import FieldSearch, LocalConfig
-from physworld.errors import CalibrationError
+from physworld.errors import CalibrationError, SimulationError
 from physworld.scene import Scene
+from physworld.simulations import Runner, in_turn
 from physworld.twin import Twin
 
 _WORTH = 0.9  # of the validation error is what a weaker prior may leave at most
@@ -78,6 +79,7 @@ def fit_fields(
     progress: Callable[[int, int, str], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
     journal: Journal | None = None,
+    runner: Runner = in_turn,
 ) -> LocalResult:
     """Fit fields to the training frames of a scene, on a twin that the global stage has fitted.
 
@@ -88,6 +90,7 @@ def fit_fields(
         progress: called with (runs done, runs about, what for) before every run.
         cancelled: polled every frame of every run.
         journal: finished steps of an earlier attempt, which are not simulated again.
+        runner: where simulations run that do not depend on each other: those of a Hessian.
 
     Raises:
         CalibrationError: the twin's own run fails, or no training frame is left for the validation.
@@ -97,7 +100,7 @@ def fit_fields(
     """
     config = config or LocalConfig()
     started = time.perf_counter()
-    search = FieldSearch(scene, twin, config, cancelled, progress, journal)
+    search = FieldSearch(scene, twin, config, cancelled, progress, journal, runner)
     split = search.split()
     plain = search.errors(np.zeros(search.size), search.end)
     if not np.isfinite(plain).all():
@@ -127,7 +130,13 @@ def fit_fields(
         else f"thrown away: at best {min(validation.values()):.3f} of the homogeneous fit's error on frames {split} to "
         f"{search.end - 1}, {1.0 - config.least_gain:.2f} was asked"
     )
-    return _result(search, final, best if kept else None, validation, held, started, reason)
+    try:
+        return _result(search, final, best if kept else None, validation, held, started, reason)
+    except SimulationError as error:  # of the held-out frames: no search has seen them
+        if not kept:
+            raise
+        reason = f"thrown away: its run over the whole recording fails: {error}"
+        return _result(search, np.zeros(search.size), None, validation, held, started, reason)
 
 
 def _unknown(search: FieldSearch, split: int, variance: float) -> dict[str, str]:

@@ -27,6 +27,8 @@ from physworld.simulations import Drive, Job, Runner, in_turn
 from physworld.twin import Twin
 
 Progress = Callable[[int, int, str], None]
+Place = tuple[list[Parameter], np.ndarray, int | None]
+"""Parameters, their values in the scale of the search, and the end of the frames (None: all training frames)."""
 
 _OFFSET_CLIP_SIGMAS = 3.0
 _FIRST_WINDOW = 0.33  # share of the training path that the first search sees
@@ -121,7 +123,7 @@ class Search:
         """
         return self.residuals([(parameters, theta, end)])[0]
 
-    def residuals(self, places: list[tuple[list[Parameter], np.ndarray, int | None]]) -> list[np.ndarray]:
+    def residuals(self, places: list[Place]) -> list[np.ndarray]:
         """:meth:`residual` at places (parameters, theta, end) that do not depend on each other."""
         allowed = max(0, self.limit - self.simulations)
         found = []
@@ -129,7 +131,7 @@ class Search:
             self.simulations += 1
             if loss is not None:
                 self._remember(loss, place[2])
-                self._tell(self.simulations, loss, place)
+                self.tell(self.simulations, loss, place)
             found.append(residual)
         return [*found, *(self._nothing(end) for _, _, end in places[allowed:])]
 
@@ -205,7 +207,7 @@ class Search:
 
     def _alone(self, one: Descent) -> Optimum:
         """A descent whose runs count at once."""
-        asking = self._descent(one)
+        asking = self.begun(one)
         asked = next(asking)
         while True:
             try:
@@ -214,32 +216,10 @@ class Search:
                 return Optimum(ended.value.theta, ended.value.cost)
 
     def _side_by_side(self, several: list[Descent]) -> list[_Descended]:
-        """Descents in step with each other: what all of them ask for next is run together."""
-        asking = [self._descent(one) for one in several]
-        asked = {k: next(one) for k, one in enumerate(asking)}
-        runs, losses = [0] * len(several), [[] for _ in several]  # type: ignore[var-annotated]
-        found: dict[int, Optimum] = {}
-        while asked:
-            places = [(several[k].parameters, theta, several[k].end) for k in asked for theta in asked[k]]
-            measured = self._measured(places)
-            for k in list(asked):
-                residuals = []
-                for theta in asked[k]:
-                    residual, loss = next(measured)
-                    runs[k] += 1
-                    if loss is not None:
-                        if several[k].end in (None, self.end):
-                            losses[k].append(loss)
-                        self._tell(self.simulations + sum(runs), loss, (several[k].parameters, theta, None))
-                    residuals.append(residual)
-                try:
-                    asked[k] = asking[k].send(residuals)
-                except StopIteration as ended:
-                    found[k] = Optimum(ended.value.theta, ended.value.cost)
-                    del asked[k]
-        return [_Descended(found[k], runs[k], losses[k]) for k in range(len(several))]
+        return in_step([(self, one) for one in several])
 
-    def _descent(self, one: Descent) -> LeastSquares:
+    def begun(self, one: Descent) -> LeastSquares:
+        """The descent before its first simulation."""
         low = np.array([p.searched(p.low) for p in one.parameters])
         return descent(one.theta, low, self._high(one.parameters), _steps(one.parameters), one.iterations)
 
@@ -334,25 +314,28 @@ class Search:
         self.simulations, self.history = found["simulations"], list(found["history"])
         return found
 
-    def _measured(
-        self, places: list[tuple[list[Parameter], np.ndarray, int | None]]
-    ) -> Iterator[tuple[np.ndarray, float | None]]:
+    def _measured(self, places: list[Place]) -> Iterator[tuple[np.ndarray, float | None]]:
         """Residuals at places and their root mean squares [m], None where the run failed; nothing is counted."""
-        times, controls = self.scene.control_track()
-        drive = Drive(times, controls, self.scene.times)
-        jobs = [
-            Job(self.twin_at(parameters, theta), self.end if end is None else end)
-            for parameters, theta, end in places
-        ]
-        made = self.runner(jobs, drive, self._poll) if jobs else iter(())
-        for job, tracks in zip(jobs, made, strict=True):
-            if tracks is None:
-                yield self._nothing(job.frames), None
-                continue
-            visible = self.scene.visible[self.begin : job.frames]
-            target = self.scene.points[self.begin : job.frames]
-            residual = (tracks[self.begin :][visible] - target[visible]).reshape(-1)
-            yield residual, float(np.sqrt(np.mean(residual**2)))
+        return measured_together([(self, place) for place in places])
+
+    def job(self, place: Place) -> Job:
+        """The simulation of a place."""
+        parameters, theta, end = place
+        return Job(self.twin_at(parameters, theta), self.end if end is None else end)
+
+    def run(self, jobs: list[Job]) -> Iterator[np.ndarray | None]:
+        """Tracks of simulations under this scene's controls, by the runner."""
+        drive = Drive(*self.scene.control_track(), self.scene.times)
+        return self.runner(jobs, drive, self._poll) if jobs else iter(())
+
+    def compared(self, job: Job, tracks: np.ndarray | None) -> tuple[np.ndarray, float | None]:
+        """Residual and root mean square [m] of tracks, None where the run failed."""
+        if tracks is None:
+            return self._nothing(job.frames), None
+        visible = self.scene.visible[self.begin : job.frames]
+        target = self.scene.points[self.begin : job.frames]
+        residual = (tracks[self.begin :][visible] - target[visible]).reshape(-1)
+        return residual, float(np.sqrt(np.mean(residual**2)))
 
     def _nothing(self, end: int | None) -> np.ndarray:
         """The residual of a run that failed."""
@@ -363,7 +346,7 @@ class Search:
         if end in (None, self.end):
             self.history.append(min(loss, self.history[-1]) if self.history else loss)
 
-    def _tell(self, done: int, loss: float, place: tuple[list[Parameter], np.ndarray, int | None]) -> None:
+    def tell(self, done: int, loss: float, place: Place) -> None:
         if self.progress is not None:
             pairs = zip(*place[:2], strict=True)
             values = ", ".join(f"{p.name} {p.value(float(t)):.3g}" for p, t in pairs)
@@ -377,6 +360,46 @@ class Search:
         if self.cancelled is not None and self.cancelled():
             where = "" if not frames else f" at frame {frames[0]} of {frames[1]}"
             raise Cancelled(f"calibration cancelled after {self.simulations} runs{where}")
+
+
+def measured_together(asked: list[tuple[Search, Place]]) -> Iterator[tuple[np.ndarray, float | None]]:
+    """Residuals and their root mean squares [m] of places of searches with one drive."""
+    jobs = [search.job(place) for search, place in asked]
+    made = asked[0][0].run(jobs) if asked else iter(())
+    for (search, _), job, tracks in zip(asked, jobs, made, strict=True):
+        yield search.compared(job, tracks)
+
+
+def in_step(several: list[tuple[Search, Descent]]) -> list[_Descended]:
+    """Descents in step with each other: what all of them ask for next is run together."""
+    asking = [search.begun(one) for search, one in several]
+    asked = {k: next(one) for k, one in enumerate(asking)}
+    runs, losses = [0] * len(several), [[] for _ in several]  # type: ignore[var-annotated]
+    found: dict[int, Optimum] = {}
+    while asked:
+        places = [
+            (several[k][0], (several[k][1].parameters, theta, several[k][1].end))
+            for k in asked
+            for theta in asked[k]
+        ]
+        measured = measured_together(places)
+        for k in list(asked):
+            search, one = several[k]
+            residuals = []
+            for theta in asked[k]:
+                residual, loss = next(measured)
+                runs[k] += 1
+                if loss is not None:
+                    if one.end in (None, search.end):
+                        losses[k].append(loss)
+                    search.tell(search.simulations + sum(runs), loss, (one.parameters, theta, None))
+                residuals.append(residual)
+            try:
+                asked[k] = asking[k].send(residuals)
+            except StopIteration as ended:
+                found[k] = Optimum(ended.value.theta, ended.value.cost)
+                del asked[k]
+    return [_Descended(found[k], runs[k], losses[k]) for k in range(len(several))]
 
 
 def _probe(candidate: Parameter) -> float:

@@ -46,7 +46,7 @@ def calibrate_in_stages(
         local: settings of the local stage; None for the defaults.
         progress: called with (runs done, runs at most, message).
         cancelled: polled every frame of every run.
-        runner: where simulations of the global stage run that do not depend on each other.
+        runner: where simulations run that do not depend on each other.
         journal: finished steps of an earlier attempt; one of the global stage alone is gone on from.
 
     Raises:
@@ -73,7 +73,7 @@ def calibrate_in_stages(
             progress(fitted.simulations + done, fitted.simulations + total, message)
 
     try:
-        found = fit_fields(scene, fitted.twin, local, after, cancelled, journal)
+        found = fit_fields(scene, fitted.twin, local, after, cancelled, journal, runner)
     except (CalibrationError, NotDifferentiable) as error:
         return replace(fitted, local=_not_searched(fitted, error))
     if not found.kept:

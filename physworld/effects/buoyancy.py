@@ -3,7 +3,8 @@
     (1 + a) m dv/dt = f + (1 - b) m g        b = rho_fluid / rho_body, a = C_m b (C_m 0.5 for a ball, 1 for a cylinder)
 
 b and a are separate strengths, since C_m depends on the shape and on the direction: b shows in the droop, a in the
-frequency. Other effects by mass (drag, wind) act on the mass with the added one.
+frequency. Other effects by mass (drag, wind) act on the mass with the added one, and a load that hangs
+from the body counts as the body.
 """
 
 from __future__ import annotations
@@ -44,9 +45,11 @@ class Buoyancy(Effect):
     def problem(self, problem: Problem, twin: Twin) -> Problem:
         """Changes gravity and the density field."""
         factor = np.ones(twin.lattice.fill.size) if problem.density_factor is None else problem.density_factor
+        load = problem.added_mass
         share = (1.0 - self.density_ratio) / (1.0 + self.added_mass_ratio)
         return replace(
             problem,
             gravity_m_s2=share * np.asarray(problem.gravity_m_s2),
             density_factor=(1.0 + self.added_mass_ratio) * factor,
+            added_mass=None if load is None else (1.0 + self.added_mass_ratio) * load,
         )

@@ -90,11 +90,10 @@ _MODELS = {
         const V flow = POSITIVE(size - PARAMETER(1) - PARAMETER(2) * STATE(3)) * (1.0 / (1.0 + PARAMETER(2)));
         STATE(3) += flow;
         for (int k = 0; k < 3; ++k) STATE(k) += flow * e[k] / size;
-        const double nu = PARAMETER(3);
-        const V stiffness = -FIELD(0) * PARAMETER(0);
-        stress[3] = stiffness * (STATE(0) + nu * STATE(1));
-        stress[4] = stiffness * (STATE(1) + nu * STATE(0));
-        stress[5] = stiffness * (1.0 - nu) * STATE(2);
+        const V stiffness = -FIELD(0) * PARAMETER(0);   // with C11, C22, C12 and C33 over it
+        stress[3] = stiffness * (PARAMETER(3) * STATE(0) + PARAMETER(5) * STATE(1));
+        stress[4] = stiffness * (PARAMETER(4) * STATE(1) + PARAMETER(5) * STATE(0));
+        stress[5] = stiffness * PARAMETER(6) * STATE(2);
     """,
         rows=4,
     ),
@@ -168,6 +167,7 @@ class Plasticity(Effect):
             if not self.yield_radius_m:
                 return problem
             stiffness = law.bending_n_m if twin.lattice.dim == 2 else law.bending_n_m2
-            numbers = (stiffness, 1.0 / self.yield_radius_m, h, getattr(law, "poissons_ratio", 0.0))
+            shape = law.bending_shape if twin.lattice.dim == 2 else ()
+            numbers = (stiffness, 1.0 / self.yield_radius_m, h, *shape)
         term = StressTerm(_MODELS[twin.lattice.dim], numbers, frequency_rad_s=0.0, name=self.name)
         return replace(problem, terms=(*problem.terms, term))

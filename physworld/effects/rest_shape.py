@@ -32,8 +32,8 @@ _MODELS = {
     """),
     2: sheet_model(r"""
         const V stiffness = -FIELD(0) * PARAMETER(0);
-        stress[3] = stiffness * (PARAMETER(1) + PARAMETER(3) * PARAMETER(2));
-        stress[4] = stiffness * (PARAMETER(2) + PARAMETER(3) * PARAMETER(1));
+        stress[3] = stiffness * (PARAMETER(3) * PARAMETER(1) + PARAMETER(5) * PARAMETER(2));
+        stress[4] = stiffness * (PARAMETER(4) * PARAMETER(2) + PARAMETER(5) * PARAMETER(1));
     """),
     1: rod_model(
         r"""
@@ -98,7 +98,7 @@ class RestShape(Effect):
 def _bending(problem: Problem, twin: Twin, bend: tuple[float, float]) -> StressTerm:
     law, lattice = problem.law, problem.lattice
     if lattice.dim == 2:
-        return StressTerm(_MODELS[2], (law.bending_n_m, *bend, law.poissons_ratio), frequency_rad_s=0.0)
+        return StressTerm(_MODELS[2], (law.bending_n_m, *bend, *law.bending_shape), frequency_rad_s=0.0)
     if lattice.dim == 1:
         slope = lattice.interpolation(lattice.particle_coordinates, (1,)) @ twin.body.start
         tangent = slope / np.linalg.norm(slope, axis=1, keepdims=True)

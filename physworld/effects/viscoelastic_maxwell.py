@@ -36,7 +36,7 @@ _MODELS = {
     ),
     2: sheet_model(
         r"""
-        const double keep = PARAMETER(2) / (PARAMETER(2) + dt), nu = PARAMETER(3);
+        const double keep = PARAMETER(2) / (PARAMETER(2) + dt);
         V e[6];
         for (int k = 0; k < 6; ++k) {
             STATE(k) = first ? strain[k] : strain[k] + (STATE(k) - strain[k]) * keep;
@@ -44,9 +44,10 @@ _MODELS = {
         }
         for (int k = 0; k < 6; k += 3) {
             const V stiffness = FIELD(0) * PARAMETER(k / 3);
-            stress[k] = stiffness * (e[k] + nu * e[k + 1]);
-            stress[k + 1] = stiffness * (e[k + 1] + nu * e[k]);
-            stress[k + 2] = stiffness * (1.0 - nu) * e[k + 2];
+            const int c = k == 0 ? 3 : 7;   // C11, C22, C12 and C33 of stretch, of bending
+            stress[k] = stiffness * (PARAMETER(c) * e[k] + PARAMETER(c + 2) * e[k + 1]);
+            stress[k + 1] = stiffness * (PARAMETER(c + 1) * e[k + 1] + PARAMETER(c + 2) * e[k]);
+            stress[k + 2] = stiffness * PARAMETER(c + 3) * e[k + 2];
         }
     """,
         rows=6,
@@ -97,7 +98,10 @@ class ViscoelasticMaxwell(Effect):
         law, g, tau = problem.law, self.share, self.relaxation_s
         numbers = {
             3: lambda: (2.0 * self.shear_modulus_pa, tau),
-            2: lambda: (g * law.membrane_n_m, g * law.bending_n_m, tau, law.poissons_ratio),
+            2: lambda: (
+                *(g * law.membrane_n_m, g * law.bending_n_m, tau),
+                *(*law.membrane_shape, *law.bending_shape),
+            ),
             1: lambda: (g * law.stretching_n, g * law.bending_n_m2, tau),
         }[twin.lattice.dim]()
         return replace(

@@ -228,6 +228,8 @@ def dominant_frequency(times: np.ndarray, tracks: np.ndarray) -> float | None:
     frequency = np.fft.rfftfreq(padded, even[1] - even[0])
     least = _LEAST_PERIODS / (times[-1] - times[0])
     allowed = np.flatnonzero(frequency >= least)
+    if not len(allowed):  # three frames or fewer
+        return None
     peak = allowed[np.argmax(power[allowed])]
     if peak == allowed[0] or peak + 1 >= len(power):
         return None

@@ -22,6 +22,7 @@ _BENDING_WEIGHT = (
 )
 _STRETCH_WEIGHT = 0.3
 _GAUSS_NEWTON_STEPS = 12
+_LONGER = 1.02  # times the extent of a straight rod's points: a declared length beyond it reaches past them
 
 
 def fit_nodes(scene: Scene, lattice: Lattice, material: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -50,6 +51,29 @@ def fit_nodes(scene: Scene, lattice: Lattice, material: np.ndarray) -> tuple[np.
     for _ in range(_GAUSS_NEWTON_STEPS):
         x = _unstretch(x, data, scene.points[0][seen] / spacing, bending, slopes)
     return x, _start_velocity(scene, lattice, material, bending)
+
+
+def straight_extent(
+    scene: Scene, along: np.ndarray, centre: np.ndarray, direction: np.ndarray, notes: list[str]
+) -> tuple[float, float]:
+    """Where a straight rod begins along ``direction`` from ``centre``, and its length [m].
+
+    Its points (at ``along``) show it whole, unless a longer one is declared: then it reaches back to where it is held,
+    and the rest of it past its last point; one that nobody holds reaches as far past its first.
+    """
+    begin, length = float(along.min()), float(np.ptp(along))
+    declared = scene.body.length_m
+    if declared is None or scene.rest_volume_points is not None or declared <= _LONGER * length:
+        return begin, length
+    missing, held = declared - length, (scene.controllers[0] - centre) @ direction
+    lead = 0.5 * missing
+    if np.any(held < 0.0):
+        lead = float(np.clip(begin - held[held < 0.0].mean(), 0.0, missing))
+    notes.append(
+        f"declared {declared:.4g} m long: it reaches {lead:.3g} m past its first and {missing - lead:.3g} m past its "
+        "last tracked point"
+    )
+    return begin - lead, float(declared)
 
 
 def _start_velocity(

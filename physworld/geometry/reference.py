@@ -21,7 +21,7 @@ from scipy.spatial import ConvexHull
 
 from physworld.errors import SceneUnsupported
 from physworld.geometry.alignment import cells_along, faces_along
-from physworld.geometry.curves import fit_nodes
+from physworld.geometry.curves import fit_nodes, straight_extent
 from physworld.geometry.declared import grips_of, load_of
 from physworld.geometry.filling import filled_body, inside_surface_points
 from physworld.geometry.sheet_cells import grips_in_plane, sheet_lattice
@@ -31,6 +31,8 @@ from physworld.scene import AS_MEASURED, Scene
 ROD_KINDS = ("rope", "rod")
 SHEET_KINDS = ("sheet", "cloth")
 _ROD_CELLS = 32
+_ROD_RADIUS_M = 0.004  # where none is declared or shown
+_ON_AXIS = 1e-6  # of a straight rod's length: points so near its axis show no radius
 _SHEET_CELLS, _SHEET_BUDGET = 24, 2000  # along the longer side at that budget, as its square root
 _FEWEST_SHEET_CELLS = 12
 _BOX_KINDS = ("beam", "block")
@@ -259,17 +261,20 @@ def _rod(scene: Scene, refinement: float) -> ReferenceBody:
         if len(scene.controllers[0]) and np.dot(scene.controllers[0].mean(axis=0) - centre, direction) > 0:
             direction = -direction
         along = (cloud - centre) @ direction
-        arc = (points - centre) @ direction - along.min()
-        length = float(np.ptp(along))
-        base = centre + along.min() * direction
+        begin, length = straight_extent(scene, along, centre, direction, notes)
+        arc = (points - centre) @ direction - begin
+        base = centre + begin * direction
         off_axis = float(np.sqrt(np.mean(np.sum((cloud - centre - along[:, None] * direction) ** 2, axis=1))))
         radius = scene.body.radius_m or float(np.sqrt(2.0) * off_axis)
+        if scene.body.radius_m is None and radius <= _ON_AXIS * length:
+            radius = _ROD_RADIUS_M
+            notes.append(f"radius not declared: {radius} m assumed (only bending over mass matters)")
         lattice = _rod_lattice(scene, length, (scene.controllers[0] - base) @ direction, refinement)
         start = base + lattice.node_coordinates * direction
         velocity = np.zeros_like(start)
     else:
         arc, length = _marker_arc_lengths(scene, points)
-        radius = scene.body.radius_m or 0.004
+        radius = scene.body.radius_m or _ROD_RADIUS_M
         if scene.body.radius_m is None:
             notes.append(f"radius not declared: {radius} m assumed (only bending over mass matters)")
         nearest = np.argmin(np.linalg.norm(scene.controllers[0][:, None] - points[None], axis=2), axis=1)
@@ -332,7 +337,7 @@ def _plane(scene: Scene, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     """Corner (3,), axes (3, 3), the last one normal, and sides (2,) of a sheet's plane; rms distance from it [m]."""
     cloud = points if scene.rest_volume_points is None else scene.rest_volume_points
     centre = cloud.mean(axis=0)
-    axes = np.linalg.svd(cloud - centre, full_matrices=len(cloud) < 3)[2]
+    _, extents, axes = np.linalg.svd(cloud - centre, full_matrices=len(cloud) < 3)
     if np.abs(axes[2]).max() > 0.999:  # a sheet in a coordinate plane: keep its edges along the axes
         normal_axis = int(np.argmax(np.abs(axes[2])))
         axes = np.stack([*(np.eye(3)[a] for a in range(3) if a != normal_axis), np.eye(3)[normal_axis]])
@@ -342,6 +347,8 @@ def _plane(scene: Scene, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     size = np.ptp(local[:, :2], axis=0)
     if size.min() <= _THIN * size.max():
         raise SceneUnsupported(f"{len(cloud)} points of a {scene.kind} span {size} m: no area")
+    if extents[1] <= _THIN * extents[0]:
+        raise SceneUnsupported(f"{len(cloud)} points of a {scene.kind} span {size} m on a line: no area")
     turn = _tightest_turn(local[:, :2])
     axes = np.concatenate([turn @ axes[:2], axes[2:]])
     local = (cloud - centre) @ axes.T

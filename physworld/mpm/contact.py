@@ -47,7 +47,9 @@ class GroundContact:
     def bind(self, problem: Problem) -> BoundCollider:
         """Device arrays for one problem; its friction may be a field."""
         plane = ground(self.height_m, self.friction)
-        surface = contact_surface(self.lattice, self.law, self.offsets)
+        surface = contact_surface(
+            problem.lattice, self.law, self.offsets
+        )  # an effect may have changed the lattice
         if problem.friction_factor is None:
             return BoundCollider(plane, surface, problem)
         return BoundGround(plane, self.height_m, surface, problem)

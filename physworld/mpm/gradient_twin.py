@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from physworld.errors import NotDifferentiable
 from physworld.geometry.rigid import least_rotation
 from physworld.mpm.adjoint import MEMORY_MB, Adjoint
 from physworld.mpm.adjoint_reverse import Gradient
@@ -83,7 +84,15 @@ class TwinRun:
         memory_mb: float = MEMORY_MB,
         progress: Callable[[int, int], None] | None = None,
     ) -> None:
-        """Integrate: arguments and errors of :meth:`Twin.simulate_nodes`, and those of :class:`Adjoint`."""
+        """Integrate: arguments and errors of :meth:`Twin.simulate_nodes`, and those of :class:`Adjoint`.
+
+        Raises:
+            NotDifferentiable: also for a twin of the updated Lagrangian form.
+        """
+        if twin.formulation != "total_lagrangian":
+            raise NotDifferentiable(
+                "a run of the updated Lagrangian form has no gradient: fit by simulations alone"
+            )
         self._twin, self._times = twin, frame_times
         self._setting = lambda t: t.integration(
             control_times, control_points, frame_times, properties=properties

@@ -12,6 +12,8 @@ import pytest
 sys.path.append(str(Path(__file__).parents[1] / "unit" / "effects"))
 from effect_twins import SCENES, TWINS
 
+from physworld.build import build_twin
+from physworld.calibrate.parameters import flow_law
 from physworld.effects.registry import EFFECTS, effect
 from physworld.errors import NotDifferentiable
 from physworld.mpm.gradient_twin import TwinRun, parameter, strength
@@ -114,6 +116,14 @@ def test_memory_that_the_run_does_not_have_is_refused() -> None:
     run = run_of(CHEAP["rope"], "rope")
     with pytest.raises(NotDifferentiable, match="small strength"):
         run.gradient(weights_of(run), {"g": strength(twin, "viscoelastic_maxwell", "share")})
+
+
+@pytest.mark.parametrize("flow", ["von_mises", None])
+def test_a_body_that_flows_has_no_gradient(flow: str | None) -> None:
+    law = None if flow is None else flow_law(flow)
+    twin = build_twin(SCENES["solid"](), 100, plasticity=law, formulation="updated_lagrangian")
+    with pytest.raises(NotDifferentiable, match="updated Lagrangian form"):
+        run_of(twin, "solid")
 
 
 def test_friction_of_the_ground() -> None:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import time
+from multiprocessing import active_children
 
 import pytest
 from tiny_scene import tiny_scene
 
 from physworld import simulations
 from physworld.build import build_twin
-from physworld.simulations import Drive, Job, engine
+from physworld.errors import WorkerLost
+from physworld.simulations import Drive, Job, Workers, engine
 
 
 def test_the_fingerprint_of_a_job_changes_with_the_engine(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -31,3 +33,16 @@ def test_the_engine_is_the_same_each_time_and_quick_to_read() -> None:
         taken.append(time.perf_counter() - begun)
         assert found == engine()
     assert min(taken) < 0.1, f"{taken} s"
+
+
+def test_a_process_that_is_killed_is_a_typed_error() -> None:
+    scene = tiny_scene()
+    drive = Drive(*scene.control_track(), scene.times)
+    jobs = [Job(build_twin(scene, 60), 3)]
+    with Workers(1) as workers:
+        assert len(list(workers(jobs, drive, lambda: None))) == 1
+        (child,) = active_children()
+        child.kill()
+        child.join()
+        with pytest.raises(WorkerLost, match="1 processes"):
+            list(workers(jobs, drive, lambda: None))

@@ -9,8 +9,9 @@ import pytest
 from made_scene import box_body, made_scene
 
 from physworld.build import build_twin
+from physworld.effects.registry import effect
 from physworld.grips import soft_regions, softly_held
-from physworld.mpm.soft_grips import AS_HELD
+from physworld.mpm.soft_grips import AS_HELD, SoftGrips
 from physworld.scene import Grip
 from physworld.trace.candidates import candidates
 from physworld.trace.unknowns import SOFTNESS, grip_softness
@@ -54,6 +55,18 @@ def test_a_soft_grip_gives_and_survives_being_stored() -> None:
     shift = (controls - controls[0]).mean(axis=1)
     gap = np.stack([(middle @ (now - found[0]))[0] for now in found]) - shift
     assert np.abs(gap).max() < 1e-3  # of a shake by 10 mm
+
+
+@pytest.mark.parametrize("strain", [0.15, -0.15])
+def test_a_soft_grip_holds_the_same_material_of_another_rest_shape(strain: float) -> None:
+    twin, times, controls = twin_held_by(CORNER)
+    held = []
+    for one in (twin, twin.with_effect(effect("rest_shape", strain_x=strain))):
+        problem = replace(one, grip_softness=1 / 10).integration(times, controls, times).problem
+        (grips,) = [term for term in problem.terms if isinstance(term, SoftGrips)]
+        held.append((grips.held.nodes, grips.stiffness / grips.stiffness.max()))
+    np.testing.assert_array_equal(held[0][0], held[1][0])
+    np.testing.assert_allclose(held[0][1], held[1][1], atol=1e-12)
 
 
 def test_only_a_grip_that_holds_a_part_of_a_section_holds_softly_and_has_its_softness_calibrated() -> None:

@@ -98,3 +98,5 @@ def test_the_dominant_frequency_is_that_of_the_strongest_cosine() -> None:
     assert dominant_frequency(times, tracks) == pytest.approx(2.3, rel=5e-3)
     assert dominant_frequency(times, np.ones((91, 2, 3))) is None
     assert dominant_frequency(times, times[:, None, None] * np.ones((91, 2, 3))) is None
+    for few in (1, 2, 3):  # too short for any frequency
+        assert dominant_frequency(times[:few], tracks[:few]) is None

@@ -74,6 +74,7 @@ def _fit(given: argparse.Namespace) -> None:
     from workers.tasks.fit_accuracy import fit_accuracy, not_measured
     from workers.tasks.fit_report import fit_files, fit_report
 
+    _refuse_places(given)
     scene = read_scene(given.scene)
     numbers = {"particle_budget": given.particles, "max_simulations": given.simulations}
     config = CalibrationConfig(
@@ -83,13 +84,13 @@ def _fit(given: argparse.Namespace) -> None:
         plasticity=given.plasticity,
     )
     journal = None if given.resume is None else journal_in(given.resume, scene, f"{given.law} {config}")
-    with progress_bar(f"law {scene.name}") if given.law == AUTO else nullcontext() as shown:
-        config, choice = chosen_laws(given.law, scene, config, shown, journal=journal)
-    pool = Workers(given.processes) if given.processes > 1 else nullcontext(in_turn)
-    with progress_bar(f"fit {scene.name}") as shown, pool as runner:
-        fitted = calibrate_in_stages(
-            scene, config, given.stages, progress=shown, journal=journal, runner=runner
-        )
+    with Workers(given.processes) if given.processes > 1 else nullcontext(in_turn) as runner:
+        with progress_bar(f"law {scene.name}") if given.law == AUTO else nullcontext() as shown:
+            config, choice = chosen_laws(given.law, scene, config, shown, journal=journal, runner=runner)
+        with progress_bar(f"fit {scene.name}") as shown:
+            fitted = calibrate_in_stages(
+                scene, config, given.stages, progress=shown, journal=journal, runner=runner
+            )
     accuracy = not_measured("left out by --quick")
     if not given.quick:
         with progress_bar(f"numerics {scene.name}") as shown:
@@ -104,6 +105,14 @@ def _fit(given: argparse.Namespace) -> None:
     if given.json is not None:
         given.json.parent.mkdir(parents=True, exist_ok=True)
         given.json.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n")
+
+
+def _refuse_places(given: argparse.Namespace) -> None:
+    """Whether the answer can be written where it is asked for, before hours are spent on it. Raises OSError."""
+    if given.out is not None and given.out.exists() and not given.out.is_dir():
+        raise NotADirectoryError(f"--out {given.out} is a file")
+    if given.json is not None and given.json.is_dir():
+        raise IsADirectoryError(f"--json {given.json} is a folder")
 
 
 def _kept(path: Path | None) -> str:
@@ -151,9 +160,9 @@ def _print(document: dict[str, Any]) -> None:
     for name, why in document["search"]["open"].items():
         print(f"{name} is not converged: {why}")
     for name, parameter in (document["converged"] or {}).items():
-        low, high = parameter["ci95"] or (float("nan"), float("nan"))
-        value = f"{parameter['value']:.5g} {parameter['unit']} [{low:.5g}, {high:.5g}]"
-        print(f"{name} without the lattice's error: {value}")
+        interval = parameter["ci95"]
+        shown = "" if interval is None else f" [{interval[0]:.5g}, {interval[1]:.5g}]"
+        print(f"{name} without the lattice's error: {parameter['value']:.5g} {parameter['unit']}{shown}")
     print(f"{document['simulations']} simulations, {document['seconds']:.0f} s")
 
 

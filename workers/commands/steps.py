@@ -5,14 +5,21 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
-from physworld.calibrate import Journal
+from physworld.calibrate.journal import JOURNAL_BEGINS, Journal
 from physworld.scene import Scene
 from physworld.simulations import engine
 from storage.scene_bundle import canonical_archive
 
 
 def journal_in(path: Path, scene: Scene, settings: str) -> Journal:
-    """Finished steps of this scene under these settings by this engine, kept in ``path``."""
+    """Finished steps of this scene under these settings by this engine, kept in ``path``.
+
+    Raises:
+        ValueError: there is a file at ``path`` that no command has written: it would be lost.
+    """
+    stored = path.read_text() if path.exists() else None
+    if stored and not stored.startswith(JOURNAL_BEGINS):
+        raise ValueError(f"{path} holds something else than finished steps and would be overwritten")
 
     def save(text: str) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -21,4 +28,4 @@ def journal_in(path: Path, scene: Scene, settings: str) -> Journal:
         partial.replace(path)
 
     key = f"{hashlib.sha256(canonical_archive(scene)).hexdigest()} {engine()} {settings}"
-    return Journal(key, path.read_text() if path.exists() else None, save)
+    return Journal(key, stored, save)

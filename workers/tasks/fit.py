@@ -44,7 +44,10 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
         transfer=config.transfer,
     )
     journal = stored_journal(stores, context.lease.job_id, payload)
-    calibration, law = chosen_laws(config.law, scene, calibration, progress, context.cancelled, journal)
+    runner = SharedRunner(context, stores, WORTH_SHARING_S)
+    calibration, law = chosen_laws(
+        config.law, scene, calibration, progress, context.cancelled, journal, runner
+    )
     fitted = calibrate_in_stages(
         scene,
         calibration,
@@ -52,7 +55,7 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
         progress=progress,
         cancelled=context.cancelled,
         journal=journal,
-        runner=SharedRunner(context, stores, WORTH_SHARING_S),
+        runner=runner,
     )
     accuracy = not_measured("left out by the request")
     if config.numerics:

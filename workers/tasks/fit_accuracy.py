@@ -13,7 +13,7 @@ from typing import Any
 from physworld.calibrate import FitResult, Journal
 from physworld.calibrate.discretisation import converged_parameters
 from physworld.calibrate.search import Progress
-from physworld.errors import Cancelled, SimulationError
+from physworld.errors import Cancelled, SceneUnsupported, SimulationError
 from physworld.evaluate.numerics import measure_numerics
 from physworld.scene import Scene
 from workers.tasks.fit_report import json_safe, parameter_json
@@ -75,7 +75,7 @@ def _measured(
             reason = "converged: numbers with cells of no size are found in the total Lagrangian form"
             return {**not_measured(reason), "numerics": json_safe(asdict(numerics))}
         converged = converged_parameters(scene, fitted, budget, poll=poll)
-    except SimulationError as error:
+    except (SimulationError, SceneUnsupported) as error:  # finer cells may not hold what these do
         return not_measured(f"{type(error).__name__}: {error}")
     return {
         "numerics": json_safe(asdict(numerics)),

@@ -105,3 +105,24 @@ def test_the_lattice_s_error_is_extrapolated_away() -> None:
     assert found.value != pytest.approx(effective, rel=0.014)
     assert found.ci95 is not None and found.ci95[0] < found.value < found.ci95[1]
     assert f"{effective:.5g}" in found.note
+
+
+def test_an_interval_that_holds_zero_keeps_its_width_without_the_lattices_error() -> None:
+    _, scene = bar()
+    twin = build_twin(scene, BUDGET).with_parameters(youngs_modulus_pa=BAR_PA)
+    ratio = next(p for p in parameters_of(twin, False) if p.name == "poissons_ratio")
+    fitted = FitResult(
+        twin=twin,
+        parameters={ratio.name: Estimate(0.3, "1", (-0.1, 0.7))},
+        searched=(ratio,),
+        correlations=Correlations((ratio.name,), np.eye(1)),
+        tracks=predicted(twin, scene),
+        particles=np.zeros((0, 0, 3)),
+        losses={},
+        simulations=0,
+        seconds=0.0,
+        loss_history=[],
+    )
+    found = converged_parameters(scene, fitted, BUDGET)[ratio.name]
+    assert found.ci95 is not None
+    assert found.ci95[1] - found.ci95[0] >= 0.8 * (1 - 1e-9) and np.isfinite(found.ci95).all()

@@ -58,7 +58,8 @@ def test_the_journal_of_something_else_or_a_torn_one_is_ignored() -> None:
     stored: list[str] = []
     Journal("a", None, stored.append).step("scan", lambda: {"cost": float("nan")})
     assert json.loads(stored[0])["entries"] == [{"name": "scan", "found": {"cost": None}}]
-    for journal in (Journal("b", stored[0]), Journal("a", stored[0][:-5])):
+    torn = [Journal("a", text) for text in (stored[0][:-5], "[]", "null", "3")]
+    for journal in (Journal("b", stored[0]), *torn):
         assert journal.step("scan", lambda: {"cost": 2.0}) == {"cost": 2.0}
     assert Journal("a", stored[0]).step("scan", lambda: {"cost": 2.0}) == {"cost": None}
 

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from made_scene import box_body, made_scene, recorded_by
+from test_shared_search import Together
 
 from physworld.build import build_twin
-from physworld.calibrate import CalibrationConfig
+from physworld.calibrate import CalibrationConfig, law_choice
 from physworld.calibrate.law_choice import PROMPT, choose_law, cross_validate, parse_answer
 from physworld.errors import LawAnswerRefused, LawAnswerUnavailable
 from physworld.materials.library import with_law
@@ -133,3 +134,37 @@ def test_a_rope_has_one_law() -> None:
     rope = made_scene([[x, 0.0, 0.0] for x in np.linspace(0, 0.3, 7)], "rope")
     choice = cross_validate(rope, CONFIG)
     assert choice.elastic == "rod" and "only law" in choice.reason
+
+
+def test_a_shared_cross_validation_is_the_same_and_its_folds_go_side_by_side() -> None:
+    scene, laws = drooping_block("hencky", 2e5), ("neo_hookean", "fixed_corotated", "hencky")
+    together = Together()
+    assert cross_validate(scene, CONFIG, laws, runner=together) == cross_validate(scene, CONFIG, laws)
+    assert together.widths.count(9) > 3  # three laws on three blocks
+
+
+@pytest.mark.parametrize("hidden", ["frames", "points"])
+def test_what_shows_too_little_to_hold_some_of_it_out_gets_the_usual_law(hidden: str) -> None:
+    scene = drooping_block("neo_hookean", 2e5)
+    if hidden == "frames":
+        scene = replace(scene, train=(0, 2))
+    else:
+        shown = np.isin(np.arange(24), [1, 2, 3, 20, 21, 22])  # of the training frames only one block
+        scene = replace(scene, visible=scene.visible & shown[:, None])
+    choice = cross_validate(scene, CONFIG)
+    assert (choice.elastic, choice.decided_by) == ("neo_hookean", "default") and "too few" in choice.reason
+
+
+def test_where_no_law_runs_through_on_a_block_the_usual_one_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(law_choice, "residuals_apart", lambda asked: [np.full(3, np.nan) for _ in asked])
+    choice = cross_validate(drooping_block("hencky", 2e5), CONFIG, ("neo_hookean", "hencky"))
+    assert (choice.elastic, choice.decided_by) == ("neo_hookean", "default") and "no law" in choice.reason
+
+
+def test_a_model_that_names_a_flow_which_the_body_cannot_have_does_not_decide() -> None:
+    points = [[x, y, 0.0] for x in np.linspace(0, 0.2, 5) for y in np.linspace(0, 0.2, 5)]
+    sheet = made_scene(points, "cloth", points[:5], 12)
+    text = "Elastic: Anisotropic Hyperelastic | Plastic: Von Mises | Reason: it creases"
+    choice = choose_law(sheet, replace(CONFIG, max_simulations=4), Says(text), lambda scene: [])
+    assert choice.plastic == "identity" and choice.decided_by != "model parrot"
+    assert "updated Lagrangian" in choice.figures["not_used_because"]

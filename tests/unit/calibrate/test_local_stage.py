@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from made_scene import box_body, made_scene
+from test_shared_search import Together
 
 from physworld.build import build_twin
-from physworld.calibrate.local_search import LocalConfig, field_modes
+from physworld.calibrate.local_search import FieldSearch, LocalConfig, field_modes
 from physworld.calibrate.local_stage import fit_fields
-from physworld.errors import CalibrationError, Cancelled
+from physworld.errors import CalibrationError, Cancelled, UnstableSimulation
 from physworld.mpm.soft_grips import AS_HELD
 from physworld.mpm.soft_grips_derivatives import same_soft_grips
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
@@ -99,3 +101,52 @@ def test_what_cannot_be_is_refused() -> None:
         fit_fields(scene, twin, replace(QUICK, fields=("viscosity",)))
     with pytest.raises(CalibrationError, match="validate"):
         fit_fields(replace(scene, train=(0, 2)), twin, QUICK)
+
+
+@pytest.mark.parametrize(
+    ("hidden", "word"), [(slice(11, 17), "12 to 16, which validate"), (slice(1, 12), "search")]
+)
+def test_frames_that_show_nothing_neither_search_nor_validate_a_field(hidden: slice, word: str) -> None:
+    scene, twin = recorded(0.0)
+    visible = scene.visible.copy()
+    visible[hidden] = False
+    with pytest.raises(CalibrationError, match=f"nothing is visible in frames .*{word}"):
+        fit_fields(replace(scene, visible=visible), twin, QUICK)
+
+
+def test_the_runs_of_a_hessian_are_shared_and_find_the_same() -> None:
+    scene, twin = recorded(-0.6)
+    together = Together()
+    shared, alone = fit_fields(scene, twin, QUICK, runner=together), fit_fields(scene, twin, QUICK)
+    np.testing.assert_array_equal(shared.properties, alone.properties)
+    assert (shared.runs, shared.simulations, shared.validation) == (
+        alone.runs,
+        alone.simulations,
+        alone.validation,
+    )
+    assert together.widths == [5, 5]  # a constant, three modes and none of them, twice
+
+
+def test_a_field_whose_run_fails_after_the_training_frames_is_thrown_away(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scene, twin = recorded(-0.6)
+    simulate = Twin.simulate_nodes
+
+    def fails(self: Twin, *given: Any, properties: np.ndarray | None = None, **more: Any) -> np.ndarray:
+        if properties is not None and properties.any() and len(given[2]) == FRAMES:
+            raise UnstableSimulation("frame 20")
+        return simulate(self, *given, properties=properties, **more)
+
+    monkeypatch.setattr(Twin, "simulate_nodes", fails)
+    found = fit_fields(scene, twin, QUICK)
+    assert not found.kept and found.strength is None and not found.properties.any()
+    assert "thrown away" in found.reason and "frame 20" in found.reason
+
+
+def test_a_line_search_that_goes_far_astray_simulates_nothing_there() -> None:
+    scene, twin = recorded(0.0)
+    search = FieldSearch(scene, twin, QUICK, cancelled=lambda: True)  # a run would end in Cancelled
+    far = np.zeros(search.size)
+    far[0] = 12.0  # a stiffness of 160 000 times
+    assert np.isnan(search.errors(far, search.end)).all()

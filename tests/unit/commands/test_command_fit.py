@@ -18,10 +18,12 @@ from chat_model import serving
 from made_scene import box_body, made_scene, recorded_by
 
 from physworld.build import build_twin
+from physworld.calibrate import CalibrationConfig, calibrate
 from physworld.scene import UNDEFORMED_AT_REST, Grip
 from physworld.twin import Twin
-from storage.scene_bundle import write_bundle
+from storage.scene_bundle import read_bundle, write_bundle
 from workers.commands import fit
+from workers.tasks.fit_accuracy import fit_accuracy
 
 FRAMES, BUDGET, SIMULATIONS = 16, 60, 60
 YOUNGS_MODULUS_PA = 4e4
@@ -168,6 +170,54 @@ def test_a_fit_that_was_ended_goes_on_from_its_file(bundle: Path, tmp_path: Path
     assert again == whole and json.loads(journal.read_text()) == stored
     fitted("other.json", "--simulations", "40")  # other settings: none of those steps is read
     assert json.loads(journal.read_text())["key"] != stored["key"]
+
+
+@pytest.mark.parametrize("option", ["--out", "--json"])
+def test_a_place_that_cannot_be_written_is_refused_before_anything_is_simulated(
+    bundle: Path, tmp_path: Path, option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    taken = tmp_path / "taken"
+    taken.write_text("a file") if option == "--out" else taken.mkdir()
+    assert fit.main(arguments(bundle, "--quick", option, str(taken))) == 2
+    shown = capsys.readouterr()
+    assert f"{option} {taken} is a" in shown.err and shown.out == ""
+
+
+def test_a_file_that_is_no_journal_is_not_overwritten(
+    bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    notes = tmp_path / "notes.json"
+    notes.write_text('{"written": "by hand"}')
+    assert fit.main(arguments(bundle, "--quick", "--resume", str(notes))) == 2
+    assert "would be overwritten" in capsys.readouterr().err
+    assert notes.read_text() == '{"written": "by hand"}'
+
+
+def test_a_grip_that_a_finer_lattice_cannot_hold_leaves_the_fit(bundle: Path) -> None:
+    scene = read_bundle(bundle)
+    beside = scene.controllers - np.array([0.004, 0.0, 0.0])  # nearer to a coarse particle than it is large
+    scene = replace(scene, controllers=beside, grips=(Grip((0, 1, 2, 3), radius_m=1e-4),))
+    fitted = calibrate(scene, CalibrationConfig(particle_budget=BUDGET, max_simulations=12))
+    found = fit_accuracy(scene, fitted, BUDGET)
+    assert found["numerics"] is None and "SceneUnsupported" in found["not_measured"]
+
+
+def test_a_recording_of_three_frames_is_fitted_and_measured(bundle: Path, tmp_path: Path) -> None:
+    scene = read_bundle(bundle)
+    few = replace(
+        scene,
+        points=scene.points[:3],
+        visible=scene.visible[:3],
+        controllers=scene.controllers[:3],
+        times=scene.times[:3],
+        train=(0, 2),
+        test=(2, 3),
+    )
+    write_bundle(few, tmp_path / "few")
+    figures = tmp_path / "fit.json"
+    assert fit.main(arguments(tmp_path / "few", "--json", str(figures))) == 0
+    numerics = json.loads(figures.read_text())["numerics"]
+    assert numerics["dominant_mode_hz"] is None and numerics["half_step_m"] is not None
 
 
 def test_the_law_may_be_a_models_choice(

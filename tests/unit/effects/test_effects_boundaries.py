@@ -9,10 +9,12 @@ import pytest
 import warp as wp
 from effect_twins import SCENES, TWINS, centroid, loose, moved
 from scipy.optimize import brentq
+from scipy.sparse import csr_matrix
 
 from physworld.effects.registry import effect
 from physworld.effects.time_varying_stiffness import GrowingStiffness
 from physworld.errors import CFLViolation
+from physworld.mpm.contact import GroundContact
 from physworld.mpm.total_lagrangian import Problem, TotalLagrangian, nodal_mass
 from physworld.twin import Twin
 
@@ -78,6 +80,19 @@ def test_adhesion_holds_a_block_until_its_weight_is_greater() -> None:
     freed = twin.with_effect(effect("adhesion", traction_pa=0.8 * weight / area))
     assert abs(centroid(twin, moved(stuck, times))[-1, 2]) < 0.002
     assert centroid(twin, moved(freed, times))[-1, 2] > 0.05
+
+
+def test_added_mass_leaves_the_weight_of_a_hanging_load() -> None:
+    twin, _ = cantilever(gravity=-9.81)
+    load = np.zeros(len(twin.body.start))
+    load[-3:] = 0.02
+    twin, scene = replace(twin, body=replace(twin.body, added_mass=load)), SCENES["rope"]()
+    weights = []
+    for ratio in (0.0, 0.8):
+        known = twin.with_effect(effect("buoyancy", density_ratio=0.3, added_mass_ratio=ratio))
+        problem = known.integration(*scene.control_track(), scene.times).problem
+        weights.append(problem.nodal_mass() * problem.gravity_m_s2[2])
+    np.testing.assert_allclose(*weights)
 
 
 def test_added_mass_lowers_the_frequency_of_a_cantilever() -> None:
@@ -156,6 +171,20 @@ def test_a_longer_rest_shape_keeps_the_mass() -> None:
     problem = Problem(twin.lattice, twin.law, twin.body.rest, np.zeros(3))
     grown = effect("rest_shape", strain_x=0.1, strain_y=-0.05, strain_z=0.02).problem(problem, twin)
     np.testing.assert_allclose(grown.nodal_mass(), problem.nodal_mass(), rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["solid", "sheet", "rope"])
+@pytest.mark.parametrize("strain", [0.1, -0.1])
+def test_another_rest_shape_touches_the_ground_with_the_same_material(name: str, strain: float) -> None:
+    twin, scene = TWINS[name], SCENES[name]()
+    places = []
+    for one in (twin, twin.with_effect(effect("rest_shape", strain_x=strain))):
+        problem = one.integration(*scene.control_track(), scene.times).problem
+        (ground,) = [term for term in problem.terms if isinstance(term, GroundContact)]
+        rows, columns, weights = (array.numpy() for array in ground.bind(problem)._surface[:3])
+        points = csr_matrix((weights, columns, rows), shape=(len(rows) - 1, len(twin.body.start)))
+        places.append(points @ twin.body.start)
+    np.testing.assert_allclose(*places, atol=1e-12)
 
 
 def test_a_bent_rest_shape_bends_a_free_rod_to_its_circle() -> None:

@@ -12,6 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from physworld.effects.base import Effect
 from physworld.effects.registry import effect
+from physworld.materials.library import with_law
+from physworld.mpm.gradient import internal_forces
 from physworld.mpm.terms import BoundTerm
 from physworld.mpm.total_lagrangian import Problem
 from physworld.twin import Twin
@@ -350,3 +352,48 @@ def test_fibres_and_friction_are_told_in_pascals(name: str) -> None:
     assert effect("anisotropy", ratio=0.5).derived(twin) == {
         "fibre_modulus_pa": (pytest.approx(0.5 * modulus), "Pa")
     }
+
+
+def woven() -> Twin:
+    """A sheet none of whose shape numbers is an isotropic one's."""
+    law = with_law(TWINS["sheet"].law, "orthotropic_sheet")
+    shape = {"weft_ratio": 2.0, "shear_ratio": 0.3, "bending_weft_ratio": 3.0}
+    return replace(TWINS["sheet"], law=law).with_parameters(
+        **shape, bending_twist_ratio=2.5, bending_coupling=0.4
+    )
+
+
+def own_forces(twin: Twin, x: np.ndarray) -> np.ndarray:
+    """Forces (n, 3) [N] of the law alone."""
+    forces = internal_forces(Problem(twin.lattice, twin.law, twin.body.rest, np.zeros(3)))
+    out = wp.zeros(x.size, dtype=wp.float64)
+    forces.launch(wp.array(x.reshape(-1), dtype=wp.float64), wp.zeros(3, dtype=wp.float64), out)
+    return out.numpy().reshape(-1, 3)
+
+
+def test_a_branch_of_a_woven_sheet_has_the_laws_own_stiffness() -> None:
+    twin = woven()
+    applied = Applied(twin, effect("viscoelastic_maxwell", share=0.3, relaxation_s=0.1))
+    applied(twin.body.rest)
+    x = deformed(twin)
+    expected = 0.3 * own_forces(twin, x)
+    np.testing.assert_allclose(applied(x, 1e-12), expected, atol=1e-9 * np.abs(expected).max())
+
+
+def test_a_woven_sheet_that_flows_at_once_bends_without_a_moment() -> None:
+    twin = woven().with_parameters(membrane_n_m=1e-12)
+    applied = Applied(twin, effect("plasticity", yield_radius_m=1e12))
+    applied(twin.body.rest)
+    x = deformed(twin)
+    elastic = own_forces(twin, x)
+    np.testing.assert_allclose(applied(x, 1e-3), -elastic, atol=1e-6 * np.abs(elastic).max())
+
+
+def test_a_woven_sheet_is_without_moment_in_its_bent_rest_shape() -> None:
+    twin, bend = woven(), np.array([2.0, -1.0, 0.0])
+    c11, c22, c12, _ = twin.law.bending_shape
+    x = deformed(twin)
+    forces = Applied(twin, effect("rest_shape", curvature_1_per_m=2.0, curvature_2_per_m=-1.0))(x)
+    moment = twin.law.bending_n_m * np.array([c11 * bend[0] + c12 * bend[1], c22 * bend[1] + c12 * bend[0]])
+    expected, picks = slope(twin, lambda y: -strains(twin, y)[:, 3:5] @ moment, x)
+    np.testing.assert_allclose(forces[picks], expected, atol=TOLERANCE["sheet"] * np.abs(forces).max())

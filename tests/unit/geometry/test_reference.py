@@ -9,6 +9,7 @@ import pytest
 from made_scene import box_body, made_scene
 from scipy.spatial.transform import Rotation
 
+from physworld.build import build_twin
 from physworld.errors import SceneUnsupported
 from physworld.geometry.reference import ReferenceBody, reference_body
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Scene
@@ -116,6 +117,29 @@ def test_a_sheet_that_is_not_flat_is_a_solid_if_its_points_bound_one_and_says_so
     assert "not flat at the start (0.0595 m rms off its plane, 0.3 m wide)" in body.notes[0]
 
 
+@pytest.mark.parametrize(("hand", "begin"), [(-0.04, -0.04), (-0.5, -0.2), (None, -0.1)])
+def test_a_straight_rope_that_is_declared_longer_reaches_back_to_its_hand(
+    hand: float | None, begin: float
+) -> None:
+    points = line(7)
+    length = float(np.ptp(points, axis=0).max())
+    direction = (points[-1] - points[0]) / length
+    hands = [] if hand is None else [points[0] + hand * direction]
+    longer = Body(length_m=length + 0.2)
+    scene = made_scene(points, "rope", hands, initial_state=UNDEFORMED_AT_REST, body=longer)
+    body = reference_body(scene, BUDGET)
+    assert measure(body) == pytest.approx(length + 0.2)
+    np.testing.assert_allclose(np.sort(body.points[:, 0])[0], -begin, atol=1e-9)
+    np.testing.assert_allclose(body.lattice.interpolation(body.points) @ body.start, points, atol=1e-9)
+    assert any("past its first" in note for note in body.notes)
+
+
+def test_a_straight_rope_whose_points_lie_on_its_axis_has_the_usual_radius() -> None:
+    twin = build_twin(made_scene(line(7), "rope", initial_state=UNDEFORMED_AT_REST))
+    assert twin.body.thickness_m == 0.004 and twin.density > 0
+    assert any("radius not declared" in note for note in twin.body.notes)
+
+
 def test_a_straight_rope_has_the_length_of_its_points() -> None:
     body = reference_body(made_scene(line(7), "rope", initial_state=UNDEFORMED_AT_REST), BUDGET)
     assert body.lattice.dim == 1 and measure(body) == pytest.approx(0.9, rel=1e-9)
@@ -180,3 +204,9 @@ def test_a_scene_without_a_body_is_refused_by_its_numbers(name: str) -> None:
     scene, words = REFUSED[name]
     with pytest.raises(SceneUnsupported, match=words):
         reference_body(scene, BUDGET)
+
+
+def test_points_of_a_sheet_on_a_slanted_line_span_no_area() -> None:
+    diagonal = np.linspace([0.0, 0.0, 0.0], [0.3, 0.3, 0.0], 5)
+    with pytest.raises(SceneUnsupported, match="no area"):
+        reference_body(made_scene(diagonal, "sheet"), BUDGET)
