@@ -64,9 +64,13 @@ def twin_on(recording: Scene, home: Scene, twin: Twin, particle_budget: int) -> 
             law=twin.law,
             air_drag_per_s=twin.air_drag_per_s,
             ground_friction=twin.ground_friction,
+            grip_softness=twin.grip_softness,
             effects=twin.effects,
+            self_friction=twin.self_friction,
             plasticity=twin.plasticity,
             formulation=twin.formulation,
+            transfer=twin.transfer,
+            properties=twin.properties,
         )
     if counts[0][1] != counts[1][1]:
         raise SceneUnsupported(

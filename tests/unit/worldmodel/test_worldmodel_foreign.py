@@ -43,6 +43,16 @@ def test_the_same_body_takes_its_new_start_and_keeps_what_was_learned() -> None:
     np.testing.assert_array_equal(placed.particles_rest, twin.particles_rest)
 
 
+def test_fields_soft_grips_and_the_transfer_go_with_the_twin() -> None:
+    home = tiny_scene()
+    twin = build_twin(home, 60)
+    field = np.full((len(twin.particles_rest), 2), 0.3)
+    twin = replace(twin, properties=field, grip_softness=0.5, transfer="asflip", self_friction=0.2)
+    placed = twin_on(replace(home, points=home.points + 1e-3), home, twin, 60)
+    np.testing.assert_array_equal(placed.properties, field)
+    assert (placed.grip_softness, placed.transfer, placed.self_friction) == (0.5, "asflip", 0.2)
+
+
 def test_a_body_that_looks_different_is_moved_as_a_whole() -> None:
     home = tiny_scene()
     twin = build_twin(home, 60).with_parameters(youngs_modulus_pa=3e4)
