@@ -84,7 +84,7 @@ def test_every_motion_keeps_the_limits() -> None:
     velocities = np.random.default_rng(0).normal(0.0, 1.0, (50, 40, 2, 3))
     kept = limits.kept(velocities, DT)
     places = DT * kept.cumsum(axis=1)
-    assert np.linalg.norm(kept, axis=-1).max() > 0.45
+    assert 0.45 < np.linalg.norm(kept, axis=-1).max() <= 0.5 + 1e-9
     assert (places >= limits.box_min_m - 1e-9).all()
     assert (places <= limits.box_max_m + 1e-9).all()
     gap = np.linalg.norm(places[..., 1, :] + limits.centres_m[1] - places[..., 0, :], axis=-1)
@@ -95,6 +95,23 @@ def test_every_motion_keeps_the_limits() -> None:
     assert np.linalg.norm(calm, axis=-1).max() <= 0.5 + 1e-9
     assert np.linalg.norm(np.diff(calm, axis=1, prepend=0.0), axis=-1).max() <= 4.0 * DT + 1e-9
     assert np.allclose(free.kept(calm, DT), calm)
+
+
+def test_a_grip_that_is_pulled_along_keeps_its_speed_limit() -> None:
+    limits = GripLimits(
+        speed_m_s=0.5,
+        acceleration_m_s2=1e3,
+        box_min_m=np.full((2, 3), -9.0),
+        box_max_m=np.full((2, 3), 9.0),
+        spread_max_m=np.array([[0.0, 0.2], [0.2, 0.0]]),
+        centres_m=np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0]]),
+    )
+    wanted = np.zeros((30, 2, 3))
+    wanted[:, 0, 1], wanted[:, 1, 0] = 0.5, 0.5  # one across the line between them, one away along it
+    kept = limits.kept(wanted, DT)
+    assert np.linalg.norm(kept, axis=-1).max() <= 0.5 + 1e-9
+    places = DT * kept.cumsum(axis=0) + limits.centres_m
+    assert np.linalg.norm(places[:, 1] - places[:, 0], axis=-1).max() <= 0.2 + 1e-4  # a pass leaves that much
 
 
 def test_a_motion_that_leaves_the_numbers_is_never_chosen() -> None:
