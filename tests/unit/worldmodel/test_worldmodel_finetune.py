@@ -11,6 +11,7 @@ from held_bar import SMALL, graph
 
 from physworld.worldmodel.config import FineTuneConfig, TrainingConfig
 from physworld.worldmodel.dataset import Track, read_track
+from physworld.worldmodel.errors import VersionUnreadable
 from physworld.worldmodel.finetune import Recording, fine_tune
 from physworld.worldmodel.model import WorldModel
 from physworld.worldmodel.published import PublishedModel
@@ -110,6 +111,28 @@ def test_published_tensors_hold_everything(
     history = episodes[2]["particles"][: SMALL.history + 1, published.spec.particle_index].astype(np.float64)
     direct = rollout(published.model, published.spec, history, controllers, published.phi)
     assert again.rollout(controllers, history=history) == pytest.approx(direct, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "name", ["graph.neighbours", "graph.rest_relative", "graph.edge_kind", "particle.index"]
+)
+def test_a_graph_of_other_sizes_is_refused(published: PublishedModel, name: str) -> None:
+    tensors = published.to_tensors()
+    short = np.ascontiguousarray(np.delete(tensors[name], -1, axis=min(1, tensors[name].ndim - 1)))
+    with pytest.raises(VersionUnreadable, match="not"):
+        PublishedModel.from_tensors(tensors | {name: short}, published.facts())
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("graph.neighbours", -1), ("graph.neighbours", 99), ("skin.index", -1), ("control.index", -1)],
+)
+def test_an_index_beyond_the_graph_is_refused(published: PublishedModel, name: str, value: int) -> None:
+    tensors = published.to_tensors()
+    tensors[name] = tensors[name].copy()
+    tensors[name].flat[0] = value
+    with pytest.raises(VersionUnreadable, match=f"{name} {value}"):
+        PublishedModel.from_tensors(tensors, published.facts())
 
 
 @pytest.fixture(scope="module")
