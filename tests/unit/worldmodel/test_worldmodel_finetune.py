@@ -101,6 +101,29 @@ def test_no_steps_leave_the_calibrated_properties(
     assert result.phi == pytest.approx(phi)
 
 
+def test_what_is_stored_of_invisible_points_changes_nothing(
+    published: PublishedModel, episodes: list[dict[str, np.ndarray]]
+) -> None:
+    controllers = episodes[1]["controllers"].astype(np.float64)
+    phi = np.full((published.spec.object_count, 2), 0.1)
+    recording = _recording(published, controllers, phi)
+    elsewhere = recording.points + np.where(recording.visible, 0.0, 5.0)[..., None]
+    other = dataclasses.replace(recording, points=elsewhere)
+    found = [fine_tune(published.model, 0.0 * phi, r, published.skin, TUNING) for r in (recording, other)]
+    np.testing.assert_array_equal(found[0].phi, found[1].phi)
+
+
+def test_without_a_training_frame_after_the_history_nothing_is_tuned(
+    published: PublishedModel, episodes: list[dict[str, np.ndarray]]
+) -> None:
+    phi = np.full((published.spec.object_count, 2), 0.1)
+    recording = _recording(published, episodes[1]["controllers"].astype(np.float64), phi)
+    none = {name: getattr(recording, name)[:0] for name in ("ticks", "points", "visible")}
+    found = fine_tune(published.model, phi, dataclasses.replace(recording, **none), published.skin, TUNING)
+    assert (found.kept, found.steps) == (False, 0)
+    np.testing.assert_array_equal(found.phi, phi)
+
+
 def test_published_tensors_hold_everything(
     published: PublishedModel, episodes: list[dict[str, np.ndarray]]
 ) -> None:
