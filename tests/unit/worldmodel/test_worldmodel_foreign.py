@@ -6,13 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from tiny_scene import tiny_scene
 
 from physworld.build import build_twin
 from physworld.effects.registry import effect
 from physworld.errors import SceneUnsupported
-from physworld.scene import Body, Scene
-from physworld.worldmodel.foreign import start_mismatch, twin_on
+from physworld.scene import Body, Ground, Scene
+from physworld.worldmodel.config import WorldModelConfig
+from physworld.worldmodel.foreign import predict, start_mismatch, twin_on
+from physworld.worldmodel.model import WorldModel
+from physworld.worldmodel.scene_view import view_scene
 
 TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 SHIFT = np.array([0.3, -0.2, 0.0])
@@ -66,6 +70,46 @@ def test_a_body_that_looks_different_is_moved_as_a_whole() -> None:
         t.simulate(scene.times, scene.controllers, times) for t, scene in ((twin, home), (placed, elsewhere))
     ]
     np.testing.assert_allclose(particles[1], particles[0] @ TURN.T + SHIFT, atol=1e-6)
+
+
+@pytest.mark.parametrize("softness", [0.0, 0.5])
+def test_a_moved_twin_stands_on_the_recordings_ground_and_is_held_as_at_home(softness: float) -> None:
+    home = replace(tiny_scene(), ground=Ground(-0.3))
+    twin = replace(build_twin(home, 60), grip_softness=softness)
+    elsewhere = replace(moved(home), ground=Ground(-0.2))
+    placed = twin_on(elsewhere, home, twin, 60)
+    assert placed.ground_height_m == -0.2
+    times = home.times[:6]
+    particles = [
+        t.simulate(scene.times, scene.controllers, times) for t, scene in ((twin, home), (placed, elsewhere))
+    ]
+    np.testing.assert_allclose(particles[1], particles[0] @ TURN.T + SHIFT, atol=1e-6)
+
+
+def test_heights_count_from_the_recordings_ground() -> None:
+    home = replace(tiny_scene(), ground=Ground(-0.02))
+    twin = build_twin(home, 60)
+    config = WorldModelConfig(hidden=16, message_passing_steps=1, vertices=20)
+    view = view_scene(home, twin, config)
+    network = WorldModel(config, view.spec)
+    torch.manual_seed(0)
+    torch.nn.init.normal_(network.skip.weight, std=1e-3)  # heights are among what it reads
+    phi = np.zeros((view.spec.object_count, 2))
+    model = view.published(network, phi, phi)
+    up = np.array([0.0, 0.0, 0.3])
+    body = replace(home.body, box_min_m=home.body.box_min_m + up, box_max_m=home.body.box_max_m + up)
+    region = home.grips[0]
+    grip = replace(region, region_min_m=region.region_min_m + up, region_max_m=region.region_max_m + up)
+    lifted = replace(
+        home,
+        points=home.points + up,
+        controllers=home.controllers + up,
+        body=body,
+        grips=(grip,),
+        ground=Ground(0.28),
+    )
+    tracks = [predict(model, r, twin_on(r, home, twin, 60)).tracks for r in (home, lifted)]
+    np.testing.assert_allclose(tracks[1], tracks[0] + up, atol=1e-5)
 
 
 def test_other_controllers_or_points_are_refused_with_their_numbers() -> None:
