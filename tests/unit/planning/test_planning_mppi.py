@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from physworld.errors import Cancelled
+from physworld.errors import Cancelled, UnstableSimulation
 from physworld.planning.goals import GoalPoints, GoalShape
 from physworld.planning.limits import GripLimits
 from physworld.planning.mppi import MppiConfig, coloured_noise, search
@@ -123,6 +123,17 @@ def test_a_motion_that_leaves_the_numbers_is_never_chosen() -> None:
     found = search(fragile, goal, LIMITS, DT, replace(QUICK, iterations=4), np.random.default_rng(0))
     assert np.abs(found.displacements).max() <= 0.05
     assert np.isfinite(found.points).all()
+
+
+@pytest.mark.parametrize("goal", [GoalPoints(np.array([0]), np.zeros((1, 3))), GoalShape(np.zeros((4, 3)))])
+def test_a_model_that_leaves_the_numbers_at_rest_is_refused(goal: GoalPoints | GoalShape) -> None:
+    def broken(displacements: np.ndarray) -> np.ndarray:
+        points = displacements.copy()
+        points[:, 29:] = np.nan
+        return points
+
+    with pytest.raises(UnstableSimulation, match="1 s after its start with grips at rest"):
+        search(broken, goal, LIMITS, DT, QUICK, np.random.default_rng(0))
 
 
 def test_a_search_can_be_stopped_and_tells_its_progress() -> None:
