@@ -122,11 +122,11 @@ def predict(model: PublishedModel, recording: Scene, twin: Twin) -> ForeignPredi
         raise SceneUnsupported(
             f"the recording has {len(times)} ticks of {dt:.4g} s, let go at tick {first}: too few for history {history}"
         )
-    particles = twin.simulate(control_times, control_points, times + control_times[0])
+    particles = twin.simulate(control_times, control_points, times + recording.times[0])
     vertices, twin_tracks = particles[:, model.spec.particle_index], twin.track(particles)
     states = np.unique(np.linspace(0, len(times) - 1, _SKIN_STATES).round().astype(np.int64))
     skin = affine_skin(twin_tracks[states], vertices[states])
-    controllers = resample(control_points, control_times - control_times[0], times)
+    controllers = resample(control_points, control_times - recording.times[0], times)
     lift = _lift(model, twin)
     start = vertices[first : first + history + 1]
     rolled = model.rollout(controllers[first:] - lift, history=start - lift) + lift

@@ -121,3 +121,16 @@ def test_other_controllers_or_points_are_refused_with_their_numbers() -> None:
     fewer = replace(fewer, points=fewer.points[:, :3], visible=fewer.visible[:, :3])
     with pytest.raises(SceneUnsupported, match="shows 3 points"):
         twin_on(fewer, home, twin, 60)
+
+
+def test_ticks_count_from_the_first_frame_not_from_the_first_control_sample() -> None:
+    home = tiny_scene()
+    clock = np.arange(0.02, home.times[-1] + 0.02, 0.01)
+    lift = 0.1 * (clock - 0.02)[:, None, None] * np.array([0.0, 0.0, 1.0])
+    late = replace(home, control_times=clock, control_points=home.controllers[:1] + lift)
+    twin = build_twin(late, 60)
+    view = view_scene(late, twin, WorldModelConfig(hidden=16, message_passing_steps=1, vertices=20))
+    expected = np.maximum(view.times - 0.02, 0.0) * 0.1
+    np.testing.assert_allclose(view.controllers[:, 0, 2] - home.controllers[0, 0, 2], expected, atol=1e-9)
+    particles = twin.simulate(*late.control_track(), late.times)
+    np.testing.assert_allclose(view.vertices, particles[:, view.spec.particle_index], atol=1e-9)
