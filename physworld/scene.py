@@ -165,7 +165,14 @@ class Scene:
         return self.points.shape[0]
 
     def control_track(self) -> tuple[np.ndarray, np.ndarray]:
-        """Times (Tc,) [s] and controller positions (Tc, K, 3) [m] at the best rate at hand."""
-        if self.control_times is not None and self.control_points is not None:
-            return self.control_times, self.control_points
-        return self.times, self.controllers
+        """Times (Tc,) [s] and controller positions (Tc, K, 3) [m] at the best rate, none before the first frame."""
+        clock, points = self.control_times, self.control_points
+        if clock is None or points is None:
+            return self.times, self.controllers
+        start = self.times[0]
+        if clock[0] >= start or clock[-1] <= start:
+            return clock, points
+        after = int(np.searchsorted(clock, start, side="right"))
+        share = (start - clock[after - 1]) / (clock[after] - clock[after - 1])
+        begin = (1.0 - share) * points[after - 1] + share * points[after]
+        return np.concatenate([[start], clock[after:]]), np.concatenate([begin[None], points[after:]])

@@ -107,7 +107,8 @@ def plan_episode(scene: Scene, twin: Twin, config: DemonstrationConfig, seed: in
     limits = limits_of(scene, twin)
     dt = model_dt(scene.fps)
     duration = (episode_frames(scene, config) - 1) * dt
-    if choice.uniform() < config.replay_share:
+    replays = choice.uniform() < config.replay_share
+    if replays and training_track(scene)[0][-1] >= dt:  # shorter training frames hold no tick to replay
         motion, rate = str(choice.choice(VARIANTS)), float(np.exp(choice.uniform(*np.log(WARP))))
         from_rest, scale = motion != "replay", 1.0
         control_times, points = _replay(scene, twin, limits, motion, rate, duration, config.control_substeps)

@@ -168,8 +168,9 @@ def material_between(grips: Sequence[np.ndarray], paths: np.ndarray) -> np.ndarr
     """Mean material path [m] between grips, (G, G), zero on the diagonal."""
     if not grips:
         return np.zeros((0, 0))
-    means = [[float(paths[np.ix_(one, other)].mean()) for other in grips] for one in grips]
-    return np.array(means) * (1.0 - np.eye(len(grips)))
+    means = np.array([[float(paths[np.ix_(one, other)].mean()) for other in grips] for one in grips])
+    np.fill_diagonal(means, 0.0)  # a grip may hold two parts, with no path between them
+    return means
 
 
 def _joined_grips(

@@ -21,6 +21,7 @@ from physworld.worldmodel.clock import resample
 
 VARIANTS = ("replay", "replay_warped", "replay_mirrored")
 EASE_S = 0.2
+ROUNDING_S = 1e-6  # a clock in single precision is so far off its ticks
 WARP = (0.6, 1.5)
 
 
@@ -64,7 +65,7 @@ def mirrored(
 
 
 def replayed(track_times: np.ndarray, track: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Control points (T, K, 3) of the track at its own ``times`` (T,) [s]; never past its end."""
-    if times[-1] > track_times[-1] + 1e-9:
+    """Control points (T, K, 3) of the track at its own ``times`` (T,) [s]; never past its end but by a rounding."""
+    if times[-1] > track_times[-1] + ROUNDING_S:
         raise ValueError(f"replay up to {times[-1]:.4f} s of a track that ends at {track_times[-1]:.4f} s")
     return resample(track, track_times, times)

@@ -2,7 +2,7 @@
 
 *Grips.* A clamp whose markers sit beside the body, not in it, says nothing of the material that it holds. If such
 markers never move and the body is a declared box without grips, the body is taken as bonded at the end face that is
-nearest to them: a grip of no depth.
+nearest to them: a grip of no depth. Controllers that carry a collider are no such markers.
 
 *Load.* ``body.tip_load`` hangs a mass from the body: ``mass_kg``, and ``place_m`` (a point, or the two ends of a
 line, in the frame of the box) or a sentence ``where`` that gives some of x, y and z ("x = 0, z = 0.03"); along an axis
@@ -35,19 +35,21 @@ class Load:
 def grips_of(scene: Scene) -> tuple[Grip, ...]:
     """The declared grips, or the clamp that still markers beside a declared box show."""
     body = scene.body
-    if scene.grips or body.box_min_m is None or body.box_max_m is None or not scene.controllers.shape[1]:
+    pushing = [i for collider in scene.colliders for i in collider.controllers]
+    markers = np.setdiff1d(np.arange(scene.controllers.shape[1]), pushing)
+    if scene.grips or body.box_min_m is None or body.box_max_m is None or not len(markers):
         return scene.grips
     low, high = np.asarray(body.box_min_m), np.asarray(body.box_max_m)
-    first = scene.controllers[0]
+    first = scene.controllers[0, markers]
     inside = np.all((first >= low) & (first <= high), axis=1)
-    if inside.any() or np.ptp(scene.controllers, axis=0).max() > _STILL_M:
+    if inside.any() or np.ptp(scene.controllers[:, markers], axis=0).max() > _STILL_M:
         return scene.grips
     axis = int(np.argmax(high - low))
     centre = first.mean(axis=0)
     at_low = abs(centre[axis] - low[axis]) <= abs(centre[axis] - high[axis])
     face_low, face_high = low.copy(), high.copy()
     (face_high if at_low else face_low)[axis] = low[axis] if at_low else high[axis]
-    return (Grip(tuple(range(len(first))), face_low, face_high),)
+    return (Grip(tuple(markers.tolist()), face_low, face_high),)
 
 
 def load_of(scene: Scene) -> Load | None:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 SPREAD_PASSES = 2
+ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,8 @@ class GripLimits:
         """Velocities (…, T, G, 3) cut to the limits, tick by tick: acceleration, speed, workspace, spread.
 
         Where a grip meets the end of its workspace it stops there within the tick: the workspace comes before the
-        acceleration.
+        acceleration. Where one that pulls another along would make it too fast, both go a part of the way: from places
+        that keep workspace and spread to places that do, every part does.
         """
         out = np.empty_like(velocities)
         place = np.zeros(velocities.shape[:-3] + velocities.shape[-2:])
@@ -45,9 +47,16 @@ class GripLimits:
             wanted = place + dt_s * _shortened(before + change, self.speed_m_s)
             wanted = self._apart(np.clip(wanted, self.box_min_m, self.box_max_m))
             wanted = np.clip(wanted, self.box_min_m, self.box_max_m)
+            wanted = self._slowed(place, wanted, self.speed_m_s * dt_s)
             out[..., t, :, :] = before = (wanted - place) / dt_s
             place = wanted
         return out
+
+    def _slowed(self, place: np.ndarray, wanted: np.ndarray, longest_m: float) -> np.ndarray:
+        """Places (…, G, 3) on the straight way to the wanted ones where no grip moves by more than ``longest_m``."""
+        move = np.linalg.norm(wanted - place, axis=-1).max(axis=-1)[..., None, None]
+        fast = move > longest_m * (1.0 + ROUNDING)
+        return np.where(fast, place + (wanted - place) * (longest_m / np.maximum(move, 1e-300)), wanted)
 
     def _apart(self, place: np.ndarray) -> np.ndarray:
         """Displacements (…, G, 3) with no two grips farther from each other than the material between them is long."""

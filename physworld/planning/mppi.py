@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from physworld.errors import Cancelled
+from physworld.errors import Cancelled, UnstableSimulation
 from physworld.planning.goals import Goal
 from physworld.planning.limits import GripLimits
 
@@ -116,10 +116,19 @@ def search(
         generator: of the noise.
         progress: told (iterations done, of, best cost [m]).
         cancelled: asked before every batch; the search then raises Cancelled.
+
+    Raises:
+        UnstableSimulation: the model leaves the numbers although nothing moves; costs would be measured by that.
     """
     grips = len(limits.centres_m)
     mean = np.zeros((config.horizon, grips, 3))
     best, points = mean, predict(np.zeros((1, config.horizon, grips, 3)))
+    finite = np.isfinite(points[0]).all(axis=(1, 2))
+    if not finite.all():
+        raise UnstableSimulation(
+            f"the model leaves the numbers {(np.argmin(finite) + 1) * dt_s:.3g} s after its start with grips at rest: "
+            "nothing can be planned with it"
+        )
     still = float(_ending(goal.distance(points), config)[0])
     best_cost = float(_costs(points, best[None], goal, limits, dt_s, config, still)[0])
     costs, best_points, drawn = [best_cost], points[0], 1

@@ -112,6 +112,6 @@ class PlanningTask:
         path = self.controllers(displacements)[len(self.model.start_history) :]
         times = self.dt_s * np.arange(past + len(path))
         control_times, control_points = self.scene.control_track()
-        recorded = resample(control_points, control_times - control_times[0], times[:past])
+        recorded = resample(control_points, control_times - self.scene.times[0], times[:past])
         nodes = self.twin.simulate_nodes(times, np.concatenate([recorded, path]), times)
         return self.twin.track_nodes(nodes)[past:]

@@ -40,6 +40,7 @@ from scipy.linalg import expm
 from physworld.worldmodel.chain_layout import ChainLayout
 
 CALMINGS = 8
+FEWEST_NODES = 3
 MOST_SUBSTEPS = 96
 STABILITY = 1.2  # the substep is that much below the stability limit
 STRETCH_DAMPING = 0.3  # of critical, of a stretch wave as long as two segments
@@ -109,6 +110,39 @@ class ChainPrior:
     reach: np.ndarray
     gravity: np.ndarray
     substeps: int
+
+    def __post_init__(self) -> None:
+        """The rollout engine reads these arrays by their sizes. Raises ValueError for others."""
+        nodes, grips = len(self.mass), len(self.markers)
+        vertices, controls = len(self.spread), [0, *self.anchor.shape][-1]
+        if nodes < FEWEST_NODES:
+            raise ValueError(f"a chain of {nodes} nodes; it has at least {FEWEST_NODES}")
+        inner, segments, square = nodes - 2, nodes - 1, (nodes, nodes)
+        expected = {
+            "spread": (vertices, nodes),
+            "read": (nodes, vertices),
+            "member": (nodes, grips),
+            "offset": (nodes, 3),
+            "axis": (grips, 3),
+            "markers": (grips,),
+            "mass": (nodes,),
+            "curve": (inner, nodes),
+            "bend": (inner,),
+            "slack": (segments, segments),
+            "share": (nodes, vertices),
+            "reach": (2,),
+            "gravity": (3,),
+            **dict.fromkeys(("anchor", "first", "second"), (grips, controls)),
+            **dict.fromkeys(("length", "pull", "dash"), (segments,)),
+            **dict.fromkeys(("hold", "keep", "calm", "smooth"), square),
+        }
+        found = {name: np.shape(getattr(self, name)) for name in expected}
+        if wrong := [f"{name} {found[name]}" for name, shape in expected.items() if found[name] != shape]:
+            raise ValueError(
+                f"{nodes} nodes of {vertices} vertices and {grips} grips, but the prior has {', '.join(wrong)}"
+            )
+        if self.substeps < 1 or self.substeps % CALMINGS:
+            raise ValueError(f"{self.substeps} substeps; there are {CALMINGS} or a multiple of them")
 
 
 def chain_of(layout: ChainLayout, physics: ChainPhysics, dt_s: float, reach: np.ndarray) -> ChainPrior:

@@ -60,8 +60,8 @@ class TrainingConfig:
         look_ahead: τ, the steps that a sub-sequence is unrolled for the loss.
         learning_rate: Adam's, decayed by a cosine to ``learning_rate_floor`` of itself.
         gradient_clip: largest norm of the gradient.
-        noise_history: standard deviation of the random walk's end on the history, in units of the data's
-            root-mean-square change of displacement per step; it teaches the network to pull errors back.
+        noise_history: standard deviation of the last velocity of the random walk on the history, in units of what the
+            prior leaves of a step (σ_change); it teaches the network to pull errors back.
         noise_properties: standard deviation of the noise on Φ, in units of the data's spread of Φ.
         average_decay: decay of the running average of the weights that is validated and published.
         validation_fraction: share of the episodes held out whole.

@@ -80,10 +80,14 @@ def fine_tune(
 
     Args:
         bounds: smallest and largest value of each strength in the model's units, (m, 2).
+
+    A recording without a frame (training ends within the network's history) leaves everything as it is.
     """
     limits = np.zeros((0, 2)) if bounds is None else np.asarray(bounds, dtype=float)
     if limits.shape != (model.strength_count, 2):
         raise ValueError(f"bounds {limits.shape}, the model takes {model.strength_count} strengths")
+    if not len(recording.ticks):
+        return FineTuneResult(np.array(phi, dtype=float), np.zeros(len(limits)), np.nan, np.nan, False, 0)
     trainable = [parameter for parameter in model.parameters() if parameter.requires_grad]
     for parameter in trainable:
         parameter.requires_grad_(False)
@@ -157,12 +161,18 @@ class _Task:
         self.visible = torch.as_tensor(recording.visible)
         self.left = np.clip(np.floor(recording.ticks + 1e-6).astype(np.int64), 0, max(last - 2, 0))
         self.part = torch.as_tensor(recording.ticks - self.left, dtype=torch.float32)
-        moved = torch.where(self.visible[..., None], self.points - self.points.mean(dim=0), 0.0)
-        self.scale = float(moved.square().sum(dim=-1).mean().sqrt().clamp(min=1e-6))
+        self.scale = self._excursion()
         self.fitting = max(1, round((1.0 - config.validation_fraction) * len(self.left)))
         self.segments = self._segments(int(self.left[self.fitting - 1]))
         self.constants = model.edge_constants()
         self.engine = None if model.strength_count else RolloutEngine(model)
+
+    def _excursion(self) -> float:
+        """s: root mean square distance [m] of the visible measured points from their own means."""
+        seen = self.visible[..., None]
+        mean = torch.where(seen, self.points, 0.0).sum(dim=0) / seen.sum(dim=0).clamp(min=1)
+        moved = torch.where(seen, self.points - mean, 0.0).square().sum(dim=-1)
+        return float((moved.sum() / seen.sum().clamp(min=1)).sqrt().clamp(min=1e-6))
 
     def _segments(self, last: int) -> list[int]:
         """First ticks of the segments: evenly over the fitting part, all of one length."""

@@ -11,9 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from physworld.build import build_twin
+from physworld.build import PRIOR_FRICTION, build_twin
+from physworld.colliders import twin_colliders
 from physworld.errors import SceneUnsupported
 from physworld.geometry.rigid import rigid_motion
+from physworld.grips import soft_regions, with_touched_nodes
 from physworld.scene import Scene
 from physworld.twin import Twin
 from physworld.worldmodel.clock import clock_times, resample, resample_smooth
@@ -44,7 +46,8 @@ def twin_on(recording: Scene, home: Scene, twin: Twin, particle_budget: int) -> 
     """The twin put where the recording starts: the same material, lattice, effects and parameters.
 
     The recording's own body is taken where its lattice is the twin's; otherwise the twin is moved as a whole, by the
-    rigid motion from the home recording's first points and controllers to this one's, and starts at rest.
+    rigid motion from the home recording's first points and controllers to this one's, and starts at rest. Ground and
+    colliders are always the recording's.
 
     Raises:
         SceneUnsupported: the recording has other controllers, or, where the twin has to be moved, other points.
@@ -64,9 +67,13 @@ def twin_on(recording: Scene, home: Scene, twin: Twin, particle_budget: int) -> 
             law=twin.law,
             air_drag_per_s=twin.air_drag_per_s,
             ground_friction=twin.ground_friction,
+            grip_softness=twin.grip_softness,
             effects=twin.effects,
+            self_friction=twin.self_friction,
             plasticity=twin.plasticity,
             formulation=twin.formulation,
+            transfer=twin.transfer,
+            properties=twin.properties,
         )
     if counts[0][1] != counts[1][1]:
         raise SceneUnsupported(
@@ -77,6 +84,8 @@ def twin_on(recording: Scene, home: Scene, twin: Twin, particle_budget: int) -> 
     seen = np.concatenate([home.visible[0] & recording.visible[0], np.ones(counts[0][0], dtype=bool)])
     turns, shifts = rigid_motion(starts[0][seen], starts[1][seen][None])
     body = twin.body
+    if soft_regions(twin):  # their boxes stand where the body was
+        twin = with_touched_nodes(twin, body.start)
     return replace(
         twin,
         body=replace(
@@ -85,6 +94,8 @@ def twin_on(recording: Scene, home: Scene, twin: Twin, particle_budget: int) -> 
             start_velocity=np.zeros_like(body.start),
         ),
         gravity_m_s2=np.asarray(recording.gravity_m_s2, dtype=float),
+        ground_height_m=None if recording.ground is None else recording.ground.height_m,
+        colliders=twin_colliders(recording, body.half_thickness_m, PRIOR_FRICTION),
         controllers_start=recording.control_track()[1][0],
         release_s=0.0 if own is None else own.release_s,
     )
@@ -111,12 +122,14 @@ def predict(model: PublishedModel, recording: Scene, twin: Twin) -> ForeignPredi
         raise SceneUnsupported(
             f"the recording has {len(times)} ticks of {dt:.4g} s, let go at tick {first}: too few for history {history}"
         )
-    particles = twin.simulate(control_times, control_points, times + control_times[0])
+    particles = twin.simulate(control_times, control_points, times + recording.times[0])
     vertices, twin_tracks = particles[:, model.spec.particle_index], twin.track(particles)
     states = np.unique(np.linspace(0, len(times) - 1, _SKIN_STATES).round().astype(np.int64))
     skin = affine_skin(twin_tracks[states], vertices[states])
-    controllers = resample(control_points, control_times - control_times[0], times)
-    rolled = model.rollout(controllers[first:], history=vertices[first : first + history + 1])
+    controllers = resample(control_points, control_times - recording.times[0], times)
+    lift = _lift(model, twin)
+    start = vertices[first : first + history + 1]
+    rolled = model.rollout(controllers[first:] - lift, history=start - lift) + lift
     held = np.repeat(vertices[:1], first, axis=0)
     frame_times = recording.times - recording.times[0]
     tracks = resample_smooth(skin.apply(np.concatenate([held, rolled])), times, frame_times)
@@ -127,6 +140,12 @@ def predict(model: PublishedModel, recording: Scene, twin: Twin) -> ForeignPredi
         first_frame=int(own[0]) if len(own) else len(frame_times),
         start_mismatch_m=mismatch,
     )
+
+
+def _lift(model: PublishedModel, twin: Twin) -> np.ndarray:
+    """How far the recording's ground lies above the model's, which counts heights from its own, (3,) [m]."""
+    own, theirs = model.spec.ground_height_m, twin.ground_height_m
+    return np.array([0.0, 0.0, 0.0 if own is None or theirs is None else theirs - own])
 
 
 def start_mismatch(recording: Scene, twin: Twin) -> float:

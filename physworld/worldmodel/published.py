@@ -31,7 +31,7 @@ from physworld.worldmodel.chain import ChainPrior
 from physworld.worldmodel.config import WorldModelConfig
 from physworld.worldmodel.engine import RolloutEngine
 from physworld.worldmodel.errors import VersionUnreadable, WorldModelError
-from physworld.worldmodel.graph import GraphSpec
+from physworld.worldmodel.graph import EDGE_KINDS, GraphSpec
 from physworld.worldmodel.inertia import InertialPrior
 from physworld.worldmodel.modal import ModalPrior
 from physworld.worldmodel.model import WorldModel
@@ -224,18 +224,32 @@ def _refuse_other_sizes(
     spec: GraphSpec,
 ) -> None:
     """Raises ValueError where arrays are not of the graph's sizes: what rolls out reads them by these."""
-    n, frames = spec.object_count, config.history + 1
+    n, controls, frames = spec.object_count, spec.control_count, config.history + 1
+    table = _table_name(spec.current_neighbours)
+    slots = (spec.vertex_count, spec.neighbours.shape[1])
     expected = {"phi": (n, 2), "phi.calibrated": (n, 2), "start.history": (frames, n, 3)}
+    expected |= {"rest.vertices": (n, 3), "particle.index": (n,), "control.index": (controls,)}
+    expected |= {table: slots, "graph.edge_kind": slots, "graph.rest_relative": (*slots, 3)}
     expected["start.controllers"] = (frames, tensors["start.controllers"].shape[1], 3)
     expected["skin.index"] = tensors["skin.weight"].shape
     if isinstance(prior, ModalPrior):
         modes = len(prior.basis)
         expected["prior.mean"] = (n, 3)
-        expected["prior.shape"] = (spec.control_count, 3)
+        expected["prior.shape"] = (controls, 3)
         expected["prior.response"] = (2, modes, frames * modes + 1)
+    elif isinstance(prior, ChainPrior):
+        expected["prior.spread"] = (n, len(prior.mass))
+        expected["prior.anchor"] = (len(prior.markers), controls)
     for name, shape in expected.items():
         if tensors[name].shape != shape:
             raise ValueError(f"{name} {tensors[name].shape}, not {shape}")
-    for name, most in (("skin.index", n), ("control.index", tensors["start.controllers"].shape[1])):
-        if tensors[name].max(initial=0) >= most:
-            raise ValueError(f"{name} {tensors[name].max()}, of {most}")
+    most = {"skin.index": n, "control.index": tensors["start.controllers"].shape[1]}
+    most |= {table: spec.vertex_count + 1, "graph.edge_kind": EDGE_KINDS}
+    for name, end in most.items():
+        if tensors[name].max(initial=0) >= end:
+            raise ValueError(f"{name} {tensors[name].max()}, of {end}")
+    for name in (*most, "particle.index"):
+        if tensors[name].min(initial=0) < 0:
+            raise ValueError(f"{name} {tensors[name].min()}, below 0")
+    if not 0 <= spec.current_neighbours < n:
+        raise ValueError(f"graph.current_neighbours {spec.current_neighbours}, of {n}")

@@ -109,7 +109,7 @@ def view_scene(scene: Scene, twin: Twin, config: WorldModelConfig) -> SceneView:
             f"{config.history}"
         )
     started = time.perf_counter()
-    particles = twin.simulate(control_times, control_points, times + control_times[0])
+    particles = twin.simulate(control_times, control_points, times + scene.times[0])
     seconds = time.perf_counter() - started
     spec = build_graph(
         twin.particles_rest,
@@ -127,7 +127,7 @@ def view_scene(scene: Scene, twin: Twin, config: WorldModelConfig) -> SceneView:
         scene=scene,
         spec=spec,
         times=times,
-        controllers=resample(control_points, control_times - control_times[0], times),
+        controllers=resample(control_points, control_times - scene.times[0], times),
         vertices=vertices,
         twin_tracks=tracks,
         skin=skin,

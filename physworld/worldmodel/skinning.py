@@ -24,6 +24,8 @@ from torch import Tensor
 
 RIDGE = 1e-4  # λ in units of the neighbourhood's mean square size: keeps weights near 1/distance where free
 DISTANCE_FLOOR = 1e-3  # of the neighbourhood's size: a point that is a vertex
+ON_A_LINE = 1e-6  # of the neighbourhood's spread along it: rounding across a line, not a shape
+LEAST_TURN = 1e-8  # of the same: weight of turning as little as may be
 
 
 @dataclass(frozen=True)
@@ -80,15 +82,19 @@ def local_rotations(rest: np.ndarray, moved: np.ndarray, neighbours: int = 8) ->
     """Rotation of every vertex's neighbourhood, (…, n, 3, 3): argmin_R Σ_j ‖R (rest_j − rest_i) − (moved_j
     − moved_i)‖².
 
-    ``rest`` (n, 3), ``moved`` (…, n, 3). Neighbourhoods on a line leave the turn about it free: it is then
-    whatever the singular vectors give, and harmless for points near the line.
+    ``rest`` (n, 3), ``moved`` (…, n, 3). Neighbourhoods on a line leave the turn about it free: it is then the least
+    rotation that turns the line.
     """
     index, _ = nearest_vertices(rest, rest, neighbours + 1)
     index = index[:, 1:]
     before = rest[index] - rest[:, None]
     after = moved[..., index, :] - moved[..., :, None, :]
     covariance = np.einsum("...nkx,nky->...nxy", after, before)
-    left, _, right = np.linalg.svd(covariance)
+    left, spread, right = np.linalg.svd(covariance)
+    line = spread[..., 1] <= ON_A_LINE * spread[..., 0]
+    if line.any():
+        along = left[line, :, :1] @ right[line, :1]
+        left[line], _, right[line] = np.linalg.svd(along + LEAST_TURN * np.eye(3))
     flip = np.ones((*covariance.shape[:-1],))
     flip[..., 2] = np.sign(np.linalg.det(left @ right))
     return (left * flip[..., None, :]) @ right

@@ -6,6 +6,7 @@ Exit codes: 0 ended by a signal, 1 could not start, 3 already running on this fo
 from __future__ import annotations
 
 import argparse
+import shutil
 import sys
 from pathlib import Path
 
@@ -14,8 +15,10 @@ from services.embedded.folder import AlreadyRunning, StillAlive
 from services.embedded.supervisor import Options, StartFailed, Stopped, Supervisor
 from storage.errors import StorageError
 from storage.settings import Settings
+from storage.store import FULL_ERRNO
 
 ALREADY_RUNNING = 3
+SQLITE_FULL = "database or disk is full"
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -45,12 +48,21 @@ def main(arguments: list[str] | None = None) -> int:
             if key in error.state:
                 _say(f"  {key:<14}{error.state[key]}")
         return ALREADY_RUNNING
-    except (StartFailed, NoBroker, StillAlive, StorageError) as error:
-        print(f"PhysWorld could not start: {error}", file=sys.stderr)
+    except (StartFailed, NoBroker, StillAlive, StorageError, OSError) as error:
+        print(f"PhysWorld could not start: {_reason(error, root)}", file=sys.stderr)
         return 1
     except Stopped:
         return 0
     return 0
+
+
+def _reason(error: Exception, root: Path) -> str:
+    """What is wrong, in one line where it is the disk or the folder."""
+    if getattr(error, "errno", None) in FULL_ERRNO or SQLITE_FULL in str(error):
+        there = next(path for path in (root.absolute(), *root.absolute().parents) if path.exists())
+        free = shutil.disk_usage(there).free
+        return f"the disk of {root} is full, {free} bytes are free on it; make room and start again"
+    return f"the data folder {root}: {error}" if isinstance(error, OSError) else str(error)
 
 
 def _say(text: str) -> None:

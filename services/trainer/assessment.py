@@ -68,8 +68,13 @@ def assess(recording: Scene, predicted: ForeignPrediction, version: ModelVersion
         raise SceneUnsupported(
             f"of {len(errors)} frames after the model's history {int(np.isfinite(errors).sum())} can be scored"
         )
-    table = version.metrics["held_out"]
-    promised = [np.nan if value is None else value for value in table["per_frame"][METRIC][WORLD_MODEL]]
+    curve = version.metrics["held_out"]["per_frame"][METRIC].get(WORLD_MODEL, [])
+    promised = [np.nan if value is None else value for value in curve]
+    if not np.isfinite(promised).any():
+        raise SceneUnsupported(
+            f"version {version.version} of {version.name} has no error of its own on held-out frames to compare with: "
+            "its prediction left the numbers there, or nothing was visible"
+        )
     floors = (
         None if recording.noise_sigma_m is None else noise_floor(recording.noise_sigma_m),
         version.metrics.get("noise_floor_m"),

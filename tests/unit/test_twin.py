@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from made_scene import FPS, box_body, made_scene
 from scipy.spatial.transform import Rotation
+from tiny_scene import tiny_scene
 
 from physworld.build import build_twin
 from physworld.materials.library import with_law
@@ -355,3 +356,19 @@ def test_ground_carries_a_solid_that_nobody_holds() -> None:
     heights = twin.particles_at(lowest)[..., 2].min(axis=1)
     assert heights.min() > -0.012
     assert heights[-1] < 0.005
+
+
+def test_a_control_clock_that_begins_before_the_first_frame_starts_there() -> None:
+    scene = tiny_scene()
+    clock = np.arange(-60, 100) / 250.0
+    lift = 0.05 * clock[:, None, None] * np.array([0.0, 0.0, 1.0])
+    track = scene.controllers[:1] + lift
+    early = replace(scene, control_times=clock + 1e-3, control_points=track)
+    times, points = early.control_track()
+    assert times[0] == scene.times[0] and np.all(np.diff(times) > 0.0) and times[-1] == clock[-1] + 1e-3
+    np.testing.assert_allclose(
+        points, scene.controllers[:1] + lift[0] * (times - 1e-3)[:, None, None] / clock[0]
+    )
+    np.testing.assert_array_equal(build_twin(early, 60).controllers_start, points[0])
+    late = replace(scene, control_times=clock[60:] + 1e-3, control_points=track[60:])
+    assert late.control_track()[0] is late.control_times

@@ -116,10 +116,11 @@ def _motion(path: Path, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray
         )
     if not np.isfinite(moved).all():
         raise ValueError(f"{name} in {path} holds {np.sum(~np.isfinite(moved))} numbers that are not finite")
-    if "times" in arrays:
-        times = np.asarray(arrays["times"], dtype=np.float64)
-    elif "dt_s" in arrays:
-        times = float(arrays["dt_s"]) * np.arange(len(moved))
+    clock = "tick_times" if name == "vertices" and "tick_times" in arrays else "times"  # a version's own
+    if clock in arrays:
+        times = np.asarray(arrays[clock], dtype=np.float64)
+    elif "dt_s" in arrays and arrays["dt_s"].size == 1:
+        times = arrays["dt_s"].item() * np.arange(len(moved))
     else:
         raise ValueError(f"{path} says neither times nor dt_s: how fast is the film?")
     if times.shape != (len(moved),):
@@ -142,7 +143,7 @@ def _camera(given: argparse.Namespace, moved: np.ndarray) -> Any:
         except (KeyError, TypeError, json.JSONDecodeError) as error:
             raise ValueError(f"{given.camera} is no camera: {error!r}") from error
     width, times, height = given.size.partition("x")
-    if not (times and width.isdigit() and height.isdigit()):
+    if not (times and width.isdecimal() and height.isdecimal() and min(int(width), int(height)) > 0):
         raise ValueError(f"--size must be WIDTHxHEIGHT in pixels, got {given.size!r}")
     return orbit_view(moved.reshape(-1, 3), given.azimuth, given.elevation, int(width), int(height))
 

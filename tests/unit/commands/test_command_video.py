@@ -63,6 +63,16 @@ def test_a_film_its_frames_and_equal_scores(motion: Path, tmp_path: Path) -> Non
     assert found == {"psnr_db": None, "ssim": pytest.approx(1.0), "iou": None, "lpips": "not measured"}
 
 
+def test_the_vertices_of_a_version_s_prediction_have_their_own_clock(motion: Path, tmp_path: Path) -> None:
+    arrays = np.load(motion)
+    prediction, film = tmp_path / "prediction.npz", tmp_path / "a.mp4"
+    tracks, times = np.zeros((9, 4, 3)), np.arange(9) / 50.0
+    own = {"vertices": arrays["vertices"], "tick_times": arrays["times"]}
+    np.savez(prediction, tracks=tracks, times=times, **own)
+    assert video.main([str(prediction), "--out", str(film), "--size", "64x48"]) == 0
+    assert size_and_rate(film) == (FRAMES, 64, 48, pytest.approx(25.0))
+
+
 def test_one_motion_of_a_batch(motion: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arrays = np.load(motion)
     batch = tmp_path / "batch.npz"
@@ -122,6 +132,7 @@ def test_what_cannot_be_drawn_is_one_line(
     for arguments, said in [
         ([str(cut), *out, "64x64"], "no npz archive"),
         ([str(motion), *out, "big"], "WIDTHxHEIGHT"),
+        ([str(motion), *out, "64x0"], "WIDTHxHEIGHT"),
         ([str(motion), *out, "64x64", "--gaussians", str(motion)], "not a PLY"),
         ([str(motion), *out, "64x64", "--camera", str(motion)], "error:"),
         ([str(motion), *out, "64x64", "--against", str(tmp_path)], "1 pictures, the film has 5 frames"),
@@ -133,6 +144,7 @@ def test_what_cannot_be_drawn_is_one_line(
         ({"vertices": good[:1], "times": times[:1]}, "got (1, 4, 3)"),
         ({"vertices": good * np.nan, "times": times}, "36 numbers that are not finite"),
         ({"vertices": good}, "neither times nor dt_s"),
+        ({"vertices": good, "dt_s": times}, "neither times nor dt_s"),
         ({"vertices": good, "times": times[:2]}, "2 times for 3 frames"),
     ]:
         assert video.main(spoilt(tmp_path, **arrays)) == 2

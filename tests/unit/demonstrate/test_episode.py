@@ -86,6 +86,14 @@ def test_a_plain_replay_follows_the_recording_until_training_ends(block, block_t
     np.testing.assert_allclose(plan.controllers, block.controllers[: block.train[1]], atol=1e-12)
 
 
+def test_training_frames_shorter_than_a_tick_are_not_replayed(block, block_twin):
+    short = replace(block, train=(0, 1))
+    config = replace(CONFIG, replay_share=1.0)
+    plans = [plan_episode(short, block_twin, config, seed) for seed in range(8)]
+    assert not any(plan.motion.startswith("replay") for plan in plans)
+    assert all(len(plan.times) == CONFIG.frames for plan in plans)
+
+
 def test_the_motion_is_the_same_at_ticks_and_between_them(block, block_twin):
     plan = plan_of(block, block_twin, "bimanual")
     np.testing.assert_array_equal(plan.control_times[::4], plan.times)

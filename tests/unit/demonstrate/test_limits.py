@@ -11,6 +11,7 @@ from physworld.demonstrate.limits import (
     REACH_FLOOR,
     SPEED_FLOOR,
     limits_of,
+    material_between,
     material_paths,
     training_track,
 )
@@ -70,6 +71,16 @@ def test_a_folded_rope_has_the_length_of_its_material():
     ends = folded[[0, -1]]
     assert np.linalg.norm(ends[1] - ends[0]) < 0.05
     assert material_paths(rest, folded, ends)[0, 1] == pytest.approx(1.0, rel=1e-9)
+
+
+def test_a_grip_that_holds_two_parts_is_no_distance_from_itself():
+    rest = np.concatenate(
+        [np.linspace(0.0, 1.0, 40)[:, None] * [1.0, 0.0, 0.0] + [0.0, y, 0.0] for y in (0, 9)]
+    )
+    paths = material_paths(rest, rest, rest[[0, 40, 39]])
+    assert np.isinf(paths[0, 1])
+    between = material_between((np.array([0, 1]), np.array([2])), paths)
+    np.testing.assert_array_equal(between, [[0.0, np.inf], [np.inf, 0.0]])
 
 
 def test_markers_of_one_clamp_are_one_grip(held_block, block_twin):

@@ -36,6 +36,13 @@ def test_a_plain_replay_is_the_track():
         replayed(times, points, np.array([0.0, 2.1]))
 
 
+def test_a_clock_in_single_precision_is_replayed_to_its_end():
+    times, points = np.arange(22) / 30, track(22)
+    rounded = times.astype(np.float32).astype(np.float64)
+    assert rounded[-1] < times[-1]
+    np.testing.assert_allclose(replayed(rounded, points, times), points, atol=1e-6)
+
+
 @pytest.mark.parametrize("rate", [0.6, 1.0, 1.5])
 def test_an_eased_playback_starts_at_rest_and_ends_with_the_track(rate):
     duration = playback_duration(3.0, rate)

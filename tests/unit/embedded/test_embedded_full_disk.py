@@ -14,8 +14,10 @@ import pytest
 
 from services.embedded import child as child_module
 from services.embedded import logs, supervisor
+from services.embedded.__main__ import main
 from services.embedded.child import Child, Program
 from services.embedded.supervisor import Options, Supervisor
+from storage.errors import DatabaseUnavailable
 
 WITHIN_S = 20.0
 
@@ -35,6 +37,33 @@ def _until(condition) -> None:
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.02)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [OSError(errno.ENOSPC, "No space left on device"), DatabaseUnavailable("database or disk is full")],
+)
+def test_a_start_on_a_full_disk_says_so_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: Exception
+) -> None:
+    def refused(self: Supervisor) -> None:
+        raise error
+
+    monkeypatch.setattr(Supervisor, "run", refused)
+    assert main(["--data", str(tmp_path / "new")]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert f"the disk of {tmp_path / 'new'} is full" in said and "bytes are free" in said
+
+
+def test_a_data_folder_that_is_a_file_is_said_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "taken").write_text("")
+    assert main(["--data", str(tmp_path / "taken")]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith(f"PhysWorld could not start: the data folder {tmp_path / 'taken'}: ")
+    assert said.count("\n") == 1
 
 
 def test_a_child_whose_log_cannot_be_cut_is_started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

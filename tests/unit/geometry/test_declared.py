@@ -12,7 +12,7 @@ from made_scene import box_body, made_scene
 from physworld.build import build_twin
 from physworld.errors import SceneUnsupported
 from physworld.geometry.declared import grips_of, load_of
-from physworld.scene import UNDEFORMED_AT_REST, Scene
+from physworld.scene import UNDEFORMED_AT_REST, DeclaredCollider, Scene
 from physworld.twin import Twin
 
 LOW, HIGH = np.array([-0.12, 0.0, 0.0]), np.array([0.0, 0.02, 0.02])
@@ -58,6 +58,13 @@ def test_markers_in_the_body_or_in_motion_are_no_bond() -> None:
     moving = bar()
     path = moving.controllers + np.linspace(0.0, 0.01, moving.frame_count)[:, None, None]
     assert grips_of(replace(moving, controllers=path)) == ()
+
+
+def test_a_controller_that_carries_a_collider_is_no_marker_of_a_clamp() -> None:
+    pusher = DeclaredCollider("peg", "sphere", radius_m=0.01, controllers=(0, 1, 2))
+    assert grips_of(replace(bar(), colliders=(pusher,))) == ()
+    (grip,) = grips_of(replace(bar(), colliders=(replace(pusher, controllers=(1,)),)))
+    assert grip.controllers == (0, 2)
 
 
 def test_a_bonded_bar_sags_as_a_cantilever_of_its_whole_length() -> None:

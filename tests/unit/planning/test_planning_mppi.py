@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from physworld.errors import Cancelled
+from physworld.errors import Cancelled, UnstableSimulation
 from physworld.planning.goals import GoalPoints, GoalShape
 from physworld.planning.limits import GripLimits
 from physworld.planning.mppi import MppiConfig, coloured_noise, search
@@ -84,7 +84,7 @@ def test_every_motion_keeps_the_limits() -> None:
     velocities = np.random.default_rng(0).normal(0.0, 1.0, (50, 40, 2, 3))
     kept = limits.kept(velocities, DT)
     places = DT * kept.cumsum(axis=1)
-    assert np.linalg.norm(kept, axis=-1).max() > 0.45
+    assert 0.45 < np.linalg.norm(kept, axis=-1).max() <= 0.5 + 1e-9
     assert (places >= limits.box_min_m - 1e-9).all()
     assert (places <= limits.box_max_m + 1e-9).all()
     gap = np.linalg.norm(places[..., 1, :] + limits.centres_m[1] - places[..., 0, :], axis=-1)
@@ -97,6 +97,23 @@ def test_every_motion_keeps_the_limits() -> None:
     assert np.allclose(free.kept(calm, DT), calm)
 
 
+def test_a_grip_that_is_pulled_along_keeps_its_speed_limit() -> None:
+    limits = GripLimits(
+        speed_m_s=0.5,
+        acceleration_m_s2=1e3,
+        box_min_m=np.full((2, 3), -9.0),
+        box_max_m=np.full((2, 3), 9.0),
+        spread_max_m=np.array([[0.0, 0.2], [0.2, 0.0]]),
+        centres_m=np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0]]),
+    )
+    wanted = np.zeros((30, 2, 3))
+    wanted[:, 0, 1], wanted[:, 1, 0] = 0.5, 0.5  # one across the line between them, one away along it
+    kept = limits.kept(wanted, DT)
+    assert np.linalg.norm(kept, axis=-1).max() <= 0.5 + 1e-9
+    places = DT * kept.cumsum(axis=0) + limits.centres_m
+    assert np.linalg.norm(places[:, 1] - places[:, 0], axis=-1).max() <= 0.2 + 1e-4  # a pass leaves that much
+
+
 def test_a_motion_that_leaves_the_numbers_is_never_chosen() -> None:
     def fragile(displacements: np.ndarray) -> np.ndarray:
         broken = np.abs(displacements).max(axis=(1, 2, 3)) > 0.05
@@ -106,6 +123,17 @@ def test_a_motion_that_leaves_the_numbers_is_never_chosen() -> None:
     found = search(fragile, goal, LIMITS, DT, replace(QUICK, iterations=4), np.random.default_rng(0))
     assert np.abs(found.displacements).max() <= 0.05
     assert np.isfinite(found.points).all()
+
+
+@pytest.mark.parametrize("goal", [GoalPoints(np.array([0]), np.zeros((1, 3))), GoalShape(np.zeros((4, 3)))])
+def test_a_model_that_leaves_the_numbers_at_rest_is_refused(goal: GoalPoints | GoalShape) -> None:
+    def broken(displacements: np.ndarray) -> np.ndarray:
+        points = displacements.copy()
+        points[:, 29:] = np.nan
+        return points
+
+    with pytest.raises(UnstableSimulation, match="1 s after its start with grips at rest"):
+        search(broken, goal, LIMITS, DT, QUICK, np.random.default_rng(0))
 
 
 def test_a_search_can_be_stopped_and_tells_its_progress() -> None:

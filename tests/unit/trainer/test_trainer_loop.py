@@ -13,6 +13,8 @@ from safetensors.numpy import load
 from tiny_scene import register, tiny_scene
 
 from physworld.effects.registry import effect
+from physworld.errors import SceneUnsupported
+from physworld.worldmodel.foreign import ForeignPrediction
 from schemas.assessment import Assessment, AssessmentCreate
 from schemas.dataset import DatasetConfig
 from schemas.fit import FitConfig
@@ -20,6 +22,7 @@ from schemas.job import Job
 from schemas.model import ModelVersion, TrainingConfig, TrainingCreate
 from schemas.trace import TraceCreate
 from services.trainer.app import HANDLERS
+from services.trainer.assessment import assess
 from storage import jobs, leases, registry, traces
 from storage.database import open_database
 from storage.settings import Settings
@@ -218,3 +221,14 @@ def test_a_recording_of_another_object_fails_with_the_numbers(runtime: Runtime, 
     assert (job.state, found.state) == ("failed", "failed")
     assert job.error is not None and job.error.code == "scene_unsupported"
     assert "3 controllers, the model was trained with 4" in job.error.detail
+
+
+def test_a_version_that_left_the_numbers_at_home_promises_nothing(plain: ModelVersion) -> None:
+    held_out = plain.metrics["held_out"]
+    per_frame = held_out["per_frame"]
+    without = {k: v for k, v in per_frame["track_m"].items() if k != "world_model_finetuned"}
+    metrics = plain.metrics | {"held_out": held_out | {"per_frame": per_frame | {"track_m": without}}}
+    scene = tiny_scene(FRAMES)
+    predicted = ForeignPrediction(scene.points, scene.points, 1, 0.0)
+    with pytest.raises(SceneUnsupported, match="no error of its own on held-out frames"):
+        assess(scene, predicted, plain.model_copy(update={"metrics": metrics}))

@@ -23,6 +23,7 @@ from physworld.worldmodel.chain_step import ChainStep
 from physworld.worldmodel.config import TrainingConfig
 from physworld.worldmodel.dataset import Track, read_track
 from physworld.worldmodel.engine import RolloutEngine
+from physworld.worldmodel.errors import VersionUnreadable
 from physworld.worldmodel.export import edge_list, onnx_program, torch_program
 from physworld.worldmodel.model import Normalisation, WorldModel
 from physworld.worldmodel.priors import fit_priors, prior_error
@@ -167,6 +168,19 @@ def test_a_published_rope_is_read_back_and_exported() -> None:
     session = onnxruntime.InferenceSession(onnx_program(model), providers=["CPUExecutionProvider"])
     (onnx,) = session.run(None, {name: value.numpy() for name, value in inputs.items()})
     assert np.abs(onnx - expected).max() < AGREEMENT_M
+
+
+def test_a_published_chain_one_short_anywhere_is_refused() -> None:
+    whole = _published(network(3), rope(3)[1][0])
+    tensors, facts = whole.to_tensors(), whole.facts()
+    chain = [name for name in tensors if name.startswith("prior.")]
+    for name in chain:
+        for axis in range(tensors[name].ndim):
+            short = np.delete(tensors[name], -1, axis=axis)
+            with pytest.raises(VersionUnreadable):
+                PublishedModel.from_tensors(tensors | {name: np.ascontiguousarray(short)}, facts)
+    with pytest.raises(VersionUnreadable, match="7 substeps"):
+        PublishedModel.from_tensors(tensors | {"prior.substeps": np.array([7])}, facts)
 
 
 def test_training_takes_the_prior_that_errs_less_and_says_so() -> None:

@@ -11,6 +11,7 @@ from held_bar import SMALL, graph
 
 from physworld.worldmodel.config import FineTuneConfig, TrainingConfig
 from physworld.worldmodel.dataset import Track, read_track
+from physworld.worldmodel.errors import VersionUnreadable
 from physworld.worldmodel.finetune import Recording, fine_tune
 from physworld.worldmodel.model import WorldModel
 from physworld.worldmodel.published import PublishedModel
@@ -100,6 +101,29 @@ def test_no_steps_leave_the_calibrated_properties(
     assert result.phi == pytest.approx(phi)
 
 
+def test_what_is_stored_of_invisible_points_changes_nothing(
+    published: PublishedModel, episodes: list[dict[str, np.ndarray]]
+) -> None:
+    controllers = episodes[1]["controllers"].astype(np.float64)
+    phi = np.full((published.spec.object_count, 2), 0.1)
+    recording = _recording(published, controllers, phi)
+    elsewhere = recording.points + np.where(recording.visible, 0.0, 5.0)[..., None]
+    other = dataclasses.replace(recording, points=elsewhere)
+    found = [fine_tune(published.model, 0.0 * phi, r, published.skin, TUNING) for r in (recording, other)]
+    np.testing.assert_array_equal(found[0].phi, found[1].phi)
+
+
+def test_without_a_training_frame_after_the_history_nothing_is_tuned(
+    published: PublishedModel, episodes: list[dict[str, np.ndarray]]
+) -> None:
+    phi = np.full((published.spec.object_count, 2), 0.1)
+    recording = _recording(published, episodes[1]["controllers"].astype(np.float64), phi)
+    none = {name: getattr(recording, name)[:0] for name in ("ticks", "points", "visible")}
+    found = fine_tune(published.model, phi, dataclasses.replace(recording, **none), published.skin, TUNING)
+    assert (found.kept, found.steps) == (False, 0)
+    np.testing.assert_array_equal(found.phi, phi)
+
+
 def test_published_tensors_hold_everything(
     published: PublishedModel, episodes: list[dict[str, np.ndarray]]
 ) -> None:
@@ -110,6 +134,28 @@ def test_published_tensors_hold_everything(
     history = episodes[2]["particles"][: SMALL.history + 1, published.spec.particle_index].astype(np.float64)
     direct = rollout(published.model, published.spec, history, controllers, published.phi)
     assert again.rollout(controllers, history=history) == pytest.approx(direct, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "name", ["graph.neighbours", "graph.rest_relative", "graph.edge_kind", "particle.index"]
+)
+def test_a_graph_of_other_sizes_is_refused(published: PublishedModel, name: str) -> None:
+    tensors = published.to_tensors()
+    short = np.ascontiguousarray(np.delete(tensors[name], -1, axis=min(1, tensors[name].ndim - 1)))
+    with pytest.raises(VersionUnreadable, match="not"):
+        PublishedModel.from_tensors(tensors | {name: short}, published.facts())
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("graph.neighbours", -1), ("graph.neighbours", 99), ("skin.index", -1), ("control.index", -1)],
+)
+def test_an_index_beyond_the_graph_is_refused(published: PublishedModel, name: str, value: int) -> None:
+    tensors = published.to_tensors()
+    tensors[name] = tensors[name].copy()
+    tensors[name].flat[0] = value
+    with pytest.raises(VersionUnreadable, match=f"{name} {value}"):
+        PublishedModel.from_tensors(tensors, published.facts())
 
 
 @pytest.fixture(scope="module")

@@ -6,13 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from tiny_scene import tiny_scene
 
 from physworld.build import build_twin
 from physworld.effects.registry import effect
 from physworld.errors import SceneUnsupported
-from physworld.scene import Body, Scene
-from physworld.worldmodel.foreign import start_mismatch, twin_on
+from physworld.scene import Body, Ground, Scene
+from physworld.worldmodel.config import WorldModelConfig
+from physworld.worldmodel.foreign import predict, start_mismatch, twin_on
+from physworld.worldmodel.model import WorldModel
+from physworld.worldmodel.scene_view import view_scene
 
 TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 SHIFT = np.array([0.3, -0.2, 0.0])
@@ -43,6 +47,16 @@ def test_the_same_body_takes_its_new_start_and_keeps_what_was_learned() -> None:
     np.testing.assert_array_equal(placed.particles_rest, twin.particles_rest)
 
 
+def test_fields_soft_grips_and_the_transfer_go_with_the_twin() -> None:
+    home = tiny_scene()
+    twin = build_twin(home, 60)
+    field = np.full((len(twin.particles_rest), 2), 0.3)
+    twin = replace(twin, properties=field, grip_softness=0.5, transfer="asflip", self_friction=0.2)
+    placed = twin_on(replace(home, points=home.points + 1e-3), home, twin, 60)
+    np.testing.assert_array_equal(placed.properties, field)
+    assert (placed.grip_softness, placed.transfer, placed.self_friction) == (0.5, "asflip", 0.2)
+
+
 def test_a_body_that_looks_different_is_moved_as_a_whole() -> None:
     home = tiny_scene()
     twin = build_twin(home, 60).with_parameters(youngs_modulus_pa=3e4)
@@ -58,6 +72,46 @@ def test_a_body_that_looks_different_is_moved_as_a_whole() -> None:
     np.testing.assert_allclose(particles[1], particles[0] @ TURN.T + SHIFT, atol=1e-6)
 
 
+@pytest.mark.parametrize("softness", [0.0, 0.5])
+def test_a_moved_twin_stands_on_the_recordings_ground_and_is_held_as_at_home(softness: float) -> None:
+    home = replace(tiny_scene(), ground=Ground(-0.3))
+    twin = replace(build_twin(home, 60), grip_softness=softness)
+    elsewhere = replace(moved(home), ground=Ground(-0.2))
+    placed = twin_on(elsewhere, home, twin, 60)
+    assert placed.ground_height_m == -0.2
+    times = home.times[:6]
+    particles = [
+        t.simulate(scene.times, scene.controllers, times) for t, scene in ((twin, home), (placed, elsewhere))
+    ]
+    np.testing.assert_allclose(particles[1], particles[0] @ TURN.T + SHIFT, atol=1e-6)
+
+
+def test_heights_count_from_the_recordings_ground() -> None:
+    home = replace(tiny_scene(), ground=Ground(-0.02))
+    twin = build_twin(home, 60)
+    config = WorldModelConfig(hidden=16, message_passing_steps=1, vertices=20)
+    view = view_scene(home, twin, config)
+    network = WorldModel(config, view.spec)
+    torch.manual_seed(0)
+    torch.nn.init.normal_(network.skip.weight, std=1e-3)  # heights are among what it reads
+    phi = np.zeros((view.spec.object_count, 2))
+    model = view.published(network, phi, phi)
+    up = np.array([0.0, 0.0, 0.3])
+    body = replace(home.body, box_min_m=home.body.box_min_m + up, box_max_m=home.body.box_max_m + up)
+    region = home.grips[0]
+    grip = replace(region, region_min_m=region.region_min_m + up, region_max_m=region.region_max_m + up)
+    lifted = replace(
+        home,
+        points=home.points + up,
+        controllers=home.controllers + up,
+        body=body,
+        grips=(grip,),
+        ground=Ground(0.28),
+    )
+    tracks = [predict(model, r, twin_on(r, home, twin, 60)).tracks for r in (home, lifted)]
+    np.testing.assert_allclose(tracks[1], tracks[0] + up, atol=1e-5)
+
+
 def test_other_controllers_or_points_are_refused_with_their_numbers() -> None:
     home = tiny_scene()
     twin = build_twin(home, 60)
@@ -67,3 +121,16 @@ def test_other_controllers_or_points_are_refused_with_their_numbers() -> None:
     fewer = replace(fewer, points=fewer.points[:, :3], visible=fewer.visible[:, :3])
     with pytest.raises(SceneUnsupported, match="shows 3 points"):
         twin_on(fewer, home, twin, 60)
+
+
+def test_ticks_count_from_the_first_frame_not_from_the_first_control_sample() -> None:
+    home = tiny_scene()
+    clock = np.arange(0.02, home.times[-1] + 0.02, 0.01)
+    lift = 0.1 * (clock - 0.02)[:, None, None] * np.array([0.0, 0.0, 1.0])
+    late = replace(home, control_times=clock, control_points=home.controllers[:1] + lift)
+    twin = build_twin(late, 60)
+    view = view_scene(late, twin, WorldModelConfig(hidden=16, message_passing_steps=1, vertices=20))
+    expected = np.maximum(view.times - 0.02, 0.0) * 0.1
+    np.testing.assert_allclose(view.controllers[:, 0, 2] - home.controllers[0, 0, 2], expected, atol=1e-9)
+    particles = twin.simulate(*late.control_track(), late.times)
+    np.testing.assert_allclose(view.vertices, particles[:, view.spec.particle_index], atol=1e-9)

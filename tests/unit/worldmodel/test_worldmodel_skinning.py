@@ -74,6 +74,21 @@ def test_linear_blend_skinning_carries_rigid_motions_and_orientations() -> None:
     assert linear_blend(points, vertices, moved)[1] is None
 
 
+def test_a_straight_rope_is_not_turned_about_its_own_line() -> None:
+    line = np.array([0.3, 0.5, 0.8]) / np.linalg.norm([0.3, 0.5, 0.8])
+    rope = np.linspace(0.0, 1.0, 40)[:, None] * line
+    still = np.repeat(np.eye(3)[None], len(rope), axis=0)
+    assert local_rotations(rope, rope + 0.1) == pytest.approx(still, abs=1e-6)
+    turn, _ = Rotation.align_vectors([np.array([1.0, 0.0, 0.0])], [line])  # the least one
+    moved = turn.apply(rope)
+    assert local_rotations(rope, moved) == pytest.approx(turn.as_matrix() @ still, abs=1e-5)
+    beside = rope[:10] + 0.02 * np.cross(line, [0.0, 0.0, 1.0])
+    start = np.repeat(np.array([[1.0, 0.0, 0.0, 0.0]]), len(beside), axis=0)
+    places, turns = linear_blend(beside, rope, rope, quaternions=start)
+    assert places == pytest.approx(beside, abs=1e-6)
+    assert turns == pytest.approx(start, abs=1e-6)
+
+
 def test_rotations_are_never_reflections() -> None:
     vertices, _ = _cloud()
     mirrored = vertices * np.array([1.0, 1.0, -1.0])
