@@ -18,7 +18,7 @@ from physworld.trace.holds import held_otherwise
 from physworld.trace.refit import Refit, refit
 from physworld.trace.score import Score, orthonormal, project
 from physworld.trace.simulations import Simulations
-from physworld.trace.unknowns import CLAMP, Unknown, at
+from physworld.trace.unknowns import CLAMP, Unknown, already, at
 from physworld.trace.whitening import Whitener
 
 REACH = f"{CLAMP}.reach_m"
@@ -253,6 +253,7 @@ class Confirmation:
         keep = [k for k, u in enumerate(base.fitted.unknowns) if u.name not in freed]
         known = [base.fitted.unknowns[k] for k in keep]
         strengths = _away_from_zero(score.strengths, gates)
+        strengths = strengths + [already(base.fitted.twin, gate) for gate in gates]
         linear = _linear(base.fitted, score.strengths, columns)[keep]
         start = np.concatenate([linear, strengths])
         own = np.concatenate([[u.start for u in known], strengths])

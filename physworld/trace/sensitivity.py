@@ -11,7 +11,7 @@ from physworld.scene import Scene
 from physworld.simulations import Job
 from physworld.trace.candidates import Candidate
 from physworld.trace.simulations import Simulations
-from physworld.trace.unknowns import Unknown, at
+from physworld.trace.unknowns import Unknown, already, at
 from physworld.trace.whitening import Whitener
 from physworld.twin import Twin
 
@@ -63,13 +63,17 @@ def candidate_responses(
     chosen: list[Candidate],
     frames: int,
 ) -> list[Response]:
-    """Sensitivities of every candidate's gates at zero, one batch of simulations for all."""
+    """Sensitivities of every candidate's gates, one batch of simulations for all.
+
+    At zero, or where the twin has them already: a clamp's reach and a rope's grip are calibrated.
+    """
     jobs, owners = [], []
     for number, candidate in enumerate(chosen):
         prepared = candidate.prepared(twin)
         for unknown in candidate.unknowns():
-            step = _step(unknown)
-            jobs.append(Job(unknown.apply(prepared, unknown.start + step), frames))
+            here = unknown.starting(already(twin, unknown))
+            step = _step(here)
+            jobs.append(Job(unknown.apply(prepared, here.start + step), frames))
             owners.append((number, step))
     found = simulations.run(jobs)
     columns: list[list[np.ndarray]] = [[] for _ in chosen]

@@ -127,7 +127,7 @@ def grip_softness(twin: Twin) -> Unknown | None:
 
 
 def grip_compliance(twin: Twin) -> Unknown | None:
-    """How far a rope's grips give, up to what its shear does there; None without a grip, a weight or a rope.
+    """How far a rope's grips give, up to what its shear does there; None without a grip or a rope.
 
     Rods here do not shear. One that does is displaced by a sideways force F next to a grip by F sqrt(B/T) / (k G A):
     under the tension T it shears over the length sqrt(B/T) along which it bends (Timoshenko 1921; B = E I, and k G A is
@@ -136,13 +136,20 @@ def grip_compliance(twin: Twin) -> Unknown | None:
     """
     slip = EFFECTS[SLIP]
     weight = float(twin.particle_mass.sum()) * gravity_size(twin)
-    if twin.lattice.dim != 1 or weight <= 0.0 or slip.refuses(twin) is not None:
+    if twin.lattice.dim != 1 or slip.refuses(twin) is not None:
         return None
     sheared = twin.body.thickness_m**2 / (1.2 * float(np.sqrt(twin.law.bending_n_m2 * weight)))
     known = next(s for s in slip.strengths(twin) if s.name == "compliance_m_n")
     scale = _SLIP_STEP * sheared
     unknown = of_strength(SLIP, replace(known, high=_SLIP_MOST * sheared), scale)
     return replace(unknown, start=1.0, prior=(0.0, 1.0 / _SLIP_STEP))
+
+
+def already(twin: Twin, gate: Unknown) -> float:
+    """A gate's place where the twin has its effect, in the scale of the search; 0 where it has not."""
+    effect, name = gate.name.split(".")
+    values = next((known.values for known in twin.effects if known.name == effect), {})
+    return float(values.get(name) or 0.0) / gate.value(1.0)
 
 
 def with_strengths(twin: Twin, effect: str, strengths: dict[str, float]) -> Twin:
