@@ -105,7 +105,7 @@ class JointSimulations(Simulations):
         self._levels: list[tuple[Twin, list[Twin]]] = []
         for factor in (1.0, refinement, 1.0 / refinement) if len(recordings.fitted) > 1 else ():
             lead = twin if factor == 1.0 else refined(recordings.lead.scene, twin, budget, factor)
-            others = [build_twin(r.scene, budget, twin.device, factor) for r in recordings.fitted[1:]]
+            others = [_built_like(twin, r.scene, budget, factor) for r in recordings.fitted[1:]]
             self._levels.append((lead, others))
 
     def run(self, jobs: Sequence[Job]) -> list[np.ndarray | None]:
@@ -146,7 +146,7 @@ class JointSimulations(Simulations):
             own = moved(self._twin_of(twin, k), places[recording.points])
             found += self.under(recording.drive, [Job(own, recording.scene.frame_count)])
         for recording in self.recordings.held_out:
-            own = taken_over(twin, build_twin(recording.scene, self._budget, twin.device))
+            own = taken_over(twin, _built_like(twin, recording.scene, self._budget))
             found += self.under(recording.drive, [Job(own, recording.scene.frame_count)])
         return found
 
@@ -166,6 +166,13 @@ class JointSimulations(Simulations):
         raise ValueError(
             f"no twin of recording {k} has the cells {twin.lattice.spacing} m of the first one's"
         )
+
+
+def _built_like(twin: Twin, scene: Scene, budget: int, refinement: float = 1.0) -> Twin:
+    """A recording's own twin, in the form in which ``twin`` is integrated and with its flow law."""
+    return build_twin(
+        scene, budget, twin.device, refinement, twin.plasticity, twin.formulation, twin.transfer
+    )
 
 
 def taken_over(twin: Twin, other: Twin) -> Twin:

@@ -12,6 +12,7 @@ from physworld.build import build_twin
 from physworld.calibrate import CalibrationConfig
 from physworld.effects.registry import effect
 from physworld.errors import SceneUnsupported
+from physworld.materials.plastic.von_mises import VonMises
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
 from physworld.simulations import Job
 from physworld.trace import TraceConfig, document, trace
@@ -139,6 +140,24 @@ def test_a_tether_holds_the_same_material_of_a_body_that_starts_elsewhere() -> N
     assert shown["attach_y_m"] == pytest.approx(0.41, abs=1e-9) and shown["attach_x_m"] > 0.14
     explicit = tied.effects[0].placed(tied)
     assert replace(carried, effects=(explicit,)).effects[0].places(carried)[1] == pytest.approx(one[1])
+
+
+def test_other_recordings_flow_as_the_first_one_does() -> None:
+    scenes = [swung(16, 9.0), swung(16, 7.0)]
+    lead = build_twin(
+        scenes[0], BUDGET, plasticity=VonMises(yield_stress_pa=200.0), formulation="updated_lagrangian",
+        transfer="asflip",
+    )  # fmt: skip
+    simulations = JointSimulations(Recordings(scenes, [], 12, 3), lead, BUDGET, 1.25)
+    both = simulations.run([Job(lead, 8)])[0]
+    own = build_twin(
+        scenes[1], BUDGET, plasticity=lead.plasticity, formulation=lead.formulation, transfer="asflip"
+    )
+    own = replace(own, law=lead.law)
+    alone = own.observe(
+        own.simulate_nodes(*scenes[1].control_track(), scenes[1].times[:8]), scenes[1].times[:8]
+    )
+    assert np.array_equal(both[:, -alone.shape[1] :], alone)
 
 
 def test_a_recording_that_ended_repeats_its_last_frame() -> None:
