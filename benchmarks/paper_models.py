@@ -183,7 +183,7 @@ def recording_alone(case: Case, seed: int) -> dict[str, Any]:
     """The same network trained on the recording's own training frames: its vertices are measured points."""
     scene, view = case.scene, case.view
     times = scene.times - scene.times[0]
-    points = resample_smooth(_filled(scene), times, view.times)
+    points = resample_smooth(filled_in(scene), times, view.times)
     first = points[view.first]
     spec = build_graph(
         first,
@@ -238,13 +238,19 @@ def horizon_errors(
     return {name: np.stack(curves) for name, curves in found.items()}
 
 
-def _filled(scene: Scene) -> np.ndarray:
-    """Measured points with hidden ones put in between their neighbours in time, (T, N, 3)."""
+def filled_in(scene: Scene) -> np.ndarray:
+    """Measured points with hidden ones put in between their neighbours in time, (T, N, 3).
+
+    Those of the training frames from training frames alone.
+    """
     points = np.array(scene.points, dtype=np.float64)
+    end = scene.train[1]
     for k in range(points.shape[1]):
-        seen = np.flatnonzero(scene.visible[:, k])
-        if len(seen) and len(seen) < len(points):
-            points[:, k] = resample(points[seen, k], scene.times[seen], scene.times)
+        for part in (slice(0, end), slice(end, None)):
+            seen = np.flatnonzero(scene.visible[part, k])
+            if len(seen) and len(seen) < len(scene.times[part]):
+                times = scene.times[part]
+                points[part, k] = resample(points[part, k][seen], times[seen], times)
     return points
 
 

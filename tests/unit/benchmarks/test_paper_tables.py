@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from made_scene import made_scene
 
 from benchmarks import paper_tables, unseen_motion
+from benchmarks.paper_models import filled_in
 from benchmarks.paper_relations import ALONE, CONDITIONS, RELATIONS, SEEDS, Relation, hold
 from benchmarks.paper_tables import Cells, plan, summarise
 
@@ -180,3 +184,13 @@ def test_a_small_ratio_is_not_printed_as_nothing() -> None:
     some = held(["soft_beam"]) | {"soft_beam/no_prior/0": cell(2.0, 2.0)}
     text = summarise(["soft_beam"], some).markdown()
     assert "no prior (400 steps): track error ratio 0.002 (soft_beam 0.002); below 1 in 1 of 1 pairs" in text
+
+
+def test_hidden_points_of_training_frames_are_filled_from_training_frames_alone() -> None:
+    scene = made_scene(np.zeros((2, 3)), "rope", frames=10)
+    scene.points[:, :, 0] = np.arange(10)[:, None]
+    scene.visible[5:7, 0] = scene.visible[8, 0] = False
+    scene.points[~scene.visible] = 99.0
+    filled = filled_in(replace(scene, train=(0, 7), test=(7, 10)))
+    assert filled[:, 0, 0].tolist() == [0, 1, 2, 3, 4, 4, 4, 7, 8, 9]
+    assert filled[:, 1, 0].tolist() == list(range(10))
