@@ -17,7 +17,7 @@ from physworld.twin import Twin
 CLAMP = "clamp_offset"
 SOFTNESS = "grip_softness"
 SLIP = "grip_slip"
-_SLIP_STEP, _SLIP_MOST = 0.25, 3.0  # of a sheared rope's compliance: difference step, and the largest
+_SLIP_STEP = 0.25  # of a sheared rope's compliance
 _SOFTNESS_SHARES = (0.1, 1.5)  # of ``AS_HELD``: finite elements as large as the grip hold so much harder
 _SOFTNESS_STEP = 0.1
 _CLAMP_STEP, _CLAMP_SPREAD = 0.25, 0.5  # cells: difference step, and deviation of what is known beforehand
@@ -141,7 +141,7 @@ def grip_compliance(twin: Twin) -> Unknown | None:
     sheared = twin.body.thickness_m**2 / (1.2 * float(np.sqrt(twin.law.bending_n_m2 * weight)))
     known = next(s for s in slip.strengths(twin) if s.name == "compliance_m_n")
     scale = _SLIP_STEP * sheared
-    unknown = of_strength(SLIP, replace(known, high=_SLIP_MOST * sheared), scale)
+    unknown = of_strength(SLIP, replace(known, high=sheared), scale)
     return replace(unknown, start=1.0, prior=(0.0, 1.0 / _SLIP_STEP))
 
 
