@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.finite_elements import Acting, Elements, Floats, Place, record
-from physworld.geometry.reference import SHEET_KINDS
+from physworld.geometry.sheet_body import SHEET_KINDS
 from physworld.scene import Body
 
 TOP_M = 0.5  # height at which bodies are held

@@ -73,7 +73,7 @@ def simulate_batch(
         time_step_s: forced time step [s], or None for the smallest of the stable ones.
 
     Raises:
-        BatchRefused: the twin is of the updated Lagrangian form, or the episodes do not share their clock or what a law
+        BatchRefused: the twin is of the updated Lagrangian form or a mesh of triangles, or the episodes do not share their clock or what a law
             must share (:class:`physworld.mpm.forces.ForcesSideBySide`).
         CFLViolation: the forced time step exceeds the stable limit of one of them.
     """
@@ -81,6 +81,8 @@ def simulate_batch(
         raise BatchRefused(
             f"{len(episodes)} episodes of the updated Lagrangian form: its bodies would meet on one grid"
         )
+    if not twin.lattice.smooth:
+        raise BatchRefused(f"{len(episodes)} episodes of a mesh of triangles: it is integrated alone")
     changed = [twin.with_parameters(**episode.parameters) for episode in episodes]
     runs = [
         one.integration(

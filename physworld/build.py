@@ -17,6 +17,7 @@ from physworld.materials.plastic import Plasticity
 from physworld.mpm.choose import choose_formulation
 from physworld.mpm.self_contact import COARSE, apart_m, refuse_thickness
 from physworld.mpm.transfer import TRANSFERS, Apic
+from physworld.mpm.triangles import Mesh
 from physworld.scene import AS_MEASURED, Scene
 from physworld.twin import Twin
 
@@ -35,6 +36,7 @@ def build_twin(
     plasticity: Plasticity | None = None,
     formulation: str = "auto",
     transfer: str = Apic.name,
+    mesh: Mesh | None = None,
 ) -> Twin:
     """A twin of the scene with prior parameters, to be calibrated.
 
@@ -48,6 +50,7 @@ def build_twin(
         formulation: "total_lagrangian", "updated_lagrangian", or "auto": by the law and the scene. The body's notes say
             which was taken and why.
         transfer: of the updated Lagrangian form, "apic" or "asflip" (:mod:`physworld.mpm.transfer`).
+        mesh: of a sheet, the mesh of linear triangles that it is to be (:mod:`physworld.mpm.triangles`).
 
     Raises:
         SceneUnsupported: the scene declares too little for a body, or the formulation cannot hold it.
@@ -55,7 +58,7 @@ def build_twin(
     """
     if transfer not in TRANSFERS:
         raise ValueError(f"no transfer is called {transfer!r}; there are {sorted(TRANSFERS)}")
-    body = reference_body(scene, particle_budget, refinement)
+    body = reference_body(scene, particle_budget, refinement, mesh)
     choice = choose_formulation(body.lattice.dim, scene.kind, scene.declared, plasticity, formulation)
     taken_form = f"{choice.formulation.replace('_', ' ')} form: {choice.reason}"
     if choice.formulation == "updated_lagrangian":
@@ -141,6 +144,10 @@ def _touching_itself(
             return None, ()
         return None, (
             "it is declared to touch itself, and passes through itself: a solid in the total Lagrangian form",
+        )
+    if not body.lattice.smooth:
+        raise SceneUnsupported(
+            f"a mesh of {len(body.lattice.cells)} cells of triangles does not touch itself"
         )
     friction = declared.get("self_friction")
     said = "declared"

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from physworld.errors import SceneUnsupported
-from physworld.geometry.reference import ReferenceBody
+from physworld.geometry.body import ReferenceBody
 from physworld.geometry.rigid import rigid_motion
 from physworld.materials.rod import RodLaw
 from physworld.mpm.soft_grips import AS_HELD, gripped_points, holds_a_part, touched_nodes

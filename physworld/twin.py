@@ -22,7 +22,7 @@ from physworld.colliders import TwinCollider
 from physworld.effects.base import Effect
 from physworld.effects.registry import in_order
 from physworld.errors import EffectRefused, SceneUnsupported
-from physworld.geometry.reference import ReferenceBody
+from physworld.geometry.body import ReferenceBody
 from physworld.geometry.rigid import least_rotation
 from physworld.grips import held_paths, soft_regions, twist_between_grips, with_touched_nodes
 from physworld.integration import Integration, solver_knots
@@ -162,7 +162,7 @@ class Twin:
         Raises:
             EffectRefused: the effect makes no sense for this twin; the message says why.
         """
-        reason = added.refuses(self)
+        reason = added.why_not(self)
         if reason is not None:
             raise EffectRefused(f"{added.name}: {reason}")
         names = [known.name for known in self.effects]

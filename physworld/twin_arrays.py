@@ -10,10 +10,11 @@ import numpy as np
 
 from physworld.colliders import from_parts, to_parts
 from physworld.effects.registry import effect
-from physworld.geometry.reference import ReferenceBody
+from physworld.geometry.body import ReferenceBody
 from physworld.materials.library import law_class
 from physworld.materials.plastic import PLASTICITIES
 from physworld.mpm.lattice import Lattice
+from physworld.mpm.triangles import TriangleLattice
 
 if TYPE_CHECKING:
     from physworld.twin import Twin
@@ -52,7 +53,7 @@ def arrays_of(twin: Twin) -> dict[str, np.ndarray]:
         "facts": np.array(json.dumps(facts)),
         "gravity": np.asarray(twin.gravity_m_s2, dtype=float),
         "controllers_start": twin.controllers_start,
-        **{f"lattice_{f.name}": getattr(lattice, f.name) for f in fields(lattice)},
+        **{f"lattice_{f.name}": np.asarray(getattr(lattice, f.name)) for f in fields(lattice)},
         **{f"body_{name}": getattr(body, name) for name in _BODY},
         **({} if body.added_mass is None else {"body_added_mass": body.added_mass}),
         **({} if twin.properties is None else {"properties": twin.properties}),
@@ -64,7 +65,9 @@ def parts_of(arrays: dict[str, np.ndarray]) -> dict[str, Any]:
     """The arguments of :class:`physworld.twin.Twin` but for its device; what older twins lack has its default."""
     facts = json.loads(str(arrays["facts"]))
     flow = facts.get("plasticity")
-    lattice = Lattice(**{f.name: arrays[f"lattice_{f.name}"] for f in fields(Lattice)})
+    held = {f.name: arrays[f"lattice_{f.name}"] for f in fields(Lattice)}
+    meshed = "lattice_odd" in arrays
+    lattice = TriangleLattice(**held, odd=bool(arrays["lattice_odd"])) if meshed else Lattice(**held)
     body = ReferenceBody(
         lattice=lattice,
         thickness_m=facts["thickness_m"],

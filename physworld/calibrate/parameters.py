@@ -163,7 +163,7 @@ def _torsion(twin: Twin) -> list[Parameter]:
 def _twist(twin: Twin) -> list[Parameter]:
     """How stiff a sheet is in twist beside bending, which decides in which valley its stiffness lies."""
     law = twin.law
-    if not isinstance(law, SheetLaw):
+    if not isinstance(law, SheetLaw) or not twin.lattice.smooth:
         return []
     known = law.bending_twist_ratio
     return [
@@ -180,7 +180,7 @@ def _shape(twin: Twin, separate_bending: bool) -> list[Parameter]:
     law = twin.law
     if not isinstance(law, SheetLaw):
         return []
-    found = [
+    found = [] if not twin.lattice.smooth else [
         Parameter(BENDING_COUPLING, "1", *_COUPLING_BOUNDS, (law.bending_coupling,), _set(BENDING_COUPLING), "shape",
                   0.1, "linear", law.bending_coupling, _BENDING_GAIN)
     ]  # fmt: skip

@@ -49,6 +49,7 @@ class Anisotropy(Effect):
     equation = "S += r E (f . E f) f f"
     kind = "stress"
     gates = ("ratio",)
+    strains = True
 
     ratio: float = 0.0
     azimuth_rad: float = 0.0

@@ -57,6 +57,7 @@ class Effect:
         equation: the law in plain text.
         kind: where it enters.
         gates: fields whose zero switches the effect off.
+        strains: acts on the strains of a body's cells, which a mesh of triangles does not have.
     """
 
     name: ClassVar[str]
@@ -64,6 +65,7 @@ class Effect:
     equation: ClassVar[str]
     kind: ClassVar[Kind]
     gates: ClassVar[tuple[str, ...]]
+    strains: ClassVar[bool] = False
 
     @property
     def active(self) -> bool:
@@ -88,6 +90,13 @@ class Effect:
     def refuses(cls, twin: Twin) -> str | None:
         """Why the effect makes no sense for this twin; None where it does."""
         return None
+
+    @classmethod
+    def why_not(cls, twin: Twin) -> str | None:
+        """Why a twin cannot have the effect: it makes no sense there, or its engine cannot do it; None if it can."""
+        if cls.strains and not twin.lattice.smooth:
+            return f"it acts on strains; a mesh of {len(twin.lattice.cells)} cells of triangles has none of splines"
+        return cls.refuses(twin)
 
     def placed(self, twin: Twin) -> Effect:
         """The same with the places that ``None`` leaves to the twin."""

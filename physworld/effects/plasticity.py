@@ -130,6 +130,7 @@ class Plasticity(Effect):
     equation = "|mu dev b| <= sqrt(2/3) Y, b = F Cp^-1 F^T"
     kind = "stress"
     gates = ("inverse_yield_per_pa", "yield_radius_m")
+    strains = True
 
     inverse_yield_per_pa: float = 0.0
     yield_radius_m: float = 0.0

@@ -58,6 +58,7 @@ class RestShape(Effect):
     equation = "rest length (1 + e) L, rest curvature k0"
     kind = "field"
     gates = ("strain_x", "strain_y", "strain_z", "curvature_1_per_m", "curvature_2_per_m")
+    strains = True
 
     strain_x: float = 0.0
     strain_y: float = 0.0

@@ -56,6 +56,7 @@ class StrainStiffening(Effect):
     equation = "S += s E (E : E) E"
     kind = "stress"
     gates = ("coefficient",)
+    strains = True
 
     coefficient: float = 0.0
 

@@ -79,6 +79,7 @@ class ViscoelasticMaxwell(Effect):
     equation = "S += 2 G1 dev(E - a), da/dt = (E - a) / tau"
     kind = "stress"
     gates = ("shear_modulus_pa", "share")
+    strains = True
 
     shear_modulus_pa: float = 0.0
     share: float = 0.0

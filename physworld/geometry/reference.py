@@ -14,69 +14,31 @@ order in the cell size (``docs/verification.md``).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-from scipy.spatial import ConvexHull
 
 from physworld.errors import SceneUnsupported
 from physworld.geometry.alignment import cells_along, faces_along
+from physworld.geometry.body import ReferenceBody, first_points
 from physworld.geometry.curves import fit_nodes, straight_extent
 from physworld.geometry.declared import grips_of, load_of
 from physworld.geometry.filling import filled_body, inside_surface_points
-from physworld.geometry.sheet_cells import grips_in_plane, sheet_lattice
+from physworld.geometry.sheet_body import SHEET_KINDS, THIN, plane_of, sheet_body
 from physworld.mpm.lattice import Lattice, lattice_from_cells
+from physworld.mpm.triangles import Mesh
 from physworld.scene import AS_MEASURED, Scene
 
 ROD_KINDS = ("rope", "rod")
-SHEET_KINDS = ("sheet", "cloth")
 _ROD_CELLS = 32
 _ROD_RADIUS_M = 0.004  # where none is declared or shown
 _ON_AXIS = 1e-6  # of a straight rod's length: points so near its axis show no radius
-_SHEET_CELLS, _SHEET_BUDGET = 24, 2000  # along the longer side at that budget, as its square root
-_FEWEST_SHEET_CELLS = 12
 _BOX_KINDS = ("beam", "block")
-_FLAT = 0.08  # a sheet's points lie within this share of its width of their plane (root mean square)
-_TIGHTER = 0.97  # a sheet is turned in its plane if that shrinks its bounding rectangle below this share
 _CLAMP_REACH = 0.5 / np.sqrt(3.0)  # cells by which a held layer of splines acts beyond its face
-_THIN = 1e-4  # points whose extent falls below this share of their largest one span a dimension less
-_NEIGHBOURS = 6  # points that tell where another one was before it was seen
 _BOX_FILL = 0.93  # a cloud that fills this share of its bounding box is a box, whatever its kind
 
 
-@dataclass(frozen=True)
-class ReferenceBody:
-    """A lattice, its nodes in the world without stress and at the start, and the tracked points inside it.
-
-    Attributes:
-        lattice: cells, nodes, particles.
-        rest: nodal positions without stress [m], (n, 3).
-        start, start_velocity: nodal positions [m] and velocities [m/s] at the first frame, (n, 3).
-        points: material coordinates of the tracked points [m], (N, d).
-        offsets: distance of a tracked point from the sheet [m], (N, 1), or from the rod at the start [m], (N, 3);
-            zero columns for a solid.
-        thickness_m: thickness of a sheet or radius of a rod, declared or assumed.
-        notes: what was assumed, in words.
-        added_mass: declared loads as lumped nodal masses [kg], (n,), or None.
-    """
-
-    lattice: Lattice
-    rest: np.ndarray
-    start: np.ndarray
-    start_velocity: np.ndarray
-    points: np.ndarray
-    offsets: np.ndarray
-    thickness_m: float
-    notes: tuple[str, ...] = ()
-    added_mass: np.ndarray | None = None
-
-    @property
-    def half_thickness_m(self) -> float:
-        """Distance of the surface from a sheet's middle or a rod's axis [m]; 0 for a solid."""
-        return {3: 0.0, 2: 0.5, 1: 1.0}[self.lattice.dim] * self.thickness_m
-
-
-def reference_body(scene: Scene, particle_budget: int, refinement: float = 1.0) -> ReferenceBody:
+def reference_body(
+    scene: Scene, particle_budget: int, refinement: float = 1.0, mesh: Mesh | None = None
+) -> ReferenceBody:
     """Build the body that the scene declares or shows.
 
     Args:
@@ -84,6 +46,7 @@ def reference_body(scene: Scene, particle_budget: int, refinement: float = 1.0) 
         particle_budget: about how many particles a solid gets; the cells of a sheet's longer side go by its square
             root, 24 at 2000 and at least 12. Rods have 32 cells.
         refinement: cells are this many times smaller along every axis, whatever the body.
+        mesh: of a sheet, the mesh of triangles that it is to be instead.
 
     Raises:
         SceneUnsupported: the scene shows or declares too little, with the missing key.
@@ -96,44 +59,26 @@ def reference_body(scene: Scene, particle_budget: int, refinement: float = 1.0) 
     if scene.kind in ROD_KINDS:
         return _rod(scene, refinement)
     if scene.kind in SHEET_KINDS:
-        sheet = _sheet(scene, particle_budget, refinement)
+        sheet = sheet_body(scene, particle_budget, refinement, mesh)
         if sheet is not None:
             return sheet
     if scene.kind == "branched_rope":
         raise SceneUnsupported(
             "branched ropes are not covered yet: a rod has two ends, this scene's topology has more"
         )
+    if mesh is not None:
+        raise SceneUnsupported(
+            f"a body of kind {scene.kind}, or one that is not flat at the start, is no {mesh}"
+        )
     return _solid(scene, round(particle_budget * refinement**3))
 
 
-def _first_points(scene: Scene) -> np.ndarray:
-    """Tracked points at the first frame, (N, 3) [m].
-
-    A point that was not seen then is where its first sight was, less what its neighbours have moved until then.
-    Held-out frames are not looked at; a point that was never seen takes another's place.
-    """
-    end = scene.train[1] or scene.frame_count
-    visible = scene.visible[:end] if scene.visible[:end].any() else scene.visible
-    points = scene.points[0].astype(float)
-    for n in np.flatnonzero(~visible[0] & visible.any(axis=0)):
-        first = int(np.argmax(visible[:, n]))
-        points[n] = scene.points[first, n]
-        known = np.flatnonzero(visible[0] & visible[first])
-        gap = np.linalg.norm(scene.points[first, known] - points[n], axis=1)
-        near = known[np.argsort(gap)[:_NEIGHBOURS]]
-        if len(near):
-            points[n] -= (scene.points[first, near] - scene.points[0, near]).mean(axis=0)
-    sighted = visible.any(axis=0)
-    points[~sighted] = points[np.argmax(sighted)]
-    return points
-
-
 def _solid(scene: Scene, budget: int) -> ReferenceBody:
-    points = _first_points(scene)
+    points = first_points(scene)
     body = scene.body
     notes: list[str] = []
     if scene.kind in SHEET_KINDS:
-        _, _, size, off_plane = _plane(scene, points)
+        _, _, size, off_plane = plane_of(scene, points)
         notes.append(
             f"the sheet is not flat at the start ({off_plane:.3g} m rms off its plane, {size.min():.3g} m wide) and is "
             "taken as a solid"
@@ -205,7 +150,7 @@ def _hanging_mass(scene: Scene, lattice: Lattice, notes: list[str]) -> np.ndarra
 
 def _require_volume(cloud: np.ndarray, kind: str) -> None:
     extent = np.linalg.svd(cloud - cloud.mean(axis=0), compute_uv=False)
-    if extent[2] <= _THIN * extent[0]:
+    if extent[2] <= THIN * extent[0]:
         raise SceneUnsupported(
             f"{len(cloud)} points lie in a plane or on a line (principal extents {extent / np.sqrt(len(cloud))} m): "
             f"they span no volume for a {kind}"
@@ -252,7 +197,7 @@ def _sampled_fill(cells: np.ndarray, origin: np.ndarray, spacing: np.ndarray, te
 
 
 def _rod(scene: Scene, refinement: float) -> ReferenceBody:
-    points = _first_points(scene)
+    points = first_points(scene)
     notes: list[str] = []
     if scene.initial_state != AS_MEASURED and len(points) > 3:
         cloud = points if scene.rest_volume_points is None else scene.rest_volume_points
@@ -331,78 +276,3 @@ def _rod_lattice(scene: Scene, length: float, grip_arcs, refinement: float) -> L
         (np.minimum(begin + 0.5 * spacing, length) - np.maximum(begin, 0.0)) / (0.5 * spacing), 0.0, 1.0
     )
     return lattice_from_cells(np.array([origin]), np.array([spacing]), cells, fill)
-
-
-def _plane(scene: Scene, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Corner (3,), axes (3, 3), the last one normal, and sides (2,) of a sheet's plane; rms distance from it [m]."""
-    cloud = points if scene.rest_volume_points is None else scene.rest_volume_points
-    centre = cloud.mean(axis=0)
-    _, extents, axes = np.linalg.svd(cloud - centre, full_matrices=len(cloud) < 3)
-    if np.abs(axes[2]).max() > 0.999:  # a sheet in a coordinate plane: keep its edges along the axes
-        normal_axis = int(np.argmax(np.abs(axes[2])))
-        axes = np.stack([*(np.eye(3)[a] for a in range(3) if a != normal_axis), np.eye(3)[normal_axis]])
-        if np.linalg.det(axes) < 0:
-            axes[2] = -axes[2]
-    local = (cloud - centre) @ axes.T
-    size = np.ptp(local[:, :2], axis=0)
-    if size.min() <= _THIN * size.max():
-        raise SceneUnsupported(f"{len(cloud)} points of a {scene.kind} span {size} m: no area")
-    if extents[1] <= _THIN * extents[0]:
-        raise SceneUnsupported(f"{len(cloud)} points of a {scene.kind} span {size} m on a line: no area")
-    turn = _tightest_turn(local[:, :2])
-    axes = np.concatenate([turn @ axes[:2], axes[2:]])
-    local = (cloud - centre) @ axes.T
-    size = np.ptp(local[:, :2], axis=0)
-    return centre + local[:, :2].min(axis=0) @ axes[:2], axes, size, float(np.sqrt(np.mean(local[:, 2] ** 2)))
-
-
-def _tightest_turn(plane: np.ndarray) -> np.ndarray:
-    """Rotation (2, 2) after which points (M, 2) fill their bounding rectangle best: the principal axes of a square
-    sheet are arbitrary. None is needed where it would gain less than a few percent.
-    """
-    corners = plane[ConvexHull(plane).vertices]
-    sides = np.roll(corners, -1, axis=0) - corners
-    angle = np.concatenate([[0.0], np.arctan2(sides[:, 1], sides[:, 0])])
-    angle = (angle + np.pi / 4) % (np.pi / 2) - np.pi / 4
-    turns = np.stack([np.cos(angle), np.sin(angle), -np.sin(angle), np.cos(angle)], axis=1).reshape(-1, 2, 2)
-    areas = np.prod(np.ptp(np.einsum("kij,mj->kmi", turns, corners), axis=1), axis=1)
-    return turns[np.argmin(areas)] if areas.min() < _TIGHTER * areas[0] else np.eye(2)
-
-
-def _sheet(scene: Scene, particle_budget: int, refinement: float) -> ReferenceBody | None:
-    points = _first_points(scene)
-    notes: list[str] = []
-    thickness = scene.body.thickness_m
-    if thickness is None and scene.body.size_m is not None:
-        thickness = float(np.min(scene.body.size_m))
-    if thickness is None:
-        thickness = 1e-3
-        notes.append("thickness not declared: 1 mm assumed (only stiffness over mass matters)")
-    grid = scene.body.grid_shape
-    if grid is not None and scene.body.side_m is not None and grid[0] * grid[1] == len(points):
-        side = scene.body.side_m
-        first, second = np.meshgrid(
-            np.linspace(0, side, grid[0]), np.linspace(0, side, grid[1]), indexing="ij"
-        )
-        material = np.stack([first.ravel(), second.ravel()], axis=1)
-        size = np.array([side, side])
-        flat_map = None
-    else:
-        origin, axes, size, off_plane = _plane(scene, points)
-        if off_plane > _FLAT * size.min():
-            return None
-        material = ((points - origin) @ axes.T)[:, :2]
-        flat_map = (origin, axes)
-    along = max(_SHEET_CELLS * np.sqrt(particle_budget / _SHEET_BUDGET), _FEWEST_SHEET_CELLS)
-    cell = max(float(size.max()) / (refinement * along), 1e-4)
-    lattice = sheet_lattice(size, cell, grips_in_plane(scene, flat_map))
-    rest = np.zeros((len(lattice.nodes), 3))
-    rest[:, :2] = lattice.node_coordinates
-    if flat_map is not None:
-        start = flat_map[0] + lattice.node_coordinates @ flat_map[1][:2]
-        velocity = np.zeros_like(start)
-        offsets = ((points - flat_map[0]) @ flat_map[1][2])[:, None]
-    else:
-        start, velocity = fit_nodes(scene, lattice, material)
-        offsets = np.zeros((len(points), 1))
-    return ReferenceBody(lattice, rest, start, velocity, material, offsets, thickness, tuple(notes))

@@ -18,6 +18,8 @@ from physworld.mpm.lattice import Lattice
 from physworld.mpm.rod_kernels import rod_forces
 from physworld.mpm.sheet_kernels import sheet_forces
 from physworld.mpm.solid_kernels import solid_forces
+from physworld.mpm.triangle_kernels import triangle_forces
+from physworld.mpm.triangles import TriangleLattice
 
 _SHARED = {
     3: {1: "gradients", 5: "numbers", 6: "cell size"},
@@ -44,12 +46,17 @@ class InternalForces:
     def __init__(
         self, lattice: Lattice, law: Law, stiffness_factor: np.ndarray, rest: np.ndarray, device: str
     ) -> None:
-        self._own(lattice, law, model_inputs(lattice, law, stiffness_factor, rest, device), 1, device)
+        inputs = _triangle_inputs if isinstance(lattice, TriangleLattice) else model_inputs
+        self._own(lattice, law, inputs(lattice, law, stiffness_factor, rest, device), 1, device)
 
     def _own(self, lattice: Lattice, law: Law, model: list[Any], bodies: int, device: str) -> None:
         cells = bodies * len(lattice.cells)
+        if isinstance(lattice, TriangleLattice):
+            cells = len(lattice.triangles) + len(lattice.hinges[0])
         self.device, self.cells, self._model = device, cells, model
-        if isinstance(law, SolidLaw):
+        if isinstance(lattice, TriangleLattice):
+            self._kernel = triangle_forces
+        elif isinstance(law, SolidLaw):
             self._kernel = solid_forces(law.stress, len(law.moduli))
         else:
             self._kernel = sheet_forces if isinstance(law, SheetLaw) else rod_forces
@@ -168,4 +175,25 @@ def model_inputs(
     return [
         nodes, array(np.stack(derivatives, axis=1), wp.float64), array(law.stretching_n * measure, wp.float64),
         array(law.bending_n_m2 * measure, wp.float64), *friction,
+    ]  # fmt: skip
+
+
+def _triangle_inputs(
+    lattice: TriangleLattice, law: Law, stiffness_factor: np.ndarray, rest: np.ndarray, device: str
+) -> list[Any]:
+    """The same of a mesh of triangles, of which two make a cell; they and the edges take the mean of its particles."""
+    if not isinstance(law, SheetLaw):
+        raise ValueError(f"a {type(law).__name__} does not fit a mesh of triangles")
+
+    def array(values: Any, dtype: Any = wp.float64) -> wp.array:
+        return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
+
+    factor = stiffness_factor.reshape(len(lattice.cells), -1).mean(axis=1)
+    edges, weights, areas = lattice.hinges
+    membrane = law.membrane_n_m * lattice.areas * np.repeat(factor, 2)
+    bending = law.bending_n_m / areas * factor[lattice.hinge_cells].mean(axis=1)
+    return [
+        array(lattice.triangles, wp.int32), array(lattice.slopes.reshape(-1, 6)), array(membrane),
+        array(law.membrane_shape), array(edges, wp.int32), array(weights), array(bending),
+        wp.float64(law.relaxation_s), int(law.relaxation_s > 0),
     ]  # fmt: skip

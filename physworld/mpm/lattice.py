@@ -8,6 +8,7 @@ share of its quarter, eighth … of the cell that material occupies (finite cell
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from scipy import sparse
@@ -35,6 +36,8 @@ class Lattice:
     fill: np.ndarray
     cell_nodes: np.ndarray
     nodes: np.ndarray
+    smooth: ClassVar[bool] = True
+    """Whether its field has slopes without jumps, as splines do: what strains and curvatures of cells are made from."""
 
     @property
     def dim(self) -> int:
@@ -56,6 +59,13 @@ class Lattice:
     def particle_measures(self) -> np.ndarray:
         """Length, area or volume that each particle stands for [m**d], (C * 2**d,)."""
         return (self.fill * (np.prod(self.spacing) / 2**self.dim)).reshape(-1)
+
+    def lumped(self, particle_mass: np.ndarray) -> np.ndarray:
+        """Lumped nodal masses [kg], (n,), of particles (P,): rows of the mass matrix summed."""
+        per_cell = particle_mass.reshape(len(self.cells), -1) @ self.table((0,) * self.dim).T
+        mass = np.zeros(len(self.nodes))
+        np.add.at(mass, self.cell_nodes, per_cell)
+        return mass
 
     def table(self, orders: tuple[int, ...]) -> np.ndarray:
         """Weights of a cell's nodes at its particles, differentiated in units of the cell, (3**d, 2**d)."""

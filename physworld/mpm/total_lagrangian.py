@@ -103,7 +103,8 @@ class TotalLagrangian:
         time_step_s: forced time step [s], or None for the stable one.
         friction: "auto": in sub-steps of its own where explicit friction would shrink the time step more than
             :data:`physworld.mpm.stability.EXPLICIT_SHRINK` times (drag: ``DRAG_SHRINK``), or a forced step asks for
-            it; "explicit": never. With a term that multiplies the internal forces it is explicit.
+            it; "explicit": never. With a term that multiplies the internal forces, and in a mesh of triangles, it is
+            explicit.
 
     Attributes:
         relaxed: whether friction is sub-cycled (:mod:`physworld.mpm.relaxation`).
@@ -139,7 +140,7 @@ class TotalLagrangian:
         rates = tuple(float(term.friction_per_s) for term in self.terms)
         steps = Steps(frequency, internal, float(problem.drag_per_s), rates)
         multiplied = any(getattr(term, "multiplies", False) for term in self.terms)
-        allowed = friction == "auto" and not multiplied
+        allowed = friction == "auto" and not multiplied and lattice.smooth
         if time_step_s is None:
             relax = allowed and steps.relax
         else:
@@ -421,8 +422,4 @@ def nodal_mass(lattice: Lattice, law: Law, density_factor: np.ndarray | None) ->
     particle_mass = getattr(law, density) * lattice.particle_measures
     if density_factor is not None:
         particle_mass = particle_mass * density_factor
-    weights = lattice.table((0,) * lattice.dim)
-    per_cell = particle_mass.reshape(len(lattice.cells), -1) @ weights.T
-    mass = np.zeros(len(lattice.nodes))
-    np.add.at(mass, lattice.cell_nodes, per_cell)
-    return mass
+    return lattice.lumped(particle_mass)

@@ -76,7 +76,7 @@ def candidates(twin: Twin, names: tuple[str, ...] = ()) -> tuple[list[Candidate]
     for name, effect in EFFECTS.items():
         if names and name not in names:
             continue
-        reason = effect.refuses(twin)
+        reason = effect.why_not(twin)
         if reason is not None:
             refused[name] = reason
             continue

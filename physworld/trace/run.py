@@ -32,6 +32,7 @@ from physworld.trace.faults import Faults, without_faults
 from physworld.trace.held_out import HeldOut, Unseen, measure, measure_all
 from physworld.trace.holds import held_otherwise
 from physworld.trace.intervals import calibrated, named, spread_of
+from physworld.trace.meshes import recorded_as
 from physworld.trace.noise import noise_sigma
 from physworld.trace.recordings import (
     FITTED,
@@ -57,6 +58,7 @@ from physworld.trace.unknowns import Unknown, clamp_reach, grip_compliance, grip
 from physworld.trace.verdict import (
     DATA,
     NOTHING,
+    NUMERICAL,
     UNEXPLAINED,
     Verdict,
     claimable,
@@ -126,7 +128,18 @@ def trace(
         looked = runs + simulations.count
         simulations, twin, runs = begin.calibrated(recordings, None, None)
         runs += looked
-    result = _Trace(recordings, config, simulations, twin, faults).run()
+    alone = len(recordings.fitted) == 1 and not recordings.held_out
+    bodies = [twin]
+    if alone:
+        bodies = recorded_as(recordings.scene, twin, simulations, recordings.split.train[1])
+    results = []
+    for body in bodies:
+        results.append(_Trace(recordings, config, simulations, body, faults).run())
+        if results[-1].verdict.name not in (UNEXPLAINED, NUMERICAL):
+            break
+    else:  # none explains it: what is said is said of the declared body
+        results.sort(key=lambda found: not found.declared.fitted.twin.lattice.smooth, reverse=True)
+    result = results[-1]
     return replace(result, simulations=simulations.count + runs, seconds=time.perf_counter() - begun)
 
 

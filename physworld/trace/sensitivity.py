@@ -100,16 +100,18 @@ def numerical_directions(
 ) -> tuple[dict[str, np.ndarray], Twin]:
     """Changes of the prediction (frames, N, 3) that are the solver's own, by name; and the twin on finer cells.
 
+    Of a mesh of triangles the cells are what is supposed of the recording: it has no finer ones, and is its own.
+
     Args:
         level: cells of ``twin`` are this many times smaller than the budget says.
     """
     frames = len(base)
-    finer = refined(scene, twin, budget, level * refinement)
-    variants = {
-        "finer cells": Job(finer, frames),
-        "coarser cells": Job(refined(scene, twin, budget, level / refinement), frames),
-        "half the time step": Job(twin, frames, 0.5),
-    }
+    finer = twin
+    variants = {"half the time step": Job(twin, frames, 0.5)}
+    if twin.lattice.smooth:
+        finer = refined(scene, twin, budget, level * refinement)
+        coarser = refined(scene, twin, budget, level / refinement)
+        variants = {"finer cells": Job(finer, frames), "coarser cells": Job(coarser, frames), **variants}
     found = zip(variants, simulations.run(list(variants.values())), strict=True)
     return {name: tracks - base for name, tracks in found if tracks is not None}, finer
 

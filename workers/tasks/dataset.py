@@ -157,7 +157,8 @@ def _made(
     """Arrays and attributes of episode ``index``, alone or as one of its block."""
     seed = config.seed % 2**63
     width = WIDTHS[twin.device.partition(":")[0]]
-    if width == 1 or twin.formulation != "total_lagrangian" or demonstration.strengths:
+    alone = twin.formulation != "total_lagrangian" or not twin.lattice.smooth
+    if width == 1 or alone or demonstration.strengths:
         return make_episode(scene, twin, demonstration, derived_seed(seed, index), progress)
     first = index - index % width
     seeds = [derived_seed(seed, other) for other in range(first, min(first + width, config.episodes))]

@@ -174,7 +174,7 @@ def test_a_scene_whose_twin_is_fitted_in_another_way_has_cells_of_its_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Cells, "case", lambda self, name: name)
-    [scene] = paper_tables.FITS
+    scene = next(iter(paper_tables.FITS))
     Cells(tmp_path, None).fill(f"{scene}/full/0", lambda case: {})
     monkeypatch.delitem(paper_tables.FITS, scene)
     assert Cells(tmp_path, None).get(f"{scene}/full/0") is None

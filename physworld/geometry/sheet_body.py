@@ -1,0 +1,164 @@
+"""The undeformed body of a sheet: its plane, its lattice or its mesh, and where its nodes are at the start."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from physworld.errors import SceneUnsupported
+from physworld.geometry.body import ReferenceBody, first_points
+from physworld.geometry.curves import fit_nodes
+from physworld.geometry.sheet_cells import grips_in_plane, sheet_lattice
+from physworld.mpm.lattice import Lattice
+from physworld.mpm.triangles import Mesh, triangle_lattice
+from physworld.scene import Scene
+
+SHEET_KINDS = ("sheet", "cloth")
+THIN = 1e-4  # points whose extent falls below this share of their largest one span a dimension less
+_CELLS, _BUDGET = 24, 2000  # along the longer side at that budget, as its square root
+_FEWEST_CELLS = 12
+_FLAT = 0.08  # a sheet's points lie within this share of its width of their plane (root mean square)
+_TIGHTER = 0.97  # a sheet is turned in its plane if that shrinks its bounding rectangle below this share
+_FEWEST_MESH_CELLS, _MOST_CELLS = 6, 24  # of a mesh, along a side
+_LONG = 1.6  # a mesh's cells are at most so much longer than wide
+_ON_LINE = 0.02  # cells by which a grip's end may miss a line of a mesh
+_AS_DECLARED = 0.05  # share by which extents of points may miss the declared size
+
+
+def sheet_body(
+    scene: Scene, particle_budget: int, refinement: float, mesh: Mesh | None = None
+) -> ReferenceBody | None:
+    """The body of a scene of a sheet, as a mesh if one is given; None if it is not flat at the start.
+
+    Raises:
+        SceneUnsupported: its points span no area.
+    """
+    points = first_points(scene)
+    notes: list[str] = []
+    thickness = scene.body.thickness_m
+    if thickness is None and scene.body.size_m is not None:
+        thickness = float(np.min(scene.body.size_m))
+    if thickness is None:
+        thickness = 1e-3
+        notes.append("thickness not declared: 1 mm assumed (only stiffness over mass matters)")
+    grid = scene.body.grid_shape
+    if grid is not None and scene.body.side_m is not None and grid[0] * grid[1] == len(points):
+        side = scene.body.side_m
+        first, second = np.meshgrid(
+            np.linspace(0, side, grid[0]), np.linspace(0, side, grid[1]), indexing="ij"
+        )
+        material = np.stack([first.ravel(), second.ravel()], axis=1)
+        size = np.array([side, side])
+        flat_map = None
+    else:
+        origin, axes, size, off_plane = plane_of(scene, points)
+        if off_plane > _FLAT * size.min():
+            return None
+        material = ((points - origin) @ axes.T)[:, :2]
+        flat_map = (origin, axes)
+    lattice: Lattice
+    if mesh is not None:
+        sides = _declared_sides(scene, flat_map, size)
+        lattice = triangle_lattice(sides, mesh, 0.5 * (size - sides))
+        notes.append(f"a mesh as other engines take it: {mesh}")
+    else:
+        along = max(_CELLS * np.sqrt(particle_budget / _BUDGET), _FEWEST_CELLS)
+        cell = max(float(size.max()) / (refinement * along), 1e-4)
+        lattice = sheet_lattice(size, cell, grips_in_plane(scene, flat_map))
+    rest = np.zeros((len(lattice.nodes), 3))
+    rest[:, :2] = lattice.node_coordinates
+    if flat_map is not None:
+        start = flat_map[0] + lattice.node_coordinates @ flat_map[1][:2]
+        velocity = np.zeros_like(start)
+        offsets = ((points - flat_map[0]) @ flat_map[1][2])[:, None]
+    else:
+        start, velocity = fit_nodes(scene, lattice, material)
+        offsets = np.zeros((len(points), 1))
+    return ReferenceBody(lattice, rest, start, velocity, material, offsets, thickness, tuple(notes))
+
+
+def possible_meshes(scene: Scene) -> list[Mesh]:
+    """Meshes that another engine may have recorded a sheet with: their lines lie where the declared grips end.
+
+    Cells are about as wide as high, and at most :data:`_MOST_CELLS` on a side. Empty where no grip ends on the sheet.
+    """
+    points = first_points(scene)
+    if scene.kind not in SHEET_KINDS or scene.body.side_m is not None:
+        return []
+    origin, axes, size, off_plane = plane_of(scene, points)
+    if off_plane > _FLAT * size.min():
+        return []
+    flat_map = (origin, axes)
+    sides = _declared_sides(scene, flat_map, size)
+    faces = [
+        np.array([end[a] for grip in grips_in_plane(scene, flat_map) for end in (grip.region_min_m, grip.region_max_m)])
+        - 0.5 * (size - sides)[a]
+        for a in range(2)
+    ]  # fmt: skip
+    counts = [_counts_through(faces[a], float(sides[a])) for a in range(2)]
+    for a, b in ((0, 1), (1, 0)):
+        if not counts[a]:
+            counts[a] = sorted({max(round(n * sides[a] / sides[b]), 1) for n in counts[b]})
+    return [
+        Mesh((across, up), odd)
+        for across in counts[0]
+        for up in counts[1]
+        if 1.0 / _LONG <= (sides[0] / across) / (sides[1] / up) <= _LONG
+        for odd in (False, True)
+    ]
+
+
+def _counts_through(faces: np.ndarray, side: float) -> list[int]:
+    """Numbers of cells along a side [m] whose lines all inner ``faces`` (F,) lie on; empty where there is none."""
+    inner = faces[(faces > _ON_LINE * side) & (faces < (1 - _ON_LINE) * side)]
+    if not len(inner):
+        return []
+    tried = range(_FEWEST_MESH_CELLS, _MOST_CELLS + 1)
+    return [n for n in tried if np.all(np.abs(inner * n / side - np.round(inner * n / side)) < _ON_LINE)]
+
+
+def _declared_sides(
+    scene: Scene, flat_map: tuple[np.ndarray, np.ndarray] | None, size: np.ndarray
+) -> np.ndarray:
+    """Sides (2,) [m] as declared, where the points' extents ``size`` (2,) agree; else these."""
+    declared = scene.body.size_m
+    if declared is None or flat_map is None:
+        return size
+    along = np.abs(flat_map[1][:2]) @ np.asarray(declared, dtype=float)
+    return along if np.allclose(along, size, rtol=_AS_DECLARED) else size
+
+
+def plane_of(scene: Scene, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Corner (3,), axes (3, 3), the last one normal, and sides (2,) of a sheet's plane; rms distance from it [m]."""
+    cloud = points if scene.rest_volume_points is None else scene.rest_volume_points
+    centre = cloud.mean(axis=0)
+    _, extents, axes = np.linalg.svd(cloud - centre, full_matrices=len(cloud) < 3)
+    if np.abs(axes[2]).max() > 0.999:  # a sheet in a coordinate plane: keep its edges along the axes
+        normal_axis = int(np.argmax(np.abs(axes[2])))
+        axes = np.stack([*(np.eye(3)[a] for a in range(3) if a != normal_axis), np.eye(3)[normal_axis]])
+        if np.linalg.det(axes) < 0:
+            axes[2] = -axes[2]
+    local = (cloud - centre) @ axes.T
+    size = np.ptp(local[:, :2], axis=0)
+    if size.min() <= THIN * size.max():
+        raise SceneUnsupported(f"{len(cloud)} points of a {scene.kind} span {size} m: no area")
+    if extents[1] <= THIN * extents[0]:
+        raise SceneUnsupported(f"{len(cloud)} points of a {scene.kind} span {size} m on a line: no area")
+    turn = _tightest_turn(local[:, :2])
+    axes = np.concatenate([turn @ axes[:2], axes[2:]])
+    local = (cloud - centre) @ axes.T
+    size = np.ptp(local[:, :2], axis=0)
+    return centre + local[:, :2].min(axis=0) @ axes[:2], axes, size, float(np.sqrt(np.mean(local[:, 2] ** 2)))
+
+
+def _tightest_turn(plane: np.ndarray) -> np.ndarray:
+    """Rotation (2, 2) after which points (M, 2) fill their bounding rectangle best: the principal axes of a square
+    sheet are arbitrary. None is needed where it would gain less than a few percent.
+    """
+    corners = plane[ConvexHull(plane).vertices]
+    sides = np.roll(corners, -1, axis=0) - corners
+    angle = np.concatenate([[0.0], np.arctan2(sides[:, 1], sides[:, 0])])
+    angle = (angle + np.pi / 4) % (np.pi / 2) - np.pi / 4
+    turns = np.stack([np.cos(angle), np.sin(angle), -np.sin(angle), np.cos(angle)], axis=1).reshape(-1, 2, 2)
+    areas = np.prod(np.ptp(np.einsum("kij,mj->kmi", turns, corners), axis=1), axis=1)
+    return turns[np.argmin(areas)] if areas.min() < _TIGHTER * areas[0] else np.eye(2)

@@ -1,0 +1,92 @@
+"""Sheets that another engine recorded as a mesh: the discretisation of the recorder as a suspect.
+
+A recording of a sheet by linear triangles and hinges shows its mesh: 16 cells a side part from their own refinement by
+more than most effects do, and no plate of ours comes to the noise (ADR 21). Which meshes it may be shows in where their
+lines lie: on the ends of the declared grips. Which one it is shows early: a sheet that is let go wrinkles at once, cell by
+cell, while what an effect does and the scene does not declare grows with time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from physworld.build import build_twin
+from physworld.geometry.sheet_body import possible_meshes
+from physworld.materials.sheet import SheetLaw
+from physworld.scene import Scene
+from physworld.simulations import Job
+from physworld.trace.simulations import Simulations
+from physworld.twin import Twin
+
+_WINDOWS = (0.375, 0.5, 0.625, 0.75)  # shares of the training frames, from their beginning
+_STIFFNESSES = tuple(0.05 * k for k in range(-5, 6))  # logarithms, over the plate's
+_NEARER = (-0.03, -0.015, 0.015, 0.03)  # about the best of those
+_BEST = 4  # bodies that are looked at more nearly
+
+
+def recorded_as(scene: Scene, plate: Twin, simulations: Simulations, frames: int) -> list[Twin]:
+    """What a sheet may be, the one that follows the first frames best first: the plate, and the best mesh for it.
+
+    Errors of several windows are added up, so that early frames count more, and all of a body have one stiffness.
+
+    Args:
+        scene: the recording.
+        plate: the declared physics, calibrated.
+        simulations: of the recording.
+        frames: that training may use.
+    """
+    meshes = possible_meshes(scene) if isinstance(plate.law, SheetLaw) else []
+    if not meshes:
+        return [plate]
+    simulations.stage = "mesh of the recorder"
+    windows = [max(round(share * frames), 2) for share in _WINDOWS]
+    bodies = [plate, *(_meshed(build_twin(scene, mesh=mesh), plate) for mesh in meshes)]
+    tried = [_stiffer(twin, shift) for twin in bodies for shift in _STIFFNESSES]
+    early = _errors(scene, tried, simulations, windows[:2]).reshape(len(bodies), -1)
+    leading = [k for k in np.argsort(early.min(axis=1))[:_BEST] if np.isfinite(early[k].min())]
+    leading += [0] if 0 not in leading else []
+    near = [
+        [_stiffer(tried[len(_STIFFNESSES) * k + int(np.argmin(early[k]))], shift) for shift in (0.0, *_NEARER)]
+        for k in leading
+    ]
+    late = _errors(scene, [twin for own in near for twin in own], simulations, windows).reshape(len(near), -1)
+    order = [k for k in np.argsort(late.min(axis=1)) if np.isfinite(late[k].min()) or leading[k] == 0]
+    best = next((k for k in order if leading[k] != 0), None)
+    found = [(k, plate if leading[k] == 0 else near[k][int(np.argmin(late[k]))]) for k in order]
+    return [twin for k, twin in found if leading[k] == 0 or k == best]
+
+
+def _meshed(mesh: Twin, plate: Twin) -> Twin:
+    """A mesh that stretches as the plate does and bends as its thickness says."""
+    law = plate.law
+    assert isinstance(law, SheetLaw)
+    bending = law.membrane_n_m * plate.body.thickness_m**2 / 12.0
+    return replace(
+        mesh,
+        law=replace(law, bending_n_m=bending, bending_twist_ratio=1.0, bending_coupling=1.0),
+        air_drag_per_s=plate.air_drag_per_s,
+        device=plate.device,
+    )
+
+
+def _stiffer(twin: Twin, shift: float) -> Twin:
+    known = twin.parameters
+    gain = float(np.exp(shift))
+    return twin.with_parameters(
+        membrane_n_m=gain * known["membrane_n_m"], bending_n_m=gain * known["bending_n_m"]
+    )
+
+
+def _errors(scene: Scene, twins: list[Twin], simulations: Simulations, windows: list[int]) -> np.ndarray:
+    """Mean squared distances of the sightings from each twin's tracks [m^2], of all windows; infinite where it failed."""
+    found = []
+    for tracks in simulations.run([Job(twin, windows[-1]) for twin in twins]):
+        squares = None if tracks is None else np.sum((tracks - scene.points[: windows[-1]]) ** 2, axis=2)
+        found.append(
+            np.inf
+            if squares is None
+            else sum(float(np.mean(squares[:end][scene.visible[:end]])) for end in windows)
+        )
+    return np.array(found)
