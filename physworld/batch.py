@@ -73,8 +73,8 @@ def simulate_batch(
         time_step_s: forced time step [s], or None for the smallest of the stable ones.
 
     Raises:
-        BatchRefused: the twin is of the updated Lagrangian form or a mesh of triangles, or the episodes do not share their clock or what a law
-            must share (:class:`physworld.mpm.forces.ForcesSideBySide`).
+        BatchRefused: the twin is of the updated Lagrangian form or a mesh of triangles, or the episodes do not share
+            their clock or what a law must share (:class:`physworld.mpm.forces.ForcesSideBySide`).
         CFLViolation: the forced time step exceeds the stable limit of one of them.
     """
     if twin.formulation != "total_lagrangian":

@@ -24,6 +24,8 @@ class FitConfig(Request):
     one; null is the usual one of the body's shape. ``plasticity``: a flow law, whose yield is calibrated too.
     ``formulation``: which form integrates the body; "auto" takes the one that its laws and its scene need.
     ``transfer``: how the updated Lagrangian form's particles and grid exchange velocities; "asflip" damps less.
+    ``mesh``: of a sheet that another engine recorded as a mesh of triangles, its cells along both sides, such as
+    "16x15"; "16x15odd" has the diagonals the other way round.
     ``stages``: "global+local" then fits a field of stiffness, and of the ground's friction where the data know it, over
     the body; it is kept only if training frames that its search did not see get better.
     ``numerics``: measure the engine's own damping on the scene, and the numbers with cells of no size.
@@ -36,6 +38,7 @@ class FitConfig(Request):
     plasticity: FlowLaw | None = None
     formulation: Literal["auto", "total_lagrangian", "updated_lagrangian"] = "auto"
     transfer: Literal["apic", "asflip"] = "apic"
+    mesh: str | None = Field(default=None, pattern=r"^[1-9]\d{0,2}x[1-9]\d{0,2}(odd)?$")
     stages: Literal["global", "global+local"] = "global"
     numerics: bool = True
 
@@ -47,6 +50,10 @@ class FitConfig(Request):
                 "the local stage of stages 'global+local' needs the total Lagrangian form: plasticity and formulation "
                 "must be left out"
             )
+        if self.stages != "global" and self.mesh is not None:
+            raise ValueError(
+                f"the local stage of stages 'global+local' needs gradients, which mesh {self.mesh} lacks"
+            )
         return self
 
     @property
@@ -55,7 +62,7 @@ class FitConfig(Request):
 
         That is what a trace can work on.
         """
-        usual_form = self.plasticity is None and self.formulation == "auto"
+        usual_form = self.plasticity is None and self.formulation == "auto" and self.mesh is None
         return self.law is None and usual_form and self.stages == "global"
 
 

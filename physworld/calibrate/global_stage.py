@@ -44,6 +44,7 @@ from physworld.calibrate.losses import training_losses
 from physworld.calibrate.parameters import Parameter, flow_law, parameters_of
 from physworld.calibrate.search import Descent, Optimum, Progress, Search
 from physworld.materials.library import with_law
+from physworld.mpm.triangles import Mesh
 from physworld.scene import Scene
 from physworld.simulations import Runner, in_turn
 from physworld.twin import Twin
@@ -73,6 +74,7 @@ class CalibrationConfig:
         transfer: of the updated Lagrangian form, "apic" or "asflip".
         plasticity: name of the flow law (:mod:`physworld.materials.plastic`), whose yield is searched too; None for an
             elastic body.
+        mesh: of a sheet, the mesh of triangles that recorded it (:mod:`physworld.mpm.triangles`); None for a plate.
     """
 
     particle_budget: int = 2000
@@ -84,6 +86,7 @@ class CalibrationConfig:
     formulation: str = "auto"
     transfer: str = "apic"
     plasticity: str | None = None
+    mesh: Mesh | None = None
 
 
 @dataclass(frozen=True)
@@ -188,6 +191,7 @@ def prior_twin(scene: Scene, config: CalibrationConfig) -> Twin:
         plasticity=None if config.plasticity is None else flow_law(config.plasticity),
         formulation=config.formulation,
         transfer=config.transfer,
+        mesh=config.mesh,
     )
     return twin if config.law is None else replace(twin, law=with_law(twin.law, config.law))
 

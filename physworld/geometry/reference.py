@@ -56,7 +56,7 @@ def reference_body(
         raise SceneUnsupported(
             f"{frames} frames with {count} points, {int(scene.visible.sum())} sightings in all: no motion to follow"
         )
-    if scene.kind in ROD_KINDS:
+    if scene.kind in ROD_KINDS and mesh is None:
         return _rod(scene, refinement)
     if scene.kind in SHEET_KINDS:
         sheet = sheet_body(scene, particle_budget, refinement, mesh)

@@ -58,8 +58,8 @@ def sheet_body(
         flat_map = (origin, axes)
     lattice: Lattice
     if mesh is not None:
-        sides = _declared_sides(scene, flat_map, size)
-        lattice = triangle_lattice(sides, mesh, 0.5 * (size - sides))
+        begin, sides = _declared_extent(scene, flat_map, size)
+        lattice = triangle_lattice(sides, mesh, begin)
         notes.append(f"a mesh as other engines take it: {mesh}")
     else:
         along = max(_CELLS * np.sqrt(particle_budget / _BUDGET), _FEWEST_CELLS)
@@ -89,13 +89,9 @@ def possible_meshes(scene: Scene) -> list[Mesh]:
     if off_plane > _FLAT * size.min():
         return []
     flat_map = (origin, axes)
-    sides = _declared_sides(scene, flat_map, size)
-    faces = [
-        np.array([end[a] for grip in grips_in_plane(scene, flat_map) for end in (grip.region_min_m, grip.region_max_m)])
-        - 0.5 * (size - sides)[a]
-        for a in range(2)
-    ]  # fmt: skip
-    counts = [_counts_through(faces[a], float(sides[a])) for a in range(2)]
+    begin, sides = _declared_extent(scene, flat_map, size)
+    faces = _grip_faces(scene, flat_map) - begin
+    counts = [_counts_through(faces[:, a], float(sides[a])) for a in range(2)]
     for a, b in ((0, 1), (1, 0)):
         if not counts[a]:
             counts[a] = sorted({max(round(n * sides[a] / sides[b]), 1) for n in counts[b]})
@@ -117,15 +113,34 @@ def _counts_through(faces: np.ndarray, side: float) -> list[int]:
     return [n for n in tried if np.all(np.abs(inner * n / side - np.round(inner * n / side)) < _ON_LINE)]
 
 
-def _declared_sides(
+def _grip_faces(scene: Scene, flat_map: tuple[np.ndarray, np.ndarray] | None) -> np.ndarray:
+    """Where the declared grips end along both axes of a sheet [m], (F, 2)."""
+    boxes = [(grip.region_min_m, grip.region_max_m) for grip in grips_in_plane(scene, flat_map)]
+    return np.array(boxes, dtype=float).reshape(-1, 2)
+
+
+def _declared_extent(
     scene: Scene, flat_map: tuple[np.ndarray, np.ndarray] | None, size: np.ndarray
-) -> np.ndarray:
-    """Sides (2,) [m] as declared, where the points' extents ``size`` (2,) agree; else these."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Lower corner (2,) and sides (2,) [m] as declared, where the points' extents ``size`` (2,) agree; else these.
+
+    Points seldom lie on the edges, so an edge is where a grip ends beside one; without such a grip the middles agree.
+    """
     declared = scene.body.size_m
     if declared is None or flat_map is None:
-        return size
-    along = np.abs(flat_map[1][:2]) @ np.asarray(declared, dtype=float)
-    return along if np.allclose(along, size, rtol=_AS_DECLARED) else size
+        return np.zeros(2), size
+    sides = np.abs(flat_map[1][:2]) @ np.asarray(declared, dtype=float)
+    if not np.allclose(sides, size, rtol=_AS_DECLARED):
+        return np.zeros(2), size
+    begin = 0.5 * (size - sides)
+    faces = _grip_faces(scene, flat_map)
+    for axis in range(2):
+        low = faces[np.abs(faces[:, axis] - begin[axis]) < _AS_DECLARED * sides[axis], axis]
+        high = faces[np.abs(faces[:, axis] - begin[axis] - sides[axis]) < _AS_DECLARED * sides[axis], axis]
+        ends = np.concatenate([low, high - sides[axis]])
+        if len(ends):
+            begin[axis] = ends[np.argmin(np.abs(ends - begin[axis]))]
+    return begin, sides
 
 
 def plane_of(scene: Scene, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:

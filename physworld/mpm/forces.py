@@ -186,14 +186,14 @@ def _triangle_inputs(
         raise ValueError(f"a {type(law).__name__} does not fit a mesh of triangles")
 
     def array(values: Any, dtype: Any = wp.float64) -> wp.array:
-        return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
+        return wp.array(np.ascontiguousarray(values).reshape(-1), dtype=dtype, device=device)
 
     factor = stiffness_factor.reshape(len(lattice.cells), -1).mean(axis=1)
     edges, weights, areas = lattice.hinges
     membrane = law.membrane_n_m * lattice.areas * np.repeat(factor, 2)
     bending = law.bending_n_m / areas * factor[lattice.hinge_cells].mean(axis=1)
     return [
-        array(lattice.triangles, wp.int32), array(lattice.slopes.reshape(-1, 6)), array(membrane),
+        len(lattice.triangles), array(lattice.triangles, wp.int32), array(lattice.slopes), array(membrane),
         array(law.membrane_shape), array(edges, wp.int32), array(weights), array(bending),
         wp.float64(law.relaxation_s), int(law.relaxation_s > 0),
     ]  # fmt: skip

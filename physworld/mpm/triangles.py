@@ -13,6 +13,7 @@ for inextensible surfaces"; they take 3 / A_e, MuJoCo 1 / A_e).
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
@@ -23,6 +24,8 @@ from scipy import sparse
 from physworld.errors import SceneUnsupported
 from physworld.mpm.lattice import Lattice
 
+MESH_TEXT = r"([1-9]\d{0,2})x([1-9]\d{0,2})(odd)?"
+
 
 @dataclass(frozen=True)
 class Mesh:
@@ -30,6 +33,18 @@ class Mesh:
 
     counts: tuple[int, int]
     odd: bool = False
+
+    @classmethod
+    def read(cls, text: str) -> Mesh:
+        """A mesh as people write it: "16x15", or "16x15odd".
+
+        Raises:
+            ValueError: the text is none.
+        """
+        found = re.fullmatch(MESH_TEXT, text)
+        if found is None:
+            raise ValueError(f'a mesh is written as 16x15, or 16x15odd; this is "{text}"')
+        return cls((int(found[1]), int(found[2])), found[3] is not None)
 
     def __str__(self) -> str:
         return f"{self.counts[0]} x {self.counts[1]} cells of two triangles"

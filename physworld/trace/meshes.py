@@ -2,8 +2,8 @@
 
 A recording of a sheet by linear triangles and hinges shows its mesh: 16 cells a side part from their own refinement by
 more than most effects do, and no plate of ours comes to the noise (ADR 21). Which meshes it may be shows in where their
-lines lie: on the ends of the declared grips. Which one it is shows early: a sheet that is let go wrinkles at once, cell by
-cell, while what an effect does and the scene does not declare grows with time.
+lines lie: on the ends of the declared grips. Which one it is shows early: a sheet that is let go wrinkles at once, cell
+by cell, while what an effect does and the scene does not declare grows with time.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ def recorded_as(scene: Scene, plate: Twin, simulations: Simulations, frames: int
         simulations: of the recording.
         frames: that training may use.
     """
-    meshes = possible_meshes(scene) if isinstance(plate.law, SheetLaw) else []
+    sheet = isinstance(plate.law, SheetLaw) and plate.lattice.smooth
+    meshes = possible_meshes(scene) if sheet else []
     if not meshes:
         return [plate]
     simulations.stage = "mesh of the recorder"
@@ -48,7 +49,10 @@ def recorded_as(scene: Scene, plate: Twin, simulations: Simulations, frames: int
     leading = [k for k in np.argsort(early.min(axis=1))[:_BEST] if np.isfinite(early[k].min())]
     leading += [0] if 0 not in leading else []
     near = [
-        [_stiffer(tried[len(_STIFFNESSES) * k + int(np.argmin(early[k]))], shift) for shift in (0.0, *_NEARER)]
+        [
+            _stiffer(tried[len(_STIFFNESSES) * k + int(np.argmin(early[k]))], shift)
+            for shift in (0.0, *_NEARER)
+        ]
         for k in leading
     ]
     late = _errors(scene, [twin for own in near for twin in own], simulations, windows).reshape(len(near), -1)
@@ -80,7 +84,7 @@ def _stiffer(twin: Twin, shift: float) -> Twin:
 
 
 def _errors(scene: Scene, twins: list[Twin], simulations: Simulations, windows: list[int]) -> np.ndarray:
-    """Mean squared distances of the sightings from each twin's tracks [m^2], of all windows; infinite where it failed."""
+    """Mean squared distances of the sightings from each twin's tracks [m^2], summed over windows; or infinite."""
     found = []
     for tracks in simulations.run([Job(twin, windows[-1]) for twin in twins]):
         squares = None if tracks is None else np.sum((tracks - scene.points[: windows[-1]]) ** 2, axis=2)

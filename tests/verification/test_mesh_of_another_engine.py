@@ -41,9 +41,7 @@ def test_forces_of_a_crumpled_mesh_are_mujocos(cells: tuple[int, int], odd: bool
     lattice = triangle_lattice(np.array(sheet.size_m), Mesh(cells, odd))
     forces = InternalForces(lattice, law_of(sheet), np.ones(lattice.fill.size), rest, "cpu")
     found = wp.zeros(rest.size, dtype=wp.float64)
-    forces.launch(
-        wp.array((rest + pushed).ravel(), dtype=wp.float64), wp.zeros(3, dtype=wp.float64), found
-    )
+    forces.launch(wp.array((rest + pushed).ravel(), dtype=wp.float64), wp.zeros(3, dtype=wp.float64), found)
     assert found.numpy() == pytest.approx(data.qfrc_spring, abs=1e-7 * np.abs(data.qfrc_spring).max())
 
 

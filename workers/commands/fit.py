@@ -39,6 +39,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--plasticity", default=None, help="flow law by name; its yield is calibrated too")
     parser.add_argument("--formulation", default="auto", help="total_lagrangian, updated_lagrangian or auto")
     parser.add_argument("--transfer", default="apic", help="of the updated Lagrangian form: apic or asflip")
+    parser.add_argument("--mesh", default=None, help="of a sheet: the mesh that recorded it, such as 16x15")
     parser.add_argument(
         "--stages", default="global", help="global, or global+local: a field on top if it holds"
     )
@@ -67,6 +68,7 @@ def _fit(given: argparse.Namespace) -> None:
 
     wp.config.quiet = True  # before the first import that starts it
     from physworld.calibrate import CalibrationConfig, calibrate_in_stages
+    from physworld.mpm.triangles import Mesh
     from physworld.simulations import Workers, in_turn
     from workers.commands.steps import journal_in
     from workers.commands.terminal import progress_bar, read_scene
@@ -82,6 +84,7 @@ def _fit(given: argparse.Namespace) -> None:
         formulation=given.formulation,
         transfer=given.transfer,
         plasticity=given.plasticity,
+        mesh=None if given.mesh is None else Mesh.read(given.mesh),
     )
     journal = None if given.resume is None else journal_in(given.resume, scene, f"{given.law} {config}")
     with Workers(given.processes) if given.processes > 1 else nullcontext(in_turn) as runner:

@@ -8,6 +8,7 @@ do not depend on each other are shared with whatever worker is free (:mod:`worke
 from __future__ import annotations
 
 from physworld.calibrate import CalibrationConfig, calibrate_in_stages
+from physworld.mpm.triangles import Mesh
 from schemas.fit import FitConfig
 from storage import helpers
 from workers.context import TaskContext
@@ -42,6 +43,7 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
         plasticity=config.plasticity,
         formulation=config.formulation,
         transfer=config.transfer,
+        mesh=None if config.mesh is None else Mesh.read(config.mesh),
     )
     journal = stored_journal(stores, context.lease.job_id, payload)
     runner = SharedRunner(context, stores, WORTH_SHARING_S)

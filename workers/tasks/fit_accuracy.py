@@ -59,6 +59,8 @@ def _measured(
     progress: Progress | None,
     cancelled: Callable[[], bool] | None,
 ) -> dict[str, Any]:
+    if not fitted.twin.lattice.smooth:
+        return not_measured("a mesh of triangles is the recorder's own: there are no finer cells to ask")
     total = MEASURED_RUNS + 1 + len(fitted.searched)
 
     def poll(done: int, frames: int) -> None:

@@ -156,7 +156,9 @@ def test_friction_does_not_feel_a_turn_of_a_bent_sheet() -> None:
     mesh = lattice()
     bent = at_rest(mesh)
     bent[:, 2] += 0.4 * (bent[:, 0] - bent[:, 0].mean()) ** 2
-    forces = InternalForces(mesh, replace(LAW, relaxation_s=0.1), np.ones(mesh.fill.size), at_rest(mesh), "cpu")
+    forces = InternalForces(
+        mesh, replace(LAW, relaxation_s=0.1), np.ones(mesh.fill.size), at_rest(mesh), "cpu"
+    )
     clock = wp.array([0.0, 1e3, 1e-3], dtype=wp.float64)
 
     def pulls(x: np.ndarray) -> np.ndarray:

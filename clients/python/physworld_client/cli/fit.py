@@ -37,6 +37,9 @@ def fit(
     transfer: Annotated[
         str | None, typer.Option(help="Of the updated Lagrangian form: apic or asflip.")
     ] = None,
+    mesh: Annotated[
+        str | None, typer.Option(help="Of a sheet: the mesh of triangles that recorded it, such as 16x15.")
+    ] = None,
     stages: Annotated[
         str | None, typer.Option(help="global, or global+local: a field over the body on top, if it holds.")
     ] = None,
@@ -60,6 +63,7 @@ def fit(
         "--plasticity": plasticity,
         "--formulation": formulation,
         "--transfer": transfer,
+        "--mesh": mesh,
         "--stages": stages,
         "--processes": processes,
         "--resume": resume,

@@ -46,6 +46,9 @@ def run(
     transfer: Annotated[
         str | None, typer.Option(help="Of the updated Lagrangian form: apic or asflip.")
     ] = None,
+    mesh: Annotated[
+        str | None, typer.Option(help="Of a sheet: the mesh of triangles that recorded it, such as 16x15.")
+    ] = None,
     stages: Annotated[
         str | None, typer.Option(help="Of the fit: global, or global+local with a field over the body.")
     ] = None,
@@ -79,6 +82,7 @@ def run(
         "plasticity": plasticity,
         "formulation": formulation,
         "transfer": transfer,
+        "mesh": mesh,
         "stages": stages,
     }
     with _service(url, token, data, workers, keep_up) as (address, alive):

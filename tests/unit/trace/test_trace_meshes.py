@@ -1,0 +1,100 @@
+"""What may have recorded a sheet: a mesh of triangles, if one follows the first frames better than the plate does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_scene import recorded_by
+
+from benchmarks.flex_sheet import FlexSheet, record
+from physworld.batch import Episode, simulate_batch
+from physworld.build import build_twin
+from physworld.calibrate.parameters import parameters_of
+from physworld.effects.air_drag_quadratic import AirDragQuadratic
+from physworld.effects.anisotropy import Anisotropy
+from physworld.errors import BatchRefused, EffectRefused, SceneUnsupported
+from physworld.mpm.triangles import Mesh, TriangleLattice
+from physworld.scene import Scene
+from physworld.trace.candidates import candidates
+from physworld.trace.meshes import recorded_as
+from physworld.trace.recordings import JointSimulations, Recordings
+from physworld.twin import Twin
+
+SHEET = FlexSheet(frames=16, noise_sigma_m=5e-4, seed=1)
+MESH = Mesh((16, 15))
+
+
+def plate_of(scene: Scene, young_pa: float) -> Twin:
+    membrane = young_pa * SHEET.thickness_m / (1.0 - SHEET.poisson**2)
+    return build_twin(scene, 500).with_parameters(
+        membrane_n_m=membrane, bending_n_m=membrane * SHEET.thickness_m**2 / 12.0, bending_twist_ratio=3.0
+    )
+
+
+def kinds(scene: Scene, plate: Twin) -> list[Mesh | None]:
+    recordings = Recordings([scene], (), 12, 3)
+    simulations = JointSimulations(recordings, plate, 500, 1.4)
+    found = recorded_as(recordings.scene, plate, simulations, recordings.split.train[1])
+    return [twin.lattice.mesh if isinstance(twin.lattice, TriangleLattice) else None for twin in found]
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """A sheet of MuJoCo's, held by two corners."""
+    return record(SHEET)
+
+
+def test_a_mesh_that_recorded_is_found_although_the_stiffness_is_off(scene: Scene) -> None:
+    assert kinds(scene, plate_of(scene, 0.87 * SHEET.young_pa)) == [MESH, None]
+
+
+def test_a_mesh_is_found_beside_an_effect_that_is_not_declared(scene: Scene) -> None:
+    own = build_twin(scene, mesh=MESH).with_effect(AirDragQuadratic(coefficient_per_m=1.5))
+    law = plate_of(scene, SHEET.young_pa).law
+    dragged = recorded_by(replace(own, law=replace(law, bending_twist_ratio=1.0)), scene, 5e-4)
+    assert kinds(dragged, plate_of(scene, 0.87 * SHEET.young_pa)) == [MESH, None]
+
+
+def test_a_plate_that_recorded_comes_first(scene: Scene) -> None:
+    finer = build_twin(scene, 2000)
+    plate = plate_of(scene, SHEET.young_pa)
+    found = kinds(recorded_by(replace(finer, law=plate.law), scene, 5e-4), plate)
+    assert found[0] is None and len(found) == 2
+
+
+def test_where_no_grip_ends_on_the_sheet_it_is_a_plate(scene: Scene) -> None:
+    loose = tuple(replace(grip, region_min_m=None, region_max_m=None) for grip in scene.grips)
+    plate = plate_of(scene, SHEET.young_pa)
+    assert kinds(replace(scene, grips=loose), plate) == [None]
+
+
+def test_a_mesh_has_no_numbers_and_no_effects_that_splines_alone_have(scene: Scene) -> None:
+    twin = build_twin(scene, mesh=MESH)
+    assert {p.name for p in parameters_of(twin, separate_bending=False, damping=False)} == {
+        "youngs_modulus_pa", "bending_ratio", "poissons_ratio"
+    }  # fmt: skip
+    found, refused = candidates(twin)
+    names = {candidate.effect for candidate in found}
+    assert {"air_drag_quadratic", "wind", "gravity_tilt", "tether", "viscosity_kelvin_voigt"} <= names
+    for name in ("anisotropy", "plasticity", "viscoelastic_maxwell", "strain_stiffening", "rest_shape"):
+        assert "240 cells of triangles" in refused[name]
+    with pytest.raises(EffectRefused, match="triangles"):
+        twin.with_effect(Anisotropy(ratio=0.5))
+
+
+def test_a_mesh_travels_as_arrays_and_is_refused_where_it_cannot_go(scene: Scene) -> None:
+    twin = build_twin(scene, mesh=Mesh((8, 15), odd=True))
+    back = Twin.from_arrays(twin.to_arrays())
+    assert isinstance(back.lattice, TriangleLattice) and back.lattice.mesh == Mesh((8, 15), odd=True)
+    times, controls = scene.control_track()
+    assert np.array_equal(
+        back.simulate_nodes(times, controls, scene.times[:3]), twin.simulate_nodes(times, controls, scene.times[:3])
+    )  # fmt: skip
+    with pytest.raises(BatchRefused, match="triangles"):
+        simulate_batch(twin, [Episode(times, controls, scene.times[:3])])
+    with pytest.raises(SceneUnsupported, match="does not touch itself"):
+        build_twin(replace(scene, declared={"body": {"self_contact": True}}), mesh=MESH)
+    with pytest.raises(SceneUnsupported, match="is no 16 x 15 cells"):
+        build_twin(replace(scene, kind="rope"), mesh=MESH)
