@@ -47,7 +47,8 @@ class Mesh:
         return cls((int(found[1]), int(found[2])), found[3] is not None)
 
     def __str__(self) -> str:
-        return f"{self.counts[0]} x {self.counts[1]} cells of two triangles"
+        cut = ", the first cut the other way" if self.odd else ""
+        return f"{self.counts[0]} x {self.counts[1]} cells of two triangles{cut}"
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,8 @@ from physworld.twin import Twin
 _WINDOWS = (0.375, 0.5, 0.625, 0.75)  # shares of the training frames, from their beginning
 _STIFFNESSES = tuple(0.05 * k for k in range(-5, 6))  # logarithms, over the plate's
 _NEARER = (-0.03, -0.015, 0.015, 0.03)  # about the best of those
+MESH_STIFFNESS = 0.06
+"""How far the logarithm of a mesh's stiffness may lie from what its first frames say: all windows see it to 0.015."""
 _BEST = 4  # bodies that are looked at more nearly
 
 

@@ -32,7 +32,7 @@ from physworld.trace.faults import Faults, without_faults
 from physworld.trace.held_out import HeldOut, Unseen, measure, measure_all
 from physworld.trace.holds import held_otherwise
 from physworld.trace.intervals import calibrated, named, spread_of
-from physworld.trace.meshes import recorded_as
+from physworld.trace.meshes import MESH_STIFFNESS, recorded_as
 from physworld.trace.noise import noise_sigma
 from physworld.trace.recordings import (
     FITTED,
@@ -54,7 +54,14 @@ from physworld.trace.sensitivity import (
 )
 from physworld.trace.simulations import Memory, Progress
 from physworld.trace.start_pose import turned_starts
-from physworld.trace.unknowns import Unknown, clamp_reach, grip_compliance, grip_softness, of_parameter
+from physworld.trace.unknowns import (
+    Unknown,
+    clamp_reach,
+    grip_compliance,
+    grip_softness,
+    near_its_start,
+    of_parameter,
+)
 from physworld.trace.verdict import (
     DATA,
     NOTHING,
@@ -286,8 +293,11 @@ class _Trace:
             BENDING_RATIO: _BENDING_SPREAD,
         }
         softness = grip_softness(twin)
-        reach = clamp_reach(twin) if softness is None else None  # a reach within a cell is what softness is
+        # a reach within a cell is what softness is, and a mesh's lines lie on the faces of its grips
+        reach = clamp_reach(twin) if softness is None and twin.lattice.smooth else None
         found = [of_parameter(p, twin, spread.get(p.name)) for p in known if p.name != BENDING_COUPLING]
+        if not twin.lattice.smooth:  # its first frames have said how stiff it is
+            found[0] = near_its_start(found[0], MESH_STIFFNESS)
         own = (reach, softness, grip_compliance(twin))
         return [*found, *(unknown for unknown in own if unknown is not None)]
 
