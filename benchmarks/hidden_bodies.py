@@ -1,4 +1,4 @@
-"""Bodies for ``benchmarks.hidden_effects``, recorded by finite elements or PyElastica, and how they are moved."""
+"""Bodies for ``benchmarks.hidden_effects``, recorded by finite elements, PyElastica or MuJoCo, and how they move."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ TOP_M = 0.5  # height at which bodies are held
 POISSON, TRACKED = 0.35, 120
 _ROPE_TRACKED, _ROPE_POISSON, _FILLING = 40, 0.4, 3000
 _RAMP_S = 0.15
+_CLOTH_TRACKED, _CLOTH_STEPS = 300, 460
 
 
 class Motion:
@@ -184,12 +185,71 @@ class Cord:
         return Recorder([Hand(box, rope.held[0], motion)], tracks, inside)
 
 
+@dataclass(frozen=True)
+class Cloth:
+    """A sheet of triangles that hangs by two corners, two cells of each in a hand.
+
+    Attributes:
+        size_m: width, thickness and height.
+        cells: across and up.
+        young_pa, density_kg_m3: of the material; density is declared.
+        stroke_m: how far hands go.
+        kind: of the scene.
+    """
+
+    size_m: tuple[float, float, float]
+    cells: tuple[int, int]
+    young_pa: float
+    density_kg_m3: float
+    stroke_m: float
+    kind: str = "sheet"
+
+    @property
+    def body(self) -> Body:
+        """What the scene declares."""
+        return Body(
+            size_m=np.array(self.size_m), thickness_m=self.size_m[1], density_kg_m3=self.density_kg_m3
+        )
+
+    def recorder(self, seed: int, rng: np.random.Generator) -> Recorder:
+        """MuJoCo flex; a camera sees any places of it."""
+        from benchmarks.flex_cloths import Mesh
+
+        width, thickness, height = self.size_m
+        mesh = Mesh((width, height), self.cells, young_pa=self.young_pa, thickness_m=thickness,
+                    density_kg_m3=self.density_kg_m3, steps_per_frame=_CLOTH_STEPS)  # fmt: skip
+        rest, boxes = mesh.vertices(), mesh.corners()
+        seen = rng.uniform(0.0, 1.0, (_CLOTH_TRACKED, 2))
+        motions = [Motion(10 * seed + g, self.stroke_m, 0.0) for g in range(len(boxes))]
+        held = [
+            np.flatnonzero(np.all((rest >= box[0] - 1e-9) & (rest <= box[1] + 1e-9), axis=1)) for box in boxes
+        ]
+
+        def tracks(acting: Acting, late_s: float, at: Floats) -> Floats:
+            grips: list[tuple[Any, Place]] = [
+                (h, partial(m.place, late_s)) for h, m in zip(held, motions, strict=True)
+            ]
+            return mesh.record(acting, grips, seen, at)
+
+        def inside(r: np.random.Generator) -> Floats:
+            return rest.min(axis=0) + r.uniform(0.0, 1.0, (_FILLING, 3)) * [width, 0.0, height] + [
+                0.0, 0.5 * thickness, 0.0,
+            ] * r.uniform(-1.0, 1.0, (_FILLING, 1))  # fmt: skip
+
+        hands = [
+            Hand(box, rest[h].mean(axis=0), motion)
+            for box, h, motion in zip(boxes, held, motions, strict=True)
+        ]
+        return Recorder(hands, tracks, inside)
+
+
 _END = (((0.0, 0.0, 0.0), (1.0 / 12, 1.0, 1.0)),)
-OBJECTS: dict[str, Object | Cord] = {
+OBJECTS: dict[str, Object | Cord | Cloth] = {
     "beam": Object("beam", (0.26, 0.038, 0.036), (12, 2, 2), 7e5, 600.0, _END, 0.03, 0.15),
     "blob": Object("blob", (0.2, 0.1, 0.09), (6, 3, 3), 5e4, 540.0,
                    (((0.0, 1 / 3, 1 / 3), (1 / 6, 2 / 3, 2 / 3)),), 0.02, round=True),
     "slab": Object("sheet", (0.22, 0.015, 0.2), (10, 1, 9), 2.6e5, 350.0,
                    (((0.0, 0.0, 8 / 9), (0.1, 1.0, 1.0)), ((0.9, 0.0, 8 / 9), (1.0, 1.0, 1.0))), 0.03),
     "rope": Cord(0.42, 0.0075, 1e6, 900.0, (0.5, 0.0, -0.86), 0.04, 0.2),
+    "cloth": Cloth((0.25, 0.0045, 0.27), (20, 18), 2e5, 370.0, 0.03),
 }  # fmt: skip

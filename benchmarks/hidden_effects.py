@@ -1,10 +1,10 @@
 """``python -m benchmarks.hidden_effects --json FILE``: trace what other engines recorded of bodies with a secret.
 
 Beams, a soft blob held at its end and a slab that hangs by two corners are recorded by finite elements
-(:mod:`benchmarks.finite_elements`), ropes by PyElastica's Cosserat rods (:mod:`benchmarks.elastica_ropes`, of the extra
-``bench``); all undamped, with noise and points that go out of sight. What acts is drawn by a seed,
-one or two effects, none, one that no library has (a gust of a tenth of a second), or a camera whose clock is off. The
-trace sees scene and recording only, as one of ``benchmarks.trace``.
+(:mod:`benchmarks.finite_elements`), ropes by PyElastica's Cosserat rods (:mod:`benchmarks.elastica_ropes`, of the
+extra ``bench``), cloths by MuJoCo's triangles (:mod:`benchmarks.flex_cloths`); all undamped, with noise and points that
+go out of sight. What acts is drawn by a seed, one or two effects, none, one that no library has (a gust of a tenth of
+a second), or a camera whose clock is off. The trace sees scene and recording only, as one of ``benchmarks.trace``.
 """
 
 from __future__ import annotations
@@ -78,6 +78,11 @@ def cases() -> tuple[Case, ...]:
         Case("e16", "rope", 16, {"control_lag": {"seconds": drawn(16, 0.02, 0.05)}}),
         Case("e17", "rope", 17, {"tether": line}),
         Case("e18", "rope", 18, {"gust": {"m_s2": 8.0, "from_s": 0.7, "to_s": 0.8}}, ("unexplained",)),
+        Case("e19", "cloth", 19, answers=nothing),
+        Case("e20", "cloth", 20, {"linear_drag": {"c": drawn(20, 0.8, 2.0)}}),
+        Case("e21", "cloth", 21, {"gravity_tilt": {"degrees": drawn(21, 2.5, 5.0), "axis": [0.3, 1.0, 0.0]}}),
+        Case("e22", "cloth", 22, {"control_lag": {"seconds": drawn(22, 0.02, 0.05)}}),
+        Case("e23", "cloth", 23, {"gust": {"m_s2": 12.0, "from_s": 0.7, "to_s": 0.8}}, ("unexplained",)),
     )  # fmt: skip
 
 

@@ -1,6 +1,8 @@
-"""Recordings with a secret: a hand's motion starts from rest, and a rope of PyElastica hangs in it and falls."""
+"""Recordings with a secret: hands start from rest; a rope of PyElastica and a cloth of MuJoCo hang in them and fall."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -42,3 +44,25 @@ def test_a_rope_follows_its_hand_and_a_tether_pulls_it() -> None:
     assert (
         along.min() >= 0.0 and along.max() <= rope.length_m and across.max() <= rope.radius_m**2 * (1 + 1e-9)
     )
+
+
+def test_a_cloth_follows_its_hands_and_drag_slows_it() -> None:
+    cloth = replace(OBJECTS["cloth"], cells=(6, 6))
+    recorder = cloth.recorder(1, np.random.default_rng(0))
+    times = np.arange(3) / 30.0
+    free = recorder.tracks(Acting(), 0.0, times)
+    for hand in recorder.hands:
+        held = np.all((free[0] >= hand.box[0]) & (free[0] <= hand.box[1]), axis=1)
+        _, shift = hand.motion.place(0.0, times[-1])
+        assert held.any() and np.allclose(free[-1, held] - free[0, held], shift, atol=1e-6)
+
+    def went(tracks: np.ndarray) -> float:
+        return float(np.linalg.norm(tracks[1] - tracks[0], axis=1).mean())
+
+    assert went(free) > 1e-3
+    assert went(recorder.tracks(Acting(linear_drag_per_s=300.0), 0.0, times)) < 0.5 * went(free)
+    low = np.array([0.0, 0.0, 0.35])
+    tie = Acting(tether_n_m=50.0, anchor=low + [0.0, 0.2, 0.0], attach=low, tether_radius_m=0.05)
+    assert recorder.tracks(tie, 0.0, times)[-1, :, 1].max() > free[-1, :, 1].max() + 1e-3
+    inside = recorder.inside(np.random.default_rng(0))
+    assert np.allclose(np.ptp(inside, axis=0), cloth.size_m, rtol=0.01)
