@@ -29,21 +29,20 @@ from physworld.trace.confirm import Model
 from physworld.trace.describe import describe
 from physworld.trace.experiment import Experiment, propose, rival_of
 from physworld.trace.faults import Faults, without_faults
-from physworld.trace.held_out import HeldOut, Unseen, measure, measure_all
 from physworld.trace.holds import held_otherwise
 from physworld.trace.intervals import calibrated, named, spread_of
 from physworld.trace.meshes import MESH_STIFFNESS, recorded_as
 from physworld.trace.noise import noise_sigma
+from physworld.trace.outcomes import Outcomes
 from physworld.trace.recordings import (
     FITTED,
     HELD_OUT,
     JointSimulations,
-    Recording,
     Recordings,
     side_by_side,
 )
 from physworld.trace.refit import refit
-from physworld.trace.result import Outcome, Step, TraceResult
+from physworld.trace.result import Step, TraceResult
 from physworld.trace.score import orthonormal, project
 from physworld.trace.second_resolution import SecondResolution
 from physworld.trace.selection import Selection, by_chance
@@ -323,14 +322,15 @@ class _Trace:
     ) -> TraceResult:
         config, simulations = self.config, self.simulations
         simulations.stage = "held-out frames"
-        outcomes = self._outcomes(declared, verdict.model, white, sigma)
+        measured = Outcomes(self.recordings, simulations, config)
+        outcomes = measured.of(declared, verdict.model, white, sigma)
         spreads = [
             spread_of(m.fitted, block_of_row, finer.get(m.names, {}), config.bootstraps, config.seed)
             for m in (verdict.model, *verdict.equivalent)
         ]
         claimed = verdict.name not in (NOTHING, UNEXPLAINED)
         unseen = [o for o in outcomes if o.role == HELD_OUT]
-        held_out = self._errors(unseen or [o for o in outcomes if o.role == FITTED], sigma)
+        held_out = measured.together(unseen or [o for o in outcomes if o.role == FITTED], sigma)
         after = side_by_side([o.after for o in outcomes if o.role == FITTED], self.scene.frame_count)
         remainder_m, remainder = describe(self.scene, after, self.split.train, white.sigma)
         return TraceResult(
@@ -354,53 +354,6 @@ class _Trace:
             remainder=remainder,
             simulations=0,
             seconds=0.0,
-            notes=tuple(self.notes),
+            notes=(*self.notes, *measured.notes),
             recordings=tuple(outcomes),
         )
-
-    def _outcomes(self, declared: Model, model: Model, white: Whitener, sigma: float | None) -> list[Outcome]:
-        """Open-loop predictions of every recording before and after, and their errors on frames that were not used."""
-        every = [*self.recordings.fitted, *self.recordings.held_out]
-        before, after = (self._predictions(m, white, every) for m in (declared, model))
-        found = []
-        for recording, was, now in zip(every, before, after, strict=True):
-            noise = recording.scene.noise_sigma_m or sigma
-            errors = measure(
-                recording.scene, recording.split, was, now, noise, self.config.bootstraps, self.config.seed
-            )
-            found.append(
-                Outcome(recording.scene.name, recording.role, recording.split.test, was, now, errors)
-            )
-        return found
-
-    def _errors(self, outcomes: list[Outcome], sigma: float | None) -> HeldOut:
-        """Those of several recordings together."""
-        if len(outcomes) == 1:
-            return outcomes[0].held_out
-        parts = [
-            Unseen(recording.scene, recording.split, outcome.before, outcome.after)
-            for recording, outcome in zip(self._recordings_of(outcomes), outcomes, strict=True)
-        ]
-        return measure_all(parts, sigma, self.config.bootstraps, self.config.seed)
-
-    def _recordings_of(self, outcomes: list[Outcome]) -> tuple[Recording, ...]:
-        return self.recordings.held_out if outcomes[0].role == HELD_OUT else self.recordings.fitted
-
-    def _predictions(self, model: Model, white: Whitener, recordings: list[Recording]) -> list[np.ndarray]:
-        """Open loop over all frames, [(T, N, 3)], with the points' own places from the training frames."""
-        places = white.place_errors(model.fitted.tracks)
-        found = []
-        for recording, tracks in zip(
-            recordings, self.simulations.predictions(model.fitted.twin, places), strict=True
-        ):
-            if tracks is None:
-                self.notes.append(
-                    f"{recording.scene.name}: the run over the frames that were not used cannot be trusted; the last "
-                    "training frame, or without one the first frame, is kept"
-                )
-                known = model.fitted.tracks[: recording.split.train[1], recording.points]
-                if recording.role == HELD_OUT:
-                    known = recording.scene.points[:1]
-                tracks = side_by_side([known], recording.scene.frame_count)
-            found.append(tracks)
-        return found
