@@ -15,6 +15,7 @@ import numpy as np
 from physworld.build import build_twin
 from physworld.geometry.sheet_body import possible_meshes
 from physworld.materials.sheet import SheetLaw
+from physworld.mpm.triangles import Mesh
 from physworld.scene import Scene
 from physworld.simulations import Job
 from physworld.trace.simulations import Simulations
@@ -64,6 +65,12 @@ def recorded_as(scene: Scene, plate: Twin, simulations: Simulations, frames: int
     return [twin for k, twin in found if leading[k] == 0 or k == best]
 
 
+def taken_as(mesh: Mesh) -> str:
+    """What a report says of a sheet that was traced as a mesh."""
+    text = f"{mesh.counts[0]}x{mesh.counts[1]}{'odd' if mesh.odd else ''}"
+    return f"taken as a mesh that another engine recorded, {mesh}; physworld fit --mesh {text} fits it so"
+
+
 def _meshed(mesh: Twin, plate: Twin) -> Twin:
     """A mesh that stretches as the plate does and bends as its thickness says."""
     law = plate.law
@@ -88,11 +95,11 @@ def _stiffer(twin: Twin, shift: float) -> Twin:
 def _errors(scene: Scene, twins: list[Twin], simulations: Simulations, windows: list[int]) -> np.ndarray:
     """Mean squared distances of the sightings from each twin's tracks [m^2], summed over windows; or infinite."""
     found = []
+    seen = scene.visible[: windows[-1]]
     for tracks in simulations.run([Job(twin, windows[-1]) for twin in twins]):
-        squares = None if tracks is None else np.sum((tracks - scene.points[: windows[-1]]) ** 2, axis=2)
-        found.append(
-            np.inf
-            if squares is None
-            else sum(float(np.mean(squares[:end][scene.visible[:end]])) for end in windows)
-        )
+        if tracks is None:
+            found.append(np.inf)
+            continue
+        squares = np.where(seen, np.sum((tracks - scene.points[: windows[-1]]) ** 2, axis=2), 0.0)
+        found.append(sum(float(squares[:end].sum()) / max(int(seen[:end].sum()), 1) for end in windows))
     return np.array(found)

@@ -19,6 +19,7 @@ import numpy as np
 from physworld.calibrate import Journal
 from physworld.calibrate.parameters import BENDING_COUPLING, BENDING_RATIO, TWIST_RATIO, parameters_of
 from physworld.errors import SceneUnsupported
+from physworld.mpm.triangles import TriangleLattice
 from physworld.scene import Scene
 from physworld.simulations import Job, Runner, in_turn, stage_s
 from physworld.trace.beginning import Beginning
@@ -31,7 +32,7 @@ from physworld.trace.experiment import Experiment, propose, rival_of
 from physworld.trace.faults import Faults, without_faults
 from physworld.trace.holds import held_otherwise
 from physworld.trace.intervals import calibrated, named, spread_of
-from physworld.trace.meshes import MESH_STIFFNESS, recorded_as
+from physworld.trace.meshes import MESH_STIFFNESS, recorded_as, taken_as
 from physworld.trace.noise import noise_sigma
 from physworld.trace.outcomes import Outcomes
 from physworld.trace.recordings import (
@@ -195,6 +196,8 @@ class _Trace:
                 break
             level *= config.refinement
             self.twin = refinement_of(declared.fitted.twin, finer)
+        if isinstance(self.twin.lattice, TriangleLattice):
+            self.notes.append(taken_as(self.twin.lattice.mesh))
         if sigma is None:
             self.notes.append("no noise is declared and none can be estimated: no claim")
         if level > 1.0:

@@ -18,7 +18,7 @@ from physworld.errors import BatchRefused, EffectRefused, SceneUnsupported
 from physworld.mpm.triangles import Mesh, TriangleLattice
 from physworld.scene import Scene
 from physworld.trace.candidates import candidates
-from physworld.trace.meshes import recorded_as
+from physworld.trace.meshes import recorded_as, taken_as
 from physworld.trace.recordings import JointSimulations, Recordings
 from physworld.twin import Twin
 
@@ -98,3 +98,21 @@ def test_a_mesh_travels_as_arrays_and_is_refused_where_it_cannot_go(scene: Scene
         build_twin(replace(scene, declared={"body": {"self_contact": True}}), mesh=MESH)
     with pytest.raises(SceneUnsupported, match="is no 16 x 15 cells"):
         build_twin(replace(scene, kind="rope"), mesh=MESH)
+
+
+def test_a_report_says_which_mesh_and_how_to_fit_it() -> None:
+    said = taken_as(Mesh((16, 15), odd=True))
+    assert "16 x 15 cells of two triangles, the first cut the other way" in said and said.endswith(
+        "--mesh 16x15odd fits it so"
+    )
+    assert Mesh.read("16x15odd") == Mesh((16, 15), odd=True) and Mesh.read("8x4") == Mesh((8, 4))
+    for wrong in ("", "16", "16x0", "x", "16x15x2", "16x15 odd", "1e3x4"):
+        with pytest.raises(ValueError, match="16x15"):
+            Mesh.read(wrong)
+
+
+def test_frames_in_which_nothing_is_seen_do_not_count(scene: Scene) -> None:
+    hidden = scene.visible.copy()
+    hidden[1:5] = False
+    plate = plate_of(scene, 0.87 * SHEET.young_pa)
+    assert kinds(replace(scene, visible=hidden), plate) == [MESH, None]
