@@ -22,11 +22,15 @@ _CLOTH_TRACKED, _CLOTH_STEPS = 300, 460
 
 
 class Motion:
-    """Ways of a grip from rest: two sines along every axis, and a turn about the second one."""
+    """Ways of a grip from rest: two sines along every axis, and a turn about the second one.
 
-    def __init__(self, seed: int, stroke_m: float, turn_rad: float) -> None:
+    Args:
+        stroke_m: of the sines, at most; along every axis or along each.
+    """
+
+    def __init__(self, seed: int, stroke_m: float | tuple[float, ...], turn_rad: float) -> None:
         rng = np.random.default_rng(seed)
-        self.size = rng.uniform(0.3, 1.0, (2, 3)) * stroke_m
+        self.size = rng.uniform(0.3, 1.0, (2, 3)) * np.asarray(stroke_m)
         self.pace = rng.uniform(((3.0,), (8.0,)), ((7.0,), (13.0,)), (2, 3))  # rad/s
         self.phase = rng.uniform(0.0, 2 * np.pi, (2, 3))
         self.turn, self.turning = turn_rad * rng.uniform(0.5, 1.0), rng.uniform(3.0, 6.0)
@@ -193,7 +197,7 @@ class Cloth:
         size_m: width, thickness and height.
         cells: across and up.
         young_pa, density_kg_m3: of the material; density is declared.
-        stroke_m: how far hands go.
+        stroke_m: how far hands go along the axes; where they approach each other, it folds and folds as it likes.
         kind: of the scene.
     """
 
@@ -201,7 +205,7 @@ class Cloth:
     cells: tuple[int, int]
     young_pa: float
     density_kg_m3: float
-    stroke_m: float
+    stroke_m: tuple[float, float, float]
     kind: str = "sheet"
 
     @property
@@ -251,5 +255,5 @@ OBJECTS: dict[str, Object | Cord | Cloth] = {
     "slab": Object("sheet", (0.22, 0.015, 0.2), (10, 1, 9), 2.6e5, 350.0,
                    (((0.0, 0.0, 8 / 9), (0.1, 1.0, 1.0)), ((0.9, 0.0, 8 / 9), (1.0, 1.0, 1.0))), 0.03),
     "rope": Cord(0.42, 0.0075, 1e6, 900.0, (0.5, 0.0, -0.86), 0.04, 0.2),
-    "cloth": Cloth((0.25, 0.0045, 0.27), (20, 18), 2e5, 370.0, 0.03),
+    "cloth": Cloth((0.25, 0.0045, 0.27), (20, 18), 2e5, 370.0, (0.004, 0.03, 0.02)),
 }  # fmt: skip
