@@ -26,6 +26,8 @@ _STIFFNESSES = tuple(0.05 * k for k in range(-5, 6))  # logarithms, over the pla
 _NEARER = (-0.03, -0.015, 0.015, 0.03)  # about the best of those
 MESH_STIFFNESS = 0.06
 """How far the logarithm of a mesh's stiffness may lie from what its first frames say: all windows see it to 0.015."""
+MESH_STARTS = tuple(0.01 * k for k in (-4, -3, -2, -1, 1, 2, 3, 4))
+"""From which a mesh's stiffness is searched: wrinkles make valleys of some percent, in which others make up for it."""
 _BEST = 4  # bodies that are looked at more nearly
 
 
@@ -72,13 +74,17 @@ def taken_as(mesh: Mesh) -> str:
 
 
 def _meshed(mesh: Twin, plate: Twin) -> Twin:
-    """A mesh that stretches as the plate does and bends as its thickness says."""
-    law = plate.law
-    assert isinstance(law, SheetLaw)
-    bending = law.membrane_n_m * plate.body.thickness_m**2 / 12.0
+    """A mesh of the plate's modulus that bends as its thickness says, with what else is known beforehand.
+
+    A plate's Poisson's ratio may have made up for its being none.
+    """
+    law, prior = plate.law, mesh.law
+    assert isinstance(law, SheetLaw) and isinstance(prior, SheetLaw)
+    membrane = law.membrane_n_m * (1.0 - law.poissons_ratio**2) / (1.0 - prior.poissons_ratio**2)
+    bending = membrane * plate.body.thickness_m**2 / 12.0
     return replace(
         mesh,
-        law=replace(law, bending_n_m=bending, bending_twist_ratio=1.0, bending_coupling=1.0),
+        law=replace(prior, membrane_n_m=membrane, bending_n_m=bending),
         air_drag_per_s=plate.air_drag_per_s,
         device=plate.device,
     )

@@ -32,7 +32,7 @@ from physworld.trace.experiment import Experiment, propose, rival_of
 from physworld.trace.faults import Faults, without_faults
 from physworld.trace.holds import held_otherwise
 from physworld.trace.intervals import calibrated, named, spread_of
-from physworld.trace.meshes import MESH_STIFFNESS, recorded_as, taken_as
+from physworld.trace.meshes import MESH_STARTS, MESH_STIFFNESS, recorded_as, taken_as
 from physworld.trace.noise import noise_sigma
 from physworld.trace.outcomes import Outcomes
 from physworld.trace.recordings import (
@@ -186,7 +186,10 @@ class _Trace:
                 simulations, self.lead, self.twin, tracks, budget, config.refinement, level
             )
             block_of_row = self.split.block_of(white.frame_of_row)
-            declared = self._declared(white, block_of_row, _OTHER_STIFFNESSES if level == 1.0 else _NEAR)
+            others = _OTHER_STIFFNESSES if level == 1.0 else _NEAR
+            declared = self._declared(
+                white, block_of_row, others if self.twin.lattice.smooth else MESH_STARTS
+            )
             basis = orthonormal(declared.fitted.free_jacobian)
             shifts = [project(basis, white.change(direction)) for direction in directions.values()]
             numerics = {
