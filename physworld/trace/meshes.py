@@ -28,13 +28,15 @@ MESH_STIFFNESS = 0.06
 """How far the logarithm of a mesh's stiffness may lie from what its first frames say: all windows see it to 0.015."""
 MESH_STARTS = tuple(0.01 * k for k in (-4, -3, -2, -1, 1, 2, 3, 4))
 """From which a mesh's stiffness is searched: wrinkles make valleys of some percent, in which others make up for it."""
+_CLEARLY = 0.9  # share of the plate's squared errors
 _BEST = 4  # bodies that are looked at more nearly
 
 
 def recorded_as(scene: Scene, plate: Twin, simulations: Simulations, frames: int) -> list[Twin]:
-    """What a sheet may be, the one that follows the first frames best first: the plate, and the best mesh for it.
+    """What a sheet may be, in the order of belief: a plate, and the best mesh where it follows the first frames better.
 
-    Errors of several windows are added up, so that early frames count more, and all of a body have one stiffness.
+    Errors of several windows are added up, so that early frames count more, and all of a body have one stiffness. A
+    mesh comes first only where it does clearly better.
 
     Args:
         scene: the recording.
@@ -61,10 +63,13 @@ def recorded_as(scene: Scene, plate: Twin, simulations: Simulations, frames: int
         for k in leading
     ]
     late = _errors(scene, [twin for own in near for twin in own], simulations, windows).reshape(len(near), -1)
-    order = [k for k in np.argsort(late.min(axis=1)) if np.isfinite(late[k].min()) or leading[k] == 0]
-    best = next((k for k in order if leading[k] != 0), None)
-    found = [(k, plate if leading[k] == 0 else near[k][int(np.argmin(late[k]))]) for k in order]
-    return [twin for k, twin in found if leading[k] == 0 or k == best]
+    left = late.min(axis=1)
+    own = left[leading.index(0)]
+    best = int(np.argmin(left))
+    if not left[best] < own:
+        return [plate]
+    mesh = near[best][int(np.argmin(late[best]))]
+    return [mesh, plate] if left[best] < _CLEARLY * own else [plate, mesh]
 
 
 def taken_as(mesh: Mesh) -> str:
