@@ -59,7 +59,7 @@ def test_a_cloth_follows_its_hands_and_drag_slows_it() -> None:
     def went(tracks: np.ndarray) -> float:
         return float(np.linalg.norm(tracks[1] - tracks[0], axis=1).mean())
 
-    assert went(free) > 1e-3
+    assert went(free) > 3e-4
     assert went(recorder.tracks(Acting(linear_drag_per_s=3000.0), 0.0, times)) < 0.8 * went(free)
     low = np.array([0.0, 0.0, 0.35])
     tie = Acting(tether_n_m=50.0, anchor=low + np.array([0.0, 0.2, 0.0]), attach=low, tether_radius_m=0.05)

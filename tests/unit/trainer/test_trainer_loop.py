@@ -201,7 +201,7 @@ def test_the_recording_it_was_trained_on_is_as_expected(
 def test_a_recording_with_something_new_opens_a_trace(runtime: Runtime, plain: ModelVersion) -> None:
     scene = tiny_scene(FRAMES)
     drift = np.zeros_like(scene.points)
-    drift[6:, 1:, 0] = 0.06
+    drift[6:, 1:, 0] = 0.2
     other = register(replace(scene, points=scene.points + drift), runtime.database, runtime.stores.artifacts)
     job, found = _assess(runtime, other, trace={"iterations": 2})
     assert found.outcome == "worse_than_expected", found.reason
