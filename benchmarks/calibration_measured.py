@@ -86,11 +86,11 @@ def undeclared(seed: int, shared: Path, resume: Path | None = None) -> Report:
         fitted = fit(scene, config, resume)
         _add(name, scene, truth, config, fitted, figures, rows)
         drive = Drive(*scene.control_track(), scene.times)
-        first = recorded_as(scene, fitted.twin, Simulations(drive), scene.train[1])[0].lattice
-        if isinstance(first, TriangleLattice):
-            meshed = replace(config, mesh=first.mesh)
-            own = f"{name} as {first.mesh}"
-            _add(own, scene, truth, meshed, fit(scene, meshed, resume), figures, rows)
+        for body in recorded_as(scene, fitted.twin, Simulations(drive), scene.train[1]):
+            if isinstance(body.lattice, TriangleLattice):
+                meshed = replace(config, mesh=body.lattice.mesh)
+                own = f"{name} as {body.lattice.mesh}"
+                _add(own, scene, truth, meshed, fit(scene, meshed, resume), figures, rows)
     return Report(
         name="calibration",
         title="Scenes of other engines without a hidden effect",

@@ -17,7 +17,8 @@ from benchmarks.harness import Report, interleave, run_alone
 from physworld.build import build_twin
 from physworld.effects.base import Effect
 from physworld.effects.registry import EFFECTS, effect
-from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian
+from physworld.mpm.problem import HeldNodes, Problem
+from physworld.mpm.total_lagrangian import TotalLagrangian
 from physworld.twin import Twin
 from workers.commands.effects import everyday_scenes
 

@@ -36,29 +36,9 @@ class Mesh(FlexSheet):
         Raises:
             FloatingPointError: the recording blew up.
         """
-        model, rest, mass = self.model(), self.vertices(), self.masses()
         steps = round(self.steps * (times[1] - times[0]) * 30.0)
-        model.opt.timestep = (times[1] - times[0]) / steps
-        model.opt.gravity[:] = acting.gravity_m_s2
-        data = mujoco.MjData(model)
-        near = np.linalg.norm(rest - acting.attach, axis=1) <= acting.tether_radius_m
-        tied = np.where(near, mass, 0.0) / max(float(mass[near].sum()), 1e-30)
-        frames = [rest.copy()]
-        for count in range(1, (len(times) - 1) * steps + 1):
-            data.qfrc_applied[:] = self._pushes(acting, rest, mass, tied, data).ravel()
-            mujoco.mj_step(model, data)
-            now, before = count * model.opt.timestep, (count - 1) * model.opt.timestep
-            for nodes, place in grips:
-                ways = [_moved(rest[nodes], place, time) for time in (now, before)]
-                rows = (3 * nodes[:, None] + np.arange(3)).ravel()
-                data.qpos[rows] = ways[0].ravel()
-                data.qvel[rows] = ((ways[0] - ways[1]) / model.opt.timestep).ravel()
-            if count % steps == 0:
-                frames.append(rest + data.qpos.reshape(-1, 3))
-        found = self.between(np.stack(frames), places)
-        if not np.isfinite(found).all():
-            raise FloatingPointError(f"the recording blew up at steps of {model.opt.timestep:.3g} s")
-        return found
+        frames = stepped(self.model(), self.vertices(), self.masses(), acting, grips, times, steps)
+        return self.between(frames, places)
 
     def between(self, nodes: Floats, places: Floats) -> Floats:
         """Tracks (T, N, 3) of places (N, 2) between 0 and 1 of the sheet, linear in its triangles."""
@@ -73,20 +53,59 @@ class Mesh(FlexSheet):
         taken = weights[np.arange(len(places)), own]
         return np.einsum("pk,tpki->tpi", taken, nodes[:, corners[own]])
 
-    def _pushes(
-        self, acting: Acting, rest: Floats, mass: Floats, tied: Floats, data: mujoco.MjData
-    ) -> Floats:
-        """Forces beside gravity and elasticity, (V, 3) [N]."""
-        v = data.qvel.reshape(-1, 3)
-        pull = acting.linear_drag_per_s + acting.quadratic_drag_per_m * np.linalg.norm(v, axis=1)
-        force = -(mass * pull)[:, None] * v
-        if acting.push is not None:
-            force += mass[:, None] * acting.push(data.time)
-        if acting.tether_n_m:
-            reach = acting.anchor - tied @ (rest + data.qpos.reshape(-1, 3))
-            length = float(np.linalg.norm(reach))
-            force += np.outer(tied, acting.tether_n_m * (length - acting.tether_rest_m) * reach / length)
-        return force
+
+def stepped(
+    model: mujoco.MjModel,
+    rest: Floats,
+    mass: Floats,
+    acting: Acting,
+    grips: list[tuple[NDArray[np.int64], Place]],
+    times: Floats,
+    steps: int,
+) -> Floats:
+    """Vertices (T, V, 3) [m] of a flex at evenly spaced times (T,) [s], in so many steps a frame.
+
+    Args:
+        rest, mass: of the vertices, (V, 3) [m] and (V,) [kg].
+        grips: vertices that are held, and how each hold moves: they are set there after every step.
+
+    Raises:
+        FloatingPointError: the recording blew up.
+    """
+    model.opt.timestep = (times[1] - times[0]) / steps
+    model.opt.gravity[:] = acting.gravity_m_s2
+    data = mujoco.MjData(model)
+    near = np.linalg.norm(rest - acting.attach, axis=1) <= acting.tether_radius_m
+    tied = np.where(near, mass, 0.0) / max(float(mass[near].sum()), 1e-30)
+    frames = [rest.copy()]
+    for count in range(1, (len(times) - 1) * steps + 1):
+        data.qfrc_applied[:] = _pushes(acting, rest, mass, tied, data).ravel()
+        mujoco.mj_step(model, data)
+        now, before = count * model.opt.timestep, (count - 1) * model.opt.timestep
+        for nodes, place in grips:
+            ways = [_moved(rest[nodes], place, time) for time in (now, before)]
+            rows = (3 * nodes[:, None] + np.arange(3)).ravel()
+            data.qpos[rows] = ways[0].ravel()
+            data.qvel[rows] = ((ways[0] - ways[1]) / model.opt.timestep).ravel()
+        if count % steps == 0:
+            frames.append(rest + data.qpos.reshape(-1, 3))
+    if not np.isfinite(frames).all():
+        raise FloatingPointError(f"the recording blew up at steps of {model.opt.timestep:.3g} s")
+    return np.stack(frames)
+
+
+def _pushes(acting: Acting, rest: Floats, mass: Floats, tied: Floats, data: mujoco.MjData) -> Floats:
+    """Forces beside gravity and elasticity, (V, 3) [N]."""
+    v = data.qvel.reshape(-1, 3)
+    pull = acting.linear_drag_per_s + acting.quadratic_drag_per_m * np.linalg.norm(v, axis=1)
+    force = -(mass * pull)[:, None] * v
+    if acting.push is not None:
+        force += mass[:, None] * acting.push(data.time)
+    if acting.tether_n_m:
+        reach = acting.anchor - tied @ (rest + data.qpos.reshape(-1, 3))
+        length = float(np.linalg.norm(reach))
+        force += np.outer(tied, acting.tether_n_m * (length - acting.tether_rest_m) * reach / length)
+    return force
 
 
 def _moved(places: Floats, place: Place, time: float) -> Floats:

@@ -18,7 +18,8 @@ from benchmarks.harness import Report, interleave, run_alone
 from benchmarks.verification_cases import GRAVITY, clamped_lattice, gripped, hold, rest_nodes
 from physworld.materials.laws import Law, RodLaw, SheetLaw, SolidLaw
 from physworld.mpm.lattice import Lattice
-from physworld.mpm.total_lagrangian import Problem, Run, TotalLagrangian
+from physworld.mpm.problem import Problem
+from physworld.mpm.total_lagrangian import Run, TotalLagrangian
 
 SHRINK = (10.0, 30.0, 100.0)
 SECONDS, FRAMES = 0.06, 4

@@ -23,7 +23,8 @@ from physworld.materials.laws import SolidLaw
 from physworld.mpm.adjoint import Adjoint
 from physworld.mpm.gradient_twin import TwinRun, strength
 from physworld.mpm.lattice import box_lattice
-from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian
+from physworld.mpm.problem import HeldNodes, Problem
+from physworld.mpm.total_lagrangian import TotalLagrangian
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Ground, Scene
 from physworld.twin import Twin
 

@@ -12,13 +12,14 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.finite_elements import Acting, Elements, Floats, Place, record
 from physworld.geometry.sheet_body import SHEET_KINDS
-from physworld.scene import Body
+from physworld.scene import Body, Ground
 
 TOP_M = 0.5  # height at which bodies are held
 POISSON, TRACKED = 0.35, 120
 _ROPE_TRACKED, _ROPE_POISSON, _FILLING = 40, 0.4, 3000
 _RAMP_S = 0.15
 _CLOTH_TRACKED, _CLOTH_STEPS = 300, 460
+_BLOCK_TRACKED, _BLOCK_STEPS = 200, 240
 
 
 class Motion:
@@ -247,13 +248,72 @@ class Cloth:
         return Recorder(hands, tracks, inside)
 
 
+@dataclass(frozen=True)
+class Brick:
+    """A block of tetrahedra that stands on a table and is drawn over it, one end of it but for its foot in a hand.
+
+    Attributes:
+        size_m: length, width and height.
+        cells: along the axes.
+        young_pa, density_kg_m3: of the material; density is declared.
+        friction: of the table, declared.
+        stroke_m: how far the hand goes along the axes.
+        kind: of the scene.
+    """
+
+    size_m: tuple[float, float, float]
+    cells: tuple[int, int, int]
+    young_pa: float
+    density_kg_m3: float
+    friction: float
+    stroke_m: tuple[float, float, float]
+    kind: str = "block"
+
+    @property
+    def body(self) -> Body:
+        """What the scene declares."""
+        return Body(size_m=np.array(self.size_m), density_kg_m3=self.density_kg_m3)
+
+    @property
+    def ground(self) -> Ground:
+        """The table."""
+        return Ground(0.0, self.friction)
+
+    def recorder(self, seed: int, rng: np.random.Generator) -> Recorder:
+        """MuJoCo flex; a camera sees places of the surface but for the one that the table hides."""
+        from benchmarks.flex_blocks import Block
+
+        block = Block(
+            self.size_m, self.cells, self.young_pa, POISSON, self.density_kg_m3, self.friction, _BLOCK_STEPS
+        )
+        rest = block.vertices()
+        low, size = rest.min(axis=0), np.array(self.size_m)
+        seen = rng.uniform(0.0, 1.0, (_BLOCK_TRACKED, 3))
+        side = rng.integers(0, 3, _BLOCK_TRACKED)
+        seen[np.arange(_BLOCK_TRACKED), side] = np.where(side == 2, 1.0, rng.integers(0, 2, _BLOCK_TRACKED))
+        motion = Motion(10 * seed, self.stroke_m, 0.0)
+        box = low + np.array([[0.0, 0.0, 2 / self.cells[2]], [1 / self.cells[0], 1.0, 1.0]]) * size
+        held = np.flatnonzero(np.all((rest >= box[0] - 1e-9) & (rest <= box[1] + 1e-9), axis=1))
+
+        def tracks(acting: Acting, late_s: float, at: Floats) -> Floats:
+            return block.record(acting, [(held, partial(motion.place, late_s))], seen, at)
+
+        def inside(r: np.random.Generator) -> Floats:
+            return low + r.uniform(0.0, 1.0, (_FILLING, 3)) * size
+
+        return Recorder([Hand(box, rest[held].mean(axis=0), motion)], tracks, inside)
+
+
 _END = (((0.0, 0.0, 0.0), (1.0 / 12, 1.0, 1.0)),)
-OBJECTS: dict[str, Object | Cord | Cloth] = {
+OBJECTS: dict[str, Object | Cord | Cloth | Brick] = {
     "beam": Object("beam", (0.26, 0.038, 0.036), (12, 2, 2), 7e5, 600.0, _END, 0.03, 0.15),
     "blob": Object("blob", (0.2, 0.1, 0.09), (6, 3, 3), 5e4, 540.0,
                    (((0.0, 1 / 3, 1 / 3), (1 / 6, 2 / 3, 2 / 3)),), 0.02, round=True),
+    "finer_blob": Object("blob", (0.2, 0.1, 0.09), (8, 4, 4), 5e4, 540.0,
+                         (((0.0, 1 / 4, 1 / 4), (1 / 8, 3 / 4, 3 / 4)),), 0.02, round=True),
     "slab": Object("sheet", (0.22, 0.015, 0.2), (10, 1, 9), 2.6e5, 350.0,
                    (((0.0, 0.0, 8 / 9), (0.1, 1.0, 1.0)), ((0.9, 0.0, 8 / 9), (1.0, 1.0, 1.0))), 0.03),
     "rope": Cord(0.42, 0.0075, 1e6, 900.0, (0.5, 0.0, -0.86), 0.04, 0.2),
     "cloth": Cloth((0.25, 0.0045, 0.27), (20, 18), 2e5, 370.0, (0.004, 0.03, 0.02)),
+    "brick": Brick((0.15, 0.09, 0.075), (9, 6, 5), 4e4, 400.0, 0.45, (0.03, 0.02, 0.0)),
 }  # fmt: skip

@@ -2,9 +2,10 @@
 
 Beams, a soft blob held at its end and a slab that hangs by two corners are recorded by finite elements
 (:mod:`benchmarks.finite_elements`), ropes by PyElastica's Cosserat rods (:mod:`benchmarks.elastica_ropes`, of the
-extra ``bench``), cloths by MuJoCo's triangles (:mod:`benchmarks.flex_cloths`); all undamped, with noise and points that
-go out of sight. What acts is drawn by a seed, one or two effects, none, one that no library has (a gust of a tenth of
-a second), or a camera whose clock is off. The trace sees scene and recording only, as one of ``benchmarks.trace``.
+extra ``bench``), cloths by MuJoCo's triangles (:mod:`benchmarks.flex_cloths`), blocks that are drawn over a table by
+its tetrahedra and contacts (:mod:`benchmarks.flex_blocks`); all undamped, with noise and points that go out of sight.
+What acts is drawn by a seed, one or two effects, none, one that no library has (a gust of a tenth of a second), or a
+camera whose clock is off. The trace sees scene and recording only, as one of ``benchmarks.trace``.
 """
 
 from __future__ import annotations
@@ -83,6 +84,12 @@ def cases() -> tuple[Case, ...]:
         Case("e21", "cloth", 21, {"gravity_tilt": {"degrees": drawn(21, 2.5, 5.0), "axis": [0.3, 1.0, 0.0]}}),
         Case("e22", "cloth", 22, {"control_lag": {"seconds": drawn(22, 0.02, 0.05)}}),
         Case("e23", "cloth", 23, {"gust": {"m_s2": 12.0, "from_s": 0.7, "to_s": 0.8}}, ("unexplained",)),
+        Case("e24", "brick", 24, answers=nothing),
+        Case("e25", "brick", 25, {"control_lag": {"seconds": drawn(25, 0.02, 0.05)}}),
+        Case("e26", "finer_blob", 26, answers=nothing),
+        Case("e27", "finer_blob", 27, {"gravity_tilt": {"degrees": drawn(27, 3.0, 6.0), "axis": [0.3, 1.0, 0.0]}}),
+        Case("e28", "finer_blob", 28, {"internal_viscosity": {"eta": drawn(28, 20.0, 40.0)}}),
+        Case("e29", "finer_blob", 29, {"linear_drag": {"c": drawn(29, 1.5, 3.0)}}),
     )  # fmt: skip
 
 
@@ -152,6 +159,7 @@ def recording(case: Case) -> tuple[Scene, dict[str, Any]]:
         controller_velocities=np.concatenate(velocities, axis=1), times=times, rest_volume_points=recorder.inside(rng),
         gravity_m_s2=GRAVITY, noise_sigma_m=SIGMA_M, train=(0, begun), test=(begun, FRAMES),
         initial_state=UNDEFORMED_AT_REST, fps=FPS, grips=tuple(grips), declared={}, body=known.body,
+        ground=getattr(known, "ground", None),
     )  # fmt: skip
     strength = "none" if not case.acts else "clear" if shown >= CLEAR else "weak"
     return scene, {"parameters": case.acts, "strength": strength, "signature_sigmas_test": shown}

@@ -20,8 +20,9 @@ from physworld.materials.laws import Law, RodLaw, SheetLaw
 from physworld.materials.library import SOLID_LAWS
 from physworld.materials.sheet import OrthotropicSheetLaw
 from physworld.mpm.lattice import Lattice, box_lattice
+from physworld.mpm.problem import HeldNodes, Problem
 from physworld.mpm.tangent import InternalTangent
-from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian
+from physworld.mpm.total_lagrangian import TotalLagrangian
 
 SUBSTEPS, PRODUCTS = 80, 8
 DT_SHARE = 0.5  # of the engine's own time step: the cost does not depend on it

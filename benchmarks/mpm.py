@@ -28,7 +28,8 @@ from benchmarks.gradients import cost
 from benchmarks.harness import Report, interleave, run_alone
 from benchmarks.mpm_limit import library, mls_mpm
 from physworld.build import build_twin
-from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian
+from physworld.mpm.problem import HeldNodes, Problem
+from physworld.mpm.total_lagrangian import TotalLagrangian
 from physworld.mpm.updated_lagrangian import UpdatedLagrangian
 from physworld.scene import UNDEFORMED_AT_REST, Body, Scene
 from physworld.twin import Twin

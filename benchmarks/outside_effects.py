@@ -16,8 +16,8 @@ from scipy.interpolate import PchipInterpolator
 
 from physworld.effects.base import Effect, Strength
 from physworld.effects.registry import EFFECTS
+from physworld.mpm.problem import Problem
 from physworld.mpm.terms import BoundTerm
-from physworld.mpm.total_lagrangian import Problem
 
 if TYPE_CHECKING:
     from physworld.twin import Twin

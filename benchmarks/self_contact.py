@@ -19,8 +19,9 @@ from benchmarks.verification_contact import CLOTH, NOBODY, still
 from physworld.materials.laws import RodLaw
 from physworld.mpm.contact import GroundContact
 from physworld.mpm.lattice import box_lattice
+from physworld.mpm.problem import Problem
 from physworld.mpm.self_contact import BoundSelfContact, SelfContact
-from physworld.mpm.total_lagrangian import Problem, TotalLagrangian
+from physworld.mpm.total_lagrangian import TotalLagrangian
 
 ROPE = RodLaw(stretching_n=200.0, bending_n_m2=1e-4, relaxation_s=2e-3, density_kg_m=0.05)
 _WAVE_M_S, _WAVE_LENGTHS = 0.2, 4
@@ -58,7 +59,7 @@ def coil() -> Scenario:
     start = np.stack(
         [radius * np.cos(turn), radius * np.sin(turn), pitch / (2 * np.pi) * turn + 0.02], axis=1
     )
-    ground = GroundContact(lattice, ROPE, 0.0, 0.5, 0.5 * diameter)
+    ground = GroundContact(0.0, 0.5, 0.5 * diameter)
     terms = (ground, SelfContact(diameter, 0.3))
     return _settled(
         Problem(lattice, ROPE, rest_nodes(lattice), GRAVITY, drag_per_s=2.0, terms=terms), start, 0.8
@@ -75,7 +76,7 @@ def fold() -> Scenario:
         np.minimum(along, low) + radius * np.sin(angle) - np.maximum(along - low - np.pi * radius, 0)
     )
     start[:, 2] = radius * (1 - np.cos(angle)) + 0.5 * thickness
-    terms = (GroundContact(lattice, CLOTH, 0.0, 0.5, 0.5 * thickness), SelfContact(thickness, 0.3))
+    terms = (GroundContact(0.0, 0.5, 0.5 * thickness), SelfContact(thickness, 0.3))
     return _settled(
         Problem(lattice, CLOTH, rest_nodes(lattice), GRAVITY, drag_per_s=2.0, terms=terms), start, 0.4
     )

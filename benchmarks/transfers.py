@@ -16,7 +16,8 @@ import warp as wp
 from benchmarks.harness import Report, run_alone
 from physworld.materials.laws import SolidLaw
 from physworld.mpm.lattice import Lattice, box_lattice
-from physworld.mpm.total_lagrangian import Formulation, HeldNodes, Problem, TotalLagrangian
+from physworld.mpm.problem import Formulation, HeldNodes, Problem
+from physworld.mpm.total_lagrangian import TotalLagrangian
 from physworld.mpm.transfer import Apic, Asflip
 from physworld.mpm.updated_lagrangian import UpdatedLagrangian
 

@@ -15,7 +15,8 @@ from scipy.optimize import curve_fit
 
 from physworld.materials.laws import Law
 from physworld.mpm.lattice import Lattice, box_lattice
-from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian
+from physworld.mpm.problem import HeldNodes, Problem
+from physworld.mpm.total_lagrangian import TotalLagrangian
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 CLAMP_REACH = 0.5 / np.sqrt(3.0)

@@ -12,8 +12,9 @@ from physworld.materials.laws import RodLaw, SheetLaw
 from physworld.mpm.contact import GroundContact
 from physworld.mpm.energy import run_with_ledger
 from physworld.mpm.lattice import Lattice, box_lattice, lattice_from_cells
+from physworld.mpm.problem import HeldNodes, Problem
 from physworld.mpm.self_contact import SelfContact
-from physworld.mpm.total_lagrangian import HeldNodes, Problem, Run, TotalLagrangian
+from physworld.mpm.total_lagrangian import Run, TotalLagrangian
 
 G = -float(GRAVITY[2])
 DIAMETER = 0.008
@@ -205,7 +206,7 @@ def layers(cells: float) -> float:
         np.minimum(along, low) + radius * np.sin(angle) - np.maximum(along - low - np.pi * radius, 0)
     )
     nodes[:, 2] = radius * (1 - np.cos(angle)) + 0.5 * thickness
-    terms = (GroundContact(lattice, CLOTH, 0.0, 0.5, 0.5 * thickness), SelfContact(thickness, 0.3))
+    terms = (GroundContact(0.0, 0.5, 0.5 * thickness), SelfContact(thickness, 0.3))
     problem = Problem(lattice, CLOTH, rest_nodes(lattice), GRAVITY, drag_per_s=2.0, terms=terms)
     moved = TotalLagrangian(problem).run(nodes, 0 * nodes, still(NOBODY, nodes, 2), np.array([0.0, 0.6]))
     points = np.stack(np.meshgrid(np.linspace(0.24, 0.295, 12), np.linspace(0.01, 0.09, 9)), axis=-1)

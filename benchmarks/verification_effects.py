@@ -18,7 +18,8 @@ from benchmarks.verification_cases import (
 from physworld.build import build_twin
 from physworld.effects.registry import effect
 from physworld.materials.laws import RodLaw, SolidLaw
-from physworld.mpm.total_lagrangian import Problem, TotalLagrangian
+from physworld.mpm.problem import Problem
+from physworld.mpm.total_lagrangian import TotalLagrangian
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Scene
 from physworld.twin import Twin
 

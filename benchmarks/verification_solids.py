@@ -25,7 +25,8 @@ from physworld.mpm.contact import GroundContact
 from physworld.mpm.energy import run_with_ledger
 from physworld.mpm.forces import InternalForces
 from physworld.mpm.lattice import Lattice, box_lattice
-from physworld.mpm.total_lagrangian import Problem, TotalLagrangian, nodal_mass
+from physworld.mpm.problem import Problem, nodal_mass
+from physworld.mpm.total_lagrangian import TotalLagrangian
 
 LENGTH, DEPTH = 0.3, 0.03
 STIFF = SolidLaw(2e6, 0.0, density_kg_m3=600.0)
@@ -272,7 +273,7 @@ def sliding_block(cells: float) -> float:
     depth = 500.0 * 9.81 * 0.03 / ((law.lame[1] + 2 * law.lame[0]) / lattice.spacing.min())
     start = rest - np.array([0.0, 0.0, depth])  # the ground already carries it
     velocity = np.tile([speed, 0.0, 0.0], (len(rest), 1))
-    ground = GroundContact(lattice, law, 0.0, friction)
+    ground = GroundContact(0.0, friction)
     times = np.linspace(0.0, 0.6, 13)
     nodes = run(lattice, law, times, nowhere(), start=start, velocity=velocity, terms=(ground,))
     middle = path(lattice, nodes, (0.06, 0.06, 0.015))[:, 0]

@@ -16,7 +16,7 @@ from benchmarks.verification_cases import Case
 from physworld.materials.laws import RodLaw
 from physworld.mpm.forces import InternalForces
 from physworld.mpm.lattice import Lattice, box_lattice
-from physworld.mpm.total_lagrangian import Problem
+from physworld.mpm.problem import Problem
 from physworld.mpm.twist import BoundTwist, Twist, span_between
 
 LENGTH = 0.4

@@ -21,7 +21,7 @@ from physworld.materials.laws import SolidLaw
 from physworld.mpm.contact import GroundContact
 from physworld.mpm.lattice import box_lattice
 from physworld.mpm.particle_energy import run_particles_with_ledger
-from physworld.mpm.total_lagrangian import Problem
+from physworld.mpm.problem import Problem
 from physworld.mpm.transfer import Apic, Asflip, Transfer
 from physworld.mpm.updated_lagrangian import UpdatedLagrangian
 
@@ -67,7 +67,7 @@ def sliding_block(cells: float) -> float:
     friction, speed = 0.4, 0.8
     rest = rest_nodes(lattice)
     velocity = np.tile([speed, 0.0, 0.0], (len(rest), 1))
-    ground = GroundContact(lattice, law, 0.0, friction)
+    ground = GroundContact(0.0, friction)
     times = np.linspace(0.0, 0.4, 9)
     engine = UpdatedLagrangian(Problem(lattice, law, rest, GRAVITY, terms=(ground,)))
     x = engine.run_particles(rest, velocity, hold(nowhere(), rest, len(times)), times)

@@ -16,9 +16,9 @@ from physworld.errors import SceneUnsupported
 from physworld.geometry.body import ReferenceBody
 from physworld.geometry.rigid import rigid_motion
 from physworld.materials.rod import RodLaw
+from physworld.mpm.problem import HeldNodes
 from physworld.mpm.soft_grips import AS_HELD, gripped_points, holds_a_part, touched_nodes
 from physworld.mpm.terms import Term
-from physworld.mpm.total_lagrangian import HeldNodes
 from physworld.mpm.twist import Twist, span_between
 from physworld.scene import Grip
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from physworld.mpm.total_lagrangian import HeldNodes, Problem
+from physworld.mpm.problem import HeldNodes, Problem
 
 _MERGE_S = 1e-6  # control and frame times closer than this are one
 

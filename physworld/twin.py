@@ -23,7 +23,7 @@ from physworld.effects.base import Effect
 from physworld.effects.registry import in_order
 from physworld.errors import EffectRefused, SceneUnsupported
 from physworld.geometry.body import ReferenceBody
-from physworld.geometry.rigid import least_rotation
+from physworld.geometry.tracks import applied, material_tracks
 from physworld.grips import held_paths, soft_regions, twist_between_grips, with_touched_nodes
 from physworld.integration import Integration, solver_knots
 from physworld.materials.laws import Law
@@ -32,10 +32,11 @@ from physworld.mpm.choose import FormulationName
 from physworld.mpm.contact import GroundContact, ground, touching
 from physworld.mpm.following import follow
 from physworld.mpm.lattice import Lattice
+from physworld.mpm.problem import Problem
 from physworld.mpm.self_contact import SelfContact
 from physworld.mpm.soft_grips import soften
 from physworld.mpm.terms import Term
-from physworld.mpm.total_lagrangian import Problem, TotalLagrangian, run_again_if_blown_up
+from physworld.mpm.total_lagrangian import TotalLagrangian, run_again_if_blown_up
 from physworld.mpm.transfer import TRANSFERS, Apic
 from physworld.mpm.updated_lagrangian import UpdatedLagrangian
 from physworld.properties import together
@@ -305,7 +306,7 @@ class Twin:
         """Particles (T, P, 3) of the carriers' trajectories (T, n, 3)."""
         if self.formulation == "updated_lagrangian":
             return nodes
-        return _apply(self._particle_rows, nodes)
+        return applied(self._particle_rows, nodes)
 
     def track_nodes(self, nodes: np.ndarray) -> np.ndarray:
         """Tracked points (T, N, 3) of the carriers' trajectories (T, n, 3), from the first frame on."""
@@ -313,17 +314,7 @@ class Twin:
         if self.formulation == "updated_lagrangian":
             material = lattice.particle_measures > 0
             return follow(lattice.interpolation(body.points) @ body.start, nodes[:, material])
-        tracks = _apply(lattice.interpolation(body.points), nodes)
-        if lattice.dim == 2 and np.any(body.offsets):
-            first = _apply(lattice.interpolation(body.points, (1, 0)), nodes)
-            second = _apply(lattice.interpolation(body.points, (0, 1)), nodes)
-            normal = np.cross(first, second)
-            tracks = tracks + body.offsets * normal / np.linalg.norm(normal, axis=-1, keepdims=True)
-        elif lattice.dim == 1 and np.any(body.offsets):
-            slope = lattice.interpolation(body.points, (1,))
-            turn = least_rotation((slope @ body.start)[None], _apply(slope, nodes))
-            tracks = tracks + np.einsum("tnij,nj->tni", turn, body.offsets)
-        return tracks
+        return material_tracks(body, nodes)
 
     def observe(self, nodes: np.ndarray, times: np.ndarray) -> np.ndarray:
         """Tracked points (T, N, 3) as the camera reports them: :meth:`track_nodes` and the measurement's effects.
@@ -374,7 +365,7 @@ class Twin:
             offsets = touching(
                 self.lattice, self.body.start, plane, self.release_s, self.body.half_thickness_m
             )
-        return (GroundContact(self.lattice, self.law, self.ground_height_m, self.ground_friction, offsets),)
+        return (GroundContact(self.ground_height_m, self.ground_friction, offsets),)
 
     def _touching_itself(self, held: np.ndarray) -> tuple[Term, ...]:
         """Contact of the body with itself, but for what the grips hold."""
@@ -403,10 +394,3 @@ class Twin:
                 )
             )
         return terms
-
-
-def _apply(matrix: Any, nodes: np.ndarray) -> np.ndarray:
-    """Sparse (M, n) times trajectories (T, n, 3): (T, M, 3)."""
-    frames, n, _ = nodes.shape
-    flat = matrix @ nodes.transpose(1, 0, 2).reshape(n, -1)
-    return np.asarray(flat).reshape(matrix.shape[0], frames, 3).transpose(1, 0, 2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from datetime import datetime
+from math import prod
 from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
@@ -14,6 +15,7 @@ ElasticLaw = Literal[
     "transversely_isotropic", "isotropic_sheet", "orthotropic_sheet", "rod",
 ]  # fmt: skip
 FlowLaw = Literal["identity", "von_mises", "drucker_prager", "st_venant_kirchhoff"]
+MOST_PARTICLES = 200_000
 
 
 class FitConfig(Request):
@@ -25,22 +27,32 @@ class FitConfig(Request):
     ``formulation``: which form integrates the body; "auto" takes the one that its laws and its scene need.
     ``transfer``: how the updated Lagrangian form's particles and grid exchange velocities; "asflip" damps less.
     ``mesh``: of a sheet that another engine recorded as a mesh of triangles, its cells along both sides, such as
-    "16x15"; "16x15odd" has the diagonals the other way round.
+    "16x15"; "16x15odd" has the diagonals the other way round. Four particles a cell, 200 000 at most. "auto" fits a
+    plate, asks the first frames for a mesh, and takes what follows the training frames better.
     ``stages``: "global+local" then fits a field of stiffness, and of the ground's friction where the data know it, over
     the body; it is kept only if training frames that its search did not see get better.
     ``numerics``: measure the engine's own damping on the scene, and the numbers with cells of no size.
     """
 
-    particle_budget: int = Field(default=2000, ge=50, le=200_000)
+    particle_budget: int = Field(default=2000, ge=50, le=MOST_PARTICLES)
     max_simulations: int = Field(default=400, ge=1, le=5000)
     damping: Literal["auto", "none"] = "auto"
     law: ElasticLaw | None = None
     plasticity: FlowLaw | None = None
     formulation: Literal["auto", "total_lagrangian", "updated_lagrangian"] = "auto"
     transfer: Literal["apic", "asflip"] = "apic"
-    mesh: str | None = Field(default=None, pattern=r"^[1-9]\d{0,2}x[1-9]\d{0,2}(odd)?$")
+    mesh: str | None = Field(default=None, pattern=r"^(auto|[1-9]\d{0,2}x[1-9]\d{0,2}(odd)?)$")
     stages: Literal["global", "global+local"] = "global"
     numerics: bool = True
+
+    @model_validator(mode="after")
+    def _small_enough(self) -> Self:
+        if self.mesh not in (None, "auto"):
+            assert self.mesh is not None
+            particles = 4 * prod(int(count) for count in self.mesh.removesuffix("odd").split("x"))
+            if particles > MOST_PARTICLES:
+                raise ValueError(f"mesh {self.mesh} has {particles} particles; {MOST_PARTICLES} are the most")
+        return self
 
     @model_validator(mode="after")
     def _differentiable(self) -> Self:

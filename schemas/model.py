@@ -47,8 +47,8 @@ class TrainingCreate(Request):
     name: str = Field(pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$")
     dataset_id: str
     config: TrainingConfig = Field(default_factory=TrainingConfig)
-    description: str = ""
-    tags: list[str] = Field(default_factory=list)
+    description: str = Field(default="", max_length=10_000)
+    tags: list[Tag] = Field(default_factory=list, max_length=50)
 
 
 class ModelVersion(Resource):

@@ -43,13 +43,20 @@ class ShapeGoal(Request):
 class PlanLimits(Request):
     """Limits of every grip; what is not given is the recording's (``physworld.demonstrate.limits``).
 
-    ``workspace_min_m``, ``workspace_max_m``: box of a grip's displacement from where the plan starts.
+    ``workspace_min_m``, ``workspace_max_m``: box of a grip's displacement from where the plan starts, which it holds.
     """
 
     speed_m_s: float | None = Field(default=None, gt=0, le=10)
     acceleration_m_s2: float | None = Field(default=None, gt=0, le=200)
     workspace_min_m: Place | None = None
     workspace_max_m: Place | None = None
+
+    @model_validator(mode="after")
+    def _holds_the_start(self) -> PlanLimits:
+        low, high = self.workspace_min_m or (0.0, 0.0, 0.0), self.workspace_max_m or (0.0, 0.0, 0.0)
+        if max(low) > 0.0 or min(high) < 0.0:
+            raise ValueError(f"the workspace {list(low)} to {list(high)} leaves out the start, 0")
+        return self
 
 
 class PlanConfig(Request):

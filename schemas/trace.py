@@ -36,8 +36,8 @@ TRACE_PARTICLES = 1000
 """Coarser than a fit's: a trace runs a thousand simulations, and asks finer cells in the end."""
 
 NO_OTHER_PHYSICS = (
-    "a trace calibrates the usual elastic law, the same all over the body: fit.law, fit.plasticity, fit.formulation "
-    "and fit.stages must be left out"
+    "a trace calibrates the usual elastic law, the same all over the body, and finds by itself which mesh recorded a "
+    "sheet: fit.law, fit.plasticity, fit.formulation, fit.mesh and fit.stages must be left out"
 )
 
 
@@ -100,7 +100,8 @@ class Trace(Resource):
 
     ``held_out`` are errors on frames that nothing before the report has seen, of the recordings that are held out if
     there are any; ``recordings`` has those of each. ``twin.npz`` is among the artifacts where an effect is
-    added: one that is ``named``, or the best of an ``equivalent_set`` unless that is a fault of the measurement.
+    added: one that is ``named``, or the best of an ``equivalent_set`` unless that is a fault of the measurement; and
+    where nothing has to be explained on the mesh of triangles that a sheet was recorded as: that mesh.
     """
 
     model_config = ConfigDict(extra="allow")

@@ -60,8 +60,8 @@ class ArtifactStore:
         end = size if end is None else min(end, size)
         if not 0 <= start <= end:
             raise ValueError(f"range {start} to {end} does not lie in {size} bytes")
-        if start == end:
-            return iter(())
+        if start == end:  # of an empty file too, which may be one that was cut short
+            return self._pieces(iter(()), sha256, whole=size == 0)
         with reading("artifact", sha256, self._settings):
             found = obstore.get(self._store, _key(sha256), options={"range": (start, end)})
             stream = found.stream(min_chunk_size=CHUNK_BYTES)
@@ -92,7 +92,9 @@ class ArtifactStore:
         except NotFound:
             return False
 
-    def _pieces(self, stream: obstore.BytesStream, sha256: str, *, whole: bool) -> Iterator[bytes]:
+    def _pieces(
+        self, stream: obstore.BytesStream | Iterator[bytes], sha256: str, *, whole: bool
+    ) -> Iterator[bytes]:
         digest = hashlib.sha256()
         with reading("artifact", sha256, self._settings):
             for piece in stream:

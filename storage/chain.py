@@ -26,7 +26,7 @@ from schemas.trace import TRACE_PARTICLES
 from storage.opening import open_dataset, open_trace, open_training
 from storage.registry import find_baseline
 from storage.tables import JobRow, TraceRow
-from storage.traces import adds_effects, trace_row
+from storage.traces import leaves_twin, trace_row
 
 _SHARES = {"fit": 0.35, "trace": 0.6, "dataset": 0.35, "training": 0.30}  # of a pipeline's time, about
 
@@ -82,7 +82,7 @@ def share_done(parent: JobRow, children: Sequence[JobRow]) -> float:
 def _wants_comparison(
     session: Session, request: PipelineCreate, trace: TraceRow, outputs: dict[str, str]
 ) -> bool:
-    if not request.compare or not adds_effects(trace):
+    if not request.compare or not leaves_twin(trace):
         return False
     dataset = request.dataset.model_dump(mode="json")
     name = request.model_name or ""
@@ -101,7 +101,7 @@ def _is_comparison(session: Session, children: Sequence[JobRow]) -> bool:
         return False
     trace = trace_row(session, str(children[kinds.index("trace")].outputs[0]["id"]))
     last_dataset = next(job for job in reversed(children) if job.kind == "dataset")
-    return adds_effects(trace) and all(item["kind"] != "trace" for item in last_dataset.inputs)
+    return leaves_twin(trace) and all(item["kind"] != "trace" for item in last_dataset.inputs)
 
 
 def _fraction(job: JobRow) -> float:

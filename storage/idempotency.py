@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any, cast
 
-from sqlalchemy import CursorResult, delete
+from sqlalchemy import CursorResult, and_, delete, func
 from sqlalchemy.orm import Session
 
 from storage.errors import Conflict, IdempotencyMismatch, NotFound
@@ -71,9 +71,12 @@ def record(session: Session, owner: str, key: str, answer: Answer) -> None:
     session.flush()
 
 
-def forget(session: Session, before: datetime) -> int:
-    """Drop keys older than ``before``; how many."""
-    result = session.execute(delete(IdempotencyRow).where(IdempotencyRow.created_at < before))
+def forget(session: Session, before: datetime, larger_than: int = -1) -> int:
+    """Drop keys older than ``before`` whose answer has more than ``larger_than`` bytes; how many."""
+    old = IdempotencyRow.created_at < before
+    if larger_than >= 0:
+        old = and_(old, func.length(IdempotencyRow.body) > larger_than)
+    result = session.execute(delete(IdempotencyRow).where(old))
     return cast("CursorResult[Any]", result).rowcount
 
 

@@ -27,7 +27,7 @@ from storage.tables import (
     insert_if_absent,
     utc_now,
 )
-from storage.traces import adds_effects, fit_digest
+from storage.traces import fit_digest, leaves_twin
 
 LATEST = "latest"
 MOST_DIGITS = 9  # of a version's number: the column holds no more
@@ -189,7 +189,7 @@ def baseline_of(
     See ``find_baseline``; a dataset whose twin carries no effects has none.
     """
     trace = session.get(TraceRow, dataset.trace_id) if dataset.trace_id else None
-    if trace is None or not adds_effects(trace):
+    if trace is None or not leaves_twin(trace):
         return None
     return find_baseline(session, name, dataset.fit_id, dataset.config, config)
 

@@ -89,17 +89,25 @@ def list_signing_keys(session: Session, *, limit: int = 50, cursor: str | None =
 
 
 def _make(path: Path) -> None:
-    """Write a new key, readable by its owner only; of two that start at once the first one's stays."""
-    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    # A name of its own for every thread: the link shares the file with it. mkstemp's mode is 0600.
-    descriptor, part = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    with os.fdopen(descriptor, "wb") as file:
-        file.write(base64.b64encode(os.urandom(KEY_BYTES)) + b"\n")
-        file.flush()
-        os.fsync(file.fileno())
-    with suppress(FileExistsError):
-        os.link(part, path)
-    Path(part).unlink()
+    """Write a new key, readable by its owner only; of two that start at once the first one's stays.
+
+    Raises ConfigurationError where the folder takes no file or no link; no key is then left in it.
+    """
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        # A name of its own for every thread: the link shares the file with it. mkstemp's mode is 0600.
+        descriptor, part = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        try:
+            with os.fdopen(descriptor, "wb") as file:
+                file.write(base64.b64encode(os.urandom(KEY_BYTES)) + b"\n")
+                file.flush()
+                os.fsync(file.fileno())
+            with suppress(FileExistsError):
+                os.link(part, path)
+        finally:
+            Path(part).unlink()
+    except OSError as error:
+        raise ConfigurationError([f"the signing key {path} cannot be made: {error}"]) from error
 
 
 def _read(path: Path) -> str:

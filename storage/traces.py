@@ -82,8 +82,12 @@ def trace_row(session: Session, trace_id: str) -> TraceRow:
     return row
 
 
-def adds_effects(trace: Trace | TraceRow) -> bool:
-    """Whether the trace left a twin that carries an effect: one that it named, or the best of an equivalent set."""
+def leaves_twin(trace: Trace | TraceRow) -> bool:
+    """Whether the trace left a better twin than the fit's.
+
+    One that carries an effect (named, or the best of an equivalent set), or, where nothing has to be explained on the
+    mesh of triangles that a sheet was recorded as, that mesh.
+    """
     names = [item["name"] if isinstance(item, dict) else item.name for item in trace.artifacts]
     return trace.state == "ready" and TWIN in names
 

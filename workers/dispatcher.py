@@ -43,8 +43,10 @@ logger = logging.getLogger(__name__)
 
 TICK_S = 0.1
 SWEEP_S = 1.0
-FORGET_EVERY_S = 3600.0
+FORGET_EVERY_S = 300.0
 IDEMPOTENCY_KEPT = timedelta(hours=24)
+LARGE_ANSWER_BYTES, LARGE_ANSWERS_KEPT = 64 * 1024, timedelta(minutes=15)
+"""Rollouts answer with up to some MiB, many times a minute: kept for as long as a client tries again."""
 LOST_AFTER_S = 2.0
 PAUSE_AFTER_ERROR_S = 1.0
 MAX_DEPTH = 64
@@ -126,10 +128,13 @@ class Dispatcher:
             logger.warning("took back %d shards: %s", len(taken), ", ".join(taken))
 
     def _forget_old_keys(self) -> None:
+        now = datetime.now(UTC)
         with self._database.session() as session:
-            forgotten = idempotency.forget(session, datetime.now(UTC) - IDEMPOTENCY_KEPT)
-        if forgotten:
-            logger.info("forgot %d idempotency keys older than %s", forgotten, IDEMPOTENCY_KEPT)
+            old = idempotency.forget(session, now - IDEMPOTENCY_KEPT)
+            large = idempotency.forget(session, now - LARGE_ANSWERS_KEPT, LARGE_ANSWER_BYTES)
+        if old or large:
+            logger.info("forgot %d idempotency keys older than %s", old, IDEMPOTENCY_KEPT)
+            logger.info("forgot %d with large answers older than %s", large, LARGE_ANSWERS_KEPT)
 
     def _look_at_queues(self) -> None:
         channel = self._connection.default_channel

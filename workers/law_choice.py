@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 from physworld.calibrate import CalibrationConfig, Journal
 from physworld.calibrate.global_stage import prior_twin
@@ -33,7 +33,7 @@ def chosen_laws(
         scene: the recording; a choice sees its training frames.
         config: the calibration's settings; its flow law, if it has one, is the caller's and stays.
         progress, cancelled: see :func:`physworld.calibrate.calibrate`.
-        journal: keeps the choice for a later attempt.
+        journal: keeps the steps of a choice for a later attempt.
         runner: where simulations of a choice run that do not depend on each other.
 
     Raises:
@@ -41,13 +41,9 @@ def chosen_laws(
         CalibrationError, Cancelled, SceneUnsupported: see :func:`physworld.calibrate.calibrate`.
     """
     if asked == AUTO:
-        found = (journal or Journal()).step(
-            "law",
-            lambda: asdict(
-                choose_law(scene, config, law_endpoint(), motion_pictures, progress, cancelled, runner)
-            ),
+        choice = choose_law(
+            scene, config, law_endpoint(), motion_pictures, progress, cancelled, runner, journal or Journal()
         )
-        choice = LawChoice(**found)
         plastic = None if choice.plastic == PURELY_ELASTIC else choice.plastic
         return replace(config, law=choice.elastic, plasticity=config.plasticity or plastic), choice
     config = replace(config, law=asked)

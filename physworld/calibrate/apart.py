@@ -8,7 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from physworld.calibrate.least_squares import most_runs
-from physworld.calibrate.search import Descent, Optimum, Place, Search, in_step, measured_together
+from physworld.calibrate.optimum import Descent, Optimum, Place
+from physworld.calibrate.search import Search, in_step, measured_together
 from physworld.simulations import in_turn
 
 

@@ -13,8 +13,9 @@ from itertools import product
 
 import numpy as np
 
+from physworld.calibrate.optimum import Descent, Optimum, cost_of
 from physworld.calibrate.parameters import Parameter
-from physworld.calibrate.search import Descent, Optimum, Search, cost_of
+from physworld.calibrate.search import Search
 
 _RATIOS = (1.0, 4.0)  # of the fibres' modulus to the matrix's, where a descent may start
 _TRIED, _TURNED, _FOLLOWED = (

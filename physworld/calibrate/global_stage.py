@@ -41,8 +41,9 @@ from physworld.calibrate.journal import Journal
 from physworld.calibrate.least_squares import Solution
 from physworld.calibrate.local_stage import LocalResult
 from physworld.calibrate.losses import training_losses
+from physworld.calibrate.optimum import Descent, Optimum
 from physworld.calibrate.parameters import Parameter, flow_law, parameters_of
-from physworld.calibrate.search import Descent, Optimum, Progress, Search
+from physworld.calibrate.search import Progress, Search
 from physworld.materials.library import with_law
 from physworld.mpm.triangles import Mesh
 from physworld.scene import Scene

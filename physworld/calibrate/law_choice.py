@@ -29,8 +29,10 @@ from physworld.calibrate.global_stage import (
     searched_parameters,
     select,
 )
+from physworld.calibrate.journal import Journal
+from physworld.calibrate.optimum import Descent, Optimum
 from physworld.calibrate.parameters import WEAVE, Parameter
-from physworld.calibrate.search import Descent, Optimum, Progress, Search
+from physworld.calibrate.search import Progress, Search
 from physworld.errors import LawAnswerRefused, LawAnswerUnavailable, SceneUnsupported
 from physworld.scene import Scene
 from physworld.simulations import Runner, in_turn
@@ -130,6 +132,7 @@ def choose_law(
     progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
     runner: Runner = in_turn,
+    journal: Journal | None = None,
 ) -> LawChoice:
     """Choose by the model where one is given and answers, else by cross-validation.
 
@@ -140,23 +143,38 @@ def choose_law(
         progress: called with (runs done, runs at most, message).
         cancelled: polled every frame of every run.
         runner: where simulations of the cross-validation run that do not depend on each other.
+        journal: keeps what a model answered and the finished steps of the fits; a choice that was cut off goes on.
 
     Raises:
         CalibrationError, Cancelled, SceneUnsupported: see :func:`physworld.calibrate.calibrate`.
     """
+    journal = journal or Journal()
     answered: dict[str, Any] = {}
     if ask is not None and images is not None:
         dimension = prior_twin(scene, config).lattice.dim
+        said = journal.step("asked", lambda: _asked(ask, images(_training_only(scene))))
         try:
-            text = ask(PROMPT, images(_training_only(scene)))
+            if said["unavailable"] is not None:
+                raise LawAnswerUnavailable(said["unavailable"])
+            text = said["text"]
             answered = {"asked": ask.name, "answer": text[:_LONGEST_REASON]}
             elastic, plastic, reason = parse_answer(text, dimension)
             _refuse_unbuildable(scene, config, elastic, plastic)
             return LawChoice(elastic, plastic, f"model {ask.name}", reason, answered)
         except (LawAnswerRefused, LawAnswerUnavailable) as error:
             answered |= {"asked": ask.name, "not_used_because": str(error)}
-    choice = cross_validate(scene, config, progress=progress, cancelled=cancelled, runner=runner)
+    choice = cross_validate(
+        scene, config, progress=progress, cancelled=cancelled, runner=runner, journal=journal
+    )
     return replace(choice, figures={**choice.figures, **answered})
+
+
+def _asked(ask: Ask, images: list[bytes]) -> dict[str, str | None]:
+    """What a model said, or why it said nothing."""
+    try:
+        return {"text": ask(PROMPT, images), "unavailable": None}
+    except LawAnswerUnavailable as error:
+        return {"text": None, "unavailable": str(error)}
 
 
 def _refuse_unbuildable(scene: Scene, config: CalibrationConfig, elastic: str, plastic: str) -> None:
@@ -175,9 +193,10 @@ def cross_validate(
     progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
     runner: Runner = in_turn,
+    journal: Journal | None = None,
 ) -> LawChoice:
     """Choose among laws by their error on blocks of training frames that their fit did not see."""
-    config = replace(config, law=None)
+    config, journal = replace(config, law=None), journal or Journal()
     twin = prior_twin(scene, config)
     names = candidates or SIMPLEST_FIRST[twin.lattice.dim]
     if len(names) == 1:
@@ -191,17 +210,25 @@ def cross_validate(
             f"too few training frames show anything to hold some of them out: {names[0]} is the usual law"
         )
         return LawChoice(names[0], reason=reason)
-    search = Search(scene, twin, config.max_simulations, progress, cancelled, runner=runner)
+    search = Search(scene, twin, config.max_simulations, progress, cancelled, journal, runner)
     kept, optimum, _ = select(search, searched_parameters(scene, search.twin, config))
     fits, needless = {}, {}
     for name in names:
         named = replace(config, law=name)
-        fitted, at, without = _freed(scene, named, kept, optimum, progress, cancelled, runner)
+        own = Search(
+            scene, prior_twin(scene, named), config.max_simulations, progress, cancelled, journal, runner
+        )
+        fitted, at, without = _freed(own, named, kept, optimum)
         if without and len(fitted) == len(kept):
             needless[name] = without
         else:
             fits[name] = (named, fitted, at)
-    scores = _block_errors(scene, blocks, fits, progress, cancelled, runner)
+    errors_of = journal.step(
+        "blocks of a choice", lambda: _block_errors(scene, blocks, fits, progress, cancelled, runner)
+    )
+    scores = {
+        name: [float("inf") if one is None else one for one in errors] for name, errors in errors_of.items()
+    }
     means = {name: float(np.mean(errors)) for name, errors in scores.items()}
     best = min(means, key=lambda name: means[name])
     figures = {
@@ -228,18 +255,10 @@ def cross_validate(
 
 
 def _freed(
-    scene: Scene,
-    config: CalibrationConfig,
-    kept: list[Parameter],
-    optimum: Optimum,
-    progress: Progress | None,
-    cancelled: Callable[[], bool] | None,
-    runner: Runner,
+    search: Search, config: CalibrationConfig, kept: list[Parameter], optimum: Optimum
 ) -> tuple[list[Parameter], Optimum, dict[str, float]]:
     """What a law has more than the usual one, freed on all training frames, and what it has that removes too little."""
-    twin = prior_twin(scene, config)
-    search = Search(scene, twin, config.max_simulations, progress, cancelled, runner=runner)
-    parameters = searched_parameters(scene, search.twin, config)
+    parameters = searched_parameters(search.scene, search.twin, config)
     fibres = [p for p in parameters if p.stage == "fibres"]
     with_fibres, at, without = free_fibres(search, kept, optimum, fibres)
     weave = [p for p in parameters if p.name in WEAVE]

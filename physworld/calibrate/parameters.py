@@ -215,10 +215,12 @@ def _weave(twin: Twin) -> list[Parameter]:
     """What the weft and the shear of a woven sheet have over its warp; an isotropic sheet's are the prior."""
     if not isinstance(twin.law, OrthotropicSheetLaw):
         return []
+    one_bending = not twin.lattice.smooth  # hinges have no weft
     return [
         Parameter(name, "1", *_WEAVE_BOUNDS[name], (getattr(twin.law, name),), _set(name), "optional", 0.05,
                   prior=getattr(twin.law, name))
         for name in WEAVE
+        if not (one_bending and name.startswith("bending"))
     ]  # fmt: skip
 
 

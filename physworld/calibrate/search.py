@@ -10,7 +10,7 @@ runner together: in this process one after the other, elsewhere at once. What is
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
@@ -20,6 +20,7 @@ from physworld.calibrate.journal import Journal
 from physworld.calibrate.least_squares import Descent as LeastSquares
 from physworld.calibrate.least_squares import Solution, descent, differences, most_runs, probes_of
 from physworld.calibrate.material_frames import material_frames
+from physworld.calibrate.optimum import Descended, Descent, Optimum, Place, cost_of
 from physworld.calibrate.parameters import Parameter
 from physworld.errors import CalibrationError, Cancelled, SimulationError
 from physworld.scene import UNDEFORMED_AT_REST, Scene
@@ -27,40 +28,11 @@ from physworld.simulations import Drive, Job, Runner, in_turn
 from physworld.twin import Twin
 
 Progress = Callable[[int, int, str], None]
-Place = tuple[list[Parameter], np.ndarray, int | None]
-"""Parameters, their values in the scale of the search, and the end of the frames (None: all training frames)."""
 
 _OFFSET_CLIP_SIGMAS = 3.0
 _FIRST_WINDOW = 0.33  # share of the training path that the first search sees
 _FIRST_WINDOW_FRAMES = 10
 _DISTINCT = 0.05  # starts that end closer than this in the logarithm are one
-
-
-@dataclass(frozen=True)
-class Optimum:
-    """Where a descent ended: theta (p,) in the scale of the search, and the mean squared residual there [m^2]."""
-
-    theta: np.ndarray
-    cost: float
-
-
-@dataclass(frozen=True)
-class Descent:
-    """A descent that is asked for: what it searches, from where, in how many iterations, over frames up to ``end``."""
-
-    parameters: list[Parameter]
-    theta: np.ndarray
-    iterations: int
-    end: int | None = None
-
-
-@dataclass(frozen=True)
-class _Descended:
-    """A descent that was done beside others: what it found, its runs, and the losses [m] over all training frames."""
-
-    optimum: Optimum
-    runs: int
-    losses: list[float]
 
 
 class Search:
@@ -184,7 +156,7 @@ class Search:
         """
         worst = sum(most_runs(len(one.parameters), one.iterations) for one in asked)
         together = len(asked) > 1 and self.runner is not in_turn and self.simulations + worst <= self.limit
-        made: dict[int, _Descended] = {}
+        made: dict[int, Descended] = {}
         found = []
         for k, one in enumerate(asked):
 
@@ -215,7 +187,7 @@ class Search:
             except StopIteration as ended:
                 return Optimum(ended.value.theta, ended.value.cost)
 
-    def _side_by_side(self, several: list[Descent]) -> list[_Descended]:
+    def _side_by_side(self, several: list[Descent]) -> list[Descended]:
         return in_step([(self, one) for one in several])
 
     def begun(self, one: Descent) -> LeastSquares:
@@ -370,7 +342,7 @@ def measured_together(asked: list[tuple[Search, Place]]) -> Iterator[tuple[np.nd
         yield search.compared(job, tracks)
 
 
-def in_step(several: list[tuple[Search, Descent]]) -> list[_Descended]:
+def in_step(several: list[tuple[Search, Descent]]) -> list[Descended]:
     """Descents in step with each other: what all of them ask for next is run together."""
     asking = [search.begun(one) for search, one in several]
     asked = {k: next(one) for k, one in enumerate(asking)}
@@ -399,7 +371,7 @@ def in_step(several: list[tuple[Search, Descent]]) -> list[_Descended]:
             except StopIteration as ended:
                 found[k] = Optimum(ended.value.theta, ended.value.cost)
                 del asked[k]
-    return [_Descended(found[k], runs[k], losses[k]) for k in range(len(several))]
+    return [Descended(found[k], runs[k], losses[k]) for k in range(len(several))]
 
 
 def _probe(candidate: Parameter) -> float:
@@ -410,8 +382,3 @@ def _probe(candidate: Parameter) -> float:
 
 def _steps(parameters: list[Parameter]) -> np.ndarray:
     return np.array([p.step for p in parameters])
-
-
-def cost_of(optimum: Optimum) -> float:
-    """Its cost, infinite where it is not a number: a key to sort by."""
-    return optimum.cost if np.isfinite(optimum.cost) else float("inf")

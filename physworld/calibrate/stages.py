@@ -51,14 +51,19 @@ def calibrate_in_stages(
 
     Raises:
         CalibrationError, Cancelled, SceneUnsupported, ValueError: see :func:`physworld.calibrate.calibrate`; also
-            SceneUnsupported for a field over a body of the updated Lagrangian form, which has no gradient, and
-            ValueError for unknown stages.
+            SceneUnsupported for a field over a body without a gradient (of the updated Lagrangian form, or a mesh of
+            triangles), and ValueError for unknown stages.
     """
     config = config or CalibrationConfig()
     if stages not in get_args(Stages):
         raise ValueError(f"no stages {stages!r}; there are {get_args(Stages)}")
     if stages != GLOBAL:
-        form = prior_twin(scene, config).formulation
+        prior = prior_twin(scene, config)
+        form = prior.formulation
+        if not prior.lattice.smooth:
+            raise SceneUnsupported(
+                f"the local stage needs gradients, which a mesh of {len(prior.lattice.cells)} cells of triangles lacks"
+            )
         if form != "total_lagrangian":
             raise SceneUnsupported(
                 f"the local stage needs the total Lagrangian form, whose runs have a gradient; this body is of the "

@@ -22,8 +22,8 @@ from physworld.mpm.bspline import GAUSS_POINTS
 from physworld.mpm.contact import GroundContact, surface_points
 from physworld.mpm.node_kernels import weighted_sum
 from physworld.mpm.particle_terms import ParticleBody
+from physworld.mpm.problem import Problem
 from physworld.mpm.terms import BoundTerm
-from physworld.mpm.total_lagrangian import Problem
 
 if TYPE_CHECKING:
     from physworld.twin import Twin

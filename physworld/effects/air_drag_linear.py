@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from physworld.effects.base import Effect, Strength
-from physworld.mpm.total_lagrangian import Problem
+from physworld.mpm.problem import Problem
 
 if TYPE_CHECKING:
     from physworld.twin import Twin

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 
-from physworld.mpm.total_lagrangian import HeldNodes, Problem
+from physworld.mpm.problem import HeldNodes, Problem
 
 if TYPE_CHECKING:
     from physworld.twin import Twin

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from physworld.effects.base import Effect, Strength
 from physworld.effects.places import body_size, held_count
-from physworld.mpm.total_lagrangian import Problem
+from physworld.mpm.problem import Problem
 
 if TYPE_CHECKING:
     from physworld.twin import Twin

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from physworld.effects.base import Effect, Strength
-from physworld.mpm.total_lagrangian import Problem
+from physworld.mpm.problem import Problem
 
 if TYPE_CHECKING:
     from physworld.twin import Twin

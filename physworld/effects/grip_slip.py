@@ -21,8 +21,8 @@ from physworld.effects.places import gravity_size, held_count
 from physworld.mpm.node_kernels import on_path
 from physworld.mpm.particle_grips import particle_grips
 from physworld.mpm.particle_terms import ParticleBody
+from physworld.mpm.problem import HeldNodes, Problem, nodal_mass
 from physworld.mpm.terms import BoundTerm
-from physworld.mpm.total_lagrangian import HeldNodes, Problem, nodal_mass
 
 if TYPE_CHECKING:
     from physworld.twin import Twin

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from physworld.effects.base import Effect, Strength
 from physworld.effects.places import body_size
 from physworld.mpm.contact import GroundContact
-from physworld.mpm.total_lagrangian import Problem
+from physworld.mpm.problem import Problem
 
 if TYPE_CHECKING:
     from physworld.twin import Twin

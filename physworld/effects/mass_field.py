@@ -15,7 +15,7 @@ import numpy as np
 
 from physworld.effects.base import Effect, Strength
 from physworld.effects.stiffness_field import field_strengths, log_field
-from physworld.mpm.total_lagrangian import Problem
+from physworld.mpm.problem import Problem
 
 if TYPE_CHECKING:
     from physworld.twin import Twin

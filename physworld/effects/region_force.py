@@ -16,8 +16,8 @@ import warp as wp
 from physworld.effects.base import Effect, Strength
 from physworld.effects.places import body_size, free_end, gravity_size, region_shares, region_weights
 from physworld.mpm.particle_terms import ParticleBody
+from physworld.mpm.problem import Problem
 from physworld.mpm.terms import BoundTerm
-from physworld.mpm.total_lagrangian import Problem
 
 if TYPE_CHECKING:
     from physworld.twin import Twin

@@ -16,7 +16,7 @@ import numpy as np
 from physworld.effects.base import Effect, Strength
 from physworld.effects.places import unit_coordinates
 from physworld.mpm.lattice import Lattice
-from physworld.mpm.total_lagrangian import Problem
+from physworld.mpm.problem import Problem
 
 if TYPE_CHECKING:
     from physworld.twin import Twin

@@ -25,8 +25,8 @@ from physworld.effects.places import (
 )
 from physworld.mpm.node_kernels import weighted_sum
 from physworld.mpm.particle_terms import ParticleBody
+from physworld.mpm.problem import Problem
 from physworld.mpm.terms import BoundTerm
-from physworld.mpm.total_lagrangian import Problem
 
 if TYPE_CHECKING:
     from physworld.twin import Twin

@@ -20,9 +20,9 @@ from physworld.materials.laws import friction_law
 from physworld.mpm.forces import InternalForces
 from physworld.mpm.particle_stress_kernels import grow_stress
 from physworld.mpm.particle_terms import BoundParticleStress, ParticleBody
+from physworld.mpm.problem import Problem
 from physworld.mpm.stability import fastest_frequency
 from physworld.mpm.terms import BoundTerm
-from physworld.mpm.total_lagrangian import Problem
 
 if TYPE_CHECKING:
     from physworld.twin import Twin

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 
 from physworld.effects.base import Effect, Strength
 from physworld.effects.places import body_size, gravity_size
+from physworld.mpm.problem import Problem
 from physworld.mpm.stress import StressTerm
 from physworld.mpm.stress_kernels import rod_model, sheet_model, solid_model
-from physworld.mpm.total_lagrangian import Problem
 
 if TYPE_CHECKING:
     from physworld.twin import Twin

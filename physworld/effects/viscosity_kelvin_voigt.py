@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from physworld.effects.base import Effect, Strength
 from physworld.effects.places import body_size, gravity_size
-from physworld.mpm.total_lagrangian import Problem
+from physworld.mpm.problem import Problem
 
 if TYPE_CHECKING:
     from physworld.twin import Twin

@@ -107,8 +107,8 @@ def _seen(curve: np.ndarray) -> np.ndarray:
 
 
 def _length(count: int) -> int:
-    """Frames in a block."""
-    return min(count, max(_SHORTEST_BLOCK, round(count**0.5)))
+    """Frames in a block; single frames where there are too few for two blocks."""
+    return max(_SHORTEST_BLOCK, round(count**0.5)) if count > _SHORTEST_BLOCK else 1
 
 
 def _widening(count: int) -> float:

@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from physworld.build import build_twin
+from physworld.errors import SceneUnsupported
 from physworld.integration import Integration
 from physworld.materials.laws import without_friction
 from physworld.mpm.energy import EnergyLedger, run_with_ledger
@@ -94,6 +95,7 @@ def measure_numerics(
         poll: called with (frames done, frames in all) of every run; may raise to stop.
 
     Raises:
+        SceneUnsupported: the body is a mesh of triangles, which has no finer cells.
         SimulationError: a run cannot be trusted.
     """
     begun = time.perf_counter()
@@ -129,7 +131,15 @@ def measure_numerics(
 
 
 def refined(scene: Scene, twin: Twin, particle_budget: int, refinement: float = REFINEMENT) -> Twin:
-    """The same twin on a lattice whose cells are ``refinement`` times smaller, with the same material points."""
+    """The same twin on a lattice whose cells are ``refinement`` times smaller, with the same material points.
+
+    Raises:
+        SceneUnsupported: the body is a mesh of triangles: its cells are what is supposed of the recording.
+    """
+    if not twin.lattice.smooth:
+        raise SceneUnsupported(
+            f"a mesh of {len(twin.lattice.cells)} cells of triangles has no finer ones: they are its recorder's"
+        )
     finer = build_twin(
         scene, particle_budget, twin.device, refinement, twin.plasticity, twin.formulation, twin.transfer
     )

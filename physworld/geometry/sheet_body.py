@@ -22,6 +22,7 @@ _TIGHTER = 0.97  # a sheet is turned in its plane if that shrinks its bounding r
 _FEWEST_MESH_CELLS, _MOST_CELLS = 6, 24  # of a mesh, along a side
 _LONG = 1.6  # a mesh's cells are at most so much longer than wide
 _ON_LINE = 0.02  # cells by which a grip's end may miss a line of a mesh
+_MOST_MESHES = 24  # that a trace asks: of more, those whose cells are the most square
 _AS_DECLARED = 0.05  # share by which extents of points may miss the declared size
 
 
@@ -31,7 +32,7 @@ def sheet_body(
     """The body of a scene of a sheet, as a mesh if one is given; None if it is not flat at the start.
 
     Raises:
-        SceneUnsupported: its points span no area.
+        SceneUnsupported: its points span no area; or a mesh is given of a sheet that is declared as a grid.
     """
     points = first_points(scene)
     notes: list[str] = []
@@ -58,9 +59,17 @@ def sheet_body(
         flat_map = (origin, axes)
     lattice: Lattice
     if mesh is not None:
+        if flat_map is None:
+            raise SceneUnsupported(
+                f"a mesh of {mesh} starts flat and undeformed; this sheet, a grid of {grid} points, starts as measured"
+            )
         begin, sides = _declared_extent(scene, flat_map, size)
         lattice = triangle_lattice(sides, mesh, begin)
         notes.append(f"a mesh as other engines take it: {mesh}")
+        if sides is size:
+            notes.append(
+                f"its sides are what the points span, {size} m: no size is declared that agrees with them"
+            )
     else:
         along = max(_CELLS * np.sqrt(particle_budget / _BUDGET), _FEWEST_CELLS)
         cell = max(float(size.max()) / (refinement * along), 1e-4)
@@ -80,7 +89,8 @@ def sheet_body(
 def possible_meshes(scene: Scene) -> list[Mesh]:
     """Meshes that another engine may have recorded a sheet with: their lines lie where the declared grips end.
 
-    Cells are about as wide as high, and at most :data:`_MOST_CELLS` on a side. Empty where no grip ends on the sheet.
+    Cells are about as wide as high, and at most :data:`_MOST_CELLS` on a side; :data:`_MOST_MESHES` in all, those with
+    the squarest cells. Empty where no grip ends on the sheet.
     """
     points = first_points(scene)
     if scene.kind not in SHEET_KINDS or scene.body.side_m is not None:
@@ -95,13 +105,12 @@ def possible_meshes(scene: Scene) -> list[Mesh]:
     for a, b in ((0, 1), (1, 0)):
         if not counts[a]:
             counts[a] = sorted({max(round(n * sides[a] / sides[b]), 1) for n in counts[b]})
-    return [
-        Mesh((across, up), odd)
-        for across in counts[0]
-        for up in counts[1]
-        if 1.0 / _LONG <= (sides[0] / across) / (sides[1] / up) <= _LONG
-        for odd in (False, True)
-    ]
+    shapes = [(across, up) for across in counts[0] for up in counts[1]]
+    long = {shape: abs(float(np.log(sides[0] / shape[0] * shape[1] / sides[1]))) for shape in shapes}
+    squarest = sorted(
+        (shape for shape in shapes if long[shape] <= np.log(_LONG)), key=lambda shape: long[shape]
+    )
+    return [Mesh(shape, odd) for shape in sorted(squarest[: _MOST_MESHES // 2]) for odd in (False, True)]
 
 
 def _counts_through(faces: np.ndarray, side: float) -> list[int]:

@@ -24,8 +24,9 @@ from physworld.mpm.adjoint_kernels import keep_row
 from physworld.mpm.adjoint_pairs import ForcePair
 from physworld.mpm.adjoint_reverse import Gradient, ReversePass
 from physworld.mpm.adjoint_terms import Memory, memories_of
+from physworld.mpm.problem import HeldNodes, Problem
 from physworld.mpm.terms import BoundTerm, refuse_undifferentiable
-from physworld.mpm.total_lagrangian import HeldNodes, Problem, Run, TotalLagrangian
+from physworld.mpm.total_lagrangian import Run, TotalLagrangian
 
 MEMORY_MB = 100.0
 

@@ -27,12 +27,12 @@ from physworld.mpm.adjoint_stages import StagesBack
 from physworld.mpm.adjoint_terms import Memory, RecordedAdjoint, Reverse, StressAdjoint, TermAdjoint
 from physworld.mpm.adjoint_twist import TwistAdjoint
 from physworld.mpm.ground import BoundGround
+from physworld.mpm.problem import Problem
 from physworld.mpm.soft_grips import BoundSoftGrips
 from physworld.mpm.soft_grips_derivatives import SoftGripsAdjoint, SoftGripsGradient
 from physworld.mpm.stress import BoundStress
 from physworld.mpm.tangent import InternalTangent
 from physworld.mpm.terms import BoundTerm
-from physworld.mpm.total_lagrangian import Problem
 from physworld.mpm.twist import BoundTwist
 
 if TYPE_CHECKING:

@@ -24,9 +24,9 @@ from physworld.mpm.adjoint_stages_kernels import (
 )
 from physworld.mpm.adjoint_terms import Reverse
 from physworld.mpm.friction import FrictionForces
+from physworld.mpm.problem import Problem
 from physworld.mpm.relaxation import coefficients
 from physworld.mpm.tangent import InternalTangent
-from physworld.mpm.total_lagrangian import Problem
 
 _LAG_S = 1.0  # of solids and rods: any would do in exact numbers, and this one loses none of single precision
 _SHEET_LAG = 1e-4  # of a sheet, as a share of the time step

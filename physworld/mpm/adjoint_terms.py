@@ -22,9 +22,9 @@ import warp as wp
 from physworld.errors import NotDifferentiable
 from physworld.mpm.adjoint_kernels import keep_rows, load_row, take_away
 from physworld.mpm.adjoint_stress_kernels import MOST_NUMBERS, stress_adjoint
+from physworld.mpm.problem import Problem
 from physworld.mpm.stress import BoundStress
 from physworld.mpm.terms import BoundTerm
-from physworld.mpm.total_lagrangian import Problem
 
 _DERIVATIVES = {
     3: np.eye(3, dtype=int).tolist(),

@@ -20,9 +20,10 @@ from physworld.materials.laws import friction_law
 from physworld.mpm.forces import ForcesSideBySide
 from physworld.mpm.lattice import Lattice
 from physworld.mpm.node_kernels import advance_nodes_side_by_side
+from physworld.mpm.problem import HeldNodes, Problem
 from physworld.mpm.stability import fastest_frequencies, stable_time_step
 from physworld.mpm.terms import BoundTerm
-from physworld.mpm.total_lagrangian import HeldNodes, Problem, Run, check_state, whole_chunks
+from physworld.mpm.total_lagrangian import Run, check_state, whole_chunks
 
 _SAME_CLOCK_S = 1e-9
 

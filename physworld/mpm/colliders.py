@@ -24,7 +24,7 @@ from physworld.mpm.colliders_path import RigidPath
 from physworld.mpm.terms import BoundTerm
 
 if TYPE_CHECKING:
-    from physworld.mpm.total_lagrangian import Problem
+    from physworld.mpm.problem import Problem
 
 _SPEED_SHARE = 0.5  # of the speed whose penetration is the collider's own depth
 _DEPTH_SHARE = 0.9  # of the collider's own depth: deeper, the nearest way out may be the wrong one

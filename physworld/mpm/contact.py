@@ -28,7 +28,7 @@ from physworld.mpm.ground import BoundGround
 from physworld.mpm.lattice import Lattice
 
 if TYPE_CHECKING:
-    from physworld.mpm.total_lagrangian import Problem
+    from physworld.mpm.problem import Problem
 
 _EMPTY = 0.02  # an eighth of a cell with less material has no surface
 _THIN_DAMPING = 0.5  # share of critical damping in the contact of sheets and rods
@@ -38,8 +38,6 @@ _THIN_DAMPING = 0.5  # share of critical damping in the contact of sheets and ro
 class GroundContact:
     """Ground at ``height_m`` with Coulomb ``friction`` under a body; see :class:`ColliderContact` for ``offsets``."""
 
-    lattice: Lattice
-    law: Law
     height_m: float
     friction: float
     offsets: np.ndarray | float = 0.0
@@ -47,9 +45,7 @@ class GroundContact:
     def bind(self, problem: Problem) -> BoundCollider:
         """Device arrays for one problem; its friction may be a field."""
         plane = ground(self.height_m, self.friction)
-        surface = contact_surface(
-            problem.lattice, self.law, self.offsets
-        )  # an effect may have changed the lattice
+        surface = contact_surface(problem.lattice, problem.law, self.offsets)
         if problem.friction_factor is None:
             return BoundCollider(plane, surface, problem)
         return BoundGround(plane, self.height_m, surface, problem)

@@ -17,12 +17,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import warp as wp
 
+from physworld.errors import SceneUnsupported
 from physworld.materials.laws import Law, RodLaw, SheetLaw, SolidLaw, without_friction
 from physworld.materials.rod import rod_strains
 from physworld.materials.sheet import sheet_strains
 from physworld.mpm.energy_kernels import keep_forces, sum_friction, sum_works
 from physworld.mpm.forces import InternalForces
-from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian
+from physworld.mpm.problem import HeldNodes, Problem
+from physworld.mpm.total_lagrangian import TotalLagrangian
 from physworld.mpm.twist import Twist, TwistMeter
 
 _AFTER_S = 1e-4  # the meter reads a frame when the next one starts: one more, this short, follows the last
@@ -97,8 +99,13 @@ def run_with_ledger(
         Nodal positions (T, n, 3) [m], the same as without a ledger, and the ledger.
 
     Raises:
+        SceneUnsupported: the body is a mesh of triangles.
         SimulationError: the run cannot be trusted.
     """
+    if not problem.lattice.smooth:
+        raise SceneUnsupported(
+            f"the energy of {len(problem.lattice.cells)} cells of triangles: the ledger is of splines"
+        )
     meter = _Meter(len(times))
     metered = replace(problem, terms=(_Marker(meter), *problem.terms, meter))
     solver = TotalLagrangian(metered, time_step_s)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from physworld.errors import BatchRefused
+from physworld.errors import BatchRefused, SceneUnsupported
 from physworld.materials.laws import Law, RodLaw, SheetLaw, SolidLaw
 from physworld.mpm.lattice import Lattice
 from physworld.mpm.rod_kernels import rod_forces
@@ -181,9 +181,20 @@ def model_inputs(
 def _triangle_inputs(
     lattice: TriangleLattice, law: Law, stiffness_factor: np.ndarray, rest: np.ndarray, device: str
 ) -> list[Any]:
-    """The same of a mesh of triangles, of which two make a cell; they and the edges take the mean of its particles."""
+    """The same of a mesh of triangles, of which two make a cell; they and the edges take the mean of its particles.
+
+    Raises:
+        ValueError: the law is of another dimension.
+        SceneUnsupported: it bends otherwise than an isotropic sheet, which hinges cannot.
+    """
     if not isinstance(law, SheetLaw):
         raise ValueError(f"a {type(law).__name__} does not fit a mesh of triangles")
+    plain = (1.0, 1.0, law.poissons_ratio, 1.0 - law.poissons_ratio)
+    if not np.allclose(law.bending_shape, plain):
+        raise SceneUnsupported(
+            f"the hinges of {len(lattice.cells)} cells of triangles have one bending stiffness; ratios of weft, twist "
+            f"and coupling make {law.bending_shape} of {plain}: leave them at 1"
+        )
 
     def array(values: Any, dtype: Any = wp.float64) -> wp.array:
         return wp.array(np.ascontiguousarray(values).reshape(-1), dtype=dtype, device=device)

@@ -25,11 +25,11 @@ from physworld.mpm.adjoint_pairs import ForcePair, ForceSide
 from physworld.mpm.adjoint_reverse import Gradient
 from physworld.mpm.forces import InternalForces
 from physworld.mpm.friction import FrictionForces
+from physworld.mpm.problem import HeldNodes, Problem
 from physworld.mpm.soft_grips import BoundSoftGrips, SoftGrips
 from physworld.mpm.soft_grips_derivatives import SoftGripsChange, same_soft_grips
 from physworld.mpm.stress import BoundStress
 from physworld.mpm.terms import BoundTerm
-from physworld.mpm.total_lagrangian import HeldNodes, Problem
 
 
 class Setting(Protocol):

@@ -27,11 +27,12 @@ from physworld.errors import NotDifferentiable
 from physworld.materials.laws import friction_law
 from physworld.mpm.gradient import Direction, Setting, internal_forces, same_internal_forces
 from physworld.mpm.gradient_forward_kernels import add_slope, advance_tangent, set_sides
+from physworld.mpm.problem import Problem
 from physworld.mpm.soft_grips import SoftGrips
 from physworld.mpm.soft_grips_derivatives import SoftGripsTangent, same_soft_grips
 from physworld.mpm.tangent import InternalTangent
 from physworld.mpm.terms import refuse_undifferentiable
-from physworld.mpm.total_lagrangian import Problem, TotalLagrangian
+from physworld.mpm.total_lagrangian import TotalLagrangian
 
 
 def sensitivities(

@@ -87,11 +87,15 @@ class TwinRun:
         """Integrate: arguments and errors of :meth:`Twin.simulate_nodes`, and those of :class:`Adjoint`.
 
         Raises:
-            NotDifferentiable: also for a twin of the updated Lagrangian form.
+            NotDifferentiable: also for a twin of the updated Lagrangian form, or a mesh of triangles.
         """
         if twin.formulation != "total_lagrangian":
             raise NotDifferentiable(
                 "a run of the updated Lagrangian form has no gradient: fit by simulations alone"
+            )
+        if not twin.lattice.smooth:
+            raise NotDifferentiable(
+                f"a mesh of {len(twin.lattice.cells)} cells of triangles has no gradient: fit by simulations alone"
             )
         self._twin, self._times = twin, frame_times
         self._setting = lambda t: t.integration(

@@ -17,7 +17,7 @@ from physworld.mpm.colliders_kernels import move_collider
 from physworld.mpm.ground_kernels import touch_ground
 
 if TYPE_CHECKING:
-    from physworld.mpm.total_lagrangian import Problem
+    from physworld.mpm.problem import Problem
 
 
 class BoundGround(BoundCollider):

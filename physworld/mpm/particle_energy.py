@@ -22,7 +22,7 @@ import numpy as np
 import warp as wp
 
 from physworld.mpm.particle_energy_kernels import sum_grid_works, sum_kinetic
-from physworld.mpm.total_lagrangian import HeldNodes
+from physworld.mpm.problem import HeldNodes
 
 if TYPE_CHECKING:
     from physworld.mpm.particle_run import ParticleRun

@@ -16,7 +16,7 @@ from physworld.mpm.grid_kernels import advance_grid, place_grips, scatter_grips
 from physworld.mpm.node_kernels import advance_counter
 from physworld.mpm.particle_grips import ParticleGrips
 from physworld.mpm.particle_stress import ParticleStress
-from physworld.mpm.total_lagrangian import HeldNodes
+from physworld.mpm.problem import HeldNodes
 from physworld.mpm.transfer_kernels import (
     ESCAPED,
     INVERTED,

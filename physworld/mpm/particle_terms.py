@@ -27,7 +27,7 @@ from physworld.mpm.particle_kernels import kick, widen
 from physworld.mpm.terms import BoundTerm, Term
 
 if TYPE_CHECKING:
-    from physworld.mpm.total_lagrangian import Problem
+    from physworld.mpm.problem import Problem
 
 
 @dataclass(frozen=True)

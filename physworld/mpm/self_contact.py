@@ -34,7 +34,7 @@ from physworld.mpm.self_contact_search import Points, Slots, end_search, place_c
 from physworld.mpm.terms import BoundTerm
 
 if TYPE_CHECKING:
-    from physworld.mpm.total_lagrangian import Problem
+    from physworld.mpm.problem import Problem
 
 THINNEST = 0.01  # of a cell: the splines' own waves are larger
 COARSE = 0.04  # of a cell: thinner layers may cross where they are bent within a cell

@@ -27,8 +27,8 @@ from scipy.linalg import eigh
 from physworld.mpm.bspline import gauss_points, tensor_weights
 from physworld.mpm.lattice import Lattice
 from physworld.mpm.node_kernels import on_path
+from physworld.mpm.problem import HeldNodes, Problem
 from physworld.mpm.terms import BoundTerm
-from physworld.mpm.total_lagrangian import HeldNodes, Problem
 
 AS_HELD = 0.16
 """Softness with which a body rings as finite elements do whose nodes in the region are prescribed."""

@@ -15,13 +15,13 @@ import warp as wp
 
 from physworld.errors import NotDifferentiable
 from physworld.mpm.adjoint_terms import Reverse
+from physworld.mpm.problem import HeldNodes, Problem
 from physworld.mpm.soft_grips import BoundSoftGrips, SoftGrips, distance_from_path, pull_to_path
 from physworld.mpm.soft_grips_derivative_kernels import (
     distance_slope,
     gather_nodes,
     take_grips_back,
 )
-from physworld.mpm.total_lagrangian import HeldNodes, Problem
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from physworld.mpm.stress_kernels import StressModel
 from physworld.mpm.terms import BoundTerm
 
 if TYPE_CHECKING:
-    from physworld.mpm.total_lagrangian import Problem
+    from physworld.mpm.problem import Problem
 
 _DERIVATIVES = {2: [(1, 0), (0, 1), (2, 0), (0, 2), (1, 1)], 1: [(1,), (2,)]}
 

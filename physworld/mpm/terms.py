@@ -18,7 +18,7 @@ import warp as wp
 from physworld.errors import NotDifferentiable
 
 if TYPE_CHECKING:
-    from physworld.mpm.total_lagrangian import Problem
+    from physworld.mpm.problem import Problem
 
 
 class BoundTerm(Protocol):

@@ -6,7 +6,8 @@ Velocities live half a substep before the positions, which makes the scheme seco
 
 Weights live in the reference configuration, so nothing is ever transferred between particles and grid and nothing is
 damped by transfers (de Vaucorbeil, Nguyen, Hutchinson 2020). It cannot tear or flow: plastic flow, and solids that
-touch themselves, belong to the updated Lagrangian form, which joins behind the same :class:`Formulation`.
+touch themselves, belong to the updated Lagrangian form, which joins
+behind the same :class:`physworld.mpm.problem.Formulation`.
 
 Substeps run in a captured graph; the host returns once a frame to record, to check and to report.
 """
@@ -14,85 +15,22 @@ Substeps run in a captured graph; the host returns once a frame to record, to ch
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 import warp as wp
 
 from physworld.errors import BlewUp, CFLViolation, ParticlesLeftTheGrid, UnstableSimulation
-from physworld.materials.laws import Law, friction_law, without_friction
+from physworld.materials.laws import friction_law, without_friction
 from physworld.mpm.forces import InternalForces
 from physworld.mpm.friction import FrictionForces
-from physworld.mpm.lattice import Lattice
 from physworld.mpm.node_kernels import advance_counter, advance_nodes
+from physworld.mpm.problem import HeldNodes, Problem
 from physworld.mpm.relaxation import MARGIN, Relaxation, stages_for
 from physworld.mpm.stability import Steps, fastest_frequency
-from physworld.mpm.terms import Term
 
 _CHUNK = 8  # substeps in one captured graph
 _REACH = 1e3  # a node farther than this many body sizes from its start has left every workspace
-
-
-@dataclass(frozen=True)
-class HeldNodes:
-    """Nodes that gripped material touches: their numbers (H,) and their paths at the frames, (T, H, 3) [m], [m/s]."""
-
-    nodes: np.ndarray
-    positions: np.ndarray
-    velocities: np.ndarray
-
-
-@dataclass(frozen=True)
-class Problem:
-    """What a formulation integrates.
-
-    Attributes:
-        lattice, law: the reference body and its constitutive parameters.
-        rest: nodal positions without stress, in the world [m], (n, 3).
-        gravity_m_s2: (3,).
-        drag_per_s: linear drag rate c of every node [1/s].
-        stiffness_factor, density_factor: fields over the particles, (P,), or None for 1.
-        friction_factor: of the ground under them, likewise.
-        added_mass: lumped masses that hang from the nodes [kg], (n,), or None.
-        terms: what else acts on the nodes, contacts and effects, in the order of their launches.
-        span_s: first and last time of the run, for terms that change in time; None where nobody says.
-    """
-
-    lattice: Lattice
-    law: Law
-    rest: np.ndarray
-    gravity_m_s2: np.ndarray
-    drag_per_s: float = 0.0
-    stiffness_factor: np.ndarray | None = None
-    density_factor: np.ndarray | None = None
-    added_mass: np.ndarray | None = None
-    terms: tuple[Term, ...] = ()
-    friction_factor: np.ndarray | None = None
-    span_s: tuple[float, float] | None = None
-    device: str = field(default="cpu")
-
-    def nodal_mass(self) -> np.ndarray:
-        """Lumped nodal masses [kg], (n,)."""
-        mass = nodal_mass(self.lattice, self.law, self.density_factor)
-        return mass if self.added_mass is None else mass + self.added_mass
-
-
-class Formulation(Protocol):
-    """One way to integrate a :class:`Problem`; the engine chooses by the scene."""
-
-    time_step_s: float
-
-    def run(
-        self,
-        x: np.ndarray,
-        v: np.ndarray,
-        held: HeldNodes,
-        times: np.ndarray,
-        progress: Callable[[int, int], None] | None = None,
-    ) -> np.ndarray:
-        """Nodal positions at ``times``, (T, n, 3)."""
-        ...
 
 
 class TotalLagrangian:
@@ -414,12 +352,3 @@ def check_state(
         raise ParticlesLeftTheGrid(
             f"a node is {farthest:.3g} m from its start at t = {time:.4f} s; the body is {size:.3g} m long"
         )
-
-
-def nodal_mass(lattice: Lattice, law: Law, density_factor: np.ndarray | None) -> np.ndarray:
-    """Lumped nodal masses [kg], (n,): rows of the mass matrix summed."""
-    density = {3: "density_kg_m3", 2: "density_kg_m2", 1: "density_kg_m"}[lattice.dim]
-    particle_mass = getattr(law, density) * lattice.particle_measures
-    if density_factor is not None:
-        particle_mass = particle_mass * density_factor
-    return lattice.lumped(particle_mass)

@@ -46,6 +46,11 @@ class Mesh:
             raise ValueError(f'a mesh is written as 16x15, or 16x15odd; this is "{text}"')
         return cls((int(found[1]), int(found[2])), found[3] is not None)
 
+    @property
+    def spelled(self) -> str:
+        """As :meth:`read` takes it."""
+        return f"{self.counts[0]}x{self.counts[1]}{'odd' if self.odd else ''}"
+
     def __str__(self) -> str:
         cut = ", the first cut the other way" if self.odd else ""
         return f"{self.counts[0]} x {self.counts[1]} cells of two triangles{cut}"
@@ -177,6 +182,11 @@ class TriangleLattice(Lattice):
                 ends = triangle[k], triangle[(k + 1) % 3]
                 sides.setdefault((min(ends), max(ends)), []).append((triangle[(k + 2) % 3], number // 2))
         return [(ends, found) for ends, found in sides.items() if len(found) == 2]
+
+
+def mesh_of(lattice: Lattice) -> Mesh | None:
+    """The mesh that a lattice is; None of splines."""
+    return lattice.mesh if isinstance(lattice, TriangleLattice) else None
 
 
 def triangle_lattice(size: np.ndarray, mesh: Mesh, origin: np.ndarray | None = None) -> TriangleLattice:

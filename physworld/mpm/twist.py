@@ -28,7 +28,7 @@ from physworld.mpm.terms import BoundTerm
 from physworld.mpm.twist_kernels import push_twisted, sum_turning, turn_spans
 
 if TYPE_CHECKING:
-    from physworld.mpm.total_lagrangian import Problem
+    from physworld.mpm.problem import Problem
 
 _FOLD = 0.02  # 1 + cosine of the angle between neighbouring tangents below which a turn is lost: 168 degrees
 _MOST_TURN_RAD = 0.75 * np.pi  # of a grip between two frames: beyond pi the sense of a turn cannot be told

@@ -6,7 +6,7 @@ Particles are the quadrature points of the reference lattice and carry everythin
 substep. Where two parts of a body share grid nodes they share one velocity: they cannot pass through one another, stick
 while they press, and begin to feel one another one to one and a half cells apart (self-contact through the grid).
 
-It integrates the same :class:`~physworld.mpm.total_lagrangian.Problem` as the total Lagrangian form, for solids:
+It integrates the same :class:`~physworld.mpm.problem.Problem` as the total Lagrangian form, for solids:
 gravity, drag, grips, fields of stiffness and density, contacts, and the terms that have a form on particles
 (:mod:`physworld.mpm.particle_terms`); others are refused by name. The transfers damp (``docs/engine.md``): elastic
 bodies belong to the other form.
@@ -29,8 +29,8 @@ from physworld.mpm.particle_grips import ParticleGrips, particle_grips
 from physworld.mpm.particle_run import ParticleRun, Particles
 from physworld.mpm.particle_stress import ParticleStress, padded
 from physworld.mpm.particle_terms import ParticleBody, ParticleTerms
+from physworld.mpm.problem import HeldNodes, Problem
 from physworld.mpm.stability import stable_time_step
-from physworld.mpm.total_lagrangian import HeldNodes, Problem
 from physworld.mpm.transfer import Apic, Transfer
 
 _LIMIT = 0.9  # stable dt in units of dx / c, measured on the full lattice (tests/physics/test_updated_lagrangian.py)

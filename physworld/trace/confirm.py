@@ -14,14 +14,13 @@ import numpy as np
 from physworld.simulations import Job
 from physworld.trace.candidates import Candidate
 from physworld.trace.comparison import CrossValidation, better_beyond_chance, cross_validated
-from physworld.trace.holds import held_otherwise
+from physworld.trace.holds import clamped_otherwise, held_otherwise
 from physworld.trace.refit import Refit, refit
 from physworld.trace.score import Score, orthonormal, project
 from physworld.trace.simulations import Simulations
-from physworld.trace.unknowns import CLAMP, Unknown, already, at
+from physworld.trace.unknowns import REACH, Unknown, already, at
 from physworld.trace.whitening import Whitener
 
-REACH = f"{CLAMP}.reach_m"
 _STARTS, _GLANCE = 3, 2  # variants of an effect that are tried, and iterations after which the best goes on
 _WORSE = 3.0  # a search is left that is this many times as far from the noise as the best so far
 _HALF = 0.5  # and has not removed this share of what the model without the effect leaves
@@ -163,16 +162,25 @@ class Confirmation:
         ]
         iterations = _MIRRORED * self.iterations
         other = refit(self.simulations, self.whitener, fitted.twin, unknowns, self.frames, iterations)
-        if other is None or other.misfit >= fitted.misfit:
-            return model
-        return Model(model.members, other, cross_validated(other, self.block_of_row))
+        return self._with(model, other)
 
     def held_otherwise(self, model: Model) -> Model:
         """The model refitted from grips that hold harder and softer, if that is better; else itself."""
         other = held_otherwise(model.fitted, self.simulations, self.whitener, self.frames, self.iterations)
-        if other is model.fitted:
-            return model
-        return Model(model.members, other, cross_validated(other, self.block_of_row))
+        return self._with(model, other)
+
+    def further(self, model: Model) -> Model:
+        """The model refitted once more from where it is, if that is better; else itself."""
+        fitted = model.fitted
+        other = refit(
+            self.simulations, self.whitener, fitted.twin, fitted.unknowns, self.frames, 2 * self.iterations
+        )
+        return self._with(model, other)
+
+    def clamped_otherwise(self, model: Model) -> Model:
+        """The model refitted from clamps that reach less far and farther, if that is better; else itself."""
+        other = clamped_otherwise(model.fitted, self.simulations, self.whitener, self.frames, self.iterations)
+        return self._with(model, other)
 
     def from_place_of(self, model: Model, other: Model, strength: float) -> Model:
         """The model refitted from another one's calibrated numbers and this strength of its one gate, if better."""
@@ -184,9 +192,7 @@ class Confirmation:
         place = np.clip(place, low, high)
         unknowns = [u.starting(t) for u, t in zip(fitted.unknowns, place, strict=True)]
         again = refit(self.simulations, self.whitener, fitted.twin, unknowns, self.frames, self.iterations)
-        if again is None or again.misfit >= fitted.misfit:
-            return model
-        return Model(model.members, again, cross_validated(again, self.block_of_row))
+        return self._with(model, again)
 
     def together(
         self, base: Model, members: tuple[Candidate, ...], strengths: list[float], other: Model
@@ -232,9 +238,13 @@ class Confirmation:
             u.starting(t) for u, t in zip(fitted.unknowns, places[int(np.argmin(costs))], strict=True)
         ]
         again = refit(self.simulations, self.whitener, fitted.twin, unknowns, self.frames, self.iterations)
-        if again is None or again.misfit >= fitted.misfit:
+        return self._with(model, again)
+
+    def _with(self, model: Model, other: Refit | None) -> Model:
+        """The model at another optimum, if that is better; else itself."""
+        if other is None or other.misfit >= model.fitted.misfit:
             return model
-        return Model(model.members, again, cross_validated(again, self.block_of_row))
+        return Model(model.members, other, cross_validated(other, self.block_of_row))
 
     def _costs(self, fitted: Refit, places: list[np.ndarray]) -> list[float]:
         """Squared residuals at places (p,); infinite where a run cannot be trusted."""

@@ -8,6 +8,7 @@ by cell, while what an effect does and the scene does not declare grows with tim
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -23,6 +24,7 @@ from physworld.twin import Twin
 
 _WINDOWS = (0.375, 0.5, 0.625, 0.75)  # shares of the training frames, from their beginning
 _STIFFNESSES = tuple(0.05 * k for k in range(-5, 6))  # logarithms, over the plate's
+_FARTHER = tuple(0.05 * k for k in range(6, 11))  # looked at on the side where the best of those is the last
 _NEARER = (-0.03, -0.015, 0.015, 0.03)  # about the best of those
 MESH_STIFFNESS = 0.06
 """How far the logarithm of a mesh's stiffness may lie from what its first frames say: all windows see it to 0.015."""
@@ -36,7 +38,8 @@ def recorded_as(scene: Scene, plate: Twin, simulations: Simulations, frames: int
     """What a sheet may be, in the order of belief: a plate, and the best mesh where it follows the first frames better.
 
     Errors of several windows are added up, so that early frames count more, and all of a body have one stiffness. A
-    mesh comes first only where it does clearly better.
+    mesh comes first only where it does clearly better. A sheet that touches itself is none, nor one of which neither
+    thickness nor size is declared: a mesh bends as its thickness says.
 
     Args:
         scene: the recording.
@@ -44,24 +47,19 @@ def recorded_as(scene: Scene, plate: Twin, simulations: Simulations, frames: int
         simulations: of the recording.
         frames: that training may use.
     """
-    sheet = isinstance(plate.law, SheetLaw) and plate.lattice.smooth
-    meshes = possible_meshes(scene) if sheet else []
+    facts = scene.body
+    sheet = isinstance(plate.law, SheetLaw) and plate.lattice.smooth and plate.self_friction is None
+    known = facts.thickness_m is not None or facts.size_m is not None
+    meshes = possible_meshes(scene) if sheet and known else []
     if not meshes:
         return [plate]
     simulations.stage = "mesh of the recorder"
     windows = [max(round(share * frames), 2) for share in _WINDOWS]
     bodies = [plate, *(_meshed(build_twin(scene, mesh=mesh), plate) for mesh in meshes)]
-    tried = [_stiffer(twin, shift) for twin in bodies for shift in _STIFFNESSES]
-    early = _errors(scene, tried, simulations, windows[:2]).reshape(len(bodies), -1)
-    leading = [k for k in np.argsort(early.min(axis=1))[:_BEST] if np.isfinite(early[k].min())]
+    shifts, least = _followed_best(scene, bodies, simulations, windows[:2])
+    leading = [int(k) for k in np.argsort(least)[:_BEST] if np.isfinite(least[k])]
     leading += [0] if 0 not in leading else []
-    near = [
-        [
-            _stiffer(tried[len(_STIFFNESSES) * k + int(np.argmin(early[k]))], shift)
-            for shift in (0.0, *_NEARER)
-        ]
-        for k in leading
-    ]
+    near = [_stiffened([_stiffer(bodies[k], shifts[k])], (0.0, *_NEARER)) for k in leading]
     late = _errors(scene, [twin for own in near for twin in own], simulations, windows).reshape(len(near), -1)
     left = late.min(axis=1)
     own = left[leading.index(0)]
@@ -72,10 +70,29 @@ def recorded_as(scene: Scene, plate: Twin, simulations: Simulations, frames: int
     return [mesh, plate] if left[best] < _CLEARLY * own else [plate, mesh]
 
 
+def _followed_best(
+    scene: Scene, bodies: list[Twin], simulations: Simulations, windows: list[int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """By which logarithm of its stiffness each body follows the windows best, (B,), and its errors there [m^2], (B,).
+
+    Where the best is the last on either side it is looked for farther on: a plate may have made up for a coarse mesh.
+    """
+    errors = _errors(scene, _stiffened(bodies, _STIFFNESSES), simulations, windows)
+    errors = errors.reshape(len(bodies), len(_STIFFNESSES))
+    shifts, least = np.array(_STIFFNESSES)[np.argmin(errors, axis=1)], errors.min(axis=1)
+    ends = [k for k, shift in enumerate(shifts) if shift in (_STIFFNESSES[0], _STIFFNESSES[-1])]
+    beyond = np.sign(shifts[ends])[:, None] * np.array(_FARTHER)
+    farther = [twin for k, own in zip(ends, beyond, strict=True) for twin in _stiffened([bodies[k]], own)]
+    errors = _errors(scene, farther, simulations, windows).reshape(beyond.shape)
+    for k, own, found in zip(ends, beyond, errors, strict=True):
+        if found.min() < least[k]:
+            shifts[k], least[k] = own[np.argmin(found)], found.min()
+    return shifts, least
+
+
 def taken_as(mesh: Mesh) -> str:
     """What a report says of a sheet that was traced as a mesh."""
-    text = f"{mesh.counts[0]}x{mesh.counts[1]}{'odd' if mesh.odd else ''}"
-    return f"taken as a mesh that another engine recorded, {mesh}; physworld fit --mesh {text} fits it so"
+    return f"taken as a mesh that another engine recorded, {mesh}; physworld fit --mesh {mesh.spelled} fits it so"
 
 
 def _meshed(mesh: Twin, plate: Twin) -> Twin:
@@ -91,8 +108,14 @@ def _meshed(mesh: Twin, plate: Twin) -> Twin:
         mesh,
         law=replace(prior, membrane_n_m=membrane, bending_n_m=bending),
         air_drag_per_s=plate.air_drag_per_s,
+        ground_friction=plate.ground_friction,
         device=plate.device,
     )
+
+
+def _stiffened(twins: list[Twin], shifts: Iterable[float]) -> list[Twin]:
+    """Every twin with each of the shifts, twin by twin."""
+    return [_stiffer(twin, float(shift)) for twin in twins for shift in shifts]
 
 
 def _stiffer(twin: Twin, shift: float) -> Twin:

@@ -20,6 +20,7 @@ import numpy as np
 from physworld.build import build_twin
 from physworld.errors import SceneUnsupported
 from physworld.evaluate.numerics import refined
+from physworld.mpm.triangles import mesh_of
 from physworld.scene import Scene
 from physworld.simulations import Drive, Job, Runner, in_turn, nodes_of
 from physworld.trace.simulations import Memory, Progress, Simulations
@@ -103,7 +104,8 @@ class JointSimulations(Simulations):
         self.recordings, self._budget = recordings, budget
         self._drives = [recording.drive for recording in recordings.fitted]
         self._levels: list[tuple[Twin, list[Twin]]] = []
-        for factor in (1.0, refinement, 1.0 / refinement) if len(recordings.fitted) > 1 else ():
+        factors = (1.0, refinement, 1.0 / refinement) if twin.lattice.smooth else (1.0,)
+        for factor in factors if len(recordings.fitted) > 1 else ():
             lead = twin if factor == 1.0 else refined(recordings.lead.scene, twin, budget, factor)
             others = [_built_like(twin, r.scene, budget, factor) for r in recordings.fitted[1:]]
             self._levels.append((lead, others))
@@ -169,10 +171,11 @@ class JointSimulations(Simulations):
 
 
 def _built_like(twin: Twin, scene: Scene, budget: int, refinement: float = 1.0) -> Twin:
-    """A recording's own twin, in the form in which ``twin`` is integrated and with its flow law."""
+    """A recording's own twin, in the form and with the flow law of ``twin``; a mesh of triangles if that is one."""
     return build_twin(
-        scene, budget, twin.device, refinement, twin.plasticity, twin.formulation, twin.transfer
-    )
+        scene, budget, twin.device, refinement, twin.plasticity, twin.formulation, twin.transfer,
+        mesh_of(twin.lattice),
+    )  # fmt: skip
 
 
 def taken_over(twin: Twin, other: Twin) -> Twin:

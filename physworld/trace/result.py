@@ -12,7 +12,8 @@ from physworld.trace.experiment import Experiment
 from physworld.trace.held_out import HeldOut
 from physworld.trace.score import Scores
 from physworld.trace.split import Split
-from physworld.trace.verdict import Verdict
+from physworld.trace.verdict import DATA, NOTHING, Verdict
+from physworld.twin import Twin
 
 
 @dataclass(frozen=True)
@@ -101,3 +102,16 @@ class TraceResult:
     experiment: Experiment | None = None
     notes: tuple[str, ...] = field(default_factory=tuple)
     recordings: tuple[Outcome, ...] = ()
+
+    @property
+    def better(self) -> Twin | None:
+        """The twin to predict with where it is another than a fit of the declared physics gives, else None.
+
+        It carries the effects of the verdict; or it is the mesh of triangles that a sheet was recorded as, where that
+        leaves nothing to explain (but faulty sightings).
+        """
+        if self.verdict.added is not None:
+            return self.verdict.added.fitted.twin
+        declared = self.declared.fitted.twin
+        alone = self.verdict.name in (NOTHING, DATA) and not self.verdict.model.members
+        return declared if alone and not declared.lattice.smooth else None

@@ -33,6 +33,7 @@ from physworld.trace.faults import Faults, without_faults
 from physworld.trace.holds import held_otherwise
 from physworld.trace.intervals import calibrated, named, spread_of
 from physworld.trace.meshes import MESH_STARTS, MESH_STIFFNESS, recorded_as, taken_as
+from physworld.trace.mixtures import Mixtures
 from physworld.trace.noise import noise_sigma
 from physworld.trace.outcomes import Outcomes
 from physworld.trace.recordings import (
@@ -70,6 +71,8 @@ from physworld.trace.verdict import (
     Verdict,
     claimable,
     decide,
+    implausible,
+    simplest_first,
 )
 from physworld.trace.whitening import Whitener, whitener
 from physworld.twin import Twin
@@ -215,11 +218,18 @@ class _Trace:
         usable = [response for response in found if not response.failed]
         refused |= {r.candidate.label: "its simulation cannot be trusted" for r in found if r.failed}
         setting = (simulations, white, block_of_row, self.frames, config)
-        path = Selection(*setting).path(declared, usable)
+        selection = Selection(*setting)
+        path = selection.path(declared, usable)
         models = [model for step in path for model in step.tried]
         facts = (solver, block_of_row, lambda model: by_chance(model, path[0].scores))
         real = claimable(declared, models, config, *facts)
-        finer_values, agreement = SecondResolution(*setting, finer).check(declared, real)
+        second = SecondResolution(*setting, finer)
+        finer_values, agreement = second.check(declared, real)
+        single = self._complete(declared, real, agreement)
+        mixed = single and Mixtures(selection, second).beside(single, usable, finer_values, agreement)
+        if mixed and mixed.kept:  # of the others only what may not be named still counts
+            path = (*path, mixed)
+            models = [mixed.kept, *(model for model in models if implausible(model) is not None)]
         tried = len({c.effect for c in chosen})
         verdict = decide(declared, models, basis, agreement, resolved, config, tried, *facts)
         if sigma is None:
@@ -231,6 +241,15 @@ class _Trace:
             verdict, declared, white, block_of_row, sigma, path, chosen, refused, numerics, finer_values
         )
         return replace(found, experiment=self._experiment(verdict, white, finer))
+
+    def _complete(
+        self, declared: Model, real: list[Model], agreement: dict[tuple[str, ...], bool]
+    ) -> Model | None:
+        """What would be named, where it leaves so little that a second effect is not looked for."""
+        ordered = simplest_first(real, declared)
+        best = next((model for model in ordered if agreement.get(model.names)), None)
+        finer = self.twin.lattice.smooth  # a mesh of triangles has no finer cells to ask
+        return best if best and finer and best.fitted.misfit <= self.config.near_floor else None
 
     def _rms(self, tracks: np.ndarray) -> float:
         """Root mean squared residual of the sightings per axis [m]."""

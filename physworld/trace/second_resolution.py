@@ -79,6 +79,29 @@ class SecondResolution:
             for member in model.members
         )
 
+    def holds_beside(self, single: Model, pair: Model, values: Values) -> bool:
+        """Whether a pair predicts better than the single effect on finer cells too, by the same strengths.
+
+        Its numbers there go into ``values``.
+        """
+        fine = [
+            refit(
+                self.simulations, self.white, refinement_of(model.fitted.twin, self.finer), model.fitted.unknowns,
+                self.frames, _FINER_STEPS, jacobian=model.fitted.jacobian,
+            )
+            for model in (single, pair)
+        ]  # fmt: skip
+        alone, both = fine
+        if alone is None or both is None:
+            return False
+        values[pair.names] = {unknown.name: both.value(unknown.name) for unknown in both.unknowns}
+        before, after = (cross_validated(fitted, self.block_of_row) for fitted in (alone, both))
+        gates = [unknown.name for member in pair.members for unknown in member.unknowns()]
+        return better_beyond_chance(after, before) and all(
+            abs(both.value(name) - pair.fitted.value(name)) <= _AGREEMENT * abs(pair.fitted.value(name))
+            for name in gates
+        )
+
     def _still_helps(self, declared: Model, fine: Refit) -> bool:
         """Whether the effect predicts better on finer cells too, beside the declared physics refitted there."""
         twin = refinement_of(declared.fitted.twin, self.finer)

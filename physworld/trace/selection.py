@@ -44,7 +44,7 @@ class Selection:
         )
         columns = {response.candidate.label: response.columns for response in usable}
         for number in range(config.effects_at_most):
-            ranked = self._scores(base, usable)
+            ranked = self.scored(base, usable)
             least = max(config.material_share, ranked.threshold if number else 0.0)
             hopeful = best_variants(ranked.ranked, least, config.confirmed, base.names)
             if declared.fitted.misfit <= config.near_floor:  # only a score beyond chance calls for an effect
@@ -62,7 +62,8 @@ class Selection:
                 self.simulations.stage = "refit from other valleys"
                 tried = with_valleys(confirmation, base, ranked, columns, tried, config.near_floor)
             tried = self._again(confirmation, base, self._mirrored(confirmation, base, tried), ranked)
-            tried = self._alike(confirmation, base, self._held_otherwise(confirmation, tried), columns)
+            tried = self._clamped_otherwise(confirmation, self._held_otherwise(confirmation, tried))
+            tried = self._alike(confirmation, base, tried, columns)
             tried = self._beside_the_best(confirmation, tried)
             tried = self._as_plates(base, [*tried, *self._in_parts(confirmation, base, tried, usable)])
             good = [m for m in tried if helps(m, base, config)]
@@ -74,11 +75,11 @@ class Selection:
             if (
                 declared.fitted.misfit > _FAR
             ):  # what the candidates did there says little of what they do here
-                usable = self._afresh(base, usable)
+                usable = self.afresh(base, usable)
                 columns = {response.candidate.label: response.columns for response in usable}
         return tuple(path)
 
-    def _afresh(self, base: Model, usable: list[Response]) -> list[Response]:
+    def afresh(self, base: Model, usable: list[Response]) -> list[Response]:
         """What the candidates do to another model's prediction."""
         self.simulations.stage = "sensitivities"
         chosen = [r.candidate for r in usable if r.candidate.effect not in base.names]
@@ -133,6 +134,17 @@ class Selection:
         self.simulations.stage = "refit of the grips"
         least = min((model.explained for model in tried), default=0.0)
         return [confirmation.held_otherwise(m) if m.explained <= _NEAR * least else m for m in tried]
+
+    def _clamped_otherwise(self, confirmation: Confirmation, tried: list[Model]) -> list[Model]:
+        """Models, the best refitted from other reaches of the clamps where it is complete; the rest of them follow it.
+
+        One that is not has been refitted from elsewhere. A reach of a part of a cell is no smooth unknown, and what
+        the declared physics made of it need not be where the effect fits.
+        """
+        best = min(tried, key=lambda m: m.fitted.misfit, default=None)
+        if best is None or best.fitted.misfit > self.config.near_floor:
+            return tried
+        return [confirmation.clamped_otherwise(m) if m is best else m for m in tried]
 
     def _in_parts(
         self, confirmation: Confirmation, base: Model, tried: list[Model], usable: list[Response]
@@ -200,7 +212,8 @@ class Selection:
             for m in tried
         ]
 
-    def _scores(self, base: Model, usable: list[Response]) -> Scores:
+    def scored(self, base: Model, usable: list[Response]) -> Scores:
+        """Scores of the candidates against what a model leaves."""
         config, white = self.config, self.white
         rest = [r for r in usable if r.candidate.effect not in base.names]
         shape = (len(white.visible), white.visible.shape[1])

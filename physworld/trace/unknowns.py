@@ -16,6 +16,7 @@ from physworld.twin import Twin
 
 CLAMP = "clamp_offset"
 SOFTNESS = "grip_softness"
+REACH = f"{CLAMP}.reach_m"
 SLIP = "grip_slip"
 _SLIP_STEP = 0.25  # of a sheared rope's compliance
 _SOFTNESS_SHARES = (0.1, 1.5)  # of ``AS_HELD``: finite elements as large as the grip hold so much harder

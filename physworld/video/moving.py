@@ -16,6 +16,7 @@ from physworld.video.gaussians import Gaussians
 from physworld.worldmodel.skinning import (
     inverse_distance_weights,
     local_rotations,
+    neighbourhoods,
     quaternion_of,
     quaternion_product,
 )
@@ -44,7 +45,7 @@ class GaussianCarrier:
                 f"half of the Gaussians are more than {np.median(distance[:, 0]):.3g} m from the vertices, whose "
                 f"extent is {size:.3g} m: is the splat in another frame or unit?"
             )
-        self.neighbours = neighbours
+        self._around = neighbourhoods(self.rest, min(neighbours, len(self.rest) - 1))
         self.index, self.weight = index, inverse_distance_weights(distance)
 
     def at(self, moved: np.ndarray) -> tuple[Gaussians, np.ndarray]:
@@ -56,7 +57,7 @@ class GaussianCarrier:
         moved = np.asarray(moved, dtype=np.float64)
         if moved.shape != self.rest.shape or not np.isfinite(moved).all():
             raise ValueError(f"vertices must be finite and of shape {self.rest.shape}, got {moved.shape}")
-        rotation = local_rotations(self.rest, moved, min(self.neighbours, len(self.rest) - 1))
+        rotation = local_rotations(self.rest, moved, index=self._around)
         offset = self.gaussians.means[:, None] - self.rest[self.index]
         carried = np.einsum("mkxy,mky->mkx", rotation[self.index], offset) + moved[self.index]
         turns = quaternion_of(rotation)[self.index]

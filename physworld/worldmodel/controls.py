@@ -33,7 +33,7 @@ def grip_groups(spec: GraphSpec, controllers: np.ndarray) -> tuple[np.ndarray, .
 def on_clock(controllers: np.ndarray, times: np.ndarray | None, dt_s: float, most_ticks: int) -> np.ndarray:
     """Control paths (B, T, K, 3) [m] known at ``times`` (T,) [s] from 0, linearly interpolated at ticks of ``dt_s``.
 
-    Without ``times`` they are at ticks already. Raises ControlsInvalid.
+    Without ``times`` they are at ticks already. Raises ControlsInvalid, also where ``times`` go beyond ``most_ticks``.
     """
     if times is None:
         return controllers
@@ -46,7 +46,9 @@ def on_clock(controllers: np.ndarray, times: np.ndarray | None, dt_s: float, mos
         raise ControlsInvalid("times must start at 0, be finite and increase strictly", "times")
     if times[-1] > most_ticks * dt_s:
         raise ControlsInvalid(
-            f"times end at {times[-1]:.4g} s; {most_ticks} ticks of {dt_s:.4g} s are the most", "times"
+            f"times end at {times[-1]:.4g} s; {most_ticks} ticks of {dt_s:.4g} s are the most for "
+            f"{len(controllers)} candidates",
+            "times",
         )
     ticks = clock_times(float(times[-1]), dt_s)
     return np.moveaxis(resample(np.moveaxis(controllers, 1, 0), times, ticks), 0, 1)

@@ -19,8 +19,9 @@ from physworld.worldmodel.chain_native import chain_arrays, chain_scratch, chain
 from physworld.worldmodel.chain_step import ChainStep
 from physworld.worldmodel.inertia import InertialStep
 from physworld.worldmodel.messages import warp_module
-from physworld.worldmodel.model import PriorStep, WorldModel
+from physworld.worldmodel.model import WorldModel
 from physworld.worldmodel.nearest import REST_RADII
+from physworld.worldmodel.prior_step import PriorStep
 
 REGISTER = 16
 GAP_FLOOR_M = 1e-7  # rounding: the reference places of object vertices are their rest places

@@ -46,8 +46,8 @@ def twin_on(recording: Scene, home: Scene, twin: Twin, particle_budget: int) -> 
     """The twin put where the recording starts: the same material, lattice, effects and parameters.
 
     The recording's own body is taken where its lattice is the twin's; otherwise the twin is moved as a whole, by the
-    rigid motion from the home recording's first points and controllers to this one's, and starts at rest. Ground and
-    colliders are always the recording's.
+    rigid motion from the home recording's first points and controllers to this one's, and starts at rest. So is a mesh
+    of triangles, whose diagonals are the home recording's. Ground and colliders are always the recording's.
 
     Raises:
         SceneUnsupported: the recording has other controllers, or, where the twin has to be moved, other points.
@@ -161,7 +161,8 @@ def start_mismatch(recording: Scene, twin: Twin) -> float:
 def _same_lattice(own: Twin, twin: Twin) -> bool:
     ours, theirs = own.lattice, twin.lattice
     return (
-        ours.cells.shape == theirs.cells.shape
+        theirs.smooth
+        and ours.cells.shape == theirs.cells.shape
         and np.array_equal(ours.cells, theirs.cells)
         and np.allclose(ours.spacing, theirs.spacing, rtol=1e-3)
         and np.allclose(ours.fill, theirs.fill, atol=1e-3)

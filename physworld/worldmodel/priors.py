@@ -17,7 +17,7 @@ from physworld.worldmodel.dataset import Track
 from physworld.worldmodel.graph import GraphSpec
 from physworld.worldmodel.inertia import InertialPrior
 from physworld.worldmodel.modal import ModalPrior, fit_prior
-from physworld.worldmodel.model import prior_step
+from physworld.worldmodel.prior_step import prior_step
 from physworld.worldmodel.rollout import mean_error, unroll_tracks
 
 MODAL, CHAIN, NONE = "modal", "chain", "none"

@@ -243,6 +243,11 @@ def _refuse_other_sizes(
     for name, shape in expected.items():
         if tensors[name].shape != shape:
             raise ValueError(f"{name} {tensors[name].shape}, not {shape}")
+    for name, values in tensors.items():
+        if np.issubdtype(values.dtype, np.floating) and np.isnan(values).any():
+            raise ValueError(
+                f"{name} with {int(np.isnan(values).sum())} of {values.size} values not a number"
+            )
     most = {"skin.index": n, "control.index": tensors["start.controllers"].shape[1]}
     most |= {table: spec.vertex_count + 1, "graph.edge_kind": EDGE_KINDS}
     for name, end in most.items():

@@ -60,6 +60,8 @@ def rollout_batch(
         controllers: all controllers of every candidate at frames 0 … T-1 [m], (B, T, K, 3).
         phi: log property ratios, (n, 2), or (B, n, 2) with one set a candidate.
         threads: that share the candidates.
+
+    Raises GraphInvalid for arrays of other shapes and for values that are not finite.
     """
     frames, n = engine.history + 1, spec.object_count
     expected = ((frames, n, 3), (n, 2))
@@ -69,6 +71,9 @@ def rollout_batch(
         raise GraphInvalid(
             f"controllers of shape {controllers.shape[1:]} do not drive a history of {frames} frames"
         )
+    broken = sum(np.count_nonzero(~np.isfinite(part)) for part in (controllers, initial_history, phi))
+    if broken:
+        raise GraphInvalid(f"{broken} values of controllers, history and phi are not finite")
     origin = graph_origin(spec, initial_history[-1])
     predicted = engine.run_batch(
         initial_history - origin, controllers[:, :, spec.control_index] - origin, phi, threads=threads

@@ -25,6 +25,7 @@ from torch import Tensor
 RIDGE = 1e-4  # λ in units of the neighbourhood's mean square size: keeps weights near 1/distance where free
 DISTANCE_FLOOR = 1e-3  # of the neighbourhood's size: a point that is a vertex
 ON_A_LINE = 1e-6  # of the neighbourhood's spread along it: rounding across a line, not a shape
+GAPS_AT_ONCE = 2**19  # pairs of a point and a vertex that are looked at together: some 60 MiB
 LEAST_TURN = 1e-8  # of the same: weight of turning as little as may be
 
 
@@ -37,7 +38,13 @@ class Skin:
 
     def apply(self, vertices: np.ndarray) -> np.ndarray:
         """Points (…, M, 3) of vertices (…, n, 3)."""
-        return np.einsum("mk,...mkx->...mx", self.weight, np.asarray(vertices)[..., self.index, :])
+        vertices = np.asarray(vertices)
+        points = self.weight[:, :1] * vertices[..., self.index[:, 0], :]
+        for k in range(
+            1, self.index.shape[1]
+        ):  # one neighbour at a time: all at once take K times the memory
+            points += self.weight[:, k, None] * vertices[..., self.index[:, k], :]
+        return points
 
     def apply_torch(self, vertices: Tensor) -> Tensor:
         """The same, differentiable."""
@@ -48,9 +55,14 @@ class Skin:
 
 def nearest_vertices(points: np.ndarray, vertices: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Indices (M, K) of the nearest vertices and their distances [m], nearest first."""
-    distance = np.linalg.norm(points[:, None] - vertices[None], axis=2)
-    index = np.argsort(distance, axis=1, kind="stable")[:, : min(count, vertices.shape[0])]
-    return index, np.take_along_axis(distance, index, axis=1)
+    rows = max(1, GAPS_AT_ONCE // max(1, len(vertices)))
+    parts = []
+    for first in range(0, max(1, len(points)), rows):
+        distance = np.linalg.norm(points[first : first + rows, None] - vertices[None], axis=2)
+        index = np.argsort(distance, axis=1, kind="stable")[:, : min(count, vertices.shape[0])]
+        parts.append((index, np.take_along_axis(distance, index, axis=1)))
+    indices, distances = zip(*parts, strict=True)
+    return np.concatenate(indices), np.concatenate(distances)
 
 
 def inverse_distance_weights(distance: np.ndarray) -> np.ndarray:
@@ -78,15 +90,21 @@ def affine_skin(points: np.ndarray, vertices: np.ndarray, neighbours: int = 8) -
     return Skin(index, weight / weight.sum(axis=1, keepdims=True))
 
 
-def local_rotations(rest: np.ndarray, moved: np.ndarray, neighbours: int = 8) -> np.ndarray:
+def neighbourhoods(rest: np.ndarray, neighbours: int = 8) -> np.ndarray:
+    """Indices (n, K) of every vertex's nearest others in the state ``rest`` (n, 3)."""
+    return nearest_vertices(rest, rest, neighbours + 1)[0][:, 1:]
+
+
+def local_rotations(
+    rest: np.ndarray, moved: np.ndarray, neighbours: int = 8, *, index: np.ndarray | None = None
+) -> np.ndarray:
     """Rotation of every vertex's neighbourhood, (…, n, 3, 3): argmin_R Σ_j ‖R (rest_j − rest_i) − (moved_j
     − moved_i)‖².
 
-    ``rest`` (n, 3), ``moved`` (…, n, 3). Neighbourhoods on a line leave the turn about it free: it is then the least
-    rotation that turns the line.
+    ``rest`` (n, 3), ``moved`` (…, n, 3); ``index`` (n, K): their ``neighbourhoods`` where these are known already.
+    Neighbourhoods on a line leave the turn about it free: it is then the least rotation that turns the line.
     """
-    index, _ = nearest_vertices(rest, rest, neighbours + 1)
-    index = index[:, 1:]
+    index = neighbourhoods(rest, neighbours) if index is None else index
     before = rest[index] - rest[:, None]
     after = moved[..., index, :] - moved[..., :, None, :]
     covariance = np.einsum("...nkx,nky->...nxy", after, before)

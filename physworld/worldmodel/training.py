@@ -42,7 +42,8 @@ from physworld.worldmodel.errors import (
     TrainingDiverged,
 )
 from physworld.worldmodel.graph import GraphSpec
-from physworld.worldmodel.model import Normalisation, WorldModel, prior_step
+from physworld.worldmodel.model import Normalisation, WorldModel
+from physworld.worldmodel.prior_step import prior_step
 from physworld.worldmodel.priors import Prior, fit_priors, prior_error
 from physworld.worldmodel.rollout import mean_error, rollout_tracks
 

@@ -6,10 +6,10 @@ sends binary control messages, and as JSON text ``{"type": "reset"}``. Velocitie
 silent stops its grips.
 
 The model is stepped in a thread, never on the event loop. A slow reader gets fewer frames, the newest each time:
-nothing queues up. A session ends after ``IDLE_S`` without a message (4408), at a message that cannot be read (1007),
-when the client does not take a frame within ``SEND_S`` (4409); a process holds ``MOST_SESSIONS`` of them (1013). One
-that is refused (1008) says why by a problem's code: ``unauthenticated``, ``not_found``, ``conflict``,
-``model_unreadable``.
+nothing queues up here, only in the connection's buffers. A session ends after ``IDLE_S`` without a message (4408), at
+a message that cannot be read (1007), when the client does not take a frame within ``SEND_S`` (4409); a process holds
+``MOST_SESSIONS`` of them (1013). One that is refused (1008) says why by a problem's code: ``unauthenticated``,
+``not_found``, ``conflict``, ``model_unreadable``.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from storage.database import Database
 from storage.errors import StorageError
 
 MOST_SESSIONS, THREADS = 4, 2
-IDLE_S, SEND_S, HOLD_S = 120.0, 10.0, 0.3
+IDLE_S, SEND_S, CLOSE_S, HOLD_S = 120.0, 10.0, 1.0, 0.3
 MOST_FRAMES = 4
 UNREADABLE, TRY_LATER, POLICY, IDLE, TOO_SLOW = 1007, 1013, 1008, 4408, 4409
 
@@ -106,8 +106,11 @@ class _Connection:
         await asyncio.gather(*tasks, return_exceptions=True)
         code, reason = next(iter(done)).result()
         if code and self._socket.application_state is WebSocketState.CONNECTED:
-            with suppress(RuntimeError):  # the client may have gone meanwhile
-                await self._socket.close(code, reason)
+            with suppress(
+                RuntimeError, TimeoutError
+            ):  # the client may have gone meanwhile, or never read again
+                async with asyncio.timeout(CLOSE_S):
+                    await self._socket.close(code, reason)
 
     async def _read(self) -> tuple[int, str]:
         clock = asyncio.get_running_loop().time
@@ -156,6 +159,7 @@ class _Connection:
             try:
                 async with asyncio.timeout(SEND_S):  # wait_for may swallow the cancellation (cpython 86296)
                     await self._socket.send_bytes(frame)
+                self._session.sent(frame)
             except TimeoutError:
                 return TOO_SLOW, f"a frame was not taken within {SEND_S:g} s"
             except (WebSocketDisconnect, RuntimeError):

@@ -74,9 +74,8 @@ def prepare(request: RolloutCreate, model: PublishedModel) -> Prepared:
             f"a controller is {np.abs(driven).max():.4g} m from the origin; {FARTHEST_M:g} m is the farthest",
             "controllers",
         )
-    driven = on_clock(
-        driven, None if request.times is None else np.array(request.times), spec.dt_s, MAX_TICKS
-    )
+    most = min(MAX_TICKS, MAX_STEPS // len(driven))  # before interpolation: two places can span every tick
+    driven = on_clock(driven, None if request.times is None else np.array(request.times), spec.dt_s, most)
     lead = 0
     history = model.start_history
     if request.start == "rest":
@@ -125,9 +124,9 @@ def run(
         taken = slice(first, first + chunk)
         phi = prepared.phi[taken] if prepared.phi.ndim == 3 else prepared.phi
         vertices = model.rollout_batch(driven[taken], history=prepared.history, phi=phi, threads=threads)
-        _check(vertices, first, model.spec.dt_s)
+        _check(vertices, first, prepared.shown[0], model.spec.dt_s)
         vertices = vertices[:, prepared.shown]
-        for part in request.returns:
+        for part in found:
             moved = vertices if part == "vertices" else model.skin.apply(vertices)
             found[part].append(moved.astype(np.float32))
         if progress is not None:
@@ -174,11 +173,12 @@ def _phi(request: RolloutCreate, model: PublishedModel, candidates: int) -> np.n
     return phi + np.log([request.stiffness_factor, request.density_factor])
 
 
-def _check(vertices: np.ndarray, first: int, dt_s: float) -> None:
+def _check(vertices: np.ndarray, first: int, lead: int, dt_s: float) -> None:
+    """Raises RolloutDiverged; ``lead`` ticks were put before the first that was asked for."""
     broken = ~(np.abs(vertices) < 10 * FARTHEST_M).all(axis=(2, 3))
     if broken.any():
         candidate, tick = np.argwhere(broken)[0]
         raise RolloutDiverged(
-            f"candidate {first + candidate} left the numbers at {tick * dt_s:.3g} s: the controls ask more than the "
-            "model has learned"
+            f"candidate {first + candidate} left the numbers at {(tick - lead) * dt_s:.3g} s: the controls ask more "
+            "than the model has learned"
         )

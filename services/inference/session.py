@@ -48,18 +48,18 @@ class LiveSession:
         self.speed_m_s, self.reach_m = SPEED_PER_SIZE * size, REACH_PER_SIZE * size
         self._start, self._flags = start, 0
         self._rollout = LiveRollout(model)
-        self._before = self._now = self._points()
+        self._before = self._now = self._places()
 
     def describe(self) -> dict[str, Any]:
         """What the client must know before the first frame; JSON types."""
         return {
             "dt_s": self.dt_s,
-            "points": len(self._now),
+            "points": len(self._now) - len(self._start),
             "controllers": self._start.tolist(),
             "grips": [group.tolist() for group in self.groups],
             "speed_m_s": self.speed_m_s,
             "reach_m": self.reach_m,
-            "start": self._now.astype(np.float32).tolist(),
+            "start": self._now[: -len(self._start)].astype(np.float32).tolist(),
         }
 
     def read(self, message: bytes) -> Control:
@@ -85,7 +85,7 @@ class LiveSession:
     def reset(self) -> None:
         """Back to the start."""
         self._rollout.reset()
-        self._before = self._now = self._points()
+        self._before = self._now = self._places()
 
     def tick(self, velocity: np.ndarray) -> None:
         """One step of the model under velocities (K, 3) [m/s]; a prediction that left the numbers is set back."""
@@ -95,19 +95,26 @@ class LiveSession:
             middle = offset[group].mean(axis=0)
             offset[group] += np.clip(middle, -self.reach_m, self.reach_m) - middle
         self._rollout.step(self._start + offset)
-        self._before, self._now = self._now, self._points()
+        self._before, self._now = self._now, self._places()
         if not (np.abs(self._now) < 1e3).all():
             self.reset()
             self._flags = SET_BACK
 
     def frame(self, share: float, number: int) -> bytes:
-        """The frame between the last two ticks: ``share`` 1 is the newest."""
-        points = (1.0 - share) * self._before + share * self._now
-        head = HEAD.pack(self._rollout.tick, number, self._rollout.tick * self.dt_s, self._flags)
-        self._flags = 0
-        body = np.concatenate([points, self._rollout.controllers]).astype("<f4")
-        return head + body.tobytes()
+        """The frame between the last two ticks: ``share`` 1 is the newest. A flag is in all frames until ``sent``.
 
-    def _points(self) -> np.ndarray:
+        Its time, points and controllers are those of that moment; its tick is the newest.
+        """
+        tick = self._rollout.tick
+        head = HEAD.pack(tick, number, max(tick - 1 + share, 0.0) * self.dt_s, self._flags)
+        return head + ((1.0 - share) * self._before + share * self._now).astype("<f4").tobytes()
+
+    def sent(self, frame: bytes) -> None:
+        """The client has this frame, and knows what its flags say; frames that were left out told nobody."""
+        self._flags &= ~HEAD.unpack_from(frame)[3]
+
+    def _places(self) -> np.ndarray:
+        """Points and then controllers now [m], (N + K, 3)."""
         vertices = self._rollout.vertices
-        return vertices if self._skin is None else self._skin.apply(vertices)
+        points = vertices if self._skin is None else self._skin.apply(vertices)
+        return np.concatenate([points, self._rollout.controllers])

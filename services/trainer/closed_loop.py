@@ -1,6 +1,6 @@
 """What the card of a model says of the trace that its twin went through.
 
-Which effects were added, with their strengths and intervals, or why nothing was added; the held-out track error of
+Which effects were added, with their strengths and intervals, or why none was; the held-out track error of
 the twin without and with them, and of the world models that learned from the one and from the other. "Before" of the
 twin is the fit's own, with the damping that it may have added; of the world model it is the version that learned from
 that twin with the same settings, where there is one. A trace also calibrates anew: ``twin.recalibrated_m`` is the error
@@ -46,7 +46,7 @@ def closed_loop(
         trace = traces.get_trace(session, payload["trace_id"])
         number = payload.get("baseline")
         baseline = None if number is None else registry.get_version(session, payload["name"], number)
-    added = traces.adds_effects(trace)
+    added = traces.leaves_twin(trace)
     section: dict[str, Any] = {
         "trace_id": trace.id,
         "verdict": trace.verdict,
@@ -75,7 +75,9 @@ def closed_loop(
 
 def statement(trace: Trace) -> str:
     """One sentence for people."""
-    if traces.adds_effects(trace):
+    if traces.leaves_twin(trace) and not trace.effects:
+        return f"The twin is the mesh of triangles that the sheet was recorded as, without an effect: {trace.reason}"
+    if traces.leaves_twin(trace):
         found = []
         for effect in trace.effects:
             strengths = [_figure(name, value.model_dump()) for name, value in effect.parameters.items()]

@@ -117,7 +117,7 @@ def _strengths(stores: Stores, payload: dict[str, Any]) -> tuple[StrengthRange, 
         return ()
     with stores.database.reading() as session:
         trace = traces.get_trace(session, payload["trace_id"])
-    return strength_ranges(trace.effects) if traces.adds_effects(trace) else ()
+    return strength_ranges(trace.effects) if traces.leaves_twin(trace) else ()
 
 
 def _train(

@@ -6,8 +6,9 @@ import numpy as np
 
 from physworld.materials.laws import Law, RodLaw, SheetLaw, SolidLaw
 from physworld.mpm.lattice import Lattice, box_lattice
+from physworld.mpm.problem import HeldNodes, Problem
 from physworld.mpm.terms import Term
-from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian
+from physworld.mpm.total_lagrangian import TotalLagrangian
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 

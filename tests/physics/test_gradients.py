@@ -12,7 +12,8 @@ from bodies import GRAVITY, RodLaw, SheetLaw, SolidLaw, clamped_lattice, rest_no
 from physworld.errors import UnstableSimulation
 from physworld.mpm.adjoint import Adjoint, RecordedRun
 from physworld.mpm.adjoint_reverse import Gradient
-from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian
+from physworld.mpm.problem import HeldNodes, Problem
+from physworld.mpm.total_lagrangian import TotalLagrangian
 
 SHAPES = ("solid", "solid with friction", "sheet", "sheet with friction", "rod", "rod with friction")
 TIMES = np.array([0.0, 0.010, 0.020, 0.032, 0.040])  # uneven: friction sees a change of the time step

@@ -13,7 +13,8 @@ from physworld.mpm.adjoint import Adjoint
 from physworld.mpm.adjoint_reverse import Gradient
 from physworld.mpm.contact import GroundContact
 from physworld.mpm.lattice import Lattice, box_lattice
-from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian
+from physworld.mpm.problem import HeldNodes, Problem
+from physworld.mpm.total_lagrangian import TotalLagrangian
 
 TIMES = np.linspace(0.0, 0.06, 7)
 SAME = {3: 1e-6, 2: 1e-12, 1: 1e-12}  # [m] solids add up single-precision forces
@@ -30,7 +31,7 @@ def sliding(dim: int, factor: np.ndarray | None) -> tuple[Problem, np.ndarray, H
     """A body that slides and turns on the ground at its lower side, free of grips."""
     lattice, law = body(dim), LAWS[dim]
     rest = rest_nodes(lattice)
-    contact = GroundContact(lattice, law, 0.0 if dim == 3 else -1e-3, 0.4, 0.0 if dim == 3 else 1e-3)
+    contact = GroundContact(0.0 if dim == 3 else -1e-3, 0.4, 0.0 if dim == 3 else 1e-3)
     problem = Problem(lattice, law, rest, GRAVITY, terms=(contact,), friction_factor=factor)
     velocity = np.zeros_like(rest)
     velocity[:, 0], velocity[:, 1] = 0.3, 0.5 + 3.0 * rest[:, 0]

@@ -19,8 +19,9 @@ from physworld.errors import NotDifferentiable
 from physworld.mpm.gradient import Direction
 from physworld.mpm.gradient_forward import sensitivities
 from physworld.mpm.gradient_twin import Neighbours, TwinRun, parameter, strength
+from physworld.mpm.problem import HeldNodes
 from physworld.mpm.soft_grips_derivatives import same_soft_grips
-from physworld.mpm.total_lagrangian import HeldNodes, TotalLagrangian
+from physworld.mpm.total_lagrangian import TotalLagrangian
 from physworld.scene import Grip
 from physworld.twin import Twin
 

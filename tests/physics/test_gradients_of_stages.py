@@ -15,7 +15,8 @@ from bodies import GRAVITY, RodLaw, SheetLaw, SolidLaw, clamped_lattice, rest_no
 
 from physworld.mpm.adjoint import Adjoint, RecordedRun
 from physworld.mpm.adjoint_reverse import Gradient
-from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian
+from physworld.mpm.problem import HeldNodes, Problem
+from physworld.mpm.total_lagrangian import TotalLagrangian
 
 SHAPES = ("solid", "sheet", "rod", "drag alone")
 TIMES = np.array([0.0, 0.010, 0.020, 0.032, 0.040])  # uneven: stages of several lengths

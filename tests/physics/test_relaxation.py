@@ -25,9 +25,10 @@ from physworld.mpm.energy import run_with_ledger
 from physworld.mpm.forces import InternalForces
 from physworld.mpm.friction import FrictionForces
 from physworld.mpm.lattice import Lattice, box_lattice
+from physworld.mpm.problem import HeldNodes, Problem
 from physworld.mpm.relaxation import coefficients, stages_for
 from physworld.mpm.stability import DRAG_SHRINK, EXPLICIT_SHRINK
-from physworld.mpm.total_lagrangian import HeldNodes, Problem, Run, TotalLagrangian
+from physworld.mpm.total_lagrangian import Run, TotalLagrangian
 
 SINGLE = 2e-4  # of forces that are differences of single-precision ones over a small displacement
 BODIES: dict[str, tuple[Lattice, Law]] = {

@@ -13,8 +13,9 @@ from physworld.mpm.batch import Batch
 from physworld.mpm.contact import GroundContact
 from physworld.mpm.energy import run_with_ledger
 from physworld.mpm.lattice import Lattice, box_lattice
+from physworld.mpm.problem import Problem
 from physworld.mpm.self_contact import SelfContact
-from physworld.mpm.total_lagrangian import Problem, Run, TotalLagrangian
+from physworld.mpm.total_lagrangian import Run, TotalLagrangian
 
 G = 9.81
 X, Y = np.eye(3)[0], np.eye(3)[1]
@@ -173,7 +174,7 @@ def test_a_sheet_that_falls_on_itself_does_not_pass_through(touching: bool) -> N
     thickness = 2e-3
     lattice = box_lattice(np.zeros(2), np.array([0.3, 0.1]), (24, 8))
     start = folded(lattice, 0.12, 0.02, 0.5 * thickness)
-    terms: tuple = (GroundContact(lattice, CLOTH, 0.0, 0.5, 0.5 * thickness),)
+    terms: tuple = (GroundContact(0.0, 0.5, 0.5 * thickness),)
     if touching:
         terms += (SelfContact(thickness, 0.3),)
     problem = Problem(lattice, CLOTH, rest_nodes(lattice), GRAVITY, drag_per_s=0.5, terms=terms)
@@ -196,7 +197,7 @@ def test_a_coil_of_rope_falls_on_itself_and_rests_a_diameter_apart() -> None:
     start = np.stack(
         [radius * np.cos(turn), radius * np.sin(turn), pitch / (2 * np.pi) * turn + 0.02], axis=1
     )
-    ground = GroundContact(lattice, ROPE, 0.0, 0.5, 0.5 * diameter)
+    ground = GroundContact(0.0, 0.5, 0.5 * diameter)
     terms = (ground, SelfContact(diameter, 0.3))
     problem = Problem(lattice, ROPE, rest_nodes(lattice), GRAVITY, drag_per_s=0.5, terms=terms)
     solver = TotalLagrangian(problem)
@@ -244,7 +245,7 @@ def test_a_stack_of_sheets_is_stable_and_comes_to_rest() -> None:
     lattice, own = in_pieces(((5, 4),) * layers, dx)
     corners = np.array([[5e-4 * k, 3e-4 * k, thickness * (0.5 + k) + 0.002 * k] for k in range(layers)])
     nodes = laid(lattice, own, corners, [np.eye(3)[:2]] * layers)
-    terms = (GroundContact(lattice, CLOTH, 0.0, 0.5, 0.5 * thickness), SelfContact(thickness, 0.4))
+    terms = (GroundContact(0.0, 0.5, 0.5 * thickness), SelfContact(thickness, 0.4))
     solver = TotalLagrangian(Problem(lattice, CLOTH, nodes, GRAVITY, drag_per_s=10.0, terms=terms))
     moved = solver.run(nodes, 0 * nodes, still(NOBODY, nodes, 3), np.array([0.0, 0.75, 0.8]))
     heights = np.array([moved[-1][k, 2].mean() for k in own])

@@ -18,7 +18,8 @@ from physworld.mpm.adjoint_reverse import Gradient
 from physworld.mpm.energy import run_with_ledger
 from physworld.mpm.gradient import Direction, gradients
 from physworld.mpm.lattice import Lattice, box_lattice
-from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian
+from physworld.mpm.problem import HeldNodes, Problem
+from physworld.mpm.total_lagrangian import TotalLagrangian
 from physworld.mpm.twist import BoundTwist, Span, Twist, span_between
 
 LENGTH, CELLS = 0.36, 12

@@ -14,7 +14,8 @@ from physworld.materials.plastic import DruckerPrager, Identity, VonMises
 from physworld.mpm import updated_lagrangian
 from physworld.mpm.contact import GroundContact
 from physworld.mpm.lattice import Lattice, box_lattice, lattice_from_cells
-from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian
+from physworld.mpm.problem import HeldNodes, Problem
+from physworld.mpm.total_lagrangian import TotalLagrangian
 from physworld.mpm.transfer import Apic, Asflip, Transfer
 from physworld.mpm.updated_lagrangian import UpdatedLagrangian
 
@@ -117,7 +118,7 @@ def test_a_block_slides_to_the_coulomb_distance_and_rests_without_a_gap(transfer
     lattice = box_lattice(np.zeros(3), np.array([0.12, 0.12, 0.06]), (4, 4, 2))
     friction, speed = 0.4, 0.8
     rest = rest_nodes(lattice)
-    problem = Problem(lattice, law, rest, GRAVITY, terms=(GroundContact(lattice, law, 0.0, friction),))
+    problem = Problem(lattice, law, rest, GRAVITY, terms=(GroundContact(0.0, friction),))
     engine = UpdatedLagrangian(problem, transfer=transfer)
     velocity = np.tile([speed, 0.0, 0.0], (len(rest), 1))
     middle = engine.run_particles(rest, velocity, unheld(4), np.linspace(0.0, 0.6, 4)).mean(axis=1)
@@ -156,7 +157,7 @@ def sand(angle_deg: float, transfer: Transfer) -> tuple[np.ndarray, np.ndarray]:
     """Particles of a collapsed column at the end, and the last tenth of a second's motion."""
     lattice = box_lattice(np.array([-0.05, -0.05, 0.0]), np.array([0.1, 0.1, 0.1]), (5, 5, 5))
     law = SolidLaw(2e5, 0.3, density_kg_m3=1500.0)
-    ground = GroundContact(lattice, law, 0.0, 0.6)
+    ground = GroundContact(0.0, 0.6)
     rest = rest_nodes(lattice)
     engine = UpdatedLagrangian(
         Problem(lattice, law, rest, GRAVITY, terms=(ground,)),

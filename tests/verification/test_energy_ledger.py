@@ -13,7 +13,8 @@ from physworld.materials.laws import Law, RodLaw, SheetLaw, SolidLaw
 from physworld.mpm.contact import GroundContact
 from physworld.mpm.energy import EnergyLedger, run_with_ledger
 from physworld.mpm.lattice import Lattice, box_lattice
-from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian
+from physworld.mpm.problem import HeldNodes, Problem
+from physworld.mpm.total_lagrangian import TotalLagrangian
 
 LEAPFROG = 5e-5  # share of the energy exchanged that a leapfrog's bounded oscillation may reach
 ROUND_OFF = 1e-12
@@ -103,7 +104,7 @@ def test_a_falling_body_trades_height_for_speed() -> None:
 def test_friction_on_the_ground_takes_the_energy_of_a_slide() -> None:
     lattice = box_lattice(np.zeros(3), np.array([0.12, 0.12, 0.03]), (4, 4, 1))
     law, rest = SolidLaw(2e5, 0.3, density_kg_m3=500.0), rest_nodes(lattice)
-    problem = Problem(lattice, law, rest, GRAVITY, terms=(GroundContact(lattice, law, 0.0, 0.4),))
+    problem = Problem(lattice, law, rest, GRAVITY, terms=(GroundContact(0.0, 0.4),))
     velocity = np.tile([0.6, 0.0, 0.0], (len(rest), 1))
     nobody = HeldNodes(nowhere(), *np.zeros((2, len(TIMES), 0, 3)))
     ledger = run_with_ledger(problem, rest, velocity, nobody, TIMES)[1]

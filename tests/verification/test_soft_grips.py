@@ -17,8 +17,9 @@ from skfem.helpers import ddot, dot, sym_grad, trace
 
 from physworld.materials.laws import SolidLaw
 from physworld.mpm.lattice import Lattice, box_lattice
+from physworld.mpm.problem import HeldNodes, Problem
 from physworld.mpm.soft_grips import AS_HELD, gram_matrix, gripped_points, holds_a_part, soften, touched_nodes
-from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian
+from physworld.mpm.total_lagrangian import TotalLagrangian
 
 SIZE = np.array([0.12, 0.06, 0.06])
 GRIP_LOW, GRIP_HIGH = np.array([0.0, 0.015, 0.015]), np.array([0.03, 0.045, 0.045])

@@ -9,7 +9,8 @@ import pytest
 
 from benchmarks import verification_twist as twist
 from benchmarks.verification_cases import hold
-from physworld.mpm.total_lagrangian import Problem, TotalLagrangian
+from physworld.mpm.problem import Problem
+from physworld.mpm.total_lagrangian import TotalLagrangian
 from physworld.mpm.twist import Twist, span_between
 
 

@@ -48,6 +48,8 @@ from workers.tasks.inputs import made_from, scene_of, twin_of
 
 FLOAT_BYTES = 4
 STORE_OVERHEAD = 1.05
+MOST_COLUMNS = 3
+"""Of an episode's properties: stiffness, density, and the ground's friction where a field of it is perturbed."""
 WIDTHS = {"cpu": 1, "cuda": 16}
 """Episodes side by side, by the kind of device. On a CPU the gain is small and two workers would share it twice."""
 RESERVED_BYTES = 256 * 2**20
@@ -66,7 +68,9 @@ def plan(context: TaskContext, stores: Stores) -> HandlerResult:
         plan_episode(scene, twin, demonstration, derived_seed(config.seed % 2**63, 0))
     particles, controllers = len(twin.particles_rest), scene.controllers.shape[1]
     per_frame = 3 * FLOAT_BYTES * (particles + min(MOST_KEPT, particles) + controllers) + 8
-    need = round(STORE_OVERHEAD * config.episodes * (frames * per_frame + 2 * FLOAT_BYTES * particles))
+    need = round(
+        STORE_OVERHEAD * config.episodes * (frames * per_frame + MOST_COLUMNS * FLOAT_BYTES * particles)
+    )
     _check_disk(stores, need, f"{config.episodes} episodes of {frames} frames x {particles} particles")
     return HandlerResult(
         {"episodes": config.episodes, "frames": frames, "particles": particles, "estimated_bytes": need}
@@ -207,7 +211,7 @@ def _strengths(stores: Stores, trace_id: str | None, config: DatasetConfig) -> t
 def _read_strengths(stores: Stores, trace_id: str) -> tuple[StrengthRange, ...]:
     with stores.database.reading() as session:
         trace = traces.get_trace(session, trace_id)
-    return strength_ranges(trace.effects) if traces.adds_effects(trace) else ()
+    return strength_ranges(trace.effects) if traces.leaves_twin(trace) else ()
 
 
 def strength_ranges(effects: Sequence[FoundEffect]) -> tuple[StrengthRange, ...]:

@@ -7,13 +7,13 @@ do not depend on each other are shared with whatever worker is free (:mod:`worke
 
 from __future__ import annotations
 
-from physworld.calibrate import CalibrationConfig, calibrate_in_stages
-from physworld.mpm.triangles import Mesh
+from physworld.calibrate import CalibrationConfig
 from schemas.fit import FitConfig
 from storage import helpers
 from workers.context import TaskContext
 from workers.law_choice import chosen_laws
 from workers.lineage import lineage_of
+from workers.mesh_choice import fitted_as_recorded, named_mesh
 from workers.registry import HandlerResult
 from workers.stores import Stores
 from workers.tasks.fit_accuracy import fit_accuracy, not_measured
@@ -43,21 +43,15 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
         plasticity=config.plasticity,
         formulation=config.formulation,
         transfer=config.transfer,
-        mesh=None if config.mesh is None else Mesh.read(config.mesh),
+        mesh=named_mesh(config.mesh),
     )
     journal = stored_journal(stores, context.lease.job_id, payload)
     runner = SharedRunner(context, stores, WORTH_SHARING_S)
     calibration, law = chosen_laws(
         config.law, scene, calibration, progress, context.cancelled, journal, runner
     )
-    fitted = calibrate_in_stages(
-        scene,
-        calibration,
-        config.stages,
-        progress=progress,
-        cancelled=context.cancelled,
-        journal=journal,
-        runner=runner,
+    fitted = fitted_as_recorded(
+        config.mesh, scene, calibration, config.stages, progress, context.cancelled, journal, runner
     )
     accuracy = not_measured("left out by the request")
     if config.numerics:

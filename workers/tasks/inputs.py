@@ -97,6 +97,6 @@ def _read_twin(stores: Stores, fit_id: str, trace_id: str | None) -> Twin:
         trace = None if trace_id is None else traces.get_trace(session, trace_id)
     if fit.state != "ready":
         raise Conflict(f"fit {fit_id} is {fit.state}; its twin exists once it is ready")
-    owner = trace if trace is not None and traces.adds_effects(trace) else fit
+    owner = trace if trace is not None and traces.leaves_twin(trace) else fit
     data = stores.artifacts.read_bytes(named(owner.artifacts, TWIN, owner.id).sha256)
     return Twin.from_arrays(npz_arrays(data), stores.settings.device)

@@ -4,7 +4,7 @@ Files: ``report.json`` (:func:`physworld.trace.document`), ``tracks.npz`` (``tim
 ``after`` (T, N, 3) f8 [m]: open loop from frame 0 without and with the effects, each calibrated on the training frames;
 of several recordings those of the first, and ``before_k``, ``after_k`` of each), ``report.html`` (one self-contained
 page), ``declared.npz``: the twin of the declared physics alone, calibrated anew (``Twin.to_arrays``), and, where the
-verdict adds one (``Verdict.added``), ``twin.npz``: the twin that carries the effects.
+trace found a better one than a fit's (``TraceResult.better``), ``twin.npz``.
 """
 
 from __future__ import annotations
@@ -40,7 +40,6 @@ def trace_files(scene: Scene, result: TraceResult, report: dict[str, Any]) -> li
         (PAGE, HTML, render(report, scene, result.before, result.after).encode()),
         (DECLARED, NPZ, npz_bytes(result.declared.fitted.twin.to_arrays())),
     ]
-    added = result.verdict.added
-    if added is not None:
-        files.append((TWIN, NPZ, npz_bytes(added.fitted.twin.to_arrays())))
+    if result.better is not None:
+        files.append((TWIN, NPZ, npz_bytes(result.better.to_arrays())))
     return files

@@ -99,6 +99,8 @@ class AsyncLive(AsyncResource):
             ConnectionFailed: no WebSocket could be opened.
         """
         ticket = await self._client.send(live_frames.ticket_create(model, version))
+        if not ticket.ticket:  # the first answer was lost on its way, and the replay of it holds none
+            ticket = await self._client.send(live_frames.ticket_create(model, version))
         where = live_frames.address(self._client.base_url, ticket, frames, part)
         proxy: Literal[True] | None = None if is_loopback(self._client.base_url) else True
         async with AsyncExitStack() as stack:

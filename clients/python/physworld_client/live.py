@@ -98,6 +98,8 @@ class Live(Resource):
             ConnectionFailed: no WebSocket could be opened.
         """
         ticket = self._client.send(live_frames.ticket_create(model, version))
+        if not ticket.ticket:  # the first answer was lost on its way, and the replay of it holds none
+            ticket = self._client.send(live_frames.ticket_create(model, version))
         where = live_frames.address(self._client.base_url, ticket, frames, part)
         proxy: Literal[True] | None = None if is_loopback(self._client.base_url) else True
         with ExitStack() as stack:

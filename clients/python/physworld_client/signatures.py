@@ -3,8 +3,8 @@
 A manifest is signed with Ed25519 by the service that published it (``manifest.sig.json``). The public key is trusted
 
 * when it is given (``public_key=``), or
-* when it is in the file of known keys, which ``client.models.download`` adds the service's keys to, as ``ssh`` does
-  with hosts: ``PHYSWORLD_KNOWN_KEYS``, else ``physworld/known-keys.json`` below ``XDG_CONFIG_HOME`` or ``~/.config``.
+* when it is in the file of known keys, which every ``client.models.download`` adds the keys to that its service lists:
+  ``PHYSWORLD_KNOWN_KEYS``, else ``physworld/known-keys.json`` below ``XDG_CONFIG_HOME`` or ``~/.config``.
 
 A key that lies beside the files would prove nothing: whoever can replace a manifest can replace that too.
 """

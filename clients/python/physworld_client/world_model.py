@@ -166,6 +166,9 @@ class WorldModel:
                 column doubles the stiffness.
             history: object vertices at the first h+1 ticks [m], (h+1, n, 3); by default the recording's.
                 From rest: one frame h+1 times, with controllers that stand still as long.
+
+        Raises:
+            ValueError: arrays of other shapes, or values that are not finite.
         """
         frames, n = self.history + 1, self._network.object_count
         start = self.start_history if history is None else np.asarray(history, dtype=np.float64)
@@ -178,6 +181,9 @@ class WorldModel:
                 f"history {start.shape} and phi {properties.shape}, not {(frames, n, 3)} and "
                 f"{(n, PROPERTY_COUNT)}"
             )
+        broken = sum(np.count_nonzero(~np.isfinite(part)) for part in (driven, start, properties))
+        if broken:
+            raise ValueError(f"{broken} values of controllers, history and phi are no finite numbers")
         origin = start[-1].mean(axis=0)
         if self.ground_height_m is not None:
             origin[2] = self.ground_height_m
@@ -194,5 +200,8 @@ class WorldModel:
         if self._skin is None:
             raise ModelUnreadable(f"{self.name} version {self.version} carries no measured points")
         index, weight = self._skin
-        points: np.ndarray = np.einsum("mk,...mkx->...mx", weight, np.asarray(vertices)[..., index, :])
+        places = np.asarray(vertices)
+        points: np.ndarray = weight[:, :1] * places[..., index[:, 0], :]
+        for k in range(1, index.shape[1]):  # one neighbour at a time: all at once take K times the memory
+            points += weight[:, k, None] * places[..., index[:, k], :]
         return points

@@ -1,7 +1,8 @@
 """Live sessions: a ticket over HTTP, then a WebSocket that is handed through to the inference service.
 
 A program may connect with its key in the header instead of a ticket. Nothing is computed here: frames pass as they
-come, and a client that reads slowly slows the inner connection, whose sender then leaves frames out.
+come, and a client that reads slowly slows the inner connection, whose sender then leaves frames out. One that takes
+nothing for ``SEND_S`` is let go here as there: its own connection may hang for minutes before the system gives it up.
 """
 
 from __future__ import annotations
@@ -35,8 +36,10 @@ router = APIRouter(prefix="/live", tags=["live"])
 sockets = APIRouter()
 
 MESSAGE_BYTES = 64 * 1024
-POLICY, UNAVAILABLE, TOO_BIG = 1008, 1013, 1009
+FIRST_MESSAGE_BYTES = 64 * 2**20  # it lists the body's points as text; the SDK reads as much
+POLICY, UNAVAILABLE, TOO_BIG, TOO_SLOW = 1008, 1013, 1009, 4409
 OPEN_S = 60.0  # the inference service loads torch at its first session
+SEND_S, CLOSE_S = 10.0, 1.0
 PASSED_CODES = frozenset({1000, 1001, 1007, 1008, 1013, *range(4000, 5000)})
 
 log = structlog.get_logger("physworld.live")
@@ -98,7 +101,12 @@ async def live(socket: WebSocket) -> None:
     address = f"{settings.inference_url.replace('http', 'ws', 1)}/live?{urlencode(inner_query)}"
     try:
         async with connect(
-            address, compression=None, proxy=None, open_timeout=OPEN_S, max_queue=2, max_size=2**22
+            address,
+            compression=None,
+            proxy=None,
+            open_timeout=OPEN_S,
+            max_queue=2,
+            max_size=FIRST_MESSAGE_BYTES,
         ) as inner:
             await _relay(socket, inner)
     except (OSError, TimeoutError, WebSocketException) as error:
@@ -155,7 +163,12 @@ async def _relay(socket: WebSocket, inner: ClientConnection) -> None:
     async def down() -> tuple[int, str]:
         while True:
             message = await inner.recv()
-            await (socket.send_bytes(message) if isinstance(message, bytes) else socket.send_text(message))
+            sending = socket.send_bytes(message) if isinstance(message, bytes) else socket.send_text(message)
+            try:
+                async with asyncio.timeout(SEND_S):
+                    await sending
+            except TimeoutError:
+                return TOO_SLOW, f"a frame was not taken within {SEND_S:g} s"
 
     tasks = [asyncio.create_task(work()) for work in (up, down)]
     done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -168,10 +181,12 @@ async def _relay(socket: WebSocket, inner: ClientConnection) -> None:
         code, reason = first.result()
     elif isinstance(error, ConnectionClosed):
         closed = error.rcvd
-        known = closed is not None and closed.code in PASSED_CODES
-        code, reason = (closed.code, closed.reason) if closed is not None and known else (UNAVAILABLE, "")
+        code, reason = UNAVAILABLE, "the inference service broke the session off"
+        if closed is not None and closed.code in PASSED_CODES:
+            code, reason = closed.code, closed.reason
     else:
         code, reason = 0, ""
     if code and socket.application_state is WebSocketState.CONNECTED:
-        with suppress(RuntimeError):
-            await socket.close(code, reason)
+        with suppress(RuntimeError, TimeoutError):
+            async with asyncio.timeout(CLOSE_S):
+                await socket.close(code, reason)

@@ -28,7 +28,8 @@ from storage import jobs, registry, resources, runs
 
 router = APIRouter(prefix="/rollouts", tags=["rollouts"])
 
-NOMINAL_RATE_HZ = 30.0
+NOMINAL_RATE_HZ, LEAST_RATE_HZ = 30.0, 22.5
+"""Ticks of a model's clock in a second: near so many, and never fewer (``physworld.worldmodel.clock.model_dt``)."""
 _ANSWERS: dict[int | str, dict[str, Any]] = {
     202: {"description": "Too large to be answered at once: a job; its output is the rollout"},
     **documented(401, 403, 404, 409, 413, 422, 503),
@@ -128,11 +129,22 @@ def _shape(body: RolloutCreate, controllers: int) -> tuple[int, int]:
             f"{shape[0]} candidates of {shape[1]} ticks; at most {MAX_CANDIDATES} candidates, {MAX_TICKS} ticks and "
             f"{MAX_STEPS} in all",
         )
-    if body.times is not None and (
-        not body.times or not np.isfinite(body.times).all() or len(body.times) != shape[1]
-    ):
-        raise invalid("times", f"{len(body.times)} times, which must be finite, for {shape[1]} places")
+    if body.times is not None:
+        _check_times(body.times, shape[0], shape[1])
     return shape[0], shape[1]
+
+
+def _check_times(times: list[float], candidates: int, places: int) -> None:
+    """Raises ApiProblem for times that are not numbers, not as many as places, or too long for any model's clock."""
+    if not times or not np.isfinite(times).all() or len(times) != places:
+        raise invalid("times", f"{len(times)} times, which must be finite, for {places} places")
+    ticks = times[-1] * LEAST_RATE_HZ
+    if ticks > MAX_TICKS or candidates * ticks > MAX_STEPS:
+        raise invalid(
+            "times",
+            f"times end at {times[-1]:.4g} s: {candidates} candidates of {ticks:.4g} ticks or more; at most "
+            f"{MAX_TICKS} ticks and {MAX_STEPS} in all",
+        )
 
 
 def _encoded(body: RolloutCreate) -> RolloutCreate:

@@ -18,6 +18,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 
 from schemas.model import TrainingConfig
+from services.api.routes import live as api_live
 from services.inference import live
 from services.inference.session import HEAD
 from storage import api_keys, registry
@@ -335,5 +336,45 @@ def test_sessions_are_limited_and_a_place_is_free_again_when_one_ends(served: Se
                 except ConnectionClosed:
                     await asyncio.sleep(0.05)
         raise AssertionError("no place became free")
+
+    asyncio.run(asyncio.wait_for(work(), 60.0))
+
+
+def many(values: np.ndarray) -> np.ndarray:
+    """The same points so often that their frames fill a connection's buffers at once."""
+    return np.tile(values, (20_000, 1))
+
+
+CROWDED = {"changed": {"skin.index": many, "skin.weight": many}}
+
+
+def test_a_client_that_reads_no_more_loses_its_place(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The end of its session waits neither for it to read the close frame nor for the system to give it up."""
+    monkeypatch.setattr(live, "SEND_S", 0.5)
+    monkeypatch.setattr(api_live, "SEND_S", 0.5)
+    name, version = publish_tiny(served.database, served.stores.artifacts, name="tiny-crowd", **CROWDED)
+    plain = f"/v1/live?{urlencode({'model': name, 'version': version})}"
+    key = {"Authorization": f"Bearer {served.token}"}
+
+    async def work() -> None:
+        stalled = [
+            await connect(
+                address(served, plain), proxy=None, additional_headers=key, max_size=2**26, max_queue=1
+            )
+            for _ in range(live.MOST_SESSIONS)
+        ]
+        for socket in stalled:
+            assert json.loads(await socket.recv())["points"] == 80_000  # more than 4 MiB of text
+        for _ in range(150):
+            async with connect(address(served, path_of(served)), proxy=None) as again:
+                try:
+                    assert json.loads(await again.recv())["type"] == "ready"
+                    break
+                except ConnectionClosed:
+                    await asyncio.sleep(0.1)
+        else:
+            raise AssertionError("no place became free")
+        for socket in stalled:
+            socket.transport.abort()
 
     asyncio.run(asyncio.wait_for(work(), 60.0))

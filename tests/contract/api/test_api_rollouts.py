@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import tracemalloc
 from collections.abc import Iterator
 
 import numpy as np
@@ -10,8 +11,11 @@ import pytest
 from inference_serving import Served, serve_inference
 from published_tiny import publish_tiny, tiny_model
 
+from physworld.worldmodel.errors import ControlsInvalid
 from schemas.arrays import EncodedArray
-from schemas.rollout import SYNC_STEPS
+from schemas.rollout import SYNC_STEPS, RolloutCreate
+from services.inference import rollouts
+from services.inference.models import Models
 from storage import leases
 from storage.tables import utc_now
 from workers.execute import Runtime, run_shard
@@ -144,6 +148,14 @@ def test_a_large_rollout_is_a_job_whose_artifact_is_the_same_prediction(served: 
     assert points[:2] == pytest.approx(expected, abs=SINGLE_PRECISION_M)
 
 
+def test_a_part_that_is_named_twice_is_returned_once(served: Served) -> None:
+    """The candidates would else stand in the answer twice, one chunk after the other."""
+    with served.client() as client:
+        answer = client.post("/v1/rollouts", json=body(served, paths(), returns=["points", "points"]))
+    assert answer.status_code == 200, answer.text
+    assert EncodedArray.model_validate(answer.json()["points"]).shape == [3, 16, 4, 3]
+
+
 def test_the_same_key_gives_the_same_answer_and_another_body_is_refused(served: Served) -> None:
     with served.client() as client:
         headers = {"Idempotency-Key": "rollout-1"}
@@ -181,6 +193,16 @@ def test_the_same_key_gives_the_same_answer_and_another_body_is_refused(served: 
         (lambda c: {"dt_s": 0.01}, "dt_s", "0.0333333"),
         (lambda c: {"times": [0.0, 0.1]}, "times", "2 times"),
         (lambda c: {"times": [0.5 + 0.1 * i for i in range(16)]}, "times", "start at 0"),
+        (lambda c: {"times": [*range(15), 1e308]}, "times", "1e+308 s"),
+        (lambda c: {"times": [*range(15), 1e306], "mode": "job"}, "times", "1e+306 s"),
+        (
+            lambda c: {
+                "controllers": EncodedArray.of(np.repeat(c[:1, :2], 4096, 0)).model_dump(),
+                "times": [0.0, 99.0],
+            },
+            "times",
+            "4096 candidates",
+        ),
         (lambda c: {"phi": [[0.0, 0.0]]}, "phi", "(20, 2)"),
         (lambda c: {"stiffness_factor": 1e9}, "stiffness_factor", "100"),
     ],
@@ -196,6 +218,47 @@ def test_what_cannot_be_rolled_out_is_refused_with_the_field_and_the_numbers(
     problem = answer.json()
     assert any(field in fault["loc"] for fault in problem["errors"]), problem
     assert words in answer.text
+
+
+def test_few_places_of_many_candidates_are_refused_before_they_are_interpolated() -> None:
+    """Two places and their times span every tick: interpolated they would fill the worker's memory."""
+    asked = RolloutCreate(
+        model="tiny-bar", controllers=EncodedArray.of(paths(1000)[:, :2]), times=[0.0, 60.0], mode="job"
+    )
+    model = tiny_model()[2]
+    tracemalloc.start()
+    with pytest.raises(
+        ControlsInvalid, match=r"500 ticks of 0\.03333 s are the most for 1000 candidates"
+    ) as refused:
+        rollouts.prepare(asked, model)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert refused.value.field == "times"
+    assert peak < 20e6
+
+
+def test_a_prediction_that_leaves_the_numbers_says_when_after_what_was_asked_for(served: Served) -> None:
+    """From rest too, where ticks of the model's history come before the first one that was asked for."""
+    name, version = publish_tiny(
+        served.database,
+        served.stores.artifacts,
+        name="tiny-wild",
+        changed={"prior.weight": lambda values: 50.0 * values},
+    )
+    start = tiny_model()[2].start_controllers[:1]
+    asked = body(served, np.repeat(start, 60, axis=0), start="rest") | {"model": name, "version": version}
+    _, wild = Models(served.database, served.stores.artifacts).get(name, version)
+    lead = wild.model.config.history
+    rolled = wild.rollout(
+        np.repeat(start, 60 + lead, axis=0).astype(np.float32).astype(float),
+        history=np.repeat(wild.start_history[:1], lead + 1, axis=0),
+    )
+    tick = int(np.argmin((np.abs(rolled) < 10 * rollouts.FARTHEST_M).all(axis=(1, 2)))) - lead
+    assert tick > 0
+    with served.client() as client:
+        answer = client.post("/v1/rollouts", json=asked)
+    assert (answer.status_code, answer.json()["code"]) == (422, "rollout_diverged")
+    assert f"candidate 0 left the numbers at {tick * wild.spec.dt_s:.3g} s" in answer.json()["detail"]
 
 
 def test_unknown_models_and_readers_are_refused(served: Served) -> None:

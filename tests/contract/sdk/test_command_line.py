@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from sdk_service import METRICS, ROWS, Service, write_scene
 
@@ -220,6 +221,64 @@ def test_an_error_is_one_clear_line(tmp_path: Path, arguments: tuple[str, ...], 
     assert done.returncode == 1
     assert done.stderr.startswith(text.format(home=tmp_path))
     assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("command", "held", "code", "text"),
+    [
+        (
+            ("rollout", "No Name"),
+            {"controllers": np.zeros((9, 4, 3))},
+            2,
+            "error: model: String should match",
+        ),
+        (
+            ("plan", "bar", "--horizon", "999"),
+            {"shape": np.zeros((2, 3))},
+            2,
+            "error: horizon: Input should be",
+        ),
+        (
+            ("plan", "bar"),
+            {"index": np.arange(3), "places": np.zeros((2, 3))},
+            1,
+            "has index (3,) of int64 and places (2, 3)",
+        ),
+        (
+            ("plan", "bar"),
+            {"index": np.array([4, 4]), "places": np.zeros((2, 3))},
+            1,
+            "names 1 of 2 points twice",
+        ),
+    ],
+)
+def test_a_request_that_cannot_be_made_is_one_clear_line(
+    tmp_path: Path, command: tuple[str, ...], held: dict[str, np.ndarray], code: int, text: str
+) -> None:
+    file = tmp_path / "given.npz"
+    np.savez(file, allow_pickle=False, **held)
+    given = "--controllers" if command[0] == "rollout" else "--goal"
+    options = (given, str(file), "--out", str(tmp_path / "out.npz"), "--url", "http://127.0.0.1:9")
+    done = physworld(None, tmp_path, *command, *options)
+    assert (done.returncode, len(done.stderr.splitlines())) == (code, 1), done.stderr
+    assert done.stderr.startswith("error: ") and text in done.stderr
+
+
+def test_a_report_that_is_none_is_named(tmp_path: Path) -> None:
+    report = tmp_path / "report.json"
+    options = (
+        "--controllers",
+        str(report),
+        "--out",
+        str(tmp_path / "out.npz"),
+        "--url",
+        "http://127.0.0.1:9",
+    )
+    for text in ("{", "[]", '{"controllers": [[[0, 0, 0]]]}'):
+        report.write_text(text)
+        done = physworld(None, tmp_path, "rollout", "bar", *options)
+        assert (done.returncode, len(done.stderr.splitlines())) == (1, 1), done.stderr
+        assert f"{report} is no report of a trace" in done.stderr
 
 
 def test_the_version_is_that_of_the_distribution(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack
 from itertools import islice
 
+import httpx
 import numpy as np
 import pytest
 from inference_serving import Served, serve_inference
@@ -114,6 +115,27 @@ def test_a_silent_service_is_not_waited_for_for_ever(served: Served) -> None:
         with pytest.raises(RequestTimedOut, match="sent nothing within"):
             for _ in range(200):
                 session.frame()
+
+
+class _Lossy(httpx.HTTPTransport):
+    """A real connection that loses its first answer."""
+
+    lost = False
+
+    def handle_request(self, request: httpx.Request) -> httpx.Response:
+        response = super().handle_request(request)
+        if not self.lost:
+            self.lost = True
+            response.close()
+            raise httpx.RemoteProtocolError("the line broke", request=request)
+        return response
+
+
+def test_a_ticket_whose_answer_was_lost_is_asked_for_anew(served: Served) -> None:
+    """The repeated request gets the replay, which holds no ticket."""
+    with Client(served.url, served.token, transport=_Lossy()) as client:
+        with client.live.open(served.model) as session:
+            assert session.frame().points.shape == (4, 3)
 
 
 def test_the_asynchronous_session_is_the_same(served: Served) -> None:

@@ -153,6 +153,11 @@ def test_a_shape_is_a_goal_too_and_nonsense_is_refused(served: Served, client: C
         client.plans.create(served.model, shape=np.full((3, 3), np.nan), config=SMALL)
     with pytest.raises(TypeError):
         client.plans.create(served.model)
+    goal = {"kind": "points", "index": [3], "places": [[0.1, 0.0, 0.0]]}
+    limits = {"workspace_min_m": [0.01, -0.1, -0.1]}
+    beside = client.http.post("/v1/plans", json={"model": served.model, "goal": goal, "limits": limits})
+    assert beside.status_code == 422
+    assert "[0.01, -0.1, -0.1] to [0.0, 0.0, 0.0] leaves out the start" in beside.json()["detail"]
 
 
 def test_the_commands_write_what_the_service_answers(served: Served, tmp_path: Path) -> None:

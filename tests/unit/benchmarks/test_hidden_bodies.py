@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.finite_elements import Acting
+from benchmarks.flex_blocks import Block
 from benchmarks.hidden_bodies import OBJECTS, Motion
 
 
@@ -66,3 +67,27 @@ def test_a_cloth_follows_its_hands_and_drag_slows_it() -> None:
     assert recorder.tracks(tie, 0.0, times)[-1, :, 1].max() > free[-1, :, 1].max() + 1e-3
     inside = recorder.inside(np.random.default_rng(0))
     assert np.allclose(np.ptp(inside, axis=0), cloth.size_m, rtol=0.01)
+
+
+def test_a_block_follows_its_hand_and_stays_on_its_table() -> None:
+    brick = replace(OBJECTS["brick"], cells=(4, 3, 3))
+    block = Block(brick.size_m, brick.cells, brick.young_pa, 0.35, brick.density_kg_m3, brick.friction, 10)
+    assert block.masses().sum() == pytest.approx(brick.density_kg_m3 * np.prod(brick.size_m))
+    corners = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.3, 0.8, 0.45]])
+    placed = block.between(block.vertices()[None], corners)[0]
+    assert np.allclose(placed, block.vertices().min(axis=0) + corners * brick.size_m, atol=1e-9)
+    recorder = brick.recorder(1, np.random.default_rng(0))
+    times = np.arange(4) / 30.0
+    free = recorder.tracks(Acting(), 0.0, times)
+    hand = recorder.hands[0]
+    held = np.all((free[0] >= hand.box[0] - 1e-9) & (free[0] <= hand.box[1] + 1e-9), axis=1)
+    _, shift = hand.motion.place(0.0, times[-1])
+    assert held.any() and np.allclose(free[-1, held] - free[0, held], shift, atol=1e-6)
+    behind = free[0, :, 0] > 0.0
+    assert 0.0 < np.linalg.norm((free[-1] - free[0])[behind].mean(axis=0)) < np.linalg.norm(shift)
+    assert free[..., 2].min() > -2e-4  # the table gives way by less
+    tilted = recorder.tracks(Acting(gravity_m_s2=np.array([1.0, 0.0, -9.7])), 0.0, times)
+    sheared_m = brick.density_kg_m3 * 1.0 * brick.size_m[2] ** 2 / (3 * brick.young_pa / 2.7)
+    assert (tilted - free)[-1, behind, 0].mean() == pytest.approx(
+        sheared_m, rel=0.4
+    )  # a foot that does not slide

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -10,11 +11,12 @@ from made_scene import box_body, made_scene, recorded_by
 from test_shared_search import Together
 
 from physworld.build import build_twin
-from physworld.calibrate import CalibrationConfig, law_choice
+from physworld.calibrate import CalibrationConfig, Journal, law_choice
 from physworld.calibrate.law_choice import PROMPT, choose_law, cross_validate, parse_answer
-from physworld.errors import LawAnswerRefused, LawAnswerUnavailable
+from physworld.errors import Cancelled, LawAnswerRefused, LawAnswerUnavailable
 from physworld.materials.library import with_law
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
+from physworld.simulations import Drive, Job, in_turn
 
 LOW, HIGH = np.array([0.0, -0.02, -0.02]), np.array([0.16, 0.02, 0.02])
 CONFIG = CalibrationConfig(particle_budget=64, max_simulations=60, damping="none")
@@ -168,3 +170,35 @@ def test_a_model_that_names_a_flow_which_the_body_cannot_have_does_not_decide() 
     choice = choose_law(sheet, replace(CONFIG, max_simulations=4), Says(text), lambda scene: [])
     assert choice.plastic == "identity" and choice.decided_by != "model parrot"
     assert "updated Lagrangian" in choice.figures["not_used_because"]
+
+
+def test_a_choice_that_was_cut_off_goes_on_where_it_was() -> None:
+    scene, texts, jobs = drooping_block("neo_hookean", 3e4), [], []
+
+    def counting(asked: list[Job], drive: Drive, poll: Callable[..., None]) -> Iterator[np.ndarray | None]:
+        jobs.append(len(asked))
+        return in_turn(asked, drive, poll)
+
+    laws = ("neo_hookean", "hencky")
+    whole = cross_validate(scene, CONFIG, laws, runner=counting)
+    took = sum(jobs)
+    jobs.clear()
+    with pytest.raises(Cancelled):
+        cross_validate(
+            scene,
+            CONFIG,
+            laws,
+            None,
+            lambda: sum(jobs) > 0.7 * took,
+            counting,
+            Journal("k", None, texts.append),
+        )
+    assert texts
+    jobs.clear()
+    again = cross_validate(scene, CONFIG, laws, runner=counting, journal=Journal("k", texts[-1]))
+    assert again == whole and 0 < sum(jobs) < 0.6 * took
+    jobs.clear()
+    asked = Says(ANSWER)
+    said = choose_law(scene, CONFIG, asked, lambda scene: [b"png"], journal=Journal("m", None, texts.append))
+    kept = choose_law(scene, CONFIG, Says(None), lambda scene: [b"png"], journal=Journal("m", texts[-1]))
+    assert kept.elastic == said.elastic == "st_venant_kirchhoff" and len(asked.prompts) == 1 and not jobs

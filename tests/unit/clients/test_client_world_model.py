@@ -184,6 +184,8 @@ def test_wrong_shapes_are_named(tmp_path: Path) -> None:
         loaded.rollout(driven(model)[:3])
     with pytest.raises(ValueError, match=r"phi \(2,\)"):
         loaded.rollout(driven(model), np.zeros(2))
+    with pytest.raises(ValueError, match="18 values of controllers, history and phi are no finite numbers"):
+        loaded.rollout(np.where(np.arange(FRAMES)[:, None, None] == 9, np.nan, driven(model)))
 
 
 def test_changed_weights_are_not_loaded(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from made_scene import FPS, box_body, made_scene
 
 from physworld.build import build_twin
-from physworld.mpm.total_lagrangian import nodal_mass
+from physworld.mpm.problem import nodal_mass
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Ground, Scene
 from physworld.twin import Twin
 

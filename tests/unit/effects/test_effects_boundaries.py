@@ -15,7 +15,8 @@ from physworld.effects.registry import effect
 from physworld.effects.time_varying_stiffness import GrowingStiffness
 from physworld.errors import CFLViolation
 from physworld.mpm.contact import GroundContact
-from physworld.mpm.total_lagrangian import Problem, TotalLagrangian, nodal_mass
+from physworld.mpm.problem import Problem, nodal_mass
+from physworld.mpm.total_lagrangian import TotalLagrangian
 from physworld.twin import Twin
 
 FIRST_ROOT = 1.8751  # of cos x cosh x = -1, the clamped-free beam

@@ -14,8 +14,8 @@ from physworld.effects.base import Effect
 from physworld.effects.registry import effect
 from physworld.materials.library import with_law
 from physworld.mpm.gradient import internal_forces
+from physworld.mpm.problem import Problem
 from physworld.mpm.terms import BoundTerm
-from physworld.mpm.total_lagrangian import Problem
 from physworld.twin import Twin
 
 SINGLE_PRECISION = 3e-4  # solids carry strains in float32; relative to the largest nodal force

@@ -11,7 +11,7 @@ from effect_twins import TWINS
 
 from physworld.effects.base import Effect
 from physworld.effects.registry import effect
-from physworld.mpm.total_lagrangian import Problem
+from physworld.mpm.problem import Problem
 from physworld.mpm.updated_lagrangian import UpdatedLagrangian
 
 SINGLE = 2e-5

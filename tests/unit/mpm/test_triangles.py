@@ -7,10 +7,11 @@ import pytest
 import warp as wp
 
 from physworld.errors import SceneUnsupported
-from physworld.materials.sheet import SheetLaw
+from physworld.materials.sheet import OrthotropicSheetLaw, SheetLaw
 from physworld.mpm.forces import InternalForces
+from physworld.mpm.problem import HeldNodes, Problem
 from physworld.mpm.stability import fastest_frequency
-from physworld.mpm.total_lagrangian import HeldNodes, Problem, TotalLagrangian
+from physworld.mpm.total_lagrangian import TotalLagrangian
 from physworld.mpm.triangles import Mesh, TriangleLattice, triangle_lattice
 
 SIZE = np.array([0.3, 0.2])
@@ -150,6 +151,21 @@ def test_what_needs_splines_says_so() -> None:
         mesh.interpolation(mesh.particle_coordinates, (2, 0))
     with pytest.raises(ValueError, match="none along a side"):
         triangle_lattice(SIZE, Mesh((0, 3)))
+
+
+def test_hinges_refuse_what_they_cannot_bend_like_and_threads_are_stretched() -> None:
+    mesh = lattice()
+    woven = OrthotropicSheetLaw(600.0, 2e-3, density_kg_m2=1.2, weft_ratio=0.5, shear_ratio=0.1)
+    stretched = at_rest(mesh) * np.array([1.0, 1.01, 1.0])
+    pulls = [np.abs(forces_of(mesh, stretched, law)[:, 1]).max() for law in (LAW, woven)]
+    assert pulls[1] == pytest.approx(0.5 * pulls[0], rel=0.05)
+    for law in (
+        replace(LAW, bending_twist_ratio=3.0),
+        replace(LAW, bending_coupling=0.5),
+        replace(woven, bending_weft_ratio=0.2),
+    ):
+        with pytest.raises(SceneUnsupported, match="one bending stiffness"):
+            forces_of(mesh, stretched, law)
 
 
 def test_friction_does_not_feel_a_turn_of_a_bent_sheet() -> None:

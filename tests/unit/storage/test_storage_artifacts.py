@@ -89,6 +89,17 @@ def test_changed_bytes_are_noticed(tmp_path: Path) -> None:
         artifacts.read_bytes(artifact.sha256)
 
 
+def test_a_file_that_was_cut_to_nothing_is_noticed(tmp_path: Path) -> None:
+    """What a power failure leaves of a file that was not yet on the disk."""
+    settings = Settings(data_dir=tmp_path)
+    artifacts = ArtifactStore(settings)
+    artifact = artifacts.put_bytes(b"truth", "fact")
+    assert settings.store_folder is not None
+    (settings.store_folder / "artifacts" / artifact.sha256[:2] / artifact.sha256).write_bytes(b"")
+    with pytest.raises(ArtifactCorrupt, match=artifact.sha256):
+        artifacts.read_bytes(artifact.sha256)
+
+
 def test_a_file_that_was_cut_short_is_written_again(tmp_path: Path) -> None:
     settings = Settings(data_dir=tmp_path)
     artifacts = ArtifactStore(settings)

@@ -131,6 +131,21 @@ def test_old_keys_are_forgotten(database: Database) -> None:
         assert idempotency.forget(session, utc_now() + timedelta(seconds=1)) == 1
 
 
+def test_large_answers_are_forgotten_before_small_ones(database: Database) -> None:
+    """Those of rollouts have some MiB each, and nobody asks for them again after minutes."""
+    large = Answer(200, {}, b"x" * 1001)
+    with database.session() as session:
+        for key, answer in (("small", ANSWER), ("large", large)):
+            idempotency.reserve(session, "key_1", key, REQUEST)
+            idempotency.record(session, "key_1", key, answer)
+        soon = utc_now() + timedelta(seconds=1)
+        assert idempotency.forget(session, utc_now() - timedelta(days=1), 1000) == 0
+        assert idempotency.forget(session, soon, 1001) == 0
+        assert idempotency.forget(session, soon, 1000) == 1
+        assert idempotency.reserve(session, "key_1", "small", REQUEST) == ANSWER
+        assert idempotency.reserve(session, "key_1", "large", REQUEST) is None
+
+
 @pytest.mark.parametrize("key", ["", "k" * 256])
 def test_a_key_without_sense_is_refused(database: Database, key: str) -> None:
     with database.session() as session, pytest.raises(Conflict, match="1 to 255 are allowed"):

@@ -58,6 +58,22 @@ def test_what_is_no_key_is_named_without_showing_it(tmp_path: Path, text: str) -
         open_signer(Settings(data_dir=tmp_path, signing_key_file=tmp_path / "absent"))
 
 
+def test_a_folder_that_takes_no_key_is_named_and_keeps_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("no folder")
+    with pytest.raises(ConfigurationError, match="signing-key cannot be made"):
+        open_signer(Settings(data_dir=tmp_path / "file"))
+
+    def without_links(source: str, target: Path) -> None:
+        raise PermissionError(1, "Operation not permitted", source)  # as FAT and some network folders answer
+
+    monkeypatch.setattr("os.link", without_links)
+    with pytest.raises(ConfigurationError, match="Operation not permitted"):
+        open_signer(Settings(data_dir=tmp_path / "data"))
+    assert list((tmp_path / "data").iterdir()) == []
+
+
 def test_signatures_are_of_the_exact_bytes(tmp_path: Path) -> None:
     signer = open_signer(Settings(data_dir=tmp_path))
     signature = ManifestSignature.model_validate_json(signer.sign(b"manifest"))

@@ -14,9 +14,14 @@ from physworld.build import build_twin
 from physworld.calibrate.parameters import parameters_of
 from physworld.effects.air_drag_quadratic import AirDragQuadratic
 from physworld.effects.anisotropy import Anisotropy
-from physworld.errors import BatchRefused, EffectRefused, SceneUnsupported
-from physworld.mpm.triangles import Mesh, TriangleLattice
-from physworld.scene import Scene
+from physworld.errors import BatchRefused, EffectRefused, NotDifferentiable, SceneUnsupported
+from physworld.evaluate.numerics import measure_numerics, refined
+from physworld.geometry.body import first_points
+from physworld.geometry.sheet_body import possible_meshes
+from physworld.mpm.gradient_twin import TwinRun
+from physworld.mpm.triangles import Mesh, TriangleLattice, mesh_of
+from physworld.scene import Ground, Scene
+from physworld.simulations import Job
 from physworld.trace.candidates import candidates
 from physworld.trace.meshes import recorded_as, taken_as
 from physworld.trace.recordings import JointSimulations, Recordings
@@ -33,11 +38,14 @@ def plate_of(scene: Scene, young_pa: float) -> Twin:
     )
 
 
-def kinds(scene: Scene, plate: Twin) -> list[Mesh | None]:
+def taken(scene: Scene, plate: Twin) -> list[Twin]:
     recordings = Recordings([scene], (), 12, 3)
     simulations = JointSimulations(recordings, plate, 500, 1.4)
-    found = recorded_as(recordings.scene, plate, simulations, recordings.split.train[1])
-    return [twin.lattice.mesh if isinstance(twin.lattice, TriangleLattice) else None for twin in found]
+    return recorded_as(recordings.scene, plate, simulations, recordings.split.train[1])
+
+
+def kinds(scene: Scene, plate: Twin) -> list[Mesh | None]:
+    return [mesh_of(twin.lattice) for twin in taken(scene, plate)]
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +56,15 @@ def scene() -> Scene:
 
 def test_a_mesh_that_recorded_is_found_although_the_stiffness_is_off(scene: Scene) -> None:
     assert kinds(scene, plate_of(scene, 0.87 * SHEET.young_pa)) == [MESH, None]
+
+
+def test_a_mesh_is_found_although_the_plate_makes_up_for_it_by_half_as_much_stiffness_again(
+    scene: Scene,
+) -> None:
+    mesh, plate = taken(scene, plate_of(scene, 1.45 * SHEET.young_pa))
+    own = plate_of(scene, SHEET.young_pa).parameters["membrane_n_m"]
+    assert mesh_of(mesh.lattice) == MESH and mesh_of(plate.lattice) is None
+    assert mesh.parameters["membrane_n_m"] == pytest.approx(own, rel=0.05)
 
 
 def test_a_mesh_is_found_beside_an_effect_that_is_not_declared(scene: Scene) -> None:
@@ -98,6 +115,77 @@ def test_a_mesh_travels_as_arrays_and_is_refused_where_it_cannot_go(scene: Scene
         build_twin(replace(scene, declared={"body": {"self_contact": True}}), mesh=MESH)
     with pytest.raises(SceneUnsupported, match="is no 16 x 15 cells"):
         build_twin(replace(scene, kind="rope"), mesh=MESH)
+    with pytest.raises(SceneUnsupported, match="no finer ones"):
+        refined(scene, twin, 500)
+    with pytest.raises(SceneUnsupported, match="the ledger is of splines"):
+        measure_numerics(scene, twin)
+    with pytest.raises(NotDifferentiable, match="120 cells of triangles"):
+        TwinRun(twin, times, controls, scene.times[:3])
+
+
+def test_a_grid_that_starts_as_measured_is_no_mesh(scene: Scene) -> None:
+    side = 6
+    grid = replace(
+        scene,
+        points=scene.points[:, : side**2],
+        visible=scene.visible[:, : side**2],
+        body=replace(scene.body, side_m=0.25, grid_shape=(side, side)),
+        grips=(),
+    )
+    with pytest.raises(SceneUnsupported, match="starts flat and undeformed"):
+        build_twin(grid, mesh=MESH)
+
+
+def test_a_sheet_that_touches_itself_is_traced_as_a_plate(scene: Scene) -> None:
+    touching = replace(scene, declared={"body": {"self_contact": True}})
+    plate = build_twin(touching, 500)
+    assert plate.self_friction is not None and possible_meshes(touching)
+    assert taken(touching, plate) == [plate]
+
+
+def test_a_sheet_whose_thickness_nobody_says_is_traced_as_a_plate(scene: Scene) -> None:
+    points = first_points(scene)
+    low, high = points.min(axis=0), points.max(axis=0)
+    half = replace(scene.grips[0], region_min_m=low, region_max_m=0.5 * (low + high))
+    facts = replace(scene.body, size_m=None, thickness_m=None)
+    unknown = replace(scene, body=facts, grips=(half, *scene.grips[1:]))
+    plate = build_twin(unknown, 500)
+    assert possible_meshes(unknown)
+    assert taken(unknown, plate) == [plate]
+
+
+def test_what_is_known_of_the_ground_goes_along_to_the_mesh(scene: Scene) -> None:
+    above = replace(scene, ground=Ground(-1.0))
+    plate = replace(plate_of(above, SHEET.young_pa), ground_friction=0.2)
+    mesh = taken(above, plate)[0]
+    assert mesh_of(mesh.lattice) == MESH and mesh.ground_friction == 0.2
+
+
+def test_grips_that_say_little_leave_the_squarest_meshes_and_not_too_many(scene: Scene) -> None:
+    middle, half = 0.5 * SHEET.size_m[1], 0.5 * SHEET.size_m[0]
+    boxes = [
+        ([-half, -0.01, 0.6 - middle], [0.0, 0.01, 0.6]),
+        ([0.0, -0.01, 0.6 - middle], [half, 0.01, 0.6]),
+    ]
+    halves = tuple(
+        replace(grip, region_min_m=np.array(low), region_max_m=np.array(high))
+        for grip, (low, high) in zip(scene.grips, boxes, strict=True)
+    )
+    found = possible_meshes(replace(scene, grips=halves))
+    assert len(found) == len(set(found)) == 24
+    shapes = [SHEET.size_m[0] / mesh.counts[0] * mesh.counts[1] / SHEET.size_m[1] for mesh in found]
+    assert all(1 / 1.3 < shape < 1.3 for shape in shapes)
+
+
+def test_other_recordings_of_a_mesh_are_that_mesh(scene: Scene) -> None:
+    mesh = build_twin(scene, mesh=MESH)
+    recordings = Recordings([scene, scene], [scene], 12, 3)
+    simulations = JointSimulations(recordings, mesh, 500, 1.4)
+    both = simulations.run([Job(mesh, 4)])[0]
+    assert both is not None
+    np.testing.assert_array_equal(*np.split(both, 2, axis=1))
+    every = simulations.predictions(mesh, np.zeros((both.shape[1], 3)))
+    np.testing.assert_array_equal(every[2], every[0])
 
 
 def test_a_report_says_which_mesh_and_how_to_fit_it() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -95,6 +96,22 @@ def test_a_bend_carries_the_means_along() -> None:
     moved, _ = GaussianCarrier(gaussians_at_points(points), rest).at(bent(rest))
     assert np.linalg.norm(moved.means - bent(points), axis=1).max() < 2e-3
     assert np.linalg.norm(bent(points) - points, axis=1).max() > 0.1
+
+
+def test_thousands_of_vertices_carry_a_splat_in_little_memory() -> None:
+    """Every pair of them at once would take gigabytes, and anew for every frame."""
+    rest = np.random.default_rng(3).uniform(-0.1, 0.1, (2500, 3))
+    splat = gaussians_at_points(rest[:20])
+    tracemalloc.start()
+    carrier = GaussianCarrier(splat, rest)
+    _, bound = tracemalloc.get_traced_memory()
+    tracemalloc.reset_peak()
+    moved, _ = carrier.at(rest + np.array([0.0, 0.0, 0.1]))
+    _, carried = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    np.testing.assert_allclose(moved.means, splat.means + np.array([0.0, 0.0, 0.1]), atol=1e-12)
+    assert bound < 100e6
+    assert carried < 20e6
 
 
 def test_a_splat_of_another_frame_and_wrong_vertices_are_refused() -> None:

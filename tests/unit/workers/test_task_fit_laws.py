@@ -54,24 +54,21 @@ def test_a_law_is_chosen_by_cross_validation_and_recorded(
     assert set(fit.metrics["law"]["figures"]["held_out_rms_m"]) >= {"neo_hookean", "fixed_corotated"}
 
 
-def test_a_choice_that_an_earlier_attempt_made_is_kept() -> None:
+def test_a_choice_that_an_earlier_attempt_made_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     from tiny_scene import tiny_scene
 
     from physworld.calibrate import CalibrationConfig
 
-    made = {
-        "elastic": "hencky",
-        "plastic": "von_mises",
-        "decided_by": "model m",
-        "reason": "r",
-        "figures": {},
-    }
+    monkeypatch.setenv("PHYSWORLD_LAW_MODEL", "m")
+    monkeypatch.setenv("PHYSWORLD_LAW_URL", "http://127.0.0.1:1")  # nobody answers there: it is not asked
+    answer = "Elastic: St. Venant-Kirchhoff | Plastic: Von Mises | Reason: it dents"
     texts: list[str] = []
-    Journal("k", None, texts.append).step("law", lambda: made)
+    Journal("k", None, texts.append).step("asked", lambda: {"text": answer, "unavailable": None})
     config, choice = chosen_laws(
         AUTO, tiny_scene(), CalibrationConfig(particle_budget=60), journal=Journal("k", texts[-1])
     )
-    assert (config.law, config.plasticity, choice.decided_by) == ("hencky", "von_mises", "model m")
+    assert (config.law, config.plasticity) == ("st_venant_kirchhoff", "von_mises")
+    assert choice.reason == "it dents"
 
 
 @pytest.mark.parametrize(

@@ -120,3 +120,16 @@ def test_a_batch_of_other_shapes_is_refused() -> None:
         model.rollout_batch(candidates(model)[:, :, :1])
     with pytest.raises(GraphInvalid, match="phi"):
         model.rollout_batch(candidates(model), phi=model.phi[:-1])
+
+
+def test_values_that_are_no_numbers_are_refused() -> None:
+    """The engine would hand them on into every vertex."""
+    model = published()
+    spoilt = candidates(model)
+    spoilt[1, 4, 0, 2] = np.nan
+    with pytest.raises(GraphInvalid, match="1 values of controllers, history and phi are not finite"):
+        model.rollout_batch(spoilt)
+    with pytest.raises(GraphInvalid, match="1 values"):
+        model.rollout(spoilt[1])
+    with pytest.raises(GraphInvalid, match=f"{model.phi.size} values"):
+        model.rollout_batch(candidates(model), phi=np.full_like(model.phi, np.inf))

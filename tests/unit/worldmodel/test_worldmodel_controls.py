@@ -46,7 +46,7 @@ def test_paths_are_interpolated_to_the_clock_and_keep_their_ends() -> None:
         (np.array([0.1, 0.2, 0.3]), "start at 0"),
         (np.array([0.0, 0.2, 0.2]), "strictly"),
         (np.array([0.0, np.nan, 0.2]), "finite"),
-        (np.array([0.0, 1.0, 100.0]), "100 s"),
+        (np.array([0.0, 1.0, 100.0]), "100 s; 60 ticks of .* are the most for 1 candidates"),
     ],
 )
 def test_times_that_cannot_be_are_refused(times: np.ndarray, words: str) -> None:

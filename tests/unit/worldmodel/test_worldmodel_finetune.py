@@ -146,6 +146,16 @@ def test_a_graph_of_other_sizes_is_refused(published: PublishedModel, name: str)
         PublishedModel.from_tensors(tensors | {name: short}, published.facts())
 
 
+def test_weights_that_are_not_a_number_are_refused(published: PublishedModel) -> None:
+    tensors = published.to_tensors()
+    broken = tensors["encoder.in.weight"].copy()
+    broken[0, 1] = np.nan
+    with pytest.raises(
+        VersionUnreadable, match=f"encoder.in.weight with 1 of {broken.size} values not a number"
+    ):
+        PublishedModel.from_tensors(tensors | {"encoder.in.weight": broken}, published.facts())
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [("graph.neighbours", -1), ("graph.neighbours", 99), ("skin.index", -1), ("control.index", -1)],

@@ -9,9 +9,11 @@ import pytest
 import torch
 from tiny_scene import tiny_scene
 
+from benchmarks.flex_sheet import FlexSheet, record
 from physworld.build import build_twin
 from physworld.effects.registry import effect
 from physworld.errors import SceneUnsupported
+from physworld.mpm.triangles import Mesh, mesh_of
 from physworld.scene import Body, Ground, Scene
 from physworld.worldmodel.config import WorldModelConfig
 from physworld.worldmodel.foreign import predict, start_mismatch, twin_on
@@ -110,6 +112,17 @@ def test_heights_count_from_the_recordings_ground() -> None:
     )
     tracks = [predict(model, r, twin_on(r, home, twin, 60)).tracks for r in (home, lifted)]
     np.testing.assert_allclose(tracks[1], tracks[0] + up, atol=1e-5)
+
+
+def test_a_mesh_stays_a_mesh_where_a_plate_would_have_the_same_cells() -> None:
+    sheet = record(FlexSheet(size_m=(0.24, 0.24), cells=(24, 24), frames=3, noise_sigma_m=0.0))
+    corners = [[x, 0.0, z] for x in (-0.12, 0.12) for z in (0.36, 0.6)]
+    points = sheet.points.copy()
+    points[0, :4] = corners
+    home = replace(sheet, points=points, visible=np.ones_like(sheet.visible))
+    twin, plate = build_twin(home, mesh=Mesh((24, 24))), build_twin(home)
+    np.testing.assert_allclose(plate.lattice.spacing, twin.lattice.spacing)
+    assert mesh_of(twin_on(home, home, twin, 2000).lattice) == Mesh((24, 24))
 
 
 def test_other_controllers_or_points_are_refused_with_their_numbers() -> None:

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from physworld.worldmodel import skinning
 from physworld.worldmodel.skinning import (
+    Skin,
     affine_skin,
     linear_blend,
     local_rotations,
+    nearest_vertices,
     quaternion_of,
     quaternion_product,
 )
@@ -117,3 +122,28 @@ def test_quaternion_algebra_is_that_of_scipy() -> None:
     product = quaternion_product(mine[:100], mine[100:])
     expected = (turns[:100] * turns[100:]).as_quat(scalar_first=True)
     assert np.abs((product * expected).sum(axis=1)) == pytest.approx(np.ones(100))
+
+
+def test_many_states_take_no_more_memory_than_a_few_times_the_points() -> None:
+    """A planner carries thousands of points through hundreds of ticks of many motions: K copies would not fit."""
+    rng = np.random.default_rng(0)
+    weight = rng.uniform(size=(400, 8))
+    skin = Skin(rng.integers(0, 60, (400, 8)), weight / weight.sum(axis=1, keepdims=True))
+    vertices = rng.normal(size=(5, 20, 60, 3))
+    expected = np.einsum("mk,...mkx->...mx", skin.weight, vertices[..., skin.index, :])
+    tracemalloc.start()
+    points = skin.apply(vertices)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert points == pytest.approx(expected, abs=1e-13)
+    assert peak < 4 * points.nbytes
+
+
+def test_the_nearest_vertices_are_the_same_however_many_are_looked_at_at_a_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    vertices, points = _cloud()
+    whole = nearest_vertices(points, vertices, 8)
+    monkeypatch.setattr(skinning, "GAPS_AT_ONCE", 4 * len(vertices))
+    for part, expected in zip(nearest_vertices(points, vertices, 8), whole, strict=True):
+        assert np.array_equal(part, expected)

@@ -14,6 +14,7 @@ from types import FrameType
 from typing import NoReturn
 
 import typer
+from pydantic import ValidationError
 
 from physworld_client.cli import effects, export, fit, lists, loop, predict, registry, run, trace, up, video
 from physworld_client.cli.output import stderr
@@ -58,6 +59,11 @@ def main() -> None:
     except PhysWorldError as error:
         stderr.print(f"error: {error}", markup=False, highlight=False, soft_wrap=True)
         sys.exit(1)
+    except ValidationError as error:  # what was given makes no request
+        faults = [(".".join(map(str, fault["loc"])), fault["msg"]) for fault in error.errors()]
+        said = "; ".join(f"{place}: {message}" if place else message for place, message in faults)
+        stderr.print(f"error: {said}", markup=False, highlight=False, soft_wrap=True)
+        sys.exit(2)
     except BrokenPipeError:
         # The reader of our output has left (``physworld jobs list | head``): not an error of ours.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

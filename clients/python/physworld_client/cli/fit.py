@@ -38,7 +38,8 @@ def fit(
         str | None, typer.Option(help="Of the updated Lagrangian form: apic or asflip.")
     ] = None,
     mesh: Annotated[
-        str | None, typer.Option(help="Of a sheet: the mesh of triangles that recorded it, such as 16x15.")
+        str | None,
+        typer.Option(help="Of a sheet: the mesh that recorded it, such as 16x15; or plate; default: ask."),
     ] = None,
     stages: Annotated[
         str | None, typer.Option(help="global, or global+local: a field over the body on top, if it holds.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json as jsonlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -90,20 +91,14 @@ def plan(
     data: Data = None,
 ) -> None:
     """Find a motion of the grips that brings the object to a goal, and check it in the twin."""
-    arrays = _npz(goal)
-    points = None
-    if "index" in arrays and "places" in arrays:
-        pairs = zip(arrays["index"].tolist(), arrays["places"].tolist(), strict=True)
-        points = {int(index): place for index, place in pairs}
-    elif "shape" not in arrays:
-        raise PhysWorldError(f"{goal} holds {sorted(arrays)}; a goal is index and places, or shape")
+    points, shape = _goal(goal)
     config = PlanConfig(horizon=horizon, samples=samples, iterations=iterations, seed=seed)
     with service.connect(url, token, data) as client:
         job = client.plans.create(
             model,
             _version(version),
             points=points,
-            shape=None if points is not None else arrays["shape"],
+            shape=shape,
             limits=PlanLimits(speed_m_s=speed),
             config=config,
         )
@@ -134,18 +129,42 @@ def _print_plan(plan: Plan, out: Path) -> None:
 def _controllers(path: Path) -> dict[str, np.ndarray]:
     """From an npz, or from the ``suggested_experiment`` of a trace's report (JSON)."""
     if path.suffix == ".json":
-        report: dict[str, Any] = jsonlib.loads(path.read_text())
-        experiment = report.get("suggested_experiment", report)
-        if not experiment or not experiment.get("controllers"):
-            raise PhysWorldError(f"{path} suggests no experiment with a motion")
-        return {
-            "controllers": np.array(experiment["controllers"], dtype=float),
-            "times": np.array(experiment["times_s"], dtype=float),
-        }
+        try:
+            report: dict[str, Any] = jsonlib.loads(path.read_text())
+            experiment = report.get("suggested_experiment", report)
+            if not experiment or not experiment.get("controllers"):
+                raise PhysWorldError(f"{path} suggests no experiment with a motion")
+            return {
+                "controllers": np.array(experiment["controllers"], dtype=float),
+                "times": np.array(experiment["times_s"], dtype=float),
+            }
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise PhysWorldError(f"{path} is no report of a trace: {error!r}") from error
     arrays = _npz(path)
     if "controllers" not in arrays:
         raise PhysWorldError(f"{path} holds {sorted(arrays)}, no controllers")
     return arrays
+
+
+def _goal(path: Path) -> tuple[dict[int, Sequence[float]] | None, np.ndarray | None]:
+    """Places (x, y, z) [m] by the number of their point, or a shape (M, 3) [m]. Raises PhysWorldError."""
+    arrays = _npz(path)
+    if not {"index", "places"} <= arrays.keys():
+        if "shape" not in arrays:
+            raise PhysWorldError(f"{path} holds {sorted(arrays)}; a goal is index and places, or shape")
+        return None, arrays["shape"]
+    index, places = arrays["index"], arrays["places"]
+    if index.ndim != 1 or index.dtype.kind not in "iu" or places.shape != (len(index), 3):
+        raise PhysWorldError(
+            f"{path} has index {index.shape} of {index.dtype} and places {places.shape}; a goal is whole numbers (M,) "
+            "and (M, 3)"
+        )
+    points: dict[int, Sequence[float]] = {
+        int(number): place for number, place in zip(index, places.tolist(), strict=True)
+    }
+    if len(points) < len(index):
+        raise PhysWorldError(f"{path} names {len(index) - len(points)} of {len(index)} points twice")
+    return points, None
 
 
 def _npz(path: Path) -> dict[str, np.ndarray]:

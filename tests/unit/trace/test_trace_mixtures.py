@@ -1,0 +1,70 @@
+"""Two effects of which one alone reaches the noise, because they do nearly the same."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_scene import box_body, made_scene
+
+from physworld.build import build_twin
+from physworld.calibrate import CalibrationConfig
+from physworld.effects.registry import effect
+from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
+from physworld.trace import TraceConfig, TraceResult, document, trace
+
+LOW, HIGH = np.array([0.0, -0.02, -0.02]), np.array([0.2, 0.02, 0.02])
+FRAMES, SIGMA = 36, 1e-3
+RATE_PER_S, VISCOSITY_PA_S = 2.5, 90.0
+CONFIG = TraceConfig(
+    calibration=CalibrationConfig(particle_budget=160, damping="none"),
+    candidates=("air_drag_linear", "air_drag_quadratic", "viscosity_kelvin_voigt"),
+    bootstraps=200,
+    experiment=None,
+)
+
+
+def shaken() -> Scene:
+    """A bar with 80 tracked points whose clamp is shaken."""
+    times = np.arange(FRAMES) / 30.0
+    grip = np.array([[0.0, y, z] for y in (-0.01, 0.01) for z in (-0.01, 0.01)])
+    points = [[x, y, z] for x in np.linspace(0.05, 0.2, 20) for y in (-0.02, 0.02) for z in (-0.02, 0.02)]
+    scene = made_scene(
+        points, "beam", grip, FRAMES, body=box_body(LOW, HIGH, density_kg_m3=400.0),
+        grips=(Grip((0, 1, 2, 3), LOW, np.array([0.04, 0.02, 0.02])),), initial_state=UNDEFORMED_AT_REST,
+    )  # fmt: skip
+    path = 0.018 * np.stack([0 * times, np.sin(11 * times), 1 - np.cos(8 * times)], axis=1)
+    return replace(scene, controllers=grip + path[:, None])
+
+
+def traced(**strengths: float) -> TraceResult:
+    """The trace of what a finer twin records with these effects."""
+    scene = shaken()
+    twin = build_twin(scene, 440).with_parameters(youngs_modulus_pa=4e4)
+    if "rate_per_s" in strengths:
+        twin = twin.with_effect(effect("air_drag_linear", rate_per_s=strengths["rate_per_s"]))
+    if "viscosity_pa_s" in strengths:
+        twin = twin.with_effect(effect("viscosity_kelvin_voigt", viscosity_pa_s=strengths["viscosity_pa_s"]))
+    tracks = twin.observe(twin.simulate_nodes(*scene.control_track(), scene.times), scene.times)
+    noise = np.random.default_rng(0).normal(scale=SIGMA, size=tracks.shape)
+    return trace(replace(scene, points=tracks + noise, noise_sigma_m=SIGMA), CONFIG)
+
+
+def test_a_viscosity_that_hides_behind_a_drag_is_found() -> None:
+    found = traced(rate_per_s=RATE_PER_S, viscosity_pa_s=VISCOSITY_PA_S)
+    assert found.verdict.name == "named"
+    strengths = {e.name: next(iter(e.parameters.values())).value for e in found.effects}
+    assert strengths["air_drag_linear"] == pytest.approx(RATE_PER_S, rel=0.25)
+    assert strengths["viscosity_kelvin_voigt"] == pytest.approx(VISCOSITY_PA_S, rel=0.35)
+    assert found.path[0].kept.fitted.misfit < CONFIG.near_floor  # one alone would have been complete
+    report = document(found)
+    assert [effect["name"] for effect in report["effects"]] == ["air_drag_linear", "viscosity_kelvin_voigt"]
+    assert len(found.path) == 2 and found.path[1].kept is found.verdict.model
+    assert report["held_out"]["after"] < 1.3 * SIGMA
+
+
+@pytest.mark.parametrize("strengths", [{"rate_per_s": 4.0}])
+def test_one_that_acts_alone_stays_alone(strengths: dict[str, float]) -> None:
+    found = traced(**strengths)
+    assert len(found.effects) == 1 and len(found.verdict.model.members) == 1
