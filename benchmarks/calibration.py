@@ -16,7 +16,13 @@ from pathlib import Path
 
 import warp as wp
 
-from benchmarks import calibration_descent, calibration_known, calibration_measured, calibration_sheets
+from benchmarks import (
+    calibration_descent,
+    calibration_known,
+    calibration_measured,
+    calibration_shared,
+    calibration_sheets,
+)
 from benchmarks.harness import Report
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -29,8 +35,9 @@ PARTS: dict[str, Callable[..., Report]] = {
     "undeclared": calibration_measured.undeclared,
     "beam": calibration_measured.beam,
     "ropes_and_cloths": calibration_measured.ropes_and_cloths,
+    "shared": calibration_shared.shared,
 }
-NEEDS_RECORDINGS = ("undeclared", "beam", "ropes_and_cloths")
+NEEDS_RECORDINGS = ("undeclared", "beam", "ropes_and_cloths", "shared")
 BEGIN, END = "<!-- calibration {}: begin -->", "<!-- calibration {}: end -->"
 
 

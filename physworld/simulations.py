@@ -86,15 +86,16 @@ class Drive:
 
 
 def nodes_of(job: Job, drive: Drive, poll: Callable[[int, int], None] | None = None) -> np.ndarray:
-    """Carriers (frames, n, 3) [m] of a job. Raises SimulationError.
-
-    The updated Lagrangian form takes its own time step.
-    """
-    if job.twin.formulation != "total_lagrangian":
-        return job.twin.simulate_nodes(
-            drive.control_times, drive.control_points, drive.times[: job.frames], progress=poll
-        )
-    run = job.twin.integration(drive.control_times, drive.control_points, drive.times[: job.frames])
+    """Carriers (frames, n, 3) [m] of a job. Raises SimulationError."""
+    twin = job.twin
+    run = twin.integration(drive.control_times, drive.control_points, drive.times[: job.frames])
+    start = twin.body.start
+    if twin.formulation != "total_lagrangian":
+        form = twin.flowing_form(run.problem)
+        if job.step_share != 1.0:
+            form = twin.flowing_form(run.problem, job.step_share * form.time_step_s)
+        solid = form.run_particles(start, run.velocity, run.held, run.knots, poll)
+        return run.at_frames(twin.particles_start, twin.with_empty_particles(form.solid, solid))
     solver = TotalLagrangian(run.problem)
     if solver.stage_s < job.least_step_s:
         raise CFLViolation(
@@ -103,8 +104,8 @@ def nodes_of(job: Job, drive: Drive, poll: Callable[[int, int], None] | None = N
         )
     if job.step_share != 1.0:
         solver = TotalLagrangian(run.problem, job.step_share * solver.time_step_s)
-    nodes = run_again_if_blown_up(solver, job.twin.body.start, run.velocity, run.held, run.knots, poll)
-    return run.at_frames(job.twin.body.start, nodes)
+    nodes = run_again_if_blown_up(solver, start, run.velocity, run.held, run.knots, poll)
+    return run.at_frames(start, nodes)
 
 
 def stage_s(twin: Twin, drive: Drive) -> float:
@@ -137,11 +138,20 @@ def in_turn(jobs: Sequence[Job], drive: Drive, poll: Callable[[], None]) -> Iter
         yield tracks_of(job, drive, lambda done, total: poll())
 
 
+def idle_beside(runner: Runner, jobs: int) -> int:
+    """Processes of a runner that wait while the last of so many simulations run; 0 where it does not say how many."""
+    return -jobs % int(getattr(runner, "processes", 1))
+
+
 class Workers:
-    """A runner over processes of its own, which share Warp's cache of kernels; a context manager."""
+    """A runner over processes of its own, which share Warp's cache of kernels; a context manager.
+
+    Attributes:
+        processes: how many.
+    """
 
     def __init__(self, processes: int = 2) -> None:
-        self._processes = processes
+        self.processes = processes
         self._pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=_begin)
 
     def __enter__(self) -> Workers:
@@ -168,7 +178,7 @@ class Workers:
                 yield future.result()
         except BrokenProcessPool as error:
             raise WorkerLost(
-                f"one of {self._processes} processes that share the simulations ended ({len(jobs)} were asked for): "
+                f"one of {self.processes} processes that share the simulations ended ({len(jobs)} were asked for): "
                 "was it out of memory?"
             ) from error
 

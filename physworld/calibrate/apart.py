@@ -9,7 +9,8 @@ import numpy as np
 
 from physworld.calibrate.least_squares import most_runs
 from physworld.calibrate.optimum import Descent, Optimum, Place
-from physworld.calibrate.search import Search, in_step, measured_together
+from physworld.calibrate.search import Search
+from physworld.calibrate.side_by_side import in_step, measured_together
 from physworld.simulations import in_turn
 
 

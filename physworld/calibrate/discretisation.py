@@ -18,8 +18,9 @@ import numpy as np
 
 from physworld.calibrate.estimates import Estimate
 from physworld.calibrate.global_stage import FitResult
-from physworld.evaluate.numerics import REFINEMENT, refined
+from physworld.evaluate.numerics import REFINEMENT, refined, trusted_tracks
 from physworld.scene import Scene
+from physworld.simulations import Drive, Job, Runner, in_turn
 
 _ORDER = 2
 _DOUBT = 0.5  # of the correction
@@ -31,6 +32,8 @@ def converged_parameters(
     particle_budget: int,
     refinement: float = REFINEMENT,
     poll: Callable[[int, int], None] | None = None,
+    runner: Runner = in_turn,
+    finer_tracks: np.ndarray | None = None,
 ) -> dict[str, Estimate]:
     """Estimates of the searched parameters without the error of the lattice.
 
@@ -39,33 +42,36 @@ def converged_parameters(
         fitted: the calibration.
         particle_budget: the one that it was made with.
         refinement: cells of the finer lattice are this many times smaller.
-        poll: called with (frames done, frames in all) of every run; may raise to stop.
+        poll: called with numbers between runs and frames; may raise to stop.
+        runner: where the runs go, which do not depend on each other.
+        finer_tracks: what the twin on the finer lattice predicts, (T, N, 3) [m], where that is known already.
 
     Raises:
         SimulationError: a run cannot be trusted.
     """
     end = scene.train[1]
     visible = scene.visible[:end]
-    times, controls = scene.control_track()
-
-    def predicted(twin) -> np.ndarray:
-        nodes = twin.simulate_nodes(times, controls, scene.times[:end], progress=poll)
-        return twin.observe(nodes, scene.times[:end])[visible].reshape(-1)
-
-    base = fitted.tracks[:end][visible].reshape(-1)
-    columns, theta = [], []
+    places = []
     for parameter in fitted.searched:
         now = parameter.searched(fitted.parameters[parameter.name].value)
-        step = (
-            parameter.step if now + parameter.step <= parameter.searched(parameter.high) else -parameter.step
-        )
-        columns.append((predicted(parameter.apply(fitted.twin, parameter.value(now + step))) - base) / step)
-        theta.append(now)
-    change = predicted(refined(scene, fitted.twin, particle_budget, refinement)) - base
+        below = now + parameter.step > parameter.searched(parameter.high)
+        places.append((parameter, now, -parameter.step if below else parameter.step))
+    jobs = {
+        f"another {p.name}": Job(p.apply(fitted.twin, p.value(now + step)), end) for p, now, step in places
+    }
+    if finer_tracks is None:
+        jobs["finer cells"] = Job(refined(scene, fitted.twin, particle_budget, refinement), end)
+    tracks = trusted_tracks(jobs, Drive(*scene.control_track(), scene.times), poll, runner)
+    finer = tracks.pop() if finer_tracks is None else finer_tracks[:end]
+    base = fitted.tracks[:end][visible].reshape(-1)
+    columns = [
+        (found[visible].reshape(-1) - base) / step for found, (_, _, step) in zip(tracks, places, strict=True)
+    ]
+    change = finer[visible].reshape(-1) - base
     delta, *_ = np.linalg.lstsq(np.stack(columns, axis=1), change, rcond=None)
     correction = -delta / (1.0 - float(refinement) ** -_ORDER)
     found = {}
-    for parameter, now, shift in zip(fitted.searched, theta, correction, strict=True):
+    for (parameter, now, _), shift in zip(places, correction, strict=True):
         estimate = fitted.parameters[parameter.name]
         interval = None
         if estimate.ci95 is not None:

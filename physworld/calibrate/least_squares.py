@@ -18,6 +18,7 @@ Residual = Callable[[np.ndarray], np.ndarray]
 
 _TOLERANCE = 2e-4  # relative fall of the cost that ends the search
 _MAX_STEP = 1.5  # in the logarithm
+_TRIALS = 5  # steps, each more damped than the last, before a search ends
 _BLOCKS = 10
 _FEWEST_POINTS = 10  # fewer tracked points than this are no clusters of their own
 
@@ -39,7 +40,10 @@ class Solution:
     jacobian: np.ndarray
 
 
-Descent = Generator[list[np.ndarray], list[np.ndarray], Solution]
+Asked = tuple[list[np.ndarray], list[np.ndarray]]
+"""Places whose residuals are needed now, and those that will be needed next if nothing speaks against them."""
+
+Descent = Generator[Asked, list[np.ndarray], Solution]
 
 
 def gauss_newton(
@@ -56,10 +60,10 @@ def gauss_newton(
     one per trial step; ``max_iterations`` Jacobians at most.
     """
     asking = descent(theta, low, high, steps, max_iterations)
-    asked = next(asking)
+    needed, _ = next(asking)
     while True:
         try:
-            asked = asking.send([residual(one) for one in asked])
+            needed, _ = asking.send([residual(one) for one in needed])
         except StopIteration as ended:
             found: Solution = ended.value
             return found
@@ -68,28 +72,29 @@ def gauss_newton(
 def descent(
     theta: np.ndarray, low: np.ndarray, high: np.ndarray, steps: np.ndarray, max_iterations: int = 6
 ) -> Descent:
-    """:func:`gauss_newton` for whoever runs its simulations: yields places that do not depend on each other, is sent
-    the residuals there, in their order, and returns the solution."""
+    """:func:`gauss_newton` for whoever runs its simulations: yields places that do not depend on each other and those
+    that it will likely ask for next, is sent the residuals of the former, in their order, and returns the solution."""
     theta = np.clip(theta, low, high)
-    (now,) = yield [theta]
+    (now,) = yield [theta], probes_of(theta, high, steps)
     cost = float(np.mean(now**2))
     damping = 1e-3
     jacobian = np.zeros((len(now), len(theta)))
-    for _ in range(max_iterations):
+    for left in reversed(range(max_iterations)):
         probes = probes_of(theta, high, steps)
-        jacobian = differences(theta, now, steps, probes, (yield probes))
+        jacobian = differences(theta, now, steps, probes, (yield probes, []))
         normal, gradient = jacobian.T @ jacobian, jacobian.T @ now
         improved = False
-        for _ in range(5):
-            scaled = normal + damping * np.diag(np.diag(normal) + 1e-12 * np.trace(normal) + 1e-30)
-            step = np.clip(np.linalg.solve(scaled, -gradient), -_MAX_STEP, _MAX_STEP)
-            trial = np.clip(theta + step, low, high)
-            (trial_residual,) = yield [trial]
+        trial = _trial(theta, normal, gradient, damping, low, high)
+        for tried in range(_TRIALS):
+            harder = max(damping, 1e-4) * 8
+            shorter = _trial(theta, normal, gradient, harder, low, high)
+            likely = [shorter] if tried else probes_of(trial, high, steps) if left else []
+            (trial_residual,) = yield [trial], likely
             trial_cost = float(np.mean(trial_residual**2))
             if np.isfinite(trial_cost) and trial_cost < cost:
                 improved = True
                 break
-            damping = max(damping, 1e-4) * 8
+            trial, damping = shorter, harder
         if not improved:
             break
         gain = (cost - trial_cost) / cost
@@ -99,9 +104,23 @@ def descent(
     return Solution(theta, cost, now, jacobian)
 
 
+def _trial(
+    theta: np.ndarray,
+    normal: np.ndarray,
+    gradient: np.ndarray,
+    damping: float,
+    low: np.ndarray,
+    high: np.ndarray,
+) -> np.ndarray:
+    """Where a damped step from ``theta`` (p,) leads."""
+    scaled = normal + damping * np.diag(np.diag(normal) + 1e-12 * np.trace(normal) + 1e-30)
+    step = np.clip(np.linalg.solve(scaled, -gradient), -_MAX_STEP, _MAX_STEP)
+    return np.clip(theta + step, low, high)
+
+
 def most_runs(parameters: int, max_iterations: int) -> int:
     """Runs that a descent takes at most."""
-    return 1 + max_iterations * (parameters + 5)
+    return 1 + max_iterations * (parameters + _TRIALS)
 
 
 def probes_of(theta: np.ndarray, high: np.ndarray, steps: np.ndarray) -> list[np.ndarray]:

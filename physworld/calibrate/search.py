@@ -22,6 +22,7 @@ from physworld.calibrate.least_squares import Solution, descent, differences, mo
 from physworld.calibrate.material_frames import material_frames
 from physworld.calibrate.optimum import Descended, Descent, Optimum, Place, cost_of
 from physworld.calibrate.parameters import Parameter
+from physworld.calibrate.side_by_side import in_step, measured_together
 from physworld.errors import CalibrationError, Cancelled, SimulationError
 from physworld.scene import UNDEFORMED_AT_REST, Scene
 from physworld.simulations import Drive, Job, Runner, in_turn
@@ -154,41 +155,44 @@ class Search:
 
         They are counted one after the other in any case; where the budget might end within them they are also done so.
         """
-        worst = sum(most_runs(len(one.parameters), one.iterations) for one in asked)
-        together = len(asked) > 1 and self.runner is not in_turn and self.simulations + worst <= self.limit
+        together = self._fit(asked)
         made: dict[int, Descended] = {}
         found = []
         for k, one in enumerate(asked):
 
             def descend(k: int = k, one: Descent = one) -> dict[str, Any]:
-                if not together:
-                    ended = self._alone(one)
-                else:
-                    if not made:  # those before it are in the journal
-                        made.update(enumerate(self._side_by_side(asked[k:]), k))
-                    ended = made[k].optimum
-                    self.simulations += made[k].runs
-                    for loss in made[k].losses:
-                        self._remember(loss, None)
-                return {"theta": ended.theta.tolist(), "cost": ended.cost}
+                if k not in made:  # those before it are in the journal
+                    several = asked[k:] if together else [one]
+                    if not self._fit(several):
+                        ended = self._alone(one)
+                        return {"theta": ended.theta.tolist(), "cost": ended.cost}
+                    made.update(enumerate(in_step([(self, other) for other in several]), k))
+                self.simulations += made[k].runs
+                for loss in made[k].losses:
+                    self._remember(loss, None)
+                return {"theta": made[k].optimum.theta.tolist(), "cost": made[k].optimum.cost}
 
             kept = self.step("solve " + " ".join(p.name for p in one.parameters), descend)
             cost = float("nan") if kept["cost"] is None else kept["cost"]
             found.append(Optimum(np.array(kept["theta"]), cost))
         return found
 
+    def _fit(self, several: list[Descent]) -> bool:
+        """Whether descents may share a runner: the budget does not end within them, whatever they take."""
+        worst = sum(most_runs(len(one.parameters), one.iterations) for one in several)
+        return self.runner is not in_turn and self.simulations + worst <= self.limit
+
     def _alone(self, one: Descent) -> Optimum:
         """A descent whose runs count at once."""
         asking = self.begun(one)
-        asked = next(asking)
+        needed, _ = next(asking)
         while True:
             try:
-                asked = asking.send(self.residuals([(one.parameters, theta, one.end) for theta in asked]))
+                needed, _ = asking.send(
+                    self.residuals([(one.parameters, theta, one.end) for theta in needed])
+                )
             except StopIteration as ended:
                 return Optimum(ended.value.theta, ended.value.cost)
-
-    def _side_by_side(self, several: list[Descent]) -> list[Descended]:
-        return in_step([(self, one) for one in several])
 
     def begun(self, one: Descent) -> LeastSquares:
         """The descent before its first simulation."""
@@ -332,46 +336,6 @@ class Search:
         if self.cancelled is not None and self.cancelled():
             where = "" if not frames else f" at frame {frames[0]} of {frames[1]}"
             raise Cancelled(f"calibration cancelled after {self.simulations} runs{where}")
-
-
-def measured_together(asked: list[tuple[Search, Place]]) -> Iterator[tuple[np.ndarray, float | None]]:
-    """Residuals and their root mean squares [m] of places of searches with one drive."""
-    jobs = [search.job(place) for search, place in asked]
-    made = asked[0][0].run(jobs) if asked else iter(())
-    for (search, _), job, tracks in zip(asked, jobs, made, strict=True):
-        yield search.compared(job, tracks)
-
-
-def in_step(several: list[tuple[Search, Descent]]) -> list[Descended]:
-    """Descents in step with each other: what all of them ask for next is run together."""
-    asking = [search.begun(one) for search, one in several]
-    asked = {k: next(one) for k, one in enumerate(asking)}
-    runs, losses = [0] * len(several), [[] for _ in several]  # type: ignore[var-annotated]
-    found: dict[int, Optimum] = {}
-    while asked:
-        places = [
-            (several[k][0], (several[k][1].parameters, theta, several[k][1].end))
-            for k in asked
-            for theta in asked[k]
-        ]
-        measured = measured_together(places)
-        for k in list(asked):
-            search, one = several[k]
-            residuals = []
-            for theta in asked[k]:
-                residual, loss = next(measured)
-                runs[k] += 1
-                if loss is not None:
-                    if one.end in (None, search.end):
-                        losses[k].append(loss)
-                    search.tell(search.simulations + sum(runs), loss, (one.parameters, theta, None))
-                residuals.append(residual)
-            try:
-                asked[k] = asking[k].send(residuals)
-            except StopIteration as ended:
-                found[k] = Optimum(ended.value.theta, ended.value.cost)
-                del asked[k]
-    return [Descended(found[k], runs[k], losses[k]) for k in range(len(several))]
 
 
 def _probe(candidate: Parameter) -> float:

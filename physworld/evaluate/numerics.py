@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from physworld.build import build_twin
-from physworld.errors import SceneUnsupported
+from physworld.errors import SceneUnsupported, SimulationError
 from physworld.integration import Integration
 from physworld.materials.laws import without_friction
 from physworld.mpm.energy import EnergyLedger, run_with_ledger
@@ -29,6 +29,7 @@ from physworld.mpm.particle_energy import ParticleLedger, run_particles_with_led
 from physworld.mpm.total_lagrangian import TotalLagrangian
 from physworld.properties import carried
 from physworld.scene import Scene
+from physworld.simulations import Drive, Job, Runner, in_turn
 from physworld.twin import Twin
 
 REFINEMENT = 1.5  # cells of the finer lattice are this many times smaller
@@ -83,6 +84,7 @@ def measure_numerics(
     refinement: float = REFINEMENT,
     progress: Callable[[int, int, str], None] | None = None,
     poll: Callable[[int, int], None] | None = None,
+    refined_tracks: RefinedTracks | None = None,
 ) -> Numerics:
     """Measure a calibrated twin's numerics on its scene.
 
@@ -93,6 +95,7 @@ def measure_numerics(
         refinement: cells of the finer lattice are this many times smaller.
         progress: called with (runs done, runs in all, what comes next); may raise to stop.
         poll: called with (frames done, frames in all) of every run; may raise to stop.
+        refined_tracks: of :func:`refined_tracks_of` with the same settings, where they are known already.
 
     Raises:
         SceneUnsupported: the body is a mesh of triangles, which has no finer cells.
@@ -107,12 +110,8 @@ def measure_numerics(
     run = twin.integration(control_times, controls, scene.times)
     carriers, ledger, step = _run_with_ledger(twin, run, run.velocity, poll=poll)
     track = twin.observe(carriers, scene.times)
-    tell(2, 4, "half the time step")
-    half_track = twin.observe(_run_at(twin, run, 0.5 * step, poll), scene.times)
-    tell(3, 4, "finer cells")
-    finer = refined(scene, twin, particle_budget, refinement)
-    finer_nodes = finer.simulate_nodes(control_times, controls, scene.times, progress=poll)
-    finer_track = finer.observe(finer_nodes, scene.times)
+    tell(2, 4, "half the time step and finer cells")
+    finer = refined_tracks or refined_tracks_of(scene, twin, particle_budget, refinement, poll)
     tell(4, 4, "done")
     return Numerics(
         equivalent_drag_per_s=damping.equivalent_drag_per_s,
@@ -120,14 +119,64 @@ def measure_numerics(
         dominant_mode_hz=damping.mode_hz,
         lost_share=float(ledger.lost[-1] / max(ledger.turnover, 1e-300)),
         time_step_s=step,
-        half_step_m=_rms(half_track - track),
-        finer_cells_m=_rms(finer_track - track),
+        half_step_m=_rms(finer.half_step - track),
+        finer_cells_m=_rms(finer.finer_cells - track),
         refinement=refinement,
         particles=twin.lattice.fill.size,
-        finer_particles=finer.lattice.fill.size,
+        finer_particles=finer.particles,
         simulations=4,
         seconds=time.perf_counter() - begun,
     )
+
+
+@dataclass(frozen=True)
+class RefinedTracks:
+    """What a twin predicts with finer numerics.
+
+    Attributes:
+        half_step: with half the time step, (T, N, 3) [m].
+        finer_cells: on the finer lattice, (T, N, 3) [m].
+        particles: of the finer lattice.
+    """
+
+    half_step: np.ndarray
+    finer_cells: np.ndarray
+    particles: int
+
+
+def refined_tracks_of(
+    scene: Scene,
+    twin: Twin,
+    particle_budget: int,
+    refinement: float = REFINEMENT,
+    poll: Poll | None = None,
+    runner: Runner = in_turn,
+) -> RefinedTracks:
+    """Predictions of the recording with half the time step and with finer cells; both are the runner's.
+
+    Raises:
+        SceneUnsupported: the body is a mesh of triangles, which has no finer cells.
+        SimulationError: a run cannot be trusted.
+    """
+    finer = refined(scene, twin, particle_budget, refinement)
+    frames = len(scene.times)
+    jobs = {"half the time step": Job(twin, frames, step_share=0.5), "finer cells": Job(finer, frames)}
+    drive = Drive(*scene.control_track(), scene.times)
+    half_step, finer_cells = trusted_tracks(jobs, drive, poll, runner)
+    return RefinedTracks(half_step, finer_cells, finer.lattice.fill.size)
+
+
+def trusted_tracks(
+    jobs: dict[str, Job], drive: Drive, poll: Poll | None = None, runner: Runner = in_turn
+) -> list[np.ndarray]:
+    """Tracks (frames, N, 3) [m] of jobs by what they are, in their order. Raises SimulationError where one failed."""
+    found = []
+    asked = runner(list(jobs.values()), drive, lambda: None if poll is None else poll(len(found), len(jobs)))
+    for name, tracks in zip(jobs, asked, strict=True):
+        if tracks is None:
+            raise SimulationError(f"the run with {name} blew up or left its grid")
+        found.append(tracks)
+    return found
 
 
 def refined(scene: Scene, twin: Twin, particle_budget: int, refinement: float = REFINEMENT) -> Twin:
@@ -267,17 +316,6 @@ def _run_with_ledger(
     solid, account = run_particles_with_ledger(form, start, velocity, run.held, run.knots, poll)
     carriers = run.at_frames(twin.particles_start, twin.with_empty_particles(form.solid, solid))
     return carriers, account, form.time_step_s
-
-
-def _run_at(twin: Twin, run: Integration, time_step_s: float, poll: Poll | None = None) -> np.ndarray:
-    """Carriers at the frames (T, n, 3) at a forced time step [s]."""
-    start = twin.body.start
-    if twin.formulation == "total_lagrangian":
-        nodes = TotalLagrangian(run.problem, time_step_s).run(start, run.velocity, run.held, run.knots, poll)
-        return run.at_frames(start, nodes)
-    form = twin.flowing_form(run.problem, time_step_s)
-    solid = form.run_particles(start, run.velocity, run.held, run.knots, poll)
-    return run.at_frames(twin.particles_start, twin.with_empty_particles(form.solid, solid))
 
 
 def _across(start: np.ndarray, gravity: np.ndarray) -> np.ndarray:

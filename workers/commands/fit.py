@@ -102,10 +102,12 @@ def _fit(given: argparse.Namespace) -> None:
             fitted = fitted_as_recorded(
                 mesh, scene, config, given.stages, shown, journal=journal, runner=runner
             )
-    accuracy = not_measured("left out by --quick")
-    if not given.quick:
-        with progress_bar(f"numerics {scene.name}") as shown:
-            accuracy = fit_accuracy(scene, fitted, config.particle_budget, shown, journal=journal)
+        accuracy = not_measured("left out by --quick")
+        if not given.quick:
+            with progress_bar(f"numerics {scene.name}") as shown:
+                accuracy = fit_accuracy(
+                    scene, fitted, config.particle_budget, shown, journal=journal, runner=runner
+                )
     report = fit_report(scene, fitted, choice, accuracy)
     document = fit_document(scene.name, report)
     _print(document)

@@ -63,7 +63,9 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
         local = fitted.local
         spent = fitted.simulations + (0 if local is None else local.runs + local.simulations)
 
-        accuracy = fit_accuracy(scene, fitted, config.particle_budget, measuring, context.cancelled, journal)
+        accuracy = fit_accuracy(
+            scene, fitted, config.particle_budget, measuring, context.cancelled, journal, runner
+        )
     context.check()
     report = fit_report(scene, fitted, law, accuracy)
     artifacts = [

@@ -14,8 +14,9 @@ from physworld.calibrate import FitResult, Journal
 from physworld.calibrate.discretisation import converged_parameters
 from physworld.calibrate.search import Progress
 from physworld.errors import Cancelled, SceneUnsupported, SimulationError
-from physworld.evaluate.numerics import measure_numerics
+from physworld.evaluate.numerics import measure_numerics, refined_tracks_of
 from physworld.scene import Scene
+from physworld.simulations import Runner, in_turn
 from workers.tasks.fit_report import json_safe, parameter_json
 
 MEASURED_RUNS = 4
@@ -28,6 +29,7 @@ def fit_accuracy(
     progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
     journal: Journal | None = None,
+    runner: Runner = in_turn,
 ) -> dict[str, Any]:
     """``numerics``, ``converged`` and ``not_measured`` (why one is null, else empty), as plain JSON.
 
@@ -38,12 +40,13 @@ def fit_accuracy(
         progress: called with (runs done, runs in all, what comes next).
         cancelled: polled every frame of every run.
         journal: keeps what was measured for a later attempt.
+        runner: where runs go that do not depend on each other.
 
     Raises:
         Cancelled: ``cancelled`` returned true.
     """
     return (journal or Journal()).step(
-        "accuracy", lambda: _measured(scene, fitted, particle_budget, progress, cancelled)
+        "accuracy", lambda: _measured(scene, fitted, particle_budget, progress, cancelled, runner)
     )
 
 
@@ -58,10 +61,11 @@ def _measured(
     budget: int,
     progress: Progress | None,
     cancelled: Callable[[], bool] | None,
+    runner: Runner,
 ) -> dict[str, Any]:
     if not fitted.twin.lattice.smooth:
         return not_measured("a mesh of triangles is the recorder's own: there are no finer cells to ask")
-    total = MEASURED_RUNS + 1 + len(fitted.searched)
+    total = MEASURED_RUNS + len(fitted.searched)
 
     def poll(done: int, frames: int) -> None:
         if cancelled is not None and cancelled():
@@ -69,14 +73,20 @@ def _measured(
 
     def tell(done: int, _: int, message: str) -> None:
         if progress is not None:
-            progress(done, total, "sensitivities and finer cells" if done == MEASURED_RUNS else message)
+            progress(done, total, "sensitivities" if done == MEASURED_RUNS else message)
 
     try:
-        numerics = measure_numerics(scene, fitted.twin, particle_budget=budget, progress=tell, poll=poll)
+        tell(0, total, "half the time step and finer cells")
+        finer = refined_tracks_of(scene, fitted.twin, budget, poll=poll, runner=runner)
+        numerics = measure_numerics(
+            scene, fitted.twin, particle_budget=budget, progress=tell, poll=poll, refined_tracks=finer
+        )
         if fitted.twin.formulation != "total_lagrangian":
             reason = "converged: numbers with cells of no size are found in the total Lagrangian form"
             return {**not_measured(reason), "numerics": json_safe(asdict(numerics))}
-        converged = converged_parameters(scene, fitted, budget, poll=poll)
+        converged = converged_parameters(
+            scene, fitted, budget, poll=poll, runner=runner, finer_tracks=finer.finer_cells
+        )
     except (SimulationError, SceneUnsupported) as error:  # finer cells may not hold what these do
         return not_measured(f"{type(error).__name__}: {error}")
     return {

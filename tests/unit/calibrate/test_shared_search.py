@@ -23,7 +23,8 @@ CONFIG = CalibrationConfig(particle_budget=60, max_simulations=140)
 class Together:
     """A runner of this process that notes how many simulations came at once."""
 
-    def __init__(self) -> None:
+    def __init__(self, processes: int = 1) -> None:
+        self.processes = processes
         self.widths: list[int] = []
 
     def __call__(
@@ -68,9 +69,22 @@ def test_descents_side_by_side_count_as_one_after_the_other() -> None:
     assert together.widths[0] == 12 and 3 in together.widths and 6 in together.widths
 
 
+def test_what_runs_ahead_in_a_free_process_changes_nothing(bar: Scene) -> None:
+    alone, steps = found(bar, in_turn)
+    by_one, by_three = Together(), Together(3)
+    found(bar, by_one)
+    shared, shared_steps = found(bar, by_three)
+    same(shared, alone)
+    assert shared_steps == steps
+    assert len(by_three.widths) < 0.8 * len(by_one.widths)  # fewer waits for the same search
+    assert sum(by_three.widths) > sum(by_one.widths)  # by runs of which some were not asked for
+
+
 @pytest.mark.parametrize("most", [12, 25, 40])
 def test_a_budget_that_ends_within_ends_at_the_same_run(bar: Scene, most: int) -> None:
-    same(found(bar, Together(), most)[0], found(bar, in_turn, most)[0])
+    alone = found(bar, in_turn, most)[0]
+    for processes in (1, 2):
+        same(found(bar, Together(processes), most)[0], alone)
 
 
 def test_a_journal_of_one_process_is_gone_on_from_by_many(bar: Scene) -> None:

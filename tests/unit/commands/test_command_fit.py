@@ -19,11 +19,14 @@ from made_scene import box_body, made_scene, recorded_by
 
 from physworld.build import build_twin
 from physworld.calibrate import CalibrationConfig, calibrate
+from physworld.calibrate.discretisation import converged_parameters
 from physworld.scene import UNDEFORMED_AT_REST, Grip
+from physworld.simulations import Workers
 from physworld.twin import Twin
 from storage.scene_bundle import read_bundle, write_bundle
 from workers.commands import fit
 from workers.tasks.fit_accuracy import fit_accuracy
+from workers.tasks.fit_report import parameter_json
 
 FRAMES, BUDGET, SIMULATIONS = 16, 60, 60
 YOUNGS_MODULUS_PA = 4e4
@@ -200,6 +203,20 @@ def test_a_grip_that_a_finer_lattice_cannot_hold_leaves_the_fit(bundle: Path) ->
     fitted = calibrate(scene, CalibrationConfig(particle_budget=BUDGET, max_simulations=12))
     found = fit_accuracy(scene, fitted, BUDGET)
     assert found["numerics"] is None and "SceneUnsupported" in found["not_measured"]
+
+
+def test_shared_runs_measure_the_same_accuracy(bundle: Path) -> None:
+    scene = read_bundle(bundle)
+    fitted = calibrate(scene, CalibrationConfig(particle_budget=BUDGET, max_simulations=12))
+    alone = fit_accuracy(scene, fitted, BUDGET)
+    with Workers(2) as workers:
+        shared = fit_accuracy(scene, fitted, BUDGET, runner=workers)
+    assert alone["numerics"].pop("seconds") > 0 and shared["numerics"].pop("seconds") > 0
+    assert shared == alone
+    assert alone["converged"] == {
+        name: parameter_json(estimate)
+        for name, estimate in converged_parameters(scene, fitted, BUDGET).items()
+    }
 
 
 def test_a_recording_of_three_frames_is_fitted_and_measured(bundle: Path, tmp_path: Path) -> None:
