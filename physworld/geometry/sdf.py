@@ -42,6 +42,11 @@ class Shape:
     low: np.ndarray
     spacing_m: float
 
+    @property
+    def exact(self) -> bool:
+        """Whether its distances are true ones: they change by no more than a point moves."""
+        return self.kind != kernels.SAMPLED
+
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Signed distances [m], (M,), at ``points`` (M, 3) [m]; far outside of a sampled grid 1e6 m."""
         return self._evaluate(points)[:, 3]

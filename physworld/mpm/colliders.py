@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
+from scipy import sparse
 
 from physworld.errors import ContactFailed
 from physworld.geometry.sdf import Shape
-from physworld.mpm.colliders_kernels import move_collider, touch_collider
+from physworld.mpm.colliders_kernels import move_collider, touch_collider, watch_nodes
 from physworld.mpm.colliders_path import RigidPath
 from physworld.mpm.terms import BoundTerm
 
@@ -27,6 +28,10 @@ if TYPE_CHECKING:
     from physworld.mpm.problem import Problem
 
 _SPEED_SHARE = 0.5  # of the speed whose penetration is the collider's own depth
+_LIGHT = (
+    0.1  # a node with less weight in any point counts for less: it may swing fast and carry next to nothing
+)
+_QUOTIENTS = 30  # steps towards the sharpest bound: within some per cent of it
 _DEPTH_SHARE = 0.9  # of the collider's own depth: deeper, the nearest way out may be the wrong one
 
 
@@ -93,21 +98,21 @@ class ContactSurface:
 class BoundCollider(BoundTerm):
     """A collider and the points of a body on a device.
 
-    The bounds on what it adds to the time step are Gershgorin's for the lumped mass: no group of points that touch at
-    once can exceed them, whatever the fill of the cells.
+    What it adds to the time step is bounded by :func:`largest_share`: no group of points that touch at once can exceed
+    it, whatever the fill of the cells.
     """
 
     def __init__(self, collider: Collider, surface: ContactSurface, problem: Problem) -> None:
         device = problem.device
         matrix = problem.lattice.interpolation(surface.points)
+        matrix.eliminate_zeros()  # a layer of nodes says nothing of a face between cells
         self.collider, self.points, self.device = collider, len(surface.points), device
         self._rate = surface.rate_per_s
         mass = problem.nodal_mass()
-        loads = [
-            np.asarray(matrix.T @ np.where(surface.groups == group, surface.measures, 0.0))
+        per_mass = max(
+            largest_share(matrix, np.where(surface.groups == group, surface.measures, 0.0), mass)
             for group in np.unique(surface.groups)
-        ]
-        per_mass = float((np.array(loads) / mass).max())
+        )
         self.frequency_rad_s = float(np.sqrt(surface.stiffness * per_mass))
         self.friction_per_s = surface.damping * per_mass
         self._path = collider.path.on_device(device)
@@ -132,6 +137,11 @@ class BoundCollider(BoundTerm):
         self._totals = wp.zeros(4, dtype=wp.float64, device=device)
         self._stretch = wp.zeros(self.points, dtype=wp.vec3d, device=device)
         self.memory = (self._stretch,)
+        self._near = not collider.path.moves and collider.shape.exact
+        self._clearance = wp.zeros(self.points, dtype=wp.float64, device=device)
+        self._reach = wp.array(reach_of_nodes(matrix), dtype=wp.float64, device=device)
+        self._seen = wp.zeros(3 * len(mass), dtype=wp.float64, device=device)
+        self._travel = wp.full(2, 0.0 if self._near else np.inf, dtype=wp.float64, device=device)
         self._times = wp.zeros(1, dtype=wp.float64, device=device)
 
     @property
@@ -185,6 +195,57 @@ class BoundCollider(BoundTerm):
         )  # fmt: skip
         wp.launch(
             touch_collider, self.points,
-            inputs=[*self._shape, *self._surface, self._pose, x, v, clock, counter, self._stretch],
+            inputs=[
+                *self._shape, *self._surface, self._pose, x, v, clock, counter, self._watched(x, counter),
+                self._clearance, self._stretch,
+            ],
             outputs=[force, self._totals], device=device,
         )  # fmt: skip
+
+    def _watched(self, x: wp.array, counter: wp.array) -> wp.array:
+        """How far points went at most since the last look [m], (2,) by the substep's parity.
+
+        Infinite beside a collider that moves, or whose distances are those of samples: every point is looked at.
+        """
+        if self._near:
+            wp.launch(
+                watch_nodes, len(x) // 3, inputs=[self._reach, x, counter], outputs=[self._seen, self._travel],
+                device=self.device, record_tape=False,
+            )  # fmt: skip
+        return self._travel
+
+
+def largest_share(matrix: sparse.csr_matrix, measures: np.ndarray, mass: np.ndarray) -> float:
+    """A bound from above on the largest eigenvalue of M^-1 W^T A W, per measure of stiffness [1/kg times A's unit].
+
+    Args:
+        matrix: weights W of points by nodes, (S, n).
+        measures: A of every point, (S,), not negative.
+        mass: lumped masses M, (n,) [kg].
+
+    With |W| the matrix has no negative entry, so its quotients (K x)_i / (m_i x_i) bound it for any positive x (Collatz
+    1942, Wielandt 1950); with x = 1 they are Gershgorin's, and steps of the power iteration make the bound sharper.
+    """
+    weights = abs(matrix)
+    touched = np.asarray(weights.T @ measures) > 0
+    weights, mass = weights[:, touched], mass[touched]
+    x, bound = np.ones(len(mass)), np.inf
+    for _ in range(_QUOTIENTS):
+        response = np.asarray(weights.T @ (measures * (weights @ x))) / mass
+        bound = min(bound, float((response / x).max(initial=0.0)))
+        x = response / response.max(initial=np.finfo(float).tiny)
+    return bound
+
+
+def reach_of_nodes(matrix: sparse.csr_matrix) -> np.ndarray:
+    """Factors r of the nodes, (n,), with which no point goes farther than the greatest r_i |d_i| of their ways d.
+
+    Args:
+        matrix: weights of points by nodes, (S, n).
+
+    A point goes sum_i w_i d_i, at most sum_i (w_i / s_i) times the greatest s_i |d_i| for any positive s.
+    """
+    weights = abs(matrix)
+    share = np.minimum(1.0, weights.max(axis=0).toarray().reshape(-1) / _LIGHT)
+    bearing = np.divide(1.0, share, out=np.zeros_like(share), where=share > 0)
+    return share * float((weights @ bearing).max(initial=0.0))

@@ -12,6 +12,8 @@ import warp as wp
 from physworld.geometry.sdf_kernels import signed_distance
 from physworld.mpm.node_kernels import weighted_sum
 
+ROUND_OFF_M = 1e-9  # a point that is nearer than this is looked at
+
 
 @wp.func
 def _turn(h: wp.vec3d) -> wp.mat33d:
@@ -93,6 +95,30 @@ def move_collider(
     pose[5] = spin
 
 
+@wp.kernel(enable_backward=False)
+def watch_nodes(
+    reach: wp.array(dtype=wp.float64),
+    x: wp.array(dtype=wp.float64),
+    counter: wp.array(dtype=wp.int32),
+    # in, out
+    seen: wp.array(dtype=wp.float64),
+    travel: wp.array(dtype=wp.float64),
+):
+    """How far any contact point went at most since the last look [m], into the entry of this substep's parity.
+
+    ``reach`` is what a node's way counts for (:func:`physworld.mpm.colliders.reach_of_nodes`). The entry of the next
+    substep is emptied; one that was not emptied in time is too far, never too near.
+    """
+    node = 3 * wp.tid()
+    parity = counter[1] % 2
+    if node == 0:
+        travel[1 - parity] = wp.float64(0.0)
+    way = wp.vec3d(x[node] - seen[node], x[node + 1] - seen[node + 1], x[node + 2] - seen[node + 2])
+    for i in range(3):
+        seen[node + i] = x[node + i]
+    wp.atomic_max(travel, parity, reach[wp.tid()] * wp.length(way))
+
+
 @wp.func
 def collider_distance(
     kind: int,
@@ -142,7 +168,9 @@ def touch_collider(
     v: wp.array(dtype=wp.float64),
     clock: wp.array(dtype=wp.float64),
     counter: wp.array(dtype=wp.int32),
+    travel: wp.array(dtype=wp.float64),
     # in, out
+    clearance: wp.array(dtype=wp.float64),
     stretch: wp.array(dtype=wp.vec3d),
     # out
     force: wp.array(dtype=wp.float64),
@@ -150,13 +178,19 @@ def touch_collider(
 ):
     """Push one point of the body out of the collider, and hold it along the surface up to Coulomb's limit.
 
-    ``stretch`` is the elastic slip of a point that sticks [m] (Cundall and Strack 1979).
+    ``stretch`` is the elastic slip of a point that sticks [m] (Cundall and Strack 1979). ``clearance`` is how far a
+    point is away at least [m]: its distance when it was last looked at, less what the nodes can have moved it since.
     """
     point = wp.tid()
     zero = wp.float64(0.0)
+    left = clearance[point] - travel[counter[1] % 2]
+    clearance[point] = left
+    if left > wp.static(wp.float64(ROUND_OFF_M)):
+        return
     here = weighted_sum(x, columns, weights, row_start[point], row_start[point + 1])
     found = collider_distance(kind, size, values, low, inverse, pose, here)
     depth = offset[point] - found[3]
+    clearance[point] = -depth
     if depth <= zero:
         stretch[point] = wp.vec3d()
         return

@@ -47,6 +47,11 @@ class RigidPath:
         turn = np.eye(3) if rotation is None else np.asarray(rotation, dtype=float)
         return cls(np.zeros(1), np.asarray(position, dtype=float)[None], turn[None])
 
+    @property
+    def moves(self) -> bool:
+        """Whether it has more than one pose."""
+        return len(self.times) > 1
+
     @cached_property
     def linear_velocities(self) -> np.ndarray:
         """At the knots, (F, 3) [m/s]."""

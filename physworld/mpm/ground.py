@@ -71,6 +71,9 @@ class BoundGround(BoundCollider):
         )  # fmt: skip
         wp.launch(
             touch_ground, self.points,
-            inputs=[*self._surface[:-1], self._friction, self._height, x, v, clock, counter, self._stretch],
+            inputs=[
+                *self._surface[:-1], self._friction, self._height, x, v, clock, counter, self._watched(x, counter),
+                self._clearance, self._stretch,
+            ],
             outputs=[force, self._totals], device=device,
         )  # fmt: skip

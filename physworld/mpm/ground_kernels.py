@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from physworld.mpm.colliders_kernels import ROUND_OFF_M
 from physworld.mpm.node_kernels import weighted_sum
 
 
@@ -34,7 +35,9 @@ def touch_ground(
     v: wp.array(dtype=wp.float64),
     clock: wp.array(dtype=wp.float64),
     counter: wp.array(dtype=wp.int32),
+    travel: wp.array(dtype=wp.float64),
     # in, out
+    clearance: wp.array(dtype=wp.float64),
     stretch: wp.array(dtype=wp.vec3d),
     # out
     force: wp.array(dtype=wp.float64),
@@ -43,8 +46,13 @@ def touch_ground(
     """Push one point of the body off the ground, and hold it along the ground up to its own limit."""
     point = wp.tid()
     zero = wp.float64(0.0)
+    left = clearance[point] - travel[counter[1] % 2]
+    clearance[point] = left
+    if left > wp.static(wp.float64(ROUND_OFF_M)):
+        return
     here = weighted_sum(x, columns, weights, row_start[point], row_start[point + 1])
     depth = offset[point] - (here[2] - height)
+    clearance[point] = -depth
     if depth <= zero:
         stretch[point] = wp.vec3d()
         return
