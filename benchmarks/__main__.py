@@ -24,6 +24,7 @@ BENCHMARKS = (
     "laws",
     "effects",
     "friction",
+    "contact",
     "self_contact",
     "world_model",
     "factory",
