@@ -9,11 +9,11 @@ from typing import TypeVar
 import httpx
 
 from physworld_client import transport as wire
+from physworld_client.async_artifacts import AsyncArtifacts
 from physworld_client.async_live import AsyncLive
 from physworld_client.async_loop import AsyncAssessments, AsyncTraces
 from physworld_client.async_predict import AsyncPlans, AsyncRollouts
 from physworld_client.async_resources import (
-    AsyncArtifacts,
     AsyncDatasets,
     AsyncFits,
     AsyncJobs,

@@ -9,11 +9,12 @@ from typing import TypeVar
 import httpx
 
 from physworld_client import transport as wire
+from physworld_client.artifacts import Artifacts
 from physworld_client.calls import Call
 from physworld_client.live import Live
 from physworld_client.loop import Assessments, Traces
 from physworld_client.predict import Plans, Rollouts
-from physworld_client.resources import Artifacts, Datasets, Fits, Jobs, Models, Pipelines, Scenes
+from physworld_client.resources import Datasets, Fits, Jobs, Models, Pipelines, Scenes
 
 Answer = TypeVar("Answer")
 

@@ -21,11 +21,9 @@ from physworld_client.errors import PhysWorldError, WaitTimedOut
 from physworld_client.export import Format, open_export
 from physworld_client.manifest import artifacts_of, verify_folder
 from physworld_client.pages import ListPage
-from physworld_client.partial import PartialFile
 from physworld_client.signatures import keys_by_id, remember
 from physworld_client.stream import HEARTBEAT_S, IDLE_LIMIT_S, EventDecoder, ends_job
 from physworld_client.waiting import Patience, job_id_of, require_success
-from schemas.base import Artifact
 from schemas.dataset import Dataset, DatasetConfig, Episode
 from schemas.fit import Fit, FitConfig
 from schemas.job import TERMINAL_STATES, Event, Job
@@ -365,49 +363,3 @@ class Jobs(Resource):
                 response.read()
                 transport.raise_for_problem(response)
             yield from response.iter_lines()
-
-
-class Artifacts(Resource):
-    """Content-addressed files."""
-
-    def download(self, artifact: Artifact | str, path: str | Path) -> Path:
-        """Downloads an artifact to ``path``: resumes a part found there, checks the digest, then renames.
-
-        Raises:
-            DigestMismatch: the bytes are not those of the digest; nothing was put at ``path``.
-        """
-        partial = PartialFile(Path(path), artifact.sha256 if isinstance(artifact, Artifact) else artifact)
-        if partial.present():
-            return partial.target
-        retry = transport.Retry(self._client.max_retries)
-        while not partial.complete():
-            offset = partial.offset
-            try:
-                response = self._fetch(partial)
-            except httpx.TransportError as error:
-                if partial.offset > offset:
-                    retry.attempt = 0
-                if not retry.again():
-                    raise transport.connection_error(error, self._client.http, retry) from error
-                time.sleep(retry.delay_s())
-                continue
-            if response.is_success:
-                break
-            if partial.refused(response):
-                continue
-            if response.status_code not in transport.RETRIED_STATUSES or not retry.again():
-                transport.raise_for_problem(response)
-            time.sleep(retry.delay_s(response))
-        return partial.finish()
-
-    def _fetch(self, partial: PartialFile) -> httpx.Response:
-        """One request for what is missing; the body of a success is in the part when this returns."""
-        path = calls.artifact_path(partial.sha256)
-        with self._client.http.stream("GET", path, headers=partial.headers()) as response:
-            if response.is_success:
-                partial.accept(response)
-                for chunk in response.iter_bytes():
-                    partial.write(chunk)
-            else:
-                response.read()
-        return response
