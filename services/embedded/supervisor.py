@@ -184,7 +184,9 @@ class Supervisor:
             else:
                 _, token = api_keys.create_key(session, KEY_NAME, "admin")
                 write_private(self._folder.api_key, token + "\n")
-            signing.register(session, signing.open_signer(settings))
+            signer = signing.open_signer(settings)
+            signing.register(session, signer)
+            self._signing_key = signer.public_key
         database.dispose()
 
     def _listen(self) -> socket.socket:
@@ -284,6 +286,7 @@ class Supervisor:
                 "docs_url": f"{self._url}/docs",
                 "dashboard_url": f"{self._url}/dashboard",
                 "api_key_file": str(self._folder.api_key),
+                "signing_key": self._signing_key,
                 "started_at": self._started_at.isoformat(),
                 "ready": ready,
                 "children": {child.program.name: child.pid for child in self._children if child.pid},

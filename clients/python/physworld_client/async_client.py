@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from pathlib import Path
 from types import TracebackType
 from typing import TypeVar
 
@@ -22,6 +23,7 @@ from physworld_client.async_resources import (
     AsyncScenes,
 )
 from physworld_client.calls import Call
+from physworld_client.known_keys import KnownKeys
 
 Answer = TypeVar("Answer")
 
@@ -37,10 +39,14 @@ class AsyncClient:
         max_retries: int = wire.DEFAULT_MAX_RETRIES,
         *,
         transport: httpx.AsyncBaseTransport | None = None,
+        known_keys: str | Path | None = None,
+        known_as: str | None = None,
     ) -> None:
         self.timeout = timeout
         self.max_retries = max_retries
+        self.known_keys = KnownKeys(known_keys)
         self.http = httpx.AsyncClient(transport=transport, **wire.client_options(base_url, token, timeout))
+        self.known_as = known_as or wire.service_name(self.base_url)
         self.scenes = AsyncScenes(self)
         self.fits = AsyncFits(self)
         self.traces = AsyncTraces(self)

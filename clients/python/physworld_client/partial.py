@@ -13,7 +13,6 @@ from __future__ import annotations
 import hashlib
 import os
 from contextlib import suppress
-from itertools import count
 from pathlib import Path
 from types import TracebackType
 from typing import IO
@@ -44,12 +43,7 @@ class PartialFile:
     def __enter__(self) -> PartialFile:
         """Takes a part: the first that nobody else is writing."""
         self.target.parent.mkdir(parents=True, exist_ok=True)
-        for number in count():
-            stream = _held(self._place(number))
-            if stream is not None:
-                break
-        self._stream: IO[bytes] = stream
-        self.part = self._place(number)
+        self.part, self._stream = self._taken()
         self.offset = self.part.stat().st_size
         return self
 
@@ -121,6 +115,12 @@ class PartialFile:
         """Whether the part found on disk is the whole already (broken off just before the rename)."""
         self._stream.flush()
         return self.offset > 0 and sha256_of(self.part) == self.sha256
+
+    def _taken(self) -> tuple[Path, IO[bytes]]:
+        number = 0
+        while (stream := _held(self._place(number))) is None:
+            number += 1
+        return self._place(number), stream
 
     def _place(self, number: int) -> Path:
         order = f".{number}" if number else ""

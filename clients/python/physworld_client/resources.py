@@ -19,9 +19,10 @@ from physworld_client.arrays import arrays_of
 from physworld_client.bundle import open_bundle
 from physworld_client.errors import PhysWorldError, WaitTimedOut
 from physworld_client.export import Format, open_export
+from physworld_client.known_keys import is_fingerprint, trusted_keys
 from physworld_client.manifest import artifacts_of, verify_folder
 from physworld_client.pages import ListPage
-from physworld_client.signatures import keys_by_id, remember
+from physworld_client.signatures import given_key
 from physworld_client.stream import HEARTBEAT_S, IDLE_LIMIT_S, EventDecoder, ends_job
 from physworld_client.waiting import Patience, job_id_of, require_success
 from schemas.dataset import Dataset, DatasetConfig, Episode
@@ -216,37 +217,62 @@ class Models(Resource):
         page = self._client.send(calls.signing_keys())
         return tuple(page.data)
 
+    def trust(self, key: str | Path) -> str:
+        """Trusts a key to sign this service's models, beside those that are; its fingerprint.
+
+        Args:
+            key: the fingerprint of a key that the service lists, a public key in base64, or the ``Path`` of a file
+                that holds one of them.
+
+        Raises:
+            SignatureInvalid: the service lists no key with that fingerprint.
+            ModelUnreadable: it is no key, or the file of known keys cannot be read or written.
+        """
+        given = given_key(key)
+        listed = self.signing_keys() if is_fingerprint(given) else ()
+        return self._client.known_keys.trust(self._client.known_as, given, listed)
+
+    def distrust(self, fingerprint: str) -> None:
+        """Trusts a key no more to sign this service's models. Raises ModelUnreadable when it was not trusted."""
+        self._client.known_keys.distrust(self._client.known_as, fingerprint)
+
     def download(
         self,
         name: str,
         folder: str | Path,
         version: int | str = LATEST,
         *,
-        public_key: str | None = None,
+        public_key: str | Path | None = None,
+        trust: str | Path | None = None,
         allow_unsigned: bool = False,
     ) -> ModelVersion:
         """Downloads every file of a version into ``folder`` and verifies them: signature, manifest, digests.
 
+        The first download from a service pins the keys that it lists; see ``physworld_client.known_keys``.
+
         Args:
-            public_key: the only key in base64 that may have signed; by default the service's own keys, which are
-                remembered on this machine (``physworld_client.signatures``).
+            public_key: the only key that may have signed, in base64 or as the ``Path`` of a file; nothing is pinned.
+            trust: a key to trust first, as in ``trust``.
             allow_unsigned: take a version that was published before there were signatures.
 
         Raises:
-            SignatureInvalid: the manifest is not signed, or not by such a key.
+            SigningKeyUntrusted: another key signed than those that are trusted for this service.
+            SignatureInvalid: the manifest is not signed, or was changed since.
             DigestMismatch: a file is not what the manifest promises.
             ModelUnreadable: the version is not ready or its artifacts are incomplete.
         """
+        if trust is not None:
+            self.trust(trust)
         found = self.version(name, version)
         target = Path(folder)
         for artifact in artifacts_of(found):
             self._client.artifacts.download(artifact.sha256, target / artifact.name)
-        keys = None
-        if public_key is not None:
-            keys = keys_by_id([public_key])
-        elif not allow_unsigned:
-            keys = remember(self.signing_keys(), self._client.base_url)
+        if public_key is not None or allow_unsigned:
+            verify_folder(target, found.sha256, keys=trusted_keys(public_key, allow_unsigned))
+            return found
+        keys = self._client.known_keys.expected(self._client.known_as, self.signing_keys())
         verify_folder(target, found.sha256, keys=keys)
+        self._client.known_keys.met(keys)
         return found
 
 
