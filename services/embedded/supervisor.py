@@ -78,6 +78,7 @@ class Supervisor:
         self._children: list[Child] = []
         self._stop = threading.Event()
         self._started_at = datetime.now(UTC)
+        self._signing_key = ""
 
     def run(self) -> None:
         """Start, watch until a signal comes, end everything.

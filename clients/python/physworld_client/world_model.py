@@ -24,6 +24,7 @@ from physworld_client.errors import ModelUnreadable
 from physworld_client.known_keys import trusted_keys
 from physworld_client.manifest import CARD_NAME, WEIGHTS_NAME, verify_folder
 from physworld_client.network import PROPERTY_COUNT, Network
+from schemas.arrays import FARTHEST_M
 
 CARD_SCHEMA = 1
 
@@ -171,7 +172,7 @@ class WorldModel:
                 From rest: one frame h+1 times, with controllers that stand still as long.
 
         Raises:
-            ValueError: arrays of other shapes, or values that are not finite.
+            ValueError: arrays of other shapes, values that are not finite, places beyond ``FARTHEST_M``.
         """
         frames, n = self.history + 1, self._network.object_count
         start = self.start_history if history is None else np.asarray(history, dtype=np.float64)
@@ -187,6 +188,11 @@ class WorldModel:
         broken = sum(np.count_nonzero(~np.isfinite(part)) for part in (driven, start, properties))
         if broken:
             raise ValueError(f"{broken} values of controllers, history and phi are no finite numbers")
+        farthest = max(float(np.abs(part).max()) for part in (driven, start))
+        if farthest > FARTHEST_M:
+            raise ValueError(
+                f"a place {farthest:.4g} m from the origin in controllers or history; {FARTHEST_M:g} m is the farthest"
+            )
         origin = start[-1].mean(axis=0)
         if self.ground_height_m is not None:
             origin[2] = self.ground_height_m

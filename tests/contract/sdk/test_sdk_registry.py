@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import json
 from pathlib import Path
 
 import pytest
@@ -174,6 +175,32 @@ def test_the_command_line_trusts_by_fingerprint_and_by_file(
     assert run(*again).exit_code != 0
     assert run(*again, "--public-key", listed.public_key).exit_code == 0
     assert run(*again, "--trust", listed.public_key).exit_code == 0
+
+
+def test_the_command_line_trusts_the_key_that_an_embedded_service_states_in_its_own_folder(
+    service: Service, client: Client, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A data folder that was made anew has a new key under an old name."""
+    monkeypatch.setenv("PHYSWORLD_KNOWN_KEYS", str(tmp_path / "known.json"))
+    (listed,) = client.models.signing_keys()
+    data = tmp_path / "data"
+    (data / "run").mkdir(parents=True)
+    (data / "api-key").write_text(service.token)
+    state = {"api_url": service.url, "dashboard_url": service.url, "api_key_file": str(data / "api-key")}
+    other = base64.b64encode(Ed25519PrivateKey.generate().public_key().public_bytes_raw()).decode()
+    KnownKeys().trust(str(data), other)
+
+    def download() -> Result:
+        place = ["-o", str(tmp_path / "out"), "--data", str(data)]
+        return CliRunner().invoke(app, ["models", "download", name, "--version", "1", *place])
+
+    (data / "run" / "state.json").write_text(json.dumps(state))
+    assert isinstance(download().exception, SigningKeyUntrusted)
+    (data / "run" / "state.json").write_text(json.dumps({**state, "signing_key": listed.public_key}))
+    found = download()
+    assert found.exit_code == 0, found.output
+    assert fingerprint_of(listed.public_key) in (KnownKeys().of(str(data)) or {})
+    assert KnownKeys().of(service.url) is None, "an embedded service is known by its folder"
 
 
 def test_the_command_line_does_the_same(service: Service, name: str, tmp_path: Path) -> None:

@@ -183,6 +183,8 @@ def test_wrong_shapes_are_named(tmp_path: Path) -> None:
         loaded.rollout(driven(model)[:3])
     with pytest.raises(ValueError, match=r"phi \(2,\)"):
         loaded.rollout(driven(model), np.zeros(2))
+    with pytest.raises(ValueError, match=r"a place 1e\+300 m from the origin.*; 1000 m is the farthest"):
+        loaded.rollout(np.where(np.arange(FRAMES)[:, None, None] == 9, 1e300, driven(model)))
     with pytest.raises(ValueError, match="18 values of controllers, history and phi are no finite numbers"):
         loaded.rollout(np.where(np.arange(FRAMES)[:, None, None] == 9, np.nan, driven(model)))
 

@@ -172,7 +172,7 @@ def _running_on(data: Path, pid: int | None = None) -> Address | None:
         token = Path(state["api_key_file"]).read_text().strip()
     except OSError as error:
         raise PhysWorldError(f"the API key cannot be read: {error}") from error
-    return Address(url, token, str(state["dashboard_url"]), data, state.get("signing_key"))
+    return Address(url, token, str(state["dashboard_url"]), data, state.get("signing_key") or None)
 
 
 def _end_with_parent(parent: int) -> Callable[[], None] | None:
