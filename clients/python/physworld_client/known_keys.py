@@ -46,7 +46,7 @@ class KnownKeys:
     def of(self, service: str) -> dict[str, str] | None:
         """Keys pinned for a service by fingerprint; None for one that was never met. Raises ModelUnreadable."""
         found = self._read().get(service)
-        return None if found is None else {print_: entry["public_key"] for print_, entry in found.items()}
+        return None if found is None else {mark: entry["public_key"] for mark, entry in found.items()}
 
     def anyones(self) -> TrustedKeys:
         """Keys pinned for any service, for a folder that is opened without one. Raises ModelUnreadable."""
@@ -87,22 +87,20 @@ class KnownKeys:
         text = given_key(key)
         if is_fingerprint(text):
             text = _with_fingerprint(text.lower(), listed_keys(listed, service), service)
-        print_, entry = _entry(text, "trusted")
-        if print_ not in (self.of(service) or {}):
+        mark, entry = _entry(text, "trusted")
+        if mark not in (self.of(service) or {}):
             with self._changing() as services:
-                services.setdefault(service, {})[print_] = entry
-        return print_
+                services.setdefault(service, {})[mark] = entry
+        return mark
 
     def distrust(self, service: str, fingerprint: str) -> None:
         """Removes a key of a service. Raises ModelUnreadable when it is not pinned."""
-        print_ = fingerprint.strip().lower()
+        mark = fingerprint.strip().lower()
         with self._changing() as services:
-            if print_ not in services.get(service, {}):
+            if mark not in services.get(service, {}):
                 held = ", ".join(services.get(service, {})) or "none"
-                raise ModelUnreadable(
-                    f"{print_[:80]!r} is no key that is trusted for {service}; there: {held}"
-                )
-            del services[service][print_]
+                raise ModelUnreadable(f"{mark[:80]!r} is no key that is trusted for {service}; there: {held}")
+            del services[service][mark]
 
     def _read(self) -> Services:
         """Raises ModelUnreadable."""
@@ -112,9 +110,9 @@ class KnownKeys:
             held = json.loads(self.path.read_bytes())
             services = held["services"] if "services" in held else _of_first_format(held)
             for keys in services.values():
-                for print_, entry in keys.items():
-                    if fingerprint_of(entry["public_key"]) != print_:
-                        raise ValueError(f"{print_} is not the fingerprint of its key")
+                for mark, entry in keys.items():
+                    if fingerprint_of(entry["public_key"]) != mark:
+                        raise ValueError(f"{mark} is not the fingerprint of its key")
         except (ValueError, KeyError, TypeError, AttributeError, ModelUnreadable) as error:
             raise ModelUnreadable(f"{self.path} is not a file of known keys: {error!r}") from error
         return dict(services)
@@ -168,12 +166,12 @@ def known_keys_file() -> Path:
     )
 
 
-def _with_fingerprint(print_: str, listed: Mapping[str, str], service: str) -> str:
+def _with_fingerprint(mark: str, listed: Mapping[str, str], service: str) -> str:
     for text in listed.values():
-        if fingerprint_of(text) == print_:
+        if fingerprint_of(text) == mark:
             return text
     offered = ", ".join(fingerprint_of(text) for text in listed.values()) or "none"
-    raise SignatureInvalid(f"{service} lists no key with the fingerprint {print_}; it lists {offered}")
+    raise SignatureInvalid(f"{service} lists no key with the fingerprint {mark}; it lists {offered}")
 
 
 def _entry(text: str, how: str) -> tuple[str, dict[str, str]]:
@@ -185,6 +183,6 @@ def _of_first_format(held: dict[str, Any]) -> Services:
     """``{key id: {"public_key", "origin"}}``, which knew only who had listed a key first."""
     services: Services = {}
     for entry in held.values():
-        print_, pinned = _entry(entry["public_key"], "first use")
-        services.setdefault(entry["origin"], {})[print_] = pinned
+        mark, pinned = _entry(entry["public_key"], "first use")
+        services.setdefault(entry["origin"], {})[mark] = pinned
     return services

@@ -116,8 +116,8 @@ def models_keys(json: Json = False, url: Url = None, token: Token = None, data: 
         pinned = client.known_keys.of(client.known_as) or {}
 
     def row(key: SigningKey) -> tuple[str, ...]:
-        print_ = fingerprint_of(key.public_key)
-        return (print_, key.algorithm, f"{key.created_at:%Y-%m-%d}", "yes" if print_ in pinned else "no")
+        mark = fingerprint_of(key.public_key)
+        return (mark, key.algorithm, f"{key.created_at:%Y-%m-%d}", "yes" if mark in pinned else "no")
 
     show_list(keys, len(keys), json, ("fingerprint", "algorithm", "since", "trusted here"), row)
 
@@ -126,8 +126,8 @@ def models_keys(json: Json = False, url: Url = None, token: Token = None, data: 
 def models_trust(key: Key, url: Url = None, token: Token = None, data: Data = None) -> None:
     """Trust a key to sign this service's models, beside those that are."""
     with service.connect(url, token, data) as client:
-        print_ = client.models.trust(_key(key))
-        stdout.print(f"{print_} is trusted for {client.known_as}", soft_wrap=True)
+        mark = client.models.trust(_key(key))
+        stdout.print(f"{mark} is trusted for {client.known_as}", soft_wrap=True)
 
 
 @models.command("distrust")
