@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import base64
-import binascii
 import math
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
+
+FARTHEST_M = 1000.0
+"""No place is farther from the origin, along an axis [m]: beyond, single precision is coarser than 0.06 mm."""
+MAX_LISTED_VALUES = 41_000
+"""Values that one request may list as JSON; arrays of more are sent as base64."""
+PIECE_BYTES = 3 * 2**18
+"""Base64 is written and read in pieces: one call would hold the interpreter for the whole array."""
 
 Side = Annotated[int, Field(ge=0, lt=2**31)]
 Nested = list[Any]
@@ -25,15 +31,28 @@ class EncodedArray(BaseModel):
 
     @classmethod
     def of(cls, values: np.ndarray) -> EncodedArray:
-        """The array in single precision."""
-        plain = np.ascontiguousarray(values, dtype="<f4")
-        return cls(shape=list(plain.shape), data=base64.b64encode(plain.tobytes()).decode())
+        """The array in single precision. Raises ValueError for a finite value that it does not hold."""
+        given = np.asarray(values)
+        with np.errstate(over="ignore"):
+            plain = np.ascontiguousarray(given, dtype="<f4")
+        lost = np.isinf(plain) & np.isfinite(given)
+        if lost.any():
+            first = np.argwhere(lost)[0].tolist()
+            raise ValueError(
+                f"{given[tuple(first)]:.4g} at {first} is beyond single precision, {np.finfo('<f4').max:.4g}"
+            )
+        raw = plain.tobytes()
+        pieces = (base64.b64encode(raw[at : at + PIECE_BYTES]) for at in range(0, len(raw), PIECE_BYTES))
+        return cls(shape=list(plain.shape), data=b"".join(pieces).decode())
 
     def numpy(self) -> np.ndarray:
         """The values, float32 of ``shape``. Raises ValueError with both sizes when they do not fit."""
+        step = PIECE_BYTES // 3 * 4
+        raw = bytearray()
         try:
-            raw = base64.b64decode(self.data, validate=True)
-        except binascii.Error as error:
+            for at in range(0, len(self.data), step):
+                raw += base64.b64decode(self.data[at : at + step], validate=True)
+        except ValueError as error:
             raise ValueError(f"data is not base64: {error}") from error
         expected = 4 * math.prod(self.shape)
         if len(raw) != expected:
@@ -44,8 +63,13 @@ class EncodedArray(BaseModel):
 ArrayInput = EncodedArray | Nested
 
 
-def array_of(value: ArrayInput, name: str, dimensions: tuple[int, ...]) -> np.ndarray:
-    """The values as float64, finite, with one of the numbers of axes. Raises ValueError that says what is wrong."""
+def array_of(
+    value: ArrayInput, name: str, dimensions: tuple[int, ...], most: float | None = None
+) -> np.ndarray:
+    """The values as float64, finite, with one of the numbers of axes, none of them beyond ±``most``.
+
+    Raises ValueError that says what is wrong.
+    """
     if isinstance(value, EncodedArray):
         values = value.numpy().astype(np.float64)
     else:
@@ -63,4 +87,10 @@ def array_of(value: ArrayInput, name: str, dimensions: tuple[int, ...]) -> np.nd
     if broken:
         first = np.argwhere(~np.isfinite(values))[0].tolist()
         raise ValueError(f"{name} holds {broken} values that are not finite, the first at {first}")
+    largest = float(np.abs(values).max())
+    if most is not None and largest > most:
+        place = np.unravel_index(int(np.abs(values).argmax()), values.shape)
+        raise ValueError(
+            f"{name} reaches {largest:.4g} at {[int(i) for i in place]}; {most:g} is the farthest from 0"
+        )
     return values

@@ -7,13 +7,13 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from schemas.arrays import ArrayInput
+from schemas.arrays import FARTHEST_M, ArrayInput
 from schemas.base import Artifact, Lineage, Request, Resource, Seed
 from schemas.rollout import ModelName, RunState, Version
 
 MAX_HORIZON, MAX_SAMPLES, MAX_ITERATIONS, MAX_PLAN_STEPS = 300, 8192, 100, 20_000_000
 
-Coordinate = Annotated[float, Field(ge=-1000, le=1000)]
+Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
 Place = tuple[Coordinate, Coordinate, Coordinate]
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from schemas.arrays import ArrayInput, EncodedArray
+from schemas.arrays import MAX_LISTED_VALUES, ArrayInput, EncodedArray
 from schemas.base import Artifact, Lineage, Request, Resource
 
 MAX_CANDIDATES, MAX_TICKS = 4096, 3000
@@ -16,6 +16,8 @@ MAX_STEPS, MAX_VALUES = 500_000, 2**26
 SYNC_STEPS, SYNC_VALUES = 3000, 2**19
 """Up to these a rollout is answered at once (some seconds of one core, 2 MiB of numbers); beyond them it is a job."""
 MAX_REQUEST_BYTES = 32 * 2**20
+MAX_LOG_RATIO = 10.0
+"""Largest logarithm of a ratio of properties; beyond, it means nothing."""
 
 ModelName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$")]
 VersionName = Annotated[str, Field(pattern=r"^([1-9][0-9]{0,8}|[a-z][a-z0-9_-]{0,31})$")]
@@ -38,7 +40,7 @@ class RolloutCreate(Request):
     model: ModelName
     version: Version = "latest"
     controllers: ArrayInput
-    times: list[float] | None = Field(default=None, max_length=100_000)
+    times: list[float] | None = Field(default=None, max_length=MAX_LISTED_VALUES)
     dt_s: float | None = Field(default=None, gt=0, lt=10)
     start: Start = "recording"
     phi: ArrayInput | None = None

@@ -1,6 +1,7 @@
 """Content-addressed files: ``artifacts/ab/<sha256>``, written once, never changed.
 
-A write is atomic (a reader sees the whole file or none); writing the same bytes again writes nothing.
+A write is atomic (a reader sees the whole file or none). Writing the same bytes again reads what is there and leaves
+it, unless it has rotted: then it is replaced.
 """
 
 from __future__ import annotations
@@ -87,10 +88,15 @@ class ArtifactStore:
             return int(obstore.head(self._store, _key(sha256))["size"])
 
     def _has(self, sha256: str, size: int) -> bool:
+        """Whether the file is there and still what it was: it is read, as a write would move as many bytes."""
         try:
-            return self.size(sha256) == size
-        except NotFound:
+            if self.size(sha256) != size:
+                return False
+            for _ in self.open(sha256):
+                pass
+        except (NotFound, ArtifactCorrupt):
             return False
+        return True
 
     def _pieces(
         self, stream: obstore.BytesStream | Iterator[bytes], sha256: str, *, whole: bool

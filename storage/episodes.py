@@ -12,7 +12,8 @@ the particles again, those that a world model takes for its vertices, so that a 
 Chunks lie along the first axis inside a shard, so a window of frames can be read without the rest.
 
 The digest of an episode is over the digests of its arrays, so that a part can be read and verified alone. Episodes of
-the first format have one digest over all bytes and are read whole.
+the first format have one digest over all bytes and are read whole. Attributes are no part of it, so that episodes made
+again from another upload of the same scene keep theirs; they stand beside a digest of their own.
 """
 
 from __future__ import annotations
@@ -50,6 +51,7 @@ CHUNK_BYTES = 1 << 20
 PACKED_BYTES = 1 << 14
 """Smaller arrays are not compressed: it would save less than a block of the disk."""
 FORMAT, FIRST_FORMAT = "physworld-episode/2", "physworld-episode/1"
+ATTRIBUTES_DIGEST = "attributes_sha256"
 MANIFEST_NAME = "manifest.json"
 MANIFEST_TYPE = "application/json"
 DATASET_ID = re.compile(r"[A-Za-z0-9_-]+")
@@ -100,7 +102,13 @@ class EpisodeStore:
         plain = {name: _plain(name, array) for name, array in arrays.items()}
         size = sum(array.nbytes for array in plain.values())
         parts = {name: _part(array) for name, array in plain.items()}
-        header = {"format": FORMAT, "arrays": parts, "attributes": dict(attributes)}
+        noted = dict(attributes)
+        header = {
+            "format": FORMAT,
+            "arrays": parts,
+            "attributes": noted,
+            ATTRIBUTES_DIGEST: _digest_of_json(noted),
+        }
         try:
             with writing(f"episode {path}", size, self._settings):
                 _finish(_write_group(self._zarr(path), header, plain))
@@ -132,9 +140,12 @@ class EpisodeStore:
             arrays = {str(name): _read_array(group, str(name)) for name in wanted}
         if digest is not None:
             self._check(path, digest, arrays, kept)
+        attributes = header.get("attributes")
+        noted = header.get(ATTRIBUTES_DIGEST)  # older episodes have none
+        if digest is not None and noted is not None and noted != _digest_of_json(attributes):
+            raise EpisodeCorrupt(f"{path}: its attributes do not have the digest they were written with")
         if names is not None:
             arrays = {name: array for name, array in arrays.items() if name in names}
-        attributes = header.get("attributes")
         return arrays, dict(attributes) if isinstance(attributes, dict) else {}
 
     @staticmethod
@@ -245,6 +256,12 @@ def _part(array: NDArray[Any]) -> str:
 def _digest_of(parts: Mapping[str, str]) -> str:
     """Digest of an episode from those of its arrays."""
     return hashlib.sha256(json.dumps(sorted(parts.items())).encode()).hexdigest()
+
+
+def _digest_of_json(value: Any) -> str:
+    """Digest of a JSON value as it is read again: with text for keys, lists for tuples."""
+    plain = json.loads(json.dumps(value))
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 
 
 def _first_digest(arrays: Mapping[str, NDArray[Any]]) -> str:

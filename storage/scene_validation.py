@@ -33,6 +33,7 @@ from storage.scene_checks_measured import (
     check_units,
     check_visibility,
 )
+from storage.scene_checks_places import check_places
 from storage.scene_declaration import Declaration, check_form
 
 
@@ -52,7 +53,7 @@ def check_scene(
         check_gravity(declaration, findings)
     with np.errstate(over="ignore", invalid="ignore"):  # absurd values overflow, and are then named
         measured = check_arrays(arrays, findings)
-        if measured is not None:
+        if measured is not None and check_places(arrays, measured, findings):
             _check_measured(declaration, arrays, meshes or {}, measured, findings)
     return findings.faults, findings.warnings
 

@@ -23,6 +23,7 @@ class GripLimits:
         box_min_m, box_max_m: of a grip's displacement from where the plan starts, (G, 3).
         spread_max_m: largest distance between grip centres, (G, G), infinite where none.
         centres_m: of the grips where the plan starts, (G, 3).
+        start_m_s: velocities that the grips have there, (G, 3); None: they are at rest.
     """
 
     speed_m_s: float
@@ -31,17 +32,24 @@ class GripLimits:
     box_max_m: np.ndarray
     spread_max_m: np.ndarray
     centres_m: np.ndarray
+    start_m_s: np.ndarray | None = None
+
+    @property
+    def started_m_s(self) -> np.ndarray:
+        """Velocities of the grips where the plan starts, (G, 3)."""
+        return np.zeros_like(self.centres_m) if self.start_m_s is None else self.start_m_s
 
     def kept(self, velocities: np.ndarray, dt_s: float) -> np.ndarray:
         """Velocities (…, T, G, 3) cut to the limits, tick by tick: acceleration, speed, workspace, spread.
 
+        The first tick's acceleration is from the velocities that the grips have where the plan starts.
         Where a grip meets the end of its workspace it stops there within the tick: the workspace comes before the
         acceleration. Where one that pulls another along would make it too fast, both go a part of the way: from places
         that keep workspace and spread to places that do, every part does.
         """
         out = np.empty_like(velocities)
         place = np.zeros(velocities.shape[:-3] + velocities.shape[-2:])
-        before = np.zeros_like(place)
+        before = np.broadcast_to(self.started_m_s, place.shape)
         for t in range(velocities.shape[-3]):
             change = _shortened(velocities[..., t, :, :] - before, self.acceleration_m_s2 * dt_s)
             wanted = place + dt_s * _shortened(before + change, self.speed_m_s)

@@ -83,7 +83,7 @@ class Found:
         displacements: of the grips at ticks 1 … T [m], (T, G, 3).
         points: predicted, (T, N, 3) [m].
         distance_m: to the goal, mean over the settling ticks.
-        costs: the best cost after every iteration [m], the first that of no motion.
+        costs: the best cost after every iteration [m], the first that of grips that come to rest.
         samples: motions rolled out.
     """
 
@@ -122,12 +122,13 @@ def search(
     """
     grips = len(limits.centres_m)
     mean = np.zeros((config.horizon, grips, 3))
-    best, points = mean, predict(np.zeros((1, config.horizon, grips, 3)))
+    mean = best = limits.kept(mean, dt_s)  # the grips come to rest as fast as they may
+    points = predict(dt_s * best[None].cumsum(axis=1))
     finite = np.isfinite(points[0]).all(axis=(1, 2))
     if not finite.all():
         raise UnstableSimulation(
-            f"the model leaves the numbers {(np.argmin(finite) + 1) * dt_s:.3g} s after its start with grips at rest: "
-            "nothing can be planned with it"
+            f"the model leaves the numbers {(np.argmin(finite) + 1) * dt_s:.3g} s after its start with grips that come "
+            "to rest: nothing can be planned with it"
         )
     still = float(_ending(goal.distance(points), config)[0])
     best_cost = float(_costs(points, best[None], goal, limits, dt_s, config, still)[0])
@@ -192,7 +193,8 @@ def _costs(
 ) -> np.ndarray:
     """S of every motion [m]; infinite where the prediction is no number."""
     distance = goal.distance(np.where(np.isfinite(points), points, 1e6))
-    changes = np.diff(velocities, axis=1, prepend=0.0)
+    first = np.broadcast_to(limits.started_m_s, (len(velocities), 1, *limits.started_m_s.shape))
+    changes = np.diff(velocities, axis=1, prepend=first)
     effort = np.sqrt((changes**2).sum(axis=-1).mean(axis=(1, 2))) / limits.speed_m_s
     total = _ending(distance, config) + config.path_share * distance.mean(axis=1)
     total = total + config.effort_share * still * effort

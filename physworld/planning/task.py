@@ -1,7 +1,8 @@
 """A world model, its twin and its recording as one planning task: predict with the first, check with the second.
 
 A plan begins where the model's history ends: until then the grips do what they did in the recording, in the model and
-in the twin alike. Grips move as the twin's do; a controller that belongs to none (a pusher) stays.
+in the twin alike, and the velocities that they have there bound the first tick of a plan. Grips move as the twin's do;
+a controller that belongs to none (a pusher) stays.
 """
 
 from __future__ import annotations
@@ -45,6 +46,7 @@ class PlanningTask:
             raise SceneUnsupported(f"scene {scene.name!r} has no grips: nothing can be planned")
         first, start = scene.control_track()[1][0], model.start_controllers[-1]
         centres = np.array([start[grip].mean(axis=0) for grip in motion.grips])
+        before = np.array([model.start_controllers[-2][grip].mean(axis=0) for grip in motion.grips])
         gone = centres - np.array([first[grip].mean(axis=0) for grip in motion.grips])
         limits = GripLimits(
             speed_m_s=motion.speed_m_s,
@@ -53,6 +55,7 @@ class PlanningTask:
             box_max_m=np.maximum(motion.reach_max_m - gone, 0.0),
             spread_max_m=motion.spread_max_m,
             centres_m=centres,
+            start_m_s=(centres - before) / model.spec.dt_s,
         )
         return cls(model, twin, scene, motion.grips, limits, threads)
 

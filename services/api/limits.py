@@ -1,10 +1,15 @@
-"""Upper bounds on request bodies, counted as they stream: 413 with both numbers, and nothing stored."""
+"""Upper bounds on request bodies, counted as they stream: 413 with both numbers, and nothing stored.
+
+JSON is parsed in one call that holds the interpreter from the first value to the last, on the event loop or in any
+other thread alike. So the values that a body lists are bounded too, by its commas; base64 has none.
+"""
 
 from __future__ import annotations
 
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from schemas.arrays import MAX_LISTED_VALUES
 from schemas.rollout import MAX_REQUEST_BYTES
 from services.api.errors import ApiProblem, answer
 
@@ -15,7 +20,10 @@ ARRAY_PATHS = frozenset({"/v1/rollouts"})
 
 
 class BodyLimit:
-    """ASGI middleware; uploads are bounded by the settings, rollouts by 32 MiB, every other body by 1 MiB."""
+    """ASGI middleware; uploads are bounded by the settings, rollouts by 32 MiB, every other body by 1 MiB.
+
+    What is no upload lists at most ``MAX_LISTED_VALUES`` values.
+    """
 
     def __init__(self, app: ASGIApp, max_upload_bytes: int) -> None:
         self.app = app
@@ -36,14 +44,19 @@ class BodyLimit:
         if declared.isdigit() and int(declared) > allowed:
             await answer(too_large(int(declared), limit), scope)(scope, receive, send)
             return
-        counted = 0
+        counted = listed = 0
+        most_listed = None if scope["path"] in UPLOAD_PATHS else MAX_LISTED_VALUES
 
         async def receive_counted() -> Message:
-            nonlocal counted
+            nonlocal counted, listed
             message = await receive()
             counted += len(message.get("body", b""))
             if counted > allowed:
                 raise too_large(counted, limit, at_least=True)
+            if most_listed is not None:
+                listed += message.get("body", b"").count(b",")
+                if listed > most_listed:
+                    raise too_long(listed, most_listed)
             return message
 
         await self.app(scope, receive_counted, send)
@@ -54,4 +67,14 @@ def too_large(size: int, limit: int, *, at_least: bool = False) -> ApiProblem:
     words = "at least " if at_least else ""
     return ApiProblem(
         413, "content_too_large", f"the body has {words}{size} bytes; the limit is {limit} bytes"
+    )
+
+
+def too_long(listed: int, most: int) -> ApiProblem:
+    """The 413 for a body that lists too many values."""
+    return ApiProblem(
+        413,
+        "content_too_large",
+        f"the body lists more than {listed} values; the limit is {most}",
+        hint='arrays may be given as {"shape", "dtype": "<f4", "data"} with base64 of little-endian float32',
     )

@@ -17,6 +17,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from schemas.base import Artifact
 from schemas.job import Job
 from services.dashboard import text
+from services.dashboard.byte_cache import ByteCache
 from services.dashboard.tables import held_out_columns, held_out_of, held_out_rows, noise_floor_of
 from services.stores import Stores
 from storage.api_keys import ApiKey
@@ -30,7 +31,8 @@ if TYPE_CHECKING:
 BASE = "/dashboard"
 HERE = Path(__file__).parent
 STATIC = HERE / "static"
-CACHED_OBJECTS = 8
+CACHED_BYTES = 256 * 2**20
+"""Of parsed recordings and arrays that a process keeps between requests."""
 
 
 class Site:
@@ -42,8 +44,7 @@ class Site:
         self.artifacts = stores.artifacts
         self.episodes = stores.episodes
         self._templates = _environment()
-        self._scene_of = lru_cache(maxsize=CACHED_OBJECTS)(self._read_scene)
-        self._arrays_of = lru_cache(maxsize=CACHED_OBJECTS)(self._read_arrays)
+        self._parsed = ByteCache(CACHED_BYTES)
 
     def page(self, request: Request, template: str, *, status: int = 200, **context: Any) -> HTMLResponse:
         """A whole page. Who looks is taken from the request, where ``access.require_viewer`` left it."""
@@ -58,12 +59,16 @@ class Site:
     def recording(self, artifacts: list[Artifact]) -> Scene | None:
         """The recording behind a scene's artifacts: its canonical archive, parsed; None without one."""
         archive = next((item for item in artifacts if item.name.endswith(".zip")), None)
-        return None if archive is None else self._scene_of(archive.sha256)
+        if archive is None:
+            return None
+        return self._parsed.get(("scene", archive.sha256), lambda: self._read_scene(archive.sha256))
 
     def arrays(self, artifacts: list[Artifact], name: str) -> Mapping[str, np.ndarray] | None:
         """The arrays of the artifact called ``name`` (an npz without pickles); None without one."""
         found = next((item for item in artifacts if item.name == name), None)
-        return None if found is None else self._arrays_of(found.sha256)
+        if found is None:
+            return None
+        return self._parsed.get(("arrays", found.sha256), lambda: self._read_arrays(found.sha256))
 
     def _read_scene(self, sha256: str) -> Scene:
         scene, _warnings = bundle_from_bytes(self.artifacts.read_bytes(sha256))

@@ -78,6 +78,7 @@ class Supervisor:
         self._children: list[Child] = []
         self._stop = threading.Event()
         self._started_at = datetime.now(UTC)
+        self._signing_key = ""
 
     def run(self) -> None:
         """Start, watch until a signal comes, end everything.
@@ -184,7 +185,9 @@ class Supervisor:
             else:
                 _, token = api_keys.create_key(session, KEY_NAME, "admin")
                 write_private(self._folder.api_key, token + "\n")
-            signing.register(session, signing.open_signer(settings))
+            signer = signing.open_signer(settings)
+            signing.register(session, signer)
+            self._signing_key = signer.public_key
         database.dispose()
 
     def _listen(self) -> socket.socket:
@@ -284,6 +287,7 @@ class Supervisor:
                 "docs_url": f"{self._url}/docs",
                 "dashboard_url": f"{self._url}/dashboard",
                 "api_key_file": str(self._folder.api_key),
+                "signing_key": self._signing_key,
                 "started_at": self._started_at.isoformat(),
                 "ready": ready,
                 "children": {child.program.name: child.pid for child in self._children if child.pid},

@@ -7,7 +7,7 @@ Arrays of ``plan.npz``, T ticks of the plan after the h + 1 of the model's histo
     predicted (T, N, 3) f4   measured points, the model's [m]
     executed (T, N, 3) f4    the same in the twin [m]
     motionless (T, N, 3) f4  in the twin when the grips do not move [m]
-    cost_history (I+1,) f8   best cost after each iteration [m], the first that of no motion
+    cost_history (I+1,) f8   best cost after each iteration [m], the first that of grips coming to rest
     goal_index (M,) i8, goal_places (M, 3) f8; or goal_shape (M, 3) f8
 """
 
@@ -21,7 +21,7 @@ from physworld.planning.goals import Goal, GoalPoints, GoalShape
 from physworld.planning.mppi import Found, MppiConfig, search
 from physworld.planning.task import PlanningTask
 from physworld.worldmodel.published import PublishedModel
-from schemas.arrays import array_of
+from schemas.arrays import FARTHEST_M, array_of
 from schemas.plan import PlanCreate, PlanLimits, PointGoal
 from workers.context import TaskContext
 from workers.stores import Stores
@@ -77,7 +77,7 @@ def goal_of(request: PlanCreate) -> tuple[Goal, dict[str, np.ndarray]]:
     if isinstance(request.goal, PointGoal):
         index, places = np.array(request.goal.index), np.array(request.goal.places)
         return GoalPoints(index, places), {"goal_index": index, "goal_places": places}
-    shape = array_of(request.goal.shape, "goal.shape", (2,))
+    shape = array_of(request.goal.shape, "goal.shape", (2,), FARTHEST_M)
     return GoalShape(shape), {"goal_shape": shape}
 
 

@@ -37,6 +37,7 @@ from physworld_client.errors import (
     SceneInvalid,
     ServerError,
     SignatureInvalid,
+    SigningKeyUntrusted,
     WaitTimedOut,
 )
 
@@ -67,6 +68,7 @@ __all__ = [
     "SceneInvalid",
     "ServerError",
     "SignatureInvalid",
+    "SigningKeyUntrusted",
     "WaitTimedOut",
     "__version__",
 ]

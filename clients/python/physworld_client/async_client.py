@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+from pathlib import Path
 from types import TracebackType
 from typing import TypeVar
 
 import httpx
 
 from physworld_client import transport as wire
+from physworld_client.async_artifacts import AsyncArtifacts
 from physworld_client.async_live import AsyncLive
 from physworld_client.async_loop import AsyncAssessments, AsyncTraces
 from physworld_client.async_predict import AsyncPlans, AsyncRollouts
 from physworld_client.async_resources import (
-    AsyncArtifacts,
     AsyncDatasets,
     AsyncFits,
     AsyncJobs,
@@ -22,6 +23,7 @@ from physworld_client.async_resources import (
     AsyncScenes,
 )
 from physworld_client.calls import Call
+from physworld_client.known_keys import KnownKeys
 
 Answer = TypeVar("Answer")
 
@@ -37,10 +39,14 @@ class AsyncClient:
         max_retries: int = wire.DEFAULT_MAX_RETRIES,
         *,
         transport: httpx.AsyncBaseTransport | None = None,
+        known_keys: str | Path | None = None,
+        known_as: str | None = None,
     ) -> None:
         self.timeout = timeout
         self.max_retries = max_retries
+        self.known_keys = KnownKeys(known_keys)
         self.http = httpx.AsyncClient(transport=transport, **wire.client_options(base_url, token, timeout))
+        self.known_as = known_as or wire.service_name(self.base_url)
         self.scenes = AsyncScenes(self)
         self.fits = AsyncFits(self)
         self.traces = AsyncTraces(self)

@@ -16,13 +16,12 @@ from physworld_client.arrays import arrays_of
 from physworld_client.bundle import open_bundle
 from physworld_client.errors import PhysWorldError, WaitTimedOut
 from physworld_client.export import Format, open_export
+from physworld_client.known_keys import is_fingerprint, trusted_keys
 from physworld_client.manifest import artifacts_of, verify_folder
 from physworld_client.pages import AsyncListPage
-from physworld_client.partial import PartialFile
-from physworld_client.signatures import keys_by_id, remember
+from physworld_client.signatures import given_key
 from physworld_client.stream import HEARTBEAT_S, IDLE_LIMIT_S, EventDecoder, ends_job
 from physworld_client.waiting import Patience, job_id_of, require_success
-from schemas.base import Artifact
 from schemas.dataset import Dataset, DatasetConfig, Episode
 from schemas.fit import Fit, FitConfig
 from schemas.job import TERMINAL_STATES, Event, Job
@@ -217,37 +216,62 @@ class AsyncModels(AsyncResource):
         page = await self._client.send(calls.signing_keys())
         return tuple(page.data)
 
+    async def trust(self, key: str | Path) -> str:
+        """Trusts a key to sign this service's models, beside those that are; its fingerprint.
+
+        Args:
+            key: the fingerprint of a key that the service lists, a public key in base64, or the ``Path`` of a file
+                that holds one of them.
+
+        Raises:
+            SignatureInvalid: the service lists no key with that fingerprint.
+            ModelUnreadable: it is no key, or the file of known keys cannot be read or written.
+        """
+        given = given_key(key)
+        listed = await self.signing_keys() if is_fingerprint(given) else ()
+        return self._client.known_keys.trust(self._client.known_as, given, listed)
+
+    async def distrust(self, fingerprint: str) -> None:
+        """Trusts a key no more to sign this service's models. Raises ModelUnreadable when it was not trusted."""
+        self._client.known_keys.distrust(self._client.known_as, fingerprint)
+
     async def download(
         self,
         name: str,
         folder: str | Path,
         version: int | str = LATEST,
         *,
-        public_key: str | None = None,
+        public_key: str | Path | None = None,
+        trust: str | Path | None = None,
         allow_unsigned: bool = False,
     ) -> ModelVersion:
         """Downloads every file of a version into ``folder`` and verifies them: signature, manifest, digests.
 
+        The first download from a service pins the keys that it lists; see ``physworld_client.known_keys``.
+
         Args:
-            public_key: the only key in base64 that may have signed; by default the service's own keys, which are
-                remembered on this machine (``physworld_client.signatures``).
+            public_key: the only key that may have signed, in base64 or as the ``Path`` of a file; nothing is pinned.
+            trust: a key to trust first, as in ``trust``.
             allow_unsigned: take a version that was published before there were signatures.
 
         Raises:
-            SignatureInvalid: the manifest is not signed, or not by such a key.
+            SigningKeyUntrusted: another key signed than those that are trusted for this service.
+            SignatureInvalid: the manifest is not signed, or was changed since.
             DigestMismatch: a file is not what the manifest promises.
             ModelUnreadable: the version is not ready or its artifacts are incomplete.
         """
+        if trust is not None:
+            await self.trust(trust)
         found = await self.version(name, version)
         target = Path(folder)
         for artifact in artifacts_of(found):
             await self._client.artifacts.download(artifact.sha256, target / artifact.name)
-        keys = None
-        if public_key is not None:
-            keys = keys_by_id([public_key])
-        elif not allow_unsigned:
-            keys = remember(await self.signing_keys(), self._client.base_url)
+        if public_key is not None or allow_unsigned:
+            verify_folder(target, found.sha256, keys=trusted_keys(public_key, allow_unsigned))
+            return found
+        keys = self._client.known_keys.expected(self._client.known_as, await self.signing_keys())
         verify_folder(target, found.sha256, keys=keys)
+        self._client.known_keys.met(keys)
         return found
 
 
@@ -367,49 +391,3 @@ class AsyncJobs(AsyncResource):
                 transport.raise_for_problem(response)
             async for line in response.aiter_lines():
                 yield line
-
-
-class AsyncArtifacts(AsyncResource):
-    """Content-addressed files."""
-
-    async def download(self, artifact: Artifact | str, path: str | Path) -> Path:
-        """Downloads an artifact to ``path``: resumes a part found there, checks the digest, then renames.
-
-        Raises:
-            DigestMismatch: the bytes are not those of the digest; nothing was put at ``path``.
-        """
-        partial = PartialFile(Path(path), artifact.sha256 if isinstance(artifact, Artifact) else artifact)
-        if partial.present():
-            return partial.target
-        retry = transport.Retry(self._client.max_retries)
-        while not partial.complete():
-            offset = partial.offset
-            try:
-                response = await self._fetch(partial)
-            except httpx.TransportError as error:
-                if partial.offset > offset:
-                    retry.attempt = 0
-                if not retry.again():
-                    raise transport.connection_error(error, self._client.http, retry) from error
-                await asyncio.sleep(retry.delay_s())
-                continue
-            if response.is_success:
-                break
-            if partial.refused(response):
-                continue
-            if response.status_code not in transport.RETRIED_STATUSES or not retry.again():
-                transport.raise_for_problem(response)
-            await asyncio.sleep(retry.delay_s(response))
-        return partial.finish()
-
-    async def _fetch(self, partial: PartialFile) -> httpx.Response:
-        """One request for what is missing; the body of a success is in the part when this returns."""
-        path = calls.artifact_path(partial.sha256)
-        async with self._client.http.stream("GET", path, headers=partial.headers()) as response:
-            if response.is_success:
-                partial.accept(response)
-                async for chunk in response.aiter_bytes():
-                    partial.write(chunk)
-            else:
-                await response.aread()
-        return response

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 from types import TracebackType
 from typing import TypeVar
 
 import httpx
 
 from physworld_client import transport as wire
+from physworld_client.artifacts import Artifacts
 from physworld_client.calls import Call
+from physworld_client.known_keys import KnownKeys
 from physworld_client.live import Live
 from physworld_client.loop import Assessments, Traces
 from physworld_client.predict import Plans, Rollouts
-from physworld_client.resources import Artifacts, Datasets, Fits, Jobs, Models, Pipelines, Scenes
+from physworld_client.resources import Datasets, Fits, Jobs, Models, Pipelines, Scenes
 
 Answer = TypeVar("Answer")
 
@@ -27,6 +30,8 @@ class Client:
         timeout: seconds for one answer (a long poll adds its own wait).
         max_retries: further attempts after the first, see ``physworld_client.transport``.
         transport: a transport of httpx, for tests or a Unix socket.
+        known_keys: the file of keys that may sign models; by default that of this machine.
+        known_as: the service's name in that file; its address without it.
 
     Attributes:
         scenes, fits, traces, datasets, models, assessments, rollouts, plans, live, jobs, pipelines, artifacts:
@@ -41,10 +46,14 @@ class Client:
         max_retries: int = wire.DEFAULT_MAX_RETRIES,
         *,
         transport: httpx.BaseTransport | None = None,
+        known_keys: str | Path | None = None,
+        known_as: str | None = None,
     ) -> None:
         self.timeout = timeout
         self.max_retries = max_retries
+        self.known_keys = KnownKeys(known_keys)
         self.http = httpx.Client(transport=transport, **wire.client_options(base_url, token, timeout))
+        self.known_as = known_as or wire.service_name(self.base_url)
         self.scenes = Scenes(self)
         self.fits = Fits(self)
         self.traces = Traces(self)

@@ -22,7 +22,8 @@
     ├── ExportRefused               episodes cannot be written in that form or to that place: what, and why
     ├── BundleUnreadable            a local scene cannot be packed: the path, and what is wrong with it
     └── ModelUnreadable             a local model artifact is incomplete or of an unknown layout
-        └── SignatureInvalid        its manifest is not signed by a known key; nothing was loaded
+        └── SignatureInvalid        its manifest is not signed, or was changed since; nothing was loaded
+            └── SigningKeyUntrusted another key signed it than those trusted here: both fingerprints
 
 ``str(error)`` is one line that a person can act on. ``ApiError.problem.request_id`` finds the request in the
 service's log.
@@ -169,6 +170,20 @@ class ModelUnreadable(PhysWorldError):
 
 class SignatureInvalid(ModelUnreadable):
     """A manifest is not signed by a known key, or is not the one that was signed."""
+
+
+class SigningKeyUntrusted(SignatureInvalid):
+    """A manifest was signed by another key than those that are trusted.
+
+    Attributes:
+        service: that the files come from; None for a folder that was opened without one.
+        signer: fingerprint of the key that signed, or its id where no list names it.
+        trusted: fingerprints of the trusted keys.
+    """
+
+    def __init__(self, text: str, service: str | None, signer: str, trusted: tuple[str, ...]) -> None:
+        self.service, self.signer, self.trusted = service, signer, trusted
+        super().__init__(text)
 
 
 _ERROR_OF_STATUS: dict[int, type[ApiError]] = {

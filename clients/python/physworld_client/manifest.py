@@ -8,14 +8,13 @@ before its files and the signature were verified.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 
 from pydantic import BaseModel, ValidationError
 
 from physworld_client.errors import DigestMismatch, ModelUnreadable
 from physworld_client.partial import sha256_of
-from physworld_client.signatures import verify_signature
+from physworld_client.signatures import TrustedKeys, verify_signature
 from schemas.base import Artifact
 from schemas.model import ModelVersion
 
@@ -39,13 +38,11 @@ class Manifest(BaseModel):
     files: dict[str, ManifestFile]
 
 
-def verify_folder(
-    folder: Path, sha256: str | None = None, *, keys: Mapping[str, str] | None = None
-) -> Manifest:
+def verify_folder(folder: Path, sha256: str | None = None, *, keys: TrustedKeys | None = None) -> Manifest:
     """Checks the signature of a model folder's manifest, the manifest against ``sha256``, every file against it.
 
     Args:
-        keys: trusted public keys in base64 by key id; None leaves the signature unchecked.
+        keys: those that may have signed; None leaves the signature unchecked.
 
     Raises:
         SignatureInvalid: no key of ``keys`` signed this manifest.

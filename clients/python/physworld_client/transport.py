@@ -93,6 +93,11 @@ def is_loopback(url: str) -> bool:
         return False
 
 
+def service_name(base_url: str) -> str:
+    """What a service is called where its keys are pinned: its address, without what lets somebody in."""
+    return str(httpx.URL(base_url).copy_with(username=None, password=None)).rstrip("/")
+
+
 def client_options(base_url: str, token: str | None, timeout: float) -> dict[str, Any]:
     """Keyword arguments common to ``httpx.Client`` and ``httpx.AsyncClient``."""
     if not base_url.startswith(("http://", "https://")):

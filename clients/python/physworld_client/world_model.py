@@ -21,9 +21,10 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
 from physworld_client.errors import ModelUnreadable
+from physworld_client.known_keys import trusted_keys
 from physworld_client.manifest import CARD_NAME, WEIGHTS_NAME, verify_folder
 from physworld_client.network import PROPERTY_COUNT, Network
-from physworld_client.signatures import trusted_keys
+from schemas.arrays import FARTHEST_M
 
 CARD_SCHEMA = 1
 
@@ -67,24 +68,27 @@ class WorldModel:
         folder: str | Path,
         *,
         sha256: str | None = None,
-        public_key: str | None = None,
+        public_key: str | Path | None = None,
         allow_unsigned: bool = False,
+        known_keys: str | Path | None = None,
     ) -> WorldModel:
         """Loads a folder written by ``client.models.download``.
 
         Args:
             sha256: the version's digest, when known from elsewhere; the folder must be exactly that version.
-            public_key: the only key in base64 that may have signed it; by default any known one
-                (``physworld_client.signatures``).
+            public_key: the only key that may have signed it, in base64 or as the ``Path`` of a file; by default any
+                that is pinned on this machine (``physworld_client.known_keys``).
             allow_unsigned: load without looking at the signature (a version published before there were any).
+            known_keys: the file of pinned keys; by default that of this machine.
 
         Raises:
-            SignatureInvalid: the manifest is not signed, not by a trusted key, or was changed since.
+            SigningKeyUntrusted: another key signed than those that are trusted.
+            SignatureInvalid: the manifest is not signed, or was changed since.
             DigestMismatch: a file is not the published one.
             ModelUnreadable: a file is missing, or the artifact has a layout that this client does not know.
         """
         place = Path(folder)
-        manifest = verify_folder(place, sha256, keys=trusted_keys(public_key, allow_unsigned))
+        manifest = verify_folder(place, sha256, keys=trusted_keys(public_key, allow_unsigned, known_keys))
         missing = [name for name in (WEIGHTS_NAME, CARD_NAME) if name not in manifest.files]
         if missing:
             raise ModelUnreadable(f"the manifest in {place} lists no {' and no '.join(missing)}")
@@ -168,7 +172,7 @@ class WorldModel:
                 From rest: one frame h+1 times, with controllers that stand still as long.
 
         Raises:
-            ValueError: arrays of other shapes, or values that are not finite.
+            ValueError: arrays of other shapes, values that are not finite, places beyond ``FARTHEST_M``.
         """
         frames, n = self.history + 1, self._network.object_count
         start = self.start_history if history is None else np.asarray(history, dtype=np.float64)
@@ -184,6 +188,11 @@ class WorldModel:
         broken = sum(np.count_nonzero(~np.isfinite(part)) for part in (driven, start, properties))
         if broken:
             raise ValueError(f"{broken} values of controllers, history and phi are no finite numbers")
+        farthest = max(float(np.abs(part).max()) for part in (driven, start))
+        if farthest > FARTHEST_M:
+            raise ValueError(
+                f"a place {farthest:.4g} m from the origin in controllers or history; {FARTHEST_M:g} m is the farthest"
+            )
         origin = start[-1].mean(axis=0)
         if self.ground_height_m is not None:
             origin[2] = self.ground_height_m

@@ -6,17 +6,18 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query, Response
 
-from schemas.arrays import EncodedArray
+from schemas.arrays import FARTHEST_M, EncodedArray
 from schemas.base import Page
 from schemas.job import Job, Progress
 from schemas.plan import Plan, PlanCreate, ShapeGoal
+from services.api.bodies import LongBodyRoute
 from services.api.dependencies import DatabaseDep, ObjectId, PageDep, StoresDep
 from services.api.errors import documented
 from services.api.idempotency import IdempotencyDep, accepted
 from services.api.routes.rollouts import invalid, read_array, ready_version
 from storage import jobs, registry, resources, runs
 
-router = APIRouter(prefix="/plans", tags=["plans"])
+router = APIRouter(prefix="/plans", tags=["plans"], route_class=LongBodyRoute)
 
 MOST_SHAPE_POINTS = 20_000
 
@@ -60,7 +61,7 @@ def get_plan(plan_id: ObjectId, database: DatabaseDep) -> Plan:
 def _checked(body: PlanCreate, points: int) -> PlanCreate:
     """The request with its goal's array checked. Raises ApiProblem, 422."""
     if isinstance(body.goal, ShapeGoal):
-        shape = read_array(body.goal.shape, "goal.shape", (2,))
+        shape = read_array(body.goal.shape, "goal.shape", (2,), FARTHEST_M)
         if shape.shape[1] != 3 or len(shape) > MOST_SHAPE_POINTS:
             raise invalid("goal.shape", f"goal.shape is {shape.shape}, not (M <= {MOST_SHAPE_POINTS}, 3)")
         return body.model_copy(update={"goal": ShapeGoal(shape=EncodedArray.of(shape))})

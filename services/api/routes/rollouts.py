@@ -7,12 +7,13 @@ from typing import Annotated, Any
 import numpy as np
 from fastapi import APIRouter, Query, Response
 
-from schemas.arrays import ArrayInput, EncodedArray, array_of
+from schemas.arrays import FARTHEST_M, ArrayInput, EncodedArray, array_of
 from schemas.base import FieldError, Page
 from schemas.job import Progress
 from schemas.model import ModelVersion
 from schemas.rollout import (
     MAX_CANDIDATES,
+    MAX_LOG_RATIO,
     MAX_STEPS,
     MAX_TICKS,
     SYNC_STEPS,
@@ -20,13 +21,14 @@ from schemas.rollout import (
     Rollout,
     RolloutCreate,
 )
+from services.api.bodies import LongBodyRoute
 from services.api.dependencies import DatabaseDep, ObjectId, PageDep, PrincipalDep, SettingsDep, StoresDep
 from services.api.errors import ApiProblem, documented
 from services.api.idempotency import IdempotencyDep, accepted, answer_of
 from services.api.inference import roll_out
 from storage import jobs, registry, resources, runs
 
-router = APIRouter(prefix="/rollouts", tags=["rollouts"])
+router = APIRouter(prefix="/rollouts", tags=["rollouts"], route_class=LongBodyRoute)
 
 NOMINAL_RATE_HZ, LEAST_RATE_HZ = 30.0, 22.5
 """Ticks of a model's clock in a second: near so many, and never fewer (``physworld.worldmodel.clock.model_dt``)."""
@@ -102,17 +104,17 @@ def invalid(field: str, message: str) -> ApiProblem:
     return ApiProblem(422, "invalid_request", message, errors=[FieldError(loc=["body", field], msg=message)])
 
 
-def read_array(value: ArrayInput, field: str, dimensions: tuple[int, ...]) -> np.ndarray:
-    """The values, finite. Raises ApiProblem, 422, with the place and the numbers."""
+def read_array(value: ArrayInput, field: str, dimensions: tuple[int, ...], most: float) -> np.ndarray:
+    """The values, finite and within ±``most``. Raises ApiProblem, 422, with the place and the numbers."""
     try:
-        return array_of(value, field, dimensions)
+        return array_of(value, field, dimensions, most)
     except ValueError as error:
         raise invalid(field, str(error)) from error
 
 
 def _shape(body: RolloutCreate, controllers: int) -> tuple[int, int]:
     """(B, T) of the control paths, after everything that needs no model was checked."""
-    values = read_array(body.controllers, "controllers", (3, 4))
+    values = read_array(body.controllers, "controllers", (3, 4), FARTHEST_M)
     shape = values.shape if values.ndim == 4 else (1, *values.shape)
     if shape[2:] != (controllers, 3):
         raise invalid(
@@ -149,7 +151,7 @@ def _check_times(times: list[float], candidates: int, places: int) -> None:
 
 def _encoded(body: RolloutCreate) -> RolloutCreate:
     """The same with its arrays in single precision."""
-    arrays = {"controllers": EncodedArray.of(read_array(body.controllers, "controllers", (3, 4)))}
+    arrays = {"controllers": EncodedArray.of(read_array(body.controllers, "controllers", (3, 4), FARTHEST_M))}
     if body.phi is not None:
-        arrays["phi"] = EncodedArray.of(read_array(body.phi, "phi", (2, 3)))
+        arrays["phi"] = EncodedArray.of(read_array(body.phi, "phi", (2, 3), MAX_LOG_RATIO))
     return body.model_copy(update=arrays)

@@ -47,6 +47,13 @@ def body(served: Served, controllers: np.ndarray, **more: object) -> dict[str, o
     return {"model": served.model, "controllers": encoded, **more}
 
 
+def absurd(controllers: np.ndarray) -> np.ndarray:
+    """The paths with one place that is finite, and beyond single precision."""
+    changed = controllers.copy()
+    changed[2, 5, 0, 1] = 1e300
+    return changed
+
+
 def _work(served: Served, ends: str = "done") -> None:
     register("rollout", "services.inference.jobs:rollout")
     runtime = Runtime(served.settings, served.database, served.stores, "test")
@@ -204,6 +211,17 @@ def test_the_same_key_gives_the_same_answer_and_another_body_is_refused(served: 
             "4096 candidates",
         ),
         (lambda c: {"phi": [[0.0, 0.0]]}, "phi", "(20, 2)"),
+        (lambda c: {"phi": np.full((20, 2), 1e300).tolist()}, "phi", "reaches 1e+300 at [0, 0]; 10 is"),
+        (
+            lambda c: {"controllers": absurd(c).tolist()},
+            "controllers",
+            "reaches 1e+300 at [2, 5, 0, 1]; 1000 is",
+        ),
+        (
+            lambda c: {"controllers": EncodedArray.of(c + 2000.0).model_dump(), "mode": "job"},
+            "controllers",
+            "; 1000 is the farthest",
+        ),
         (lambda c: {"stiffness_factor": 1e9}, "stiffness_factor", "100"),
     ],
 )
@@ -218,6 +236,19 @@ def test_what_cannot_be_rolled_out_is_refused_with_the_field_and_the_numbers(
     problem = answer.json()
     assert any(field in fault["loc"] for fault in problem["errors"]), problem
     assert words in answer.text
+
+
+@pytest.mark.parametrize(
+    ("goal", "words"),
+    [
+        ({"kind": "shape", "shape": [[0.0, 1e300, 0.0]]}, "goal.shape reaches 1e+300 at [0, 1]; 1000 is"),
+        ({"kind": "points", "index": [0], "places": [[0.0, 1e300, 0.0]]}, "less than or equal to 1000"),
+    ],
+)
+def test_a_goal_that_is_absurdly_far_is_refused(served: Served, goal: dict[str, object], words: str) -> None:
+    with served.client() as client:
+        answer = client.post("/v1/plans", json={"model": served.model, "goal": goal})
+    assert answer.status_code == 422 and words in answer.text, answer.text
 
 
 def test_few_places_of_many_candidates_are_refused_before_they_are_interpolated() -> None:

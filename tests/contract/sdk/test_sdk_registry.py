@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import asyncio
+import base64
+import json
 from pathlib import Path
 
 import pytest
-from physworld_client import Client
+from click.testing import Result
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from physworld_client import AsyncClient, Client
 from physworld_client.cli.app import app
-from physworld_client.errors import Conflict, NotFound, SignatureInvalid
-from physworld_client.signatures import known_keys
+from physworld_client.errors import Conflict, NotFound, SignatureInvalid, SigningKeyUntrusted
+from physworld_client.known_keys import KnownKeys
+from physworld_client.signatures import fingerprint_of
 from sdk_service import Service, write_scene
 from typer.testing import CliRunner
 
@@ -78,10 +84,10 @@ def test_a_download_is_verified_with_the_services_key_or_with_the_one_given(
 ) -> None:
     client.models.download(name, tmp_path / "one", 1)
     (key,) = client.models.signing_keys()
-    assert known_keys()[key.key_id] == key.public_key
+    assert client.known_keys.of(service.url) == {fingerprint_of(key.public_key): key.public_key}
     client.models.download(name, tmp_path / "two", 1, public_key=key.public_key)
     other = "AAECAwQFBgcICQoLDA0ODxAREhMUFRYXGBkaGxwdHh8="
-    with pytest.raises(SignatureInvalid, match=f"{key.key_id}, which is not known here"):
+    with pytest.raises(SigningKeyUntrusted, match=f"{key.key_id}, which is not the key that was given"):
         client.models.download(name, tmp_path / "three", 1, public_key=other)
 
 
@@ -104,6 +110,97 @@ def test_a_version_of_another_manifest_than_its_signature_is_refused(
         with service.database.session() as session:
             row = registry.version_row(session, name, 2)
             row.artifacts, row.sha256 = was, digest
+
+
+@pytest.mark.parametrize("kind", ["sync", "async"])
+def test_a_service_whose_key_changed_is_refused_until_the_new_key_is_trusted(
+    service: Service, name: str, tmp_path: Path, kind: str
+) -> None:
+    """This machine knows the address with another key: what a thief of the address, or a rotation, looks like."""
+    other = base64.b64encode(Ed25519PrivateKey.generate().public_key().public_bytes_raw()).decode()
+    file = tmp_path / "known.json"
+    KnownKeys(file).trust(service.url, other)
+    with service.client(known_keys=file) as client:
+        (listed,) = client.models.signing_keys()
+        new = fingerprint_of(listed.public_key)
+        if kind == "sync":
+            with pytest.raises(SigningKeyUntrusted) as found:
+                client.models.download(name, tmp_path / "one", 1)
+            client.models.download(name, tmp_path / "one", 1, trust=new)
+            client.models.distrust(fingerprint_of(other))
+            client.models.download(name, tmp_path / "two", 1)
+        else:
+            found = asyncio.run(_refused_then_trusted(service, name, tmp_path, file, new))
+        assert (found.value.signer, found.value.trusted) == (new, (fingerprint_of(other),))
+        assert f"models trust {new}" in str(found.value)
+        client.models.distrust(new)
+        with pytest.raises(SigningKeyUntrusted):
+            client.models.download(name, tmp_path / "one", 1)
+
+
+async def _refused_then_trusted(
+    service: Service, name: str, folder: Path, file: Path, new: str
+) -> pytest.ExceptionInfo[SigningKeyUntrusted]:
+    async with AsyncClient(service.url, service.token, known_keys=file) as client:
+        with pytest.raises(SigningKeyUntrusted) as found:
+            await client.models.download(name, folder / "one", 1)
+        assert await client.models.trust(new) == new
+        await client.models.download(name, folder / "one", 1)
+    return found
+
+
+def test_the_command_line_trusts_by_fingerprint_and_by_file(
+    service: Service, client: Client, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PHYSWORLD_KNOWN_KEYS", str(tmp_path / "known.json"))
+    other = base64.b64encode(Ed25519PrivateKey.generate().public_key().public_bytes_raw()).decode()
+    (tmp_path / "other.pub").write_text(other)
+    (listed,) = client.models.signing_keys()
+    new = fingerprint_of(listed.public_key)
+    place = ["--url", service.url, "--token", service.token]
+
+    def run(*words: str) -> Result:
+        return CliRunner().invoke(app, ["models", *words, *place])
+
+    assert run("trust", str(tmp_path / "other.pub")).exit_code == 0
+    refused = run("download", name, "--version", "1", "-o", str(tmp_path / "one"))
+    assert refused.exit_code != 0 and isinstance(refused.exception, SigningKeyUntrusted)
+    assert "no" in run("keys").output.split()
+    trusted = run("trust", new)
+    assert trusted.exit_code == 0 and f"{new} is trusted for {service.url}" in trusted.output
+    assert "yes" in run("keys").output.split()
+    assert run("download", name, "--version", "1", "-o", str(tmp_path / "one")).exit_code == 0
+    assert run("distrust", new).exit_code == 0
+    again = ("download", name, "--version", "1", "-o", str(tmp_path / "one"))
+    assert run(*again).exit_code != 0
+    assert run(*again, "--public-key", listed.public_key).exit_code == 0
+    assert run(*again, "--trust", listed.public_key).exit_code == 0
+
+
+def test_the_command_line_trusts_the_key_that_an_embedded_service_states_in_its_own_folder(
+    service: Service, client: Client, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A data folder that was made anew has a new key under an old name."""
+    monkeypatch.setenv("PHYSWORLD_KNOWN_KEYS", str(tmp_path / "known.json"))
+    (listed,) = client.models.signing_keys()
+    data = tmp_path / "data"
+    (data / "run").mkdir(parents=True)
+    (data / "api-key").write_text(service.token)
+    state = {"api_url": service.url, "dashboard_url": service.url, "api_key_file": str(data / "api-key")}
+    other = base64.b64encode(Ed25519PrivateKey.generate().public_key().public_bytes_raw()).decode()
+    KnownKeys().trust(str(data), other)
+
+    def download() -> Result:
+        place = ["-o", str(tmp_path / "out"), "--data", str(data)]
+        return CliRunner().invoke(app, ["models", "download", name, "--version", "1", *place])
+
+    (data / "run" / "state.json").write_text(json.dumps(state))
+    assert isinstance(download().exception, SigningKeyUntrusted)
+    (data / "run" / "state.json").write_text(json.dumps({**state, "signing_key": listed.public_key}))
+    found = download()
+    assert found.exit_code == 0, found.output
+    assert fingerprint_of(listed.public_key) in (KnownKeys().of(str(data)) or {})
+    assert KnownKeys().of(service.url) is None, "an embedded service is known by its folder"
 
 
 def test_the_command_line_does_the_same(service: Service, name: str, tmp_path: Path) -> None:

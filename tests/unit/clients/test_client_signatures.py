@@ -8,11 +8,10 @@ import json
 from pathlib import Path
 
 import pytest
-from physworld_client.errors import DigestMismatch, ModelUnreadable, SignatureInvalid
+from physworld_client.errors import DigestMismatch, SignatureInvalid, SigningKeyUntrusted
+from physworld_client.known_keys import KnownKeys, trusted_keys
 from physworld_client.manifest import verify_folder
-from physworld_client.signatures import known_keys, known_keys_file, remember, trusted_keys
 
-from schemas.signing import SigningKey
 from storage.signing import Signer, signer_of
 
 OURS = signer_of(base64.b64encode(bytes(range(32))).decode(), "ours")
@@ -36,13 +35,9 @@ def publish(folder: Path, signer: Signer, weights: bytes = WEIGHTS) -> None:
     (folder / "manifest.sig.json").write_bytes(signer.sign(manifest))
 
 
-def wire(signer: Signer) -> SigningKey:
-    return SigningKey(key_id=signer.key_id, public_key=signer.public_key)
-
-
 def test_a_known_key_opens_a_model(tmp_path: Path) -> None:
     publish(tmp_path / "model", OURS)
-    remember([wire(OURS)], "https://ours")
+    KnownKeys().trust("https://ours", OURS.public_key)
     assert verify_folder(tmp_path / "model", keys=trusted_keys(None)).version == 2
     assert verify_folder(tmp_path / "model", keys=trusted_keys(OURS.public_key)).version == 2
 
@@ -69,10 +64,10 @@ def test_a_manifest_that_was_adapted_to_changed_files_is_refused(tmp_path: Path)
 
 def test_another_key_is_refused_though_it_signed_well(tmp_path: Path) -> None:
     publish(tmp_path / "model", THEIRS)
-    remember([wire(OURS)], "https://ours")
-    with pytest.raises(SignatureInvalid, match=f"{THEIRS.key_id}, which is not known here.*{OURS.key_id}"):
+    KnownKeys().trust("https://ours", OURS.public_key)
+    with pytest.raises(SigningKeyUntrusted, match=f"{THEIRS.key_id}, which is not known here: {OURS.key_id}"):
         verify_folder(tmp_path / "model", keys=trusted_keys(None))
-    with pytest.raises(SignatureInvalid, match="not known"):
+    with pytest.raises(SigningKeyUntrusted, match=f"not the key that was given: {OURS.key_id}"):
         verify_folder(tmp_path / "model", keys=trusted_keys(OURS.public_key))
 
 
@@ -101,31 +96,3 @@ def test_what_is_no_signature_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "model" / "manifest.sig.json").write_text(text.replace("%s", OURS.key_id))
     with pytest.raises(SignatureInvalid, match="is not an Ed25519 signature"):
         verify_folder(tmp_path / "model", keys=trusted_keys(OURS.public_key))
-
-
-def test_keys_are_remembered_once_and_never_overwritten(keys_file: Path) -> None:
-    assert known_keys() == {}
-    remember([wire(OURS)], "https://ours")
-    before = keys_file.read_bytes()
-    assert remember([wire(OURS)], "https://elsewhere") == {OURS.key_id: OURS.public_key}
-    assert known_keys_file().read_bytes() == before
-    forged = SigningKey(key_id=OURS.key_id, public_key=THEIRS.public_key)
-    with pytest.raises(SignatureInvalid, match="another id"):
-        remember([forged], "https://evil")
-    assert remember([wire(THEIRS)], "https://theirs").keys() == {OURS.key_id, THEIRS.key_id}
-
-
-def test_a_place_that_cannot_be_written_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv("PHYSWORLD_KNOWN_KEYS", str(tmp_path / "file" / "known.json"))
-    with pytest.raises(ModelUnreadable, match=r"cannot be remembered in .*set PHYSWORLD_KNOWN_KEYS"):
-        remember([wire(OURS)], "https://ours")
-
-
-def test_a_damaged_file_of_keys_is_named(keys_file: Path) -> None:
-    keys_file.parent.mkdir()
-    keys_file.write_text('{"0": 3}')
-    with pytest.raises(ModelUnreadable, match=r"known\.json is not a file of known keys"):
-        known_keys()
-    with pytest.raises(ModelUnreadable, match="is no Ed25519 public key"):
-        trusted_keys("bm90IGEga2V5")

@@ -15,6 +15,8 @@ import pytest
 from physworld_client import (
     AsyncClient,
     Client,
+    artifacts,
+    async_artifacts,
     async_live,
     async_loop,
     async_predict,
@@ -194,6 +196,7 @@ def test_the_asynchronous_resources_have_the_same_names_and_arguments() -> None:
         }
 
     assert public(resources) == public(async_resources)
+    assert public(artifacts) == public(async_artifacts)
     assert public(loop) == public(async_loop)
     assert public(predict) == public(async_predict)
     assert called(public(live)) == called(public(async_live))

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 from physworld_client.errors import DigestMismatch, ModelUnreadable
-from physworld_client.signatures import remember
+from physworld_client.known_keys import KnownKeys
 from physworld_client.world_model import WorldModel
 from safetensors.numpy import load_file, save_file
 
@@ -24,7 +24,6 @@ from physworld.worldmodel.inertia import InertialPrior
 from physworld.worldmodel.modal import ModalPrior, regressor_count, rigid_prior
 from physworld.worldmodel.model import Normalisation
 from physworld.worldmodel.model import WorldModel as Network
-from schemas.signing import SigningKey
 from storage import signing
 
 FRAMES = 60
@@ -36,7 +35,7 @@ AGREEMENT = 5e-5  # of the largest coordinate: single precision over 60 steps of
 def known(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
     """This machine has met the service that signs here."""
     monkeypatch.setenv("PHYSWORLD_KNOWN_KEYS", str(tmp_path_factory.mktemp("keys") / "known.json"))
-    remember([SigningKey(key_id=SIGNER.key_id, public_key=SIGNER.public_key)], "the test")
+    KnownKeys().trust("the test", SIGNER.public_key)
 
 
 def published(
@@ -184,6 +183,8 @@ def test_wrong_shapes_are_named(tmp_path: Path) -> None:
         loaded.rollout(driven(model)[:3])
     with pytest.raises(ValueError, match=r"phi \(2,\)"):
         loaded.rollout(driven(model), np.zeros(2))
+    with pytest.raises(ValueError, match=r"a place 1e\+300 m from the origin.*; 1000 m is the farthest"):
+        loaded.rollout(np.where(np.arange(FRAMES)[:, None, None] == 9, 1e300, driven(model)))
     with pytest.raises(ValueError, match="18 values of controllers, history and phi are no finite numbers"):
         loaded.rollout(np.where(np.arange(FRAMES)[:, None, None] == 9, np.nan, driven(model)))
 

@@ -97,6 +97,30 @@ def test_every_motion_keeps_the_limits() -> None:
     assert np.allclose(free.kept(calm, DT), calm)
 
 
+def test_a_plan_of_moving_grips_keeps_their_acceleration_from_its_first_tick() -> None:
+    start = np.array([[0.4, 0.0, 0.0]])
+    roomy = replace(LIMITS, box_min_m=np.full((1, 3), -9.0), box_max_m=np.full((1, 3), 9.0))
+    limits = replace(roomy, start_m_s=start)
+    for wanted in (np.zeros((1, 40, 1, 3)), np.random.default_rng(0).normal(0.0, 1.0, (50, 40, 1, 3))):
+        kept = limits.kept(wanted, DT)
+        before = np.broadcast_to(start, (len(kept), 1, 1, 3))
+        assert np.linalg.norm(np.diff(kept, axis=1, prepend=before), axis=-1).max() <= 4.0 * DT + 1e-9
+    stopping = limits.kept(np.zeros((40, 1, 3)), DT)
+    assert stopping[0, 0, 0] == pytest.approx(0.4 - 4.0 * DT)
+    assert np.abs(stopping[3:]).max() < 1e-9
+
+
+def test_a_search_from_moving_grips_never_jumps_to_rest() -> None:
+    """Its first motion, and its answer where nothing is better, is the stop that the limits allow."""
+    start = np.array([[0.4, 0.0, 0.0]])
+    limits = replace(LIMITS, start_m_s=start)
+    goal = GoalPoints(np.array([0]), np.zeros((1, 3)))
+    found = search(carried, goal, limits, DT, replace(QUICK, iterations=2), np.random.default_rng(0))
+    velocities = np.diff(found.displacements, axis=0, prepend=np.zeros((1, 1, 3))) / DT
+    change = np.linalg.norm(np.diff(velocities, axis=0, prepend=start[None]), axis=-1)
+    assert change.max() <= 4.0 * DT + 1e-9
+
+
 def test_a_grip_that_is_pulled_along_keeps_its_speed_limit() -> None:
     limits = GripLimits(
         speed_m_s=0.5,
@@ -132,7 +156,7 @@ def test_a_model_that_leaves_the_numbers_at_rest_is_refused(goal: GoalPoints | G
         points[:, 29:] = np.nan
         return points
 
-    with pytest.raises(UnstableSimulation, match="1 s after its start with grips at rest"):
+    with pytest.raises(UnstableSimulation, match="1 s after its start with grips that come to rest"):
         search(broken, goal, LIMITS, DT, QUICK, np.random.default_rng(0))
 
 

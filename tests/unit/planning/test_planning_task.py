@@ -41,6 +41,13 @@ def test_the_twin_starts_a_plan_where_the_model_does(task: PlanningTask) -> None
     assert apart < 0.75 * a_tick_late
 
 
+def test_a_plan_starts_with_the_velocities_that_the_recording_ends_with(task: PlanningTask) -> None:
+    past = task.model.start_controllers
+    expected = [(past[-1][grip] - past[-2][grip]).mean(axis=0) / task.dt_s for grip in task.grips]
+    assert task.limits.started_m_s == pytest.approx(np.array(expected))
+    assert task.with_limits(speed_m_s=0.2).limits.started_m_s == pytest.approx(np.array(expected))
+
+
 def test_a_planned_motion_brings_the_twin_nearer_to_the_goal(task: PlanningTask) -> None:
     end = task.start_points[-1] + np.array([0.0, 0.02, 0.01])
     goal = GoalPoints(np.array([len(task.start_points) - 1]), end[None])

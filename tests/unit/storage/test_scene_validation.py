@@ -53,6 +53,32 @@ def grip(**facts: Any) -> Break:
     return lambda d, a: d["grips"][0].update(facts)
 
 
+@pytest.mark.parametrize("name", ["points", "controllers", "rest_volume_points"])
+@pytest.mark.parametrize("far", [1e300, -2e300, 1001.0])
+def test_a_place_that_is_absurdly_far_is_the_one_fault_with_its_number_and_the_limit(
+    name: str, far: float
+) -> None:
+    declared, arrays = sound_parts()
+    at = (3, 0, 1)[-arrays[name].ndim :]
+    arrays[name] = arrays[name].astype(np.float64)
+    arrays[name][at] = far
+    if name == "points":
+        arrays["visible"][3, 0] = True
+    faults, _ = check_scene(declared, arrays)
+    (fault,) = faults
+    assert fault.loc == ["scene.npz", name]
+    assert f"1 of {arrays[name].size} values are farther than 1000 m from the origin" in fault.msg
+    assert f"the farthest {abs(far):.4g} m at {at}" in fault.msg
+
+
+def test_a_place_that_is_not_visible_may_be_anywhere() -> None:
+    declared, arrays = sound_parts()
+    arrays["visible"][3, 0] = False
+    arrays["points"] = arrays["points"].astype(np.float64)
+    arrays["points"][3, 0] = 1e300
+    assert check_scene(declared, arrays)[0] == []
+
+
 def test_a_sound_scene_has_neither_fault_nor_warning() -> None:
     assert check_scene(*sound_parts()) == ([], [])
 

@@ -6,6 +6,7 @@ import hashlib
 import socket
 from pathlib import Path
 
+import obstore
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -48,6 +49,28 @@ def test_a_big_file_comes_back_in_pieces(artifacts: ArtifactStore, tmp_path: Pat
     assert len(pieces) > 1
     assert b"".join(pieces) == data
     assert artifacts.put_file(path, "again.bin").sha256 == artifact.sha256
+
+
+@pytest.mark.parametrize("rotten", [b"HELLO, world", b"hello", b""])
+def test_a_file_that_has_rotted_is_replaced_by_the_next_write(
+    artifacts: ArtifactStore, tmp_path: Path, rotten: bytes
+) -> None:
+    data = b"hello, world"
+    sha256 = artifacts.put_bytes(data, "greeting.txt").sha256
+    for again in (lambda: artifacts.put_bytes(data, "again"), lambda: artifacts.put_file(tmp_path / "file")):
+        (tmp_path / "file").write_bytes(data)
+        obstore.put(artifacts._store, f"artifacts/{sha256[:2]}/{sha256}", rotten)
+        with pytest.raises(ArtifactCorrupt):
+            artifacts.read_bytes(sha256)
+        assert again().sha256 == sha256
+        assert artifacts.read_bytes(sha256) == data
+
+
+def test_a_file_that_is_sound_is_not_written_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    artifacts = ArtifactStore(Settings(data_dir=tmp_path))
+    artifacts.put_bytes(b"hello", "greeting.txt")
+    monkeypatch.setattr(obstore, "put", lambda *_: pytest.fail("written again"))
+    artifacts.put_bytes(b"hello", "greeting.txt")
 
 
 def test_a_range_is_what_lies_between(artifacts: ArtifactStore) -> None:

@@ -107,6 +107,29 @@ def test_an_episode_of_the_first_format_is_read_whole(local: EpisodeStore, tmp_p
         local.verified(path, arrays_digest(wanted))
 
 
+def test_attributes_that_have_rotted_are_noticed_and_no_part_of_the_digest(
+    local: EpisodeStore, tmp_path: Path
+) -> None:
+    noted = {
+        "effect_strengths": {"air_drag_linear": 0.25},
+        "counts": {2: "b", 10: "a"},
+        "range": (1.5, 2.5e-7),
+    }
+    path, digest = local.write(DATASET, 0, 1, episode(), noted)
+    assert digest == arrays_digest(episode())
+    local.verify(path, digest)
+    file = tmp_path / "store" / path / "zarr.json"
+    file.write_text(file.read_text().replace("0.25", "0.35"))
+    with pytest.raises(EpisodeCorrupt, match="its attributes do not have the digest"):
+        local.verify(path, digest)
+    without = json.loads(file.read_text())
+    del without["attributes"]["attributes_sha256"]
+    file.write_text(json.dumps(without))
+    assert local.verified(path, digest)[1]["effect_strengths"] == {"air_drag_linear": 0.35}, (
+        "an older episode"
+    )
+
+
 def test_an_episode_without_controllers_is_kept(episodes: EpisodeStore) -> None:
     path, digest = episodes.write(DATASET, 0, 1, episode(controllers=0), {})
     episodes.verify(path, digest)

@@ -250,25 +250,6 @@ def modelsshow(
         show(client.models.version(name, version), json)
 
 
-@models.command("download")
-def models_download(
-    name: str,
-    version: VersionName = LATEST,
-    out: Out = None,
-    url: Url = None,
-    token: Token = None,
-    data: Data = None,
-) -> None:
-    """Download a version and verify it against its manifest."""
-    with service.connect(url, token, data) as client:
-        number = client.models.version(name, version).version
-        folder = out or Path(f"{name}-{number}")
-        found = client.models.download(name, folder, number)
-    stdout.print(
-        f"{name} version {number}, sha256 {found.sha256}: verified in {folder.absolute()}", soft_wrap=True
-    )
-
-
 @models.command("alias")
 def models_alias(
     name: str, alias: str, version: int, url: Url = None, token: Token = None, data: Data = None

@@ -1,4 +1,4 @@
-"""``physworld models compare|describe|unalias|verify|keys``: the registry beyond looking things up."""
+"""``physworld models compare|describe|unalias|download|verify|keys|trust|distrust``: the registry beyond looking."""
 
 from __future__ import annotations
 
@@ -8,18 +8,20 @@ from typing import Annotated
 import typer
 
 from physworld_client.cli import service
-from physworld_client.cli.lists import VersionName, models, show, show_list
+from physworld_client.cli.lists import Out, VersionName, models, show, show_list
 from physworld_client.cli.options import Data, Json, Token, Url
 from physworld_client.cli.output import print_json, print_table, stdout
+from physworld_client.known_keys import trusted_keys
 from physworld_client.manifest import verify_folder
 from physworld_client.resources import LATEST
-from physworld_client.signatures import trusted_keys
+from physworld_client.signatures import fingerprint_of
 from schemas.model import MeasuredError, ModelComparison
 from schemas.signing import SigningKey
 
 PublicKey = Annotated[
-    str | None, typer.Option("--public-key", help="The only key that may have signed, base64.")
+    str | None, typer.Option("--public-key", help="The only key that may have signed: base64, or a file.")
 ]
+Key = Annotated[str, typer.Argument(help="A fingerprint (`models keys`), a key in base64, or a file.")]
 
 
 @models.command("compare")
@@ -66,13 +68,41 @@ def models_unalias(name: str, alias: str, url: Url = None, token: Token = None, 
     stdout.print(f"{name}@{alias} is no more")
 
 
+@models.command("download")
+def models_download(
+    name: str,
+    version: VersionName = LATEST,
+    out: Out = None,
+    trust: Annotated[
+        str | None, typer.Option("--trust", help="A key to trust first: fingerprint, base64, or a file.")
+    ] = None,
+    public_key: PublicKey = None,
+    url: Url = None,
+    token: Token = None,
+    data: Data = None,
+) -> None:
+    """Download a version; verify its signature and every file."""
+    address = service.require(url, token, data)
+    only = None if public_key is None else _key(public_key)
+    own = address.signing_key if only is None else None
+    key = own if trust is None else _key(trust)
+    with address.client() as client:
+        number = client.models.version(name, version).version
+        folder = out or Path(f"{name}-{number}")
+        found = client.models.download(name, folder, number, trust=key, public_key=only)
+    stdout.print(
+        f"{name} version {number}, sha256 {found.sha256}: verified in {folder.absolute()}", soft_wrap=True
+    )
+
+
 @models.command("verify")
 def models_verify(
     folder: Annotated[Path, typer.Argument(help="A folder that `models download` wrote.")],
     public_key: PublicKey = None,
 ) -> None:
     """Check signature and digests of a downloaded version, without the service."""
-    manifest = verify_folder(folder, keys=trusted_keys(public_key))
+    keys = trusted_keys(None if public_key is None else _key(public_key))
+    manifest = verify_folder(folder, keys=keys)
     stdout.print(
         f"{manifest.name} version {manifest.version}: {len(manifest.files)} files and the signature are good"
     )
@@ -80,14 +110,43 @@ def models_verify(
 
 @models.command("keys")
 def models_keys(json: Json = False, url: Url = None, token: Token = None, data: Data = None) -> None:
-    """The public keys that sign, or once signed, this service's models."""
-
-    def row(key: SigningKey) -> tuple[str, ...]:
-        return (key.key_id, key.algorithm, key.public_key, f"{key.created_at:%Y-%m-%d}")
-
+    """The public keys that sign, or once signed, this service's models, and whether they are trusted here."""
     with service.connect(url, token, data) as client:
         keys = client.models.signing_keys()
-    show_list(keys, len(keys), json, ("key", "algorithm", "public key", "since"), row)
+        pinned = client.known_keys.of(client.known_as) or {}
+
+    def row(key: SigningKey) -> tuple[str, ...]:
+        mark = fingerprint_of(key.public_key)
+        return (mark, key.algorithm, f"{key.created_at:%Y-%m-%d}", "yes" if mark in pinned else "no")
+
+    show_list(keys, len(keys), json, ("fingerprint", "algorithm", "since", "trusted here"), row)
+
+
+@models.command("trust")
+def models_trust(key: Key, url: Url = None, token: Token = None, data: Data = None) -> None:
+    """Trust a key to sign this service's models, beside those that are."""
+    with service.connect(url, token, data) as client:
+        mark = client.models.trust(_key(key))
+        stdout.print(f"{mark} is trusted for {client.known_as}", soft_wrap=True)
+
+
+@models.command("distrust")
+def models_distrust(
+    fingerprint: Annotated[str, typer.Argument(help="Of a key that is trusted (`models keys`).")],
+    url: Url = None,
+    token: Token = None,
+    data: Data = None,
+) -> None:
+    """Trust a key no more to sign this service's models."""
+    with service.connect(url, token, data) as client:
+        client.models.distrust(fingerprint)
+        stdout.print(f"{fingerprint} is trusted no more for {client.known_as}", soft_wrap=True)
+
+
+def _key(given: str) -> str | Path:
+    """A key, or the file of that name."""
+    path = Path(given)
+    return path if path.is_file() else given
 
 
 def _print_comparison(found: ModelComparison) -> None:

@@ -18,6 +18,7 @@ from physworld_client.cli.report import CLOSED_LOOP, STAGES, build_report, print
 from physworld_client.cli.up import require_service_code
 from physworld_client.client import Client
 from physworld_client.errors import JobFailed, PhysWorldError
+from physworld_client.transport import DEFAULT_MAX_RETRIES
 from physworld_client.waiting import require_success
 from schemas.dataset import DatasetConfig
 from schemas.fit import FitConfig
@@ -86,9 +87,9 @@ def run(
         "stages": stages,
     }
     with _service(url, token, data, workers, keep_up) as (address, alive):
-        with Client(address.url, address.token) as client:
+        with address.client(DEFAULT_MAX_RETRIES) as client:
             loop = {"close_the_loop": True, "compare": compare} if close_the_loop else {}
-            report, folder = _run(client, scene, name, settings, loop, out, address.data, alive)
+            report, folder = _run(client, scene, name, settings, loop, out, address, alive)
     print_report(report)
     if json is not None:
         write_report(report, json)
@@ -135,7 +136,7 @@ def _run(
     settings: dict[str, object],
     loop: dict[str, bool],
     out: Path | None,
-    data: Path | None,
+    address: service.Address,
     alive: Callable[[], bool],
 ) -> tuple[RunReport, Path]:
     """The main job on a running service: its report, and the folder with the verified model."""
@@ -161,8 +162,8 @@ def _run(
     if missing:
         raise PhysWorldError(f"job {pipeline.id} succeeded without a {' and a '.join(missing)}")
     model_name, _, number = outputs["model"].rpartition(":")
-    folder = out or (data / "models" if data else Path()) / f"{model_name}-{number}"
-    version = client.models.download(model_name, folder, int(number))
+    folder = out or (address.data / "models" if address.data else Path()) / f"{model_name}-{number}"
+    version = client.models.download(model_name, folder, int(number), trust=address.signing_key)
     dataset = client.datasets.get(outputs["dataset"])
     fit = client.fits.get(outputs["fit"])
     return build_report(uploaded.name, pipeline, stages, fit, version, dataset.episodes_done), folder

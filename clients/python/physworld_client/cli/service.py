@@ -37,12 +37,19 @@ class Address:
     Attributes:
         dashboard_url: what people look at.
         data: the data folder of an embedded service; None for a remote one.
+        signing_key: public key in base64 that an embedded service says it signs with, in its own data folder.
     """
 
     url: str
     token: str | None
     dashboard_url: str
     data: Path | None = None
+    signing_key: str | None = None
+
+    def client(self, max_retries: int = MAX_RETRIES) -> Client:
+        """A client of it; the keys of an embedded service are pinned for its data folder: its port may change."""
+        known_as = None if self.data is None else str(self.data)
+        return Client(self.url, self.token, max_retries=max_retries, known_as=known_as)
 
 
 def data_folder(given: Path | None) -> Path:
@@ -61,8 +68,8 @@ def find(url: str | None, token: str | None, data: Path | None) -> Address | Non
     return _running_on(data_folder(data))
 
 
-def connect(url: str | None, token: str | None, data: Path | None) -> Client:
-    """A client of the service that ``find`` finds.
+def require(url: str | None, token: str | None, data: Path | None) -> Address:
+    """The service that ``find`` finds.
 
     Raises:
         PhysWorldError: no address was given and none runs on the data folder.
@@ -72,7 +79,12 @@ def connect(url: str | None, token: str | None, data: Path | None) -> Client:
         raise PhysWorldError(
             f"no service runs on {data_folder(data)}: start it with `physworld up`, or give --url and --token"
         )
-    return Client(address.url, address.token, max_retries=MAX_RETRIES)
+    return address
+
+
+def connect(url: str | None, token: str | None, data: Path | None) -> Client:
+    """A client of the service that ``find`` finds. Raises PhysWorldError without one."""
+    return require(url, token, data).client()
 
 
 class Embedded:
@@ -160,7 +172,7 @@ def _running_on(data: Path, pid: int | None = None) -> Address | None:
         token = Path(state["api_key_file"]).read_text().strip()
     except OSError as error:
         raise PhysWorldError(f"the API key cannot be read: {error}") from error
-    return Address(url, token, str(state["dashboard_url"]), data)
+    return Address(url, token, str(state["dashboard_url"]), data, state.get("signing_key") or None)
 
 
 def _end_with_parent(parent: int) -> Callable[[], None] | None:

@@ -1,0 +1,72 @@
+"""The service's artifacts, asynchronous: content-addressed files that are downloaded, awaited."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import httpx
+
+from physworld_client import calls, transport
+from physworld_client.partial import PartialFile
+from schemas.base import Artifact
+
+if TYPE_CHECKING:
+    from physworld_client.async_client import AsyncClient
+
+
+class AsyncArtifacts:
+    """Content-addressed files."""
+
+    def __init__(self, client: AsyncClient) -> None:
+        self._client = client
+
+    async def download(self, artifact: Artifact | str, path: str | Path) -> Path:
+        """Downloads an artifact to ``path``: resumes a part found there, checks the digest, then renames.
+
+        Several downloads of one file to one place may run at once, in threads or processes.
+
+        Raises:
+            DigestMismatch: the bytes are not those of the digest; nothing was put at ``path``.
+        """
+        partial = PartialFile(Path(path), artifact.sha256 if isinstance(artifact, Artifact) else artifact)
+        if partial.present():
+            return partial.target
+        with partial:
+            await self._fill(partial)
+            return partial.finish()
+
+    async def _fill(self, partial: PartialFile) -> None:
+        """Requests with retries until the part holds every byte."""
+        retry = transport.Retry(self._client.max_retries)
+        while not partial.complete():
+            offset = partial.offset
+            try:
+                response = await self._fetch(partial)
+            except httpx.TransportError as error:
+                if partial.offset > offset:
+                    retry.attempt = 0
+                if not retry.again():
+                    raise transport.connection_error(error, self._client.http, retry) from error
+                await asyncio.sleep(retry.delay_s())
+                continue
+            if response.is_success:
+                return
+            if partial.refused(response):
+                continue
+            if response.status_code not in transport.RETRIED_STATUSES or not retry.again():
+                transport.raise_for_problem(response)
+            await asyncio.sleep(retry.delay_s(response))
+
+    async def _fetch(self, partial: PartialFile) -> httpx.Response:
+        """One request for what is missing; the body of a success is in the part when this returns."""
+        path = calls.artifact_path(partial.sha256)
+        async with self._client.http.stream("GET", path, headers=partial.headers()) as response:
+            if response.is_success:
+                partial.accept(response)
+                async for chunk in response.aiter_bytes():
+                    partial.write(chunk)
+            else:
+                await response.aread()
+        return response
