@@ -16,7 +16,7 @@ from benchmarks.harness import Report
 
 SCENES = {"d02": ("undeclared/d02", "plate"), "beam_free_a": ("real/beam_free_a", "plate")}
 PROCESSES = (1, 2)
-ROUNDS = 3
+ROUNDS = 2
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 TIMED = ("seconds",)  # keys of an answer that differ from run to run
 

@@ -121,7 +121,8 @@ def tracks_of(job: Job, drive: Drive, poll: Callable[[int, int], None] | None = 
     except SimulationError:
         return None
     tracks = job.twin.observe(nodes, drive.times[: job.frames])
-    return tracks if np.isfinite(tracks).all() else None
+    # in one order in memory wherever it was run, for sums depend on it in their last digits
+    return np.ascontiguousarray(tracks) if np.isfinite(tracks).all() else None
 
 
 class Runner(Protocol):
