@@ -155,7 +155,7 @@ class Search:
 
         They are counted one after the other in any case; where the budget might end within them they are also done so.
         """
-        together = self._fit(asked)
+        together = self._may_share(asked)
         made: dict[int, Descended] = {}
         found = []
         for k, one in enumerate(asked):
@@ -163,7 +163,7 @@ class Search:
             def descend(k: int = k, one: Descent = one) -> dict[str, Any]:
                 if k not in made:  # those before it are in the journal
                     several = asked[k:] if together else [one]
-                    if not self._fit(several):
+                    if not self._may_share(several):
                         ended = self._alone(one)
                         return {"theta": ended.theta.tolist(), "cost": ended.cost}
                     made.update(enumerate(in_step([(self, other) for other in several]), k))
@@ -177,7 +177,7 @@ class Search:
             found.append(Optimum(np.array(kept["theta"]), cost))
         return found
 
-    def _fit(self, several: list[Descent]) -> bool:
+    def _may_share(self, several: list[Descent]) -> bool:
         """Whether descents may share a runner: the budget does not end within them, whatever they take."""
         worst = sum(most_runs(len(one.parameters), one.iterations) for one in several)
         return self.runner is not in_turn and self.simulations + worst <= self.limit

@@ -184,6 +184,8 @@ def touch_collider(
     point = wp.tid()
     zero = wp.float64(0.0)
     left = clearance[point] - travel[counter[1] % 2]
+    if counter[0] == 0 and counter[1] == 0:  # whatever a run before left, even one that blew up
+        left = zero
     clearance[point] = left
     if left > wp.static(wp.float64(ROUND_OFF_M)):
         return

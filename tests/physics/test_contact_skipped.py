@@ -57,6 +57,14 @@ def test_a_second_run_of_a_solver_is_the_first() -> None:
     np.testing.assert_array_equal(thrown(solver), thrown(solver))
 
 
+def test_what_a_run_that_blew_up_left_does_not_count() -> None:
+    solver, fresh = (ready((ColliderContact(collider("ground", 1)),)) for _ in range(2))
+    term = solver.terms[0]
+    term._seen.fill_(np.nan)  # no way from there has a length
+    term._clearance.fill_(1.0)
+    np.testing.assert_array_equal(thrown(solver), thrown(fresh))
+
+
 def test_the_share_is_the_largest_eigenvalue_from_above() -> None:
     points, areas, groups = contact_points(BLOCK)
     matrix = BLOCK.interpolation(points)
