@@ -9,7 +9,7 @@ import hashlib
 import json
 import signal
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import cache
@@ -164,16 +164,17 @@ class Workers:
     def __call__(
         self, jobs: Sequence[Job], drive: Drive, poll: Callable[[], None]
     ) -> Iterator[np.ndarray | None]:
-        """Every job in a process; ``poll`` is called before each is waited for.
+        """Every job in a process; ``poll`` is called before each is waited for. Where it raises, jobs that have not
+        begun never do.
 
         Raises:
             WorkerLost: a process ended, by the system's hand or another's.
         """
+        futures: list[Future[np.ndarray | None]] = []
         try:
-            futures = [
-                self._pool.submit(_work, job.twin.to_arrays(), job.twin.device, _facts(job), drive)
-                for job in jobs
-            ]
+            for job in jobs:
+                facts = (job.twin.to_arrays(), job.twin.device, _facts(job), drive)
+                futures.append(self._pool.submit(_work, *facts))
             for future in futures:
                 poll()
                 yield future.result()
@@ -182,6 +183,9 @@ class Workers:
                 f"one of {self.processes} processes that share the simulations ended ({len(jobs)} were asked for): "
                 "was it out of memory?"
             ) from error
+        finally:
+            for future in futures:
+                future.cancel()
 
 
 def _begin() -> None:

@@ -17,10 +17,12 @@ TraceState = Literal["pending", "ready", "failed"]
 
 
 class TraceConfig(Request):
-    """Settings of a trace; the same scene and settings give the same answer.
+    """Settings of a trace; the same scene and settings give the same answer, unless time is limited.
 
     ``candidates`` are names of the effects' registry, none for all of them. The best ``confirmed`` are refitted with
-    the full simulator, in ``iterations`` Gauss-Newton steps; an answer has ``effects_at_most`` effects.
+    the full simulator, in ``iterations`` Gauss-Newton steps; an answer has ``effects_at_most`` effects. After about
+    ``time_limit_s`` seconds of one attempt, those of waiting for workers included, searches are left and the answer is
+    made of what there is; none: never.
     """
 
     candidates: list[str] = Field(default_factory=list, max_length=64)
@@ -28,6 +30,7 @@ class TraceConfig(Request):
     confirmed: int = Field(default=8, ge=1, le=32)
     iterations: int = Field(default=5, ge=1, le=50)
     resamples: int = Field(default=2000, ge=100, le=100_000)
+    time_limit_s: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
     seed: Seed = 0
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from physworld.calibrate import Journal, calibrate
 from physworld.grips import softly_held
@@ -12,25 +13,26 @@ from physworld.trace.config import TraceConfig
 from physworld.trace.faults import Faults, find_faults
 from physworld.trace.noise import noise_sigma
 from physworld.trace.recordings import JointSimulations, Recordings
-from physworld.trace.simulations import Memory, Progress
+from physworld.trace.simulations import Ledger, Memory, Progress
 from physworld.twin import Twin
 
 
 @dataclass(frozen=True)
 class Beginning:
-    """Settings and means of a trace, as :func:`physworld.trace.trace` was given them."""
+    """Settings and means of a trace, as :func:`physworld.trace.trace` was given them, and what its stages cost."""
 
     config: TraceConfig
     runner: Runner
     memory: Memory | None
     progress: Progress | None
     cancelled: Callable[[], bool] | None
+    ledger: Ledger = field(default_factory=Ledger)
 
     def calibrated(
         self, recordings: Recordings, twin: Twin | None, journal: Journal | None
     ) -> tuple[JointSimulations, Twin, int]:
         """The simulations, the declared physics calibrated on the training frames, and the runs that this took."""
-        config, runs = self.config, 0
+        config, runs, begun = self.config, 0, time.perf_counter()
         if twin is None:
             # fibres would go into a free shape of bending
             declared = replace(config.calibration, bending="declared")
@@ -38,11 +40,13 @@ class Beginning:
                 recordings.lead.scene, declared, self.progress, self.cancelled, journal, runner=self.runner
             )
             twin, runs = fitted.twin, fitted.simulations
+            self.ledger.add("calibration", runs, time.perf_counter() - begun)
         twin = softly_held(twin)
         simulations = JointSimulations(
             recordings, twin, config.calibration.particle_budget, config.refinement, self.runner, self.memory,
             self.progress, self.cancelled,
         )  # fmt: skip
+        simulations.ledger = self.ledger
         return simulations, twin, runs
 
     def faults(self, simulations: JointSimulations, twin: Twin) -> tuple[Faults, ...]:

@@ -43,6 +43,8 @@ class TraceConfig:
         seed: everything random follows from it.
         candidates: names of the registry to try; empty for all.
         experiment: of the search for a motion that tells an equivalent set apart; None for no search.
+        time_limit_s: after about so long, by the clock, searches that have not ended are left and the answer is made of
+            what there is; None: never. What was left is in the result's notes.
     """
 
     calibration: CalibrationConfig = field(default_factory=_declared)
@@ -66,3 +68,4 @@ class TraceConfig:
     seed: int = 0
     candidates: tuple[str, ...] = ()
     experiment: ExperimentConfig | None = field(default_factory=ExperimentConfig)
+    time_limit_s: float | None = None

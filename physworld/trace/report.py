@@ -81,6 +81,9 @@ def document(result: TraceResult) -> dict[str, Any]:
         "unexplained": {"rms_m": result.remainder_m, "description": result.remainder},
         "suggested_experiment": None if result.experiment is None else result.experiment.document(),
         "notes": list(result.notes),
+        "stages": [
+            {"name": s.name, "simulations": s.simulations, "seconds": s.seconds} for s in result.stages
+        ],
         "seconds": result.seconds,
         "simulations": result.simulations,
     }

@@ -56,6 +56,15 @@ class Outcome:
 
 
 @dataclass(frozen=True)
+class Stage:
+    """What a stage of a trace has cost: simulations that were not remembered, and the seconds of waiting for them."""
+
+    name: str
+    simulations: int
+    seconds: float
+
+
+@dataclass(frozen=True)
 class TraceResult:
     """See :mod:`physworld.trace.run`.
 
@@ -77,6 +86,7 @@ class TraceResult:
         simulations, seconds: cost.
         notes: what a reader has to know.
         recordings: every recording of its own, those that are held out last.
+        stages: what each has cost, in the order in which they began.
     """
 
     scene: str
@@ -102,6 +112,7 @@ class TraceResult:
     experiment: Experiment | None = None
     notes: tuple[str, ...] = field(default_factory=tuple)
     recordings: tuple[Outcome, ...] = ()
+    stages: tuple[Stage, ...] = ()
 
     @property
     def better(self) -> Twin | None:

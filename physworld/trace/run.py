@@ -44,7 +44,7 @@ from physworld.trace.recordings import (
     side_by_side,
 )
 from physworld.trace.refit import refit
-from physworld.trace.result import Step, TraceResult
+from physworld.trace.result import Stage, Step, TraceResult
 from physworld.trace.score import orthonormal, project
 from physworld.trace.second_resolution import SecondResolution
 from physworld.trace.selection import Selection, by_chance
@@ -55,6 +55,7 @@ from physworld.trace.sensitivity import (
 )
 from physworld.trace.simulations import Memory, Progress
 from physworld.trace.start_pose import turned_starts
+from physworld.trace.time_limit import CONFIRMATION, EXPERIMENT, SELECTION, Clock
 from physworld.trace.unknowns import (
     Unknown,
     clamp_reach,
@@ -142,15 +143,18 @@ def trace(
     bodies = [twin]
     if alone:
         bodies = recorded_as(recordings.scene, twin, simulations, recordings.split.train[1])
-    results = []
+    results, clock = [], Clock(begun, config.time_limit_s, begin.ledger, len(bodies))
     for body in bodies:
-        results.append(_Trace(recordings, config, simulations, body, faults).run())
+        results.append(_Trace(recordings, config, simulations, body, faults, clock).run())
         if results[-1].verdict.name not in (UNEXPLAINED, NUMERICAL):
             break
     else:  # none explains it: what is said is said of the declared body
         results.sort(key=lambda found: not found.declared.fitted.twin.lattice.smooth, reverse=True)
     result = results[-1]
-    return replace(result, simulations=simulations.count + runs, seconds=time.perf_counter() - begun)
+    stages = tuple(Stage(name, *cost) for name, cost in begin.ledger.spent.items())
+    return replace(
+        result, simulations=simulations.count + runs, seconds=time.perf_counter() - begun, stages=stages
+    )
 
 
 class _Trace:
@@ -163,8 +167,9 @@ class _Trace:
         simulations: JointSimulations,
         twin: Twin,
         faults: tuple[Faults, ...],
+        clock: Clock,
     ) -> None:
-        self.recordings, self.lead = recordings, recordings.lead.scene
+        self.recordings, self.lead, self.clock = recordings, recordings.lead.scene, clock
         self.scene, self.split = recordings.scene, recordings.split
         self.config, self.simulations = config, simulations
         self.frames = self.split.train[1]
@@ -219,14 +224,19 @@ class _Trace:
         refused |= {r.candidate.label: "its simulation cannot be trusted" for r in found if r.failed}
         setting = (simulations, white, block_of_row, self.frames, config)
         selection = Selection(*setting)
-        path = selection.path(declared, usable)
+        self.clock.start()
+        with self.clock.until(SELECTION):
+            path = selection.path(declared, usable)
         models = [model for step in path for model in step.tried]
         facts = (solver, block_of_row, lambda model: by_chance(model, path[0].scores))
         real = claimable(declared, models, config, *facts)
         second = SecondResolution(*setting, finer)
-        finer_values, agreement = second.check(declared, real)
-        single = self._complete(declared, real, agreement)
-        mixed = single and Mixtures(selection, second).beside(single, usable, finer_values, agreement)
+        mixed = None
+        with self.clock.until(CONFIRMATION):
+            finer_values, agreement = second.check(declared, real)
+            single = self._complete(declared, real, agreement)
+            with simulations.time_permitting("refit of mixtures"):
+                mixed = single and Mixtures(selection, second).beside(single, usable, finer_values, agreement)
         if mixed and mixed.kept:  # of the others only what may not be named still counts
             path = (*path, mixed)
             models = [mixed.kept, *(model for model in models if implausible(model) is not None)]
@@ -237,10 +247,16 @@ class _Trace:
         if self.faults and verdict.name == NOTHING:
             reason = f"faulty sightings ({self.faults}); of the others {verdict.reason}"
             verdict = Verdict(DATA, declared, (), reason)
+        verdict = self.clock.told(verdict, declared, agreement)
         found = self._result(
             verdict, declared, white, block_of_row, sigma, path, chosen, refused, numerics, finer_values
         )
-        return replace(found, experiment=self._experiment(verdict, white, finer))
+        experiment, notes = None, found.notes
+        with self.clock.until(EXPERIMENT), simulations.time_permitting("experiment"):
+            experiment = self._experiment(verdict, white, finer)
+        if simulations.ledger.cut[-1:] == ["experiment"]:
+            notes = (*notes, "time was up before an experiment was found that would tell these apart")
+        return replace(found, experiment=experiment, notes=notes)
 
     def _complete(
         self, declared: Model, real: list[Model], agreement: dict[tuple[str, ...], bool]

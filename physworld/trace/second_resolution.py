@@ -56,8 +56,9 @@ class SecondResolution:
         for model in simplest_first(real, declared):
             if not accounts(model, declared, self.config):
                 break
-            agreement[model.names] = self._agrees(declared, model, values)
-            if agreement[model.names] or declared.fitted.misfit <= self.config.acceptable:
+            with self.simulations.time_permitting("second resolution"):
+                agreement[model.names] = self._agrees(declared, model, values)
+            if agreement.get(model.names, True) or declared.fitted.misfit <= self.config.acceptable:
                 break
         return values, agreement
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,7 @@ from physworld.trace.valleys import with_valleys
 from physworld.trace.verdict import as_good, helps, simplest
 from physworld.trace.whitening import Whitener
 
+Search = Callable[[list[Model]], list[Model]]
 _OUTDONE = 0.5  # share of what a complete model's effect explains that a rival must explain to be refitted
 _LEADING = 2  # models that are refitted from elsewhere
 _NEAR = 3.0  # times what the best leaves above the noise
@@ -49,39 +51,71 @@ class Selection:
             hopeful = best_variants(ranked.ranked, least, config.confirmed, base.names)
             if declared.fitted.misfit <= config.near_floor:  # only a score beyond chance calls for an effect
                 hopeful = [variants for variants in hopeful if variants[0].share >= ranked.threshold]
-            tried = []
-            for variants in hopeful:
-                self.simulations.stage = f"refit with {variants[0].candidate.effect}"
-                best = min(tried, key=lambda m: m.fitted.misfit, default=None)
-                if best is not None and self._outdone(base, best, variants[0], ranked):
-                    continue
-                model = confirmation.model(base, variants, columns, best)
-                if model is not None:
-                    tried.append(model)
-            if number == 0:
-                self.simulations.stage = "refit from other valleys"
-                tried = with_valleys(confirmation, base, ranked, columns, tried, config.near_floor)
-            tried = self._again(confirmation, base, self._mirrored(confirmation, base, tried), ranked)
-            tried = self._clamped_otherwise(confirmation, self._held_otherwise(confirmation, tried))
-            tried = self._alike(confirmation, base, tried, columns)
-            tried = self._beside_the_best(confirmation, tried)
-            tried = self._as_plates(base, [*tried, *self._in_parts(confirmation, base, tried, usable)])
+            tried = self._singles(confirmation, base, hopeful, columns, ranked)
+            for stage, search in self._searches(confirmation, base, ranked, columns, usable)[bool(number) :]:
+                with self.simulations.time_permitting(stage):
+                    tried = search(tried)
             good = [m for m in tried if helps(m, base, config)]
             kept = simplest(good, base) if good else None
             path.append(Step(base, ranked, tuple(tried), kept))
-            if kept is None or kept.fitted.misfit <= config.near_floor:
+            if kept is None or kept.fitted.misfit <= config.near_floor or self.simulations.ledger.cut:
                 break
             base = kept
             if (
                 declared.fitted.misfit > _FAR
             ):  # what the candidates did there says little of what they do here
-                usable = self.afresh(base, usable)
+                with self.simulations.time_permitting("sensitivities of a second effect"):
+                    usable = self.afresh(base, usable)
+                if self.simulations.ledger.cut:
+                    break
                 columns = {response.candidate.label: response.columns for response in usable}
         return tuple(path)
 
+    def _singles(
+        self,
+        confirmation: Confirmation,
+        base: Model,
+        hopeful: list[list[Score]],
+        columns: dict[str, np.ndarray],
+        ranked: Scores,
+    ) -> list[Model]:
+        """The base with one more effect, each of the hopeful ones refitted from its linear scores."""
+        tried: list[Model] = []
+        for variants in hopeful:
+            best = min(tried, key=lambda m: m.fitted.misfit, default=None)
+            if best is not None and self._outdone(base, best, variants[0], ranked):
+                continue
+            with self.simulations.time_permitting(f"refit with {variants[0].candidate.effect}"):
+                model = confirmation.model(base, variants, columns, best)
+                if model is not None:
+                    tried.append(model)
+        return tried
+
+    def _searches(
+        self,
+        confirmation: Confirmation,
+        base: Model,
+        ranked: Scores,
+        columns: dict[str, np.ndarray],
+        usable: list[Response],
+    ) -> tuple[tuple[str, Search], ...]:
+        """What is done to the models with one more effect, in turn; the first to single effects only."""
+        floor = self.config.near_floor
+        return (
+            ("refit from other valleys",
+             lambda tried: with_valleys(confirmation, base, ranked, columns, tried, floor)),
+            ("refit of mirror images", lambda tried: self._mirrored(confirmation, base, tried)),
+            ("refit from elsewhere", lambda tried: self._again(confirmation, base, tried, ranked)),
+            ("refit of the grips", lambda tried: self._held_otherwise(confirmation, tried)),
+            ("refit of the clamps", lambda tried: self._clamped_otherwise(confirmation, tried)),
+            ("refit of the like", lambda tried: self._alike(confirmation, base, tried, columns)),
+            ("refit beside the best", lambda tried: self._beside_the_best(confirmation, tried)),
+            ("refit in parts", lambda tried: [*tried, *self._in_parts(confirmation, base, tried, usable)]),
+            ("refit as a plate", lambda tried: self._as_plates(base, tried)),
+        )  # fmt: skip
+
     def afresh(self, base: Model, usable: list[Response]) -> list[Response]:
         """What the candidates do to another model's prediction."""
-        self.simulations.stage = "sensitivities"
         chosen = [r.candidate for r in usable if r.candidate.effect not in base.names]
         found = candidate_responses(
             self.simulations, self.white, base.fitted.twin, base.fitted.tracks, chosen, self.frames
@@ -97,7 +131,6 @@ class Selection:
 
     def _mirrored(self, confirmation: Confirmation, base: Model, tried: list[Model]) -> list[Model]:
         """Models, those that explain most of what there is refitted from the mirror images of their shapes."""
-        self.simulations.stage = "refit of mirror images"
         worth = max(_OUTDONE * base.explained, _NEAR * min((model.explained for model in tried), default=0.0))
         return [confirmation.mirrored(m) if m.explained <= worth else m for m in tried]
 
@@ -105,7 +138,6 @@ class Selection:
         self, confirmation: Confirmation, base: Model, tried: list[Model], ranked: Scores
     ) -> list[Model]:
         """Models that leave too much, refitted from elsewhere: the best, and simpler ones that scored like them."""
-        self.simulations.stage = "refit from elsewhere"
         floor, ordered = self.config.near_floor, sorted(tried, key=lambda m: m.fitted.misfit)
         if not ordered:
             return tried
@@ -131,7 +163,6 @@ class Selection:
 
     def _held_otherwise(self, confirmation: Confirmation, tried: list[Model]) -> list[Model]:
         """Models, those that are near the best refitted from grips that hold otherwise."""
-        self.simulations.stage = "refit of the grips"
         least = min((model.explained for model in tried), default=0.0)
         return [confirmation.held_otherwise(m) if m.explained <= _NEAR * least else m for m in tried]
 
@@ -150,7 +181,6 @@ class Selection:
         self, confirmation: Confirmation, base: Model, tried: list[Model], usable: list[Response]
     ) -> list[Model]:
         """The two effects that a wind may be as well, where it leaves little."""
-        self.simulations.stage = "refit in parts"
         found = [
             in_parts(confirmation, base, m, [response.candidate for response in usable])
             for m in tried
@@ -162,7 +192,6 @@ class Selection:
 
     def _as_plates(self, base: Model, tried: list[Model]) -> list[Model]:
         """Models of sheets, those that are near the best without numbers of their own for bending where that does."""
-        self.simulations.stage = "refit as a plate"
         least = min((model.explained for model in tried), default=0.0)
         found = []
         for model in tried:
@@ -183,7 +212,6 @@ class Selection:
 
         A lag and a clock that is off do the same; that one search found the better place is no reason to prefer it.
         """
-        self.simulations.stage = "refit of the like"
         best = min(tried, key=lambda m: m.fitted.misfit, default=None)
         if best is None:
             return tried
@@ -201,7 +229,6 @@ class Selection:
 
     def _beside_the_best(self, confirmation: Confirmation, tried: list[Model]) -> list[Model]:
         """Models of one strength; those clearly worse than one near the noise are refitted from where that fits."""
-        self.simulations.stage = "refit beside the best"
         best = min(tried, key=lambda m: m.fitted.misfit, default=None)
         if best is None or best.fitted.misfit > self.config.acceptable:
             return tried

@@ -6,8 +6,10 @@ memory goes on where it was.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +50,30 @@ class Memory:
         part.replace(self._folder / f"{key}.npy")
 
 
+class TimeUp(Exception):
+    """The time for what is being searched is up; raised by a run, caught by :meth:`Simulations.time_permitting`."""
+
+
+@dataclass
+class Ledger:
+    """What the stages of a trace have cost, and until when it searches.
+
+    Attributes:
+        spent: runs that were not remembered and their seconds, by stage.
+        ends_at: by ``time.perf_counter``.
+        cut: searches that ended before they were through, or did not begin.
+    """
+
+    spent: dict[str, tuple[int, float]] = field(default_factory=dict)
+    ends_at: float = float("inf")
+    cut: list[str] = field(default_factory=list)
+
+    def add(self, stage: str, runs: int, seconds: float) -> None:
+        """Add to what a stage has cost."""
+        before = self.spent.get(stage, (0, 0.0))
+        self.spent[stage] = (before[0] + runs, before[1] + seconds)
+
+
 class Simulations:
     """Counts, remembers, reports and stops.
 
@@ -55,6 +81,7 @@ class Simulations:
         count: runs asked for, those remembered included.
         stage: what they are for.
         least_step_s: a twin that needs a smaller time step is not run.
+        ledger: what stages cost, and until when they may go on.
     """
 
     def __init__(
@@ -68,14 +95,23 @@ class Simulations:
         self.drive, self.count = drive, 0
         self._runner, self._memory = runner, memory or Memory()
         self._progress, self._cancelled = progress, cancelled
-        self.stage, self.least_step_s = "", 0.0
+        self.stage, self.least_step_s, self.ledger = "", 0.0, Ledger()
+
+    @contextmanager
+    def time_permitting(self, stage: str) -> Iterator[None]:
+        """A search that is left where time is up, and then is in ``ledger.cut``; ``stage``: what it is for."""
+        self.stage = stage
+        try:
+            yield
+        except TimeUp:
+            self.ledger.cut.append(stage)
 
     def run(self, jobs: Sequence[Job]) -> list[np.ndarray | None]:
-        """Tracks of every job. Raises Cancelled."""
+        """Tracks of every job. Raises Cancelled, TimeUp."""
         return self.under(self.drive, jobs)
 
     def under(self, drive: Drive, jobs: Sequence[Job]) -> list[np.ndarray | None]:
-        """Tracks of every job under this drive. Raises Cancelled."""
+        """Tracks of every job under this drive. Raises Cancelled, TimeUp."""
         digest = drive.digest()
         keys = [job.fingerprint(digest) for job in jobs]
         known = [self._memory.get(key) for key in keys]
@@ -83,8 +119,10 @@ class Simulations:
         tracks = [found for _, found in known]
         self.count += len(jobs) - len(missing)
         waiting = [replace(jobs[k], least_step_s=self.least_step_s) for k in missing]
+        if missing:
+            self._poll()
         fresh = self._runner(waiting, drive, self._poll) if missing else iter(())
-        for k, made in zip(missing, fresh, strict=True):
+        for k, made in zip(missing, self._timed(fresh), strict=True):
             self._memory.put(keys[k], made)
             tracks[k] = made
             self.count += 1
@@ -92,12 +130,24 @@ class Simulations:
                 self._progress(self.count, 0, self.stage)
         return tracks
 
+    def _timed(self, fresh: Iterator[np.ndarray | None]) -> Iterator[np.ndarray | None]:
+        """The same, with its seconds in the ledger."""
+        begun = time.perf_counter()
+        for made in fresh:
+            now = time.perf_counter()
+            self.ledger.add(self.stage, 1, now - begun)
+            yield made
+            begun = time.perf_counter()
+
     def elsewhere(self, drive: Drive) -> Simulations:
         """Simulations under another drive, with the same runner, memory and watchers; their count goes on from here."""
         other = Simulations(drive, self._runner, self._memory, self._progress, self._cancelled)
         other.count, other.stage, other.least_step_s = self.count, self.stage, self.least_step_s
+        other.ledger = self.ledger
         return other
 
     def _poll(self) -> None:
+        if time.perf_counter() > self.ledger.ends_at:
+            raise TimeUp(f"after {self.count} simulations in the stage {self.stage!r}")
         if self._cancelled is not None and self._cancelled():
             raise Cancelled(f"trace cancelled after {self.count} simulations in the stage {self.stage!r}")

@@ -8,6 +8,7 @@ The report is :func:`physworld.trace.document`; ``--predictions FILE`` keeps the
 ``--html FILE`` shows all of it as one self-contained page.
 Simulations run in two processes unless ``--processes`` says otherwise; ``--resume DIR`` keeps every simulation there,
 so that the same command goes on where an earlier one was cut off. Ctrl-C cancels; nothing is written before the end.
+After ``--time-limit`` minutes searches are left and the answer is made of what there is; the report says which.
 """
 
 from __future__ import annotations
@@ -16,10 +17,12 @@ import argparse
 import json
 import sys
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 PROCESSES = 2
+MINUTES = 10.0
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -54,6 +57,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--html", type=Path, default=None, help="write the report as a page to this file")
     parser.add_argument("--particles", type=_count, default=None, help="particles of the twin, about")
     parser.add_argument("--processes", type=_count, default=PROCESSES, help="processes that simulate")
+    parser.add_argument(
+        "--time-limit",
+        type=_minutes,
+        default=MINUTES,
+        metavar="MINUTES",
+        help="after about so long searches are left and the answer is made of what there is; 0: never",
+    )
     parser.add_argument("--resume", type=Path, default=None, help="folder that remembers every simulation")
     return parser
 
@@ -62,6 +72,13 @@ def _count(text: str) -> int:
     value = int(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"{value} is below 1")
+    return value
+
+
+def _minutes(text: str) -> float:
+    value = float(text)
+    if not 0.0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is no number of minutes")
     return value
 
 
@@ -81,9 +98,10 @@ def _trace(given: argparse.Namespace) -> None:
     scenes = [read_scene(path) for path in given.scenes]
     held_out = [read_scene(path) for path in given.held_out]
     scene = scenes[0]
-    config = TraceConfig()
+    config = TraceConfig(time_limit_s=60.0 * given.time_limit or None)
     if given.particles is not None:
-        config = TraceConfig(calibration=CalibrationConfig(particle_budget=given.particles, damping="none"))
+        budget = CalibrationConfig(particle_budget=given.particles, damping="none")
+        config = replace(config, calibration=budget)
     memory = journal = None
     if given.resume is not None:
         memory = Memory(given.resume / "simulations")

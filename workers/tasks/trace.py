@@ -108,6 +108,7 @@ def translate(fit: FitConfig, config: WireConfig, device: str) -> TraceConfig:
         confirmed=config.confirmed,
         iterations=config.iterations,
         resamples=config.resamples,
+        time_limit_s=config.time_limit_s,
         seed=config.seed,
     )
 

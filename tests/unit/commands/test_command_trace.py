@@ -111,3 +111,10 @@ def test_steps_of_a_calibration_belong_to_everything_that_the_scene_declares(
         given = [str(tmp_path / str(k)), "--resume", str(tmp_path / "kept"), "--processes", "1"]
         assert trace.main(given) == INTERRUPTED
     assert found == [0, 0, 2, 3, 4]
+
+
+@pytest.mark.parametrize("wrong", ["-1", "nan", "inf", "soon"])
+def test_a_time_limit_is_a_number_of_minutes(wrong: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        trace.main([f"--time-limit={wrong}", "--", "scene"])
+    assert "--time-limit" in capsys.readouterr().err

@@ -12,6 +12,7 @@ from benchmarks.flex_sheet import FlexSheet, record
 from physworld.batch import Episode, simulate_batch
 from physworld.build import build_twin
 from physworld.calibrate.parameters import parameters_of
+from physworld.effects.actuation_lag import ActuationLag
 from physworld.effects.air_drag_quadratic import AirDragQuadratic
 from physworld.effects.anisotropy import Anisotropy
 from physworld.errors import BatchRefused, EffectRefused, NotDifferentiable, SceneUnsupported
@@ -22,6 +23,7 @@ from physworld.mpm.gradient_twin import TwinRun
 from physworld.mpm.triangles import Mesh, TriangleLattice, mesh_of
 from physworld.scene import Ground, Scene
 from physworld.simulations import Job
+from physworld.trace import meshes
 from physworld.trace.candidates import candidates
 from physworld.trace.meshes import recorded_as, taken_as
 from physworld.trace.recordings import JointSimulations, Recordings
@@ -197,6 +199,20 @@ def test_a_report_says_which_mesh_and_how_to_fit_it() -> None:
     for wrong in ("", "16", "16x0", "x", "16x15x2", "16x15 odd", "1e3x4"):
         with pytest.raises(ValueError, match="16x15"):
             Mesh.read(wrong)
+
+
+def test_a_mesh_is_found_although_the_controls_come_late(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = build_twin(scene, mesh=MESH).with_effect(ActuationLag(lag_s=0.04))
+    law = plate_of(scene, SHEET.young_pa).law
+    late = recorded_by(replace(own, law=replace(law, bending_twist_ratio=1.0)), scene, 5e-4)
+    plate = plate_of(late, 0.87 * SHEET.young_pa)
+    found = taken(late, plate)
+    assert [mesh_of(twin.lattice) for twin in found] == [MESH, None]
+    assert not any(twin.effects for twin in found)  # a lag is for the trace to find
+    monkeypatch.setattr(meshes, "_LAGS_S", (-0.01, 0.0))  # without it the mesh is not told from the plate
+    assert kinds(late, plate) != [MESH, None]
 
 
 def test_frames_in_which_nothing_is_seen_do_not_count(scene: Scene) -> None:

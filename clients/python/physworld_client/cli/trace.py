@@ -52,6 +52,14 @@ def trace(
     html: Annotated[Path | None, typer.Option(help="Write the report as a page to this file.")] = None,
     particles: Annotated[int | None, typer.Option(min=50, help="Particles of the twin, about.")] = None,
     processes: Annotated[int | None, typer.Option(min=1, help="Processes that simulate.")] = None,
+    time_limit: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            metavar="MINUTES",
+            help="After about so long searches are left and the answer is made of what there is (10); 0: never.",
+        ),
+    ] = None,
     resume: Annotated[
         Path | None, typer.Option(help="Folder that remembers every simulation, to go on after a cut.")
     ] = None,
@@ -63,6 +71,7 @@ def trace(
         "--html": html,
         "--particles": particles,
         "--processes": processes,
+        "--time-limit": time_limit,
         "--resume": resume,
     }
     options = [text for name, value in given.items() if value is not None for text in (name, str(value))]
