@@ -79,8 +79,9 @@ class Object:
         counts: elements.
         young_pa, density_kg_m3: of the material; density is declared.
         held: boxes of the unit cube that grips hold, (2, 3) each.
-        stroke_m, turn_rad: how far grips go and turn.
+        stroke_m, turn_rad: how far grips go, along every axis or along each, and turn.
         round: the section across the first axis shrinks towards the ends, as an ellipsoid's with blunt ends does.
+        around: a grip's box goes around all that its box of the cube becomes, not from its first corner to its last.
     """
 
     kind: str
@@ -89,9 +90,10 @@ class Object:
     young_pa: float
     density_kg_m3: float
     held: tuple[tuple[tuple[float, float, float], tuple[float, float, float]], ...]
-    stroke_m: float
+    stroke_m: float | tuple[float, ...]
     turn_rad: float = 0.0
     round: bool = False
+    around: bool = False
 
     @property
     def body(self) -> Body:
@@ -109,7 +111,7 @@ class Object:
             units[np.arange(TRACKED), side] = rng.integers(0, 2, TRACKED)
         nodes, weights = elements.weights(np.clip(units, 1e-6, 1 - 1e-6))
         motions = [Motion(10 * seed + g, self.stroke_m, self.turn_rad) for g in range(len(self.held))]
-        boxes = [self.shape(np.array(box)) for box in self.held]
+        boxes = [self._box(np.array(box)) for box in self.held]
         held = [
             np.flatnonzero(np.all((elements.nodes >= b[0] - 1e-9) & (elements.nodes <= b[1] + 1e-9), axis=1))
             for b in boxes
@@ -126,6 +128,12 @@ class Object:
             for box, h, motion in zip(boxes, held, motions, strict=True)
         ]
         return Recorder(hands, tracks, lambda r: self.shape(r.uniform(0.0, 1.0, (_FILLING, 3))))
+
+    def _box(self, box: Floats) -> Floats:
+        """Of a grip, (2, 3) [m], that holds this box of the unit cube."""
+        corners = np.array([[x, y, z] for x in box[:, 0] for y in box[:, 1] for z in box[:, 2]])
+        shaped = self.shape(corners)
+        return np.array([shaped.min(axis=0), shaped.max(axis=0)]) if self.around else self.shape(box)
 
     def shape(self, unit: Floats) -> Floats:
         """Places at rest [m] of points (N, 3) of the unit cube."""
@@ -311,8 +319,13 @@ OBJECTS: dict[str, Object | Cord | Cloth | Brick] = {
                    (((0.0, 1 / 3, 1 / 3), (1 / 6, 2 / 3, 2 / 3)),), 0.02, round=True),
     "finer_blob": Object("blob", (0.2, 0.1, 0.09), (8, 4, 4), 5e4, 540.0,
                          (((0.0, 1 / 4, 1 / 4), (1 / 8, 3 / 4, 3 / 4)),), 0.02, round=True),
+    "capped_blob": Object("blob", (0.2, 0.1, 0.09), (8, 4, 4), 5e4, 540.0,
+                          (((0.0, 1 / 4, 1 / 4), (1 / 8, 3 / 4, 3 / 4)),), 0.02, round=True, around=True),
     "slab": Object("sheet", (0.22, 0.015, 0.2), (10, 1, 9), 2.6e5, 350.0,
                    (((0.0, 0.0, 8 / 9), (0.1, 1.0, 1.0)), ((0.9, 0.0, 8 / 9), (1.0, 1.0, 1.0))), 0.03),
+    "calm_slab": Object("sheet", (0.22, 0.015, 0.2), (10, 1, 9), 2.6e5, 350.0,
+                        (((0.0, 0.0, 8 / 9), (0.1, 1.0, 1.0)), ((0.9, 0.0, 8 / 9), (1.0, 1.0, 1.0))),
+                        (0.004, 0.03, 0.02)),
     "rope": Cord(0.42, 0.0075, 1e6, 900.0, (0.5, 0.0, -0.86), 0.04, 0.2),
     "cloth": Cloth((0.25, 0.0045, 0.27), (20, 18), 2e5, 370.0, (0.004, 0.03, 0.02)),
     "brick": Brick((0.15, 0.09, 0.075), (9, 6, 5), 4e4, 400.0, 0.45, (0.03, 0.02, 0.0)),

@@ -90,6 +90,15 @@ def cases() -> tuple[Case, ...]:
         Case("e27", "finer_blob", 27, {"gravity_tilt": {"degrees": drawn(27, 3.0, 6.0), "axis": [0.3, 1.0, 0.0]}}),
         Case("e28", "finer_blob", 28, {"internal_viscosity": {"eta": drawn(28, 20.0, 40.0)}}),
         Case("e29", "finer_blob", 29, {"linear_drag": {"c": drawn(29, 1.5, 3.0)}}),
+        Case("e30", "capped_blob", 30, answers=nothing),
+        Case("e31", "capped_blob", 31, {"linear_drag": {"c": drawn(31, 1.5, 3.0)}}),
+        Case("e32", "capped_blob", 32, {"gravity_tilt": {"degrees": drawn(32, 3.0, 6.0), "axis": [0.3, 1.0, 0.0]}}),
+        Case("e33", "capped_blob", 33, {"control_lag": {"seconds": drawn(33, 0.02, 0.05)}}),
+        Case("e34", "calm_slab", 34, answers=nothing),
+        Case("e35", "calm_slab", 35, {"linear_drag": {"c": drawn(35, 1.5, 3.0)}}),
+        Case("e36", "calm_slab", 36, {"gravity_tilt": {"degrees": drawn(36, 3.0, 6.0), "axis": [1.0, 0.3, 0.0]}}),
+        Case("e37", "beam", 37, {"internal_viscosity": {"eta": drawn(37, 300.0, 800.0)}}),
+        Case("e38", "brick", 38, {"linear_drag": {"c": drawn(38, 1.5, 3.0)}}),
     )  # fmt: skip
 
 
@@ -237,6 +246,9 @@ def main() -> int:
     parser.add_argument("--only", nargs="*", default=[], help="names of scenes; none given: all")
     parser.add_argument("--resume", type=Path, default=None, help="folder that remembers simulations")
     parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument(
+        "--time-limit", type=float, default=None, help="minutes; as the command has it if left out"
+    )
     parser.add_argument("--docs", type=Path, default=None, help="Markdown file whose section is replaced")
     given = parser.parse_args()
     rows = (
@@ -250,7 +262,7 @@ def main() -> int:
             if given.only and case.name not in given.only:
                 continue
             scene = _made(case, given.scenes or Path(folder, "made"))
-            report = traced(scene, Path(folder), given.resume, given.processes)
+            report = traced(scene, Path(folder), given.resume, given.processes, given.time_limit)
             failed |= report is None
             if report is not None:
                 rows[case.name] = scored(case, scene, report)

@@ -100,8 +100,13 @@ def score(report: dict[str, Any], truth: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def traced(scene: Path, folder: Path, resume: Path | None, processes: int) -> dict[str, Any] | None:
-    """The report of one scene; None where the command failed (it has said why)."""
+def traced(
+    scene: Path, folder: Path, resume: Path | None, processes: int, minutes: float | None = None
+) -> dict[str, Any] | None:
+    """The report of one scene; None where the command failed (it has said why).
+
+    ``minutes``: its time limit; None for the command's own.
+    """
     blind = folder / scene.name
     blind.mkdir()
     for name in ("scene.json", "scene.npz"):
@@ -109,6 +114,8 @@ def traced(scene: Path, folder: Path, resume: Path | None, processes: int) -> di
     out = folder / f"{scene.name}.json"
     command = [sys.executable, "-m", "workers.commands.trace", str(blind), "--out", str(out)]
     command += ["--predictions", str(folder / f"{scene.name}.npz"), "--processes", str(processes)]
+    if minutes is not None:
+        command += ["--time-limit", str(minutes)]
     if resume is not None:
         command += ["--resume", str(resume / scene.name)]
     done = subprocess.run(command, env={**os.environ, **ONE_THREAD}, check=False, stdout=subprocess.DEVNULL)
@@ -145,6 +152,9 @@ def main() -> int:
     parser.add_argument("--only", nargs="*", default=[], help="names of scenes; none: all")
     parser.add_argument("--resume", type=Path, default=None, help="folder that remembers simulations")
     parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument(
+        "--time-limit", type=float, default=None, help="minutes; as the command has it if left out"
+    )
     parser.add_argument("--docs", type=Path, default=None, help="Markdown file whose section is replaced")
     given = parser.parse_args()
     scenes = sorted(path.parent for path in given.set.glob("*/scene.json"))
@@ -154,7 +164,7 @@ def main() -> int:
             if given.only and scene.name not in given.only:
                 continue
             begun = time.perf_counter()
-            report = traced(scene, Path(folder), given.resume, given.processes)
+            report = traced(scene, Path(folder), given.resume, given.processes, given.time_limit)
             if report is None:
                 failed.append(scene.name)
                 continue
