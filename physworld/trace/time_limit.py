@@ -17,7 +17,7 @@ from physworld.trace.confirm import Model
 from physworld.trace.simulations import Ledger
 from physworld.trace.verdict import DATA, EQUIVALENT, NAMED, UNEXPLAINED, Verdict
 
-SELECTION, CONFIRMATION, EXPERIMENT = 0.65, 0.9, 1.0
+SELECTION, CONFIRMATION, EXPERIMENT = 0.7, 0.95, 1.0
 """By which share of the time that is left after the scores a part ends."""
 _AT_LEAST = 0.25  # share of the limit that the searches have, however long what comes before them took
 _SHOWN = 6  # searches that a reason lists
