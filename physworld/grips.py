@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from physworld.twin import Twin
 
 _OFF_LINE = 0.05  # second extent of control points over the first, below which they count as a line
+_FLAT = 1e-9  # component of a unit normal along which a sheet has no depth
 _LEVER_SIGMAS = 10.0  # of the tracking noise that control points must stand off the rope's axis
 
 
@@ -49,8 +50,7 @@ def gripped_nodes(body: ReferenceBody, controllers: np.ndarray, grip: Grip | Non
         inside = _within(body, particles, controllers, radius)
     elif declared:
         low, high = np.asarray(grip.region_min_m) - slack, np.asarray(grip.region_max_m) + slack
-        margin = 0.5 * body.thickness_m if lattice.dim < 3 else 0.0
-        inside = np.all((particles >= low - margin) & (particles <= high + margin), axis=1)
+        inside = _through(body, particles, low, high)
     else:
         nearest = lattice.particle_coordinates[_nearest(particles, controllers)]
         reach = 0.5 * lattice.spacing
@@ -67,6 +67,35 @@ def gripped_nodes(body: ReferenceBody, controllers: np.ndarray, grip: Grip | Non
         cells = np.zeros(len(lattice.cells), dtype=bool)
         cells[np.unique(_nearest(particles, controllers) // lattice.fill.shape[1])] = True
     return np.unique(lattice.cell_nodes[cells])
+
+
+def _through(body: ReferenceBody, particles: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Whether the body lies in the box from ``low`` to ``high`` (3,) at particles (P, 3), somewhere in its depth, (P,).
+
+    A sheet reaches half its thickness to either side along its normal, and nowhere else: a box that ends on it holds
+    nothing beyond its end. The material of a cell that is filled in part lies beside its particle.
+    """
+    lattice = body.lattice
+    if lattice.dim != 2:
+        margin = 0.5 * body.thickness_m if lattice.dim == 1 else 0.0
+        return np.all((particles >= low - margin) & (particles <= high + margin), axis=1)
+    along, across = (
+        lattice.interpolation(lattice.particle_coordinates, orders) @ body.start
+        for orders in ((1, 0), (0, 1))
+    )
+    beside = 0.25 * lattice.spacing.max() * (1.0 - lattice.fill.reshape(-1, 1))
+    low, high = low - beside, high + beside
+    normal = np.cross(along, across)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    # the depths along the normal between which each axis lies in the box; those at which all do
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = np.stack([(low - particles) / normal, (high - particles) / normal])
+    flat = np.abs(normal) < _FLAT
+    outside = flat & ((particles < low) | (particles > high))
+    ends = np.where(flat, np.array([-np.inf, np.inf])[:, None, None], ends)
+    first = np.maximum(ends.min(axis=0).max(axis=1), -body.half_thickness_m)
+    last = np.minimum(ends.max(axis=0).min(axis=1), body.half_thickness_m)
+    return (first <= last) & ~outside.any(axis=1)
 
 
 def _within(
