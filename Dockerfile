@@ -15,7 +15,8 @@ ENV PYTHONUNBUFFERED=1 \
     PIP_DISABLE_PIP_VERSION_CHECK=1 \
     HOME=/var/lib/physworld \
     PHYSWORLD_DATA_DIR=/var/lib/physworld \
-    WARP_CACHE_PATH=/var/cache/physworld/warp
+    WARP_CACHE_PATH=/var/cache/physworld/warp \
+    MPLCONFIGDIR=/var/cache/physworld/matplotlib
 RUN groupadd --gid 10001 physworld \
     && useradd --uid 10001 --gid 10001 --home-dir /var/lib/physworld --shell /usr/sbin/nologin physworld \
     && mkdir -p /var/lib/physworld /var/cache/physworld \

@@ -46,7 +46,6 @@ TRAINING = TrainingConfig(
     steps=12,
     batch_size=2,
     look_ahead=2,
-    formats=[],
 )
 EPISODES, FRAMES = 40, 60
 NAME = "bar"
@@ -185,13 +184,13 @@ def test_containers_can_write_to_their_volumes_and_nowhere_else(stack: Stack) ->
 
 
 def test_the_chain_runs_through_the_containers(
-    stack: Stack, client: Client, published: dict[str, str], tmp_path: Path
+    stack: Stack, client: Client, published: dict[str, str], known_keys: Path, tmp_path: Path
 ) -> None:
     folder = tmp_path / "model"
     version = client.models.download(NAME, folder)  # refuses a manifest that is not signed
     assert version.state == "ready"
     assert (folder / SIGNATURE_NAME).exists() and len(client.models.signing_keys()) == 1
-    model = WorldModel.load(folder, sha256=version.sha256)
+    model = WorldModel.load(folder, sha256=version.sha256, known_keys=known_keys)
     path = np.repeat(model.start_controllers[-1:], 12, axis=0)
     path[: len(model.start_controllers)] = model.start_controllers
     here = model.track(model.rollout(path))
