@@ -15,8 +15,7 @@ ENV PYTHONUNBUFFERED=1 \
     PIP_DISABLE_PIP_VERSION_CHECK=1 \
     HOME=/var/lib/physworld \
     PHYSWORLD_DATA_DIR=/var/lib/physworld \
-    WARP_CACHE_PATH=/var/cache/physworld/warp \
-    MPLCONFIGDIR=/var/cache/physworld/matplotlib
+    WARP_CACHE_PATH=/var/cache/physworld/warp
 RUN groupadd --gid 10001 physworld \
     && useradd --uid 10001 --gid 10001 --home-dir /var/lib/physworld --shell /usr/sbin/nologin physworld \
     && mkdir -p /var/lib/physworld /var/cache/physworld \
@@ -42,6 +41,7 @@ FROM base AS worker
 ARG PIP_INDEX_URL=
 ARG PIP_EXTRA_INDEX_URL=
 RUN python requirements.py api sim > requirements.txt && pip install -r requirements.txt -c constraints.txt
+ENV MPLCONFIGDIR=/var/cache/physworld/matplotlib
 COPY schemas/ schemas/
 COPY storage/ storage/
 COPY physworld/ physworld/
@@ -53,6 +53,7 @@ FROM base AS trainer
 ARG PIP_INDEX_URL=
 ARG PIP_EXTRA_INDEX_URL=
 RUN python requirements.py api sim train > requirements.txt && pip install -r requirements.txt -c constraints.txt
+ENV MPLCONFIGDIR=/var/cache/physworld/matplotlib
 COPY schemas/ schemas/
 COPY storage/ storage/
 COPY physworld/ physworld/
@@ -66,6 +67,7 @@ FROM base AS inference
 ARG PIP_INDEX_URL=
 ARG PIP_EXTRA_INDEX_URL=
 RUN python requirements.py api sim train > requirements.txt && pip install -r requirements.txt -c constraints.txt
+ENV MPLCONFIGDIR=/var/cache/physworld/matplotlib
 COPY schemas/ schemas/
 COPY storage/ storage/
 COPY physworld/ physworld/
