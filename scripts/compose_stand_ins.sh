@@ -164,4 +164,6 @@ for secret in $(sed -n 's/^\([A-Z0-9_]*\)=$/\1/p' .env.example); do export "$sec
 COMPOSE=docker-compose
 command -v "$COMPOSE" >/dev/null || COMPOSE="docker compose"
 $COMPOSE --file docker-compose.yml --file "$WORK/network.yml" --project-directory . build
-say "done"
+for image in "$PYTHON" $OURS "$VALKEY" "$POSTGRES" "$STORE"; do
+    say "$image: $(($(docker image inspect --format '{{.Size}}' "$image") / 1000000)) MB"
+done

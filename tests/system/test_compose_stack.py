@@ -13,6 +13,7 @@ import secrets
 import shutil
 import socket
 import subprocess
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -47,7 +48,7 @@ TRAINING = TrainingConfig(
     batch_size=2,
     look_ahead=2,
 )
-EPISODES, FRAMES = 40, 60
+EPISODES, FRAMES = 40, 400  # some minutes of work, so that both kills come in the middle of it
 NAME = "bar"
 
 
@@ -103,7 +104,9 @@ class Stack:
                 state["Health"]["Status"] == "healthy" for state in states.values() if "Health" in state
             )
 
+        began = time.monotonic()
         until(healthy, "the stack is not healthy", HEALTHY_WITHIN_S)
+        print(f"healthy {time.monotonic() - began:.0f} s after compose had started everything")
 
     def client(self, known_keys: Path) -> Client:
         return Client(self.url, self.token, timeout=120.0, known_keys=known_keys)
@@ -221,7 +224,7 @@ def test_a_killed_worker_and_an_emptied_broker_lose_nothing(
     until(at_least(3), "no episodes are committed", JOB_WITHIN_S)
     docker("kill", "--signal", "KILL", stack.containers("worker")[0]["Id"])
     until(at_least(8), "the other worker commits nothing", JOB_WITHIN_S)
-    stack.compose("rm", "--stop", "--force", "broker")
+    docker("rm", "--force", stack.containers("broker")[0]["Id"])
     docker("volume", "rm", f"{stack.project}_broker-data")
     before = committed()
     assert len(before) < EPISODES, "the dataset was complete before the broker was emptied"
