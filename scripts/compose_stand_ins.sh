@@ -35,7 +35,7 @@ WORK=$(mktemp -d)
 WHEELS=${WHEELS:-$WORK/wheels}
 PORT=${PORT:-38091}
 INDEX=
-trap '[ -z "$INDEX" ] || kill "$INDEX"; rm -rf "$WORK"' EXIT
+trap 'kill $INDEX 2>/dev/null || true; rm -rf "$WORK"' EXIT
 mkdir -p "$WHEELS" "$WORK/index" "$WORK/context"
 
 say() { printf 'stand-ins: %s\n' "$*"; }

@@ -42,8 +42,7 @@ FIT = FitConfig(particle_budget=60, max_simulations=2, damping="none", numerics=
 TRAINING = TrainingConfig(
     hidden=16, message_passing_steps=2, history=2, vertices=20, steps=12, batch_size=2, look_ahead=2
 )
-EPISODES, FRAMES = 40, 400  # some minutes of work, so that both kills come in the middle of it
-NAME = "bar"
+EPISODES, FRAMES, NAME = 40, 400, "bar"  # so much work that both kills come in the middle of it
 
 
 class Stack:
