@@ -5,7 +5,7 @@
 #   inference  rollouts, plans and live sessions: warp and torch
 # Dependencies are installed before the source is copied, so that a change of code rebuilds one small layer.
 # Build arguments: PIP_INDEX_URL and PIP_EXTRA_INDEX_URL where packages come from another index (the pinned CPU
-# build of torch lies on its project's own index).
+# build of torch lies on its project's own index). The classic builder forgets them at the end of a stage.
 ARG PYTHON_IMAGE=python:3.11.14-slim-bookworm
 
 FROM ${PYTHON_IMAGE} AS base
@@ -22,14 +22,14 @@ RUN groupadd --gid 10001 physworld \
     && chown 10001:10001 /var/lib/physworld /var/cache/physworld
 WORKDIR /app
 COPY pyproject.toml constraints.txt scripts/requirements.py ./
-ARG PIP_INDEX_URL=
-ARG PIP_EXTRA_INDEX_URL=
 
 FROM base AS api
+ARG PIP_INDEX_URL=
+ARG PIP_EXTRA_INDEX_URL=
 RUN python requirements.py api > requirements.txt && pip install -r requirements.txt -c constraints.txt
 COPY schemas/ schemas/
 COPY storage/ storage/
-COPY physworld/__init__.py physworld/scene.py physworld/
+COPY physworld/ physworld/
 COPY services/__init__.py services/stores.py services/web.py services/
 COPY services/api/ services/api/
 COPY services/dashboard/ services/dashboard/
@@ -38,7 +38,10 @@ EXPOSE 8000
 CMD ["python", "-m", "services.web", "--host", "0.0.0.0", "--port", "8000"]
 
 FROM base AS worker
+ARG PIP_INDEX_URL=
+ARG PIP_EXTRA_INDEX_URL=
 RUN python requirements.py api sim > requirements.txt && pip install -r requirements.txt -c constraints.txt
+ENV MPLCONFIGDIR=/var/cache/physworld/matplotlib
 COPY schemas/ schemas/
 COPY storage/ storage/
 COPY physworld/ physworld/
@@ -47,7 +50,10 @@ USER 10001:10001
 CMD ["python", "-m", "workers"]
 
 FROM base AS trainer
+ARG PIP_INDEX_URL=
+ARG PIP_EXTRA_INDEX_URL=
 RUN python requirements.py api sim train > requirements.txt && pip install -r requirements.txt -c constraints.txt
+ENV MPLCONFIGDIR=/var/cache/physworld/matplotlib
 COPY schemas/ schemas/
 COPY storage/ storage/
 COPY physworld/ physworld/
@@ -58,7 +64,10 @@ USER 10001:10001
 CMD ["python", "-m", "services.trainer"]
 
 FROM base AS inference
+ARG PIP_INDEX_URL=
+ARG PIP_EXTRA_INDEX_URL=
 RUN python requirements.py api sim train > requirements.txt && pip install -r requirements.txt -c constraints.txt
+ENV MPLCONFIGDIR=/var/cache/physworld/matplotlib
 COPY schemas/ schemas/
 COPY storage/ storage/
 COPY physworld/ physworld/

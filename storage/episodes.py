@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 from obstore.exceptions import BaseError
 from pydantic import ValidationError
 from zarr.codecs import BloscCodec
+from zarr.core.buffer import Buffer
 from zarr.storage import LocalStore as ZarrLocalStore
 from zarr.storage import ObjectStore as ZarrObjectStore
 
@@ -76,6 +77,15 @@ class Manifest(Resource):
     schema_version: int = 1
     dataset_id: str
     episodes: list[ManifestEpisode]
+
+
+class _AnyBucket(ZarrObjectStore[Store]):
+    """A bucket of any S3 server: one that ignores ``If-None-Match`` would replace a group's header by an empty one."""
+
+    async def set_if_not_exists(self, key: str, value: Buffer) -> None:
+        """An episode has one writer: nothing comes between the look and the write."""
+        if not await self.exists(key):
+            await self.set(key, value)
 
 
 class EpisodeStore:
@@ -222,7 +232,7 @@ class EpisodeStore:
         folder = self._settings.store_folder
         if folder is not None:
             return ZarrLocalStore(folder / path)
-        return ZarrObjectStore(open_store(self._settings, path))
+        return _AnyBucket(open_store(self._settings, path))
 
     def _remove(self, path: str) -> None:
         for batch in obstore.list(self._store, prefix=path):

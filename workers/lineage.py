@@ -6,9 +6,9 @@ import hashlib
 import json
 import platform
 from collections.abc import Sequence
-from importlib import metadata
 from typing import Any
 
+import physworld
 from schemas.base import Lineage, Reference
 
 
@@ -28,5 +28,5 @@ def lineage_of(
 
 
 def code_version() -> str:
-    """The installed version of this distribution, e.g. ``physworld 0.1.0``."""
-    return f"physworld {metadata.version('physworld')}"
+    """The version of this code, e.g. ``physworld 0.1.0``; the images hold it without installing a distribution."""
+    return f"physworld {physworld.__version__}"

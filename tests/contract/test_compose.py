@@ -155,6 +155,13 @@ def test_commands_exist_in_their_image(services: dict[str, Any], repository: Pat
         assert all((repository / word).exists() for word in sources)
 
 
+def test_the_index_of_packages_reaches_every_stage_that_installs(repository: Path) -> None:
+    for stage in re.split(r"(?m)^FROM ", (repository / "Dockerfile").read_text())[1:]:
+        before, installs, _ = stage.partition("pip install")
+        if installs:  # the classic builder drops an argument at the end of the stage that declares it
+            assert "ARG PIP_INDEX_URL" in before and "ARG PIP_EXTRA_INDEX_URL" in before
+
+
 def test_named_volumes_are_declared(text: str) -> None:
     document = yaml.safe_load(text)
     used = {
@@ -190,6 +197,7 @@ def test_an_image_holds_what_its_process_imports(
             shutil.copy(repository / word, destination)
     program = f"""
 import importlib, sys
+sys.meta_path[:] = [finder for finder in sys.meta_path if "editable" not in repr(finder).lower()]
 sys.modules.update(dict.fromkeys({absent.split()!r}))  # importing one of these fails
 for name in {modules.split()!r}:
     importlib.import_module(name)

@@ -10,8 +10,10 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import obstore
 import pytest
 import zarr
 from hypothesis import HealthCheck, given, settings
@@ -44,6 +46,19 @@ def episodes(store_settings: Settings) -> EpisodeStore:
 @pytest.fixture
 def local(tmp_path: Path) -> EpisodeStore:
     return EpisodeStore(Settings(data_dir=tmp_path))
+
+
+def test_a_bucket_that_writes_whatever_the_condition_keeps_an_episode_whole(
+    episodes: EpisodeStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put = obstore.put_async
+
+    async def unconditional(store: Any, path: str, data: Any, *, mode: str = "overwrite") -> Any:
+        return await put(store, path, data)
+
+    monkeypatch.setattr(obstore, "put_async", unconditional)
+    path, digest = episodes.write(DATASET, 0, 1, episode(), {"seed": 7})
+    assert episodes.read(path, digest)[1] == {"seed": 7}
 
 
 def test_what_was_written_is_read_again(episodes: EpisodeStore) -> None:
