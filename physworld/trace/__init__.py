@@ -5,6 +5,16 @@ from physworld.trace.config import TraceConfig
 from physworld.trace.report import document
 from physworld.trace.result import Named, Number, TraceResult
 from physworld.trace.run import trace
-from physworld.trace.simulations import Memory
+from physworld.trace.simulations import Memory, TimeUp
 
-__all__ = ["Memory", "Named", "Number", "TraceConfig", "TraceResult", "Workers", "document", "trace"]
+__all__ = [
+    "Memory",
+    "Named",
+    "Number",
+    "TimeUp",
+    "TraceConfig",
+    "TraceResult",
+    "Workers",
+    "document",
+    "trace",
+]

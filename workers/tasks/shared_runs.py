@@ -18,7 +18,7 @@ import numpy as np
 
 from physworld.calibrate import Journal
 from physworld.simulations import Drive, Job, engine, tracks_of
-from physworld.trace import Memory
+from physworld.trace import Memory, TimeUp
 from physworld.twin import Twin
 from storage import helpers
 from storage.errors import NotFound
@@ -110,8 +110,13 @@ class SharedRunner:
         keys = [job.fingerprint(drive.digest()) for job in jobs]
         shards = self._put_up(jobs, keys, drive)
         for shard, key in zip(shards, keys, strict=True):
-            while not self._done(shard, shards, poll):
-                time.sleep(LOOK_S)
+            try:
+                while not self._done(shard, shards, poll):
+                    time.sleep(LOOK_S)
+            except TimeUp:  # the trace goes on without them, and so do the workers
+                with self._stores.database.session() as session:
+                    helpers.call_off(session, self._job_id)
+                raise
             known, tracks = self._memory.get(key)
             if not known:
                 raise NotFound("scratch file", f"{key}.npy of {self._job_id}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -14,6 +15,7 @@ from physworld.build import build_twin
 from physworld.scene import Body
 from physworld.trace import Memory
 from physworld.trace import TraceConfig as LibraryConfig
+from physworld.trace.time_limit import Clock
 from physworld.twin import Twin
 from schemas.dataset import DatasetConfig
 from schemas.fit import FitConfig
@@ -151,6 +153,37 @@ def test_a_cancelled_trace_stops_at_its_next_simulation(
     assert _trace(stores, job).state == "failed"
     assert {s.state for s in _shards(stores, job)} == {"CANCELLED"}
     assert stores.scratch.jobs() == []
+
+
+def test_a_trace_whose_time_is_up_calls_off_what_it_has_asked_for(
+    runtime_with: Callable[..., Runtime], stores: Stores, scene_id: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    limited = SMALL.model_copy(update={"time_limit_s": 3600.0})
+    with stores.database.session() as session:
+        job = jobs.create_trace(session, TraceCreate(scene_id=scene_id, fit=FIT, config=limited))
+    (driver,) = _waiting(stores)
+    put_up, clock, asked = helpers.put_up, time.perf_counter, []
+
+    def an_hour_later(*arguments: object) -> list[str]:
+        shards = put_up(*arguments)  # type: ignore[arg-type]
+        asked.append(len(shards))
+        monkeypatch.setattr(time, "perf_counter", lambda: clock() + 3600.0)
+        return shards
+
+    start = Clock.start
+
+    def searching(own: Clock) -> None:
+        start(own)
+        monkeypatch.setattr(helpers, "put_up", an_hour_later)
+
+    monkeypatch.setattr(Clock, "start", searching)
+    assert run_shard(runtime_with(), driver) == "done"
+    assert _job(stores, job).state == "succeeded"
+    found = _trace(stores, job)
+    assert len(asked) == 1 and asked[0] > 1
+    assert found.verdict == "unexplained" and "refit with air_drag_linear" in (found.reason or "")
+    states = [shard.state for shard in _shards(stores, job)]
+    assert states.count("CANCELLED") == asked[0] and set(states) == {"DONE", "CANCELLED"}
 
 
 def test_what_an_ended_job_left_in_the_scratch_is_swept(stores: Stores, scene_id: str) -> None:
