@@ -51,7 +51,8 @@ def test_a_plan_starts_with_the_velocities_that_the_recording_ends_with(task: Pl
 def test_a_planned_motion_brings_the_twin_nearer_to_the_goal(task: PlanningTask) -> None:
     end = task.start_points[-1] + np.array([0.0, 0.02, 0.01])
     goal = GoalPoints(np.array([len(task.start_points) - 1]), end[None])
-    config = MppiConfig(horizon=HORIZON, samples=48, iterations=6)
+    # enough of a search that its seed and the processor's algebra count little
+    config = MppiConfig(horizon=HORIZON, samples=96, iterations=12)
     found = search(task.predict, goal, task.limits, task.dt_s, config, np.random.default_rng(0))
     ending = slice(-config.settling, None)
     executed = goal.distance(task.execute(found.displacements)[ending]).mean()
