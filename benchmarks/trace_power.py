@@ -32,7 +32,7 @@ from physworld.build import build_twin
 from physworld.effects.registry import EFFECTS
 from physworld.errors import PhysworldError
 from physworld.scene import Scene
-from physworld.trace import TraceResult, document, trace
+from physworld.trace import Memory, TraceResult, document, trace
 
 NULLS = 36
 METHOD = tuple(
@@ -81,13 +81,14 @@ def _needs_ground(name: str) -> bool:
     return name in ("ground_friction", "adhesion")
 
 
-def run(task: Task) -> dict[str, Any]:
-    """One line: what was injected, and what the trace said."""
+def run(task: Task, memory: Path | None = None) -> dict[str, Any]:
+    """One line: what was injected, and what the trace said; ``memory`` keeps its simulations."""
     known = OBJECTS[task.object](task.seed)
+    kept = Memory(memory / task.key.replace("/", "_")) if memory is not None else Memory()
     line: dict[str, Any] = asdict(task)
     without = observed(known.truth, known.scene)
     if task.effect is None:
-        return line | traced(known, recorded(known.scene, without, task.seed))
+        return line | traced(known, recorded(known.scene, without, task.seed), kept)
     reason = refusal(task.effect, known)
     if reason is not None:
         return line | {"outcome": "refused", "reason": reason}
@@ -97,17 +98,17 @@ def run(task: Task) -> dict[str, Any]:
     line |= {"strengths": made.strengths, "size": made.size, "unit": made.unit, "clipped": made.clipped}
     line |= {"displacement": made.displacement}
     noise_seed = 1000 + sorted(EFFECTS).index(task.effect)
-    return line | traced(known, recorded(known.scene, made.tracks, noise_seed))
+    return line | traced(known, recorded(known.scene, made.tracks, noise_seed), kept)
 
 
-def traced(known: Object, scene: Scene) -> dict[str, Any]:
+def traced(known: Object, scene: Scene, memory: Memory | None = None) -> dict[str, Any]:
     """What a trace says of a recording, and its seconds."""
     start = build_twin(scene, known.budget)
     true = known.truth.parameters
     start = start.with_parameters(**{n: _OFF * true[n] for n in _STIFFNESS if n in true})
     begun, cpu = time.perf_counter(), time.process_time()
     try:
-        found = trace(scene, known.config(), calibrated_twin=start)
+        found = trace(scene, known.config(), calibrated_twin=start, memory=memory)
     except (PhysworldError, RuntimeError) as failure:
         return {"outcome": "failed", "reason": f"{type(failure).__name__}: {failure}"}
     return _answer(found) | {
@@ -176,6 +177,12 @@ def main() -> int:
     parser.add_argument("--docs", type=Path, default=None, help="Markdown file whose section is replaced")
     parser.add_argument("--resume", type=Path, default=None, help="folder that keeps every trace")
     parser.add_argument(
+        "--memory",
+        type=Path,
+        default=None,
+        help="folder that remembers simulations, for other rules of the trace",
+    )
+    parser.add_argument(
         "--only", nargs="*", default=[], help="objects, effects, 'none' or keys; none given: all"
     )
     parser.add_argument("--nulls", type=int, default=NULLS, help="recordings without an effect")
@@ -191,7 +198,7 @@ def main() -> int:
 
     wp.config.quiet = True
     for task in missing[: given.at_most]:
-        line = {"key": task.key, **run(task), **method}
+        line = {"key": task.key, **run(task, given.memory), **method}
         line = json.loads(json.dumps(line, default=float))
         lines[task.key] = line
         if given.resume is not None:
