@@ -99,6 +99,17 @@ def cases() -> tuple[Case, ...]:
         Case("e36", "calm_slab", 36, {"gravity_tilt": {"degrees": drawn(36, 3.0, 6.0), "axis": [1.0, 0.3, 0.0]}}),
         Case("e37", "beam", 37, {"internal_viscosity": {"eta": drawn(37, 300.0, 800.0)}}),
         Case("e38", "brick", 38, {"linear_drag": {"c": drawn(38, 1.5, 3.0)}}),
+        Case("e39", "rope", 39, {"linear_drag": {"c": drawn(39, 1.0, 2.5)},
+             "gravity_tilt": {"degrees": drawn(390, 2.5, 5.0), "axis": [1.0, 0.4, 0.0]}}),
+        Case("e40", "rope", 40, {"quadratic_drag": {"k": drawn(40, 0.8, 2.5)},
+             "control_lag": {"seconds": drawn(400, 0.02, 0.05)}}),
+        Case("e41", "cloth", 41, {"linear_drag": {"c": drawn(41, 0.8, 2.0)},
+             "gravity_tilt": {"degrees": drawn(410, 2.5, 5.0), "axis": [0.3, 1.0, 0.0]}}),
+        Case("e42", "beam", 42, {"internal_viscosity": {"eta": drawn(42, 300.0, 800.0)},
+             "gravity_tilt": {"degrees": drawn(420, 2.5, 5.0), "axis": [1.0, 0.4, 0.0]}}),
+        Case("e43", "beam", 43, {"linear_drag": {"c": drawn(43, 1.0, 2.5)},
+             "control_lag": {"seconds": drawn(430, 0.02, 0.05)}}),
+        Case("e44", "beam", 44, {"tether": tether, "linear_drag": {"c": drawn(44, 1.0, 2.5)}}),
     )  # fmt: skip
 
 
