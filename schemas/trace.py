@@ -22,7 +22,8 @@ class TraceConfig(Request):
     ``candidates`` are names of the effects' registry, none for all of them. The best ``confirmed`` are refitted with
     the full simulator, in ``iterations`` Gauss-Newton steps; an answer has ``effects_at_most`` effects. After about
     ``time_limit_s`` seconds of one attempt, those of waiting for workers included, searches are left and the answer is
-    made of what there is; none: never.
+    made of what there is; none: never. ``noise_m`` counts as every recording's noise per axis in metres, for a camera
+    that sees more finely than the experiment repeats; none: what scenes declare.
     """
 
     candidates: list[str] = Field(default_factory=list, max_length=64)
@@ -31,6 +32,7 @@ class TraceConfig(Request):
     iterations: int = Field(default=5, ge=1, le=50)
     resamples: int = Field(default=2000, ge=100, le=100_000)
     time_limit_s: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
+    noise_m: float | None = Field(default=None, gt=0.0, le=1.0, allow_inf_nan=False)
     seed: Seed = 0
 
 

@@ -45,6 +45,8 @@ class TraceConfig:
         experiment: of the search for a motion that tells an equivalent set apart; None for no search.
         time_limit_s: after about so long, by the clock, searches that have not ended are left and the answer is made of
             what there is; None: never. What was left is in the result's notes.
+        noise_m: deviation per axis that counts as noise of every recording [m], positive; None: what scenes declare.
+            For a camera that sees more finely than the experiment repeats, or than a twin resolves.
     """
 
     calibration: CalibrationConfig = field(default_factory=_declared)
@@ -69,3 +71,4 @@ class TraceConfig:
     candidates: tuple[str, ...] = ()
     experiment: ExperimentConfig | None = field(default_factory=ExperimentConfig)
     time_limit_s: float | None = None
+    noise_m: float | None = None

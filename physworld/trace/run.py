@@ -34,7 +34,7 @@ from physworld.trace.holds import held_otherwise
 from physworld.trace.intervals import calibrated, named, spread_of
 from physworld.trace.meshes import MESH_STARTS, MESH_STIFFNESS, recorded_as, taken_as
 from physworld.trace.mixtures import Mixtures
-from physworld.trace.noise import noise_sigma
+from physworld.trace.noise import noise_sigma, remarks, taken_with
 from physworld.trace.outcomes import Outcomes
 from physworld.trace.recordings import (
     FITTED,
@@ -120,6 +120,7 @@ def trace(
         Cancelled: ``cancelled`` returned true.
         SceneUnsupported: the scene declares too little for a body; the recordings are of different kinds; or the
             calibrated twin carries a field.
+        ValueError: ``config.noise_m`` is not positive.
     """
     if calibrated_twin is not None and calibrated_twin.properties is not None:
         raise SceneUnsupported(
@@ -128,7 +129,8 @@ def trace(
         )
     config = config or TraceConfig()
     begun = time.perf_counter()
-    scenes = [scene] if isinstance(scene, Scene) else list(scene)
+    both = ([scene] if isinstance(scene, Scene) else scene, held_out)
+    scenes, held_out = (taken_with(many, config.noise_m) for many in both)
     recordings = Recordings(scenes, held_out, config.blocks, config.shortest_block)
     begin = Beginning(config, runner, memory, progress, cancelled)
     simulations, twin, runs = begin.calibrated(recordings, calibrated_twin, journal)
@@ -172,8 +174,7 @@ class _Trace:
         self.recordings, self.lead, self.clock = recordings, recordings.lead.scene, clock
         self.scene, self.split = recordings.scene, recordings.split
         self.config, self.simulations = config, simulations
-        self.frames = self.split.train[1]
-        self.twin = twin
+        self.frames, self.twin = self.split.train[1], twin
         self.faults = "; ".join(known.words for known in faults if known)
         self.notes = [f"left out as faulty sightings: {self.faults}"] if self.faults else []
 
@@ -209,8 +210,7 @@ class _Trace:
             self.twin = refinement_of(declared.fitted.twin, finer)
         if isinstance(self.twin.lattice, TriangleLattice):
             self.notes.append(taken_as(self.twin.lattice.mesh))
-        if sigma is None:
-            self.notes.append("no noise is declared and none can be estimated: no claim")
+        self.notes += remarks(sigma, config.noise_m is not None, numerics)
         if level > 1.0:
             self.notes.append(f"cells {level:.3g} times smaller than asked for: coarser ones change too much")
         solver = orthonormal(np.stack(shifts, axis=1)) if shifts else basis[:, :0]

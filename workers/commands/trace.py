@@ -64,6 +64,13 @@ def _parser() -> argparse.ArgumentParser:
         metavar="MINUTES",
         help="after about so long searches are left and the answer is made of what there is; 0: never",
     )
+    parser.add_argument(
+        "--noise",
+        type=_metres,
+        default=None,
+        metavar="METRES",
+        help="deviation per axis to take for the noise: how well the experiment repeats, say",
+    )
     parser.add_argument("--resume", type=Path, default=None, help="folder that remembers every simulation")
     return parser
 
@@ -79,6 +86,13 @@ def _minutes(text: str) -> float:
     value = float(text)
     if not 0.0 <= value < float("inf"):
         raise argparse.ArgumentTypeError(f"{text} is no number of minutes")
+    return value
+
+
+def _metres(text: str) -> float:
+    value = float(text)
+    if not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is no positive number of metres")
     return value
 
 
@@ -98,14 +112,16 @@ def _trace(given: argparse.Namespace) -> None:
     scenes = [read_scene(path) for path in given.scenes]
     held_out = [read_scene(path) for path in given.held_out]
     scene = scenes[0]
-    config = TraceConfig(time_limit_s=60.0 * given.time_limit or None)
+    config = TraceConfig(time_limit_s=60.0 * given.time_limit or None, noise_m=given.noise)
     if given.particles is not None:
         budget = CalibrationConfig(particle_budget=given.particles, damping="none")
         config = replace(config, calibration=budget)
     memory = journal = None
     if given.resume is not None:
         memory = Memory(given.resume / "simulations")
-        journal = journal_in(given.resume / "calibration.json", scene, f"{config.calibration}")
+        journal = journal_in(
+            given.resume / "calibration.json", scene, f"{config.calibration}{given.noise or ''}"
+        )
     pool = Workers(given.processes) if given.processes > 1 else nullcontext(in_turn)
     with progress_bar(f"trace {scene.name}") as shown, pool as runner:
         result = trace(

@@ -109,6 +109,7 @@ def translate(fit: FitConfig, config: WireConfig, device: str) -> TraceConfig:
         iterations=config.iterations,
         resamples=config.resamples,
         time_limit_s=config.time_limit_s,
+        noise_m=config.noise_m,
         seed=config.seed,
     )
 

@@ -113,8 +113,11 @@ def test_steps_of_a_calibration_belong_to_everything_that_the_scene_declares(
     assert found == [0, 0, 2, 3, 4]
 
 
+@pytest.mark.parametrize("option", ["--time-limit", "--noise"])
 @pytest.mark.parametrize("wrong", ["-1", "nan", "inf", "soon"])
-def test_a_time_limit_is_a_number_of_minutes(wrong: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_time_limit_and_a_noise_are_numbers(
+    option: str, wrong: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit):
-        trace.main([f"--time-limit={wrong}", "--", "scene"])
-    assert "--time-limit" in capsys.readouterr().err
+        trace.main([f"{option}={wrong}", "--", "scene"])
+    assert option in capsys.readouterr().err

@@ -60,6 +60,13 @@ def trace(
             help="After about so long searches are left and the answer is made of what there is (10); 0: never.",
         ),
     ] = None,
+    noise: Annotated[
+        float | None,
+        typer.Option(
+            metavar="METRES",
+            help="Deviation per axis to take for the noise: how well the experiment repeats, say.",
+        ),
+    ] = None,
     resume: Annotated[
         Path | None, typer.Option(help="Folder that remembers every simulation, to go on after a cut.")
     ] = None,
@@ -72,6 +79,7 @@ def trace(
         "--particles": particles,
         "--processes": processes,
         "--time-limit": time_limit,
+        "--noise": noise,
         "--resume": resume,
     }
     options = [text for name, value in given.items() if value is not None for text in (name, str(value))]
