@@ -8,7 +8,7 @@ refit then frees the shape of the best.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -23,6 +23,12 @@ Mirror = Callable[[Shape], Shape]
 _SHAPE_STEP = 0.01  # difference step of a shape, of its range
 _RELAXATIONS_S = (0.02, 0.1, 0.5)
 _DIAGONAL = 0.25 * np.pi
+_KNOWN_BEFOREHAND = {"tilt_x_rad": 0.1, "tilt_y_rad": 0.1}
+"""Deviations of what is known before any recording: who sets up a camera sees a frame that is far off the vertical.
+
+A strong recording overrules them, and where it says a tilt that nobody believes that stays so. A weak one that hardly
+tells a tilt of 3 degrees from one of 13 says the one that is believed.
+"""
 _SHORTEST = 0.05  # length of a tether on its other side over the one at rest
 
 
@@ -54,8 +60,13 @@ class Candidate:
         return self.effect if not self.variant else f"{self.effect} ({self.variant})"
 
     def unknowns(self) -> list[Unknown]:
-        """The gates, in units of their probes."""
-        return [of_strength(self.effect, gate) for gate in self.gates]
+        """The gates, in units of their probes; with what is known of them beforehand."""
+        return [
+            replace(of_strength(self.effect, gate), prior=(0.0, _KNOWN_BEFOREHAND[gate.name] / gate.probe))
+            if gate.name in _KNOWN_BEFOREHAND
+            else of_strength(self.effect, gate)
+            for gate in self.gates
+        ]
 
     def shape_unknowns(self) -> list[Unknown]:
         """The shapes that a refit frees, from where the variant has them."""

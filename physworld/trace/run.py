@@ -230,7 +230,7 @@ class _Trace:
         models = [model for step in path for model in step.tried]
         facts = (solver, block_of_row, lambda model: by_chance(model, path[0].scores))
         real = claimable(declared, models, config, *facts)
-        second = SecondResolution(*setting, finer)
+        second = SecondResolution(*setting, finer, numerics.get("finer cells", 0.0))
         mixed = None
         with self.clock.until(CONFIRMATION):
             finer_values, agreement = second.check(declared, real)

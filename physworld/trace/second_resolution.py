@@ -1,5 +1,8 @@
 """The winner on finer cells: its effect has to help there too, and to do the same.
 
+Where finer cells change the twin by more than the effect explains, coarse ones are no judge of which effect it is: what
+is no better than a part of their error may go to any name. Then its rivals are asked there too.
+
 Sensitivities hardly change with the cells, so those of the coarser ones serve the refit: a few fine simulations do.
 """
 
@@ -21,7 +24,7 @@ from physworld.trace.score import orthonormal, project
 from physworld.trace.sensitivity import refinement_of
 from physworld.trace.simulations import Simulations
 from physworld.trace.unknowns import with_strengths
-from physworld.trace.verdict import accounts, simplest_first
+from physworld.trace.verdict import accounts, as_good, simplest_first
 from physworld.trace.whitening import Whitener
 from physworld.twin import Twin
 
@@ -33,7 +36,12 @@ _FINER_STEPS = 3  # of the refit on finer cells
 
 @dataclass(frozen=True)
 class SecondResolution:
-    """The check of one trace: as :class:`physworld.trace.selection.Selection`, and the twin on finer cells."""
+    """The check of one trace: as :class:`physworld.trace.selection.Selection`, and the twin on finer cells.
+
+    Attributes:
+        finer: the declared physics there.
+        cells: by how many times the noise these cells change it, beside what re-tuning can do.
+    """
 
     simulations: Simulations
     white: Whitener
@@ -41,6 +49,7 @@ class SecondResolution:
     frames: int
     config: TraceConfig
     finer: Twin
+    cells: float = 0.0
 
     def check(self, declared: Model, real: list[Model]) -> tuple[Values, dict[tuple[str, ...], bool]]:
         """Values of the best of the models that may be claimed, on the finer cells, and whether they agree.
@@ -57,42 +66,66 @@ class SecondResolution:
             if not accounts(model, declared, self.config):
                 break
             with self.simulations.time_permitting("second resolution"):
-                agreement[model.names] = self._agrees(declared, model, values)
+                agreement[model.names] = self._agrees(
+                    declared, model, self._rivals(declared, model, real), values
+                )
             if agreement.get(model.names, True) or declared.fitted.misfit <= self.config.acceptable:
                 break
         return values, agreement
 
-    def _agrees(self, declared: Model, model: Model, values: Values) -> bool:
-        """Whether a model does the same on the finer cells; its numbers there go into ``values``."""
-        twin = refinement_of(model.fitted.twin, self.finer)
-        found = refit(
-            self.simulations, self.white, twin, model.fitted.unknowns, self.frames, _FINER_STEPS,
-            jacobian=model.fitted.jacobian,
-        )  # fmt: skip
+    def _rivals(self, declared: Model, model: Model, real: list[Model]) -> list[Model]:
+        """Other effects that may be claimed, if the cells change more than this one explains."""
+        explained = np.sqrt(max(declared.fitted.misfit**2 - model.fitted.misfit**2, 0.0))
+        others = [m for m in real if len(m.members) <= len(model.members) and m.names != model.names]
+        return sorted(others, key=lambda m: m.validated.mean) if self.cells > explained else []
+
+    def _agrees(self, declared: Model, model: Model, rivals: list[Model], values: Values) -> bool:
+        """Whether a model does the same on the finer cells, and none of the rivals is better there.
+
+        Its numbers there go into ``values``.
+        """
+        found = self._there(model)
         if found is None:
             return False
         values[model.names] = {unknown.name: found.value(unknown.name) for unknown in found.unknowns}
         config = self.config
         known = spread_of(model.fitted, self.block_of_row, {}, config.bootstraps, config.seed).numbers()
-        return self._still_helps(declared, found) and all(
-            self.does_the_same(model.fitted, found, member)
-            or _within(model.fitted, values[model.names], known, member)
-            for member in model.members
+        plain = self._there(declared)
+        return (
+            plain is not None
+            and self._still_helps(plain, found)
+            and all(
+                self.does_the_same(model.fitted, found, member)
+                or _within(model.fitted, values[model.names], known, member)
+                for member in model.members
+            )
+            and not any(self._better(rival, model, found, plain) for rival in rivals)
         )
+
+    def _there(self, model: Model) -> Refit | None:
+        """A model refitted on the finer cells; None if it cannot be simulated there."""
+        return refit(
+            self.simulations, self.white, refinement_of(model.fitted.twin, self.finer), model.fitted.unknowns,
+            self.frames, _FINER_STEPS, jacobian=model.fitted.jacobian,
+        )  # fmt: skip
+
+    def _better(self, rival: Model, model: Model, fine: Refit, plain: Refit) -> bool:
+        """Whether a rival predicts left-out blocks better on the finer cells, and the model not as well."""
+        found = self._there(rival)
+        if found is None:
+            return False
+        other, own, declared = (
+            Model(members, fitted, cross_validated(fitted, self.block_of_row))
+            for members, fitted in ((rival.members, found), (model.members, fine), ((), plain))
+        )
+        return other.validated.mean < own.validated.mean and not as_good(own, other, declared)
 
     def holds_beside(self, single: Model, pair: Model, values: Values) -> bool:
         """Whether a pair predicts better than the single effect on finer cells too, by the same strengths.
 
         Its numbers there go into ``values``.
         """
-        fine = [
-            refit(
-                self.simulations, self.white, refinement_of(model.fitted.twin, self.finer), model.fitted.unknowns,
-                self.frames, _FINER_STEPS, jacobian=model.fitted.jacobian,
-            )
-            for model in (single, pair)
-        ]  # fmt: skip
-        alone, both = fine
+        alone, both = self._there(single), self._there(pair)
         if alone is None or both is None:
             return False
         values[pair.names] = {unknown.name: both.value(unknown.name) for unknown in both.unknowns}
@@ -103,15 +136,8 @@ class SecondResolution:
             for name in gates
         )
 
-    def _still_helps(self, declared: Model, fine: Refit) -> bool:
-        """Whether the effect predicts better on finer cells too, beside the declared physics refitted there."""
-        twin = refinement_of(declared.fitted.twin, self.finer)
-        plain = refit(
-            self.simulations, self.white, twin, declared.fitted.unknowns, self.frames, _FINER_STEPS,
-            jacobian=declared.fitted.jacobian,
-        )  # fmt: skip
-        if plain is None:
-            return False
+    def _still_helps(self, plain: Refit, fine: Refit) -> bool:
+        """Whether the effect predicts better on finer cells too than the declared physics there."""
         before, after = (cross_validated(fitted, self.block_of_row) for fitted in (plain, fine))
         share = 1.0 - after.mean / before.mean
         return better_beyond_chance(after, before) and share >= self.config.material_share

@@ -79,3 +79,14 @@ def test_a_wind_is_taken_apart_into_a_drag_and_a_tilt_of_gravity() -> None:
     tilt = parts.fitted.value("gravity_tilt.tilt_x_rad")
     assert np.cross([np.sin(tilt), 0.0, 0.0], blown.plain.gravity_m_s2)[1] == pytest.approx(0.6, rel=0.1)
     assert in_parts(blown.confirmation, base, whole, candidates(blown.plain, ("air_drag_linear",))[0]) is None
+
+
+def test_a_tilt_is_known_to_be_small_and_a_strong_recording_overrules_that() -> None:
+    bar = Bar(effect("gravity_tilt", tilt_x_rad=0.05, tilt_y_rad=0.3))
+    found = bar.confirmation.further(bar.model("gravity_tilt", TRUE_PA, tilt_x_rad=0.01, tilt_y_rad=0.01))
+    tilts = {u.name: u for u in found.fitted.unknowns if u.prior is not None}
+    assert set(tilts) == {"gravity_tilt.tilt_x_rad", "gravity_tilt.tilt_y_rad"}
+    for unknown in tilts.values():
+        assert unknown.prior is not None and unknown.value(unknown.prior[1]) == pytest.approx(0.1)
+    assert found.fitted.value("gravity_tilt.tilt_y_rad") == pytest.approx(0.3, rel=0.06)
+    assert found.fitted.misfit < 1.05

@@ -58,3 +58,23 @@ def test_an_effect_without_a_run_to_compare_with_does_not(bar: Bar) -> None:
         assert not known.does_the_same(coarse.fitted, fine, coarse.members[0])
     finally:
         known.simulations.least_step_s = 0.0
+
+
+@pytest.mark.parametrize(("cells", "agrees"), [(0.0, True), (100.0, False)])
+def test_where_cells_change_more_than_an_effect_explains_its_rivals_are_asked_too(
+    bar: Bar, cells: float, agrees: bool
+) -> None:
+    """Coarse cells say viscosity, finer ones drag, and drag it is."""
+    right = drag(bar, DRAG_PER_S)
+    there = bar.confirmation.further(bar.model("viscosity_kelvin_voigt", TRUE_PA, viscosity_pa_s=20.0))
+    assert there.validated.mean > 1.2 * right.validated.mean
+    wrong = replace(
+        there,
+        fitted=replace(there.fitted, residual=0.99 * right.fitted.residual),
+        validated=replace(right.validated, errors=0.99 * right.validated.errors),
+    )
+    asked = replace(second(bar), cells=cells)
+    _, agreement = asked.check(bar.declared(TRUE_PA), [wrong, right])
+    assert agreement[wrong.names] == agrees
+    if not agrees:  # and the next best one is asked
+        assert agreement[right.names]
