@@ -26,6 +26,7 @@ _LEADING = 2  # models that are refitted from elsewhere
 _NEAR = 3.0  # times what the best leaves above the noise
 _FAR = 3.0  # misfit over the noise from which on sensitivities are asked again after an effect was added
 _CLEARLY = 1.02  # misfit over the best one's from which a model that does the same is worth another search
+_ANOTHER_VALLEY = 0.25  # logarithm of the stiffness from which on another search is worth it
 
 
 @dataclass(frozen=True)
@@ -228,16 +229,24 @@ class Selection:
         return found
 
     def _beside_the_best(self, confirmation: Confirmation, tried: list[Model]) -> list[Model]:
-        """Models of one strength; those clearly worse than one near the noise are refitted from where that fits."""
-        best = min(tried, key=lambda m: m.fitted.misfit, default=None)
-        if best is None or best.fitted.misfit > self.config.acceptable:
+        """Models of one strength; those clearly worse than one near the noise are refitted from where that fits.
+
+        Likewise from every complete model in another valley: the best need not be the one that is believed in the end.
+        """
+        ordered = sorted(tried, key=lambda m: m.fitted.misfit)
+        if not ordered or ordered[0].fitted.misfit > self.config.acceptable:
             return tried
-        return [
-            confirmation.beside(m, best)
-            if len(m.members[-1].gates) == 1 and m.fitted.misfit > _CLEARLY * best.fitted.misfit
-            else m
-            for m in tried
-        ]
+        for place in _one_a_valley([ordered[0], *(m for m in ordered[1:] if self._complete(m))]):
+            tried = [
+                confirmation.beside(m, place)
+                if len(m.members[-1].gates) == 1 and m.fitted.misfit > _CLEARLY * place.fitted.misfit
+                else m
+                for m in tried
+            ]
+        return tried
+
+    def _complete(self, model: Model) -> bool:
+        return model.fitted.misfit <= self.config.near_floor
 
     def scored(self, base: Model, usable: list[Response]) -> Scores:
         """Scores of the candidates against what a model leaves."""
@@ -249,6 +258,15 @@ class Selection:
             base.fitted.residual, base.fitted.free_jacobian, rest, fakes, self.block_of_row,
             config.family_wise_level, config.resamples, config.seed,
         )  # fmt: skip
+
+
+def _one_a_valley(models: list[Model]) -> list[Model]:
+    """Models, of those with nearly the same stiffness the first."""
+    found: list[Model] = []
+    for model in models:
+        if all(abs(model.fitted.theta[0] - known.fitted.theta[0]) > _ANOTHER_VALLEY for known in found):
+            found.append(model)
+    return found
 
 
 def _strengths(model: Model) -> np.ndarray:

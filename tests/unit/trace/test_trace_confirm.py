@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from modelled_bar import Bar
@@ -12,6 +14,9 @@ from physworld.effects.places import middle_of_free_end
 from physworld.effects.registry import effect
 from physworld.trace.candidates import candidates
 from physworld.trace.compound import in_parts
+from physworld.trace.config import TraceConfig
+from physworld.trace.confirm import Confirmation, Model
+from physworld.trace.selection import Selection
 
 VISCOSITY_PA_S, FAR_PA, STIFF_N_M = 120.0, 1.2e5, 3.0
 
@@ -38,6 +43,28 @@ def test_a_rival_that_fits_nowhere_near_the_best_model_is_left_as_it_is(bar: Bar
     runs = bar.simulations.count
     assert bar.confirmation.beside(good, elsewhere) is good
     assert bar.simulations.count == runs + 8  # a look at eight strengths, and no search
+
+
+def test_a_rival_is_searched_in_every_valley_where_a_model_is_complete(
+    bar: Bar, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The best may be what is not believed in the end, at a stiffness where no other effect fits."""
+    right = bar.model("viscosity_kelvin_voigt", TRUE_PA, viscosity_pa_s=VISCOSITY_PA_S)
+    near = bar.model("viscosity_kelvin_voigt", 1.01 * TRUE_PA, viscosity_pa_s=VISCOSITY_PA_S)
+    away = bar.model("gravity_tilt", 20 * TRUE_PA, tilt_x_rad=0.0, tilt_y_rad=0.0)
+    best = replace(away, fitted=replace(away.fitted, residual=0.95 * right.fitted.residual))
+    lost = bar.model("air_drag_linear", FAR_PA, rate_per_s=8.0)
+    selection = Selection(bar.simulations, bar.white, bar.blocks, bar.frames, TraceConfig())
+    assert right.fitted.misfit < near.fitted.misfit <= TraceConfig().near_floor < lost.fitted.misfit
+    asked: list[Model] = []
+
+    def watched(confirmation: Confirmation, model: Model, place: Model) -> Model:
+        asked.extend([place] if model is lost else [])
+        return model
+
+    monkeypatch.setattr(Confirmation, "beside", watched)
+    assert selection._beside_the_best(bar.confirmation, [best, right, near, lost])[-1] is lost
+    assert [id(place) for place in asked] == [id(best), id(right)]
 
 
 def test_a_tether_is_also_searched_on_the_other_side() -> None:
