@@ -42,7 +42,9 @@ class Mixtures:
             values, agreement: of the check at the second resolution; what is found here goes into them.
         """
         member = single.members[-1]
-        below = single.validated.mean <= 1.0  # of left-out blocks nothing is left to tell two effects from one
+        below = (
+            single.validated.mean <= 1.0
+        )  # of left-out blocks nothing is left to tell two effects from one
         if (
             below
             or len(single.members) > 1

@@ -112,7 +112,7 @@ class SecondResolution:
     def _better(self, rival: Model, model: Model, fine: Refit, plain: Refit) -> bool:
         """Whether a rival predicts left-out blocks better on the finer cells, and the model not as well."""
         found = self._there(rival)
-        if found is None:
+        if found is None or found.misfit > fine.misfit:
             return False
         other, own, declared = (
             Model(members, fitted, cross_validated(fitted, self.block_of_row))
@@ -137,10 +137,18 @@ class SecondResolution:
         )
 
     def _still_helps(self, plain: Refit, fine: Refit) -> bool:
-        """Whether the effect predicts better on finer cells too than the declared physics there."""
+        """Whether the effect fits and predicts better on finer cells too than the declared physics there.
+
+        Errors on left-out blocks are to first order, and where a few steps with the sensitivities of other cells lead
+        nowhere they are not those of any twin.
+        """
         before, after = (cross_validated(fitted, self.block_of_row) for fitted in (plain, fine))
         share = 1.0 - after.mean / before.mean
-        return better_beyond_chance(after, before) and share >= self.config.material_share
+        return (
+            fine.misfit < plain.misfit
+            and better_beyond_chance(after, before)
+            and share >= self.config.material_share
+        )
 
     def does_the_same(self, coarse: Refit, fine: Refit, member: Candidate) -> bool:
         """Whether an effect does the same to the prediction at both resolutions, whatever its numbers.
