@@ -51,8 +51,8 @@ def remarks(sigma: float | None, asked: bool, numerics: Mapping[str, float]) -> 
     return [
         *found,
         f"finer cells change the twin by {1e3 * cells * sigma:.3g} mm, {cells:.3g} times the noise of "
-        f"{1e3 * sigma:.3g} mm: hardly anything so fine can be named. How well the experiment repeats, given as the "
-        "noise, asks what can be named at that accuracy",
+        f"{1e3 * sigma:.3g} mm: little that is finer than that can be named. How well the experiment repeats, given as "
+        "the noise, asks what can be named at that accuracy",
     ]
 
 
