@@ -287,10 +287,11 @@ def indistinguishable(model: Model, best: Model, basis: np.ndarray, declared: Mo
     """Whether another model that is no less simple does as well, and by explaining the same.
 
     As well: within one standard error, or within half of what the better one leaves above the noise, which may as well
-    lie between the two as elsewhere. A wind does all that a drag and a tilt do, with a number more.
+    lie between the two as elsewhere. A wind does all that a drag and a tilt do, with a number more: it is they as well
+    unless it predicts better beyond chance.
     """
     if other_names(model, best):
-        return is_in_parts(best) or as_good(model, best, declared)
+        return is_in_parts(best) or as_good(model, best, declared) or not beats(best, model)
     if len(model.members) != len(best.members) or len(model.fitted.unknowns) > len(best.fitted.unknowns):
         return False
     same = alikeness(explained_direction(model, declared, basis), explained_direction(best, declared, basis))

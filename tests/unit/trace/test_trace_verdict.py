@@ -153,6 +153,16 @@ def test_a_wind_may_as_well_be_a_drag_where_gravity_is_tilted() -> None:
     assert answer([looser, parts], before)[0] == "equivalent_set"
     upwards = model(1.1 * NOISE + OTHER, "air_drag_linear", "gravity_tilt", unknowns=3)
     assert answer([wind, upwards], before) == ("named", ("wind",))
+    steady, uneven = (
+        np.full(ROWS, 1.15),
+        np.where(BLOCK_OF_ROW % 2, 1.45, 0.85),
+    )  # squared errors over the wind's
+    for worse, verdict in (
+        (steady, "named"),
+        (uneven, "equivalent_set"),
+    ):  # the same mean, beyond chance or not
+        looser = model(np.sqrt(worse) * NOISE, "air_drag_linear", "gravity_tilt", unknowns=3)
+        assert answer([wind, looser], before) == (verdict, ("wind",))
     drag = model(NOISE, "air_drag_linear")
     assert answer([wind, parts, drag], before) == ("named", ("air_drag_linear",))
 
