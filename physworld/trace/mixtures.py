@@ -42,14 +42,9 @@ class Mixtures:
             values, agreement: of the check at the second resolution; what is found here goes into them.
         """
         member = single.members[-1]
-        below = (
-            single.validated.mean <= 1.0
-        )  # of left-out blocks nothing is left to tell two effects from one
-        if (
-            below
-            or len(single.members) > 1
-            or not _simple(member.kind, len(member.gates), len(member.shapes))
-        ):
+        if single.validated.mean <= 1.0:  # of left-out blocks nothing is left to tell two effects from one
+            return None
+        if len(single.members) > 1 or not _simple(member.kind, len(member.gates), len(member.shapes)):
             return None
         simulations, config = self.selection.simulations, self.selection.config
         partners = [
