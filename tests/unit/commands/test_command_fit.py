@@ -100,7 +100,7 @@ def test_a_given_law_is_used_and_an_unknown_one_refused(
 
 
 @pytest.mark.parametrize(
-    ("content", "word"), [(None, "FileNotFoundError"), (b"nothing that we read", "SceneInvalid")]
+    ("content", "word"), [(None, "{path}: No such file"), (b"nothing that we read", "SceneInvalid")]
 )
 def test_what_cannot_be_read_is_one_line_and_exit_code_2(
     tmp_path: Path, content: bytes | None, word: str, capsys: pytest.CaptureFixture[str]
@@ -110,7 +110,7 @@ def test_what_cannot_be_read_is_one_line_and_exit_code_2(
         path.write_bytes(content)
     assert fit.main([str(path), "--json", str(tmp_path / "fit.json")]) == 2
     lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1 and lines[0].startswith(f"error: {word}")
+    assert len(lines) == 1 and lines[0].startswith(f"error: {word.format(path=path)}")
     assert not (tmp_path / "fit.json").exists()
 
 
