@@ -16,6 +16,7 @@ from physworld.trace.result import Step
 from physworld.trace.score import Score, Scores, orthonormal, project, scores
 from physworld.trace.sensitivity import Response, candidate_responses, decoys
 from physworld.trace.simulations import Simulations
+from physworld.trace.tethers import with_tethers
 from physworld.trace.valleys import with_valleys
 from physworld.trace.verdict import as_good, helps, simplest
 from physworld.trace.whitening import Whitener
@@ -105,6 +106,8 @@ class Selection:
         return (
             ("refit from other valleys",
              lambda tried: with_valleys(confirmation, base, ranked, columns, tried, floor)),
+            ("refit of tethers",
+             lambda tried: with_tethers(confirmation, base, ranked, columns, usable, tried, floor)),
             ("refit of mirror images", lambda tried: self._mirrored(confirmation, base, tried)),
             ("refit from elsewhere", lambda tried: self._again(confirmation, base, tried, ranked)),
             ("refit of the grips", lambda tried: self._held_otherwise(confirmation, tried)),
