@@ -25,6 +25,7 @@ Search = Callable[[list[Model]], list[Model]]
 _OUTDONE = 0.5  # share of what a complete model's effect explains that a rival must explain to be refitted
 _LEADING = 2  # models that are refitted from elsewhere
 _NEAR = 3.0  # times what the best leaves above the noise
+_NEARLY_ALL = 0.1  # share of what there is to explain that such a model may leave
 _FAR = 3.0  # misfit over the noise from which on sensitivities are asked again after an effect was added
 _CLEARLY = 1.02  # misfit over the best one's from which a model that does the same is worth another search
 _ANOTHER_VALLEY = 0.25  # logarithm of the stiffness from which on another search is worth it
@@ -195,11 +196,16 @@ class Selection:
         return [model for model in found if model is not None]
 
     def _as_plates(self, base: Model, tried: list[Model]) -> list[Model]:
-        """Models of sheets, those that are near the best without numbers of their own for bending where that does."""
+        """Models of sheets without numbers of their own for bending where that does as well.
+
+        Those that are near the best, and those that explain nearly all: with such numbers an effect that does not act
+        may come nearer to the noise than the one that does.
+        """
         least = min((model.explained for model in tried), default=0.0)
+        worth = max(_NEAR * least, _NEARLY_ALL * base.explained)
         found = []
         for model in tried:
-            if model.explained <= _NEAR * least:
+            if model.explained <= worth:
                 fitted = as_a_plate(
                     model.fitted, self.simulations, self.white, self.frames, self.config.iterations
                 )

@@ -67,6 +67,26 @@ def test_a_rival_is_searched_in_every_valley_where_a_model_is_complete(
     assert [id(place) for place in asked] == [id(best), id(right)]
 
 
+def test_plates_are_asked_of_all_that_explain_nearly_everything(
+    bar: Bar, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A drag at 1.41 of the noise lost to a Maxwell branch at 1.13 that was a plate; as one it reaches 1.13 too."""
+    known = bar.declared(TRUE_PA)
+
+    def leaving(misfit: float) -> Model:
+        same = np.full_like(known.fitted.residual, misfit)
+        return replace(known, fitted=replace(known.fitted, residual=same))
+
+    base, best, near, far = leaving(6.4), leaving(1.13), leaving(1.41), leaving(2.7)
+    asked: list[float] = []
+    monkeypatch.setattr(
+        "physworld.trace.selection.as_a_plate", lambda fitted, *rest: asked.append(fitted.misfit)
+    )
+    selection = Selection(bar.simulations, bar.white, bar.blocks, bar.frames, TraceConfig())
+    assert selection._as_plates(base, [best, near, far]) == [best, near, far]
+    assert asked == pytest.approx([1.13, 1.41])
+
+
 def test_a_tether_is_also_searched_on_the_other_side() -> None:
     rest, pulled = 0.1, 0.02
     attach = middle_of_free_end(build_twin(sagging(), BUDGET))
