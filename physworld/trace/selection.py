@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from physworld.trace.comparison import alikeness, cross_validated
 from physworld.trace.compound import WHOLE, in_parts, is_in_parts
 from physworld.trace.config import TraceConfig
-from physworld.trace.confirm import Confirmation, Model, best_variants
+from physworld.trace.confirm import Confirmation, Model, best_variants, explained_direction
 from physworld.trace.plates import as_a_plate
 from physworld.trace.result import Step
 from physworld.trace.score import Score, Scores, orthonormal, project, scores
@@ -58,6 +58,9 @@ class Selection:
             for stage, search in self._searches(confirmation, base, ranked, columns, usable)[bool(number) :]:
                 with self.simulations.time_permitting(stage):
                     tried = search(tried)
+            if number == 1:
+                with self.simulations.time_permitting("refit of pairs with another first effect"):
+                    tried = self._exchanged(confirmation, declared, base, path[0].tried, tried)
             good = [m for m in tried if helps(m, base, config)]
             kept = simplest(good, base) if good else None
             path.append(Step(base, ranked, tuple(tried), kept))
@@ -256,6 +259,38 @@ class Selection:
 
     def _complete(self, model: Model) -> bool:
         return model.fitted.misfit <= self.config.near_floor
+
+    def _exchanged(
+        self,
+        confirmation: Confirmation,
+        declared: Model,
+        single: Model,
+        singles: Sequence[Model],
+        tried: list[Model],
+    ) -> list[Model]:
+        """Pairs; where the best is not complete, with others in the place of its first effect that do the same as it.
+
+        Alone a linear and a quadratic drag do about as well, and which one is nearer depends on what else acts. So what
+        was taken first may be the wrong one, and only the pair shows it.
+        """
+        best = min(tried, key=lambda m: m.fitted.misfit, default=None)
+        if best is None or len(best.members) != 2 or self._complete(best):
+            return tried
+        second = best.members[-1]
+        basis = orthonormal(declared.fitted.free_jacobian)
+        does = explained_direction(single, declared, basis)
+        found = []
+        for other in singles:
+            if len(other.members) > 1 or other.names[0] in best.names:
+                continue
+            members = (*other.members, second)
+            like = alikeness(explained_direction(other, declared, basis), does) > self.config.alike
+            if like and not any(member.shapes for member in members):
+                strengths = [other.fitted.value(gate.name) for gate in members[0].unknowns()]
+                strengths += [best.fitted.value(gate.name) for gate in second.unknowns()]
+                pair = confirmation.together(declared, members, strengths, best)
+                found += [pair] if pair is not None else []
+        return [*tried, *found]
 
     def scored(self, base: Model, usable: list[Response]) -> Scores:
         """Scores of the candidates against what a model leaves."""

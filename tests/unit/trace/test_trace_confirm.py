@@ -67,6 +67,40 @@ def test_a_rival_is_searched_in_every_valley_where_a_model_is_complete(
     assert [id(place) for place in asked] == [id(best), id(right)]
 
 
+def test_the_first_of_two_effects_is_exchanged_for_its_like(
+    bar: Bar, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A linear drag may be nearer alone where a quadratic one and something else act."""
+    declared = bar.declared(TRUE_PA)
+    linear = bar.model("air_drag_linear", TRUE_PA, rate_per_s=2.0)
+    viscous = bar.model("viscosity_kelvin_voigt", TRUE_PA, viscosity_pa_s=VISCOSITY_PA_S)
+    tilt = bar.model("gravity_tilt", TRUE_PA, tilt_x_rad=0.0, tilt_y_rad=0.05)
+    lag = bar.model("actuation_lag", TRUE_PA, lag_s=0.02)
+    gate = lag.fitted.unknowns[-1]
+    both = replace(linear.fitted, unknowns=[*linear.fitted.unknowns, gate])
+    both = replace(both, theta=np.append(linear.fitted.theta, gate.start))
+    pair = replace(linear, members=(*linear.members, *lag.members), fitted=both)
+    selection = Selection(bar.simulations, bar.white, bar.blocks, bar.frames, TraceConfig())
+    asked: list[tuple[tuple[str, ...], list[float]]] = []
+
+    def together(self: Confirmation, base: Model, members: tuple, strengths: list, other: Model) -> Model:
+        assert base is declared and other is pair
+        asked.append((tuple(member.effect for member in members), strengths))
+        return replace(pair, members=members)
+
+    monkeypatch.setattr(Confirmation, "together", together)
+    singles, given = [linear, viscous, tilt, lag], (bar.confirmation, declared, linear)
+    assert pair.fitted.misfit > TraceConfig().near_floor
+    found = selection._exchanged(*given, singles, [pair])
+    assert [model.names for model in found] == [
+        ("air_drag_linear", "actuation_lag"), ("viscosity_kelvin_voigt", "actuation_lag")
+    ]  # fmt: skip
+    assert asked == [(found[1].names, pytest.approx([VISCOSITY_PA_S, 0.02]))]
+    complete = replace(pair, fitted=replace(both, residual=np.ones_like(both.residual)))
+    assert selection._exchanged(*given, singles, [complete]) == [complete]
+    assert selection._exchanged(*given, singles, []) == []
+
+
 def test_plates_are_asked_of_all_that_explain_nearly_everything(
     bar: Bar, monkeypatch: pytest.MonkeyPatch
 ) -> None:
