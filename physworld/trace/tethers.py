@@ -74,7 +74,7 @@ def with_tethers(
         tried: models with one effect more.
         complete: misfit over the noise up to which nothing is left to explain.
     """
-    if TETHER in base.names or any(model.fitted.misfit <= complete for model in tried):
+    if TETHER in base.names or any(model.fitted.misfit <= complete for model in (base, *tried)):
         return tried
     others = [model for model in tried if model.names[-1] != TETHER]
     known = [model for model in tried if model.names[-1] == TETHER]

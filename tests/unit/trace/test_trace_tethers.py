@@ -96,6 +96,8 @@ def test_none_is_looked_for_where_a_model_is_complete_or_a_tether_is_in_it(tied:
     ranked, runs = _ranked(tied, base, usable), tied.simulations.count
     tried = [base]
     assert with_tethers(tied.confirmation, base, ranked, {}, usable, tried, 1e9) is tried
+    nothing: list[Model] = []
+    assert with_tethers(tied.confirmation, base, ranked, {}, usable, nothing, 1e9) is nothing
     other = tied.model("tether", TRUE_PA, stiffness_n_m=STIFFNESS_N_M)
     assert with_tethers(tied.confirmation, other, ranked, {}, usable, tried, COMPLETE) is tried
     assert tied.simulations.count <= runs + 3  # of the model made here
