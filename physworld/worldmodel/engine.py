@@ -133,7 +133,7 @@ class RolloutEngine:
         return edges | {
             "gapped": self._fixed["gapped"].copy(),
             "found": np.zeros(self.objects, dtype=np.int32),
-            "reach": np.zeros(nearest, dtype=np.float32),
+            "search_room": np.zeros(nearest + 3 * self.objects, dtype=np.float32),
         }
 
     def _launch(self, path: np.ndarray, phi: np.ndarray, soft: np.ndarray, logs: np.ndarray) -> None:

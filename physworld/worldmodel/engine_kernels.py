@@ -35,7 +35,7 @@ ARRAYS = (
     "update_in", "update_in_bias", "update_out", "update_out_bias",
     "decode_in", "decode_in_bias", "decode_out", "decode_out_bias", "skip",
     "features", "places", "state", "hear", "say", "placed", "heard", "sent", "sums", "inner", "correction",
-    "length", "regressors", "ahead", "logs", "found", "reach", *CHAIN_ARRAYS,
+    "length", "regressors", "ahead", "logs", "found", "search_room", *CHAIN_ARRAYS,
 )  # fmt: skip
 INTEGER_ARRAYS = frozenset({"offsets", "edge_sender", "edge_receiver", "gapped", "found"})
 
@@ -214,7 +214,7 @@ _ROLLOUT = (
             }
             if (nearest) {  // NEAR edges of the places now: those of vertex i lie from edges + i nearest on
                 gapped[0] = 0;
-                find_nearest(now, N, nearest, radius, edge_sender + edges, found, reach);
+                find_nearest(now, N, nearest, radius, edge_sender + edges, found, search_room);
                 for (int i = 0; i < N; ++i)
                     for (int e = edges + i * nearest; e < edges + i * nearest + found[i]; ++e) {
                         const float *x = now + 3 * i, *y = now + 3 * edge_sender[e];

@@ -40,8 +40,8 @@ def find_nearest(places: np.ndarray, most: int, radius_m: float) -> tuple[np.nda
     single = np.ascontiguousarray(places, dtype=np.float32)
     senders = np.full((batch, n, most), -1, dtype=np.int32)
     counts = np.zeros((batch, n), dtype=np.int32)
-    reach = np.zeros(most, dtype=np.float32)
-    addresses = [array.ctypes.data for array in (single, senders, counts, reach)]
+    room = np.zeros(most + 3 * n, dtype=np.float32)
+    addresses = [array.ctypes.data for array in (single, senders, counts, room)]
     inputs = [batch, n, most, float(np.float32(radius_m)), *addresses]
     warp_module().launch(_kernels().nearest, dim=1, inputs=inputs, device="cpu", record_tape=False)
     return senders, counts

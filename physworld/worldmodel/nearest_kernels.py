@@ -12,26 +12,49 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 NEAREST = r"""
-    // senders (n, most) ascending and found (n) of places (n, 3); reach (most) is working memory
-    auto find_nearest = [](const float* place, int n, int most, float radius, int* senders, int* found, float* reach) {
+    // senders (n, most) ascending and found (n) of places (n, 3); room (most + 3 n) is working memory. What senders and
+    // found hold on entry bounds the search: no k-th neighbour is farther than the farthest of any k.
+    auto find_nearest = [](const float* place, int n, int most, float radius, int* senders, int* found, float* room) {
         const float square = radius * radius;
+        float *reach = room, *xs = room + most, *ys = xs + n, *zs = ys + n;
+        for (int i = 0; i < n; ++i) {
+            xs[i] = place[3 * i];
+            ys[i] = place[3 * i + 1];
+            zs[i] = place[3 * i + 2];
+        }
         for (int i = 0; i < n; ++i) {
             int* mine = senders + (long long)i * most;
+            auto apart = [&](int j) -> float {
+                const float x = xs[j] - xs[i], y = ys[j] - ys[i], z = zs[j] - zs[i];
+                return x * x + y * y + z * z;
+            };
+            float limit = square;
+            if (found[i] == most) {
+                float farthest = 0.0f;
+                bool within = true;  // not where a place is not finite
+                for (int a = 0; a < most; ++a) {
+                    const float d = apart(mine[a]);
+                    within = within && d <= square;
+                    farthest = d > farthest ? d : farthest;
+                }
+                const float bound = farthest * 1.000001f;  // rounding: the loop below may fuse its products
+                if (within && bound < square) limit = bound;
+            }
             int kept = 0;
-            float last = square;
+            float last = limit;
             for (int from = 0; from < n; from += 64) {
                 float distance[64];
+                int likely[64], many = 0;
                 const int count = from + 64 < n ? 64 : n - from;
-                const float* other = place + 3 * from;
+                for (int j = 0; j < count; ++j) distance[j] = apart(from + j);
                 for (int j = 0; j < count; ++j) {
-                    const float x = other[3 * j] - place[3 * i], y = other[3 * j + 1] - place[3 * i + 1],
-                                z = other[3 * j + 2] - place[3 * i + 2];
-                    distance[j] = x * x + y * y + z * z;
+                    likely[many] = j;
+                    many += distance[j] <= limit;
                 }
-                for (int j = 0; j < count; ++j) {
+                for (int a = 0; a < many; ++a) {
+                    const int j = likely[a];
                     const float d = distance[j];
-                    if (kept < most ? !(d <= square) : !(d < last)) continue;
-                    if (from + j == i) continue;
+                    if ((kept == most && !(d < last)) || from + j == i) continue;
                     int at = kept < most ? kept++ : most - 1;
                     for (; at > 0 && reach[at - 1] > d; --at) {
                         reach[at] = reach[at - 1];
@@ -58,7 +81,7 @@ _SEARCH = (
     + r"""
     for (int b = 0; b < batch; ++b)
         find_nearest((const float*)places + (long long)b * n * 3, n, most, radius,
-                     (int*)senders + (long long)b * n * most, (int*)found + (long long)b * n, (float*)reach);
+                     (int*)senders + (long long)b * n * most, (int*)found + (long long)b * n, (float*)room);
 """
 )
 
@@ -72,7 +95,7 @@ def nearest_rows(
     places: wp.uint64,
     senders: wp.uint64,
     found: wp.uint64,
-    reach: wp.uint64,
+    room: wp.uint64,
 ): ...
 
 
@@ -85,7 +108,7 @@ def nearest(
     places: wp.uint64,
     senders: wp.uint64,
     found: wp.uint64,
-    reach: wp.uint64,
+    room: wp.uint64,
 ):
     """Launch with dim 1; addresses of contiguous float32 and int32 memory."""
-    nearest_rows(batch, n, most, radius, places, senders, found, reach)
+    nearest_rows(batch, n, most, radius, places, senders, found, room)

@@ -116,10 +116,11 @@ def test_the_gradient_by_places_is_that_of_finite_differences() -> None:
     assert float((gradient * slope).sum()) == pytest.approx((sides[0] - sides[1]) / 2e-7, rel=1e-4)
 
 
-@pytest.mark.parametrize("hidden", [16, 24])
-def test_the_native_rollout_is_that_of_torch(hidden: int) -> None:
+@pytest.mark.parametrize(("hidden", "radius"), [(16, 0.026), (24, 0.026), (16, 0.3)])
+def test_the_native_rollout_is_that_of_torch(hidden: int, radius: float) -> None:
+    """At the larger radius every vertex has all its neighbours, and those of a step bound the next search."""
     config = dataclasses.replace(CURRENT, hidden=hidden)
-    spec = spec_of(config, radius_m=0.026)
+    spec = spec_of(config, radius_m=radius)
     model = model_of(spec, config)
     window, control_next, phi = folded(spec)
     n = spec.object_count
