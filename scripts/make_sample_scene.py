@@ -308,8 +308,15 @@ def main() -> None:
     )
     parser.add_argument("--check", action="store_true", help="print the physics checks and write nothing")
     parser.add_argument("--target", type=Path, default=TARGET, help="folder to write (default %(default)s)")
+    parser.add_argument(
+        "--cells",
+        type=int,
+        nargs=3,
+        default=Recipe.cells,
+        help="hexahedra along x, y, z (default %(default)s)",
+    )
     arguments = parser.parse_args()
-    recipe = Recipe()
+    recipe = Recipe(cells=tuple(arguments.cells))
     if arguments.check:
         print(json.dumps(check(recipe), indent=1))
         return
