@@ -167,7 +167,7 @@ def measure(repeats: int, seed: int) -> Report:
             f"Two workers against one: {speedup:.2f} times the episodes a minute.",
             f"{FULL} episodes of {FRAMES} frames at {full.particles} particles: {full.wall_s / 60.0:.1f} min by two "
             f"workers (target: at most {TARGET_MINUTES:.0f} min at 2000 particles), sealed with its card after "
-            f"{full.sealed_s / 60.0:.1f} min; {full.rejected} tries were rejected and replaced. They are of the "
+            f"{full.sealed_s / 60.0:.1f} min; rejected and replaced tries: {full.rejected}. They are of the "
             f"sample's beam at {LONG_CELLS[0] / SAMPLE_CELLS:.2f} times its length.",
             f"The other rows: {EPISODES} episodes of the sample scene `{SCENE.name}`, {runs[1][0].particles} "
             f"particles, {rounds} rounds.",
