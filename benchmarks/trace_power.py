@@ -34,7 +34,7 @@ from physworld.errors import PhysworldError
 from physworld.scene import Scene
 from physworld.trace import Memory, TraceResult, document, trace
 
-NULLS = 36
+NULLS = 120
 METHOD = tuple(
     f"physworld/{room}" for room in ("trace", "calibrate", "effects", "mpm", "geometry", "evaluate")
 )

@@ -22,10 +22,10 @@ import asyncio
 import hashlib
 import json
 import re
-from collections.abc import Collection, Coroutine, Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Collection, Coroutine, Iterable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import obstore
@@ -46,6 +46,7 @@ from storage.errors import EpisodeCorrupt, NotFound, StoreError
 from storage.settings import Settings
 from storage.store import Store, open_store, reading, writing
 
+T = TypeVar("T")
 Arrays = dict[str, NDArray[Any]]
 
 CHUNK_BYTES = 1 << 20
@@ -304,10 +305,21 @@ def _finish(work: Coroutine[Any, Any, None]) -> None:
         thread.submit(asyncio.run, work).result()
 
 
+class _Here(ThreadPoolExecutor):
+    """No pool: zarr hands every file and every chunk of an episode to a thread, which costs more than its work."""
+
+    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
+        """Done at once, in the caller's thread; what it raises is raised here."""
+        done: Future[T] = Future()
+        done.set_result(fn(*args, **kwargs))
+        return done
+
+
 async def _write_group(
     place: ZarrLocalStore | ZarrObjectStore[Store], header: dict[str, Any], arrays: Arrays
 ) -> None:
     """Group and arrays on an event loop of this thread: zarr's own, in another one, costs half as much again."""
+    asyncio.get_running_loop().set_default_executor(_Here())
     group = await zarr.api.asynchronous.create_group(store=place, overwrite=True, attributes=header)
     for name, array in arrays.items():
         await _write_array(group, name, array)
