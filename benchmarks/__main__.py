@@ -28,6 +28,8 @@ BENCHMARKS = (
     "self_contact",
     "world_model",
     "factory",
+    "idle_and_start",
+    "api_load",
     "video",
 )
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")

@@ -1,13 +1,18 @@
-"""Arrays on the wire: nested lists for people, or base64 of little-endian float32 for everything longer."""
+"""Arrays on the wire: nested lists for people, or base64 of little-endian float32 for everything longer.
+
+NumPy is imported where it is used: processes that pass requests on (supervisor, dispatcher) start without it.
+"""
 
 from __future__ import annotations
 
 import base64
 import math
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
+
+if TYPE_CHECKING:
+    import numpy as np
 
 FARTHEST_M = 1000.0
 """No place is farther from the origin, along an axis [m]: beyond, single precision is coarser than 0.06 mm."""
@@ -32,6 +37,8 @@ class EncodedArray(BaseModel):
     @classmethod
     def of(cls, values: np.ndarray) -> EncodedArray:
         """The array in single precision. Raises ValueError for a finite value that it does not hold."""
+        import numpy as np
+
         given = np.asarray(values)
         with np.errstate(over="ignore"):
             plain = np.ascontiguousarray(given, dtype="<f4")
@@ -47,6 +54,8 @@ class EncodedArray(BaseModel):
 
     def numpy(self) -> np.ndarray:
         """The values, float32 of ``shape``. Raises ValueError with both sizes when they do not fit."""
+        import numpy as np
+
         step = PIECE_BYTES // 3 * 4
         raw = bytearray()
         try:
@@ -70,6 +79,8 @@ def array_of(
 
     Raises ValueError that says what is wrong.
     """
+    import numpy as np
+
     if isinstance(value, EncodedArray):
         values = value.numpy().astype(np.float64)
     else:

@@ -86,7 +86,11 @@ class FitCreate(Request):
 
 
 class Parameter(Resource):
-    """A calibrated quantity with its 95 % interval; ``identified`` false: held at its prior."""
+    """A calibrated quantity with its 95 % interval, null where none can be given.
+
+    ``identified`` false: the data were not shown to fix it, and ``note`` says why: it was held at its prior, or the
+    search did not end by itself.
+    """
 
     value: float
     unit: str
@@ -118,7 +122,11 @@ class Numerics(Resource):
 
 
 class SearchState(Resource):
-    """Whether the search converged; ``open`` says why not, by parameter."""
+    """Whether the search converged, which is so only where every search of the fit ended by itself.
+
+    ``open`` says why not, by parameter (``law``, ``mesh``: the choice of it). A search that spent ``max_simulations``
+    leaves the best found so far, without intervals.
+    """
 
     converged: bool
     open: dict[str, str] = Field(default_factory=dict)

@@ -11,20 +11,44 @@ from schemas.base import Request, Resource
 
 Role = Literal["read", "write", "admin"]
 
+DEFAULT_LIFETIME_DAYS = 365
+MAX_LIFETIME_DAYS = 3650
+DEFAULT_GRACE_MINUTES = 60
+MAX_GRACE_MINUTES = 7 * 24 * 60
+
 
 class KeyCreate(Request):
     """Body of POST /v1/keys."""
 
     name: str = Field(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f]*$")
     role: Role = "read"
+    expires_in_days: int | None = Field(
+        default=DEFAULT_LIFETIME_DAYS, ge=1, le=MAX_LIFETIME_DAYS, description="null: it never expires"
+    )
+
+
+class KeyRotate(Request):
+    """Body of POST /v1/keys/{key_id}/rotate."""
+
+    grace_minutes: int = Field(
+        default=DEFAULT_GRACE_MINUTES,
+        ge=0,
+        le=MAX_GRACE_MINUTES,
+        description="how long the old token stays good; 0 ends it, and what it opened, at once",
+    )
 
 
 class ApiKey(Resource):
-    """An API key; ``token`` is given once, in the answer that creates it, and is not stored."""
+    """An API key; ``token`` is given once, in the answer that makes it, and is not stored.
+
+    ``old_token_until`` is in the answer of a rotation: when the token before ends.
+    """
 
     id: str
     name: str
     role: Role
     created_at: datetime
+    expires_at: datetime | None = None
     revoked_at: datetime | None = None
     token: str | None = None
+    old_token_until: datetime | None = None

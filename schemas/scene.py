@@ -31,7 +31,10 @@ class SceneImport(Request):
 
 
 class Scene(Resource):
-    """A measured scene as stored: immutable, addressed by the digest of its canonical bundle."""
+    """A measured scene as stored: immutable, addressed by the digest of its canonical bundle.
+
+    ``declared`` is its ``scene.json``; a list leaves it out (null), since it may be long.
+    """
 
     id: str
     name: str
@@ -47,7 +50,7 @@ class Scene(Resource):
     noise_sigma_m: float | None = None
     train: tuple[int, int]
     test: tuple[int, int]
-    declared: dict[str, Any] = Field(default_factory=dict)
+    declared: dict[str, Any] | None = None
     warnings: list[str] = Field(default_factory=list)
     artifacts: list[Artifact] = Field(default_factory=list)
     tags: list[str] = Field(default_factory=list)

@@ -8,13 +8,17 @@ from __future__ import annotations
 
 import argparse
 import sys
+from typing import Any
 
+import structlog
 import uvicorn
 from fastapi import FastAPI
 from fastapi.responses import RedirectResponse
 
+from services import interpreter
 from services.api.app import create_api
 from services.api.logs import configure_logs
+from services.connections import Connection, Session
 from services.dashboard.app import mount as mount_dashboard
 from services.stores import open_all
 from storage.settings import Settings, get_settings
@@ -30,6 +34,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     if settings is None:
         settings = get_settings()
         configure_logs(settings.log_level)
+        if (old := interpreter.warning()) is not None:
+            structlog.get_logger("physworld.web").warning("old_interpreter", detail=old)
     settings.check(broker=False)
     database, stores = open_all(settings)
     app = create_api(settings, database, stores)
@@ -40,6 +46,15 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         return RedirectResponse("/dashboard")
 
     return app
+
+
+def proxy_options(settings: Settings) -> dict[str, Any]:
+    """What uvicorn is told of ``X-Forwarded-For`` and ``-Proto``: believed of the proxies in the settings, of no other.
+
+    Its own default believes every process of this machine, which could then choose its address for each attempt.
+    """
+    trusted = [address.strip() for address in settings.trusted_proxies.split(",") if address.strip()]
+    return {"proxy_headers": bool(trusted), "forwarded_allow_ips": trusted}
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -54,9 +69,12 @@ def main(arguments: list[str] | None = None) -> int:
         create_app(),
         host=options.host,
         port=options.port,
+        http=Connection,
+        ws=Session,
         log_config=None,
         access_log=False,
         server_header=False,
+        **proxy_options(get_settings()),
         timeout_graceful_shutdown=GRACEFUL_SHUTDOWN_S,
     )
     return 0

@@ -2,8 +2,9 @@
 
 A zip or a tar (plain, gzip) is read member by member. Refused, each with its name and numbers: a path that
 climbs out of the archive, is absolute, names a drive or is not UTF-8; a link, a device, a sparse or an encrypted
-member; two members of one name; more members or bytes than the limits, whether declared or met while inflating; a
-compression ratio that only a bomb has; a truncated or damaged archive.
+member; two members of one name, or one of none; more members or bytes than the limits, whether declared or met while
+inflating; a compression ratio that only a bomb has; a truncated or damaged archive. What the standard library would
+parse without a limit is counted before it does: the directory of a zip, the extension headers of a tar.
 
 ``read_arrays`` reads an ``npz`` the same way. It parses the array headers itself: numpy would allocate what
 a header claims before it looks at the data, and no array of Python objects is ever decoded.
@@ -39,6 +40,18 @@ TAR_MAGIC = b"ustar"
 _SURROGATE = re.compile("[\ud800-\udfff]")
 NUMERIC_KINDS = "biuf"
 NPY_HEADER_LIMIT = 10_000
+MOST_DIMENSIONS = 8
+ZIP_ENTRY_BYTES = 4096
+"""Of the directory of a zip, a member, at most: names are some hundred bytes long."""
+END_OF_ZIP = b"PK\x05\x06"
+END_OF_ZIP_SEARCHED = 22 + 0xFFFF
+TAR_BLOCK = 512
+TAR_EXTENSIONS = b"xgXLK"
+"""Type flags of headers that only say more of the member after them: PAX, GNU long names."""
+TAR_EXTENSION_BYTES = 4096
+TAR_EXTENSIONS_IN_A_ROW = 3
+TAR_DIGITS = 20
+"""Of the length that a PAX record begins with. Older interpreters parse longer ones for minutes: CVE-2024-6232."""
 
 
 class ArchiveRefused(ValueError):
@@ -74,6 +87,7 @@ DAMAGED = (
     NotImplementedError,
     ValueError,
     OverflowError,
+    RecursionError,
 )
 """What the standard library raises on truncated or malformed archives."""
 
@@ -162,6 +176,7 @@ def write_zip(files: dict[str, bytes]) -> bytes:
 
 def _read_zip(data: bytes, wanted: frozenset[str] | None, limits: ArchiveLimits) -> dict[str, bytes]:
     """Wanted members of a zip (all of them for None)."""
+    _check_directory(data, limits)
     found: dict[str, bytes] = {}
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         entries = archive.infolist()
@@ -214,8 +229,68 @@ def _read_tar(data: bytes, wanted: frozenset[str], limits: ArchiveLimits) -> dic
     return found
 
 
+def _check_directory(data: bytes, limits: ArchiveLimits) -> None:
+    """Refuse a zip by the size that its end record claims for the directory, before anybody parses it."""
+    at = data.rfind(END_OF_ZIP, max(0, len(data) - END_OF_ZIP_SEARCHED))
+    if at < 0 or at + 22 > len(data):
+        raise ArchiveRefused(f"the zip of {len(data)} bytes is damaged or truncated: it has no end record")
+    entries, size = struct.unpack_from("<HI", data, at + 10)
+    allowed = limits.members * ZIP_ENTRY_BYTES
+    if entries == 0xFFFF or size == 0xFFFFFFFF or entries > limits.members or size > allowed:
+        raise ArchiveRefused(
+            f"its directory claims {entries} members in {size} bytes, at most {limits.members} in {allowed} are allowed"
+        )
+
+
+class _TarHeaders:
+    """Watches the headers of a tar go by, block by block, and refuses extensions that are long, many or malformed."""
+
+    def __init__(self) -> None:
+        self._to_come = 0  # bytes of the present member's content, padding included
+        self._extension = b""
+        self._in_a_row = 0
+
+    def see(self, block: bytes) -> None:
+        """The next 512 bytes of the archive. Raises ArchiveRefused."""
+        if self._to_come > 0:
+            self._to_come -= TAR_BLOCK
+            if self._extension:
+                self._check_record(block)
+                self._extension = b""
+            return
+        if len(block) < TAR_BLOCK or block.count(0) == TAR_BLOCK:
+            return
+        kind, size = block[156:157], _octal(block[124:136])
+        if kind not in (b"1", b"2", b"3", b"4", b"5", b"6"):  # links, devices and folders have no content
+            self._to_come = -(-size // TAR_BLOCK) * TAR_BLOCK
+        if kind and kind in TAR_EXTENSIONS:
+            self._in_a_row += 1
+            if size > TAR_EXTENSION_BYTES or self._in_a_row > TAR_EXTENSIONS_IN_A_ROW:
+                raise ArchiveRefused(
+                    f"{self._in_a_row} extension headers in a row, the last of {size} bytes: at most "
+                    f"{TAR_EXTENSIONS_IN_A_ROW} of {TAR_EXTENSION_BYTES} bytes are read"
+                )
+            self._extension = kind
+        else:
+            self._in_a_row = 0
+
+    def _check_record(self, block: bytes) -> None:
+        digits = len(block) - len(block.lstrip(b"0123456789"))
+        if self._extension in b"xgX" and digits > TAR_DIGITS:
+            raise ArchiveRefused(f"a PAX header that begins with {digits} digits or more")
+
+
+def _octal(field: bytes) -> int:
+    """A number of a tar header; sizes in base 256, of members beyond 8 GiB, are none that is read."""
+    text = field.split(b"\0")[0].strip()
+    try:
+        return int(text or b"0", 8)
+    except ValueError as error:
+        raise ArchiveRefused(f"a header claims a size of {field!r}") from error
+
+
 class _MeteredStream:
-    """A forward-only stream that inflates if asked and stops at the limits."""
+    """A forward-only stream that inflates if asked, watches a tar's headers, and stops at the limits."""
 
     def __init__(self, raw: IO[bytes], size: int, limits: ArchiveLimits, *, inflate: bool) -> None:
         self._raw = raw
@@ -224,6 +299,8 @@ class _MeteredStream:
         self._inflater = zlib.decompressobj(wbits=31) if inflate else None
         self._pending = b""
         self._total = 0
+        self._headers = _TarHeaders()
+        self._unseen = b""
 
     def read(self, count: int) -> bytes:
         """Next ``count`` bytes, fewer at the end."""
@@ -236,7 +313,13 @@ class _MeteredStream:
             have += len(part)
         self._total += have
         _check_total(self._total, self._size, self._limits, "inflates to")
-        return b"".join(parts)
+        content = b"".join(parts)
+        unseen = self._unseen + content
+        whole = len(unseen) - len(unseen) % TAR_BLOCK
+        for at in range(0, whole, TAR_BLOCK):
+            self._headers.see(unseen[at : at + TAR_BLOCK])
+        self._unseen = unseen[whole:]
+        return content
 
     def _next(self, count: int) -> bytes:
         if self._inflater is None:
@@ -275,6 +358,8 @@ def _checked_name(raw: str, seen: set[str]) -> str:
     if ".." in parts:
         raise ArchiveRefused(f"the member {raw!r} climbs out of the archive")
     name = "/".join(parts)
+    if not raw:
+        raise ArchiveRefused("a member has no name")
     if name and name in seen:
         raise ArchiveRefused(f"two members are called {name!r}")
     seen.add(name)
@@ -307,8 +392,11 @@ def _parse_array(name: str, content: bytes) -> np.ndarray:
         raise ArchiveRefused(f"{name} is not an npy file: {error}") from error
     if dtype.kind not in NUMERIC_KINDS or dtype.hasobject or dtype.subdtype is not None:
         raise ArchiveRefused(f"{name} holds {dtype}; only plain numbers are read, never Python objects")
-    if any(length < 0 for length in shape):
-        raise ArchiveRefused(f"{name} claims the shape {shape}")
+    whole = all(type(length) is int and length >= 0 for length in shape)  # True is an int, and no length
+    if not whole or len(shape) > MOST_DIMENSIONS:
+        raise ArchiveRefused(
+            f"{name} claims the shape {str(shape)[:80]}: at most {MOST_DIMENSIONS} lengths are read"
+        )
     here, claimed = len(content) - stream.tell(), math.prod(shape) * dtype.itemsize
     if claimed != here:
         raise ArchiveRefused(f"{name} claims shape {shape} of {dtype}, {claimed} bytes, and holds {here}")

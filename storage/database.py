@@ -14,15 +14,11 @@ import os
 import sqlite3
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from alembic import command
-from alembic.config import Config
-from alembic.runtime.migration import MigrationContext
-from alembic.script import ScriptDirectory
-from sqlalchemy import Connection, Engine, create_engine, event, make_url, text
+from sqlalchemy import Connection, Engine, create_engine, event, inspect, make_url, text
 from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
 from sqlalchemy.orm import Session
 
@@ -33,6 +29,7 @@ BUSY_SECONDS = 30.0
 DEFAULT_MAX_ATTEMPTS = 5
 MAX_ATTEMPTS = "max_attempts"  # key of Session.info: the cap that new shards are given
 MIGRATIONS = Path(__file__).parent / "migrations"
+REVISION_TABLE = "alembic_version"
 
 _dumps = functools.partial(json.dumps, allow_nan=False)
 
@@ -60,9 +57,15 @@ class Database:
 
     def upgrade(self) -> None:
         """Bring the tables to the newest revision; harmless when several processes do it at once."""
-        self._leave_parent()
+        if self.revision() == newest_revision():
+            return
+        from alembic import command  # takes as long to import as a process without migrations to start
+        from alembic.config import Config
+
+        config = Config()
+        config.set_main_option("script_location", str(MIGRATIONS).replace("%", "%%"))
+        config.set_main_option("path_separator", "os")
         with _translated(), self.engine.begin() as connection:
-            config = _alembic_config()
             config.attributes["connection"] = connection
             command.upgrade(config, "head")
 
@@ -70,13 +73,23 @@ class Database:
         """The revision that the tables have, None before the first ``upgrade``."""
         self._leave_parent()
         with _translated(), self._reading_engine.connect() as connection:
-            return MigrationContext.configure(connection).get_current_revision()
+            if not inspect(connection).has_table(REVISION_TABLE):
+                return None
+            return connection.scalar(text(f"SELECT version_num FROM {REVISION_TABLE}"))
 
     def check(self) -> None:
         """Raise DatabaseUnavailable unless the database answers and has this code's tables."""
-        found, wanted = self.revision(), ScriptDirectory.from_config(_alembic_config()).get_current_head()
+        found, wanted = self.revision(), newest_revision()
         if found != wanted:
             raise DatabaseUnavailable(f"the database has revision {found}, this code needs {wanted}")
+
+    def own_connection(self) -> Any:
+        """A connection of the driver's, outside of the pool: the caller keeps it and closes it."""
+        self._leave_parent()
+        with _translated():
+            pooled = self.engine.raw_connection()
+            pooled.detach()
+            return pooled.dbapi_connection
 
     def dispose(self) -> None:
         """Close every connection of this process."""
@@ -103,8 +116,8 @@ def open_database(settings: Settings) -> Database:
 def _create_engine(address: str) -> Engine:
     url = make_url(address)
     if url.get_backend_name() == "sqlite":
-        if url.database:
-            Path(url.database).parent.mkdir(parents=True, exist_ok=True)
+        if url.database and url.database != ":memory:" and not url.database.startswith("file:"):
+            _make_private(Path(url.database))
         engine = create_engine(url, connect_args={"timeout": BUSY_SECONDS}, json_serializer=_dumps)
         event.listen(engine, "connect", _prepare_sqlite)
         event.listen(engine, "begin", _begin_sqlite)
@@ -112,6 +125,21 @@ def _create_engine(address: str) -> Engine:
     if url.drivername in {"postgresql", "postgres"}:
         url = url.set(drivername="postgresql+psycopg")
     return create_engine(url, pool_pre_ping=True, json_serializer=_dumps)
+
+
+def _make_private(path: Path) -> None:
+    """Make the file and its folder for their owner only, and close files of before, which were readable by all.
+
+    SQLite gives the files beside it (``-wal``, ``-shm``) the mode of the database.
+    """
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    with suppress(FileExistsError):
+        os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600))
+    for name in (path.name, f"{path.name}-wal", f"{path.name}-shm"):
+        with suppress(FileNotFoundError, PermissionError):  # gone meanwhile, or another owner's
+            file = path.with_name(name)
+            if file.stat().st_mode & 0o077:
+                file.chmod(0o600)
 
 
 def _prepare_sqlite(connection: sqlite3.Connection, _record: Any) -> None:
@@ -134,11 +162,11 @@ def _begin_sqlite(connection: Connection) -> None:
     connection.exec_driver_sql(connection.get_execution_options().get("sqlite_begin", "BEGIN IMMEDIATE"))
 
 
-def _alembic_config() -> Config:
-    config = Config()
-    config.set_main_option("script_location", str(MIGRATIONS).replace("%", "%%"))
-    config.set_main_option("path_separator", "os")
-    return config
+@functools.cache
+def newest_revision() -> str:
+    """The revision that this code needs: migrations are called NNNN_title.py by their revision."""
+    scripts = (MIGRATIONS / "versions").glob("[0-9]*_*.py")
+    return max(script.name.partition("_")[0] for script in scripts)
 
 
 @contextmanager

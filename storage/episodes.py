@@ -1,7 +1,7 @@
-"""The episode store: one zarr group for each attempt at an episode, one shard for each of its arrays.
+"""The episode store: one file for each attempt at an episode, a zarr group with one shard for each of its arrays.
 
-``datasets/{dataset}/episodes/{index}-e{epoch}.zarr`` belongs to one lease (``epoch`` is its fencing token),
-so no two writers ever share a shard or a piece of metadata. An episode exists once the database has committed
+``datasets/{dataset}/episodes/{index}-e{epoch}.zarr.zip`` belongs to one lease (``epoch`` is its fencing token),
+so no two writers ever share a file. An episode exists once the database has committed
 its path and digest; anything else below ``episodes/`` is an orphan of a dead attempt. A sealed dataset is its
 manifest: an artifact that lists (path, digest) of every episode.
 
@@ -9,7 +9,8 @@ Arrays (T frames, P particles, K controllers): ``times`` (T,) f8 [s]; ``particle
 ``controllers`` (T, K, 3) f4 [m]; ``properties`` (P, 2 or 3) f4, log(E/E_fit), log(rho/rho_fit) and, where the
 ground's friction is perturbed, log(mu/mu_fit); ``vertices`` (T, M, 3) f4 [m] and ``vertex_index`` (M,) i4: some of
 the particles again, those that a world model takes for its vertices, so that a training need not read the others.
-Chunks lie along the first axis inside a shard, so a window of frames can be read without the rest.
+Chunks lie along the first axis inside a shard. Datasets made before ADR 33 hold a folder ``….zarr`` for each episode,
+with a file for each array and each header; they are read as ever.
 
 The digest of an episode is over the digests of its arrays, so that a part can be read and verified alone. Episodes of
 the first format have one digest over all bytes and are read whole. Attributes are no part of it, so that episodes made
@@ -18,46 +19,40 @@ again from another upload of the same scene keep theirs; they stand beside a dig
 
 from __future__ import annotations
 
-import asyncio
 import hashlib
 import json
 import re
-from collections.abc import Callable, Collection, Coroutine, Iterable, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
-from typing import Any, TypeVar
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING, Any
+from zipfile import BadZipFile
 
 import numpy as np
 import obstore
-import zarr
-import zarr.api.asynchronous
 from numpy.typing import NDArray
-from obstore.exceptions import BaseError
+from obstore.exceptions import NotFoundError
 from pydantic import ValidationError
-from zarr.codecs import BloscCodec
-from zarr.core.buffer import Buffer
-from zarr.storage import LocalStore as ZarrLocalStore
-from zarr.storage import ObjectStore as ZarrObjectStore
 
 from schemas.base import Artifact, Resource
 from schemas.dataset import Episode
 from storage.artifacts import ArtifactStore
-from storage.errors import EpisodeCorrupt, NotFound, StoreError
+from storage.errors import EpisodeCorrupt, NotFound
 from storage.settings import Settings
-from storage.store import Store, open_store, reading, writing
+from storage.store import open_store, reading, writing
 
-T = TypeVar("T")
+if TYPE_CHECKING:
+    import zarr
+
 Arrays = dict[str, NDArray[Any]]
 
-CHUNK_BYTES = 1 << 20
-PACKED_BYTES = 1 << 14
-"""Smaller arrays are not compressed: it would save less than a block of the disk."""
 FORMAT, FIRST_FORMAT = "physworld-episode/2", "physworld-episode/1"
 ATTRIBUTES_DIGEST = "attributes_sha256"
 MANIFEST_NAME = "manifest.json"
 MANIFEST_TYPE = "application/json"
 DATASET_ID = re.compile(r"[A-Za-z0-9_-]+")
-EPISODE_PATH = re.compile(r"datasets/[A-Za-z0-9_-]+/episodes/[0-9]{5,}-e[0-9]+\.zarr")
+EPISODE_PATH = re.compile(r"datasets/[A-Za-z0-9_-]+/episodes/[0-9]{5,}-e[0-9]+\.zarr(\.zip)?")
+FILE = ".zip"
+"""What the path of an episode in one file ends with; older ones are folders."""
 
 
 class ManifestEpisode(Resource):
@@ -80,15 +75,6 @@ class Manifest(Resource):
     episodes: list[ManifestEpisode]
 
 
-class _AnyBucket(ZarrObjectStore[Store]):
-    """A bucket of any S3 server: one that ignores ``If-None-Match`` would replace a group's header by an empty one."""
-
-    async def set_if_not_exists(self, key: str, value: Buffer) -> None:
-        """An episode has one writer: nothing comes between the look and the write."""
-        if not await self.exists(key):
-            await self.set(key, value)
-
-
 class EpisodeStore:
     """Episodes in a local folder or a bucket."""
 
@@ -105,10 +91,12 @@ class EpisodeStore:
         arrays: Mapping[str, NDArray[Any]],
         attributes: Mapping[str, Any],
     ) -> tuple[str, str]:
-        """Write one attempt at an episode; its path and the digest of its arrays.
+        """Write one attempt at an episode, at once; its path and the digest of its arrays.
 
-        Raises StoreWriteFailed or StoreFull, and removes what it had written of it.
+        Raises StoreWriteFailed or StoreFull; nothing of it is then there.
         """
+        from storage.episode_files import packed  # zarr takes as long to import as the API's own routes
+
         path = episode_path(dataset_id, index, epoch)
         plain = {name: _plain(name, array) for name, array in arrays.items()}
         size = sum(array.nbytes for array in plain.values())
@@ -120,12 +108,9 @@ class EpisodeStore:
             "attributes": noted,
             ATTRIBUTES_DIGEST: _digest_of_json(noted),
         }
-        try:
-            with writing(f"episode {path}", size, self._settings):
-                _finish(_write_group(self._zarr(path), header, plain))
-        except StoreError:
-            self._remove_quietly(path)
-            raise
+        content = packed(header, plain)
+        with writing(f"episode {path}", size, self._settings):
+            obstore.put(self._store, path, content)
         return path, _digest_of(parts)
 
     def read(
@@ -140,7 +125,7 @@ class EpisodeStore:
         if not EPISODE_PATH.fullmatch(path):
             raise NotFound("episode", path[:200])
         with _decoding(path), reading("episode", path, self._settings):
-            group = zarr.open_group(self._zarr(path), mode="r", zarr_format=3, use_consolidated=False)
+            group = self._group(path)
             header = dict(group.attrs)
         with _decoding(path), reading("array of episode", path, self._settings):
             layout = header.get("format")
@@ -221,35 +206,43 @@ class EpisodeStore:
         folder = f"datasets/{_checked(dataset_id)}/episodes"
         keep = set(keep_paths)
         with reading("dataset", dataset_id, self._settings):
-            found = obstore.list_with_delimiter(self._store, prefix=folder)["common_prefixes"]
-        orphans = sorted(path for path in found if path not in keep)
+            found = obstore.list_with_delimiter(self._store, prefix=folder)
+        paths = {*found["common_prefixes"], *(entry["path"] for entry in found["objects"])}
+        orphans = sorted(paths - keep)
         for path in orphans:
             with writing(f"the removal of {path}", 0, self._settings):
                 self._remove(path)
+        self._remove_unfinished(folder)
         return orphans
 
-    def _zarr(self, path: str) -> ZarrLocalStore | ZarrObjectStore[Store]:
-        """A zarr store whose root is the episode: zarr writes nothing above it."""
+    def _group(self, path: str) -> zarr.Group:
+        """The episode's group, whose arrays are read when they are asked for."""
+        from storage.episode_files import open_folder, open_packed
+
+        if path.endswith(FILE):
+            return open_packed(self._store, path)
         folder = self._settings.store_folder
-        if folder is not None:
-            return ZarrLocalStore(folder / path)
-        return _AnyBucket(open_store(self._settings, path))
+        return open_folder(open_store(self._settings, path) if folder is None else folder / path)
 
     def _remove(self, path: str) -> None:
+        """Remove an episode, also one of which somebody else has removed a part."""
+        if path.endswith(FILE):
+            with suppress(NotFoundError, FileNotFoundError):
+                obstore.delete(self._store, path)
         for batch in obstore.list(self._store, prefix=path):
             obstore.delete(self._store, [entry["path"] for entry in batch])
 
-    def _remove_quietly(self, path: str) -> None:
-        """Tidy up after a failed write; what cannot be removed now is an orphan until the seal."""
-        try:
-            self._remove(path)
-        except (OSError, BaseError):
-            return
+    def _remove_unfinished(self, folder: str) -> None:
+        """Remove ``NAME#1``: a writer that is killed in the middle leaves it in a local folder; no list shows it."""
+        if self._settings.store_folder is not None:
+            for part in (self._settings.store_folder / folder).glob("*#*"):
+                with writing(f"the removal of {part.name}", 0, self._settings):
+                    part.unlink(missing_ok=True)
 
 
 def episode_path(dataset_id: str, index: int, epoch: int) -> str:
     """Where the attempt with this epoch writes the episode."""
-    return f"datasets/{_checked(dataset_id)}/episodes/{index:05d}-e{epoch}.zarr"
+    return f"datasets/{_checked(dataset_id)}/episodes/{index:05d}-e{epoch}.zarr{FILE}"
 
 
 def arrays_digest(arrays: Mapping[str, NDArray[Any]]) -> str:
@@ -294,61 +287,9 @@ def _plain(name: str, array: NDArray[Any]) -> NDArray[Any]:
     return np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
 
 
-def _finish(work: Coroutine[Any, Any, None]) -> None:
-    """Run ``work`` to its end on a loop of its own, in another thread where this one has a loop that runs."""
-    try:
-        asyncio.get_running_loop()
-    except RuntimeError:
-        asyncio.run(work)
-        return
-    with ThreadPoolExecutor(max_workers=1) as thread:
-        thread.submit(asyncio.run, work).result()
-
-
-class _Here(ThreadPoolExecutor):
-    """No pool: zarr hands every file and every chunk of an episode to a thread, which costs more than its work."""
-
-    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
-        """Done at once, in the caller's thread; what it raises is raised here."""
-        done: Future[T] = Future()
-        done.set_result(fn(*args, **kwargs))
-        return done
-
-
-async def _write_group(
-    place: ZarrLocalStore | ZarrObjectStore[Store], header: dict[str, Any], arrays: Arrays
-) -> None:
-    """Group and arrays on an event loop of this thread: zarr's own, in another one, costs half as much again."""
-    asyncio.get_running_loop().set_default_executor(_Here())
-    group = await zarr.api.asynchronous.create_group(store=place, overwrite=True, attributes=header)
-    for name, array in arrays.items():
-        await _write_array(group, name, array)
-
-
-async def _write_array(group: zarr.AsyncGroup, name: str, array: NDArray[Any]) -> None:
-    """One file beside its metadata: a shard of chunks, or a chunk alone where one holds all.
-
-    LZ4 with shuffled bytes leaves as much of floating-point tracks as zstd does, in two thirds of its time.
-    """
-    row = max(1, array.nbytes // max(1, array.shape[0]))
-    rows = max(1, min(array.shape[0], CHUNK_BYTES // row))
-    rest = tuple(max(1, length) for length in array.shape[1:])
-    shards = -(-max(1, array.shape[0]) // rows) * rows
-    packed = array.nbytes >= PACKED_BYTES
-    stored = await group.create_array(
-        name,
-        shape=array.shape,
-        dtype=array.dtype,
-        chunks=(rows, *rest),
-        shards=(shards, *rest) if shards > rows else None,
-        compressors=BloscCodec(cname="lz4", clevel=1, shuffle="shuffle") if packed else None,
-        fill_value=np.nan if array.dtype.kind == "f" else 0,  # a lost file must not read as zeros
-        config={"write_empty_chunks": True},
-    )
-    await stored.setitem(..., array)
-
-
 def _read_array(group: zarr.Group, name: str) -> NDArray[Any]:
+    import zarr
+
     stored = group[name]
     if not isinstance(stored, zarr.Array):
         raise EpisodeCorrupt(f"{group.path}/{name} is not an array")
@@ -363,8 +304,10 @@ def _checked(dataset_id: str) -> str:
 
 @contextmanager
 def _decoding(path: str) -> Iterator[None]:
-    """What zarr and its codecs raise for bytes that are not what they should be becomes EpisodeCorrupt."""
+    """What zarr, its codecs and a ZIP raise for bytes that are not what they should be becomes EpisodeCorrupt."""
     try:
         yield
-    except (ValueError, RuntimeError, LookupError, TypeError, AttributeError, ArithmeticError) as error:
+    except (
+        ValueError, RuntimeError, LookupError, TypeError, AttributeError, ArithmeticError, EOFError, BadZipFile
+    ) as error:  # fmt: skip
         raise EpisodeCorrupt(f"{path} cannot be decoded: {type(error).__name__}: {error}") from error

@@ -6,7 +6,8 @@
     ├── ConfigurationError        the settings cannot work; ``faults`` names each of them
     ├── NotFound                  no object of that kind and id
     ├── Conflict                  the object's state forbids it
-    │   └── IdempotencyMismatch   the same Idempotency-Key came with another body
+    │   ├── IdempotencyMismatch   the same Idempotency-Key came with another body
+    │   └── KeyEnded              a token whose key was revoked, has expired or was given another token
     ├── InvalidCursor             a ``cursor`` that no list ever gave out
     ├── SceneInvalid              a scene bundle with faults; ``faults`` are FieldErrors
     ├── ResultInvalid             a shard's result that its kind does not allow
@@ -63,6 +64,10 @@ class IdempotencyMismatch(Conflict):
     """An Idempotency-Key that was used for another request."""
 
     code = "idempotency_mismatch"
+
+
+class KeyEnded(Conflict):
+    """A token that was a key's once and is none any more."""
 
 
 class InvalidCursor(StorageError):

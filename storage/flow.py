@@ -5,7 +5,7 @@
     fit        stage 0  one `fit` shard, which may put up `simulation` helpers (``storage.helpers``)
     trace      stage 0  one `trace` shard, which puts them up too
     dataset    stage 0  one `dataset_plan` shard, whose result says how many episodes follow
-               stage 1  one `episode` shard each
+               stage 1  one `episode` shard each, made as the work goes on (``storage.opening.add_more``)
                stage 2  one `dataset_seal` shard
     training   stage 0  one `training` shard
     assessment stage 0  one `assessment` shard, whose result may open a trace
@@ -40,6 +40,7 @@ from storage.opening import (
     CANCELLED,
     QUEUED,
     RUNNING,
+    add_more,
     add_shards,
     open_trace,
 )
@@ -88,7 +89,9 @@ def shard_succeeded(
     if job.kind == "dataset" and isinstance(result, EpisodeResult):
         done = Progress(done=job.stage_done, total=job.stage_total, unit="episodes")
         report_progress(session, job, done)
-    if job.stage_done == job.stage_total and not _start_next_stage(session, job, shard, result):
+    if job.stage_done < job.stage_total:
+        add_more(session, job, shard)
+    elif not _start_next_stage(session, job, shard, result):
         job.finished_at = now
         _set_state(session, job, "succeeded")
         _child_succeeded(session, job, now)
@@ -229,8 +232,7 @@ def _start_next_stage(session: Session, job: JobRow, shard: ShardRow, result: Sh
     if isinstance(result, PlanResult):
         job.stage += 1
         plan = {"frames": result.frames, "particles": result.particles}
-        payloads = [{**shard.payload, "index": index, "plan": plan} for index in range(result.episodes)]
-        add_shards(session, job, "episode", payloads)
+        add_shards(session, job, "episode", {**shard.payload, "plan": plan}, result.episodes)
         report_progress(session, job, Progress(done=0, total=result.episodes, unit="episodes"))
         parent = _parent(session, job)
         if parent is not None:
@@ -239,7 +241,7 @@ def _start_next_stage(session: Session, job: JobRow, shard: ShardRow, result: Sh
     if isinstance(result, EpisodeResult):
         job.stage += 1
         base = {key: value for key, value in shard.payload.items() if key not in {"index", "plan"}}
-        add_shards(session, job, "dataset_seal", [base])
+        add_shards(session, job, "dataset_seal", base)
         return True
     return False
 

@@ -18,6 +18,7 @@ from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
 from schemas.ids import new_id
+from storage.changes import announce
 from storage.database import DEFAULT_MAX_ATTEMPTS, MAX_ATTEMPTS
 from storage.locks import lock_job
 from storage.opening import CANCELLED, QUEUED, RUNNING
@@ -62,6 +63,7 @@ def put_up(
     ]
     session.add_all(shards)
     session.flush()
+    announce(session)
     return [shard.id for shard in shards]
 
 

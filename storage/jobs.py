@@ -5,6 +5,7 @@ States: queued -> running -> succeeded | failed, and queued | running -> cancell
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from sqlalchemy import select
@@ -48,6 +49,7 @@ __all__ = [
     "events_after",
     "get_job",
     "list_jobs",
+    "states_of",
 ]
 
 
@@ -109,6 +111,12 @@ def get_job(session: Session, job_id: str) -> Job:
     if row is None:
         raise NotFound("job", job_id)
     return _job(session, row)
+
+
+def states_of(session: Session, job_ids: Sequence[str]) -> dict[str, str]:
+    """States of these jobs; unknown ones are left out."""
+    rows = session.execute(select(JobRow.id, JobRow.state).where(JobRow.id.in_(job_ids)))
+    return {row.id: row.state for row in rows}
 
 
 def list_jobs(

@@ -27,6 +27,7 @@ from sqlalchemy.orm import Session
 from schemas.base import Problem
 from schemas.job import TERMINAL_STATES, Progress
 from schemas.queues import QUEUE_OF_SHARD
+from storage.changes import announce
 from storage.errors import NotFound
 from storage.flow import (
     LONG_SHARDS,
@@ -201,6 +202,7 @@ def release(session: Session, lease: Lease) -> bool:
     if not _compare_and_set(session, lease, attempt=lease.attempt - 1):
         return False
     _requeue(_shard(session, lease.shard_id), not_before=None)
+    announce(session)
     return True
 
 
@@ -312,6 +314,15 @@ def recover(session: Session, now: datetime) -> int:
     count = cast("CursorResult[Any]", session.execute(ended)).rowcount
     session.execute(update(ShardRow).where(ShardRow.state == QUEUED).values(published_at=None))
     return count
+
+
+def open_work(session: Session) -> tuple[bool, bool]:
+    """Whether any shard is queued, and whether any runs."""
+    queued, running = (
+        select(ShardRow.id).where(ShardRow.state == state).exists() for state in (QUEUED, RUNNING)
+    )
+    found = session.execute(select(queued, running)).one()
+    return bool(found[0]), bool(found[1])
 
 
 def _reap(session: Session, job: JobRow, shard: ShardRow, now: datetime) -> None:

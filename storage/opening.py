@@ -7,9 +7,11 @@ cannot be seen by anybody.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from datetime import datetime
 from typing import Any
 
+from sqlalchemy import func, insert, select
 from sqlalchemy.orm import Session
 
 from schemas.assessment import AssessmentCreate
@@ -21,6 +23,7 @@ from schemas.job import JobKind, Progress
 from schemas.model import TrainingCreate
 from schemas.pipeline import PipelineCreate
 from schemas.trace import TraceConfig
+from storage.changes import announce
 from storage.database import DEFAULT_MAX_ATTEMPTS, MAX_ATTEMPTS
 from storage.errors import Conflict, NotFound
 from storage.events import append_event
@@ -39,6 +42,8 @@ from storage.traces import fit_digest, trace_digest, trace_row
 
 QUEUED, RUNNING, DONE, FAILED, CANCELLED = "QUEUED", "RUNNING", "DONE", "FAILED", "CANCELLED"
 NAME_LENGTH = 64
+STAGE_WINDOW = 1024
+"""Shards of a stage that exist ahead of the work: enough for every worker, few enough for one short transaction."""
 
 
 def open_fit(session: Session, scene_id: str, config: FitConfig, parent: JobRow | None = None) -> JobRow:
@@ -67,7 +72,7 @@ def open_fit(session: Session, scene_id: str, config: FitConfig, parent: JobRow 
         artifacts=[],
     )
     session.add(row)
-    add_shards(session, job, "fit", [{"fit_id": fit_id, "scene_id": scene_id, "config": job.config}])
+    add_shards(session, job, "fit", {"fit_id": fit_id, "scene_id": scene_id, "config": job.config})
     return job
 
 
@@ -126,7 +131,7 @@ def open_trace(
     )
     session.add(row)
     payload = {"trace_id": trace_id, "scene_id": scene_id, "fit_id": fit_id, **others, **settings}
-    add_shards(session, job, "trace", [payload])
+    add_shards(session, job, "trace", payload)
     return job
 
 
@@ -181,7 +186,7 @@ def open_dataset(
         "scene_id": fit.scene_id,
         "config": job.config,
     }
-    add_shards(session, job, "dataset_plan", [payload])
+    add_shards(session, job, "dataset_plan", payload)
     return job
 
 
@@ -235,7 +240,7 @@ def open_training(session: Session, request: TrainingCreate, parent: JobRow | No
         "scene_id": dataset.scene_id,
         "config": version.config,
     }
-    add_shards(session, job, "training", [payload])
+    add_shards(session, job, "training", payload)
     return job
 
 
@@ -280,7 +285,7 @@ def open_assessment(session: Session, name: str, version: int, request: Assessme
         "fit_id": model.fit_id,
         "trace_id": model.trace_id,
     }
-    add_shards(session, job, "assessment", [payload])
+    add_shards(session, job, "assessment", payload)
     return job
 
 
@@ -301,27 +306,58 @@ def open_pipeline(session: Session, request: PipelineCreate) -> JobRow:
     return job
 
 
-def add_shards(session: Session, job: JobRow, kind: str, payloads: Iterable[dict[str, Any]]) -> None:
-    """Put the job's present stage up for execution, one shard for each payload."""
-    now = utc_now()
+def add_shards(
+    session: Session, job: JobRow, kind: str, payload: dict[str, Any], total: int | None = None
+) -> None:
+    """Put the job's present stage up for execution: one shard, or ``total`` of them that differ in their index.
+
+    Of many only the first ``STAGE_WINDOW`` are made now, so that no transaction grows with the stage; ``add_more``
+    makes the others as these are done.
+    """
+    job.stage_total, job.stage_done = 1 if total is None else total, 0
+    payloads = (
+        [payload] if total is None else [{**payload, "index": i} for i in range(min(total, STAGE_WINDOW))]
+    )
+    _insert_shards(session, job, kind, 0, payloads, utc_now())
+
+
+def add_more(session: Session, job: JobRow, like: ShardRow) -> None:
+    """Make the next shards of the stage that ``like`` belongs to, where fewer than half a window are left.
+
+    Called under the job's lock in the transaction that commits a shard, so none is left out and none made twice.
+    """
+    place = (ShardRow.job_id == job.id, ShardRow.stage == job.stage, ShardRow.kind == like.kind)
+    made = 1 + (session.scalar(select(func.max(ShardRow.index)).where(*place)) or 0)
+    if made >= job.stage_total or made - job.stage_done > STAGE_WINDOW // 2:
+        return
+    indices = range(made, min(job.stage_total, job.stage_done + STAGE_WINDOW))
+    payloads = [{**like.payload, "index": index} for index in indices]
+    _insert_shards(session, job, like.kind, made, payloads, like.created_at)
+
+
+def _insert_shards(
+    session: Session, job: JobRow, kind: str, first: int, payloads: list[dict[str, Any]], at: datetime
+) -> None:
     cap = session.info.get(MAX_ATTEMPTS, DEFAULT_MAX_ATTEMPTS)
-    shards = [
-        ShardRow(
-            id=new_id("shard"),
-            job_id=job.id,
-            stage=job.stage,
-            index=index,
-            kind=kind,
-            state=QUEUED,
-            max_attempts=cap,
-            created_at=now,
-            payload=payload,
-        )
-        for index, payload in enumerate(payloads)
+    rows = [
+        {
+            "id": new_id("shard"),
+            "job_id": job.id,
+            "stage": job.stage,
+            "index": first + number,
+            "kind": kind,
+            "state": QUEUED,
+            "attempt": 0,
+            "max_attempts": cap,
+            "epoch": 0,
+            "created_at": at,
+            "payload": payload,
+        }
+        for number, payload in enumerate(payloads)
     ]
-    job.stage_total, job.stage_done = len(shards), 0
-    session.add_all(shards)
     session.flush()
+    session.execute(insert(ShardRow), rows)
+    announce(session)
 
 
 def model_name_of(scene_name: str) -> str:

@@ -71,5 +71,5 @@ def open_run(
         "fit_id": model.fit_id,
         "trace_id": model.trace_id,
     }
-    add_shards(session, job, kind, [payload])
+    add_shards(session, job, kind, payload)
     return job

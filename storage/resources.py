@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any, TypeVar
 
 from sqlalchemy import func, select
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, defer
 
 from schemas.base import Artifact, Lineage, Page
 from schemas.dataset import Dataset, Episode
@@ -91,12 +91,12 @@ def find_scene(session: Session, digest: str) -> Scene | None:
 def list_scenes(
     session: Session, *, limit: int = 50, cursor: str | None = None, kind: str | None = None
 ) -> Page[Scene]:
-    """Scenes, newest first."""
-    statement = select(SceneRow)
+    """Scenes, newest first, without their declared documents, which are not read either."""
+    statement = select(SceneRow).options(defer(SceneRow.declared, raiseload=True))
     if kind is not None:
         statement = statement.where(SceneRow.kind == kind)
     keys = (SceneRow.created_at, SceneRow.id)
-    return page_of(session, statement, keys, _scene, limit=limit, cursor=cursor)
+    return page_of(session, statement, keys, _listed_scene, limit=limit, cursor=cursor)
 
 
 def get_fit(session: Session, fit_id: str) -> Fit:
@@ -272,6 +272,10 @@ def _plain(artifacts: list[Artifact]) -> list[dict[str, Any]]:
 
 def _scene(row: SceneRow) -> Scene:
     return Scene.model_validate(columns_of(row))
+
+
+def _listed_scene(row: SceneRow) -> Scene:
+    return Scene.model_validate(columns_of(row, without="declared"))
 
 
 def _fit(row: FitRow) -> Fit:

@@ -11,7 +11,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from schemas.base import FieldError
 
@@ -230,6 +229,8 @@ def check_jumps(measured: Measured, findings: Findings) -> None:
 
 def check_controllers(measured: Measured, object_size_m: float, findings: Findings) -> None:
     """Controllers that come near the object at some time."""
+    from scipy.spatial import cKDTree  # for uploads only; it takes as long to import as the API's own routes
+
     where = ["scene.npz", "controllers"]
     if not measured.controllers.shape[1] or not measured.seen.any() or object_size_m <= 0.0:
         return

@@ -1,6 +1,7 @@
 """The form of ``scene.json``, schema version 1: types and ranges of every key that the service reads.
 
-Keys that it does not read (in ``body``, ``topology`` and ``notes``) pass through untouched. What the numbers
+Keys that it does not read (in ``body``, ``topology`` and ``notes``) pass through untouched, up to ``MAX_UNREAD_BYTES``
+in all. What the numbers
 mean together with the arrays is the business of ``scene_validation``.
 """
 
@@ -15,7 +16,10 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from schemas.base import FieldError
 
 SCHEMA_VERSION = 1
-MAX_JSON_BYTES = 16 << 20
+MAX_JSON_BYTES = 2 << 20
+MAX_JSON_VALUES = 200_000
+MAX_UNREAD_BYTES = 64 << 10
+"""Of what the keys hold that nobody reads: they travel with the scene, and lie in the database."""
 MAX_DEPTH = 64
 UNDEFORMED_TEXT = "undeformed and at rest at t=0; gravity acts from t=0"
 
@@ -142,6 +146,13 @@ def parse_json(text: bytes) -> tuple[dict[str, Any], list[FieldError]]:
     where: list[str | int] = ["scene.json"]
     if len(text) > MAX_JSON_BYTES:
         return {}, [FieldError(loc=where, msg=f"has {len(text)} bytes, at most {MAX_JSON_BYTES} are read")]
+    values = sum(
+        text.count(mark) for mark in (b",", b"[", b"{")
+    )  # before anything is parsed; a few more than there are
+    if values > MAX_JSON_VALUES:
+        return {}, [
+            FieldError(loc=where, msg=f"holds about {values} values, at most {MAX_JSON_VALUES} are read")
+        ]
     try:
         declared = json.loads(text.decode("utf-8-sig"))
     except UnicodeDecodeError as error:
@@ -170,7 +181,30 @@ def check_form(declared: dict[str, Any]) -> tuple[Declaration | None, list[Field
         named = [fault.loc for fault in faults]
         found = [_field_error(fault) for fault in error.errors(include_url=False, include_context=False)]
         return None, faults + [fault for fault in found if fault.loc not in named]
+    unread = {"/".join(path): len(json.dumps(value)) for path, value in _unread(declared, declaration, [])}
+    if sum(unread.values()) > MAX_UNREAD_BYTES:
+        largest = max(unread, key=lambda path: unread[path])
+        message = (
+            f"holds {sum(unread.values())} bytes under keys that are not read, at most {MAX_UNREAD_BYTES} are kept; "
+            f"the most, {unread[largest]}, under {largest[:80]!r}"
+        )
+        faults.append(FieldError(loc=["scene.json"], msg=message))
     return (None if faults else declaration), faults
+
+
+def _unread(given: Any, form: Any, path: list[str]) -> list[tuple[list[str], Any]]:
+    """What of a JSON tree no field of the form takes, with where it is; ``notes`` are kept and never read."""
+    if isinstance(form, list):
+        return [found for item, part in zip(given, form, strict=False) for found in _unread(item, part, path)]
+    if not isinstance(form, Form) or not isinstance(given, dict):
+        return []
+    found = []
+    for key, value in given.items():
+        if key == "notes" or key not in type(form).model_fields:
+            found.append(([*path, key], value))
+        else:
+            found += _unread(value, getattr(form, key), [*path, key])
+    return found
 
 
 def _field_error(fault: Any) -> FieldError:

@@ -9,6 +9,7 @@ Embedded and distributed differ here and nowhere else::
     PHYSWORLD_STORE_URL      file:///folder or s3://bucket/prefix      file://{data_dir}/store
     PHYSWORLD_INFERENCE_URL  http://host:port of the inference service   none (the embedded service sets it)
     PHYSWORLD_DEVICE         of the simulations, cpu or cuda:0          cpu
+    PHYSWORLD_TRUSTED_PROXIES  whose word on client and scheme counts     none
     PHYSWORLD_SIGNING_KEY    base64 of an Ed25519 key (32 bytes)        made in data_dir (``storage.signing``)
     PHYSWORLD_SIGNING_KEY_FILE  a file that holds it                    none
 """
@@ -50,6 +51,7 @@ class Settings(BaseSettings):
     max_upload_bytes: int = Field(default=512 * 2**20, ge=1)
     signing_key: SecretStr | None = None
     signing_key_file: Path | None = None
+    trusted_proxies: str = Field(default="", pattern=r"^[0-9A-Fa-f.:/, ]*$")
     inference_url: str = Field(default="", pattern=r"^(https?://[^/\s]+)?$")
     device: str = Field(default="cpu", pattern=r"^(cpu|cuda:\d+)$")
     log_level: Literal["debug", "info", "warning", "error"] = "info"

@@ -44,6 +44,10 @@ def open_store(settings: Settings, below: str = "") -> Store:
     if settings.store_folder is not None:
         folder = settings.store_folder / below
         with writing(f"the folder {folder}", 0, settings):
+            if (
+                settings.data_dir in folder.parents
+            ):  # parents that are made on the way would be readable by all
+                settings.data_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
             folder.mkdir(parents=True, exist_ok=True)
             return LocalStore(folder, automatic_cleanup=True)
     url = urlsplit(settings.store_url)

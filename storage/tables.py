@@ -78,9 +78,10 @@ class Base(DeclarativeBase):
     type_annotation_map = {datetime: UtcDateTime, Json: JSON, JsonList: JSON}  # noqa: RUF012 (SQLAlchemy's name)
 
 
-def columns_of(row: Base) -> Json:
-    """The row's values by column name, as the wire models read them."""
-    return {column.key: getattr(row, column.key) for column in inspect(type(row)).column_attrs}
+def columns_of(row: Base, without: str = "") -> Json:
+    """The row's values by column name, as the wire models read them; ``without`` names one that is not loaded."""
+    columns = (column.key for column in inspect(type(row)).column_attrs)
+    return {key: getattr(row, key) for key in columns if key != without}
 
 
 def insert_if_absent(session: Session, table: type[Base], values: Json) -> bool:
@@ -358,7 +359,47 @@ class ApiKeyRow(Base):
     role: Mapped[str]
     digest: Mapped[str] = mapped_column(unique=True)
     created_at: Mapped[datetime]
+    expires_at: Mapped[datetime | None]
+    lifetime_days: Mapped[int | None]
     revoked_at: Mapped[datetime | None]
+
+
+class RetiredTokenRow(Base):
+    """A token that a key had before a rotation: its SHA-256, good until ``valid_until`` and remembered for ever."""
+
+    __tablename__ = "retired_tokens"
+
+    digest: Mapped[str] = mapped_column(primary_key=True)
+    key_id: Mapped[str] = mapped_column(ForeignKey("api_keys.id"), index=True)
+    valid_until: Mapped[datetime]
+
+
+class SessionRow(Base):
+    """A browser's session: the SHA-256 of the text in its cookie, never the text."""
+
+    __tablename__ = "sessions"
+
+    digest: Mapped[str] = mapped_column(primary_key=True)
+    key_id: Mapped[str] = mapped_column(ForeignKey("api_keys.id"), index=True)
+    address: Mapped[str | None]
+    created_at: Mapped[datetime]
+    seen_at: Mapped[datetime]
+    expires_at: Mapped[datetime]
+
+
+class AuditRow(Base):
+    """One change that matters to security; rows are added, never changed. ``seq`` is never used twice."""
+
+    __tablename__ = "audit"
+    __table_args__ = ({"sqlite_autoincrement": True},)
+
+    seq: Mapped[int] = mapped_column(BIG_KEY, primary_key=True, autoincrement=True)
+    at: Mapped[datetime]
+    actor: Mapped[str | None]
+    address: Mapped[str | None]
+    action: Mapped[str]
+    subject: Mapped[str | None]
+    detail: Mapped[Json]
 
 
 class IdempotencyRow(Base):
@@ -399,12 +440,15 @@ class RunRow(Base):
 
 
 class TicketRow(Base):
-    """A ticket that lets one connection in where no header can be sent: the SHA-256 of its text, never the text."""
+    """A ticket that lets one connection in where no header can be sent: the SHA-256 of its text, never the text.
+
+    ``credential`` is that of the request which asked for it: the ticket and what it opens end with it.
+    """
 
     __tablename__ = "tickets"
     __table_args__ = (Index(None, "expires_at"),)
 
     digest: Mapped[str] = mapped_column(primary_key=True)
-    key_id: Mapped[str]
+    credential: Mapped[str]
     subject: Mapped[str]
     expires_at: Mapped[datetime]

@@ -15,6 +15,7 @@ import httpx
 import uvicorn
 from published_tiny import publish_tiny
 
+from services.connections import Session
 from services.inference.app import create_app as create_inference
 from services.web import create_app as create_web
 from storage import api_keys
@@ -45,7 +46,7 @@ class Served:
 @contextmanager
 def running(app: Any, listening: socket.socket) -> Iterator[None]:
     """An application on a socket that listens already."""
-    server = uvicorn.Server(uvicorn.Config(app, log_config=None, timeout_graceful_shutdown=1))
+    server = uvicorn.Server(uvicorn.Config(app, ws=Session, log_config=None, timeout_graceful_shutdown=1))
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
     thread.start()
     while not server.started:

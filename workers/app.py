@@ -15,6 +15,7 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import socket
 import sys
 from pathlib import Path
 from typing import Any
@@ -83,25 +84,26 @@ def transport_options(prefix: str = "") -> dict[str, Any]:
 
 
 def run_worker(settings: Settings, queue: str, name: str) -> int:
-    """Serve one queue with one warm child process until told to stop; returns the exit code."""
+    """Serve one queue with one warm child process until told to stop; returns the exit code.
+
+    The worker is built here rather than by Celery's command line, whose imports take as long as its own.
+    """
     logging.getLogger("alembic").setLevel(logging.WARNING)
     app = create_app(settings)
     signals.worker_init.connect(_refuse_heavy_modules, weak=False)
     signals.worker_process_init.connect(_die_with_parent, weak=False)
     signals.worker_ready.connect(_announce, weak=False)
-    app.worker_main(
-        [
-            "worker",
-            "--pool=prefork",
-            "--concurrency=1",
-            f"--queues={queue}",
-            f"--hostname={name}@%h",
-            f"--loglevel={settings.log_level.upper()}",
-            "--without-gossip",
-            "--without-mingle",
-        ]
+    worker = app.Worker(
+        pool_cls="prefork",
+        concurrency=1,
+        queues=[queue],
+        hostname=f"{name}@{socket.gethostname()}",
+        loglevel=settings.log_level.upper(),
+        without_gossip=True,
+        without_mingle=True,
     )
-    return 0
+    worker.start()
+    return int(worker.exitcode or 0)
 
 
 def _run_shard(shard_id: str) -> None:

@@ -1,8 +1,10 @@
 """Moves work from the database to the broker, and back when somebody dies: ``python -m workers.dispatcher``.
 
-Every 0.1 s: publish the shards that wait (an outbox: publish first, then mark; a crash in between publishes
-twice, which a claim by compare-and-set makes harmless). Every second: take back leases that ran out, at once
-those whose owner on this host is provably dead, and look how deep the broker's queues are. Every hour: forget
+Whenever somebody commits (``storage.changes``), ten times a second at most: publish the shards that wait (an outbox:
+publish first, then mark; a crash in between publishes twice, which a claim by compare-and-set makes harmless). Every
+second while shards wait or run: publish those whose time has come, take back leases that ran out, at once those whose
+owner on this host is provably dead, and look how deep the broker's queues are. While there is no work: one question to
+the database every two seconds, should a change have gone unheard, and none to the broker. Every five minutes: forget
 the idempotency keys of more than a day ago, and remove what jobs that have ended left in the scratch.
 
 A queue that is empty in two looks while shards of it wait has lost their messages: they are published again
@@ -31,6 +33,7 @@ from redis.exceptions import RedisError
 from schemas.job import TERMINAL_STATES
 from schemas.queues import INFERENCE, SIMULATION, TASK_NAME, TRAINING
 from storage import idempotency, leases
+from storage.changes import Changes
 from storage.database import Database, open_database
 from storage.errors import DatabaseUnavailable, StoreError
 from storage.scratch import ScratchStore
@@ -43,6 +46,7 @@ logger = logging.getLogger(__name__)
 
 TICK_S = 0.1
 SWEEP_S = 1.0
+IDLE_SWEEP_S = 2.0
 FORGET_EVERY_S = 300.0
 IDEMPOTENCY_KEPT = timedelta(hours=24)
 LARGE_ANSWER_BYTES, LARGE_ANSWERS_KEPT = 64 * 1024, timedelta(minutes=15)
@@ -59,6 +63,7 @@ class Dispatcher:
     def __init__(self, settings: Settings, database: Database, app: Celery) -> None:
         self._settings = settings
         self._database = database
+        self._changes = Changes(database)
         self._app = app
         self._connection = app.connection_for_write()
         self._depth = dict.fromkeys((SIMULATION, TRAINING, INFERENCE), 0)
@@ -70,6 +75,7 @@ class Dispatcher:
         """Tick until told to stop; a broker or database that is away, or takes nothing, is waited for."""
         while not stop.is_set():
             try:
+                self._changes.wait(self._due_in(), stop)
                 self.tick()
             except (BrokerError, RedisError, *self._connection.connection_errors) as error:
                 logger.warning("broker away or full: %s", error)
@@ -80,20 +86,37 @@ class Dispatcher:
                 logger.warning("database or store away: %s", error)
                 stop.wait(PAUSE_AFTER_ERROR_S)
             stop.wait(TICK_S)
+        self._changes.close()
 
     def tick(self) -> None:
         """One pass."""
-        if time.monotonic() >= self._sweep_due:
-            self._sweep_due = time.monotonic() + SWEEP_S
-            self._take_back()
-            self._look_at_queues()
-            lost_in = {queue for queue, looks in self._empty_looks.items() if looks >= 2}
-            self._publish(LOST_AFTER_S, lost_in)
-        self._publish(self._settings.republish_seconds, set(self._depth))
+        waiting = self._sweep() if time.monotonic() >= self._sweep_due else True
+        if waiting:
+            self._publish(self._settings.republish_seconds, set(self._depth))
         if time.monotonic() >= self._forget_due:
             self._forget_due = time.monotonic() + FORGET_EVERY_S
             self._forget_old_keys()
             remove_ended_scratch(ScratchStore(self._settings), self._database)
+
+    def _due_in(self) -> float:
+        """Seconds until there is something to do although nobody has committed."""
+        return max(0.0, min(self._sweep_due, self._forget_due) - time.monotonic())
+
+    def _sweep(self) -> bool:
+        """What has to be looked at now and then; whether shards wait. The next look is due sooner where they do."""
+        with self._database.reading() as session:
+            waiting, running = leases.open_work(session)
+        self._sweep_due = time.monotonic() + (SWEEP_S if waiting or running else IDLE_SWEEP_S)
+        if waiting or running:
+            waiting |= self._take_back() > 0
+        if waiting:
+            self._look_at_queues()
+            lost_in = {queue for queue, looks in self._empty_looks.items() if looks >= 2}
+            self._publish(LOST_AFTER_S, lost_in)
+        else:  # what the broker still holds repeats what was done
+            self._depth = dict.fromkeys(self._depth, 0)
+            self._empty_looks = dict.fromkeys(self._empty_looks, 0)
+        return waiting
 
     def _publish(self, republish_seconds: float, queues: set[str]) -> None:
         open_queues = {queue for queue in queues if self._depth[queue] < MAX_DEPTH}
@@ -118,14 +141,16 @@ class Dispatcher:
                 self._depth[publication.queue] += 1
         with self._database.session() as session:
             leases.mark_published(session, waiting, datetime.now(UTC))
+        self._sweep_due = min(self._sweep_due, time.monotonic() + SWEEP_S)
         logger.info("published %d shards", len(waiting))
 
-    def _take_back(self) -> None:
+    def _take_back(self) -> int:
         with self._database.session() as session:
             leases.end_leases_of(session, owner_is_gone, datetime.now(UTC))
             taken = leases.reap(session, datetime.now(UTC))
         if taken:
             logger.warning("took back %d shards: %s", len(taken), ", ".join(taken))
+        return len(taken)
 
     def _forget_old_keys(self) -> None:
         now = datetime.now(UTC)

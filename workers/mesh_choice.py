@@ -64,8 +64,13 @@ def fitted_as_recorded(
     own = replace(config, mesh=Mesh.read(found))
     other = calibrate_in_stages(scene, own, stages, None, progress, cancelled, journal, runner)
     best = min((first, other), key=lambda fitted: float(fitted.losses[_MISFIT]))
+    spent = f"the fit that it was weighed against was cut short by its budget of {config.max_simulations} simulations"
+    unsure = (first.cut_short or other.cut_short) and not best.cut_short
     return replace(
-        best, simulations=first.simulations + other.simulations, seconds=first.seconds + other.seconds
+        best,
+        simulations=first.simulations + other.simulations,
+        seconds=first.seconds + other.seconds,
+        open={**best.open, **({"mesh": spent} if unsure else {})},
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,7 +16,7 @@ UNIDENTIFIED_HALF_WIDTH = {"log": 1.5, "linear": 0.25}
 
 _EDGE = 0.01  # closer than this to a bound, in the scale of the search, is at it
 
-NOT_MEASURED = "its sensitivity was not measured: the budget of simulations ended first"
+NOT_MEASURED = "its sensitivity was not measured: no run beside the optimum could be used"
 MOVING = "the search had not converged on it"
 NOT_CONVERGED = (NOT_MEASURED, MOVING)
 """Notes of a number on which the search did not converge, or cannot say so."""
@@ -76,6 +76,15 @@ def estimates(
         )
         found[parameter.name] = Estimate(value, parameter.unit, ends, identified, note)
     return found, Correlations(tuple(p.name for p in parameters), correlations(covariance))
+
+
+def cut_short(found: dict[str, Estimate], simulations: int) -> dict[str, Estimate]:
+    """The estimates of a search that did not end by itself: no interval, nothing identified.
+
+    An interval says how far an optimum may be off; where the budget ended the search, nobody knows how far that is.
+    """
+    note = f"the search was cut short by its budget of {simulations} simulations: the best found so far, no interval"
+    return {name: replace(known, ci95=None, identified=False, note=note) for name, known in found.items()}
 
 
 def held_at_priors(

@@ -14,7 +14,8 @@
 5. Gauss-Newton again on all that were kept; hold at its prior what the data turn out not to fix; intervals and
    correlations from the sensitivities at the optimum.
 
-Only training frames enter. The simulation's budget counts every run. A journal of the finished steps makes it
+Only training frames enter. The simulation's budget counts every run. A search that it cut short at any step, in which
+anything was left out for want of runs, has no intervals and did not converge. A journal of the finished steps makes it
 resumable: see :mod:`physworld.calibrate.journal`.
 """
 
@@ -29,9 +30,11 @@ import numpy as np
 
 from physworld.build import build_twin
 from physworld.calibrate.estimates import (
+    NOT_CONVERGED,
     UNIDENTIFIED_HALF_WIDTH,
     Correlations,
     Estimate,
+    cut_short,
     estimates,
     held_at_priors,
 )
@@ -105,6 +108,8 @@ class FitResult:
         simulations: runs used.
         seconds: wall time.
         loss_history: root mean squared training residual after each run [m], best so far.
+        cut_short: the budget of simulations ended the search before it ended by itself; there are no intervals then.
+        open: what the search did not converge on, with the reason in words.
         rejected: parameters that were tried and not kept, with the share of the cost that they removed.
         local: what the local stage found, or None where it was not asked for; a field that it kept is the twin's.
         homogeneous: tracks of the twin without that field, (T, N, 3) [m]; None without one.
@@ -120,6 +125,8 @@ class FitResult:
     simulations: int
     seconds: float
     loss_history: list[float]
+    cut_short: bool = False
+    open: dict[str, str] = field(default_factory=dict)
     rejected: dict[str, float] = field(default_factory=dict)
     local: LocalResult | None = None
     homogeneous: np.ndarray | None = None
@@ -164,6 +171,8 @@ def calibrate(
     kept, optimum, solution = _hold_the_unknown(search, kept, optimum, rejected)
     twin = search.twin_at(kept, optimum.theta)
     found, correlated = _estimates(search, kept, optimum, solution)
+    if search.cut_short:
+        found = cut_short(found, config.max_simulations)
     held = held_at_priors(scene, twin, rejected, parameters)
     times, controls = scene.control_track()
     nodes = twin.simulate_nodes(times, controls, scene.times)
@@ -179,6 +188,8 @@ def calibrate(
         simulations=search.simulations,
         seconds=time.perf_counter() - started,
         loss_history=search.history,
+        cut_short=search.cut_short,
+        open={name: e.note for name, e in found.items() if search.cut_short or e.note in NOT_CONVERGED},
         rejected=rejected,
     )
 

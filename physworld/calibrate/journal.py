@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-_VERSION = 1
+_VERSION = 2  # an entry of a search says whether the budget cut it short
 JOURNAL_BEGINS = '{"version": '
 """First characters of a stored journal."""
 

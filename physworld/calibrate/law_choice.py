@@ -93,6 +93,7 @@ class LawChoice:
         decided_by: "default", "given", "cross_validation", or "model NAME".
         reason: why, in words.
         figures: held-out error of every candidate in the blocks, and what a model answered.
+        ended: whether the fits behind it ended by themselves; else the reason says that their budget was spent.
     """
 
     elastic: str
@@ -100,6 +101,7 @@ class LawChoice:
     decided_by: str = "default"
     reason: str = "the usual law of this shape of body"
     figures: dict[str, Any] = field(default_factory=dict)
+    ended: bool = True
 
 
 def parse_answer(text: str, dimension: int) -> tuple[str, str, str]:
@@ -213,21 +215,30 @@ def cross_validate(
     search = Search(scene, twin, config.max_simulations, progress, cancelled, journal, runner)
     kept, optimum, _ = select(search, searched_parameters(scene, search.twin, config))
     fits, needless = {}, {}
+    ended = not search.cut_short
     for name in names:
         named = replace(config, law=name)
         own = Search(
             scene, prior_twin(scene, named), config.max_simulations, progress, cancelled, journal, runner
         )
         fitted, at, without = _freed(own, named, kept, optimum)
+        ended &= not own.cut_short
         if without and len(fitted) == len(kept):
             needless[name] = without
         else:
             fits[name] = (named, fitted, at)
-    errors_of = journal.step(
+    measured = journal.step(
         "blocks of a choice", lambda: _block_errors(scene, blocks, fits, progress, cancelled, runner)
     )
+    ended &= not measured["cut_short"]
+    spent = (
+        ""
+        if ended
+        else f"; fits behind the choice were cut short by their budget of {config.max_simulations} simulations"
+    )
     scores = {
-        name: [float("inf") if one is None else one for one in errors] for name, errors in errors_of.items()
+        name: [float("inf") if one is None else one for one in errors]
+        for name, errors in measured["errors"].items()
     }
     means = {name: float(np.mean(errors)) for name, errors in scores.items()}
     best = min(means, key=lambda name: means[name])
@@ -242,7 +253,7 @@ def cross_validate(
         reason = (
             f"no law's simulations hold on all {len(blocks)} blocks of training frames: it is the usual one"
         )
-        return LawChoice(names[0], reason=reason, figures=figures)
+        return LawChoice(names[0], reason=reason + spent, figures=figures, ended=ended)
     spread = float(np.std(scores[best], ddof=1) / np.sqrt(len(blocks)))
     chosen = next(name for name in names if name in means and means[name] <= means[best] + spread)
     reason = (
@@ -251,7 +262,9 @@ def cross_validate(
         else f"the simplest within one standard error ({spread:.3g} m) of {best}: these data do not tell them apart"
     )
     figures["standard_error_m"] = spread
-    return LawChoice(chosen, decided_by="cross_validation", reason=reason, figures=figures)
+    return LawChoice(
+        chosen, decided_by="cross_validation", reason=reason + spent, figures=figures, ended=ended
+    )
 
 
 def _freed(
@@ -287,8 +300,11 @@ def _block_errors(
     progress: Progress | None,
     cancelled: Callable[[], bool] | None,
     runner: Runner,
-) -> dict[str, list[float]]:
-    """Error [m] (rms) of every law on each block after a fit to the others; infinite where a run blew up."""
+) -> dict[str, Any]:
+    """``errors``: [m] (rms) of every law on each block after a fit to the others, infinite where a run blew up.
+
+    ``cut_short``: whether the budget ended one of these fits.
+    """
     asked: list[tuple[Search, Descent]] = []
     judges: list[Search] = []
     for config, kept, optimum in fits.values():
@@ -306,7 +322,10 @@ def _block_errors(
     )
     squares = [float(np.mean(residual**2)) for residual in judged]
     errors = iter([float(np.sqrt(square)) if np.isfinite(square) else float("inf") for square in squares])
-    return {name: [next(errors) for _ in blocks] for name in fits}
+    return {
+        "errors": {name: [next(errors) for _ in blocks] for name in fits},
+        "cut_short": any(fold.cut_short for fold, _ in asked),
+    }
 
 
 def _training_only(scene: Scene) -> Scene:

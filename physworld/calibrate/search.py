@@ -37,7 +37,13 @@ _DISTINCT = 0.05  # starts that end closer than this in the logarithm are one
 
 
 class Search:
-    """Residuals of a twin on the training frames, counted, reported and cancellable."""
+    """Residuals of a twin on the training frames, counted, reported and cancellable.
+
+    Attributes:
+        simulations: runs so far.
+        limit: how many there may be at the present stage.
+        cut_short: whether something was not simulated because the limit was reached: the search did not end by itself.
+    """
 
     def __init__(
         self,
@@ -54,6 +60,7 @@ class Search:
         self.journal = journal or Journal()
         self.progress, self.cancelled = progress, cancelled
         self.simulations, self.limit = 0, max_simulations
+        self.cut_short = False
         self.history: list[float] = []
         self.begin, self.end = (
             max(scene.train[0], 1),
@@ -99,6 +106,7 @@ class Search:
     def residuals(self, places: list[Place]) -> list[np.ndarray]:
         """:meth:`residual` at places (parameters, theta, end) that do not depend on each other."""
         allowed = max(0, self.limit - self.simulations)
+        self.cut_short |= len(places) > allowed
         found = []
         for place, (residual, loss) in zip(places, self._measured(places[:allowed]), strict=False):
             self.simulations += 1
@@ -201,7 +209,7 @@ class Search:
 
     def linearise(self, parameters: list[Parameter], optimum: Optimum) -> Solution | None:
         """Residual and sensitivities at an optimum; None where the budget does not reach."""
-        if self.simulations + 1 + len(parameters) > self.limit:
+        if not self._reaches(1 + len(parameters)):
             return None
         probes = probes_of(optimum.theta, self._high(parameters), _steps(parameters))
         now, *there = self.residuals([(parameters, theta, None) for theta in (optimum.theta, *probes)])
@@ -259,7 +267,7 @@ class Search:
 
     def _mean_offsets(self, parameters: list[Parameter], theta: np.ndarray, sigma: float) -> list | None:
         """Mean residual of every point in the material's frame [m], (N, 3), clipped; None where it cannot be had."""
-        if self.simulations + 2 + len(parameters) > self.limit:
+        if not self._reaches(2 + len(parameters)):
             return None  # the search on the moved points needs a residual and a Jacobian of its own
         twin = self.twin_at(parameters, theta)
         times, controls = self.scene.control_track()
@@ -280,15 +288,23 @@ class Search:
         return np.clip(local.sum(axis=0) / seen, -limit, limit).tolist()
 
     def step(self, name: str, compute: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-        """A journalled step, which also brings the count of runs and their history to where they were after it."""
+        """A journalled step; the runs, whether any were left out, and their history are brought to where they were."""
 
         def counted() -> dict[str, Any]:
             found = compute()
-            return {**found, "simulations": self.simulations, "history": list(self.history)}
+            counts = {"simulations": self.simulations, "cut_short": self.cut_short}
+            return {**found, **counts, "history": list(self.history)}
 
         found = self.journal.step(name, counted)
         self.simulations, self.history = found["simulations"], list(found["history"])
+        self.cut_short = found["cut_short"]
         return found
+
+    def _reaches(self, runs: int) -> bool:
+        """Whether so many runs are left; the search is cut short where they are not."""
+        reaches = self.simulations + runs <= self.limit
+        self.cut_short |= not reaches
+        return reaches
 
     def _measured(self, places: list[Place]) -> Iterator[tuple[np.ndarray, float | None]]:
         """Residuals at places and their root mean squares [m], None where the run failed; nothing is counted."""

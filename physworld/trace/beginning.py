@@ -27,6 +27,7 @@ class Beginning:
     progress: Progress | None
     cancelled: Callable[[], bool] | None
     ledger: Ledger = field(default_factory=Ledger)
+    notes: list[str] = field(default_factory=list)
 
     def calibrated(
         self, recordings: Recordings, twin: Twin | None, journal: Journal | None
@@ -40,6 +41,11 @@ class Beginning:
                 recordings.lead.scene, declared, self.progress, self.cancelled, journal, runner=self.runner
             )
             twin, runs = fitted.twin, fitted.simulations
+            if fitted.cut_short:
+                most = config.calibration.max_simulations
+                self.notes[:] = [
+                    f"the calibration of the declared physics was cut short by its budget of {most} simulations"
+                ]
             self.ledger.add("calibration", runs, time.perf_counter() - begun)
         twin = softly_held(twin)
         simulations = JointSimulations(

@@ -155,7 +155,11 @@ def trace(
     result = results[-1]
     stages = tuple(Stage(name, *cost) for name, cost in begin.ledger.spent.items())
     return replace(
-        result, simulations=simulations.count + runs, seconds=time.perf_counter() - begun, stages=stages
+        result,
+        simulations=simulations.count + runs,
+        seconds=time.perf_counter() - begun,
+        stages=stages,
+        notes=(*begin.notes, *result.notes),
     )
 
 

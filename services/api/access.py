@@ -1,4 +1,4 @@
-"""Request ids, the JSON access log and the request metrics: one middleware around everything.
+"""Request ids, the JSON access log, the request metrics and the headers of every answer: one middleware around all.
 
 A client may send ``X-Request-Id`` (letters, digits, ``._-``, at most 64); otherwise the service makes one.
 The answer carries it, every problem carries it, every log line of the request carries it.
@@ -15,10 +15,20 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from schemas.ids import new_id
 from services.api.metrics import Metrics
+from services.api.security import address_of
 
 _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 _METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 _UNLOGGED = frozenset({"/health/live", "/health/ready", "/metrics"})
+
+# What a browser may do with an answer of the API, which is data: nothing. The page at /docs has a script in itself.
+_SCRIPTS = "'self' 'unsafe-inline'"
+_DATA_POLICY = "default-src 'none'; frame-ancestors 'none'"
+_DOCS_POLICY = (
+    f"default-src 'none'; script-src {_SCRIPTS}; style-src {_SCRIPTS}; img-src 'self' data:; connect-src 'self'; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+_TLS_ONLY = "max-age=31536000; includeSubDomains"
 
 log = structlog.get_logger("physworld.access")
 
@@ -45,7 +55,7 @@ class Access:
                 status = message["status"]
                 headers = MutableHeaders(scope=message)
                 headers["X-Request-Id"] = request_id
-                headers.setdefault("X-Content-Type-Options", "nosniff")
+                _protect(headers, scope)
             await send(message)
 
         started = time.perf_counter()
@@ -63,18 +73,29 @@ class Access:
         route = _route_of(scope)
         self.metrics.requests.labels(method, route, str(status)).inc()
         self.metrics.latency.labels(method, route).observe(seconds)
-        if scope["path"] in _UNLOGGED:
+        if scope["path"] in _UNLOGGED or scope["state"].get("unlogged"):
             return
-        client = scope.get("client")
         log.info(
             "request",
             method=scope["method"],
             path=scope["path"],
             status=status,
             seconds=round(seconds, 6),
-            client=client[0] if client else None,
+            client=address_of(scope),
             key=scope["state"].get("key_id"),
         )
+
+
+def _protect(headers: MutableHeaders, scope: Scope) -> None:
+    """Say what browsers and caches may do with an answer, where its route has not said it."""
+    headers.setdefault("X-Content-Type-Options", "nosniff")
+    headers.setdefault("Referrer-Policy", "no-referrer")
+    policy = _DOCS_POLICY if scope["path"].startswith("/docs") else _DATA_POLICY
+    headers.setdefault("Content-Security-Policy", policy)
+    if scope["path"].startswith("/v1"):
+        headers.setdefault("Cache-Control", "no-store")
+    if scope.get("scheme") == "https":
+        headers.setdefault("Strict-Transport-Security", _TLS_ONLY)
 
 
 def _request_id(headers: Headers) -> str:

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
 import anyio
 from fastapi import APIRouter, FastAPI
 from fastapi_offline import FastAPIOffline
 
 from services.api import errors
 from services.api.access import Access
+from services.api.attempts import Attempts
 from services.api.closing import Closing
+from services.api.ending import Endings, EndWithCredential
+from services.api.feed import Feed
 from services.api.limits import BodyLimit
 from services.api.metrics import Metrics
 from services.api.openapi import describe
+from services.api.parsing import Parsers
 from services.api.routes import (
     artifacts,
     assessments,
+    audit,
     datasets,
     fits,
     health,
@@ -30,33 +38,44 @@ from services.api.routes import (
     signing_keys,
     traces,
 )
-from services.api.security import Authentication, bearer
+from services.api.security import Authentication, Gate, bearer
 from services.stores import Stores
 from storage.database import Database
 from storage.settings import Settings
 
 VERSION = "0.1.0"
 PREFIX = "/v1"
-PARALLEL_UPLOADS = 2  # each holds its file in memory while it is parsed
+PARALLEL_UPLOADS = 2  # each by a process of its own
 
 
 def create_api(settings: Settings, database: Database, stores: Stores) -> FastAPI:
     """The application on opened stores; its documentation is served from the installed package, at /docs."""
-    closing = Closing()
+    closing, parsers = Closing(), Parsers(PARALLEL_UPLOADS)
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        async with closing.lifespan(app):
+            yield
+        parsers.close()
+
     app = FastAPIOffline(
         title="PhysWorld",
         version=VERSION,
         summary="From a recording of a deformable object to a published world model",
         redoc_url=None,
         docs_url="/docs",
-        lifespan=closing.lifespan,
+        lifespan=lifespan,
     )
     app.state.closing = closing
+    app.state.feed = Feed(database, closing)
     app.state.settings = settings
     app.state.database = database
     app.state.stores = stores
     app.state.metrics = Metrics(database)
+    app.state.gate = Gate(database, Attempts())
+    app.state.endings = Endings(database)
     app.state.upload_slots = anyio.CapacityLimiter(PARALLEL_UPLOADS)
+    app.state.parsers = parsers
     versioned = APIRouter(prefix=PREFIX, dependencies=[bearer])
     for module in (
         scenes,
@@ -74,6 +93,7 @@ def create_api(settings: Settings, database: Database, stores: Stores) -> FastAP
         library,
         signing_keys,
         keys,
+        audit,
     ):
         versioned.include_router(module.router)
     app.include_router(versioned)
@@ -81,8 +101,9 @@ def create_api(settings: Settings, database: Database, stores: Stores) -> FastAP
     app.include_router(health.router)
     errors.install(app)
     describe(app)
-    # The last one added runs first: access log, then body limit, then authentication.
-    app.add_middleware(Authentication, database=database, prefix=PREFIX)
+    # The last one added runs first: access log, then body limit, then authentication, then ends of credentials.
+    app.add_middleware(EndWithCredential, endings=app.state.endings)
+    app.add_middleware(Authentication, gate=app.state.gate, prefix=PREFIX)
     app.add_middleware(BodyLimit, max_upload_bytes=settings.max_upload_bytes)
     app.add_middleware(Access, metrics=app.state.metrics)
     return app

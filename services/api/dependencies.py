@@ -7,9 +7,10 @@ from typing import Annotated, cast
 
 from fastapi import Depends, Path, Query, Request
 
-from services.api.closing import Closing
-from services.api.security import Principal
+from services.api.feed import Feed
+from services.api.security import Principal, address_of
 from services.stores import Stores
+from storage.audit import Actor
 from storage.database import Database
 from storage.settings import Settings
 
@@ -33,14 +34,19 @@ def get_app_settings(request: Request) -> Settings:
     return cast(Settings, request.app.state.settings)
 
 
-def get_closing(request: Request) -> Closing:
-    """Whether the server was told to stop."""
-    return cast(Closing, request.app.state.closing)
+def get_feed(request: Request) -> Feed:
+    """The events of followed jobs, as this process reads them."""
+    return cast(Feed, request.app.state.feed)
 
 
 def get_principal(request: Request) -> Principal:
     """The API key behind the request, put there by the authentication middleware."""
     return cast(Principal, request.state.principal)
+
+
+def get_actor(request: Request) -> Actor:
+    """Who asks and from where, for the audit log."""
+    return Actor(get_principal(request).id, address_of(request.scope))
 
 
 @dataclass(frozen=True)
@@ -64,8 +70,9 @@ def get_page_query(
 DatabaseDep = Annotated[Database, Depends(get_database)]
 StoresDep = Annotated[Stores, Depends(get_stores)]
 SettingsDep = Annotated[Settings, Depends(get_app_settings)]
-ClosingDep = Annotated[Closing, Depends(get_closing)]
+FeedDep = Annotated[Feed, Depends(get_feed)]
 PrincipalDep = Annotated[Principal, Depends(get_principal)]
+ActorDep = Annotated[Actor, Depends(get_actor)]
 PageDep = Annotated[PageQuery, Depends(get_page_query)]
 
 ObjectId = Annotated[str, Path(pattern=ID_PATTERN, description="prefix and ULID")]

@@ -17,10 +17,10 @@ _HINT = (
 )
 
 
-def roll_out(url: str, database: Database, key_id: str, request: RolloutCreate) -> Rollout:
+def roll_out(url: str, database: Database, credential: str, request: RolloutCreate) -> Rollout:
     """The answer of the inference service at ``url``. Raises ApiProblem: its own, or 503."""
     with database.session() as session:
-        ticket, _ = tickets.issue(session, key_id, f"rollout:{request.model}:{request.version}")
+        ticket, _ = tickets.issue(session, credential, f"rollout:{request.model}:{request.version}")
     try:
         answer = httpx.post(
             f"{url}/rollouts",

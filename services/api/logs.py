@@ -4,8 +4,17 @@ from __future__ import annotations
 
 import logging
 import sys
+from typing import Any
 
 import structlog
+
+from storage.tickets import hide_tickets
+
+
+def _hide_tickets(logger: Any, name: str, entry: structlog.typing.EventDict) -> structlog.typing.EventDict:
+    """No line holds a ticket, which stands in the addresses of live sessions."""
+    return {key: hide_tickets(value) if isinstance(value, str) else value for key, value in entry.items()}
+
 
 _SHARED: list[structlog.typing.Processor] = [
     structlog.contextvars.merge_contextvars,
@@ -30,6 +39,7 @@ def configure_logs(level: str) -> None:
             processors=[
                 structlog.stdlib.ProcessorFormatter.remove_processors_meta,
                 structlog.processors.format_exc_info,
+                _hide_tickets,
                 structlog.processors.JSONRenderer(),
             ],
         )
@@ -39,5 +49,10 @@ def configure_logs(level: str) -> None:
     root.setLevel(level.upper())
     for name in ("uvicorn", "uvicorn.error"):
         logging.getLogger(name).handlers.clear()
+    for name in (
+        "uvicorn.error",
+        "websockets",
+    ):  # below that they write whole requests, keys and cookies included
+        logging.getLogger(name).setLevel(max(root.level, logging.INFO))
     # The access middleware writes these lines, with the request id.
     logging.getLogger("uvicorn.access").disabled = True

@@ -1,4 +1,4 @@
-"""Corrections of the generated OpenAPI document: problems as the one error schema, HEAD left out."""
+"""Corrections of the generated OpenAPI document: problems as the one error schema, 429 wherever a key is asked for."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from fastapi import FastAPI
 from pydantic.json_schema import models_json_schema
 
 from schemas.base import Problem
+from services.api.errors import documented
 
 REFERENCE = "#/components/schemas/{model}"
 
@@ -23,6 +24,10 @@ def describe(app: FastAPI) -> None:
             schemas = document.setdefault("components", {}).setdefault("schemas", {})
             for name, schema in definitions["$defs"].items():
                 schemas.setdefault(name, schema)
+            for methods in document["paths"].values():
+                for operation in methods.values():
+                    if operation.get("security"):
+                        operation["responses"].setdefault("429", documented(429)[429])
             app.openapi_schema = document
         return app.openapi_schema
 

@@ -1,15 +1,19 @@
 """A scene file on its way in: multipart parts to a temporary file, parsed, named, made canonical.
 
-The file is read while it streams into a temporary file (``limits`` bounds it), then parsed by the storage's
-importers, which treat it as hostile. The temporary file is gone when the request is.
+The file is read while it streams into a temporary file (``limits`` bounds it), then parsed in another process
+(``services.api.parsing``). The temporary files are gone when the request is.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from fastapi import Request
 from pydantic import ValidationError
@@ -19,16 +23,12 @@ from schemas.base import FieldError
 from schemas.scene import SceneImport
 from services.api.errors import ApiProblem
 from services.api.limits import too_large
-from storage.importers import import_any
-from storage.importers.options import ImportOptions
-from storage.scene_bundle import canonical_archive, checked
+from services.api.parsing import Found, Parsers
 from storage.scene_declaration import KINDS
-
-if TYPE_CHECKING:
-    from physworld.scene import Scene
 
 FIELDS = frozenset({"bundle", "name", "options"})
 FIELD_LIMIT_BYTES = 64 * 1024
+COPIED_BYTES = 1024 * 1024
 
 MULTIPART_BODY: dict[str, Any] = {
     "requestBody": {
@@ -99,15 +99,15 @@ def upload_of(form: FormData, limit_bytes: int) -> Upload:
     return Upload(file, options)
 
 
-def parse_scene(upload: Upload) -> tuple[Scene, list[str], bytes]:
-    """The scene in an upload, its warnings, and the one archive that its content has. Raises SceneInvalid."""
-    options = upload.options
-    given = {name: value for name, value in options.model_dump().items() if value is not None}
-    upload.file.file.seek(0)
-    scene, warnings = import_any(upload.file.file.read(), upload.file.filename or "", ImportOptions(**given))
-    if options.name is not None and options.name != scene.name:
-        scene, warnings = checked(dataclasses.replace(scene, name=options.name))
-    return scene, warnings, canonical_archive(scene)
+@contextmanager
+def parsed(upload: Upload, parsers: Parsers) -> Iterator[Found]:
+    """What the upload holds, read in another process; its files go with the block. Raises SceneInvalid."""
+    given = {name: value for name, value in upload.options.model_dump().items() if value is not None}
+    with tempfile.TemporaryDirectory(prefix="physworld-upload-") as folder:
+        upload.file.file.seek(0)
+        with (Path(folder) / "upload").open("wb") as file:
+            shutil.copyfileobj(upload.file.file, file, COPIED_BYTES)
+        yield parsers.parse(Path(folder), upload.file.filename or "", upload.options.name, given)
 
 
 def _options(

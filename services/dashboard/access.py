@@ -1,73 +1,54 @@
-"""Who may look: an API key typed into a form becomes a signed cookie, which every page asks for.
+"""Who may look: an API key typed into a form opens a session, which every page asks for.
 
-The cookie holds the key's id and an expiry under an HMAC; it is HttpOnly and SameSite=Strict, and of no use
-to the REST API. The key itself is looked up again for every page, so a revoked key is out at once. What
-changes something must come from one of our own pages (``require_same_origin``).
+The session lies in the database (``storage.sessions``); the cookie holds a random text and nothing else, is HttpOnly
+and SameSite=Strict, and of no use to the REST API. A log-out or a revoked key ends it at once, on every web process.
+What changes something must come from one of our own pages (``require_same_origin``).
 """
 
 from __future__ import annotations
 
-import hashlib
-import hmac
-import os
-import secrets
-import time
-from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 from urllib.parse import quote, urlsplit
 
 from fastapi import APIRouter, Depends, Form, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from starlette.exceptions import HTTPException
 
+from services.api.errors import ApiProblem
+from services.api.security import Gate, address_of
 from services.dashboard.site import BASE, Site
-from storage import api_keys
+from storage import api_keys, sessions
+from storage.audit import Actor
+from storage.database import Database
 
 COOKIE = "physworld_session"
-LIFETIME_SECONDS = 12 * 3600
-SECRET_BYTES = 32
-SECRET_NAME = "dashboard-secret"
+SECURE_COOKIE = f"__Host-{COOKIE}"  # a browser takes this name over TLS only, from this host, for this host
 
 
 class LoginRequired(Exception):
     """No valid session; ``app`` answers with the login form, or with 401 where no person would see a form."""
 
 
-class Sessions:
-    """Makes and reads session cookies."""
-
-    def __init__(self, site: Site) -> None:
-        self._database = site.database
-        self._secret = _secret(site.settings.data_dir / SECRET_NAME)
-
-    def issue(self, key_id: str) -> str:
-        """A cookie's value for the holder of this key."""
-        body = f"{key_id}.{int(time.time()) + LIFETIME_SECONDS}"
-        return f"{body}.{self._signature(body)}"
-
-    def viewer(self, cookie: str | None) -> api_keys.ApiKey | None:
-        """The key behind a cookie, None when it is forged, over or its key revoked."""
-        body, _, signature = (cookie or "").rpartition(".")
-        if not hmac.compare_digest(self._signature(body).encode(), signature.encode()):
-            return None
-        key_id, _, expiry = body.partition(".")
-        if int(expiry) < time.time():
-            return None
-        with self._database.reading() as session:
-            return api_keys.get_active_key(session, key_id)
-
-    def _signature(self, body: str) -> str:
-        return hmac.new(self._secret, body.encode(), hashlib.sha256).hexdigest()
-
-
 def require_viewer(request: Request) -> None:
     """Dependency of every page: puts the viewer's key on the request or raises LoginRequired."""
-    sessions: Sessions = request.app.state.sessions
-    viewer = sessions.viewer(request.cookies.get(COOKIE))
-    if viewer is None:
+    database: Database = request.app.state.site.database
+    with database.reading() as session:
+        found = sessions.viewer(session, _text_of(request))
+    if found is None:
         raise LoginRequired
+    viewer, to_touch = found
+    if to_touch:
+        with database.session() as session:
+            sessions.touch(session, viewer.credential)
     request.state.viewer = viewer
     request.state.key_id = viewer.id  # for the access log
+    request.state.credential = viewer.credential  # what a live part of a page ends with
+
+
+def actor_of(request: Request) -> Actor:
+    """Who looks and from where, for the audit log."""
+    viewer: api_keys.ApiKey = request.state.viewer
+    return Actor(viewer.id, address_of(request.scope))
 
 
 def require_same_origin(request: Request) -> None:
@@ -100,28 +81,41 @@ def router(site: Site) -> APIRouter:
     def login(
         request: Request, key: Annotated[str, Form()] = "", next: Annotated[str, Form()] = f"{BASE}/"
     ) -> Response:
-        with site.database.reading() as session:
-            found = api_keys.verify(session, key.strip())
+        gate: Gate = request.app.state.gate
+        address = address_of(request.scope)
+        try:
+            found = gate.key_of(key.strip(), address)
+        except ApiProblem as problem:
+            refused = f"{problem.detail[0].upper()}{problem.detail[1:]}."
+            answer = site.page(request, "login.html", status=429, next=_own_path(next), refused=refused)
+            answer.headers.update(problem.headers or {})
+            request.state.unlogged = True  # a flood fills no log
+            return answer
         if found is None:
-            refused = "This key is not known here, or it was revoked."
+            gate.record("login.failed", address)
+            refused = "This key is not known here, or it was revoked or has expired."
             return site.page(request, "login.html", status=401, next=_own_path(next), refused=refused)
-        sessions: Sessions = request.app.state.sessions
+        actor = Actor(found.id, address)
+        with site.database.session() as session:
+            sessions.end(session, api_keys.digest_of(_text_of(request)), actor)
+            text = sessions.begin(session, found, actor)
         response = RedirectResponse(_own_path(next), 303)
-        response.set_cookie(
-            COOKIE,
-            sessions.issue(found.id),
-            max_age=LIFETIME_SECONDS,
-            path=BASE,
-            httponly=True,
-            samesite="strict",
-            secure=request.url.scheme == "https",
-        )
+        response.set_cookie(value=text, max_age=int(sessions.LIFETIME.total_seconds()), **_cookie(request))
         return response
 
     @routes.post("/logout", dependencies=[Depends(require_same_origin)])
-    def logout() -> Response:
+    def logout(request: Request, everywhere: Annotated[bool, Form()] = False) -> Response:
+        text = _text_of(request)
+        with site.database.session() as session:
+            found = sessions.viewer(session, text)
+            if found is not None:
+                actor = Actor(found[0].id, address_of(request.scope))
+                if everywhere:
+                    sessions.end_all(session, found[0].id, actor)
+                else:
+                    sessions.end(session, api_keys.digest_of(text), actor)
         response = RedirectResponse(f"{BASE}/login", 303)
-        response.delete_cookie(COOKIE, path=BASE)
+        response.delete_cookie(**_cookie(request))
         return response
 
     return routes
@@ -139,20 +133,13 @@ def _own_path(path: str) -> str:
     return path if plain else f"{BASE}/"
 
 
-def _secret(path: Path) -> bytes:
-    """The secret that signs cookies, kept beside the database so that a restart logs nobody out.
+def _text_of(request: Request) -> str:
+    """What the browser's cookie says; empty without one."""
+    return request.cookies.get(_cookie(request)["key"], "")
 
-    Where the folder cannot be written (a read-only container) sessions last as long as the process.
-    """
-    made = secrets.token_bytes(SECRET_BYTES)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    except FileExistsError:
-        kept = path.read_bytes()
-        return kept if len(kept) == SECRET_BYTES else made
-    except OSError:
-        return made
-    with os.fdopen(handle, "wb") as file:
-        file.write(made)
-    return made
+
+def _cookie(request: Request) -> dict[str, Any]:
+    """Name and attributes of the cookie. The name for TLS demands the path ``/``."""
+    secure = request.url.scheme == "https"
+    name, path = (SECURE_COOKIE, "/") if secure else (COOKIE, BASE)
+    return {"key": name, "path": path, "httponly": True, "samesite": "strict", "secure": secure}

@@ -18,6 +18,8 @@ from starlette.middleware.gzip import GZipMiddleware
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from services.api.attempts import Attempts
+from services.api.security import Gate
 from services.dashboard import (
     access,
     pages_datasets,
@@ -25,6 +27,7 @@ from services.dashboard import (
     pages_jobs,
     pages_models,
     pages_scenes,
+    pages_sessions,
     pages_traces,
 )
 from services.dashboard.site import BASE, STATIC, Site
@@ -57,7 +60,10 @@ FOREVER = "public, max-age=31536000, immutable"
 
 def mount(app: FastAPI, settings: Settings, database: Database, stores: Stores) -> None:
     """Add the dashboard to the web process: pages and static files under /dashboard."""
-    dashboard = create_dashboard(Site(settings, database, stores))
+    gate = getattr(app.state, "gate", None) or Gate(
+        database, Attempts()
+    )  # one with the API's, where there is one
+    dashboard = create_dashboard(Site(settings, database, stores), gate)
 
     @app.get(BASE, include_in_schema=False)
     def without_slash() -> RedirectResponse:
@@ -66,12 +72,21 @@ def mount(app: FastAPI, settings: Settings, database: Database, stores: Stores) 
     app.mount(BASE, dashboard, name="dashboard")
 
 
-def create_dashboard(site: Site) -> FastAPI:
+def create_dashboard(site: Site, gate: Gate) -> FastAPI:
     """The application itself, for paths relative to /dashboard."""
     app = FastAPI(openapi_url=None, docs_url=None, redoc_url=None)
-    app.state.sessions = access.Sessions(site)
+    app.state.site, app.state.gate = site, gate
     app.include_router(access.router(site))
-    for module in (pages_jobs, pages_scenes, pages_traces, pages_datasets, pages_models, pages_files):
+    pages = (
+        pages_jobs,
+        pages_scenes,
+        pages_traces,
+        pages_datasets,
+        pages_models,
+        pages_files,
+        pages_sessions,
+    )
+    for module in pages:
         app.include_router(module.router(site), dependencies=[Depends(access.require_viewer)])
     app.mount("/static", GZipMiddleware(StaticFiles(directory=STATIC), minimum_size=1024))
     app.add_middleware(SecurityHeaders)

@@ -13,10 +13,10 @@ from sqlalchemy.orm import Session
 from schemas.base import Reference
 from schemas.job import TERMINAL_STATES, Event, Job
 from services.dashboard import live
-from services.dashboard.access import require_same_origin, require_writer
+from services.dashboard.access import actor_of, require_same_origin, require_writer
 from services.dashboard.site import BASE, Site
 from services.dashboard.text import figure
-from storage import jobs, overview, runs
+from storage import audit, jobs, overview, runs
 
 PAGE_SIZE = 20
 EVENTS_SHOWN = 100
@@ -67,9 +67,10 @@ def router(site: Site) -> APIRouter:
     @routes.post(
         "/jobs/{job_id}/cancel", dependencies=[Depends(require_same_origin), Depends(require_writer)]
     )
-    def cancel(job_id: str) -> Response:
+    def cancel(request: Request, job_id: str) -> Response:
         with site.database.session() as session:
             jobs.cancel_job(session, job_id)
+            audit.record(session, actor_of(request), "job.cancelled", job_id)
         return RedirectResponse(f"{BASE}/jobs/{job_id}", 303)
 
     return routes

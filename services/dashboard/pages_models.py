@@ -118,7 +118,7 @@ def router(site: Site) -> APIRouter:
         version = _version(site, name, number).version
         with site.database.session() as session:
             ready_version(session, name, version)
-            ticket, _ = tickets.issue(session, viewer.id, f"session:{name}:{version}")
+            ticket, _ = tickets.issue(session, viewer.credential, f"session:{name}:{version}")
         return JSONResponse({"path": f"/v1/live?{urlencode(_session(name, version, ticket))}"})
 
     @routes.get("/models/{name}/{number}/curve")

@@ -157,7 +157,7 @@ def _declared(record: SceneRecord) -> list[tuple[str, object]]:
     """Declared facts worth a line: the body's one by one, the others as they are."""
     facts: list[tuple[str, object]] = []
     for key in DECLARED_SHOWN:
-        value = record.declared.get(key)
+        value = (record.declared or {}).get(key)
         if key == "body" and isinstance(value, dict):
             facts += [(_fact_label(name), item) for name, item in value.items() if _is_short(item)]
         elif value not in (None, [], {}):

@@ -13,13 +13,13 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from services.embedded import logs
+from services.embedded import forked, logs
+from services.embedded.forked import PR_SET_PDEATHSIG, Forked
 
 FIRST_PAUSE_S = 0.5
 LONGEST_PAUSE_S = 30.0
 STEADY_S = 60.0
 """A child that ran this long starts again with the first pause."""
-PR_SET_PDEATHSIG = 1
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,7 @@ class Program:
         stop_signal: what asks it to end at once without losing anything.
         descriptors: open files that it inherits besides the family lock.
         ready_file: a file that it writes once it serves; None if something else tells.
+        module: of a Python program whose command is ``python -m MODULE …``, which may be forked instead.
     """
 
     name: str
@@ -41,6 +42,7 @@ class Program:
     stop_signal: signal.Signals = signal.SIGTERM
     descriptors: tuple[int, ...] = ()
     ready_file: Path | None = None
+    module: str = ""
 
 
 @dataclass
@@ -50,7 +52,7 @@ class Child:
     program: Program
     log: Path
     family_descriptor: int
-    process: subprocess.Popen[bytes] | None = None
+    process: subprocess.Popen[bytes] | Forked | None = None
     exits: int = 0
     last_exit: int | None = None
     _started_at: float = 0.0
@@ -80,17 +82,28 @@ class Child:
             logs.rotate(self.log)
         if self.program.ready_file is not None:
             self.program.ready_file.unlink(missing_ok=True)
+        program, descriptors = self.program, (self.family_descriptor, *self.program.descriptors)
         with self.log.open("ab") as output:
-            self.process = subprocess.Popen(
-                list(self.program.command),
-                env=dict(self.program.environment),
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                pass_fds=(self.family_descriptor, *self.program.descriptors),
-                start_new_session=True,
-                preexec_fn=_death_with_parent(os.getpid()),
-            )
+            if program.module and forked.AVAILABLE:
+                self.process = Forked(
+                    program.name,
+                    program.module,
+                    program.command[3:],
+                    program.environment,
+                    output.fileno(),
+                    descriptors,
+                )
+            else:
+                self.process = subprocess.Popen(
+                    list(program.command),
+                    env=dict(program.environment),
+                    stdin=subprocess.DEVNULL,
+                    stdout=output,
+                    stderr=subprocess.STDOUT,
+                    pass_fds=descriptors,
+                    start_new_session=True,
+                    preexec_fn=_death_with_parent(os.getpid()),
+                )
         self._started_at = time.monotonic()
 
     def ask_to_stop(self) -> None:

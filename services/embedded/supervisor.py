@@ -1,9 +1,10 @@
 """Starts the parts in their order, keeps them running, says when they serve, and ends them all.
 
-Order: folder locks → database at its newest revision → admin key, signing key → broker (waited for) → web,
-dispatcher, workers, trainer, inference. A child that ends is started again with growing pauses; the broker comes back
-on its port with its append-only file. The supervisor is one thread that sleeps between looks; its death by any signal
-ends every child (Linux: PR_SET_PDEATHSIG) and the next start carries on from the database.
+Order: folder locks → database at its newest revision → admin key, signing key → broker, web → once the broker answers:
+dispatcher, workers, trainer, inference. Python programs are forks of the supervisor (``forked``). A child that ends is
+started again with growing pauses; the broker comes back on its port with its append-only file. The supervisor is one
+thread that sleeps between looks; its death by any signal ends every child (Linux: PR_SET_PDEATHSIG) and the next start
+carries on from the database.
 """
 
 from __future__ import annotations
@@ -24,17 +25,21 @@ from pathlib import Path
 from types import FrameType
 
 from pydantic import SecretStr
+from sqlalchemy.orm import Session
 
 from schemas.queues import SIMULATION
 from services.embedded import logs
 from services.embedded.broker import Broker, choose_broker
 from services.embedded.child import Child, Program
 from services.embedded.folder import DataFolder, FolderLocks, write_private
+from services.embedded.forked import import_shared
 from storage import api_keys, leases, signing
 from storage.database import open_database
+from storage.errors import KeyEnded
 from storage.settings import Settings
 
 WATCH_S = 0.2
+STARTING_S = 0.05
 LOGS_S = 60.0
 START_WITHIN_S = 120.0
 END_WITHIN_S = 8.0
@@ -117,8 +122,11 @@ class Supervisor:
         self._url = f"http://127.0.0.1:{listening.getsockname()[1]}"
         if broker.command:
             self._add(Program("broker", broker.command, environment), family)
+        web, *others = self._programs(environment, listening, inference)
+        self._add(web, family)  # takes longest and needs no broker
+        import_shared()
         self._wait_for_broker(broker)
-        for program in self._programs(environment, listening, inference):
+        for program in others:
             self._add(program, family)
         self._write_state(ready=False)
         self._wait_until_ready()
@@ -132,41 +140,37 @@ class Supervisor:
     def _programs(
         self, environment: dict[str, str], listening: socket.socket, inference: socket.socket
     ) -> list[Program]:
-        python = (sys.executable, "-m")
         programs = [
-            Program(
-                "web",
-                (*python, "services.embedded.web", "--fd", str(listening.fileno())),
-                environment,
-                descriptors=(listening.fileno(),),
-            ),
-            self._python_program("dispatcher", (*python, "workers.dispatcher"), environment),
+            _server("web", "services.embedded.web", (), environment, listening),
+            self._consumer("dispatcher", "workers.dispatcher", (), environment, signal.SIGTERM),
         ]
         for number in range(1, self._options.workers + 1):
             name = f"worker-{number}"
-            serve = (*python, "workers", "--queue", SIMULATION, "--name", name)
-            programs.append(self._python_program(name, serve, environment, signal.SIGQUIT))
+            serve = ("--queue", SIMULATION, "--name", name)
+            programs.append(self._consumer(name, "workers", serve, environment))
         if self._options.trainer:
-            train = (*python, "services.trainer", "--name", "trainer")
-            programs.append(self._python_program("trainer", train, environment, signal.SIGQUIT))
+            train = ("--name", "trainer")
+            programs.append(self._consumer("trainer", "services.trainer", train, environment))
         if self._options.inference:
-            module = (*python, "services.inference")
-            answer = (*module, "serve", "--fd", str(inference.fileno()))
-            programs.append(Program("inference", answer, environment, descriptors=(inference.fileno(),)))
-            work = (*module, "work", "--name", "planner")
-            programs.append(self._python_program("planner", work, environment, signal.SIGQUIT))
+            module = "services.inference"
+            programs.append(_server("inference", module, ("serve",), environment, inference))
+            work = ("work", "--name", "planner")
+            programs.append(self._consumer("planner", module, work, environment))
         return programs
 
-    def _python_program(
+    def _consumer(
         self,
         name: str,
-        command: tuple[str, ...],
+        module: str,
+        arguments: tuple[str, ...],
         environment: dict[str, str],
-        stop_signal: signal.Signals = signal.SIGTERM,
+        stop_signal: signal.Signals = signal.SIGQUIT,
     ) -> Program:
+        """A program that writes a file once it works."""
         ready = self._folder.run / f"{name}.ready"
         own = {**environment, READY_FILE: str(ready)}
-        return Program(name, command, own, stop_signal, ready_file=ready)
+        command = (sys.executable, "-m", module, *arguments)
+        return Program(name, command, own, stop_signal, ready_file=ready, module=module)
 
     def _add(self, program: Program, family: int) -> None:
         child = Child(program, self._folder.logs / f"{program.name}.log", family)
@@ -180,15 +184,22 @@ class Supervisor:
             with database.session() as session:  # alone on it: nobody of an earlier run is left
                 leases.recover(session, datetime.now(UTC))
         with database.session() as session:
-            if self._folder.api_key.exists():
-                api_keys.ensure_key(session, self._folder.api_key.read_text().strip(), KEY_NAME, "admin")
-            else:
-                _, token = api_keys.create_key(session, KEY_NAME, "admin")
-                write_private(self._folder.api_key, token + "\n")
+            self._ensure_key(session)
             signer = signing.open_signer(settings)
             signing.register(session, signer)
             self._signing_key = signer.public_key
         database.dispose()
+
+    def _ensure_key(self, session: Session) -> None:
+        """The key in the file; one that is gone or has ended is replaced: who has the folder has the service."""
+        try:
+            if self._folder.api_key.exists():
+                api_keys.ensure_key(session, self._folder.api_key.read_text().strip(), KEY_NAME, "admin")
+                return
+        except KeyEnded as error:
+            self._say(f"{self._folder.api_key} holds an ended key: {error}. A new one is written there")
+        _, token = api_keys.create_key(session, KEY_NAME, "admin")
+        write_private(self._folder.api_key, token + "\n")
 
     def _listen(self) -> socket.socket:
         """The web process's socket: on the asked port, or on the last one, or on any that is free."""
@@ -222,7 +233,7 @@ class Supervisor:
     def _wait(self, what: str, condition: Callable[[], bool]) -> None:
         deadline = time.monotonic() + START_WITHIN_S
         while not condition():
-            if self._stop.wait(WATCH_S):
+            if self._stop.wait(STARTING_S):
                 raise Stopped
             for child in self._children:
                 child.watch()
@@ -302,6 +313,15 @@ class Supervisor:
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self._stop.set()
+
+
+def _server(
+    name: str, module: str, arguments: tuple[str, ...], environment: dict[str, str], listening: socket.socket
+) -> Program:
+    """A program that serves on a socket of the supervisor's."""
+    descriptor = listening.fileno()
+    command = (sys.executable, "-m", module, *arguments, "--fd", str(descriptor))
+    return Program(name, command, environment, descriptors=(descriptor,), module=module)
 
 
 def _any_port() -> socket.socket:

@@ -13,7 +13,8 @@ import sys
 import uvicorn
 
 from services.api.logs import configure_logs
-from services.web import create_app
+from services.connections import Connection, Session
+from services.web import create_app, proxy_options
 from storage.settings import get_settings
 
 GRACE_S = 3
@@ -28,9 +29,12 @@ def main(arguments: list[str] | None = None) -> int:
     configure_logs(settings.log_level)
     config = uvicorn.Config(
         create_app(settings),
+        http=Connection,
+        ws=Session,
         log_config=None,
         access_log=False,
         server_header=False,
+        **proxy_options(settings),
         timeout_graceful_shutdown=GRACE_S,
     )
     server = uvicorn.Server(config)

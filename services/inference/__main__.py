@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import os
 import socket
 import sys
@@ -45,7 +46,9 @@ def _work(settings: Settings, name: str) -> int:
 def _serve(settings: Settings, options: argparse.Namespace) -> int:
     import uvicorn
 
+    from services.connections import Session
     from services.inference.lazy import LazyApp
+    from storage.tickets import TicketFilter
 
     config = uvicorn.Config(
         LazyApp(settings),
@@ -54,9 +57,13 @@ def _serve(settings: Settings, options: argparse.Namespace) -> int:
         log_level=settings.log_level,
         access_log=False,
         server_header=False,
+        proxy_headers=False,
+        ws=Session,
         ws_max_size=2**20,
         timeout_graceful_shutdown=GRACE_S,
     )
+    for handler in logging.getLogger("uvicorn").handlers:  # it logs the addresses of live sessions
+        handler.addFilter(TicketFilter())
     server = uvicorn.Server(config)
     if options.fd is None:
         server.run()

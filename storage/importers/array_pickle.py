@@ -49,7 +49,7 @@ def load_arrays(data: bytes) -> Any:
     """
     try:
         loaded = _ArrayUnpickler(io.BytesIO(data)).load()
-        return _unwrap(loaded, depth=0)
+        return _Unwrapping().of(loaded, depth=0)
     except PickleRefused:
         raise
     except MALFORMED as error:
@@ -158,23 +158,32 @@ class _ArrayUnpickler(pickle._Unpickler):
 
 MAX_DEPTH = 8
 MAX_ITEMS = 1_000_000
+"""Of all containers together, each counted as often as it is met: lists that share a child are small only on disk."""
 
 
-def _unwrap(value: Any, depth: int) -> Any:
+class _Unwrapping:
     """Containers with the arrays themselves in the stand-ins' places."""
-    if depth > MAX_DEPTH:
-        raise PickleRefused(f"nests deeper than {MAX_DEPTH} levels")
-    if isinstance(value, _Array):
-        if value.value is None:
-            raise PickleRefused("holds an array without content")
-        return value.value
-    if isinstance(value, dict | list | tuple) and len(value) > MAX_ITEMS:
-        raise PickleRefused(f"holds a container of {len(value)} items, at most {MAX_ITEMS} are read")
-    if isinstance(value, dict):
-        return {_plain(key): _unwrap(item, depth + 1) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_unwrap(item, depth + 1) for item in value]
-    return _plain(value)
+
+    def __init__(self) -> None:
+        self._left = MAX_ITEMS
+
+    def of(self, value: Any, depth: int) -> Any:
+        """The value without stand-ins."""
+        if depth > MAX_DEPTH:
+            raise PickleRefused(f"nests deeper than {MAX_DEPTH} levels")
+        if isinstance(value, _Array):
+            if value.value is None:
+                raise PickleRefused("holds an array without content")
+            return value.value
+        if isinstance(value, dict | list | tuple):
+            self._left -= len(value)
+            if self._left < 0:
+                raise PickleRefused(f"holds more than {MAX_ITEMS} items, which is the most that is read")
+        if isinstance(value, dict):
+            return {_plain(key): self.of(item, depth + 1) for key, item in value.items()}
+        if isinstance(value, list | tuple):
+            return [self.of(item, depth + 1) for item in value]
+        return _plain(value)
 
 
 def _plain(value: Any) -> Any:

@@ -5,7 +5,8 @@ number is a gap: it is filled in by interpolation and marked invisible. Which ma
 in the file: labels that begin with ``base``, ``clamp``, ``ctrl``, ``grip`` or ``robot``, or those named in
 the options. ``up`` says which axis of the recording points up.
 
-The file is parsed by ezc3d in a child process with limited memory: a forged file can at most end that child.
+The file is parsed by ezc3d in a child process with limited memory: a forged file can at most end that child. A process
+that is such a child itself says so by ``limit_here``, and parses the file without another.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +27,7 @@ from physworld.scene import Scene
 from schemas.base import FieldError
 from storage.archives import ArchiveRefused, read_arrays
 from storage.errors import SceneInvalid
+from storage.importers.c3d_child import content_of
 from storage.importers.options import ImportOptions, estimate_noise, split_of
 from storage.scene_bundle import checked, scene_from_parts
 
@@ -143,40 +146,56 @@ def read_bytes(data: bytes, name: str, options: ImportOptions | None = None) -> 
     return scene, warnings
 
 
+_limited_here = False
+
+
+def limit_here() -> None:
+    """This process is one that a forged file may end: parse in it."""
+    global _limited_here
+    _limited_here = True
+
+
 def parse(data: bytes) -> Recording:
-    """Markers of a C3D file, read in a child process.
+    """Markers of a C3D file.
 
     Raises:
-        SceneInvalid: it is no C3D file, it is cut short, or the child failed.
+        SceneInvalid: it is no C3D file, it is cut short, or it cannot be parsed.
     """
     _check_header(data)
     with tempfile.TemporaryDirectory(prefix="physworld-c3d-") as folder:
-        source, target = Path(folder) / "recording.c3d", Path(folder) / "recording.npz"
+        source = Path(folder) / "recording.c3d"
         source.write_bytes(data)
-        command = [sys.executable, "-m", "storage.importers.c3d_child", str(source), str(target)]
-        try:
-            child = subprocess.run(
-                command,
-                cwd=Path(__file__).parents[2],
-                capture_output=True,
-                timeout=CHILD_SECONDS,
-                check=False,
-            )
-        except subprocess.TimeoutExpired as error:
-            raise _invalid([f"reading it took more than {CHILD_SECONDS:.0f} s"]) from error
-        if child.returncode != 0 or not target.is_file():
-            lines = child.stderr.decode(errors="replace").strip().splitlines()
-            reason = lines[-1][:200] if lines else f"exit status {child.returncode}"
-            raise _invalid([f"cannot be read: {reason}"])
-        header = json.loads(child.stdout)
-        try:
-            arrays = read_arrays(target.read_bytes())
-        except ArchiveRefused as error:
-            raise _invalid([f"cannot be read: {error}"]) from error
-    positions, residuals = arrays["positions"], arrays["residuals"]
+        positions, residuals, header = _parsed_here(source) if _limited_here else _parsed_in_child(source)
     valid = (residuals >= 0.0) & np.isfinite(residuals) & np.isfinite(positions).all(axis=2)
     positions = np.where(valid[..., None], positions, 0.0)
     return Recording(positions, valid, header["labels"], header["unit"], float(header["rate_hz"]))
+
+
+def _parsed_here(source: Path) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
+    try:
+        return content_of(str(source))
+    except (MemoryError, KeyError, IndexError, TypeError, ValueError, OSError, RuntimeError) as error:
+        raise _invalid([f"cannot be read: {str(error)[:200] or type(error).__name__}"]) from error
+
+
+def _parsed_in_child(source: Path) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
+    target = source.with_suffix(".npz")
+    command = [sys.executable, "-m", "storage.importers.c3d_child", str(source), str(target)]
+    try:
+        child = subprocess.run(
+            command, cwd=Path(__file__).parents[2], capture_output=True, timeout=CHILD_SECONDS, check=False
+        )
+    except subprocess.TimeoutExpired as error:
+        raise _invalid([f"reading it took more than {CHILD_SECONDS:.0f} s"]) from error
+    if child.returncode != 0 or not target.is_file():
+        lines = child.stderr.decode(errors="replace").strip().splitlines()
+        reason = lines[-1][:200] if lines else f"exit status {child.returncode}"
+        raise _invalid([f"cannot be read: {reason}"])
+    try:
+        arrays = read_arrays(target.read_bytes())
+    except ArchiveRefused as error:
+        raise _invalid([f"cannot be read: {error}"]) from error
+    return arrays["positions"], arrays["residuals"], json.loads(child.stdout)
 
 
 def fill_gaps(positions: np.ndarray, valid: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ import json
 import resource
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +20,14 @@ MEMORY_BYTES = 4 << 30
 def main(source: str, target: str) -> None:
     """Parse ``source``; positions (T, N, 3) and residuals (T, N) go to ``target`` (npz)."""
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
+    positions, residuals, header = content_of(source)
+    with Path(target).open("wb") as stream:
+        np.savez(stream, positions=positions, residuals=residuals)
+    print(json.dumps(header))
+
+
+def content_of(source: str) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
+    """Positions (T, N, 3), residuals (T, N), and labels, unit and rate [Hz] of a C3D file, in this process."""
     import ezc3d
 
     content = ezc3d.c3d(source)
@@ -38,9 +47,7 @@ def main(source: str, target: str) -> None:
         "unit": str(units[0]),
         "rate_hz": float(np.ravel(rate)[0]) if len(rate) else 0.0,
     }
-    with Path(target).open("wb") as stream:
-        np.savez(stream, positions=positions, residuals=residuals)
-    print(json.dumps(header))
+    return positions, residuals, header
 
 
 if __name__ == "__main__":

@@ -22,8 +22,8 @@ from schemas.fit import FitConfig
 from schemas.job import Job
 from services.embedded.broker import choose_broker
 from services.embedded.folder import DataFolder
-from storage import jobs
-from storage.tables import ShardRow
+from storage import api_keys, jobs
+from storage.tables import ApiKeyRow, ShardRow
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
 
@@ -75,6 +75,38 @@ def test_start_look_start_again_and_ctrl_c(tmp_path: Path) -> None:
         _, alive = psutil.wait_procs(family, END_WITHIN_S)
         assert alive == []
         assert service.state() == {}
+
+
+def test_a_service_whose_own_key_was_ended_says_so_and_makes_another(tmp_path: Path) -> None:
+    with ServiceProcess(tmp_path / "data", "--workers", "0", "--no-trainer", "--no-inference") as service:
+        service.start()
+        key_file = service.data / "api-key"
+        first = key_file.read_text().strip()
+        assert service.interrupt() == 0
+        database, _ = service.stores()
+        with database.session() as session:
+            own = api_keys.verify(session, first)
+            assert own is not None
+            api_keys.create_key(session, "person", "admin")
+            api_keys.revoke_key(session, own.id)
+        service.start()
+        second = key_file.read_text().strip()
+        assert second != first and stat.S_IMODE(key_file.stat().st_mode) == 0o600
+        said = service.output.read_text()
+        assert f"{key_file} holds an ended key: the token is known as key {own.id}, revoked at" in said
+        assert second not in said
+        assert _status(f"{service.state()['api_url']}/v1/audit", second) == 200
+        modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in service.data.glob("physworld.db*")}
+        assert set(modes.values()) == {0o600}, modes
+        assert service.interrupt() == 0
+        key_file.unlink()
+        with database.session() as session:
+            for key in api_keys.list_keys(session).data:
+                session.get_one(ApiKeyRow, key.id).revoked_at = key.created_at  # nobody is left
+        service.start()
+        assert _status(f"{service.state()['api_url']}/v1/keys", key_file.read_text().strip()) == 200
+        assert service.interrupt() == 0
+        database.dispose()
 
 
 def test_a_killed_child_is_started_again_and_the_url_stays(tmp_path: Path) -> None:

@@ -168,8 +168,8 @@ def _print(document: dict[str, Any]) -> None:
         print(
             f"the engine's own damping: a drag of {drag:.3g} 1/s; finer cells move points by {1e3 * cells:.3g} mm"
         )
-    elif document["not_measured"]:
-        print(f"the engine's own damping was not measured: {document['not_measured']}")
+    if document["not_measured"]:
+        print(f"not measured: {document['not_measured']}")
     for name, why in document["search"]["open"].items():
         print(f"{name} is not converged: {why}")
     for name, parameter in (document["converged"] or {}).items():

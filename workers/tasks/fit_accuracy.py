@@ -65,7 +65,8 @@ def _measured(
 ) -> dict[str, Any]:
     if not fitted.twin.lattice.smooth:
         return not_measured("a mesh of triangles is the recorder's own: there are no finer cells to ask")
-    total = MEASURED_RUNS + len(fitted.searched)
+    none = _not_extrapolated(fitted)
+    total = MEASURED_RUNS + (0 if none else len(fitted.searched))
 
     def poll(done: int, frames: int) -> None:
         if cancelled is not None and cancelled():
@@ -81,9 +82,8 @@ def _measured(
         numerics = measure_numerics(
             scene, fitted.twin, particle_budget=budget, progress=tell, poll=poll, refined_tracks=finer
         )
-        if fitted.twin.formulation != "total_lagrangian":
-            reason = "converged: numbers with cells of no size are found in the total Lagrangian form"
-            return {**not_measured(reason), "numerics": json_safe(asdict(numerics))}
+        if none:
+            return {**not_measured(none), "numerics": json_safe(asdict(numerics))}
         converged = converged_parameters(
             scene, fitted, budget, poll=poll, runner=runner, finer_tracks=finer.finer_cells
         )
@@ -94,3 +94,12 @@ def _measured(
         "converged": {name: parameter_json(estimate) for name, estimate in converged.items()},
         "not_measured": "",
     }
+
+
+def _not_extrapolated(fitted: FitResult) -> str:
+    """Why there are no numbers with cells of no size, empty where there are."""
+    if fitted.twin.formulation != "total_lagrangian":
+        return "converged: numbers with cells of no size are found in the total Lagrangian form"
+    if fitted.cut_short:
+        return "converged: the budget of simulations cut the search short, there is no optimum to extrapolate"
+    return ""

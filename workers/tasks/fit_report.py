@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from physworld.calibrate import Estimate, FitResult
-from physworld.calibrate.estimates import NOT_CONVERGED
 from physworld.calibrate.law_choice import LawChoice
 from physworld.calibrate.local_search import FIELDS
 from physworld.calibrate.local_stage import LocalResult
@@ -41,11 +40,8 @@ def fit_report(
         law: how the law was chosen; None: it is the usual one.
         accuracy: of :func:`workers.tasks.fit_accuracy.fit_accuracy`.
     """
-    open_ones = {
-        known.name: fitted.parameters[known.name].note
-        for known in fitted.searched
-        if fitted.parameters[known.name].note in NOT_CONVERGED
-    }
+    law = law or LawChoice(fitted.twin.law.name)
+    open_ones = {**fitted.open, **({} if law.ended else {"law": law.reason})}
     metrics = {
         "held_out": held_out_table(scene, _predictors(fitted)),
         "simulations": fitted.simulations,
@@ -58,7 +54,7 @@ def fit_report(
             "matrix": fitted.correlations.matrix,
         },
         "training": fitted.losses,
-        "law": asdict(law or LawChoice(fitted.twin.law.name)),
+        "law": asdict(law),
         "formulation": {"name": fitted.twin.formulation, "reason": _formulation_reason(fitted)},
         "local": _local_record(fitted.local),
         "search": {"converged": not open_ones, "open": open_ones},

@@ -2,27 +2,26 @@
 
 from __future__ import annotations
 
-import time
 from typing import Annotated
 
-import anyio
 from fastapi import APIRouter, Header, Query, Response
+from sqlalchemy.orm import Session
 from sse_starlette import EventSourceResponse
 from starlette.concurrency import run_in_threadpool
 
 from schemas.base import Page
 from schemas.job import TERMINAL_STATES, Job, JobKind, JobState
-from services.api.dependencies import ClosingDep, DatabaseDep, ObjectId, PageDep
+from services.api.dependencies import ActorDep, DatabaseDep, FeedDep, ObjectId, PageDep, PrincipalDep
 from services.api.errors import documented
 from services.api.idempotency import IdempotencyDep, accepted, job_links
-from services.api.sse import event_response, pending_events
-from storage import jobs
+from services.api.sse import event_response
+from storage import audit, events, jobs
 from storage.database import Database
+from storage.idempotency import Answer
 
 router = APIRouter(prefix="/jobs", tags=["jobs"])
 
 MAX_WAIT_S = 60
-POLL_S = 0.2
 MAX_SEQ = 2**63 - 1
 
 
@@ -41,19 +40,17 @@ def list_jobs(
 async def get_job(
     job_id: ObjectId,
     database: DatabaseDep,
-    closing: ClosingDep,
+    feed: FeedDep,
     wait: Annotated[
         float, Query(ge=0, le=MAX_WAIT_S, description="seconds to wait for the job's end before answering")
     ] = 0,
 ) -> Job:
     """A job; with `wait` the answer comes when the job has ended, or after that many seconds."""
-    until = time.monotonic() + wait
-    while True:
-        job = await run_in_threadpool(_read, database, job_id)
-        left = until - time.monotonic()
-        if job.state in TERMINAL_STATES or left <= 0 or closing:
-            return job_links(job)
-        await anyio.sleep(min(POLL_S, left))
+    job, tip = await run_in_threadpool(_read, database, job_id)
+    if wait > 0 and job.state not in TERMINAL_STATES:
+        await feed.wait(job_id, tip, wait)
+        job, _ = await run_in_threadpool(_read, database, job_id)
+    return job_links(job)
 
 
 @router.post(
@@ -62,9 +59,14 @@ async def get_job(
     response_model=Job,
     responses=documented(401, 403, 404, 409, 422),
 )
-def cancel_job(job_id: ObjectId, idempotency: IdempotencyDep) -> Response:
+def cancel_job(job_id: ObjectId, idempotency: IdempotencyDep, actor: ActorDep) -> Response:
     """Ask a job (and its children) to stop. A job that has ended stays as it is."""
-    return idempotency.run(job_id, lambda session: accepted(jobs.cancel_job(session, job_id)))
+
+    def work(session: Session) -> Answer:
+        audit.record(session, actor, "job.cancelled", job_id)
+        return accepted(jobs.cancel_job(session, job_id))
+
+    return idempotency.run(job_id, work)
 
 
 @router.get(
@@ -76,22 +78,31 @@ def cancel_job(job_id: ObjectId, idempotency: IdempotencyDep) -> Response:
             "content": {"text/event-stream": {"schema": {"type": "string"}}},
         },
         204: {"description": "The job has ended and the client has seen every event"},
-        **documented(401, 403, 404, 422),
+        **documented(401, 403, 404, 422, 429, 503),
     },
 )
-def follow_job(
+async def follow_job(
     job_id: ObjectId,
-    database: DatabaseDep,
-    closing: ClosingDep,
-    last_event_id: Annotated[int, Header(ge=0, le=MAX_SEQ, description="resume after this event")] = 0,
+    feed: FeedDep,
+    principal: PrincipalDep,
+    last_event_id: Annotated[
+        int | None, Header(ge=0, le=MAX_SEQ, description="resume after this event")
+    ] = None,
 ) -> Response:
-    """Follow a job until it has ended."""
-    batch, ended = pending_events(database, job_id, last_event_id)
-    if ended and not batch:
+    """Follow a job until it has ended.
+
+    With `Last-Event-ID` every event after that one is sent. Without it a long job's older progress events are left
+    out; states and log entries never are.
+    """
+    feed.admit(principal.id)
+    start = await feed.start(job_id, last_event_id)
+    if start.ended and start.seq >= start.tip:
         return Response(status_code=204)
-    return event_response(database, job_id, batch, last_event_id, ended, closing)
+    return event_response(feed.follow(job_id, start, principal.id))
 
 
-def _read(database: Database, job_id: str) -> Job:
+def _read(database: Database, job_id: str) -> tuple[Job, int]:
+    """The job, and its newest event, which is read first: what ends the job after that is news."""
     with database.reading() as session:
-        return jobs.get_job(session, job_id)
+        tip = events.newest(session, job_id)
+        return jobs.get_job(session, job_id), tip

@@ -3,6 +3,7 @@
 A program may connect with its key in the header instead of a ticket. Nothing is computed here: frames pass as they
 come, and a client that reads slowly slows the inner connection, whose sender then leaves frames out. One that takes
 nothing for ``SEND_S`` is let go here as there: its own connection may hang for minutes before the system gives it up.
+A session ends (1008) within seconds of the key, token or browser's session that opened it (``services.api.ending``).
 """
 
 from __future__ import annotations
@@ -21,11 +22,13 @@ from websockets.exceptions import ConnectionClosed, WebSocketException
 
 from schemas.live import LiveTicket, LiveTicketCreate, close_reason
 from services.api.dependencies import DatabaseDep, PrincipalDep, SettingsDep
-from services.api.errors import documented
+from services.api.ending import Endings
+from services.api.errors import ApiProblem, documented
 from services.api.idempotency import IdempotencyDep, answer_of
 from services.api.inference import unavailable
 from services.api.routes.rollouts import ready_version
-from storage import api_keys, registry, tickets
+from services.api.security import Gate, address_of
+from storage import registry, tickets
 from storage.api_keys import ApiKey
 from storage.database import Database
 from storage.errors import NotFound, StorageError
@@ -59,17 +62,19 @@ def create_ticket(
     principal: PrincipalDep,
 ) -> Response:
     """A ticket for one live session, good for one connection within a minute. A replay holds no ticket."""
-    made = issue(database, settings, principal.id, body.model, body.version)
+    made = issue(database, settings, principal.credential, body.model, body.version)
     return idempotency.run(body, lambda session: answer_of(201, made), stored=_without_ticket)
 
 
-def issue(database: Database, settings: Settings, key_id: str, model: str, version: int | str) -> LiveTicket:
+def issue(
+    database: Database, settings: Settings, credential: str, model: str, version: int | str
+) -> LiveTicket:
     """The ticket and the address that takes it. Raises NotFound, or ApiProblem: 409, 503."""
     with database.session() as session:
         found = ready_version(registry.get_version(session, model, version))
         if not settings.inference_url:
             raise unavailable("no inference service belongs to this installation")
-        ticket, until = tickets.issue(session, key_id, _subject(model, found.version))
+        ticket, until = tickets.issue(session, credential, _subject(model, found.version))
     query = urlencode({"model": model, "version": found.version, "ticket": ticket})
     return LiveTicket(
         ticket=ticket, model=model, version=found.version, expires_at=until, path=f"/v1/live?{query}"
@@ -89,26 +94,33 @@ async def live(socket: WebSocket) -> None:
         await socket.close(UNAVAILABLE, "no inference service belongs to this installation")
         return
     try:
-        entry = await run_in_threadpool(_enter, database, model, version, ticket, header)
-    except StorageError as error:
-        await socket.close(POLICY, close_reason(error.code, str(error)))
+        key = await run_in_threadpool(_bearer, socket, header) if not ticket else None
+        entry = await run_in_threadpool(_enter, database, model, version, ticket, key)
+    except (StorageError, ApiProblem) as error:
+        detail = error.detail if isinstance(error, ApiProblem) else str(error)
+        await socket.close(POLICY, close_reason(error.code, detail))
         return
     if entry is None:
         needed = "a ticket of POST /v1/live/tickets, or a key that may write, is needed"
         await socket.close(POLICY, close_reason("unauthenticated", needed))
         return
-    inner_query = {**entry, "frames": query.get("frames", "1")[:2], "part": query.get("part", "points")[:10]}
+    credential, inner_query = entry
+    inner_query |= {"frames": query.get("frames", "1")[:2], "part": query.get("part", "points")[:10]}
+    endings: Endings = socket.app.state.endings
     address = f"{settings.inference_url.replace('http', 'ws', 1)}/live?{urlencode(inner_query)}"
     try:
-        async with connect(
-            address,
-            compression=None,
-            proxy=None,
-            open_timeout=OPEN_S,
-            max_queue=2,
-            max_size=FIRST_MESSAGE_BYTES,
-        ) as inner:
-            await _relay(socket, inner)
+        async with (
+            connect(
+                address,
+                compression=None,
+                proxy=None,
+                open_timeout=OPEN_S,
+                max_queue=2,
+                max_size=FIRST_MESSAGE_BYTES,
+            ) as inner,
+            endings.of(credential) as ended,
+        ):
+            await _relay(socket, inner, ended)
     except (OSError, TimeoutError, WebSocketException) as error:
         log.warning("live_session_not_opened", error=str(error))
         with suppress(RuntimeError):
@@ -124,31 +136,39 @@ def _subject(model: str, version: int) -> str:
     return f"session:{model}:{version}"
 
 
-def _enter(database: Database, model: str, version: str, ticket: str, header: str) -> dict[str, Any] | None:
-    """The inner connection's query for whoever may open a session, else None, whether there is such a model or not.
+def _bearer(socket: WebSocket, header: str) -> ApiKey | None:
+    """The key in the header, if it may write. Raises ApiProblem, 429, and StorageError."""
+    scheme, _, token = header.partition(" ")
+    if scheme.lower() != "bearer" or not token:
+        return None
+    gate: Gate = socket.app.state.gate
+    key = gate.key_of(token.strip(), address_of(socket.scope))
+    return key if key is not None and key.allows("write") else None
+
+
+def _enter(
+    database: Database, model: str, version: str, ticket: str, key: ApiKey | None
+) -> tuple[str, dict[str, Any]] | None:
+    """The credential of whoever may open a session and the inner connection's query; None for others, whatever exists.
 
     Raises NotFound, but only for the holder of a key.
     """
     with database.session() as session:
-        key: ApiKey | None = None
         number = 0
         if ticket:
             with suppress(NotFound):
                 number = registry.get_version(session, model, version).version
                 key = tickets.redeem(session, ticket, _subject(model, number))
-        elif header.lower().startswith("bearer "):
-            key = api_keys.verify(session, header[7:].strip())
-            key = key if key is not None and key.allows("write") else None
-            if key is not None:
-                number = registry.get_version(session, model, version).version
+        elif key is not None:
+            number = registry.get_version(session, model, version).version
         if key is None:
             return None
-        inner, _ = tickets.issue(session, key.id, f"live:{model}:{number}")
-    return {"model": model, "version": number, "ticket": inner}
+        inner, _ = tickets.issue(session, key.credential, f"live:{model}:{number}")
+    return key.credential, {"model": model, "version": number, "ticket": inner}
 
 
-async def _relay(socket: WebSocket, inner: ClientConnection) -> None:
-    """Hand messages through until one side ends, then end the other with the same words."""
+async def _relay(socket: WebSocket, inner: ClientConnection, ended: asyncio.Event) -> None:
+    """Hand messages through until one side ends, then end the other with the same words; or until ``ended``."""
 
     async def up() -> tuple[int, str]:
         while True:
@@ -170,7 +190,11 @@ async def _relay(socket: WebSocket, inner: ClientConnection) -> None:
             except TimeoutError:
                 return TOO_SLOW, f"a frame was not taken within {SEND_S:g} s"
 
-    tasks = [asyncio.create_task(work()) for work in (up, down)]
+    async def over() -> tuple[int, str]:
+        await ended.wait()
+        return POLICY, close_reason("unauthenticated", "the key or session that opened this is over")
+
+    tasks = [asyncio.create_task(work()) for work in (up, down, over)]
     done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
     for task in tasks:
         task.cancel()

@@ -9,10 +9,10 @@ from fastapi import APIRouter, Path, Query, Response
 from schemas.base import Page
 from schemas.job import Job
 from schemas.model import AliasSet, Model, ModelComparison, ModelVersion, TrainingCreate, VersionPatch
-from services.api.dependencies import DatabaseDep, ModelName, PageDep
+from services.api.dependencies import ActorDep, DatabaseDep, ModelName, PageDep
 from services.api.errors import documented
 from services.api.idempotency import IdempotencyDep, accepted
-from storage import jobs, registry
+from storage import audit, jobs, registry
 from storage.comparison import compare_versions
 
 router = APIRouter(prefix="/models", tags=["models"])
@@ -80,14 +80,16 @@ def compare(name: ModelName, a: OneOfTwo, b: OneOfTwo, database: DatabaseDep) ->
 
 
 @router.put("/{name}/aliases/{alias}", responses=documented(401, 403, 404, 409, 413, 422))
-def set_alias(name: ModelName, alias: Alias, body: AliasSet, database: DatabaseDep) -> Model:
+def set_alias(name: ModelName, alias: Alias, body: AliasSet, database: DatabaseDep, actor: ActorDep) -> Model:
     """Point an alias at a ready version; it moves if it exists."""
     with database.session() as session:
+        audit.record(session, actor, "alias.set", f"{name}@{alias}", version=body.version)
         return registry.set_alias(session, name, alias, body.version)
 
 
 @router.delete("/{name}/aliases/{alias}", responses=documented(401, 403, 404, 422))
-def delete_alias(name: ModelName, alias: Alias, database: DatabaseDep) -> Model:
+def delete_alias(name: ModelName, alias: Alias, database: DatabaseDep, actor: ActorDep) -> Model:
     """Remove an alias; the version stays."""
     with database.session() as session:
+        audit.record(session, actor, "alias.removed", f"{name}@{alias}")
         return registry.delete_alias(session, name, alias)

@@ -59,7 +59,7 @@ def create_rollout(
     )
     small = shape[0] * ticks <= SYNC_STEPS and 3 * shape[0] * -(-ticks // body.every) * places <= SYNC_VALUES
     if small and body.mode == "auto" and settings.inference_url:
-        found = roll_out(settings.inference_url, database, principal.id, asked)
+        found = roll_out(settings.inference_url, database, principal.credential, asked)
         return idempotency.run(body, lambda session: answer_of(200, found))
     request = stores.artifacts.put_bytes(asked.model_dump_json().encode(), runs.REQUEST, "application/json")
     config = asked.model_dump(mode="json", exclude={"controllers", "phi", "times"}) | {"shape": list(shape)}

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import Annotated, cast
 
 import anyio
 from fastapi import APIRouter, Query, Request, Response
 from sqlalchemy.orm import Session
 
-from schemas.base import Artifact, Page
+from schemas.base import Page
 from schemas.scene import Scene
 from services.api.dependencies import DatabaseDep, ObjectId, PageDep, SettingsDep, StoresDep
 from services.api.errors import documented
 from services.api.idempotency import Idempotency, IdempotencyDep, answer_of
-from services.api.uploads import MULTIPART_BODY, Upload, parse_scene, read_form, upload_of
+from services.api.parsing import Parsers
+from services.api.uploads import MULTIPART_BODY, Upload, parsed, read_form, upload_of
 from services.stores import Stores
 from storage import resources
 from storage.idempotency import Answer
-
-if TYPE_CHECKING:
-    from physworld.scene import Scene as Recording
 
 router = APIRouter(prefix="/scenes", tags=["scenes"])
 
@@ -44,7 +42,8 @@ async def create_scene(
     form = await read_form(request)
     try:
         upload = upload_of(form, settings.max_upload_bytes)
-        return await anyio.to_thread.run_sync(_register, upload, stores, idempotency, limiter=slots)
+        parsers = cast(Parsers, request.app.state.parsers)
+        return await anyio.to_thread.run_sync(_register, upload, parsers, stores, idempotency, limiter=slots)
     finally:
         await form.close()
 
@@ -67,34 +66,16 @@ def get_scene(scene_id: ObjectId, database: DatabaseDep) -> Scene:
         return resources.get_scene(session, scene_id)
 
 
-def _register(upload: Upload, stores: Stores, idempotency: Idempotency) -> Response:
-    recording, warnings, archive = parse_scene(upload)
-    artifact = stores.artifacts.put_bytes(archive, ARCHIVE_NAME, "application/zip")
+def _register(upload: Upload, parsers: Parsers, stores: Stores, idempotency: Idempotency) -> Response:
+    with parsed(upload, parsers) as found:
+        artifact = stores.artifacts.put_file(found.archive, ARCHIVE_NAME, "application/zip")
+        facts = found.facts
 
     def work(session: Session) -> Answer:
         known = resources.find_scene(session, artifact.sha256)
-        scene = known or _create(session, recording, warnings, artifact)
+        scene = known or resources.create_scene(
+            session, digest=artifact.sha256, artifacts=[artifact], **facts
+        )
         return answer_of(200 if known else 201, scene, {"Location": f"/v1/scenes/{scene.id}"})
 
     return idempotency.run(upload.fingerprint(), work)
-
-
-def _create(session: Session, recording: Recording, warnings: list[str], artifact: Artifact) -> Scene:
-    return resources.create_scene(
-        session,
-        name=recording.name,
-        kind=recording.kind,
-        description=recording.description,
-        digest=artifact.sha256,
-        frames=recording.frame_count,
-        points=recording.points.shape[1],
-        controllers=recording.controllers.shape[1],
-        fps=recording.fps,
-        duration_s=float(recording.times[-1] - recording.times[0]),
-        noise_sigma_m=recording.noise_sigma_m,
-        train=recording.train,
-        test=recording.test,
-        declared=recording.declared,
-        warnings=warnings,
-        artifacts=[artifact],
-    )

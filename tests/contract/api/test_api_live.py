@@ -7,6 +7,7 @@ import json
 import struct
 import time
 from collections.abc import Awaitable, Callable, Iterator
+from pathlib import Path
 from urllib.parse import urlencode
 
 import numpy as np
@@ -18,6 +19,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 
 from schemas.model import TrainingConfig
+from services.api.attempts import PER_ADDRESS
 from services.api.routes import live as api_live
 from services.inference import live
 from services.inference.session import HEAD
@@ -255,6 +257,17 @@ def test_a_stranger_does_not_learn_which_models_exist(served: Served) -> None:
     assert code == 1008 and reason.startswith("unauthenticated: ")
 
 
+def test_wrong_keys_are_limited_here_as_over_http(tmp_path: Path) -> None:
+    with serve_inference(tmp_path) as alone:
+        path = f"/v1/live?{urlencode({'model': alone.model, 'version': alone.version})}"
+        answers = [
+            refusal(alone, path, {"Authorization": f"Bearer guess-{turn}"})[1]
+            for turn in range(PER_ADDRESS + 1)
+        ]
+    assert {answer.partition(":")[0] for answer in answers[:-1]} == {"unauthenticated"}
+    assert answers[-1].startswith("too_many_attempts: too many wrong keys from this address; try again in ")
+
+
 def test_a_version_of_too_many_digits_is_not_found(served: Served) -> None:
     digits = "9" * 5000
     path = f"/v1/live?{urlencode({'model': served.model, 'version': digits})}"
@@ -359,7 +372,12 @@ def test_a_client_that_reads_no_more_loses_its_place(served: Served, monkeypatch
     async def work() -> None:
         stalled = [
             await connect(
-                address(served, plain), proxy=None, additional_headers=key, max_size=2**26, max_queue=1
+                address(served, plain),
+                proxy=None,
+                additional_headers=key,
+                compression=None,  # or thousands of such frames would fit into the buffers
+                max_size=2**26,
+                max_queue=1,
             )
             for _ in range(live.MOST_SESSIONS)
         ]

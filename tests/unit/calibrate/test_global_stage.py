@@ -9,7 +9,7 @@ import pytest
 from made_scene import box_body, made_scene, recorded_by
 
 from physworld.build import build_twin
-from physworld.calibrate import CalibrationConfig, calibrate
+from physworld.calibrate import CalibrationConfig, Journal, calibrate
 from physworld.calibrate.search import Search
 from physworld.errors import CalibrationError, Cancelled, SceneUnsupported
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Scene
@@ -122,10 +122,30 @@ def test_a_budget_that_ends_early_is_kept_and_never_adds_damping(undamped: Scene
     assert np.isfinite(found.tracks).all()
 
 
-def test_a_budget_that_ended_before_any_sensitivity_is_reported(undamped: Scene) -> None:
-    estimate = calibrate(undamped, replace(CONFIG, max_simulations=3)).parameters["youngs_modulus_pa"]
-    assert not estimate.identified and estimate.ci95 is None
-    assert "budget of simulations ended first" in estimate.note
+@pytest.mark.parametrize("budget", [3, 12, 24, 31])
+def test_a_search_that_spent_its_budget_gives_no_interval_and_did_not_converge(
+    undamped: Scene, budget: int
+) -> None:
+    found = calibrate(undamped, replace(CONFIG, max_simulations=budget))
+    estimate = found.parameters["youngs_modulus_pa"]
+    assert found.cut_short and set(found.open) == {p.name for p in found.searched}
+    assert estimate.ci95 is None and not estimate.identified
+    assert f"cut short by its budget of {budget} simulations" in estimate.note
+
+
+def test_a_search_that_ended_by_itself_is_the_same_whatever_budget_was_left(undamped: Scene) -> None:
+    config = replace(CONFIG, damping="none")
+    first, second = (calibrate(undamped, replace(config, max_simulations=most)) for most in (200, 400))
+    assert not first.cut_short and first.open == {}
+    assert first.parameters == second.parameters and first.parameters["youngs_modulus_pa"].ci95 is not None
+
+
+def test_a_search_that_is_resumed_still_knows_that_its_budget_was_spent(undamped: Scene) -> None:
+    saved: list[str] = []
+    config = replace(CONFIG, max_simulations=24)
+    first = calibrate(undamped, config, journal=Journal("bar", None, saved.append))
+    again = calibrate(undamped, config, journal=Journal("bar", saved[-1]))
+    assert first.cut_short and again.cut_short and again.parameters == first.parameters
 
 
 def test_one_scored_frame_gives_no_interval(undamped: Scene) -> None:

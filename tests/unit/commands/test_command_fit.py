@@ -25,10 +25,11 @@ from physworld.simulations import Workers
 from physworld.twin import Twin
 from storage.scene_bundle import read_bundle, write_bundle
 from workers.commands import fit
-from workers.tasks.fit_accuracy import fit_accuracy
-from workers.tasks.fit_report import parameter_json
+from workers.law_choice import chosen_laws
+from workers.tasks.fit_accuracy import fit_accuracy, not_measured
+from workers.tasks.fit_report import fit_report, parameter_json
 
-FRAMES, BUDGET, SIMULATIONS = 16, 60, 60
+FRAMES, BUDGET, SIMULATIONS = 16, 60, 100
 YOUNGS_MODULUS_PA = 4e4
 LOW, HIGH = np.array([0.0, -0.015, -0.015]), np.array([0.12, 0.015, 0.015])
 
@@ -84,6 +85,32 @@ def test_the_figures_and_the_files_of_a_fit(
     assert twin.parameters["youngs_modulus_pa"] == modulus["value"]
     assert {path.name for path in out.iterdir()} == {"twin.npz", "prediction.npz", "report.json"}
     assert "youngs_modulus_pa" in capsys.readouterr().out
+
+
+def test_a_search_that_its_budget_cut_short_is_said_in_words_and_in_figures(
+    bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    figures = tmp_path / "fit.json"
+    given = [str(bundle), "--particles", str(BUDGET), "--simulations", "20", "--json", str(figures)]
+    assert fit.main(given) == 0
+    found = json.loads(figures.read_text())
+    modulus = found["parameters"]["youngs_modulus_pa"]
+    assert modulus["ci95"] is None and not modulus["identified"]
+    assert not found["search"]["converged"] and found["converged"] is None and found["numerics"] is not None
+    said = "youngs_modulus_pa is not converged: the search was cut short by its budget of 20 simulations"
+    assert said in capsys.readouterr().out
+
+
+def test_a_law_that_was_chosen_under_a_budget_that_did_not_suffice_is_not_converged(bundle: Path) -> None:
+    scene = read_bundle(bundle)
+    config = CalibrationConfig(particle_budget=BUDGET, max_simulations=20, damping="none")
+    ended, choice = chosen_laws("auto", scene, config)
+    fitted = calibrate(scene, replace(ended, max_simulations=400))
+    report = fit_report(scene, fitted, choice, not_measured("left out"))
+    assert not choice.ended and fitted.open == {}
+    assert report["metrics"]["search"]["open"] == {"law": choice.reason}
+    assert "budget of 20 simulations" in choice.reason
+    assert not report["metrics"]["search"]["converged"]
 
 
 def test_a_given_law_is_used_and_an_unknown_one_refused(
@@ -207,7 +234,7 @@ def test_a_grip_that_a_finer_lattice_cannot_hold_leaves_the_fit(bundle: Path) ->
 
 def test_shared_runs_measure_the_same_accuracy(bundle: Path) -> None:
     scene = read_bundle(bundle)
-    fitted = calibrate(scene, CalibrationConfig(particle_budget=BUDGET, max_simulations=12))
+    fitted = calibrate(scene, CalibrationConfig(particle_budget=BUDGET, damping="none"))
     alone = fit_accuracy(scene, fitted, BUDGET)
     with Workers(2) as workers:
         shared = fit_accuracy(scene, fitted, BUDGET, runner=workers)

@@ -247,3 +247,26 @@ def test_the_page_of_a_fit_says_what_the_engine_itself_does(
         "0.0612 1/s", "7.7 Hz", "0.420 mm", "6,750", "204,000", "not converged: E, the search", "a clamp of 4 markers",
     ):  # fmt: skip
         assert text in page, text
+
+
+def test_the_page_of_a_fit_that_its_budget_cut_short_gives_no_interval_and_says_why(
+    client: httpx.Client, world: tuple[Settings, Database, Stores]
+) -> None:
+    _, database, stores = world
+    scene_id = register(tiny_scene(), database, stores.artifacts)
+    with database.session() as session:
+        fit_id = jobs.create_fit(session, scene_id, FitConfig(max_simulations=40)).outputs[0].id
+    note = "the search was cut short by its budget of 40 simulations: the best found so far, no interval"
+    modulus = {"value": 2.0e5, "unit": "Pa", "ci95": None, "identified": False, "note": note}
+    metrics = {
+        "numerics": None,
+        "converged": None,
+        "not_measured": "converged: there is no optimum to extrapolate",
+        "search": {"converged": False, "open": {"E": note}},
+        "notes": [],
+    }
+    _complete(database, {"parameters": {"E": modulus}, "metrics": metrics, "artifacts": []})
+    page = client.get(f"/dashboard/fits/{fit_id}", follow_redirects=True).text
+    for text in (note, "not known", "not converged: E, the search was cut short", "there is no optimum"):
+        assert text in page, text
+    assert "held at its prior" not in page

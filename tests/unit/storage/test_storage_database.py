@@ -12,18 +12,19 @@ from typing import TYPE_CHECKING
 import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
+from alembic.script import ScriptDirectory
 from sqlalchemy import func, select, text
 
 from schemas.fit import FitConfig
 from storage import jobs
-from storage.database import Database, ping
+from storage.database import MIGRATIONS, Database, newest_revision, ping
 from storage.errors import DatabaseUnavailable
 from storage.tables import Base, JobRow, SceneRow, utc_now
 
 if TYPE_CHECKING:
     from conftest import Work
 
-NEWEST = "0004"
+NEWEST = "0006"
 SPAWN = multiprocessing.get_context("spawn")
 
 
@@ -44,6 +45,18 @@ def test_an_upgrade_twice_is_one(database: Database) -> None:
     database.upgrade()
     database.check()
     assert database.revision() == revision == NEWEST
+
+
+def test_the_newest_revision_is_known_without_the_migration_tool(database_url: str) -> None:
+    """Alembic takes as long to import as a process takes to start: only a start that has to migrate pays for it."""
+    scripts = ScriptDirectory(str(MIGRATIONS))
+    assert newest_revision() == scripts.get_current_head()
+    code = (
+        "import sys; from storage.database import Database\n"
+        "database = Database(sys.argv[1]); database.upgrade(); database.check()\n"
+        "assert 'alembic' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code, database_url], check=True)
 
 
 def test_processes_that_upgrade_at_once_do_not_collide(tmp_path: Path) -> None:

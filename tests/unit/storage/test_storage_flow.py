@@ -10,9 +10,10 @@ from schemas.dataset import DatasetConfig
 from schemas.fit import FitConfig
 from schemas.model import TrainingCreate
 from schemas.pipeline import PipelineCreate
-from storage import jobs, leases, registry, resources
+from storage import jobs, leases, opening, registry, resources
+from storage.counts import count_shards
 from storage.errors import Conflict, NotFound, ResultInvalid
-from storage.opening import model_name_of
+from storage.opening import STAGE_WINDOW, model_name_of
 from storage.tables import utc_now
 
 if TYPE_CHECKING:
@@ -262,3 +263,55 @@ def test_jobs_are_listed_newest_first_in_pages(work: Work) -> None:
 def test_a_scenes_name_becomes_a_valid_model_name(scene: str, model: str) -> None:
     assert model_name_of(scene) == model
     TrainingCreate(name=model_name_of(scene), dataset_id="dst_x")
+
+
+def test_a_stage_of_twenty_thousand_shards_is_opened_by_one_short_transaction(work: Work) -> None:
+    dataset = work.dataset(episodes=20_000)
+    work.complete(work.claim())
+    opened = work.job(dataset)
+    assert (opened.progress.done, opened.progress.total) == (0, 20_000)
+    assert len(work.waiting()) == STAGE_WINDOW
+    with work.database.reading() as session:
+        assert count_shards(session)["episode", "QUEUED"] == 20_000
+
+
+def test_the_shards_of_a_stage_are_made_as_it_goes_on_and_none_is_left_out(
+    work: Work, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(opening, "STAGE_WINDOW", 4)
+    dataset = work.dataset(episodes=11)
+    work.complete(work.claim())
+    taken, most = [], 0
+    while work.job(dataset).progress.done < 11:
+        most = max(most, len(work.waiting()))
+        lease = work.claim()
+        taken.append(lease.index)
+        work.complete(lease)
+    assert taken == list(range(11))
+    assert most == 4
+    assert work.finish(dataset).state == "succeeded"
+
+
+def test_a_stage_goes_on_when_its_shards_end_in_another_order(
+    work: Work, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(opening, "STAGE_WINDOW", 4)
+    dataset = work.dataset(episodes=10)
+    work.complete(work.claim())
+    while work.job(dataset).progress.done < 10:
+        for lease in reversed([work.claim(shard) for shard in work.waiting()]):
+            work.complete(lease)
+    with work.database.reading() as session:
+        episodes = resources.all_episodes(session, dataset.outputs[0].id)
+    assert [episode.index for episode in episodes] == list(range(10))
+
+
+def test_a_cancelled_stage_makes_no_more_shards(work: Work, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(opening, "STAGE_WINDOW", 4)
+    dataset = work.dataset(episodes=10)
+    work.complete(work.claim())
+    lease = work.claim()
+    work.cancel(dataset)
+    assert not work.complete(lease)
+    assert work.waiting() == []
+    assert work.job(dataset).state == "cancelled"

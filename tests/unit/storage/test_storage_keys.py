@@ -8,9 +8,9 @@ from datetime import timedelta
 import pytest
 from sqlalchemy import select
 
-from storage import api_keys, idempotency
+from storage import api_keys, credentials, idempotency
 from storage.database import Database
-from storage.errors import Conflict, IdempotencyMismatch, NotFound
+from storage.errors import Conflict, IdempotencyMismatch, KeyEnded, NotFound
 from storage.idempotency import Answer, fingerprint
 from storage.tables import ApiKeyRow, utc_now
 
@@ -23,12 +23,12 @@ def test_a_key_is_known_by_its_token_until_it_is_revoked(database: Database) -> 
         key, token = api_keys.create_key(session, "laptop", "write")
     with database.session() as session:
         assert api_keys.verify(session, token) == key
-        assert api_keys.get_active_key(session, key.id) == key
+        assert credentials.key_of(session, key.credential) == key
         assert api_keys.verify(session, token + "x") is None
         assert api_keys.verify(session, "") is None
         api_keys.revoke_key(session, key.id)
         assert api_keys.verify(session, token) is None
-        assert api_keys.get_active_key(session, key.id) is None
+        assert credentials.key_of(session, key.credential) is None
         assert api_keys.list_keys(session).data[0].revoked_at is not None
         with pytest.raises(NotFound):
             api_keys.revoke_key(session, "key_none")
@@ -67,8 +67,9 @@ def test_a_deployments_own_token_is_registered_once(database: Database) -> None:
             api_keys.ensure_key(session, token, "compose", "read")
         with pytest.raises(Conflict, match="a token of 5 characters"):
             api_keys.ensure_key(session, "short", "compose", "admin")
+        api_keys.create_key(session, "another", "admin")
         api_keys.revoke_key(session, first.id)
-        with pytest.raises(Conflict, match="revoked"):
+        with pytest.raises(KeyEnded, match="revoked"):
             api_keys.ensure_key(session, token, "compose", "admin")
 
 

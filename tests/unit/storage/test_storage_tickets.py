@@ -26,7 +26,7 @@ def opened(tmp_path: Path) -> Iterator[Database]:
 def test_a_ticket_is_good_once_and_for_its_purpose(opened: Database) -> None:
     with opened.session() as session:
         key, _ = api_keys.create_key(session, "robot", "write")
-        ticket, until = tickets.issue(session, key.id, "live:beam:1")
+        ticket, until = tickets.issue(session, key.credential, "live:beam:1")
         assert utc_now() < until <= utc_now() + tickets.LIFETIME
         assert ticket not in {row.digest for row in session.scalars(select(TicketRow))}
     with opened.session() as session:
@@ -44,10 +44,10 @@ def test_a_ticket_ends_with_its_minute_and_with_its_key(
 ) -> None:
     with opened.session() as session:
         key, _ = api_keys.create_key(session, "robot", "write")
-        late, _ = tickets.issue(session, key.id, "live:beam:1")
+        late, _ = tickets.issue(session, key.credential, "live:beam:1")
         monkeypatch.setattr(tickets, "utc_now", lambda: utc_now() + tickets.LIFETIME + timedelta(seconds=1))
         assert tickets.redeem(session, late, "live:beam:1") is None
-        other, _ = tickets.issue(session, key.id, "live:beam:1")  # sweeps what is over
+        other, _ = tickets.issue(session, key.credential, "live:beam:1")  # sweeps what is over
         assert len(list(session.scalars(select(TicketRow)))) == 1
         api_keys.revoke_key(session, key.id)
         assert tickets.redeem(session, other, "live:beam:1") is None

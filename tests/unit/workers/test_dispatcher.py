@@ -14,14 +14,16 @@ from datetime import UTC, datetime, timedelta
 import pytest
 import redis
 from pydantic import SecretStr
+from sqlalchemy import event
 
+import workers.dispatcher
 from schemas.fit import FitConfig
 from schemas.queues import SIMULATION
 from storage import idempotency, jobs, leases
 from storage.settings import Settings
 from storage.tables import IdempotencyRow, ShardRow
 from workers.app import create_app
-from workers.dispatcher import FORGET_EVERY_S, MAX_DEPTH, Dispatcher
+from workers.dispatcher import FORGET_EVERY_S, IDLE_SWEEP_S, MAX_DEPTH, Dispatcher
 from workers.stores import Stores
 
 WITHIN_S = 20.0
@@ -136,6 +138,38 @@ def test_the_broker_is_not_filled_with_a_large_dataset(
     _until(lambda: broker.llen(SIMULATION) == MAX_DEPTH)
     time.sleep(1.5)
     assert broker.llen(SIMULATION) == MAX_DEPTH
+
+
+def test_a_dispatcher_without_work_asks_the_database_seldom_and_the_broker_never(
+    settings: Settings, stores: Stores, broker: redis.Redis
+) -> None:
+    statements: list[str] = []
+    app, stop = create_app(settings), threading.Event()
+    dispatcher = Dispatcher(settings, stores.database, app)
+    dispatcher.tick()  # the first one forgets old keys too
+    event.listen(stores.database.engine, "before_cursor_execute", lambda *given: statements.append(given[2]))
+    commands = broker.info("stats")["total_commands_processed"]
+    thread = threading.Thread(target=dispatcher.run, args=(stop,))
+    began = time.monotonic()
+    thread.start()
+    time.sleep(3 * IDLE_SWEEP_S)
+    stop.set()
+    thread.join()
+    app.close()
+    looks = (time.monotonic() - began) / IDLE_SWEEP_S
+    asked = [statement for statement in statements if not statement.startswith("BEGIN")]
+    assert 1 <= len(asked) <= looks + 2, asked  # two when it begins to listen, then one every two seconds
+    assert broker.info("stats")["total_commands_processed"] - commands <= 1  # this question itself
+
+
+@pytest.mark.usefixtures("dispatching")
+def test_a_shard_that_is_queued_while_nobody_looks_is_published_without_waiting_for_the_next_look(
+    stores: Stores, scene_id: str, broker: redis.Redis, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(workers.dispatcher, "IDLE_SWEEP_S", 3600.0)
+    time.sleep(IDLE_SWEEP_S + 1.0)  # the look that sets the next one an hour from now
+    _create_fits(stores, scene_id, 1)
+    _until(lambda: broker.llen(SIMULATION) == 1)
 
 
 @pytest.mark.usefixtures("dispatching")

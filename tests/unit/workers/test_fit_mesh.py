@@ -78,3 +78,13 @@ def test_which_mesh_recorded_a_sheet_is_found_and_kept_for_a_later_attempt() -> 
     assert mesh_of(fitted_as_recorded("auto", record(sheet), woven, "global").twin.lattice) is None
     with pytest.raises(ValueError, match="need gradients"):
         fitted_as_recorded("auto", record(sheet), config, "global+local")
+
+
+def test_a_mesh_that_was_weighed_against_a_fit_without_its_budget_is_not_a_converged_choice() -> None:
+    """100 simulations are enough for the mesh's search, not for the plate's: its interval holds, the choice may not."""
+    sheet = Recorder(cells=(8, 7), frames=14, noise_sigma_m=5e-4, seed=3)
+    config = CalibrationConfig(particle_budget=300, max_simulations=100, damping="none")
+    fitted = fitted_as_recorded("auto", record(sheet), config, "global")
+    assert mesh_of(fitted.twin.lattice) == Mesh((8, 7)) and not fitted.cut_short
+    assert fitted.parameters["youngs_modulus_pa"].ci95 is not None
+    assert set(fitted.open) == {"mesh"} and "budget of 100 simulations" in fitted.open["mesh"]

@@ -98,7 +98,8 @@ class Embedded:
 
     def __init__(self, data: Path, workers: int, *, stays: bool) -> None:
         logs = data / "logs"
-        logs.mkdir(mode=0o700, parents=True, exist_ok=True)
+        for folder in (data, logs):  # a parent that is made on the way would be readable by all
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         self.data = data
         self.log = logs / "supervisor.log"
         with self.log.open("ab") as log:

@@ -1,0 +1,161 @@
+"""The process that reads uploads: ``python -m services.api.parser_process``, started by ``services.api.parsing``.
+
+It has imported what the importers need and then, for each line on its standard input, forks a child that reads one
+upload under limits which the kernel keeps, waits for it, and answers with a line. The limits, of processor seconds,
+memory, wall clock and output, grow with the upload's size, so that a long recording is read and a small file that
+unfolds is not. Hostile content meets neither the web process nor its secrets: this process has none in its environment.
+
+A request is ``{"folder", "filename", "name", "options"}``: the upload lies in the folder as ``upload``; the child
+leaves ``scene.zip``, the canonical archive, and ``found.json`` beside it. An answer is ``{"outcome", "cpu_s",
+"peak_bytes"}``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import resource
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+import scipy.spatial  # noqa: F401  so that a child need not
+import trimesh  # noqa: F401
+
+from schemas.base import FieldError
+from storage.errors import SceneInvalid
+from storage.importers import ImportOptions, import_any
+from storage.importers.c3d import limit_here
+from storage.scene_bundle import canonical_archive, checked
+
+UPLOAD, ARCHIVE, FOUND = "upload", "scene.zip", "found.json"
+MEBIBYTE = 1 << 20
+CPU_S, BYTES_A_CPU_S = 4, 16 * MEBIBYTE
+WALL_S, WALL_A_CPU_S = 30, 4
+MEMORY_BYTES, MEMORY_A_BYTE = 256 * MEBIBYTE, 8
+OUTPUT_BYTES = 1152 * MEBIBYTE
+MOST_FAULTS, FAULT_CHARACTERS = 50, 2000
+PR_SET_PDEATHSIG = 1
+REFUSED, TOO_LARGE = 2, 3  # exit statuses of a child: faults are in found.json; memory or output ran out
+
+
+@dataclasses.dataclass(frozen=True)
+class Limits:
+    """What reading an upload of some bytes may take."""
+
+    cpu_s: int
+    wall_s: int
+    memory_bytes: int
+    output_bytes: int = OUTPUT_BYTES
+
+    @classmethod
+    def of(cls, size: int) -> Limits:
+        """The limits of an upload of ``size`` bytes."""
+        cpu_s = CPU_S + size // BYTES_A_CPU_S
+        return cls(cpu_s, WALL_S + WALL_A_CPU_S * cpu_s, MEMORY_BYTES + MEMORY_A_BYTE * size)
+
+    def impose(self) -> None:
+        """Let the kernel end this process where it goes beyond them."""
+        resource.setrlimit(resource.RLIMIT_CPU, (self.cpu_s, self.cpu_s + 1))
+        resource.setrlimit(resource.RLIMIT_DATA, (_data_bytes() + self.memory_bytes,) * 2)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (self.output_bytes,) * 2)
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        signal.setitimer(signal.ITIMER_REAL, self.wall_s)
+
+
+def main() -> int:
+    """Serve until the web process closes the pipe, which it does by ending, too."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the web process's to act on
+    for line in sys.stdin:
+        request = json.loads(line)
+        child = os.fork()
+        if child == 0:
+            os._exit(_read(request))
+        _, status, used = os.wait4(child, 0)
+        answer = {
+            "outcome": _outcome(status),
+            "cpu_s": used.ru_utime + used.ru_stime,
+            "peak_bytes": used.ru_maxrss * 1024,
+        }
+        print(json.dumps(answer), flush=True)
+    return 0
+
+
+def _outcome(status: int) -> str:
+    """What became of a child: ``read``, ``refused``, or the limit that stopped it."""
+    code = os.waitstatus_to_exitcode(status)
+    if code < 0:
+        return {-signal.SIGXCPU: "cpu", -signal.SIGKILL: "killed", -signal.SIGALRM: "wall"}.get(
+            code, "crashed"
+        )
+    return {0: "read", REFUSED: "refused", TOO_LARGE: "memory"}.get(code, "crashed")
+
+
+def _read(request: dict[str, Any]) -> int:
+    """In the child: read, check, write; the exit status."""
+    folder = Path(request["folder"])
+    try:
+        _die_with_parent()
+        os.close(0)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # answers are the parent's
+        Limits.of((folder / UPLOAD).stat().st_size).impose()
+        data = (folder / UPLOAD).read_bytes()
+        options = ImportOptions(**request["options"])
+        limit_here()
+        scene, warnings = import_any(data, request["filename"], options)
+        if request["name"] is not None and request["name"] != scene.name:
+            scene, warnings = checked(dataclasses.replace(scene, name=request["name"]))
+        (folder / ARCHIVE).write_bytes(canonical_archive(scene))
+        found = {
+            "name": scene.name,
+            "kind": scene.kind,
+            "description": scene.description,
+            "frames": scene.frame_count,
+            "points": scene.points.shape[1],
+            "controllers": scene.controllers.shape[1],
+            "fps": scene.fps,
+            "duration_s": float(scene.times[-1] - scene.times[0]),
+            "noise_sigma_m": scene.noise_sigma_m,
+            "train": scene.train,
+            "test": scene.test,
+            "declared": scene.declared,
+            "warnings": [warning[:FAULT_CHARACTERS] for warning in warnings[:MOST_FAULTS]],
+        }
+        (folder / FOUND).write_text(json.dumps(found))
+        return 0
+    except SceneInvalid as error:
+        return _refuse(folder, error.faults)
+    except (MemoryError, OSError):
+        return TOO_LARGE
+
+
+def _refuse(folder: Path, faults: list[FieldError]) -> int:
+    told = [
+        {"loc": [part if isinstance(part, int) else part[:200] for part in fault.loc[:20]],
+         "msg": fault.msg[:FAULT_CHARACTERS]}
+        for fault in faults[:MOST_FAULTS]
+    ]  # fmt: skip
+    (folder / FOUND).write_text(json.dumps({"faults": told, "count": len(faults)}))
+    return REFUSED
+
+
+def _data_bytes() -> int:
+    """Private memory of this process now, as RLIMIT_DATA counts it."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("VmData:"):
+            return int(line.split()[1]) * 1024
+    return 0
+
+
+def _die_with_parent() -> None:
+    if sys.platform == "linux":
+        import ctypes
+
+        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

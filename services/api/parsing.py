@@ -1,0 +1,150 @@
+"""Reading of uploads in other processes, from the web process's side: ``services.api.parser_process`` does the work.
+
+The web process never holds an upload's content: it hands over a file and takes back a file and a page of facts. A file
+that goes beyond its limits, or crashes its reader, is a refusal like any other, with the limit in it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import structlog
+
+from schemas.base import FieldError
+from services.api.errors import ApiProblem
+from storage.errors import SceneInvalid
+
+ROOT = Path(__file__).parents[2]
+PASSED_ON = ("PATH", "HOME", "TMPDIR", "LANG", "LC_ALL", "PYTHONPATH", "VIRTUAL_ENV", "LD_LIBRARY_PATH")
+"""Of the environment: a reader of hostile files has no use for addresses and keys."""
+STOPPED = {
+    "cpu": "reading it takes more processor time than a file of its size may",
+    "killed": "reading it takes more processor time or memory than a file of its size may",
+    "wall": "reading it takes longer than a file of its size may",
+    "memory": "reading it takes more memory or room on disk than a file of its size may",
+    "crashed": "reading it crashed the reader",
+}
+
+log = structlog.get_logger("physworld.parsing")
+
+
+@dataclass(frozen=True)
+class Found:
+    """What an upload turned out to hold: ``facts`` of the scene, and the file of its canonical archive."""
+
+    facts: dict[str, Any]
+    archive: Path
+
+
+class Parsers:
+    """Up to ``count`` parser processes, each started when it is first needed and again when it has died."""
+
+    def __init__(self, count: int) -> None:
+        self._idle: queue.SimpleQueue[_Parser] = queue.SimpleQueue()
+        for _ in range(count):
+            self._idle.put(_Parser())
+
+    def parse(self, folder: Path, filename: str, name: str | None, options: dict[str, Any]) -> Found:
+        """Read the file ``upload`` in ``folder``; what comes of it lies there too.
+
+        Args:
+            filename: what the sender calls it.
+            name: the scene's name, where it is not to be the file's.
+            options: keyword arguments of ``storage.importers.ImportOptions``.
+
+        Raises:
+            SceneInvalid: with every fault, or the limit that it went beyond.
+            ApiProblem: 503, no parser process could be started.
+        """
+        request = {"folder": str(folder), "filename": filename, "name": name, "options": options}
+        with self._one() as parser:
+            answer = parser.ask(request)
+        size = (folder / "upload").stat().st_size
+        log.info("upload_read", bytes=size, **answer)
+        outcome = answer["outcome"]
+        if outcome in STOPPED:
+            used = f"{answer['cpu_s']:.1f} s of processor time and {answer['peak_bytes'] / 2**20:.0f} MiB"
+            fault = FieldError(
+                loc=[filename[:200] or "file"], msg=f"{STOPPED[outcome]}: {size} bytes took {used}"
+            )
+            raise SceneInvalid([fault])
+        found = json.loads((folder / "found.json").read_text())
+        if outcome == "refused":
+            raise SceneInvalid([FieldError.model_validate(fault) for fault in found["faults"]])
+        return Found(found, folder / "scene.zip")
+
+    def close(self) -> None:
+        """End the processes that are idle."""
+        while not self._idle.empty():
+            self._idle.get_nowait().close()
+
+    @contextmanager
+    def _one(self) -> Iterator[_Parser]:
+        parser = self._idle.get()
+        try:
+            yield parser
+        finally:
+            self._idle.put(parser)
+
+
+class _Parser:
+    """One parser process; used by one thread at a time."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[str] | None = None
+
+    def ask(self, request: dict[str, Any]) -> dict[str, Any]:
+        """The answer to a request; a process that is gone is replaced once."""
+        for _ in range(2):
+            process = self._running()
+            assert process.stdin is not None and process.stdout is not None
+            try:
+                process.stdin.write(json.dumps(request) + "\n")
+                process.stdin.flush()
+                line = process.stdout.readline()
+            except OSError:
+                line = ""
+            if line:
+                answer: dict[str, Any] = json.loads(line)
+                return answer
+            log.warning("parser_gone", status=process.poll())
+            self.close()
+        raise ApiProblem(
+            503,
+            "unavailable",
+            "the process that reads uploads cannot be started",
+            headers={"Retry-After": "5"},
+        )
+
+    def close(self) -> None:
+        """End the process."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+            for pipe in (self._process.stdin, self._process.stdout):
+                if pipe is not None:
+                    pipe.close()
+            self._process = None
+
+    def _running(self) -> subprocess.Popen[str]:
+        if self._process is None or self._process.poll() is not None:
+            self.close()
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "services.api.parser_process"],
+                cwd=ROOT,
+                env={name: os.environ[name] for name in PASSED_ON if name in os.environ}
+                | {"OMP_NUM_THREADS": "1"},
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                text=True,
+            )
+        return self._process

@@ -1,0 +1,20 @@
+"""The audit log, for administrators."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter
+
+from schemas.audit import AuditEntry
+from schemas.base import Page
+from services.api.dependencies import DatabaseDep, PageDep
+from services.api.errors import documented
+from storage import audit
+
+router = APIRouter(prefix="/audit", tags=["keys"])
+
+
+@router.get("", responses=documented(401, 403, 422))
+def list_audit(database: DatabaseDep, page: PageDep) -> Page[AuditEntry]:
+    """What was done to keys, logins, jobs and aliases, by which key and from where, newest first."""
+    with database.reading() as session:
+        return audit.list_entries(session, limit=page.limit, cursor=page.cursor)
