@@ -30,7 +30,7 @@ RUN python requirements.py api > requirements.txt && pip install -r requirements
 COPY schemas/ schemas/
 COPY storage/ storage/
 COPY physworld/ physworld/
-COPY services/__init__.py services/stores.py services/web.py services/
+COPY services/__init__.py services/connections.py services/interpreter.py services/stores.py services/web.py services/
 COPY services/api/ services/api/
 COPY services/dashboard/ services/dashboard/
 USER 10001:10001
