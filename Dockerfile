@@ -21,12 +21,13 @@ RUN groupadd --gid 10001 physworld \
     && mkdir -p /var/lib/physworld /var/cache/physworld \
     && chown 10001:10001 /var/lib/physworld /var/cache/physworld
 WORKDIR /app
-COPY pyproject.toml constraints.txt scripts/requirements.py ./
+COPY pyproject.toml requirements.lock scripts/requirements.py scripts/install_torch.sh ./
 
 FROM base AS api
 ARG PIP_INDEX_URL=
 ARG PIP_EXTRA_INDEX_URL=
-RUN python requirements.py api > requirements.txt && pip install -r requirements.txt -c constraints.txt
+RUN python requirements.py api > requirements.txt \
+    && pip install --no-deps --require-hashes -r requirements.txt
 COPY schemas/ schemas/
 COPY storage/ storage/
 COPY physworld/ physworld/
@@ -40,7 +41,8 @@ CMD ["python", "-m", "services.web", "--host", "0.0.0.0", "--port", "8000"]
 FROM base AS worker
 ARG PIP_INDEX_URL=
 ARG PIP_EXTRA_INDEX_URL=
-RUN python requirements.py api sim > requirements.txt && pip install -r requirements.txt -c constraints.txt
+RUN python requirements.py api sim > requirements.txt \
+    && pip install --no-deps --require-hashes -r requirements.txt
 ENV MPLCONFIGDIR=/var/cache/physworld/matplotlib
 COPY schemas/ schemas/
 COPY storage/ storage/
@@ -52,7 +54,9 @@ CMD ["python", "-m", "workers"]
 FROM base AS trainer
 ARG PIP_INDEX_URL=
 ARG PIP_EXTRA_INDEX_URL=
-RUN python requirements.py api sim train > requirements.txt && pip install -r requirements.txt -c constraints.txt
+RUN python requirements.py api sim train > requirements.txt \
+    && pip install --no-deps --require-hashes -r requirements.txt \
+    && ./install_torch.sh python
 ENV MPLCONFIGDIR=/var/cache/physworld/matplotlib
 COPY schemas/ schemas/
 COPY storage/ storage/
@@ -66,7 +70,9 @@ CMD ["python", "-m", "services.trainer"]
 FROM base AS inference
 ARG PIP_INDEX_URL=
 ARG PIP_EXTRA_INDEX_URL=
-RUN python requirements.py api sim train > requirements.txt && pip install -r requirements.txt -c constraints.txt
+RUN python requirements.py api sim train > requirements.txt \
+    && pip install --no-deps --require-hashes -r requirements.txt \
+    && ./install_torch.sh python
 ENV MPLCONFIGDIR=/var/cache/physworld/matplotlib
 COPY schemas/ schemas/
 COPY storage/ storage/

