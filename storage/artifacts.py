@@ -15,6 +15,7 @@ import obstore
 
 from schemas.base import Artifact
 from storage.errors import ArtifactCorrupt, NotFound
+from storage.patience import WORKING, Patience
 from storage.settings import Settings
 from storage.store import open_store, reading, writing
 
@@ -26,9 +27,9 @@ SHA256 = re.compile(r"[0-9a-f]{64}")
 class ArtifactStore:
     """Files by the SHA-256 of their bytes, in a local folder or a bucket."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, patience: Patience = WORKING) -> None:
         self._settings = settings
-        self._store = open_store(settings)
+        self._store = open_store(settings, patience=patience)
 
     def put_bytes(self, data: bytes, name: str, media_type: str = DEFAULT_MEDIA_TYPE) -> Artifact:
         """Store ``data``. Raises StoreWriteFailed or StoreFull; nothing is then visible."""

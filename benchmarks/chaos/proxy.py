@@ -18,6 +18,7 @@ from __future__ import annotations
 import socket
 import struct
 import threading
+from contextlib import suppress
 from types import TracebackType
 
 BACKLOG = 512  # connections that are established while nobody accepts them
@@ -90,13 +91,9 @@ class FrozenProxy:
     def close(self) -> None:
         """Refuse new connections and reset those that are open."""
         self._closed = True
-        with self._lock:
-            listener = self._listener
-        try:
-            listener.shutdown(socket.SHUT_RDWR)  # wakes the accepting thread
-        except OSError:
-            pass
-        listener.close()
+        with suppress(OSError):
+            self._listener.shutdown(socket.SHUT_RDWR)  # wakes the accepting thread
+        self._listener.close()
         self.cut()
         self._flowing.set()
 
@@ -154,9 +151,7 @@ class FrozenProxy:
 
 def _reset(end: socket.socket) -> None:
     """End a connection at once, also for a thread that waits for it."""
-    try:
+    with suppress(OSError):
         end.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
         end.shutdown(socket.SHUT_RDWR)
-    except OSError:
-        pass
     end.close()
