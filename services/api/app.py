@@ -75,7 +75,7 @@ def create_api(settings: Settings, database: Database, stores: Stores) -> FastAP
     app.state.stores = stores
     app.state.metrics = Metrics(database)
     app.state.probes = (
-        Probe("database", database.check),
+        Probe("database", lambda: database.check()),
         Probe("store", lambda: stores.artifacts.exists(ABSENT)),
     )
     app.state.gate = Gate(database, Attempts())
