@@ -82,6 +82,7 @@ class EpisodeStore:
     def __init__(self, settings: Settings, patience: Patience = WORKING) -> None:
         self._settings = settings
         self._store = open_store(settings, patience=patience)
+        self._uploads = open_store(settings, patience=patience, uploads=True)
         self._patience = patience
         self._artifacts = ArtifactStore(settings, patience)
 
@@ -112,7 +113,7 @@ class EpisodeStore:
         }
         content = packed(header, plain)
         with writing(f"episode {path}", size, self._settings):
-            obstore.put(self._store, path, content)
+            obstore.put(self._uploads, path, content)
         return path, _digest_of(parts)
 
     def read(

@@ -26,6 +26,7 @@ class Patience:
         lock_s: a writer's wait for SQLite's lock.
         pool_s: until another thread gives a connection back.
         store_silence_s: without a byte of an answer of the store.
+        store_upload_s: until the store has taken a part of an upload (5 MiB, twelve at a time) and said so.
         store_retry_s: after which a request that failed is not sent to the store again.
     """
 
@@ -35,11 +36,19 @@ class Patience:
     lock_s: float
     pool_s: float
     store_silence_s: float
+    store_upload_s: float
     store_retry_s: float
 
 
 ANSWERING = Patience(
-    connect_s=3, ping_s=2.0, statement_s=6.0, lock_s=5.0, pool_s=5.0, store_silence_s=4.0, store_retry_s=3.0
+    connect_s=3,
+    ping_s=2.0,
+    statement_s=6.0,
+    lock_s=5.0,
+    pool_s=5.0,
+    store_silence_s=4.0,
+    store_upload_s=30.0,
+    store_retry_s=3.0,
 )
 WORKING = Patience(
     connect_s=5,
@@ -48,6 +57,7 @@ WORKING = Patience(
     lock_s=30.0,
     pool_s=30.0,
     store_silence_s=30.0,
+    store_upload_s=60.0,
     store_retry_s=30.0,
 )
 GRACE_S = 1.5

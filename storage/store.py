@@ -45,9 +45,12 @@ FULL_WORDS = (
 Store = LocalStore | S3Store
 
 
-def open_store(settings: Settings, below: str = "", patience: Patience = WORKING) -> Store:
+def open_store(
+    settings: Settings, below: str = "", patience: Patience = WORKING, *, uploads: bool = False
+) -> Store:
     """The store that ``settings.store_url`` names, or what lies ``below`` a path in it.
 
+    ``uploads`` is for putting objects: there sending counts as silence, so each part has ``Patience.store_upload_s``.
     Raises ConfigurationError, or StoreWriteFailed when the local folder cannot be made.
     """
     if settings.store_folder is not None:
@@ -75,7 +78,9 @@ def open_store(settings: Settings, below: str = "", patience: Patience = WORKING
         region=settings.s3_region,
         client_options={
             "connect_timeout": timedelta(seconds=patience.connect_s),
-            "read_timeout": timedelta(seconds=patience.store_silence_s),
+            "read_timeout": timedelta(
+                seconds=patience.store_upload_s if uploads else patience.store_silence_s
+            ),
             "timeout": WHOLE_REQUEST,
             "allow_http": plain,
         },

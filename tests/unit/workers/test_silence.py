@@ -31,7 +31,14 @@ from workers.stores import Stores
 
 WITHIN_S = 25.0
 SHORT = Patience(
-    connect_s=2, ping_s=1.0, statement_s=2.0, lock_s=2.0, pool_s=2.0, store_silence_s=2.0, store_retry_s=1.0
+    connect_s=2,
+    ping_s=1.0,
+    statement_s=2.0,
+    lock_s=2.0,
+    pool_s=2.0,
+    store_silence_s=2.0,
+    store_upload_s=9.0,
+    store_retry_s=1.0,
 )
 
 
