@@ -5,7 +5,11 @@ from __future__ import annotations
 from storage.artifacts import ArtifactStore
 from storage.database import Database, open_database
 from storage.episodes import EpisodeStore
+from storage.patience import ANSWERING
 from storage.settings import Settings
+
+THREADS = 48
+"""That use the database at once: anyio's 40, and those of followed jobs, uploads, probes and the metrics."""
 
 
 class Stores:
@@ -17,10 +21,10 @@ class Stores:
     """
 
     def __init__(self, settings: Settings) -> None:
-        self.artifacts = ArtifactStore(settings)
-        self.episodes = EpisodeStore(settings)
+        self.artifacts = ArtifactStore(settings, ANSWERING)
+        self.episodes = EpisodeStore(settings, ANSWERING)
 
 
 def open_all(settings: Settings) -> tuple[Database, Stores]:
     """Database and stores that the settings name."""
-    return open_database(settings), Stores(settings)
+    return open_database(settings, threads=THREADS, patience=ANSWERING), Stores(settings)

@@ -15,6 +15,7 @@ import obstore
 
 from schemas.base import Artifact
 from storage.errors import ArtifactCorrupt, NotFound
+from storage.patience import WORKING, Patience
 from storage.settings import Settings
 from storage.store import open_store, reading, writing
 
@@ -26,16 +27,17 @@ SHA256 = re.compile(r"[0-9a-f]{64}")
 class ArtifactStore:
     """Files by the SHA-256 of their bytes, in a local folder or a bucket."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, patience: Patience = WORKING) -> None:
         self._settings = settings
-        self._store = open_store(settings)
+        self._store = open_store(settings, patience=patience)
+        self._uploads = open_store(settings, patience=patience, uploads=True)
 
     def put_bytes(self, data: bytes, name: str, media_type: str = DEFAULT_MEDIA_TYPE) -> Artifact:
         """Store ``data``. Raises StoreWriteFailed or StoreFull; nothing is then visible."""
         sha256 = hashlib.sha256(data).hexdigest()
         if not self._has(sha256, len(data)):
             with writing(f"artifact {name}", len(data), self._settings):
-                obstore.put(self._store, _key(sha256), data)
+                obstore.put(self._uploads, _key(sha256), data)
         return Artifact(name=name, sha256=sha256, size=len(data), media_type=media_type)
 
     def put_file(
@@ -49,7 +51,7 @@ class ArtifactStore:
         name = name or path.name
         if not self._has(sha256, size):
             with writing(f"artifact {name}", size, self._settings):
-                obstore.put(self._store, _key(sha256), path)
+                obstore.put(self._uploads, _key(sha256), path)
         return Artifact(name=name, sha256=sha256, size=size, media_type=media_type)
 
     def open(self, sha256: str, start: int = 0, end: int | None = None) -> Iterator[bytes]:

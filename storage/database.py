@@ -20,12 +20,19 @@ from typing import Any
 
 from sqlalchemy import Connection, Engine, create_engine, event, inspect, make_url, text
 from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
+from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.orm import Session
 
 from storage.errors import DatabaseUnavailable
+from storage.patience import GRACE_S, WORKING, Patience, Silence
 from storage.settings import Settings
 
-BUSY_SECONDS = 30.0
+FEW_THREADS = 8
+KEPT_CONNECTIONS = 10
+"""Connections that stay open when nobody uses them; more are made while more threads want one."""
+SHORT_LOCK_S = 0.25
+"""A writer's wait for SQLite's lock while another one has just waited in vain."""
+NEVER = 10 * 365 * 86400.0
 DEFAULT_MAX_ATTEMPTS = 5
 MAX_ATTEMPTS = "max_attempts"  # key of Session.info: the cap that new shards are given
 MIGRATIONS = Path(__file__).parent / "migrations"
@@ -35,10 +42,24 @@ _dumps = functools.partial(json.dumps, allow_nan=False)
 
 
 class Database:
-    """An engine and its transactions. Safe over ``fork``: a child never uses its parent's connections."""
+    """An engine and its transactions. Safe over ``fork``: a child never uses its parent's connections.
 
-    def __init__(self, url: str, *, max_attempts: int = DEFAULT_MAX_ATTEMPTS) -> None:
-        self.engine = _create_engine(url)
+    Args:
+        threads: of the process that use it at the same time; as many connections are made at most.
+        patience: how long anything of it is waited for. Migrations are waited for without an end.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        *,
+        max_attempts: int = DEFAULT_MAX_ATTEMPTS,
+        threads: int = FEW_THREADS,
+        patience: Patience = WORKING,
+    ) -> None:
+        self._silence = Silence(patience.ping_s + patience.connect_s)
+        self._patience = patience
+        self.engine = _create_engine(url, threads, patience, self._silence)
         self._reading_engine = self.engine.execution_options(sqlite_begin="BEGIN")
         self._max_attempts = max_attempts
         self._process = os.getpid()
@@ -65,14 +86,15 @@ class Database:
         config = Config()
         config.set_main_option("script_location", str(MIGRATIONS).replace("%", "%%"))
         config.set_main_option("path_separator", "os")
-        with _translated(), self.engine.begin() as connection:
+        with self._translated(), self.engine.begin() as connection, _without_limits(connection):
             config.attributes["connection"] = connection
             command.upgrade(config, "head")
 
     def revision(self) -> str | None:
         """The revision that the tables have, None before the first ``upgrade``."""
         self._leave_parent()
-        with _translated(), self._reading_engine.connect() as connection:
+        self._ask()
+        with self._translated(), self._reading_engine.connect() as connection:
             if not inspect(connection).has_table(REVISION_TABLE):
                 return None
             return connection.scalar(text(f"SELECT version_num FROM {REVISION_TABLE}"))
@@ -81,12 +103,13 @@ class Database:
         """Raise DatabaseUnavailable unless the database answers and has this code's tables."""
         found, wanted = self.revision(), newest_revision()
         if found != wanted:
-            raise DatabaseUnavailable(f"the database has revision {found}, this code needs {wanted}")
+            told = f"the database has revision {found}, this code needs {wanted}"
+            raise DatabaseUnavailable(told, told)
 
     def own_connection(self) -> Any:
         """A connection of the driver's, outside of the pool: the caller keeps it and closes it."""
         self._leave_parent()
-        with _translated():
+        with self._translated():
             pooled = self.engine.raw_connection()
             pooled.detach()
             return pooled.dbapi_connection
@@ -98,9 +121,28 @@ class Database:
     @contextmanager
     def _transaction(self, engine: Engine) -> Iterator[Session]:
         self._leave_parent()
-        with _translated(), Session(engine, expire_on_commit=False) as session, session.begin():
+        self._ask()
+        with self._translated(), Session(engine, expire_on_commit=False) as session, session.begin():
             session.info[MAX_ATTEMPTS] = self._max_attempts
             yield session
+
+    def _ask(self) -> None:
+        """Raise DatabaseUnavailable at once while the server is known to be silent."""
+        silent_s = self._silence.silent_s()
+        if silent_s is not None:
+            told = f"the database has not answered for {silent_s:.1f} s"
+            raise DatabaseUnavailable(told, told)
+
+    @contextmanager
+    def _translated(self) -> Iterator[None]:
+        """What the database itself refuses (locked, full, gone, silent) becomes DatabaseUnavailable."""
+        try:
+            yield
+        except PoolTimeout as error:
+            told = f"no connection to the database came free within {self._patience.pool_s:g} s"
+            raise DatabaseUnavailable(told, told) from error
+        except (OperationalError, InterfaceError) as error:
+            raise DatabaseUnavailable(*_reasons(error)) from error
 
     def _leave_parent(self) -> None:
         if os.getpid() != self._process:
@@ -108,23 +150,49 @@ class Database:
             self._process = os.getpid()
 
 
-def open_database(settings: Settings) -> Database:
+def open_database(
+    settings: Settings, *, threads: int = FEW_THREADS, patience: Patience = WORKING
+) -> Database:
     """The database that the settings name; its tables are made by ``upgrade``."""
-    return Database(settings.database_url, max_attempts=settings.max_attempts)
+    return Database(
+        settings.database_url, max_attempts=settings.max_attempts, threads=threads, patience=patience
+    )
 
 
-def _create_engine(address: str) -> Engine:
+def _create_engine(address: str, threads: int, patience: Patience, silence: Silence) -> Engine:
     url = make_url(address)
+    kept = min(threads, KEPT_CONNECTIONS)
+    options: dict[str, Any] = {"json_serializer": _dumps}
+    pool = {"pool_size": kept, "max_overflow": threads - kept, "pool_timeout": patience.pool_s}
     if url.get_backend_name() == "sqlite":
         if url.database and url.database != ":memory:" and not url.database.startswith("file:"):
             _make_private(Path(url.database))
-        engine = create_engine(url, connect_args={"timeout": BUSY_SECONDS}, json_serializer=_dumps)
-        event.listen(engine, "connect", _prepare_sqlite)
-        event.listen(engine, "begin", _begin_sqlite)
+        if url.database and url.database != ":memory:":  # one in memory has one connection
+            options.update(pool)
+        engine = create_engine(url, connect_args={"timeout": patience.lock_s}, **options)
+        event.listen(engine, "connect", functools.partial(_prepare_sqlite, patience))
+        event.listen(engine, "begin", _Lock(patience))
         return engine
+    from storage import postgres  # the driver, which SQLite does not need
+
     if url.drivername in {"postgresql", "postgres"}:
         url = url.set(drivername="postgresql+psycopg")
-    return create_engine(url, pool_pre_ping=True, json_serializer=_dumps)
+    engine = create_engine(url, pool_pre_ping=True, **pool, **options)
+
+    @event.listens_for(engine, "do_connect")
+    def connect(_dialect: Any, _record: Any, arguments: Any, given: dict[str, Any]) -> Any:
+        return postgres.connect(patience, silence, arguments, given)
+
+    @event.listens_for(engine, "checkin")
+    def returned(connection: Any, _record: Any) -> None:
+        if connection is not None:
+            connection.silence_s = patience.ping_s  # the next thing asked of it is whether it is still good
+
+    @event.listens_for(engine, "checkout")
+    def taken(connection: Any, _record: Any, _proxy: Any) -> None:
+        connection.silence_s = patience.statement_s + GRACE_S
+
+    return engine
 
 
 def _make_private(path: Path) -> None:
@@ -142,9 +210,9 @@ def _make_private(path: Path) -> None:
                 file.chmod(0o600)
 
 
-def _prepare_sqlite(connection: sqlite3.Connection, _record: Any) -> None:
-    connection.isolation_level = None  # transactions are begun by _begin_sqlite, not guessed by the driver
-    deadline = time.monotonic() + BUSY_SECONDS
+def _prepare_sqlite(patience: Patience, connection: sqlite3.Connection, _record: Any) -> None:
+    connection.isolation_level = None  # transactions are begun by _Lock, not guessed by the driver
+    deadline = time.monotonic() + patience.lock_s
     for pragma in ("journal_mode=WAL", "synchronous=NORMAL", "foreign_keys=ON"):
         while True:
             try:
@@ -158,8 +226,44 @@ def _prepare_sqlite(connection: sqlite3.Connection, _record: Any) -> None:
                 time.sleep(0.02)
 
 
-def _begin_sqlite(connection: Connection) -> None:
-    connection.exec_driver_sql(connection.get_execution_options().get("sqlite_begin", "BEGIN IMMEDIATE"))
+class _Lock:
+    """Begins transactions in SQLite. While its lock is known not to come free, writers wait ``SHORT_LOCK_S`` only.
+
+    Otherwise those that had to wait for a thread of the process would begin to wait when the first ones gave up.
+    """
+
+    def __init__(self, patience: Patience) -> None:
+        self._patience_s = patience.lock_s
+        self._in_vain = False
+
+    def __call__(self, connection: Connection) -> None:
+        begin = connection.get_execution_options().get("sqlite_begin", "BEGIN IMMEDIATE")
+        if begin != "BEGIN IMMEDIATE":
+            connection.exec_driver_sql(begin)
+            return
+        wait_s = SHORT_LOCK_S if self._in_vain else self._patience_s
+        connection.exec_driver_sql(f"PRAGMA busy_timeout = {round(1000 * wait_s)}").close()
+        try:
+            connection.exec_driver_sql(begin)
+        except OperationalError as error:
+            self._in_vain = self._in_vain or "locked" in str(error.orig)
+            raise
+        self._in_vain = False
+
+
+@contextmanager
+def _without_limits(connection: Connection) -> Iterator[None]:
+    """Statements of this transaction may take as long as they take: rewriting a large table has no usual length."""
+    if connection.dialect.name != "postgresql":
+        yield
+        return
+    connection.exec_driver_sql("SET LOCAL statement_timeout = 0")
+    driver: Any = connection.connection.dbapi_connection
+    limit_s, driver.silence_s = driver.silence_s, NEVER
+    try:
+        yield
+    finally:
+        driver.silence_s = limit_s
 
 
 @functools.cache
@@ -169,20 +273,15 @@ def newest_revision() -> str:
     return max(script.name.partition("_")[0] for script in scripts)
 
 
-@contextmanager
-def _translated() -> Iterator[None]:
-    """What the database itself refuses (locked, full, gone) becomes DatabaseUnavailable."""
-    try:
-        yield
-    except (OperationalError, InterfaceError) as error:
-        raise DatabaseUnavailable(_reason(error)) from error
-
-
-def _reason(error: DBAPIError) -> str:
+def _reasons(error: DBAPIError) -> tuple[str, str]:
+    """What the driver says, which may name hosts and is for the log; and what anybody may be told."""
     reason = str(error.orig).strip() or type(error.orig).__name__
     if "locked" in reason:
-        return f"{reason}: another writer held the database for more than {BUSY_SECONDS:.0f} s"
-    return reason
+        told = "another writer held the database for too long"
+        return f"{reason}: {told}", told
+    if "silent" in reason or "timeout" in reason:
+        return reason, "the database did not answer in time"
+    return reason, "the database cannot be reached or refuses to work"
 
 
 def ping(session: Session) -> None:

@@ -37,6 +37,7 @@ from schemas.base import Artifact, Resource
 from schemas.dataset import Episode
 from storage.artifacts import ArtifactStore
 from storage.errors import EpisodeCorrupt, NotFound
+from storage.patience import WORKING, Patience
 from storage.settings import Settings
 from storage.store import open_store, reading, writing
 
@@ -78,10 +79,12 @@ class Manifest(Resource):
 class EpisodeStore:
     """Episodes in a local folder or a bucket."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, patience: Patience = WORKING) -> None:
         self._settings = settings
-        self._store = open_store(settings)
-        self._artifacts = ArtifactStore(settings)
+        self._store = open_store(settings, patience=patience)
+        self._uploads = open_store(settings, patience=patience, uploads=True)
+        self._patience = patience
+        self._artifacts = ArtifactStore(settings, patience)
 
     def write(
         self,
@@ -110,7 +113,7 @@ class EpisodeStore:
         }
         content = packed(header, plain)
         with writing(f"episode {path}", size, self._settings):
-            obstore.put(self._store, path, content)
+            obstore.put(self._uploads, path, content)
         return path, _digest_of(parts)
 
     def read(
@@ -222,7 +225,9 @@ class EpisodeStore:
         if path.endswith(FILE):
             return open_packed(self._store, path)
         folder = self._settings.store_folder
-        return open_folder(open_store(self._settings, path) if folder is None else folder / path)
+        return open_folder(
+            open_store(self._settings, path, self._patience) if folder is None else folder / path
+        )
 
     def _remove(self, path: str) -> None:
         """Remove an episode, also one of which somebody else has removed a part."""

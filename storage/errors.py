@@ -32,6 +32,11 @@ class StorageError(Exception):
 
     code = "storage_error"
 
+    @property
+    def told(self) -> str:
+        """What anybody may be told: without addresses, which the message may hold."""
+        return str(self)
+
 
 class ConfigurationError(StorageError):
     """The settings cannot work. ``faults`` holds one sentence for each."""
@@ -92,7 +97,20 @@ class ResultInvalid(StorageError):
     code = "result_invalid"
 
 
-class DatabaseUnavailable(StorageError):
+class Unavailable(StorageError):
+    """Something behind the service does not answer; the message may name it, ``told`` does not."""
+
+    def __init__(self, message: str, told: str = "") -> None:
+        super().__init__(message)
+        self._told = told or message
+
+    @property
+    def told(self) -> str:
+        """What anybody may be told."""
+        return self._told
+
+
+class DatabaseUnavailable(Unavailable):
     """The database refused or could not be reached; the transaction did not happen."""
 
     code = "database_unavailable"
@@ -104,7 +122,7 @@ class StoreError(StorageError):
     code = "store_error"
 
 
-class StoreWriteFailed(StoreError):
+class StoreWriteFailed(StoreError, Unavailable):
     """A write failed; nothing was committed."""
 
     code = "store_write_failed"
@@ -116,7 +134,7 @@ class StoreFull(StoreWriteFailed):
     code = "store_full"
 
 
-class StoreReadFailed(StoreError):
+class StoreReadFailed(StoreError, Unavailable):
     """A read failed for a reason other than absence."""
 
     code = "store_read_failed"

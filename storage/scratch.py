@@ -23,7 +23,7 @@ class ScratchStore:
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self._store = open_store(settings)
+        self._store = open_store(settings, uploads=True)
 
     def put(self, job_id: str, name: str, data: bytes) -> None:
         """Write a file. Raises StoreWriteFailed or StoreFull; nothing is then visible."""

@@ -26,6 +26,8 @@ logger = logging.getLogger(__name__)
 
 RENEW_INTERVAL_S = 2.0
 PROGRESS_INTERVAL_S = 0.5
+JOIN_S = 5.0
+"""That the end of a task waits for a renewal under way, which may wait for a silent database."""
 
 
 class TaskContext:
@@ -54,7 +56,7 @@ class TaskContext:
     ) -> None:
         self._stop.set()
         self._fresh.set()
-        self._thread.join()
+        self._thread.join(JOIN_S)  # a renewal that hangs writes nothing that the epoch does not allow
 
     def progress(self, done: float, total: float, unit: str = "", message: str = "") -> None:
         """Report how far the shard is; written to the database at most twice a second."""

@@ -53,6 +53,8 @@ LARGE_ANSWER_BYTES, LARGE_ANSWERS_KEPT = 64 * 1024, timedelta(minutes=15)
 """Rollouts answer with up to some MiB, many times a minute: kept for as long as a client tries again."""
 LOST_AFTER_S = 2.0
 PAUSE_AFTER_ERROR_S = 1.0
+BROKER_SILENCE = {"socket_timeout": 5.0}
+"""Of the dispatcher, whose commands are answered at once; a worker waits longer in commands that block."""
 MAX_DEPTH = 64
 """Messages of one queue in the broker at a time."""
 
@@ -65,7 +67,7 @@ class Dispatcher:
         self._database = database
         self._changes = Changes(database)
         self._app = app
-        self._connection = app.connection_for_write()
+        self._connection = app.connection_for_write(transport_options=BROKER_SILENCE)
         self._depth = dict.fromkeys((SIMULATION, TRAINING, INFERENCE), 0)
         self._empty_looks = dict.fromkeys((SIMULATION, TRAINING, INFERENCE), 0)
         self._sweep_due = 0.0
@@ -80,7 +82,7 @@ class Dispatcher:
             except (BrokerError, RedisError, *self._connection.connection_errors) as error:
                 logger.warning("broker away or full: %s", error)
                 self._connection.close()
-                self._connection = self._app.connection_for_write()
+                self._connection = self._app.connection_for_write(transport_options=BROKER_SILENCE)
                 stop.wait(PAUSE_AFTER_ERROR_S)
             except (DatabaseUnavailable, StoreError) as error:
                 logger.warning("database or store away: %s", error)

@@ -19,6 +19,7 @@ from services.api.limits import BodyLimit
 from services.api.metrics import Metrics
 from services.api.openapi import describe
 from services.api.parsing import Parsers
+from services.api.probes import Probe
 from services.api.routes import (
     artifacts,
     assessments,
@@ -45,6 +46,7 @@ from storage.settings import Settings
 
 VERSION = "0.1.0"
 PREFIX = "/v1"
+ABSENT = "0" * 64  # the digest of no artifact
 PARALLEL_UPLOADS = 2  # each by a process of its own
 
 
@@ -72,6 +74,10 @@ def create_api(settings: Settings, database: Database, stores: Stores) -> FastAP
     app.state.database = database
     app.state.stores = stores
     app.state.metrics = Metrics(database)
+    app.state.probes = (
+        Probe("database", lambda: database.check()),
+        Probe("store", lambda: stores.artifacts.exists(ABSENT)),
+    )
     app.state.gate = Gate(database, Attempts())
     app.state.endings = Endings(database)
     app.state.upload_slots = anyio.CapacityLimiter(PARALLEL_UPLOADS)

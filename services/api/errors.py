@@ -98,8 +98,9 @@ def problem_response(
     errors: Sequence[FieldError] = (),
     hint: str | None = None,
     headers: Mapping[str, str] | None = None,
+    **more: Any,
 ) -> JSONResponse:
-    """The answer for one problem."""
+    """The answer for one problem; ``more`` are members of it that only this kind has."""
     problem = Problem(
         type=f"{TYPE_PREFIX}{code}",
         title=HTTPStatus(status).phrase,
@@ -111,7 +112,10 @@ def problem_response(
         hint=hint,
     )
     return JSONResponse(
-        problem.model_dump(mode="json"), status, headers=dict(headers or {}), media_type=PROBLEM_MEDIA_TYPE
+        {**problem.model_dump(mode="json"), **more},
+        status,
+        headers=dict(headers or {}),
+        media_type=PROBLEM_MEDIA_TYPE,
     )
 
 
@@ -210,7 +214,7 @@ async def _storage(request: Request, error: Exception) -> JSONResponse:
     return problem_response(
         status,
         "idempotency_key_reused" if isinstance(error, IdempotencyMismatch) else error.code,
-        str(error),
+        error.told,
         request_id=request_id_of(request.scope),
         errors=error.faults if isinstance(error, SceneInvalid) else (),
         headers={"Retry-After": "2"} if status == 503 else None,

@@ -37,7 +37,11 @@ def roll_out(url: str, database: Database, credential: str, request: RolloutCrea
         problem = answer.json()
         faults = [FieldError.model_validate(item) for item in problem.get("errors", [])]
         if answer.status_code != 401:
-            raise ApiProblem(answer.status_code, problem["code"], problem["detail"], errors=faults)
+            later = answer.headers.get("Retry-After")
+            headers = None if later is None else {"Retry-After": later}
+            raise ApiProblem(
+                answer.status_code, problem["code"], problem["detail"], errors=faults, headers=headers
+            )
     raise unavailable(f"the inference service answered {answer.status_code}")
 
 

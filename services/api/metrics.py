@@ -1,7 +1,8 @@
 """Prometheus figures: requests and their latency, jobs by state, shards by queue and state.
 
 The job and shard figures are counted in the database when a scrape asks for them, so that every web process
-tells the same truth and none of them keeps books.
+tells the same truth and none of them keeps books. While the database does not answer within ``COUNT_S``, they are left
+out and ``physworld_database_up`` is 0.
 """
 
 from __future__ import annotations
@@ -11,13 +12,18 @@ from collections.abc import Iterator
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
 from prometheus_client.core import GaugeMetricFamily
+from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
 from schemas.queues import QUEUE_OF_SHARD
+from services.api.probes import Probe
 from storage.counts import count_jobs, count_shards
 from storage.database import Database
+from storage.errors import StorageError
 
 WAITING = "QUEUED"
+COUNT_S = 2.0
+Counts = tuple[dict[tuple[str, str], int], dict[tuple[str, str], int]]
 _LATENCY_BUCKETS_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0)
 
 
@@ -41,27 +47,39 @@ class Metrics:
             buckets=_LATENCY_BUCKETS_S,
             registry=self._registry,
         )
-        self._registry.register(_DatabaseFigures(database))
+        self._database = database
+        self._count = Probe("count", self._counted)
 
-    def exposition(self) -> bytes:
+    async def exposition(self) -> bytes:
         """All figures in the Prometheus text format."""
-        return generate_latest(self._registry)
+        try:
+            counts = await self._count.answer(COUNT_S)
+        except (StorageError, TimeoutError):
+            counts = None
+        figures = CollectorRegistry()
+        figures.register(_DatabaseFigures(counts))
+        return generate_latest(self._registry) + generate_latest(figures)
+
+    def _counted(self) -> Counts:
+        """Jobs and shards as the database has them now, in one reading transaction."""
+        with self._database.reading() as session:
+            return count_jobs(session), count_shards(session)
 
 
 class _DatabaseFigures(Collector):
-    """Jobs and shards as the database has them at the time of the scrape."""
+    """Jobs and shards as they were counted for one scrape; None: the database did not answer."""
 
-    def __init__(self, database: Database) -> None:
-        self._database = database
+    def __init__(self, counts: Counts | None) -> None:
+        self._counts = counts
 
-    def describe(self) -> Iterator[GaugeMetricFamily]:
-        """Names without values: registering must not need a migrated database."""
-        yield from (_jobs(), _shards(), _depth())
-
-    def collect(self) -> Iterator[GaugeMetricFamily]:
-        """One reading transaction for all figures of a scrape."""
-        with self._database.reading() as session:
-            jobs, shards = count_jobs(session), count_shards(session)
+    def collect(self) -> Iterator[Metric]:
+        """The figures of the scrape."""
+        yield GaugeMetricFamily(
+            "physworld_database_up", "1 if the database answered", value=float(self._counts is not None)
+        )
+        if self._counts is None:
+            return
+        jobs, shards = self._counts
         by_job, by_shard, depth = _jobs(), _shards(), _depth()
         for (kind, state), count in sorted(jobs.items()):
             by_job.add_metric([kind, state], count)

@@ -118,7 +118,8 @@ class Authentication:
         try:
             found = self.gate.key_of(token.strip(), address)
         except StorageError as error:
-            raise ApiProblem(503, error.code, str(error), headers={"Retry-After": "2"}) from error
+            log.error(error.code, error=str(error))
+            raise ApiProblem(503, error.code, error.told, headers={"Retry-After": "2"}) from error
         if found is None:
             raise ApiProblem(
                 401,

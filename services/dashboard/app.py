@@ -40,6 +40,7 @@ from storage.errors import (
     EpisodeCorrupt,
     InvalidCursor,
     NotFound,
+    StorageError,
     StoreError,
 )
 from storage.settings import Settings
@@ -155,8 +156,10 @@ def _install_errors(app: FastAPI, site: Site) -> None:
 
     @app.exception_handler(DatabaseUnavailable)
     @app.exception_handler(StoreError)
-    def unavailable(request: Request, error: Exception) -> Response:
-        return answer(request, 503, f"{error}. Nothing was changed; try again in a moment.")
+    def unavailable(request: Request, error: StorageError) -> Response:
+        told = answer(request, 503, f"{error.told}. Nothing was changed; try again in a moment.")
+        told.headers["Retry-After"] = "2"
+        return told
 
     @app.exception_handler(ArtifactCorrupt)
     @app.exception_handler(EpisodeCorrupt)

@@ -32,6 +32,7 @@ from storage import tickets
 from storage.artifacts import ArtifactStore
 from storage.database import Database
 from storage.errors import ArtifactCorrupt, Conflict, NotFound, StorageError
+from storage.patience import ANSWERING
 from storage.settings import Settings
 
 TICKET_HEADER = "X-Physworld-Ticket"
@@ -42,7 +43,7 @@ log = structlog.get_logger("physworld.inference")
 
 def create_app(settings: Settings, database: Database) -> Starlette:
     """The application on an opened database."""
-    models = Models(database, ArtifactStore(settings))
+    models = Models(database, ArtifactStore(settings, ANSWERING))
     service = _Service(database, models)
     sessions = LiveSessions(database, models)
 
@@ -110,10 +111,11 @@ def problem_of(error: StorageError | WorldModelError) -> Response:
     if isinstance(error, WorldModelError):
         return _problem(422, "rollout_diverged", str(error))
     status = {NotFound: 404, Conflict: 409, ArtifactCorrupt: 500}.get(type(error), 503)
-    return _problem(status, error.code, str(error))
+    return _problem(status, error.code, error.told)
 
 
 def _problem(status: int, code: str, detail: str, errors: list[FieldError] | None = None) -> Response:
     problem = Problem(title=code, status=status, code=code, detail=detail, errors=errors or [])
     content: dict[str, Any] = json.loads(problem.model_dump_json())
-    return JSONResponse(content, status, media_type="application/problem+json")
+    headers = {"Retry-After": "2"} if status == 503 else None
+    return JSONResponse(content, status, headers, media_type="application/problem+json")

@@ -40,7 +40,9 @@ def _build(settings: Settings) -> ASGIApp:
     import torch
 
     from services.inference.app import create_app
+    from services.stores import THREADS
     from storage.database import open_database
+    from storage.patience import ANSWERING
 
     torch.set_num_threads(1)
-    return create_app(settings, open_database(settings))
+    return create_app(settings, open_database(settings, threads=THREADS, patience=ANSWERING))

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import threading
 import time
 from collections.abc import Iterator
+from uuid import uuid4
 
 import httpx
 import pytest
 import structlog
 import uvicorn
 from api_service import Service
+from sqlalchemy import create_engine, make_url, text
 
 from services.stores import Stores
 from services.web import create_app
 from storage.database import open_database
 from storage.settings import Settings
 
+POSTGRES_VARIABLE = "PHYSWORLD_TEST_POSTGRES_URL"
 START_WITHIN_S = 60.0
 MAX_UPLOAD_BYTES = 300_000
 
@@ -33,6 +37,23 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     """The web application on SQLite and a local folder."""
     settings = Settings(data_dir=tmp_path_factory.mktemp("data"), max_upload_bytes=MAX_UPLOAD_BYTES)
     yield from serve(settings)
+
+
+@pytest.fixture(scope="module")
+def postgres_url() -> Iterator[str]:
+    """A database of our own on the server, dropped afterwards."""
+    server = os.environ.get(POSTGRES_VARIABLE)
+    if not server:
+        pytest.skip(f"{POSTGRES_VARIABLE} names no Postgres server")
+    url = make_url(server).set(drivername="postgresql+psycopg")
+    name = f"physworld_api_{uuid4().hex[:12]}"
+    engine = create_engine(url, isolation_level="AUTOCOMMIT")
+    with engine.connect() as connection:
+        connection.execute(text(f"CREATE DATABASE {name}"))
+    yield url.set(drivername="postgresql", database=name).render_as_string(hide_password=False)
+    with engine.connect() as connection:
+        connection.execute(text(f"DROP DATABASE {name} WITH (FORCE)"))
+    engine.dispose()
 
 
 @pytest.fixture

@@ -6,39 +6,17 @@ moto's server over real HTTP.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from pathlib import Path
-from uuid import uuid4
 
 import boto3
 import pytest
 from api_service import Service, ask, assert_problem, bundle, scene_id, upload
 from conftest import serve
 from moto.server import ThreadedMotoServer
-from sqlalchemy import create_engine, make_url, text
 
 from services.web import create_app
 from storage.settings import get_settings
-
-POSTGRES_VARIABLE = "PHYSWORLD_TEST_POSTGRES_URL"
-
-
-@pytest.fixture(scope="module")
-def postgres_url() -> Iterator[str]:
-    """A database of our own on the server, dropped afterwards."""
-    server = os.environ.get(POSTGRES_VARIABLE)
-    if not server:
-        pytest.skip(f"{POSTGRES_VARIABLE} names no Postgres server")
-    url = make_url(server).set(drivername="postgresql+psycopg")
-    name = f"physworld_api_{uuid4().hex[:12]}"
-    engine = create_engine(url, isolation_level="AUTOCOMMIT")
-    with engine.connect() as connection:
-        connection.execute(text(f"CREATE DATABASE {name}"))
-    yield url.set(drivername="postgresql", database=name).render_as_string(hide_password=False)
-    with engine.connect() as connection:
-        connection.execute(text(f"DROP DATABASE {name} WITH (FORCE)"))
-    engine.dispose()
 
 
 @pytest.fixture(scope="module")

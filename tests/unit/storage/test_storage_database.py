@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import multiprocessing
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from schemas.fit import FitConfig
 from storage import jobs
 from storage.database import MIGRATIONS, Database, newest_revision, ping
 from storage.errors import DatabaseUnavailable
+from storage.patience import WORKING
 from storage.tables import Base, JobRow, SceneRow, utc_now
 
 if TYPE_CHECKING:
@@ -129,13 +131,11 @@ def test_writers_queue_up_and_none_is_lost(work: Work, database: Database) -> No
         assert session.get_one(SceneRow, scene.id).frames == 10 + writers * rounds
 
 
-def test_a_locked_database_is_unavailable_and_says_why(
-    tmp_path: Path, sqlite_template: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("storage.database.BUSY_SECONDS", 0.05)
+def test_a_locked_database_is_unavailable_and_says_why(tmp_path: Path, sqlite_template: Path) -> None:
     path = tmp_path / "physworld.db"
     path.write_bytes(sqlite_template.read_bytes())
-    first, second = Database(f"sqlite:///{path}"), Database(f"sqlite:///{path}")
+    first = Database(f"sqlite:///{path}")
+    second = Database(f"sqlite:///{path}", patience=dataclasses.replace(WORKING, lock_s=0.05))
     with first.session() as holder:
         ping(holder)
         with pytest.raises(DatabaseUnavailable, match="database is locked: another writer"):
