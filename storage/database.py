@@ -23,6 +23,7 @@ from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.orm import Session
 
+from storage.clock import CLOCK, Clock
 from storage.errors import DatabaseUnavailable
 from storage.patience import GRACE_S, WORKING, Patience, Silence
 from storage.settings import Settings
@@ -47,6 +48,7 @@ class Database:
     Args:
         threads: of the process that use it at the same time; as many connections are made at most.
         patience: how long anything of it is waited for. Migrations are waited for without an end.
+        clock: what leases go by instead of the database's clock, for tests that move the time.
     """
 
     def __init__(
@@ -56,12 +58,14 @@ class Database:
         max_attempts: int = DEFAULT_MAX_ATTEMPTS,
         threads: int = FEW_THREADS,
         patience: Patience = WORKING,
+        clock: Clock | None = None,
     ) -> None:
         self._silence = Silence(patience.ping_s + patience.connect_s)
         self._patience = patience
         self.engine = _create_engine(url, threads, patience, self._silence)
         self._reading_engine = self.engine.execution_options(sqlite_begin="BEGIN")
         self._max_attempts = max_attempts
+        self._clock = clock
         self._process = os.getpid()
 
     @contextmanager
@@ -124,6 +128,7 @@ class Database:
         self._ask()
         with self._translated(), Session(engine, expire_on_commit=False) as session, session.begin():
             session.info[MAX_ATTEMPTS] = self._max_attempts
+            session.info[CLOCK] = self._clock
             yield session
 
     def _ask(self) -> None:

@@ -10,7 +10,7 @@ A shard's life::
 Every change is a compare-and-set on (id, epoch, state). ``claim`` raises the epoch, so a worker that was
 presumed dead and comes back finds that its epoch is no longer the shard's: it cannot commit, renew or fail
 anything. A kill at any instant leaves the shard RUNNING until its lease ends, never half committed.
-``now`` is an aware UTC time; hosts' clocks should agree within a fraction of the lease.
+All times are of the database's clock (``storage.clock``), so hosts whose clocks are wrong do no harm.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from schemas.base import Problem
 from schemas.job import TERMINAL_STATES, Progress
 from schemas.queues import QUEUE_OF_SHARD
 from storage.changes import announce
+from storage.clock import database_now
 from storage.errors import NotFound
 from storage.flow import (
     LONG_SHARDS,
@@ -40,7 +41,7 @@ from storage.flow import (
 from storage.locks import lock_job
 from storage.opening import CANCELLED, DONE, FAILED, QUEUED, RUNNING
 from storage.results import parse_result
-from storage.tables import JobRow, ShardRow, utc_now
+from storage.tables import JobRow, ShardRow
 
 BACKOFF_SECONDS = 1.0  # before the second attempt; doubles with each further one
 BACKOFF_LIMIT_SECONDS = 60.0
@@ -74,7 +75,7 @@ class Publication:
     epoch: int
 
 
-def claim(session: Session, shard_id: str, owner: str, now: datetime, lease_seconds: float) -> Lease | None:
+def claim(session: Session, shard_id: str, owner: str, lease_seconds: float) -> Lease | None:
     """Take a queued shard, or None: somebody has it, it is done, called off, or must not start yet."""
     seen = session.execute(
         select(ShardRow.job_id, ShardRow.state, ShardRow.epoch).where(ShardRow.id == shard_id)
@@ -84,6 +85,7 @@ def claim(session: Session, shard_id: str, owner: str, now: datetime, lease_seco
     job = lock_job(session, seen.job_id)
     if job.state not in OPEN_STATES:
         return None
+    now = database_now(session)
     taken = _changed(
         session,
         update(ShardRow)
@@ -117,13 +119,14 @@ def claim(session: Session, shard_id: str, owner: str, now: datetime, lease_seco
 
 
 def renew(
-    session: Session, lease: Lease, now: datetime, lease_seconds: float, progress: Progress | None = None
+    session: Session, lease: Lease, lease_seconds: float, progress: Progress | None = None
 ) -> LeaseState:
     """Prolong a lease and report progress.
 
     "held": carry on. "cancel": stop, then ``mark_cancelled``. "lost": stop at once and write nothing more.
     """
     job = lock_job(session, lease.job_id)
+    now = database_now(session)
     until = now + timedelta(seconds=lease_seconds)
     if not _compare_and_set(session, lease, lease_until=until):
         return "lost"
@@ -142,8 +145,8 @@ def complete(session: Session, lease: Lease, result: dict[str, Any], digest: str
     belongs to nobody. Raises ResultInvalid, before anything is changed, for a result of the wrong form.
     """
     parsed = parse_result(lease.kind, lease.index, result)
-    now = utc_now()
     job = lock_job(session, lease.job_id)
+    now = database_now(session)
     if job.state == "cancelling":
         mark_cancelled(session, lease)
         return False
@@ -154,16 +157,14 @@ def complete(session: Session, lease: Lease, result: dict[str, Any], digest: str
     return True
 
 
-def fail(
-    session: Session, lease: Lease, problem: Problem, retry: bool, now: datetime | None = None
-) -> LeaseState:
+def fail(session: Session, lease: Lease, problem: Problem, retry: bool) -> LeaseState:
     """An attempt went wrong: queue the shard again, later, or fail the job with the problem.
 
     It is queued again when ``retry`` and fewer than ``max_attempts`` were made. Returns "lost" when the lease
     was no longer ours, "cancel" when the job was being cancelled (the shard then is), else "held".
     """
-    now = now or utc_now()
     job = lock_job(session, lease.job_id)
+    now = database_now(session)
     if job.state == "cancelling":
         return "cancel" if mark_cancelled(session, lease) else "lost"
     error = problem.model_dump(mode="json")
@@ -186,7 +187,7 @@ def fail(
 def mark_cancelled(session: Session, lease: Lease) -> bool:
     """The worker has stopped because of a cancel; False when the lease was lost meanwhile."""
     job = lock_job(session, lease.job_id)
-    now = utc_now()
+    now = database_now(session)
     values = {"state": CANCELLED, "lease_owner": None, "lease_until": None, "finished_at": now}
     if not _compare_and_set(session, lease, **values):
         return False
@@ -208,7 +209,6 @@ def release(session: Session, lease: Lease) -> bool:
 
 def publishable(
     session: Session,
-    now: datetime,
     limit: int = 100,
     *,
     republish_seconds: float = REPUBLISH_SECONDS,
@@ -219,6 +219,7 @@ def publishable(
     At most ``limit`` for each queue, oldest first, and so that at most ``window`` are announced at a time.
     A message too many is harmless: its ``claim`` finds nothing to take.
     """
+    now = database_now(session)
     stale = now - timedelta(seconds=republish_seconds)
     fresh = func.sum(case((ShardRow.published_at > stale, 1), else_=0))
     queued, announced = Counter[str](), Counter[str]()
@@ -255,8 +256,9 @@ def publishable(
     return found
 
 
-def mark_published(session: Session, publications: Sequence[Publication], now: datetime) -> None:
+def mark_published(session: Session, publications: Sequence[Publication]) -> None:
     """Remember that these were handed to the broker; one claimed or requeued meanwhile is left alone."""
+    now = database_now(session)
     for publication in publications:
         session.execute(
             update(ShardRow)
@@ -269,8 +271,9 @@ def mark_published(session: Session, publications: Sequence[Publication], now: d
         )
 
 
-def reap(session: Session, now: datetime, limit: int = 100) -> list[str]:
+def reap(session: Session, limit: int = 100) -> list[str]:
     """Take back shards whose lease ran out: queued again, or failed after ``max_attempts``. Their ids."""
+    now = database_now(session)
     root = func.coalesce(JobRow.parent_id, JobRow.id)
     expired = session.execute(
         select(ShardRow.id, ShardRow.job_id)
@@ -289,11 +292,12 @@ def reap(session: Session, now: datetime, limit: int = 100) -> list[str]:
     return reaped
 
 
-def end_leases_of(session: Session, is_gone: Callable[[str], bool], now: datetime) -> int:
+def end_leases_of(session: Session, is_gone: Callable[[str], bool]) -> int:
     """End the leases of owners that are provably dead, so that ``reap`` need not wait for them to run out.
 
     Returns how many shards they held.
     """
+    now = database_now(session)
     running = (ShardRow.state == RUNNING, ShardRow.lease_until >= now)
     owners = session.scalars(select(ShardRow.lease_owner).where(*running).distinct())
     gone = [owner for owner in owners if owner is not None and is_gone(owner)]
@@ -304,12 +308,13 @@ def end_leases_of(session: Session, is_gone: Callable[[str], bool], now: datetim
     return cast("CursorResult[Any]", session.execute(values)).rowcount
 
 
-def recover(session: Session, now: datetime) -> int:
+def recover(session: Session) -> int:
     """After a restart of the *whole* service: no former worker lives, the broker may have lost messages.
 
     Ends every lease (``reap`` then queues the shards again) and forgets every announcement. Returns how many
     shards were running. Only for a caller that knows that it is alone (the embedded supervisor's lock).
     """
+    now = database_now(session)
     ended = update(ShardRow).where(ShardRow.state == RUNNING).values(lease_until=now - timedelta(seconds=1))
     count = cast("CursorResult[Any]", session.execute(ended)).rowcount
     session.execute(update(ShardRow).where(ShardRow.state == QUEUED).values(published_at=None))

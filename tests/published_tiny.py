@@ -27,7 +27,6 @@ from schemas.model import TrainingConfig as WireConfig
 from storage import jobs, leases, registry
 from storage.artifacts import ArtifactStore
 from storage.database import Database
-from storage.tables import utc_now
 
 NAME = "tiny-bar"
 FRAMES, EPISODES = 24, 6
@@ -71,9 +70,9 @@ def publish_tiny(
     with database.session() as session:
         job = jobs.create_fit(session, scene_id, FitConfig())
     with database.session() as session:
-        waiting = next(p for p in leases.publishable(session, utc_now()) if p.kind == "fit")
-        leases.mark_published(session, [waiting], utc_now())
-        lease = leases.claim(session, waiting.shard_id, "test", utc_now(), 30.0)
+        waiting = next(p for p in leases.publishable(session) if p.kind == "fit")
+        leases.mark_published(session, [waiting])
+        lease = leases.claim(session, waiting.shard_id, "test", 30.0)
         assert lease is not None
         result = {"parameters": {}, "metrics": {}, "artifacts": [file.model_dump()]}
         assert leases.complete(session, lease, result, None)

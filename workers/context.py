@@ -12,7 +12,6 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from datetime import UTC, datetime
 from types import TracebackType
 
 from schemas.job import Progress
@@ -103,9 +102,7 @@ class TaskContext:
     def _renew(self, progress: Progress | None) -> None:
         started = time.monotonic()
         with self.database.session() as session:
-            state = leases.renew(
-                session, self.lease, datetime.now(UTC), self.settings.lease_seconds, progress
-            )
+            state = leases.renew(session, self.lease, self.settings.lease_seconds, progress)
         if state == "lost":
             self._lost = True
             return

@@ -125,9 +125,7 @@ class Dispatcher:
         if not open_queues:
             return
         with self._database.reading() as session:
-            found = leases.publishable(
-                session, datetime.now(UTC), republish_seconds=republish_seconds, window=MAX_DEPTH
-            )
+            found = leases.publishable(session, republish_seconds=republish_seconds, window=MAX_DEPTH)
         waiting = [publication for publication in found if publication.queue in open_queues]
         if not waiting:
             return
@@ -142,14 +140,14 @@ class Dispatcher:
                 )
                 self._depth[publication.queue] += 1
         with self._database.session() as session:
-            leases.mark_published(session, waiting, datetime.now(UTC))
+            leases.mark_published(session, waiting)
         self._sweep_due = min(self._sweep_due, time.monotonic() + SWEEP_S)
         logger.info("published %d shards", len(waiting))
 
     def _take_back(self) -> int:
         with self._database.session() as session:
-            leases.end_leases_of(session, owner_is_gone, datetime.now(UTC))
-            taken = leases.reap(session, datetime.now(UTC))
+            leases.end_leases_of(session, owner_is_gone)
+            taken = leases.reap(session)
         if taken:
             logger.warning("took back %d shards: %s", len(taken), ", ".join(taken))
         return len(taken)

@@ -14,7 +14,6 @@ import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from typing import Literal
 
 from celery.exceptions import SoftTimeLimitExceeded
@@ -80,9 +79,7 @@ def process_runtime() -> Runtime:
 def run_shard(runtime: Runtime, shard_id: str) -> Outcome:
     """Do the shard if it can be had; a duplicate or late message ends here without effect."""
     with runtime.database.session() as session:
-        lease = leases.claim(
-            session, shard_id, runtime.owner, datetime.now(UTC), runtime.settings.lease_seconds
-        )
+        lease = leases.claim(session, shard_id, runtime.owner, runtime.settings.lease_seconds)
     if lease is None:
         logger.info("shard %s: not to be had (done, cancelled or held by another)", shard_id)
         return "not claimed"

@@ -182,7 +182,7 @@ class Supervisor:
         database.upgrade()
         if not os.environ.get("PHYSWORLD_DATABASE_URL"):
             with database.session() as session:  # alone on it: nobody of an earlier run is left
-                leases.recover(session, datetime.now(UTC))
+                leases.recover(session)
         with database.session() as session:
             self._ensure_key(session)
             signer = signing.open_signer(settings)

@@ -9,7 +9,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -66,7 +65,7 @@ def runtime(tmp_path: Path) -> Iterator[Runtime]:
 def drain(runtime: Runtime) -> None:
     while True:
         with runtime.database.reading() as session:
-            waiting = leases.publishable(session, datetime.now(UTC))
+            waiting = leases.publishable(session)
         if not waiting:
             return
         for publication in waiting:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import sys
 import time
-from datetime import UTC, datetime
 from pathlib import Path
 
 from storage import leases
@@ -29,11 +28,11 @@ def main(data_dir: Path) -> int:
     runtime = Runtime(settings, database, Stores(settings, database), process_owner())
     for take_back in (leases.recover, leases.reap):
         with database.session() as session:
-            take_back(session, datetime.now(UTC))
+            take_back(session)
     until = time.monotonic() + PATIENCE_S
     while time.monotonic() < until:
         with database.reading() as session:
-            waiting = leases.publishable(session, datetime.now(UTC))
+            waiting = leases.publishable(session)
         for publication in waiting:
             return 0 if run_shard(runtime, publication.shard_id) == "done" else 1
         time.sleep(0.1)

@@ -27,7 +27,6 @@ from storage import api_keys, jobs, leases, resources
 from storage.database import Database, open_database
 from storage.scene_bundle import canonical_archive
 from storage.settings import Settings
-from storage.tables import utc_now
 from workers.tasks.dataset_card import store_card
 
 FRAMES, POINTS, PARTICLES = 90, 24, 300
@@ -133,8 +132,8 @@ def claim(world: World, job_id: str) -> leases.Lease:
     """Take the next queued shard of a job, as a worker does."""
     with world.database.session() as session:
         family = {job_id, *jobs.get_job(session, job_id).children}
-        for publication in leases.publishable(session, utc_now(), 1000):
-            lease = leases.claim(session, publication.shard_id, "test", utc_now(), LEASE_SECONDS)
+        for publication in leases.publishable(session, 1000):
+            lease = leases.claim(session, publication.shard_id, "test", LEASE_SECONDS)
             if lease is not None and lease.job_id in family:
                 return lease
             if lease is not None:
@@ -146,7 +145,7 @@ def report(world: World, lease: leases.Lease, done: float, total: float, unit: s
     """Renew a lease with progress."""
     progress = Progress(done=done, total=total, unit=unit, message=message)
     with world.database.session() as session:
-        leases.renew(session, lease, utc_now(), LEASE_SECONDS, progress)
+        leases.renew(session, lease, LEASE_SECONDS, progress)
 
 
 def complete(world: World, lease: leases.Lease, result: dict[str, Any], digest: str | None = None) -> None:

@@ -20,7 +20,6 @@ from storage.api_keys import Role, create_key
 from storage.database import Database
 from storage.leases import Lease
 from storage.settings import Settings
-from storage.tables import utc_now
 
 LEASE_S = 30.0
 FRAMES, POINTS = 20, 9
@@ -97,10 +96,9 @@ class Service:
     def claim(self) -> Lease | None:
         """Take the next queued shard, or None."""
         with self.database.session() as session:
-            now = utc_now()
-            ready = leases.publishable(session, now)
-            leases.mark_published(session, ready[:1], now)
-            return leases.claim(session, ready[0].shard_id, "test", now, LEASE_S) if ready else None
+            ready = leases.publishable(session)
+            leases.mark_published(session, ready[:1])
+            return leases.claim(session, ready[0].shard_id, "test", LEASE_S) if ready else None
 
     def _result(self, lease: Lease) -> tuple[dict[str, Any], str | None]:
         put = self.stores.artifacts.put_bytes

@@ -17,7 +17,6 @@ from schemas.rollout import SYNC_STEPS, RolloutCreate
 from services.inference import rollouts
 from services.inference.models import Models
 from storage import leases
-from storage.tables import utc_now
 from workers.execute import Runtime, run_shard
 from workers.registry import register
 
@@ -59,8 +58,8 @@ def _work(served: Served, ends: str = "done") -> None:
     runtime = Runtime(served.settings, served.database, served.stores, "test")
     while True:
         with served.database.session() as session:
-            waiting = leases.publishable(session, utc_now())
-            leases.mark_published(session, waiting, utc_now())
+            waiting = leases.publishable(session)
+            leases.mark_published(session, waiting)
         if not waiting:
             return
         for publication in waiting:

@@ -20,7 +20,6 @@ from schemas.base import Artifact, Problem
 from services.stores import Stores
 from storage import leases, signing
 from storage.database import Database
-from storage.tables import utc_now
 
 LEASE_S = 30.0
 METRICS = ("track_m", "chamfer_phystwin_m", "chamfer_l2_m")
@@ -56,10 +55,9 @@ class Service:
     def claim(self) -> leases.Lease | None:
         """Takes the next queued shard, or None."""
         with self.database.session() as session:
-            now = utc_now()
-            ready = leases.publishable(session, now)
-            leases.mark_published(session, ready[:1], now)
-            return leases.claim(session, ready[0].shard_id, "test", now, LEASE_S) if ready else None
+            ready = leases.publishable(session)
+            leases.mark_published(session, ready[:1])
+            return leases.claim(session, ready[0].shard_id, "test", LEASE_S) if ready else None
 
     def fail(self, problem: Problem) -> None:
         """The next queued shard fails for good."""

@@ -23,7 +23,6 @@ from typer.testing import CliRunner
 from schemas.plan import PlanConfig, PlanLimits
 from schemas.rollout import SYNC_STEPS
 from storage import leases
-from storage.tables import utc_now
 from workers.execute import Runtime, run_shard
 from workers.registry import register
 
@@ -43,8 +42,8 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         def work() -> None:
             while not over.wait(0.1):
                 with served.database.session() as session:
-                    waiting = leases.publishable(session, utc_now())
-                    leases.mark_published(session, waiting, utc_now())
+                    waiting = leases.publishable(session)
+                    leases.mark_published(session, waiting)
                 for publication in waiting:
                     run_shard(runtime, publication.shard_id)
 

@@ -84,8 +84,8 @@ def client(world: tuple[Settings, Database, Stores]) -> Iterator[httpx.Client]:
 
 def _complete(database: Database, result: dict[str, Any]) -> None:
     with database.session() as session:
-        (waiting, *_) = leases.publishable(session, utc_now())
-        lease = leases.claim(session, waiting.shard_id, "test", utc_now(), 60.0)
+        (waiting, *_) = leases.publishable(session)
+        lease = leases.claim(session, waiting.shard_id, "test", 60.0)
         assert lease is not None and leases.complete(session, lease, result)
 
 

@@ -28,7 +28,6 @@ from storage import jobs, leases, resources
 from storage.database import Database, open_database
 from storage.leases import Lease
 from storage.settings import Settings
-from storage.tables import utc_now
 
 POSTGRES_VARIABLE = "PHYSWORLD_TEST_POSTGRES_URL"
 BACKENDS = ["sqlite", *(["postgres"] if os.environ.get(POSTGRES_VARIABLE) else [])]
@@ -89,16 +88,14 @@ class Work:
     def waiting(self) -> list[str]:
         """Ids of the queued shards."""
         with self.database.reading() as session:
-            found = leases.publishable(
-                session, utc_now(), limit=10_000, republish_seconds=1e-9, window=10_000
-            )
+            found = leases.publishable(session, limit=10_000, republish_seconds=1e-9, window=10_000)
         return [publication.shard_id for publication in found]
 
     def claim(self, shard_id: str | None = None, owner: str = "worker-1") -> Lease:
         """Take a shard, the first that waits unless it is named."""
         chosen = shard_id or self.waiting()[0]
         with self.database.session() as session:
-            lease = leases.claim(session, chosen, owner, utc_now(), LEASE_SECONDS)
+            lease = leases.claim(session, chosen, owner, LEASE_SECONDS)
         assert lease is not None
         return lease
 

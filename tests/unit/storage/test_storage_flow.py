@@ -14,7 +14,6 @@ from storage import jobs, leases, opening, registry, resources
 from storage.counts import count_shards
 from storage.errors import Conflict, NotFound, ResultInvalid
 from storage.opening import STAGE_WINDOW, model_name_of
-from storage.tables import utc_now
 
 if TYPE_CHECKING:
     from conftest import Work
@@ -126,7 +125,7 @@ def test_a_failed_episode_calls_off_the_others(work: Work) -> None:
     assert work.waiting() == []
     assert not work.complete(held)
     with work.database.session() as session:
-        assert leases.renew(session, held, utc_now(), 30.0) == "lost"
+        assert leases.renew(session, held, 30.0) == "lost"
         dataset = resources.get_dataset(session, job.outputs[0].id)
         assert (dataset.state, dataset.episodes_done) == ("failed", 1)
 
@@ -145,7 +144,7 @@ def test_running_work_sees_the_cancel_at_its_next_renewal(work: Work) -> None:
     assert work.cancel(job).state == "cancelling"
     assert work.waiting() == []
     with work.database.session() as session:
-        assert leases.renew(session, first, utc_now(), 30.0) == "cancel"
+        assert leases.renew(session, first, 30.0) == "cancel"
         assert leases.mark_cancelled(session, first)
     assert work.job(job).state == "cancelling"
     assert work.complete(second) is False
@@ -183,8 +182,8 @@ def test_a_worker_that_dies_while_cancelling_is_reaped_as_cancelled(work: Work) 
     lease = work.claim()
     work.cancel(pipeline)
     with work.database.session() as session:
-        leases.recover(session, utc_now())
-        assert leases.reap(session, utc_now()) == [lease.shard_id]
+        leases.recover(session)
+        assert leases.reap(session) == [lease.shard_id]
     assert work.job(pipeline).state == "cancelled"
     assert work.waiting() == []
 

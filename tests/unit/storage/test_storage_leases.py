@@ -8,12 +8,14 @@ from datetime import timedelta
 from typing import TYPE_CHECKING
 
 import pytest
+from sqlalchemy.orm import Session
 
 from schemas.base import Problem
 from schemas.job import Progress
 from schemas.model import TrainingCreate
 from schemas.queues import SIMULATION, TRAINING
 from storage import jobs, leases, resources
+from storage.clock import CLOCK
 from storage.database import Database
 from storage.errors import ResultInvalid
 from storage.tables import ShardRow, utc_now
@@ -26,10 +28,16 @@ if TYPE_CHECKING:
 LEASE_SECONDS = 30.0
 
 
+def put_forward(session: Session, seconds: float) -> None:
+    """Put the clock of this transaction forward."""
+    session.info[CLOCK] = lambda: utc_now() + timedelta(seconds=seconds)
+
+
 def expire(work: Work, lease: Lease) -> list[str]:
     """Let the lease run out and reap."""
     with work.database.session() as session:
-        return leases.reap(session, utc_now() + timedelta(seconds=LEASE_SECONDS + 1))
+        put_forward(session, LEASE_SECONDS + 1)
+        return leases.reap(session)
 
 
 def shard(work: Work, shard_id: str) -> ShardRow:
@@ -47,7 +55,7 @@ def test_of_many_claimers_one_wins(work: Work) -> None:
     def claim(owner: str) -> None:
         barrier.wait()
         with work.database.session() as session:
-            lease = leases.claim(session, shard_id, owner, utc_now(), LEASE_SECONDS)
+            lease = leases.claim(session, shard_id, owner, LEASE_SECONDS)
         if lease is not None:
             won.append(lease)
 
@@ -64,8 +72,8 @@ def test_an_unknown_or_finished_shard_cannot_be_claimed(work: Work) -> None:
     lease = work.claim()
     assert work.complete(lease)
     with work.database.session() as session:
-        assert leases.claim(session, "shd_unknown", "worker", utc_now(), LEASE_SECONDS) is None
-        assert leases.claim(session, lease.shard_id, "worker", utc_now(), LEASE_SECONDS) is None
+        assert leases.claim(session, "shd_unknown", "worker", LEASE_SECONDS) is None
+        assert leases.claim(session, lease.shard_id, "worker", LEASE_SECONDS) is None
 
 
 def test_a_lost_lease_can_do_nothing(work: Work) -> None:
@@ -75,7 +83,7 @@ def test_a_lost_lease_can_do_nothing(work: Work) -> None:
     current = work.claim(owner="quick")
     assert current.epoch == late.epoch + 1
     with work.database.session() as session:
-        assert leases.renew(session, late, utc_now(), LEASE_SECONDS) == "lost"
+        assert leases.renew(session, late, LEASE_SECONDS) == "lost"
         assert leases.complete(session, late, work.result(late), None) is False
         assert leases.release(session, late) is False
         assert leases.mark_cancelled(session, late) is False
@@ -95,12 +103,14 @@ def test_a_result_is_committed_once(work: Work) -> None:
 def test_renew_prolongs_the_lease(work: Work) -> None:
     work.fit()
     lease = work.claim()
-    later = utc_now() + timedelta(seconds=20)
     with work.database.session() as session:
-        assert leases.renew(session, lease, later, LEASE_SECONDS) == "held"
+        put_forward(session, 20)
+        assert leases.renew(session, lease, LEASE_SECONDS) == "held"
     with work.database.session() as session:
-        assert leases.reap(session, later + timedelta(seconds=LEASE_SECONDS - 1)) == []
-        assert leases.reap(session, later + timedelta(seconds=LEASE_SECONDS + 1)) == [lease.shard_id]
+        put_forward(session, 20 + LEASE_SECONDS - 1)
+        assert leases.reap(session) == []
+        put_forward(session, 20 + LEASE_SECONDS + 1)
+        assert leases.reap(session) == [lease.shard_id]
 
 
 def test_progress_of_a_long_shard_is_the_jobs(work: Work) -> None:
@@ -108,7 +118,7 @@ def test_progress_of_a_long_shard_is_the_jobs(work: Work) -> None:
     lease = work.claim()
     progress = Progress(done=12, total=80, unit="simulations", message="loss 3e-4")
     with work.database.session() as session:
-        leases.renew(session, lease, utc_now(), LEASE_SECONDS, progress)
+        leases.renew(session, lease, LEASE_SECONDS, progress)
     assert work.job(job).progress == progress
     with work.database.reading() as session:
         last = jobs.events_after(session, job.id, 0)[-1]
@@ -120,7 +130,7 @@ def test_progress_of_a_dataset_counts_episodes(work: Work) -> None:
     work.complete(work.claim())
     lease = work.claim()
     with work.database.session() as session:
-        leases.renew(session, lease, utc_now(), LEASE_SECONDS, Progress(done=7, total=10, unit="frames"))
+        leases.renew(session, lease, LEASE_SECONDS, Progress(done=7, total=10, unit="frames"))
     assert work.job(job).progress.done == 0
     work.complete(lease)
     progress = work.job(job).progress
@@ -154,7 +164,8 @@ def test_a_retried_failure_waits_and_is_capped(work: Work) -> None:
         assert row.not_before is not None
         waits.append(round((row.not_before - before).total_seconds()))
         with work.database.session() as session:
-            assert leases.claim(session, lease.shard_id, "early", before, LEASE_SECONDS) is None
+            put_forward(session, -5)
+            assert leases.claim(session, lease.shard_id, "early", LEASE_SECONDS) is None
             row = session.get_one(ShardRow, lease.shard_id)
             row.not_before = None
     assert waits == [1, 2, 4, 8]
@@ -209,39 +220,39 @@ def test_a_transaction_that_breaks_leaves_no_trace(work: Work) -> None:
 
 def test_published_shards_are_not_published_again_until_they_are_stale(work: Work) -> None:
     work.fit()
-    now = utc_now()
     with work.database.session() as session:
-        found = leases.publishable(session, now)
+        found = leases.publishable(session)
         assert [publication.queue for publication in found] == [SIMULATION]
-        leases.mark_published(session, found, now)
+        leases.mark_published(session, found)
     with work.database.reading() as session:
-        assert leases.publishable(session, now + timedelta(seconds=59)) == []
-        assert leases.publishable(session, now + timedelta(seconds=61)) == found
+        put_forward(session, 59)
+        assert leases.publishable(session) == []
+        put_forward(session, 61)
+        assert leases.publishable(session) == found
 
 
 def test_marking_published_spares_a_shard_that_was_claimed_and_requeued_meanwhile(work: Work) -> None:
     work.fit()
     with work.database.reading() as session:
-        found = leases.publishable(session, utc_now())
+        found = leases.publishable(session)
     lease = work.claim()
     expire(work, lease)
     with work.database.session() as session:
-        leases.mark_published(session, found, utc_now())
+        leases.mark_published(session, found)
     with work.database.reading() as session:
-        again = leases.publishable(session, utc_now())
+        again = leases.publishable(session)
     assert [(publication.shard_id, publication.epoch) for publication in again] == [(lease.shard_id, 1)]
 
 
 def test_only_a_window_of_a_long_queue_is_announced(work: Work) -> None:
     work.dataset(episodes=30)
     work.complete(work.claim())
-    now = utc_now()
     with work.database.session() as session:
-        first = leases.publishable(session, now, limit=4, window=6)
-        leases.mark_published(session, first, now)
-        second = leases.publishable(session, now, limit=4, window=6)
-        leases.mark_published(session, second, now)
-        assert leases.publishable(session, now, limit=4, window=6) == []
+        first = leases.publishable(session, limit=4, window=6)
+        leases.mark_published(session, first)
+        second = leases.publishable(session, limit=4, window=6)
+        leases.mark_published(session, second)
+        assert leases.publishable(session, limit=4, window=6) == []
     assert (len(first), len(second)) == (4, 2)
     rows = [shard(work, publication.shard_id).index for publication in first + second]
     assert rows == [0, 1, 2, 3, 4, 5]
@@ -255,7 +266,7 @@ def test_a_long_simulation_queue_does_not_hold_up_training(work: Work) -> None:
     work.complete(work.claim())
     with work.database.session() as session:
         jobs.create_training(session, TrainingCreate(name="beam", dataset_id=dataset.id))
-        found = leases.publishable(session, utc_now(), limit=5, window=5)
+        found = leases.publishable(session, limit=5, window=5)
     assert {publication.queue for publication in found} == {SIMULATION, TRAINING}
 
 
@@ -263,22 +274,20 @@ def test_recovery_ends_every_lease_and_forgets_every_message(work: Work) -> None
     work.dataset(episodes=3)
     work.complete(work.claim())
     lease = work.claim()
-    now = utc_now()
     with work.database.session() as session:
-        leases.mark_published(session, leases.publishable(session, now), now)
-        assert leases.recover(session, now) == 1
-        assert leases.reap(session, now) == [lease.shard_id]
-        assert len(leases.publishable(session, now)) == 3
+        leases.mark_published(session, leases.publishable(session))
+        assert leases.recover(session) == 1
+        assert leases.reap(session) == [lease.shard_id]
+        assert len(leases.publishable(session)) == 3
 
 
 def test_leases_of_the_provably_dead_end_at_once(work: Work) -> None:
     work.dataset(episodes=2)
     work.complete(work.claim())
     dead, alive = work.claim(owner="dead"), work.claim(owner="alive")
-    now = utc_now()
     with work.database.session() as session:
-        assert leases.end_leases_of(session, lambda owner: owner == "dead", now) == 1
-        assert leases.reap(session, now) == [dead.shard_id]
+        assert leases.end_leases_of(session, lambda owner: owner == "dead") == 1
+        assert leases.reap(session) == [dead.shard_id]
     assert not work.complete(dead)
     assert work.complete(alive)
 
@@ -287,14 +296,14 @@ def test_reapers_at_the_same_time_requeue_a_shard_once(work: Work) -> None:
     work.dataset(episodes=6)
     work.complete(work.claim())
     held = [work.claim() for _ in range(6)]
-    late = utc_now() + timedelta(seconds=LEASE_SECONDS + 1)
     barrier = threading.Barrier(4)
     reaped: list[str] = []
 
     def reap() -> None:
         barrier.wait()
         with work.database.session() as session:
-            found = leases.reap(session, late)
+            put_forward(session, LEASE_SECONDS + 1)
+            found = leases.reap(session)
         reaped.extend(found)
 
     threads = [threading.Thread(target=reap) for _ in range(4)]

@@ -13,6 +13,7 @@ from schemas.model import TrainingConfig
 from schemas.pipeline import PipelineCreate
 from schemas.trace import TraceCreate
 from storage import helpers, jobs, leases, registry, traces
+from storage.clock import CLOCK
 from storage.database import Database
 from storage.errors import Conflict, ResultInvalid
 from storage.scratch import ScratchStore
@@ -84,7 +85,8 @@ def test_a_driver_that_lost_its_lease_puts_nothing_up(work: Work, database: Data
     first = work.claim()
     assert len(put_up(database, first, 2)) == 2
     with database.session() as session:
-        leases.reap(session, utc_now() + timedelta(hours=1))
+        session.info[CLOCK] = lambda: utc_now() + timedelta(hours=1)
+        leases.reap(session)
     assert put_up(database, first, 1, first=2) == []
     second = work.claim(first.shard_id)
     with database.session() as session:
@@ -133,7 +135,7 @@ def test_shards_of_ended_jobs_take_no_place_in_the_queue(work: Work, database: D
         orphan(database, ended, index)
     waiting = trace_job(work, database)
     with database.reading() as session:
-        found = leases.publishable(session, utc_now(), limit=1, window=1)
+        found = leases.publishable(session, limit=1, window=1)
         (wanted,) = session.query(ShardRow.id).where(ShardRow.job_id == waiting.id).one()
     assert [publication.shard_id for publication in found] == [wanted]
 

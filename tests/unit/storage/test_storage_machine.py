@@ -53,10 +53,10 @@ class Histories(RuleBasedStateMachine):
         self.folder = Path(tempfile.mkdtemp(prefix="physworld-machine-"))
         path = self.folder / "physworld.db"
         shutil.copy(self.template, path)
-        self.database = Database(f"sqlite:///{path}", max_attempts=MAX_ATTEMPTS)
+        self.now: datetime = utc_now() + timedelta(seconds=1)
+        self.database = Database(f"sqlite:///{path}", max_attempts=MAX_ATTEMPTS, clock=lambda: self.now)
         self.work = self.work_class(self.database)
         self.pipelines = [self.work.pipeline(episodes=2).id for _ in range(2)]
-        self.now: datetime = utc_now() + timedelta(seconds=1)
         self.committed: set[str] = set()
         self.epochs: dict[str, int] = {}
         self.ended: dict[str, str] = {}
@@ -79,7 +79,7 @@ class Histories(RuleBasedStateMachine):
     def renew(self, lease: Lease) -> None:
         holds = self._holds(lease)
         with self.database.session() as session:
-            assert (leases.renew(session, lease, self.now, LEASE_SECONDS) != "lost") == holds
+            assert (leases.renew(session, lease, LEASE_SECONDS) != "lost") == holds
 
     @rule(lease=held)
     def complete(self, lease: Lease) -> None:
@@ -90,7 +90,7 @@ class Histories(RuleBasedStateMachine):
         holds = self._holds(lease)
         problem = Problem(title="x", status=500, code="x", detail="1 of 2")
         with self.database.session() as session:
-            assert (leases.fail(session, lease, problem, retry, self.now) != "lost") == holds
+            assert (leases.fail(session, lease, problem, retry) != "lost") == holds
 
     @rule(lease=consumes(held))
     def release(self, lease: Lease) -> None:
@@ -101,7 +101,7 @@ class Histories(RuleBasedStateMachine):
     @rule(lease=held)
     def stop_when_told(self, lease: Lease) -> None:
         with self.database.session() as session:
-            if leases.renew(session, lease, self.now, LEASE_SECONDS) == "cancel":
+            if leases.renew(session, lease, LEASE_SECONDS) == "cancel":
                 assert leases.mark_cancelled(session, lease)
 
     @rule(target=held, lease=held, act=st.sampled_from(["complete", "fail", "release", "renew"]))
@@ -111,9 +111,9 @@ class Histories(RuleBasedStateMachine):
             return multiple()
         self.now += timedelta(seconds=LEASE_SECONDS + 1)
         with self.database.session() as session:
-            leases.reap(session, self.now)
+            leases.reap(session)
         with self.database.session() as session:
-            other = leases.claim(session, lease.shard_id, "another", self.now, LEASE_SECONDS)
+            other = leases.claim(session, lease.shard_id, "another", LEASE_SECONDS)
         if act == "complete":
             assert not self._complete(lease)
         elif act == "fail":
@@ -137,7 +137,7 @@ class Histories(RuleBasedStateMachine):
         self.now += timedelta(seconds=seconds)
         if reap:
             with self.database.session() as session:
-                leases.reap(session, self.now)
+                leases.reap(session)
 
     @rule(choice=CHOICE)
     def cancel(self, choice: int) -> None:
@@ -228,11 +228,11 @@ class Histories(RuleBasedStateMachine):
 
     def _claim_any(self, choice: int, owner: str) -> Lease | None:
         with self.database.session() as session:
-            found = leases.publishable(session, self.now, republish_seconds=1e-9)
+            found = leases.publishable(session, republish_seconds=1e-9)
             if not found:
                 return None
             shard_id = found[choice % len(found)].shard_id
-            lease = leases.claim(session, shard_id, owner, self.now, LEASE_SECONDS)
+            lease = leases.claim(session, shard_id, owner, LEASE_SECONDS)
         assert lease is not None
         assert lease.attempt <= MAX_ATTEMPTS
         return lease

@@ -14,7 +14,7 @@ from sqlalchemy import func, select
 
 from storage import leases, resources
 from storage.database import Database
-from storage.tables import EpisodeRow, JobRow, ShardRow, utc_now
+from storage.tables import EpisodeRow, JobRow, ShardRow
 
 if TYPE_CHECKING:
     from ctypes import c_int
@@ -48,13 +48,13 @@ def work_episodes(url: str, owner: str, allowed: c_int) -> None:
             time.sleep(0.02)
             continue
         with database.session() as session:
-            waiting = leases.publishable(session, utc_now(), limit=3, republish_seconds=1e-9, window=10_000)
+            waiting = leases.publishable(session, limit=3, republish_seconds=1e-9, window=10_000)
         episodes = [publication for publication in waiting if publication.kind == "episode"]
         if not episodes:
             time.sleep(0.02)
             continue
         with database.session() as session:
-            lease = leases.claim(session, random.choice(episodes).shard_id, owner, utc_now(), LEASE_SECONDS)
+            lease = leases.claim(session, random.choice(episodes).shard_id, owner, LEASE_SECONDS)
         if lease is None:
             continue
         time.sleep(0.01)
@@ -96,7 +96,7 @@ def test_killed_workers_lose_nothing_and_double_nothing(
             kills += 1
             allowed.value = PART * (kills + 1)
         with database.session() as session:
-            leases.reap(session, utc_now())
+            leases.reap(session)
     for worker in workers:
         worker.kill()
         worker.join()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import replace
-from datetime import UTC, datetime
 
 import numpy as np
 import pytest
@@ -59,7 +58,7 @@ def _drain(runtime: Runtime) -> set[str]:
     outcomes: set[str] = set()
     while True:
         with runtime.database.reading() as session:
-            waiting = leases.publishable(session, datetime.now(UTC))
+            waiting = leases.publishable(session)
         if not waiting:
             return outcomes
         outcomes |= {run_shard(runtime, publication.shard_id) for publication in waiting}
@@ -193,7 +192,7 @@ def _assess(runtime: Runtime, scene_id: str, **request: object) -> tuple[Job, As
     with runtime.database.session() as session:
         body = AssessmentCreate.model_validate({"scene_id": scene_id, **request})
         job = jobs.create_assessment(session, "bar", 1, body)
-        (waiting,) = leases.publishable(session, datetime.now(UTC))
+        (waiting,) = leases.publishable(session)
     run_shard(runtime, waiting.shard_id)
     with runtime.database.reading() as session:
         return jobs.get_job(session, job.id), traces.get_assessment(session, job.outputs[0].id)

@@ -9,7 +9,6 @@ import json
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -94,7 +93,7 @@ def _drain(runtime: Runtime) -> set[str]:
     outcomes: set[str] = set()
     while True:
         with runtime.database.reading() as session:
-            waiting = leases.publishable(session, datetime.now(UTC))
+            waiting = leases.publishable(session)
         if not waiting:
             return outcomes
         outcomes |= {run_shard(runtime, publication.shard_id) for publication in waiting}
@@ -256,7 +255,7 @@ def test_a_killed_training_carries_on_from_its_checkpoint(
     with runtime.database.session() as session:
         jobs.create_training(session, TrainingCreate(name="bar", dataset_id=dataset_id, config=SMALL))
     with runtime.database.reading() as session:
-        (first,) = leases.publishable(session, datetime.now(UTC))
+        (first,) = leases.publishable(session)
     run_shard(runtime, first.shard_id)
     with runtime.database.session() as session:
         session.get_one(ShardRow, first.shard_id).not_before = None  # the pause before a retry
@@ -308,7 +307,7 @@ def test_a_training_begins_while_its_dataset_is_being_written(runtime: Runtime) 
         request = TrainingCreate(name="bar", dataset_id=made.outputs[0].id, config=streamed)
         job = jobs.create_training(session, request)
     with runtime.database.reading() as session:
-        waiting = leases.publishable(session, datetime.now(UTC))
+        waiting = leases.publishable(session)
     (training_shard,) = [item.shard_id for item in waiting if item.kind == "training"]
     with ThreadPoolExecutor(1) as pool:
         outcome = pool.submit(run_shard, runtime, training_shard)
@@ -337,7 +336,7 @@ def _write_episodes(runtime: Runtime, count: int) -> None:
     for kind, shards in (("dataset_plan", 1), ("episode", count)):
         for _ in range(shards):
             with runtime.database.reading() as session:
-                waiting = leases.publishable(session, datetime.now(UTC))
+                waiting = leases.publishable(session)
             first = next(item.shard_id for item in waiting if item.kind == kind)
             assert run_shard(runtime, first) == "done"
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from datetime import UTC, datetime
 
 import pytest
 
@@ -43,7 +42,7 @@ def job(stores: Stores, scene_id: str) -> Job:
 def lease(stores: Stores, job: Job) -> leases.Lease:
     with stores.database.session() as session:
         shard_id = session.query(ShardRow.id).scalar()
-        claimed = leases.claim(session, shard_id, "test", datetime.now(UTC), LEASE_S)
+        claimed = leases.claim(session, shard_id, "test", LEASE_S)
     assert claimed is not None
     return claimed
 
@@ -53,7 +52,7 @@ def test_the_lease_outlives_its_first_term(stores: Stores, lease: leases.Lease, 
         time.sleep(1.5 * LEASE_S)
         context.check()
         with stores.database.session() as session:
-            assert leases.reap(session, datetime.now(UTC)) == []
+            assert leases.reap(session) == []
 
 
 def test_progress_reaches_the_job(stores: Stores, lease: leases.Lease, settings: Settings, job: Job) -> None:
@@ -85,8 +84,8 @@ def test_a_cancel_is_seen_by_a_handler_that_only_polls(
 def test_a_lease_that_another_took_is_lost(stores: Stores, lease: leases.Lease, settings: Settings) -> None:
     with TaskContext(lease, stores.database, settings) as context:
         with stores.database.session() as session:
-            leases.recover(session, datetime.now(UTC))
-            leases.reap(session, datetime.now(UTC))
+            leases.recover(session)
+            leases.reap(session)
 
         def lost() -> bool:
             try:

@@ -185,7 +185,7 @@ def test_the_shard_of_a_killed_worker_comes_back_before_its_lease_ends(
         owner = worker.stdout.readline().strip()
         _create_fits(stores, scene_id, 1)
         with stores.database.session() as session:
-            lease = leases.claim(session, _shards(stores)[0].id, owner, datetime.now(UTC), 3600.0)
+            lease = leases.claim(session, _shards(stores)[0].id, owner, 3600.0)
         assert lease is not None
         time.sleep(1.5)
         assert _shards(stores)[0].state == "RUNNING"

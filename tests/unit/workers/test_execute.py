@@ -136,9 +136,9 @@ def test_a_job_cancelled_before_the_commit_is_cancelled_not_done(
 def test_an_overtaken_worker_commits_nothing(runtime_with, stores: Stores, job: Job) -> None:
     def be_overtaken(context: TaskContext, stores: Stores) -> HandlerResult:
         with stores.database.session() as session:
-            leases.recover(session, datetime.now(UTC))
-            leases.reap(session, datetime.now(UTC))
-            leases.claim(session, context.lease.shard_id, "another", datetime.now(UTC), 60.0)
+            leases.recover(session)
+            leases.reap(session)
+            leases.claim(session, context.lease.shard_id, "another", 60.0)
         return HandlerResult(FIT_RESULT)
 
     assert run_shard(runtime_with(fit=be_overtaken), _shard(stores).id) == "not committed"
@@ -181,9 +181,9 @@ def test_an_overtaken_worker_leaves_the_scratch_to_its_successor(
     def be_overtaken(context: TaskContext, stores: Stores) -> HandlerResult:
         stores.scratch.put(job.id, "calibration.json", b"{}")
         with stores.database.session() as session:
-            leases.recover(session, datetime.now(UTC))
-            leases.reap(session, datetime.now(UTC))
-            leases.claim(session, context.lease.shard_id, "another", datetime.now(UTC), 60.0)
+            leases.recover(session)
+            leases.reap(session)
+            leases.claim(session, context.lease.shard_id, "another", 60.0)
         raise Cancelled(f"job {job.id} goes on elsewhere")
 
     assert run_shard(runtime_with(fit=be_overtaken), _shard(stores).id) == "not committed"

@@ -111,7 +111,7 @@ def test_a_worker_whose_renewals_hang_stops_in_time_and_leaves_its_task(
         proxy.thaw()
         _until(lambda: _answers(database))
         with database.session() as session:
-            assert leases.renew(session, lease, utc_now(), 4.0) == "held"  # nobody took it meanwhile
+            assert leases.renew(session, lease, 4.0) == "held"  # nobody took it meanwhile
         database.dispose()
     with engine.connect() as connection:
         connection.execute(text(f"DROP DATABASE {name} WITH (FORCE)"))
@@ -153,6 +153,6 @@ def _claimed(database: Database) -> leases.Lease:
             )
         )
         session.flush()
-        found = leases.claim(session, "shd_1", "test", utc_now(), 30.0)
+        found = leases.claim(session, "shd_1", "test", 30.0)
     assert found is not None
     return found

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Iterator
-from datetime import UTC, datetime
 from xml.etree import ElementTree
 
 import numpy as np
@@ -35,7 +34,7 @@ FIT = FitConfig(particle_budget=60, max_simulations=6)
 def drain(runtime: Runtime) -> None:
     while True:
         with runtime.database.reading() as session:
-            waiting = leases.publishable(session, datetime.now(UTC))
+            waiting = leases.publishable(session)
         if not waiting:
             return
         for publication in waiting:

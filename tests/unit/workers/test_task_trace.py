@@ -22,6 +22,7 @@ from schemas.fit import FitConfig
 from schemas.job import Job
 from schemas.trace import Trace, TraceConfig, TraceCreate
 from storage import helpers, jobs, leases, resources, traces
+from storage.clock import CLOCK
 from storage.tables import ShardRow, TraceRow
 from workers.dispatcher import remove_ended_scratch
 from workers.execute import Runtime, run_shard
@@ -40,7 +41,7 @@ def _open(stores: Stores, scene_id: str) -> Job:
 
 def _waiting(stores: Stores) -> list[str]:
     with stores.database.reading() as session:
-        return [found.shard_id for found in leases.publishable(session, datetime.now(UTC))]
+        return [found.shard_id for found in leases.publishable(session)]
 
 
 def _job(stores: Stores, job: Job) -> Job:
@@ -128,7 +129,8 @@ def test_a_killed_trace_goes_on_without_repeating_simulations(
         task.SharedMemory, "put", lambda self, key, tracks: (keys.append(key), put(self, key, tracks))
     )
     with stores.database.session() as session:
-        leases.reap(session, datetime.now(UTC) + timedelta(minutes=5))
+        session.info[CLOCK] = lambda: datetime.now(UTC) + timedelta(minutes=5)
+        leases.reap(session)
     assert run_shard(runtime_with(), driver) == "done"
     assert not before & set(keys), "a simulation was run again"
     assert _trace(stores, job).state == "ready"

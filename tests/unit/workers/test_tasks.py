@@ -15,6 +15,7 @@ from schemas.dataset import Dataset, DatasetConfig
 from schemas.fit import Fit, FitConfig
 from schemas.job import Job
 from storage import helpers, jobs, leases, resources
+from storage.clock import CLOCK
 from storage.tables import EpisodeRow, ShardRow
 from workers.execute import Runtime, run_shard
 from workers.stores import Stores
@@ -31,7 +32,7 @@ def _drain(runtime: Runtime) -> list[str]:
     outcomes = []
     while True:
         with runtime.database.reading() as session:
-            waiting = leases.publishable(session, datetime.now(UTC))
+            waiting = leases.publishable(session)
         if not waiting:
             return outcomes
         outcomes += [run_shard(runtime, publication.shard_id) for publication in waiting]
@@ -39,7 +40,7 @@ def _drain(runtime: Runtime) -> list[str]:
 
 def _waiting(stores: Stores) -> list[str]:
     with stores.database.reading() as session:
-        return [found.shard_id for found in leases.publishable(session, datetime.now(UTC))]
+        return [found.shard_id for found in leases.publishable(session)]
 
 
 def _job(stores: Stores, job: Job) -> Job:
@@ -162,7 +163,8 @@ def test_the_journal_of_a_fit_outlives_its_worker_and_not_the_fit(
             run_shard(runtime_with(), driver)
     assert stores.scratch.has(job.id, JOURNAL)
     with stores.database.session() as session:
-        leases.reap(session, datetime.now(UTC) + timedelta(minutes=5))
+        session.info[CLOCK] = lambda: datetime.now(UTC) + timedelta(minutes=5)
+        leases.reap(session)
     simulated: list[object] = []
     monkeypatch.setattr(fit_task.SharedRunner, "__call__", lambda self, *given: simulated.append(given))
     elsewhere = Stores(stores.settings, stores.database)
@@ -264,7 +266,7 @@ def test_a_dataset_with_a_missing_episode_is_not_sealed(runtime_with, fit: Fit, 
         job = jobs.create_dataset(session, fit.id, DatasetConfig(episodes=2, frames=8))
     for _ in range(2):  # plan, then episodes
         with stores.database.reading() as session:
-            waiting = leases.publishable(session, datetime.now(UTC))
+            waiting = leases.publishable(session)
         for publication in waiting:
             run_shard(runtime, publication.shard_id)
     with stores.database.session() as session:
