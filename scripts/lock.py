@@ -83,7 +83,9 @@ def held_versions(upgraded: str) -> list[str]:
 
 def main() -> int:
     """Resolve every extra under the same versions and write the lock."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--upgrade", default="", help="a package, or 'all'")
     options = parser.parse_args()
     extras = wanted()

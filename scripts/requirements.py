@@ -1,6 +1,6 @@
 """Print the locked requirements of the named extras with their digests, for ``pip install --no-deps --require-hashes``.
 
-``python scripts/requirements.py api sim`` prints what the distribution with the extras *api* and *sim* needs, all of it:
+``python scripts/requirements.py api sim`` prints all that the distribution with the extras *api* and *sim* needs:
 ``requirements.lock`` names for each package the extras that need it, directly or not. *torch* is an extra of the lock
 alone: the CPU build, whose packages are among those of *train*. *bootstrap* is what makes an environment where Python
 has no ensurepip.

@@ -1,7 +1,7 @@
 """Who changed what, written in the transaction of the change; entries are added and read, never changed.
 
-Keys made, rotated, revoked and recovered, logins and log-outs, addresses that tried too often, jobs cancelled,
-aliases moved. No entry holds a token, a ticket or a session.
+Keys made, rotated, revoked and recovered, logins and log-outs, addresses that tried too often, jobs cancelled
+or retried, aliases moved. No entry holds a token, a ticket or a session.
 """
 
 from __future__ import annotations

@@ -33,6 +33,7 @@ from storage.opening import (
 )
 from storage.opening_runs import open_run
 from storage.pages import page_of
+from storage.retries import retry_job as reopen
 from storage.runs import RunKind
 from storage.tables import JobRow, columns_of, utc_now
 
@@ -49,6 +50,7 @@ __all__ = [
     "events_after",
     "get_job",
     "list_jobs",
+    "retry_job",
     "states_of",
 ]
 
@@ -145,6 +147,14 @@ def cancel_job(session: Session, job_id: str) -> Job:
     job = lock_job(session, job_id)
     request_cancel(session, job, utc_now())
     return _job(session, job)
+
+
+def retry_job(session: Session, job_id: str) -> Job:
+    """Take a failed job up again with its pipeline; what is stored stays.
+
+    Raises NotFound, or Conflict when the job has not failed or its pipeline was cancelled.
+    """
+    return _job(session, reopen(session, job_id))
 
 
 def _job(session: Session, row: JobRow) -> Job:

@@ -5,7 +5,7 @@ A shard's life::
     QUEUED --claim--> RUNNING --complete--> DONE
       ^                 |  |------fail----> QUEUED (again, later) or FAILED (the job with it)
       |                 |  '--mark_cancelled--> CANCELLED
-      '------reap-------'  the lease ran out: QUEUED, or FAILED after ``max_attempts``
+      '------reap-------'  the lease ran out: QUEUED; FAILED only where the work kills its workers
 
 Every change is a compare-and-set on (id, epoch, state). ``claim`` raises the epoch, so a worker that was
 presumed dead and comes back finds that its epoch is no longer the shard's: it cannot commit, renew or fail
@@ -27,6 +27,7 @@ from sqlalchemy.orm import Session
 from schemas.base import Problem
 from schemas.job import TERMINAL_STATES, Progress
 from schemas.queues import QUEUE_OF_SHARD
+from storage import losses
 from storage.changes import announce
 from storage.clock import database_now
 from storage.errors import NotFound
@@ -101,6 +102,9 @@ def claim(session: Session, shard_id: str, owner: str, lease_seconds: float) -> 
             attempt=ShardRow.attempt + 1,
             lease_owner=owner,
             lease_until=now + timedelta(seconds=lease_seconds),
+            claimed_at=now,
+            renewed_at=now,
+            progress=None,
         ),
     )
     if not taken:
@@ -128,7 +132,8 @@ def renew(
     job = lock_job(session, lease.job_id)
     now = database_now(session)
     until = now + timedelta(seconds=lease_seconds)
-    if not _compare_and_set(session, lease, lease_until=until):
+    reached = {} if progress is None else {"progress": progress.model_dump(mode="json")}
+    if not _compare_and_set(session, lease, lease_until=until, renewed_at=now, **reached):
         return "lost"
     job.heartbeat_at = now
     if job.state == "cancelling":
@@ -160,8 +165,8 @@ def complete(session: Session, lease: Lease, result: dict[str, Any], digest: str
 def fail(session: Session, lease: Lease, problem: Problem, retry: bool) -> LeaseState:
     """An attempt went wrong: queue the shard again, later, or fail the job with the problem.
 
-    It is queued again when ``retry`` and fewer than ``max_attempts`` were made. Returns "lost" when the lease
-    was no longer ours, "cancel" when the job was being cancelled (the shard then is), else "held".
+    It is queued again when ``retry`` and it failed fewer than ``max_attempts`` times; losses do not count. Returns
+    "lost" when the lease was no longer ours, "cancel" when the job was being cancelled (the shard then is), else "held".
     """
     job = lock_job(session, lease.job_id)
     now = database_now(session)
@@ -171,13 +176,14 @@ def fail(session: Session, lease: Lease, problem: Problem, retry: bool) -> Lease
     if not _compare_and_set(session, lease, error=error, lease_owner=None, lease_until=None):
         return "lost"
     shard = _shard(session, lease.shard_id)
-    if retry and shard.attempt < shard.max_attempts:
-        wait = min(BACKOFF_LIMIT_SECONDS, BACKOFF_SECONDS * 2 ** (shard.attempt - 1))
+    shard.failures += 1
+    if retry and shard.failures < shard.max_attempts:
+        wait = min(BACKOFF_LIMIT_SECONDS, BACKOFF_SECONDS * 2 ** (shard.failures - 1))
         _requeue(shard, not_before=now + timedelta(seconds=wait))
     else:
         if retry:
             reason = problem.detail or problem.title
-            counted = f"attempt {shard.attempt} of {shard.max_attempts} failed: {reason}"
+            counted = f"attempt {shard.failures} of {shard.max_attempts} failed: {reason}"
             problem = problem.model_copy(update={"detail": counted})
         _fail_shard(session, job, shard, problem, now)
     session.flush()
@@ -272,7 +278,7 @@ def mark_published(session: Session, publications: Sequence[Publication]) -> Non
 
 
 def reap(session: Session, limit: int = 100) -> list[str]:
-    """Take back shards whose lease ran out: queued again, or failed after ``max_attempts``. Their ids."""
+    """Take back shards whose lease ran out: queued again, or failed where the work kills its workers. Their ids."""
     now = database_now(session)
     root = func.coalesce(JobRow.parent_id, JobRow.id)
     expired = session.execute(
@@ -315,7 +321,8 @@ def recover(session: Session) -> int:
     shards were running. Only for a caller that knows that it is alone (the embedded supervisor's lock).
     """
     now = database_now(session)
-    ended = update(ShardRow).where(ShardRow.state == RUNNING).values(lease_until=now - timedelta(seconds=1))
+    over = {"lease_until": now - timedelta(seconds=1), "claimed_at": None}  # nobody's loss: all were ended
+    ended = update(ShardRow).where(ShardRow.state == RUNNING).values(over)
     count = cast("CursorResult[Any]", session.execute(ended)).rowcount
     session.execute(update(ShardRow).where(ShardRow.state == QUEUED).values(published_at=None))
     return count
@@ -335,23 +342,25 @@ def _reap(session: Session, job: JobRow, shard: ShardRow, now: datetime) -> None
         _end(shard, CANCELLED, now)
         session.flush()
         settle_cancel(session, job, now)
-    elif shard.attempt >= shard.max_attempts:
-        detail = (
-            f"{shard.kind} shard {shard.index} was lost {shard.attempt} times, "
-            f"{shard.max_attempts} attempts are allowed: the last worker, {shard.lease_owner}, "
-            "stopped renewing its lease"
-        )
+        return
+    if shard.claimed_at is not None:
+        shard.losses = losses.with_this_one(shard)
+    lost = shard.losses or []
+    if losses.deadly(lost):
         problem = Problem(
-            title="The work was lost too many times",
+            type="urn:physworld:problem:work_kills_its_workers",
+            title="The work kills its workers",
             status=500,
-            code="attempts_exhausted",
-            detail=detail,
-            hint="The worker's log or the kernel's says whether it was killed for want of memory.",
+            code="work_kills_its_workers",
+            detail=f"{shard.kind} shard {shard.index} was {losses.told(lost)}",
+            hint="The worker's log or the kernel's says whether it was killed for want of memory. "
+            "A retry of the job keeps what is stored.",
         )
         shard.error = problem.model_dump(mode="json")
         _fail_shard(session, job, shard, problem, now)
     else:
-        _requeue(shard, not_before=None)
+        pause_s = losses.pause_s(lost)
+        _requeue(shard, not_before=now + timedelta(seconds=pause_s) if pause_s else None)
         session.flush()
 
 

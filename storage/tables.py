@@ -148,7 +148,11 @@ class JobRow(Base):
 
 
 class ShardRow(Base):
-    """One unit that a worker executes under a lease; ``epoch`` is the fencing token, it only grows."""
+    """One unit that a worker executes under a lease; ``epoch`` is the fencing token, it only grows.
+
+    ``attempt`` counts claims, ``failures`` those that failed; ``losses`` are those that were lost since the shard last
+    got on (``storage.losses``), ``claimed_at``, ``renewed_at`` and ``progress`` say where the present attempt is.
+    """
 
     __tablename__ = "shards"
     __table_args__ = (
@@ -165,7 +169,12 @@ class ShardRow(Base):
     state: Mapped[str]
     attempt: Mapped[int] = mapped_column(default=0)
     max_attempts: Mapped[int]
+    failures: Mapped[int] = mapped_column(default=0, server_default="0")
     epoch: Mapped[int] = mapped_column(default=0)
+    claimed_at: Mapped[datetime | None]
+    renewed_at: Mapped[datetime | None]
+    progress: Mapped[Json | None] = mapped_column(JSON(none_as_null=True))
+    losses: Mapped[JsonList | None] = mapped_column(JSON(none_as_null=True))
     lease_owner: Mapped[str | None]
     lease_until: Mapped[datetime | None]
     created_at: Mapped[datetime]

@@ -34,6 +34,7 @@ from schemas.job import TERMINAL_STATES
 from schemas.queues import INFERENCE, SIMULATION, TASK_NAME, TRAINING
 from storage import idempotency, leases
 from storage.changes import Changes
+from storage.clock import database_now
 from storage.database import Database, open_database
 from storage.errors import DatabaseUnavailable, StoreError
 from storage.scratch import ScratchStore
@@ -49,6 +50,7 @@ SWEEP_S = 1.0
 IDLE_SWEEP_S = 2.0
 FORGET_EVERY_S = 300.0
 IDEMPOTENCY_KEPT = timedelta(hours=24)
+FAILED_KEPT = timedelta(days=7)  # journals and checkpoints of a failed job
 LARGE_ANSWER_BYTES, LARGE_ANSWERS_KEPT = 64 * 1024, timedelta(minutes=15)
 """Rollouts answer with up to some MiB, many times a minute: kept for as long as a client tries again."""
 LOST_AFTER_S = 2.0
@@ -170,12 +172,16 @@ class Dispatcher:
 
 
 def remove_ended_scratch(scratch: ScratchStore, database: Database) -> list[str]:
-    """Remove scratch files of jobs that have ended while nobody could tidy up; the jobs."""
+    """Remove scratch files of jobs that have ended; the jobs. A failed one keeps them a while, for a retry."""
     ended = []
     for job_id in scratch.jobs():
         with database.reading() as session:
             job = session.get(JobRow, job_id)
-        if job is None or job.state in TERMINAL_STATES:
+            since = (
+                None if job is None or job.finished_at is None else database_now(session) - job.finished_at
+            )
+        may_be_retried = job is not None and job.state == "failed" and (since is None or since < FAILED_KEPT)
+        if job is None or (job.state in TERMINAL_STATES and not may_be_retried):
             scratch.remove(job_id)
             ended.append(job_id)
     return ended

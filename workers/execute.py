@@ -135,10 +135,10 @@ def _commit(runtime: Runtime, context: TaskContext, made: HandlerResult) -> Outc
 
 
 def _tidy(runtime: Runtime, job_id: str) -> None:
-    """Empty the scratch of a job that has ended; where that fails the dispatcher does it later."""
+    """Empty the scratch of a job that has ended, unless it may be retried; else the dispatcher does it later."""
     try:
         with runtime.database.reading() as session:
-            ended = session.get_one(JobRow, job_id).state in TERMINAL_STATES
+            ended = session.get_one(JobRow, job_id).state in TERMINAL_STATES - {"failed"}
         if ended:
             runtime.stores.scratch.remove(job_id)
     except StorageError as error:

@@ -1,6 +1,6 @@
 """What people look at: server-rendered pages over the storage, live through server-sent events.
 
-Reads the database and the artifact store; the one thing that it changes is a job that somebody cancels.
+Reads the database and the artifact store; the one thing that it changes is a job that somebody cancels or retries.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The overview of jobs, a job's page, their live streams, and the button that cancels a job."""
+"""The overview of jobs, a job's page, their live streams, and the buttons that cancel or retry a job."""
 
 from __future__ import annotations
 
@@ -71,6 +71,13 @@ def router(site: Site) -> APIRouter:
         with site.database.session() as session:
             jobs.cancel_job(session, job_id)
             audit.record(session, actor_of(request), "job.cancelled", job_id)
+        return RedirectResponse(f"{BASE}/jobs/{job_id}", 303)
+
+    @routes.post("/jobs/{job_id}/retry", dependencies=[Depends(require_same_origin), Depends(require_writer)])
+    def retry(request: Request, job_id: str) -> Response:
+        with site.database.session() as session:
+            jobs.retry_job(session, job_id)
+            audit.record(session, actor_of(request), "job.retried", job_id)
         return RedirectResponse(f"{BASE}/jobs/{job_id}", 303)
 
     return routes

@@ -303,6 +303,10 @@ class AsyncJobs(AsyncResource):
             lambda at: calls.job_list(limit=limit, cursor=at, state=state, kind=kind), cursor
         )
 
+    async def retry(self, job_id: str) -> Job:
+        """Takes a failed job up again, with its pipeline: stored episodes, journals and checkpoints are kept."""
+        return await self._client.send(calls.job_retry(job_id))
+
     async def cancel(self, job_id: str) -> Job:
         """Asks for the job's end; it is ``cancelling`` until its workers have let go."""
         return await self._client.send(calls.job_cancel(job_id))

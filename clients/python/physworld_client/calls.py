@@ -298,6 +298,11 @@ def job_list(
     return Call("GET", "/v1/jobs", _JOBS, query=_given(limit=limit, cursor=cursor, state=state, kind=kind))
 
 
+def job_retry(job_id: str) -> Call[Job]:
+    """POST /v1/jobs/{id}/retry."""
+    return Call("POST", f"/v1/jobs/{_part(job_id)}/retry", _JOB)
+
+
 def job_cancel(job_id: str) -> Call[Job]:
     """POST /v1/jobs/{id}/cancel."""
     return Call("POST", f"/v1/jobs/{_part(job_id)}/cancel", _JOB)

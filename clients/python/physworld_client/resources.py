@@ -302,6 +302,10 @@ class Jobs(Resource):
         """Jobs, newest first."""
         return self._page(lambda at: calls.job_list(limit=limit, cursor=at, state=state, kind=kind), cursor)
 
+    def retry(self, job_id: str) -> Job:
+        """Takes a failed job up again, with its pipeline: stored episodes, journals and checkpoints are kept."""
+        return self._client.send(calls.job_retry(job_id))
+
     def cancel(self, job_id: str) -> Job:
         """Asks for the job's end; it is ``cancelling`` until its workers have let go."""
         return self._client.send(calls.job_cancel(job_id))

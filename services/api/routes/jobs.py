@@ -1,4 +1,4 @@
-"""Jobs: list, look at, wait for, follow and cancel."""
+"""Jobs: list, look at, wait for, follow, cancel and retry."""
 
 from __future__ import annotations
 
@@ -65,6 +65,22 @@ def cancel_job(job_id: ObjectId, idempotency: IdempotencyDep, actor: ActorDep) -
     def work(session: Session) -> Answer:
         audit.record(session, actor, "job.cancelled", job_id)
         return accepted(jobs.cancel_job(session, job_id))
+
+    return idempotency.run(job_id, work)
+
+
+@router.post(
+    "/{job_id}/retry",
+    status_code=202,
+    response_model=Job,
+    responses=documented(401, 403, 404, 409, 422),
+)
+def retry_job(job_id: ObjectId, idempotency: IdempotencyDep, actor: ActorDep) -> Response:
+    """Take a failed job (and its pipeline) up again: finished shards, journals and checkpoints are kept."""
+
+    def work(session: Session) -> Answer:
+        audit.record(session, actor, "job.retried", job_id)
+        return accepted(jobs.retry_job(session, job_id))
 
     return idempotency.run(job_id, work)
 

@@ -26,7 +26,7 @@ from storage.tables import Base, JobRow, SceneRow, utc_now
 if TYPE_CHECKING:
     from conftest import Work
 
-NEWEST = "0006"
+NEWEST = "0007"
 SPAWN = multiprocessing.get_context("spawn")
 
 

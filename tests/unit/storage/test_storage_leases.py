@@ -1,4 +1,4 @@
-"""Laws of the leases: one holder at a time, nothing from a lost lease, capped attempts."""
+"""Laws of the leases: one holder at a time, nothing from a lost lease, capped failures."""
 
 from __future__ import annotations
 
@@ -135,22 +135,6 @@ def test_progress_of_a_dataset_counts_episodes(work: Work) -> None:
     work.complete(lease)
     progress = work.job(job).progress
     assert (progress.done, progress.total, progress.unit) == (1, 3, "episodes")
-
-
-def test_a_lost_shard_is_queued_again_until_the_attempts_are_used_up(work: Work) -> None:
-    job = work.fit()
-    for attempt in range(1, 6):
-        lease = work.claim(owner=f"worker-{attempt}")
-        assert lease.attempt == attempt
-        expire(work, lease)
-    ended = work.job(job)
-    assert ended.state == "failed"
-    assert ended.attempt == 5
-    assert ended.error is not None
-    assert ended.error.code == "attempts_exhausted"
-    assert "lost 5 times" in ended.error.detail
-    assert "worker-5" in ended.error.detail
-    assert work.waiting() == []
 
 
 def test_a_retried_failure_waits_and_is_capped(work: Work) -> None:
@@ -344,7 +328,7 @@ def test_the_cap_of_the_settings_holds(database_url: str, make_work: Callable[[D
     database = Database(database_url, max_attempts=1)
     work = make_work(database)
     job = work.fit()
-    expire(work, work.claim())
+    work.fail(work.claim(), retry=True)
     assert work.job(job).state == "failed"
     database.dispose()
 

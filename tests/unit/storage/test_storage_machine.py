@@ -150,17 +150,32 @@ class Histories(RuleBasedStateMachine):
             except Conflict:
                 assert session.get_one(JobRow, job_id).state in {"succeeded", "failed"}
 
+    @rule(choice=CHOICE)
+    def retry(self, choice: int) -> None:
+        """What failed is taken up again with its family; what succeeded or was cancelled stays ended."""
+        job_id = self.pipelines[choice % len(self.pipelines)]
+        with self.database.session() as session:
+            state = session.get_one(JobRow, job_id).state
+            try:
+                jobs.retry_job(session, job_id)
+            except Conflict:
+                assert state != "failed"
+                return
+            assert state == "failed"
+        self.ended = {ended: state for ended, state in self.ended.items() if state != "failed" or not self._of(ended, job_id)}
+
     @precondition(lambda self: len(self.ended_pipelines()) > len(self.pipelines) - 2)
     @rule()
     def open_another(self) -> None:
         self.pipelines.append(self.work.pipeline(episodes=2).id)
 
     @invariant()
-    def epochs_only_grow_and_attempts_are_capped(self) -> None:
+    def epochs_only_grow_and_failures_are_capped(self) -> None:
         with self.database.reading() as session:
             for shard in session.scalars(select(ShardRow)):
                 assert shard.epoch >= self.epochs.get(shard.id, 0)
-                assert 0 <= shard.attempt <= min(shard.epoch, MAX_ATTEMPTS)
+                assert 0 <= shard.failures <= min(shard.attempt, MAX_ATTEMPTS)
+                assert shard.attempt <= shard.epoch
                 assert (shard.lease_until is not None) == (shard.state == "RUNNING")
                 self.epochs[shard.id] = shard.epoch
 
@@ -226,6 +241,10 @@ class Histories(RuleBasedStateMachine):
     def ended_pipelines(self) -> list[str]:
         return [job_id for job_id in self.pipelines if job_id in self.ended]
 
+    def _of(self, job_id: str, root: str) -> bool:
+        with self.database.reading() as session:
+            return root in {job_id, session.get_one(JobRow, job_id).parent_id}
+
     def _claim_any(self, choice: int, owner: str) -> Lease | None:
         with self.database.session() as session:
             found = leases.publishable(session, republish_seconds=1e-9)
@@ -234,7 +253,6 @@ class Histories(RuleBasedStateMachine):
             shard_id = found[choice % len(found)].shard_id
             lease = leases.claim(session, shard_id, owner, LEASE_SECONDS)
         assert lease is not None
-        assert lease.attempt <= MAX_ATTEMPTS
         return lease
 
     def _complete(self, lease: Lease) -> bool:

@@ -23,7 +23,7 @@ from schemas.job import Job
 from schemas.trace import Trace, TraceConfig, TraceCreate
 from storage import helpers, jobs, leases, resources, traces
 from storage.clock import CLOCK
-from storage.tables import ShardRow, TraceRow
+from storage.tables import JobRow, ShardRow, TraceRow, utc_now
 from workers.dispatcher import remove_ended_scratch
 from workers.execute import Runtime, run_shard
 from workers.stores import Stores
@@ -189,13 +189,17 @@ def test_a_trace_whose_time_is_up_calls_off_what_it_has_asked_for(
 
 
 def test_what_an_ended_job_left_in_the_scratch_is_swept(stores: Stores, scene_id: str) -> None:
-    running, ended = _open(stores, scene_id), _open(stores, scene_id)
+    running, ended, failed, forgotten = (_open(stores, scene_id) for _ in range(4))
     with stores.database.session() as session:
         jobs.cancel_job(session, ended.id)
-    for job_id in (running.id, ended.id, "job_nobody"):
+        for job, days in ((failed, 6), (forgotten, 8)):
+            row = session.get_one(JobRow, job.id)
+            row.state, row.finished_at = "failed", utc_now() - timedelta(days=days)
+    for job_id in (running.id, ended.id, failed.id, forgotten.id, "job_nobody"):
         stores.scratch.put(job_id, "x.npy", b"1")
-    assert sorted(remove_ended_scratch(stores.scratch, stores.database)) == sorted([ended.id, "job_nobody"])
-    assert stores.scratch.jobs() == [running.id]
+    swept = remove_ended_scratch(stores.scratch, stores.database)
+    assert sorted(swept) == sorted([ended.id, forgotten.id, "job_nobody"])
+    assert sorted(stores.scratch.jobs()) == sorted([running.id, failed.id])
 
 
 def test_a_dataset_comes_from_the_twin_with_the_added_effect(

@@ -310,6 +310,19 @@ def jobs_wait(
         print_json(job)
 
 
+@jobs.command("retry")
+def jobs_retry(
+    job_id: str, json: Json = False, url: Url = None, token: Token = None, data: Data = None
+) -> None:
+    """Take a failed job up again; what it stored is kept."""
+    with service.connect(url, token, data) as client:
+        job = client.jobs.retry(job_id)
+    if json:
+        print_json(job)
+    else:
+        stdout.print(f"{job.id} is {job.state}")
+
+
 @jobs.command("cancel")
 def jobs_cancel(
     job_id: str, json: Json = False, url: Url = None, token: Token = None, data: Data = None

@@ -1,0 +1,87 @@
+"""A failed job is taken up again: what is stored stays, what failed is queued with fresh counters.
+
+Finished shards (stored episodes among them), journals and checkpoints in the scratch are kept for a failed job
+(``workers.dispatcher``), so that a retry goes on where the job ended. A pipeline and its children are one piece of
+work: to retry one of them retries every child that failed, and the pipeline goes on after them.
+"""
+
+from __future__ import annotations
+
+from sqlalchemy import select, update
+from sqlalchemy.orm import Session
+
+from storage import registry
+from storage.changes import announce
+from storage.errors import Conflict
+from storage.events import append_event
+from storage.helpers import SIMULATION
+from storage.locks import lock_job
+from storage.opening import CANCELLED, FAILED, QUEUED
+from storage.runs import RunKind, run_row
+from storage.tables import AssessmentRow, DatasetRow, FitRow, JobRow, ShardRow, TraceRow
+
+
+def retry_job(session: Session, job_id: str) -> JobRow:
+    """Queue a failed job again, with its pipeline and what failed beside it.
+
+    Raises NotFound, or Conflict when the job has not failed or its pipeline was cancelled.
+    """
+    job = lock_job(session, job_id)
+    if job.state != "failed":
+        raise Conflict(f"job {job_id} is {job.state}; only a failed job can be retried")
+    root = job if job.parent_id is None else session.get_one(JobRow, job.parent_id)
+    if root.state not in {"failed", "running"}:
+        raise Conflict(f"job {job_id} belongs to pipeline {root.id}, which is {root.state}")
+    children = list(session.scalars(select(JobRow).where(JobRow.parent_id == root.id).with_for_update()))
+    for row in children if root.kind == "pipeline" else [root]:
+        if row.state == "failed":
+            _reopen(session, row, "queued")
+            _reopen_shards(session, row)
+            _reopen_output(session, row)
+    if root.kind == "pipeline" and root.state == "failed":
+        _reopen(session, root, "running")
+    session.flush()
+    announce(session)
+    return job
+
+
+def _reopen(session: Session, job: JobRow, state: str) -> None:
+    job.state, job.error, job.finished_at = state, None, None
+    append_event(session, job.id, "log", {"message": "retried: what is stored stays"})
+    append_event(session, job.id, "state", {"state": state})
+
+
+def _reopen_shards(session: Session, job: JobRow) -> None:
+    """Queue what failed or was called off in the present stage; the driver puts its helpers up anew."""
+    ended = (ShardRow.job_id == job.id, ShardRow.stage == job.stage, ShardRow.kind != SIMULATION)
+    session.execute(
+        update(ShardRow)
+        .where(*ended, ShardRow.state.in_((FAILED, CANCELLED)))
+        .values(
+            state=QUEUED,
+            failures=0,
+            losses=[],
+            error=None,
+            finished_at=None,
+            not_before=None,
+            published_at=None,
+            lease_owner=None,
+            lease_until=None,
+        )
+    )
+
+
+def _reopen_output(session: Session, job: JobRow) -> None:
+    output = str(job.outputs[0]["id"])
+    if job.kind == "dataset":
+        session.get_one(DatasetRow, output).state = "writing" if job.stage > 0 else "pending"
+    elif job.kind == "training":
+        name, _, version = output.rpartition(":")
+        row = registry.version_row(session, name, int(version))
+        row.state, row.message = "pending", ""
+    elif job.kind in {"rollout", "plan"}:
+        kind: RunKind = "plan" if job.kind == "plan" else "rollout"
+        run_row(session, kind, output).state = "pending"
+    else:
+        table = {"fit": FitRow, "trace": TraceRow, "assessment": AssessmentRow}[job.kind]
+        session.get_one(table, output).state = "pending"
