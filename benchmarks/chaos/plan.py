@@ -12,7 +12,7 @@ import random
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-KILL_EVERY_S = (1.0, 4.0)
+KILL_EVERY_S = (2.0, 8.0)
 LASTING_EVERY_S = (2.0, 7.0)
 STEPS_S = (-30.0, 30.0)
 
