@@ -166,7 +166,8 @@ def fail(session: Session, lease: Lease, problem: Problem, retry: bool) -> Lease
     """An attempt went wrong: queue the shard again, later, or fail the job with the problem.
 
     It is queued again when ``retry`` and it failed fewer than ``max_attempts`` times; losses do not count. Returns
-    "lost" when the lease was no longer ours, "cancel" when the job was being cancelled (the shard then is), else "held".
+    "lost" when the lease was no longer ours, "cancel" when the job was being cancelled (the shard then is),
+    else "held".
     """
     job = lock_job(session, lease.job_id)
     now = database_now(session)

@@ -67,8 +67,8 @@ def told(losses: list[Loss]) -> str:
     place = max(loss["reached"] for loss in losses)
     return (
         f"lost {len(losses)} times in a row by {workers} workers, each time after {min(times):.0f} to "
-        f"{max(times):.0f} s and no further than {100 * place:.0f} % of its {losses[-1]['unit'] or 'work'}; the last worker was "
-        f"{losses[-1]['owner']}"
+        f"{max(times):.0f} s and no further than {100 * place:.0f} % of its {losses[-1]['unit'] or 'work'}; "
+        f"the last worker was {losses[-1]['owner']}"
     )
 
 

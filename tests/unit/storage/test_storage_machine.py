@@ -162,7 +162,11 @@ class Histories(RuleBasedStateMachine):
                 assert state != "failed"
                 return
             assert state == "failed"
-        self.ended = {ended: state for ended, state in self.ended.items() if state != "failed" or not self._of(ended, job_id)}
+        self.ended = {
+            ended: state
+            for ended, state in self.ended.items()
+            if state != "failed" or not self._of(ended, job_id)
+        }
 
     @precondition(lambda self: len(self.ended_pipelines()) > len(self.pipelines) - 2)
     @rule()
