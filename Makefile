@@ -3,7 +3,7 @@
 # make bench               the figures of docs/benchmarks.md
 # make up                  the embedded service in the foreground
 # make lock [UPGRADE=name] write requirements.lock anew; UPGRADE=all moves every package to its newest release
-# make audit               bandit over the product, known vulnerabilities of the locked packages, the SBOM
+# make audit               the SBOM (build/sbom.cdx.json), and known vulnerabilities of the locked packages
 SHELL := /bin/bash
 SCENE ?= sample/soft_beam
 DATA ?= .demo
@@ -30,6 +30,7 @@ lint: dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/bandit --quiet --recursive --configfile pyproject.toml physworld schemas storage workers services clients/python
 
 test: lint
 	$(BIN)/python -m pytest --numprocesses=$(JOBS) --dist=loadfile
@@ -44,9 +45,9 @@ lock:
 	$(BIN)/python scripts/lock.py --upgrade "$(UPGRADE)"
 
 audit: dev
-	$(BIN)/bandit --quiet --recursive --configfile pyproject.toml physworld schemas storage workers services clients/python
-	$(BIN)/python scripts/sbom.py --out build/sbom.cdx.json
-	$(BIN)/python scripts/vulnerabilities.py
+	@mkdir -p build
+	$(BIN)/cyclonedx-py requirements --output-file build/sbom.cdx.json requirements.lock
+	$(BIN)/pip-audit --requirement requirements.lock --disable-pip --no-deps --strict
 
 clean:
 	rm -rf .venv .bootstrap .demo .pytest_cache .ruff_cache .mypy_cache .hypothesis .import_linter_cache build

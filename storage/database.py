@@ -18,7 +18,18 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, Engine, create_engine, event, inspect, make_url, text
+from sqlalchemy import (
+    Connection,
+    Engine,
+    column,
+    create_engine,
+    event,
+    inspect,
+    make_url,
+    select,
+    table,
+    text,
+)
 from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.orm import Session
@@ -101,7 +112,7 @@ class Database:
         with self._translated(), self._reading_engine.connect() as connection:
             if not inspect(connection).has_table(REVISION_TABLE):
                 return None
-            return connection.scalar(text(f"SELECT version_num FROM {REVISION_TABLE}"))
+            return connection.scalar(select(column("version_num")).select_from(table(REVISION_TABLE)))
 
     def check(self) -> None:
         """Raise DatabaseUnavailable unless the database answers and has this code's tables."""

@@ -83,5 +83,9 @@ def _reopen_output(session: Session, job: JobRow) -> None:
         kind: RunKind = "plan" if job.kind == "plan" else "rollout"
         run_row(session, kind, output).state = "pending"
     else:
-        table = {"fit": FitRow, "trace": TraceRow, "assessment": AssessmentRow}[job.kind]
+        table: type[FitRow] | type[TraceRow] | type[AssessmentRow] = {
+            "fit": FitRow,
+            "trace": TraceRow,
+            "assessment": AssessmentRow,
+        }[job.kind]
         session.get_one(table, output).state = "pending"

@@ -10,7 +10,6 @@ import shutil
 import sys
 from pathlib import Path
 
-from services import interpreter
 from services.embedded.broker import NoBroker
 from services.embedded.folder import AlreadyRunning, StillAlive
 from services.embedded.supervisor import Options, StartFailed, Stopped, Supervisor
@@ -41,8 +40,6 @@ def main(arguments: list[str] | None = None) -> int:
     options = Options(
         root, given.workers, given.port, trainer=not given.no_trainer, inference=not given.no_inference
     )
-    if (old := interpreter.warning()) is not None:
-        print(old, file=sys.stderr, flush=True)
     try:
         Supervisor(options, _say).run()
     except AlreadyRunning as error:

@@ -28,6 +28,7 @@ from pydantic import SecretStr
 from sqlalchemy.orm import Session
 
 from schemas.queues import SIMULATION
+from services import interpreter
 from services.embedded import logs
 from services.embedded.broker import Broker, choose_broker
 from services.embedded.child import Child, Program
@@ -136,6 +137,8 @@ class Supervisor:
         self._say(f"  API docs   {self._url}/docs")
         self._say(f"  API key    {self._folder.api_key}")
         self._say(f"  data       {self._folder.root}")
+        if (old := interpreter.warning()) is not None:
+            self._say(old)
 
     def _programs(
         self, environment: dict[str, str], listening: socket.socket, inference: socket.socket
