@@ -25,7 +25,7 @@ LOCK = ROOT / "requirements.lock"
 PYTHON = "3.11"
 SETUPTOOLS = "setuptools==84.2.1"  # what builds the two distributions
 TORCH = "2.13.0"
-OF_CUDA = re.compile(r"^(torch|triton|cuda-|nvidia-)")
+OF_CUDA = re.compile(r"^(torch$|triton$|cuda-|nvidia-)")
 
 
 def wanted() -> dict[str, list[str]]:
@@ -78,7 +78,7 @@ def held_versions(upgraded: str) -> list[str]:
         return []
     lines = [line for line in LOCK.read_text().splitlines() if re.match(r"^[a-z0-9]", line)]
     pins = [re.split(r"[\s;]", line)[0] for line in lines]
-    return [pin for pin in pins if not OF_CUDA.match(pin) and pin.split("==")[0] != upgraded]
+    return [pin for pin in pins if pin.split("==")[0] not in {"torch", upgraded}]
 
 
 def main() -> int:

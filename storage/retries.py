@@ -20,6 +20,12 @@ from storage.opening import CANCELLED, FAILED, QUEUED
 from storage.runs import RunKind, run_row
 from storage.tables import AssessmentRow, DatasetRow, FitRow, JobRow, ShardRow, TraceRow
 
+_TABLES: dict[str, type[FitRow | TraceRow | AssessmentRow]] = {
+    "fit": FitRow,
+    "trace": TraceRow,
+    "assessment": AssessmentRow,
+}
+
 
 def retry_job(session: Session, job_id: str) -> JobRow:
     """Queue a failed job again, with its pipeline and what failed beside it.
@@ -77,15 +83,11 @@ def _reopen_output(session: Session, job: JobRow) -> None:
         session.get_one(DatasetRow, output).state = "writing" if job.stage > 0 else "pending"
     elif job.kind == "training":
         name, _, version = output.rpartition(":")
-        row = registry.version_row(session, name, int(version))
-        row.state, row.message = "pending", ""
+        version_row = registry.version_row(session, name, int(version))
+        version_row.state, version_row.message = "pending", ""
     elif job.kind in {"rollout", "plan"}:
         kind: RunKind = "plan" if job.kind == "plan" else "rollout"
         run_row(session, kind, output).state = "pending"
     else:
-        table: type[FitRow] | type[TraceRow] | type[AssessmentRow] = {
-            "fit": FitRow,
-            "trace": TraceRow,
-            "assessment": AssessmentRow,
-        }[job.kind]
-        session.get_one(table, output).state = "pending"
+        row = session.get_one(_TABLES[job.kind], output)
+        row.state = "pending"

@@ -30,7 +30,7 @@ def ago(when: datetime, now: datetime | None = None) -> str:
 def moment(when: datetime | None) -> Markup:
     """A ``<time>`` element: relative words, the absolute time as its title."""
     if when is None:
-        return Markup(DASH)  # nosec B704: a constant
+        return Markup(DASH)  # nosec B704
     absolute = when.astimezone(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
     stamp = when.astimezone(UTC).isoformat()
     return Markup('<time datetime="{}" title="{}" data-ago>{}</time>').format(stamp, absolute, ago(when))
