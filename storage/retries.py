@@ -7,6 +7,8 @@ work: to retry one of them retries every child that failed, and the pipeline goe
 
 from __future__ import annotations
 
+from typing import Any
+
 from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
@@ -89,5 +91,5 @@ def _reopen_output(session: Session, job: JobRow) -> None:
         kind: RunKind = "plan" if job.kind == "plan" else "rollout"
         run_row(session, kind, output).state = "pending"
     else:
-        row = session.get_one(_TABLES[job.kind], output)
+        row: Any = session.get_one(_TABLES[job.kind], output)
         row.state = "pending"
