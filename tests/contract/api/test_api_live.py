@@ -394,5 +394,6 @@ def test_a_client_that_reads_no_more_loses_its_place(served: Served, monkeypatch
             raise AssertionError("no place became free")
         for socket in stalled:
             socket.transport.abort()
+            await socket.wait_closed()
 
     asyncio.run(asyncio.wait_for(work(), 60.0))
