@@ -18,10 +18,9 @@ def test_a_reader_that_dies_leaves_its_files_in_the_uploads_folder(tmp_path: Pat
     """Sixty bent C3D files: the library that reads them crashes or is stopped on about every tenth."""
     temporary, corpus, outcomes = tmp_path / "temporary", Corpus(tmp_path, sound_bundle()), []
     temporary.mkdir()
-    with subprocess.Popen(
-        [sys.executable, "-m", "services.api.parser_process"],
-        cwd=ROOT, env={**os.environ, "TMPDIR": str(temporary)}, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-    ) as parser:  # fmt: skip
+    words = [sys.executable, "-m", "services.api.parser_process"]
+    environment, pipe = {**os.environ, "TMPDIR": str(temporary)}, subprocess.PIPE
+    with subprocess.Popen(words, cwd=ROOT, env=environment, stdin=pipe, stdout=pipe, text=True) as parser:
         assert parser.stdin is not None and parser.stdout is not None
         for number in C3D_FILES:
             folder = tmp_path / str(number)
