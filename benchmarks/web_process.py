@@ -7,7 +7,7 @@ import secrets
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,14 +34,17 @@ class WebProcess:
 
 
 @contextmanager
-def serving(folder: Path) -> Iterator[WebProcess]:
+def serving(folder: Path, more: Mapping[str, str] | None = None) -> Iterator[WebProcess]:
     """The process on a data folder, from when it is ready to the end of the block.
+
+    Args:
+        more: of its environment.
 
     Raises RuntimeError where it does not become ready within ``START_WITHIN_S``.
     """
     token = "pw_" + secrets.token_hex(20)
     kept = {name: value for name, value in os.environ.items() if not name.startswith("PHYSWORLD_")}
-    environment = {**kept, "PHYSWORLD_DATA_DIR": str(folder), "PHYSWORLD_ADMIN_TOKEN": token}
+    environment = {**kept, "PHYSWORLD_DATA_DIR": str(folder), "PHYSWORLD_ADMIN_TOKEN": token, **(more or {})}
     migrate = [sys.executable, "-m", "services.api.migrate"]
     subprocess.run(migrate, env=environment, check=True, stdout=subprocess.DEVNULL)
     log = folder / "web.log"

@@ -10,6 +10,7 @@ import struct
 import tarfile
 import zipfile
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 
 def zipped(files: Mapping[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> bytes:
@@ -80,9 +81,9 @@ def chained_headers(kind: bytes, count: int = 1_000) -> bytes:
     return gzip.compress(tar, mtime=0)
 
 
-def huge_directory(count: int = 5_000) -> bytes:
-    """A ZIP whose directory holds more entries than its end says."""
-    entry = struct.pack("<4s4B4HL2L5H2L", b"PK\x01\x02", *[0] * 18) + b"a"
+def huge_directory(count: int = 3_000_000) -> bytes:
+    """A ZIP whose directory holds many entries of 47 bytes, more than its end says; their name is ``a``."""
+    entry = struct.pack("<4s4B4HL2L5H2L", b"PK\x01\x02", *[0] * 11, 1, *[0] * 6) + b"a"
     directory = entry * count
     end = struct.pack("<4s4H2LH", b"PK\x05\x06", 0, 0, 65535, 65535, len(directory), 4, 0)
     return b"PK\x03\x04" + directory + end
@@ -96,21 +97,33 @@ def nameless_member() -> bytes:
     return buffer.getvalue()
 
 
-BOMBS: dict[str, Callable[[bytes], bytes]] = {
-    "lists that share one child": lambda bundle: shared_lists(),
-    "five million lists under an unknown key": many_empty_lists,
-    "two million edges": many_edges,
-    "keys that nobody reads": unread_keys,
-    "a length of 60,000 digits": lambda bundle: long_digits(),
-    "a thousand PAX headers": lambda bundle: chained_headers(tarfile.XHDTYPE),
-    "a thousand long names": lambda bundle: chained_headers(tarfile.GNUTYPE_LONGNAME),
-    "a directory of many entries": lambda bundle: huge_directory(),
-    "a member without a name": lambda bundle: nameless_member(),
-    "a shape of True": lambda bundle: with_npy(
-        bundle, "{'descr': '<f8', 'fortran_order': False, 'shape': (True,), }"
+@dataclass(frozen=True)
+class Bomb:
+    """How a bomb is made of a sound bundle, and the file name under which the service looks into it."""
+
+    filename: str
+    make: Callable[[bytes], bytes]
+
+
+BOMBS: dict[str, Bomb] = {
+    "lists that share one child": Bomb("final_data.pkl", lambda bundle: shared_lists()),
+    "five million lists under an unknown key": Bomb("scene.zip", many_empty_lists),
+    "two million edges": Bomb("scene.zip", many_edges),
+    "keys that nobody reads": Bomb("scene.zip", unread_keys),
+    "a length of 60,000 digits": Bomb("scene.tar", lambda bundle: long_digits()),
+    "a thousand PAX headers": Bomb("scene.tar.gz", lambda bundle: chained_headers(tarfile.XHDTYPE)),
+    "a thousand long names": Bomb("scene.tar.gz", lambda bundle: chained_headers(tarfile.GNUTYPE_LONGNAME)),
+    "a directory of three million entries": Bomb("scene.zip", lambda bundle: huge_directory()),
+    "a member without a name": Bomb("scene.zip", lambda bundle: nameless_member()),
+    "a shape of True": Bomb(
+        "scene.zip",
+        lambda bundle: with_npy(bundle, "{'descr': '<f8', 'fortran_order': False, 'shape': (True,), }"),
     ),
-    "seventy dimensions": lambda bundle: with_npy(
-        bundle, "{'descr': '<f8', 'fortran_order': False, 'shape': (" + "1," * 70 + "), }"
+    "seventy dimensions": Bomb(
+        "scene.zip",
+        lambda bundle: with_npy(
+            bundle, "{'descr': '<f8', 'fortran_order': False, 'shape': (" + "1," * 70 + "), }"
+        ),
     ),
 }
-"""By what makes each one a bomb: from a sound bundle to the hostile file."""
+"""At full size, by what makes each one a bomb."""

@@ -2,7 +2,7 @@
 
 A third is mutated bytes of sound files, the rest is forged: JSON that means something else, archives that lie about
 themselves, arrays of impossible shapes, pickles that call functions. Whatever would write a file or run a command, if
-anybody obeyed it, leaves a trace that ``trespasses`` finds.
+anybody obeyed it, leaves a trace that ``traces`` finds.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import pickle
 import struct
 import tarfile
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -53,7 +53,7 @@ class Hostile:
 
 
 class Corpus:
-    """Hostile files by number; the same seed and number give the same file.
+    """Hostile files by number; the same folder, seed and number give the same file, whatever was made before.
 
     Args:
         folder: where pickles and archives would leave their traces; also room for the sound C3D file.
@@ -90,10 +90,10 @@ class Corpus:
         filename, content = self._families[family](rng)
         return Hostile(family, filename, content)
 
-    def trespasses(self) -> list[str]:
-        """Files that exist although only a file that was obeyed could have made them."""
-        places = (self._folder, Path("/tmp"), Path.cwd(), Path("/"), Path.home())
-        return sorted({str(found) for place in places for found in place.glob(f"*{CANARY}*")})
+    def known(self) -> Iterator[Hostile]:
+        """Every known bomb at full size, under the file name of its type."""
+        for name, bomb in bombs.BOMBS.items():
+            yield Hostile(name, bomb.filename, bomb.make(self._bundle))
 
     def _changed(self, rng: np.random.Generator) -> tuple[str, bytes]:
         name = str(rng.choice(list(self._sound)))
@@ -218,7 +218,8 @@ class Corpus:
             data[block + 124 : block + 136] = one(rng, SIZES)
             total = sum(data[block : block + 512]) - sum(data[block + 148 : block + 156]) + 8 * 32
             data[block + 148 : block + 156] = b"%06o\0 " % total
-        packed = [bytes, gzip.compress, bz2.compress, lzma.compress][int(rng.integers(4))](bytes(data))
+        packers = [bytes, lambda tar: gzip.compress(tar, mtime=0), bz2.compress, lzma.compress]
+        packed = packers[int(rng.integers(4))](bytes(data))
         return str(rng.choice(["scene.tar", "scene.tar.gz", "scene.tgz", "scene"])), packed
 
     def _pickle(self, rng: np.random.Generator) -> tuple[str, bytes]:
@@ -294,10 +295,10 @@ class Corpus:
                     kinds[int(rng.integers(4))], int(10 ** rng.uniform(0, 4))
                 )
             case 5:
-                return "scene.zip", bombs.huge_directory(int(10 ** rng.uniform(1, 5.5)))
+                return "scene.zip", bombs.huge_directory(int(10 ** rng.uniform(1, 6.5)))
             case _:
-                names = list(bombs.BOMBS)
-                return "scene.zip", bombs.BOMBS[names[int(rng.integers(len(names)))]](self._bundle)
+                bomb = one(rng, list(bombs.BOMBS.values()))
+                return bomb.filename, bomb.make(self._bundle)
 
     def _elsewhere(self, rng: np.random.Generator) -> str:
         """A member's name that leads out of any folder, or is none."""

@@ -1,86 +1,26 @@
-"""What a file costs the service: the real web process, the kernel's account of it, and a ledger."""
+"""What a file costs the service: the real web process and the kernel's account of it."""
 
 from __future__ import annotations
 
 import json
 import sys
 import time
-from collections import Counter
-from contextlib import closing
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
 import httpx
 import psutil
 
-from benchmarks.harness import describe_machine
-from benchmarks.hostile_files.corpus import Corpus
+from benchmarks.hostile_files.corpus import Corpus, Hostile
+from benchmarks.hostile_files.ledger import Cost, Ledger
+from benchmarks.hostile_files.traces import Traces
 from benchmarks.web_process import WebProcess, serving
+from services.api.parser_process import Limits
 
-MOST_CPU_S, MOST_BYTES = 5.0, 512 * 2**20
 ANSWER_WITHIN_S = 120.0
 CLEAR_PEAK = "5"  # into /proc/PID/clear_refs: the peak of resident memory begins anew
-KEPT = 20
-
-
-@dataclass
-class Cost:
-    """What the service's processes spent on one file."""
-
-    status: int
-    cpu_s: float
-    peak_bytes: int
-    wall_s: float
-
-
-@dataclass
-class Ledger:
-    """Everything about a run that is worth keeping.
-
-    Attributes:
-        statuses: how often each status was answered; 0 stands for no answer.
-        families: of each family of files, the count and the most that one cost.
-        beyond: the files that broke a limit, at most ``KEPT``.
-    """
-
-    statuses: Counter[int] = field(default_factory=Counter)
-    families: dict[str, dict[str, float]] = field(default_factory=dict)
-    beyond: list[dict[str, Any]] = field(default_factory=list)
-    count: int = 0
-
-    def add(self, number: int, family: str, size: int, cost: Cost) -> None:
-        """One file's cost."""
-        self.count += 1
-        self.statuses[cost.status] += 1
-        most = self.families.setdefault(
-            family, {"files": 0, "most_cpu_s": 0.0, "most_mib": 0.0, "most_wall_s": 0.0}
-        )
-        mib = cost.peak_bytes / 2**20
-        most["files"] += 1
-        for name, value in (("most_cpu_s", cost.cpu_s), ("most_mib", mib), ("most_wall_s", cost.wall_s)):
-            most[name] = round(max(most[name], value), 2)
-        broken = cost.status == 0 or cost.status >= 500
-        if (broken or cost.cpu_s > MOST_CPU_S or cost.peak_bytes > MOST_BYTES) and len(self.beyond) < KEPT:
-            self.beyond.append(
-                {"number": number, "family": family, "bytes": size, "status": cost.status,
-                 "cpu_s": round(cost.cpu_s, 2), "mib": round(mib, 1)}
-            )  # fmt: skip
-
-    def report(self, seed: int, trespasses: list[str]) -> dict[str, Any]:
-        """The ledger as JSON."""
-        return {
-            "files": self.count,
-            "seed": seed,
-            "statuses": {str(status): count for status, count in sorted(self.statuses.items())},
-            "errors_of_the_service": sum(n for status, n in self.statuses.items() if not 0 < status < 500),
-            "most_cpu_s": max((most["most_cpu_s"] for most in self.families.values()), default=0.0),
-            "most_mib": max((most["most_mib"] for most in self.families.values()), default=0.0),
-            "beyond": self.beyond,
-            "files_outside": trespasses,
-            "families": self.families,
-            "machine": describe_machine(),
-        }
 
 
 class Meter:
@@ -104,7 +44,9 @@ class Meter:
         except httpx.TransportError:
             status = 0
         wall_s = time.perf_counter() - started
-        return Cost(status, self._cpu_s() - before, max(self._peak_bytes(), self._reader_peak()), wall_s)
+        cpu_s = max(0.0, self._cpu_s() - before)
+        reader = self.reader_peak(status, len(content))
+        return Cost(status, cpu_s, max(self._peak_bytes(), reader), wall_s)
 
     def _processes(self) -> list[psutil.Process]:
         return [self._process, *self._process.children(recursive=True)]
@@ -121,42 +63,72 @@ class Meter:
 
     def _forget(self) -> None:
         for process in self._processes():
-            Path(f"/proc/{process.pid}/clear_refs").write_text(CLEAR_PEAK)
+            with suppress(OSError):  # it has ended
+                Path(f"/proc/{process.pid}/clear_refs").write_text(CLEAR_PEAK)
         self._read = self._log.stat().st_size
 
     def _peak_bytes(self) -> int:
         """The most resident memory of one process."""
         peaks = [0]
         for process in self._processes():
-            for line in Path(f"/proc/{process.pid}/status").read_text().splitlines():
-                if line.startswith("VmHWM:"):
-                    peaks.append(int(line.split()[1]) * 1024)
+            with suppress(OSError):  # it has ended
+                for line in Path(f"/proc/{process.pid}/status").read_text().splitlines():
+                    if line.startswith("VmHWM:"):
+                        peaks.append(int(line.split()[1]) * 1024)
         return max(peaks)
 
-    def _reader_peak(self) -> int:
-        """The most resident memory of the child that read the file, which has ended: from the log."""
+    def reader_peak(self, status: int, size: int) -> int:
+        """The most resident memory of the child that read a file of ``size`` bytes, which has ended, in bytes.
+
+        The parser process takes it from the kernel (``wait4``) and the web process logs it, also of a child that was
+        killed. Where that line is missing because the parser process died, the web process failed (5xx) or did not
+        answer (``status`` 0), the child counts with all that it was allowed. An answer below 500 without the line
+        means that no child was asked: the request was refused before.
+        """
         with self._log.open("rb") as log:
             log.seek(self._read)
             lines = log.read().splitlines()
         told = [json.loads(line) for line in lines if b'"upload_read"' in line]
-        return max((int(line["peak_bytes"]) for line in told), default=0)
+        lost = any(b'"parser_gone"' in line for line in lines)
+        failed = not told and not 0 < status < 500
+        allowed = Limits.of(size).memory_bytes if lost or failed else 0
+        return max([allowed, *(int(line["peak_bytes"]) for line in told)])
 
 
-def run(count: int, seed: int, folder: Path, bundle: bytes, first: int = 0) -> dict[str, Any]:
-    """Send the files ``first`` to ``first + count`` of a seed's corpus; the ledger."""
-    (folder / "traces").mkdir()
-    (folder / "data").mkdir()
-    corpus, ledger = Corpus(folder / "traces", bundle, seed), Ledger()
-    earlier = set(corpus.trespasses())
-    with serving(folder / "data") as web, closing(Meter(web)) as meter:
-        sound = meter.send("sound.zip", bundle)
-        if sound.status != 201:
-            raise RuntimeError(f"a sound file was answered {sound.status}")
-        for number in range(first, first + count):
-            hostile = corpus.file(number)
-            ledger.add(
-                number, hostile.family, len(hostile.content), meter.send(hostile.filename, hostile.content)
-            )
-            if number % 500 == 499:
-                print(f"{number + 1} files, {dict(ledger.statuses)}", file=sys.stderr, flush=True)
-    return ledger.report(seed, sorted(set(corpus.trespasses()) - earlier))
+def run(
+    count: int, seed: int, folder: Path, bundle: bytes, first: int = 0, ledger: Ledger | None = None
+) -> dict[str, Any]:
+    """Send the known bombs, then the files ``first`` to ``first + count`` of a seed's corpus; the ledger as JSON.
+
+    Args:
+        folder: empty; gets the service's data folder, its temporary directory and room for traces.
+        ledger: filled as the files are answered, so that the caller has it also where the run breaks off.
+    """
+    places = {name: folder / name for name in ("traces", "data", "temporary")}
+    for place in places.values():
+        place.mkdir()
+    corpus, ledger = Corpus(places["traces"], bundle, seed), ledger or Ledger(seed, count)
+    traces = Traces(places["data"])
+    try:
+        with (
+            serving(places["data"], {"TMPDIR": str(places["temporary"])}) as web,
+            closing(Meter(web)) as meter,
+        ):
+            sound = meter.send("sound.zip", bundle)
+            if sound.status != 201:
+                raise RuntimeError(f"a sound file was answered {sound.status}")
+            for number, hostile in _files(corpus, first, count):
+                cost = meter.send(hostile.filename, hostile.content)
+                ledger.add(number, hostile.family, len(hostile.content), cost)
+                if ledger.count % 500 == 0:
+                    print(f"{ledger.count} files, {dict(ledger.statuses)}", file=sys.stderr, flush=True)
+    finally:
+        ledger.outside = traces.since()
+    return ledger.report()
+
+
+def _files(corpus: Corpus, first: int, count: int) -> Iterator[tuple[int | None, Hostile]]:
+    for bomb in corpus.known():
+        yield None, bomb
+    for number in range(first, first + count):
+        yield number, corpus.file(number)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import struct
 from collections.abc import Sequence
 from typing import TypeVar
@@ -42,11 +43,12 @@ def one(rng: np.random.Generator, things: Sequence[Thing]) -> Thing:
 
 
 def value(rng: np.random.Generator) -> object:
-    """Something of JSON that is seldom expected."""
+    """Something of JSON that is seldom expected; the caller's own, to write into."""
     deep: object = 0
     for _ in range(int(rng.choice([1, 50, 900]))):
         deep = [deep] if rng.random() < 0.5 else {"a": deep}
-    return one(rng, (*VALUES, deep))
+    chosen = one(rng, (*VALUES, deep))
+    return chosen if chosen is deep else copy.deepcopy(chosen)
 
 
 def mutated(rng: np.random.Generator, data: bytes) -> bytes:

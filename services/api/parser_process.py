@@ -18,6 +18,7 @@ import os
 import resource
 import signal
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -102,6 +103,7 @@ def _read(request: dict[str, Any]) -> int:
         os.close(0)
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # answers are the parent's
         Limits.of((folder / UPLOAD).stat().st_size).impose()
+        tempfile.tempdir = str(folder)  # what a killed child leaves goes with the upload
         data = (folder / UPLOAD).read_bytes()
         options = ImportOptions(**request["options"])
         limit_here()
