@@ -1,7 +1,7 @@
 """Does one shard: claim by compare-and-set, run the handler under a renewed lease, commit by compare-and-set.
 
 A handler's failure becomes a problem document with the exception's own numbers. Physics, faulty input and
-bugs fail the shard at once: they would fail again. Storage, network and memory are tried again with the
+bugs fail the shard at once: they would fail again. Storage, network, memory and a full disk are tried again with the
 attempts capped in the database. What a job kept in the scratch is removed once the job has ended, never before: an
 attempt whose result could not be committed is gone on with.
 """
@@ -29,7 +29,7 @@ from storage.errors import DatabaseUnavailable, StorageError, StoreReadFailed, S
 from storage.settings import Settings, get_settings
 from storage.tables import JobRow
 from workers.context import TaskContext
-from workers.errors import Cancelled, LeaseLost, UnknownShardKind, WorkerError
+from workers.errors import Cancelled, LeaseLost, NotEnoughDisk, UnknownShardKind, WorkerError
 from workers.owner import process_owner
 from workers.registry import Handler, HandlerResult, handler_of
 from workers.stores import Stores
@@ -46,6 +46,7 @@ WORTH_A_RETRY = (
     StoreReadFailed,
     StoreWriteFailed,
     UnknownShardKind,
+    NotEnoughDisk,
 )
 SAID_BY_THE_WORK = (
     PhysworldError,
