@@ -30,17 +30,15 @@ from celery import Celery
 from kombu.exceptions import OperationalError as BrokerError
 from redis.exceptions import RedisError
 
-from schemas.job import TERMINAL_STATES
 from schemas.queues import INFERENCE, SIMULATION, TASK_NAME, TRAINING
 from storage import idempotency, leases
 from storage.changes import Changes
-from storage.clock import database_now
 from storage.database import Database, open_database
 from storage.errors import DatabaseUnavailable, StoreError
 from storage.scratch import ScratchStore
 from storage.settings import Settings, get_settings
-from storage.tables import JobRow
 from workers.app import READY_FILE_VARIABLE, create_app
+from workers.housekeeping import remove_ended_scratch, remove_orphan_episodes
 from workers.owner import owner_is_gone
 
 logger = logging.getLogger(__name__)
@@ -50,7 +48,6 @@ SWEEP_S = 1.0
 IDLE_SWEEP_S = 2.0
 FORGET_EVERY_S = 300.0
 IDEMPOTENCY_KEPT = timedelta(hours=24)
-FAILED_KEPT = timedelta(days=7)  # journals and checkpoints of a failed job
 LARGE_ANSWER_BYTES, LARGE_ANSWERS_KEPT = 64 * 1024, timedelta(minutes=15)
 """Rollouts answer with up to some MiB, many times a minute: kept for as long as a client tries again."""
 LOST_AFTER_S = 2.0
@@ -101,6 +98,7 @@ class Dispatcher:
             self._forget_due = time.monotonic() + FORGET_EVERY_S
             self._forget_old_keys()
             remove_ended_scratch(ScratchStore(self._settings), self._database)
+            remove_orphan_episodes(self._settings, self._database)
 
     def _due_in(self) -> float:
         """Seconds until there is something to do although nobody has committed."""
@@ -169,22 +167,6 @@ class Dispatcher:
             depth = channel.queue_declare(queue=queue, durable=True, auto_delete=False).message_count
             self._depth[queue] = depth
             self._empty_looks[queue] = 0 if depth else self._empty_looks[queue] + 1
-
-
-def remove_ended_scratch(scratch: ScratchStore, database: Database) -> list[str]:
-    """Remove scratch files of jobs that have ended; the jobs. A failed one keeps them a while, for a retry."""
-    ended = []
-    for job_id in scratch.jobs():
-        with database.reading() as session:
-            job = session.get(JobRow, job_id)
-            since = (
-                None if job is None or job.finished_at is None else database_now(session) - job.finished_at
-            )
-        may_be_retried = job is not None and job.state == "failed" and (since is None or since < FAILED_KEPT)
-        if job is None or (job.state in TERMINAL_STATES and not may_be_retried):
-            scratch.remove(job_id)
-            ended.append(job_id)
-    return ended
 
 
 def main() -> int:

@@ -24,8 +24,8 @@ from schemas.trace import Trace, TraceConfig, TraceCreate
 from storage import helpers, jobs, leases, resources, traces
 from storage.clock import CLOCK
 from storage.tables import JobRow, ShardRow, TraceRow, utc_now
-from workers.dispatcher import remove_ended_scratch
 from workers.execute import Runtime, run_shard
+from workers.housekeeping import remove_ended_scratch
 from workers.stores import Stores
 from workers.tasks import trace as task
 from workers.tasks.inputs import named, npz_arrays, npz_bytes, twin_of

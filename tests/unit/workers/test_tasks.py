@@ -19,6 +19,7 @@ from storage import helpers, jobs, leases, resources
 from storage.clock import CLOCK
 from storage.tables import EpisodeRow, ShardRow
 from workers.execute import Runtime, run_shard
+from workers.housekeeping import remove_orphan_episodes
 from workers.stores import Stores
 from workers.tasks import dataset as dataset_task
 from workers.tasks import fit as fit_task
@@ -293,6 +294,29 @@ def test_a_dataset_that_the_disk_cannot_hold_is_refused_before_its_first_episode
         job = _job(stores, job)
     assert job.state == "failed" and job.error is not None
     assert job.error.code == "budget_exceeded" and "MiB are free" in job.error.detail
+
+
+def test_episodes_without_a_row_go_with_a_cancelled_dataset(runtime_with, fit: Fit, stores: Stores) -> None:
+    runtime = runtime_with()
+    with stores.database.session() as session:
+        job = jobs.create_dataset(session, fit.id, DatasetConfig(episodes=3, frames=8))
+    for _ in range(2):  # the plan, then one episode
+        with stores.database.reading() as session:
+            run_shard(runtime, leases.publishable(session)[0].shard_id)
+    dataset_id = job.outputs[0].id
+    with stores.database.reading() as session:
+        (committed,) = resources.all_episodes(session, dataset_id)
+    folder = runtime.settings.store_folder / "datasets"
+    known = (
+        folder / committed.path if (folder / committed.path).exists() else next(folder.rglob("*.zarr.zip"))
+    )
+    orphan = known.with_name("2-e9.zarr.zip")
+    orphan.write_bytes(known.read_bytes())
+    assert remove_orphan_episodes(runtime.settings, stores.database) == []  # it is still written
+    with stores.database.session() as session:
+        jobs.cancel_job(session, job.id)
+    assert len(remove_orphan_episodes(runtime.settings, stores.database)) == 1
+    assert known.exists() and not orphan.exists()
 
 
 def test_arrays_survive_the_npz_and_the_same_arrays_give_the_same_bytes() -> None:
