@@ -10,7 +10,9 @@ import httpx
 import pytest
 from api_service import Service, assert_problem, scene_id
 
+from schemas.base import Problem
 from services.api import sse
+from storage import leases
 
 WAIT_S = 20.0
 
@@ -138,6 +140,26 @@ def test_a_job_that_succeeded_cannot_be_cancelled(client: httpx.Client, service:
     job = client.post("/v1/fits", json={"scene_id": scene_id(client)}).json()
     service.work()
     assert_problem(client.post(f"/v1/jobs/{job['id']}/cancel"), 409, "conflict")
+
+
+def test_a_failed_job_is_retried_once_and_goes_on(client: httpx.Client, service: Service) -> None:
+    job = pipeline(client, "retried")
+    again = f"/v1/jobs/{job['id']}/retry"
+    assert_problem(client.post(again), 409, "conflict")
+    service.work(2)  # fit, plan
+    lease = service.claim()
+    assert lease is not None
+    problem = Problem(title="Boom", status=500, code="boom", detail="12 of 400 nodes are not finite")
+    with service.database.session() as session:
+        leases.fail(session, lease, problem, retry=False)
+    assert client.get(f"/v1/jobs/{job['id']}").json()["state"] == "failed"
+    answers = [client.post(again, headers={"Idempotency-Key": "again"}) for _ in range(2)]
+    assert [answer.status_code for answer in answers] == [202, 202]
+    assert answers[0].content == answers[1].content and answers[0].json()["state"] == "running"
+    assert client.get("/v1/audit").json()["data"][0]["action"] == "job.retried"
+    service.work()
+    assert client.get(f"/v1/jobs/{job['id']}").json()["state"] == "succeeded"
+    assert_problem(client.post("/v1/jobs/job_none/retry"), 404, "not_found")
 
 
 def test_work_needs_its_input_ready(client: httpx.Client) -> None:

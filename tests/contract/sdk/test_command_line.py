@@ -19,6 +19,7 @@ import pytest
 from sdk_service import METRICS, ROWS, Service, write_scene
 
 from schemas.base import Problem
+from storage import leases
 
 COMMAND = Path(sys.executable).with_name("physworld")
 WITHIN_S = 120.0
@@ -205,6 +206,20 @@ def test_jobs_are_cancelled_and_waited_for(service: Service, tmp_path: Path) -> 
     assert physworld(service, tmp_path, "jobs", "wait", job.id).returncode == 0
     done = physworld(service, tmp_path, "jobs", "wait", other.id)
     assert (done.returncode, done.stderr) == (1, f"error: fit job {other.id} was cancelled\n")
+
+
+def test_a_failed_job_is_retried(service: Service, tmp_path: Path) -> None:
+    with service.client() as client:
+        job = client.fits.create(client.scenes.create(write_scene(tmp_path / "again", "again")).id)
+    refused = physworld(service, tmp_path, "jobs", "retry", job.id)
+    assert refused.returncode != 0 and "only a failed job can be retried" in refused.stderr
+    lease = service.claim()
+    assert lease is not None and lease.job_id == job.id
+    with service.database.session() as session:
+        leases.fail(session, lease, Problem(title="Boom", status=500, code="boom"), retry=False)
+    assert output_of(service, tmp_path, "jobs", "retry", job.id)["state"] == "queued"
+    service.work()
+    assert physworld(service, tmp_path, "jobs", "wait", job.id).returncode == 0
 
 
 @pytest.mark.parametrize(

@@ -262,9 +262,10 @@ def test_a_form_of_another_site_changes_nothing(client: httpx.Client, database: 
 
 def test_a_reader_cancels_nothing(client: httpx.Client, database: Database) -> None:
     login(client, database, "read")
-    answer = client.post("/dashboard/jobs/job_x/cancel", headers=from_page(client))
-    assert answer.status_code == 403
-    assert "this one may read" in answer.text
+    for act in ("cancel", "retry"):
+        answer = client.post(f"/dashboard/jobs/job_x/{act}", headers=from_page(client))
+        assert answer.status_code == 403
+        assert "this one may read" in answer.text
 
 
 def test_empty_lists_say_what_to_do_next(client: httpx.Client, database: Database) -> None:

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 from fastapi import FastAPI
 from serving import serve
+from sqlalchemy import select
 from test_dashboard_access import browser_at, login
 from tiny_scene import register, tiny_scene
 
-from schemas.base import Artifact
+from schemas.base import Artifact, Problem
 from schemas.fit import FitConfig
 from schemas.pipeline import PipelineCreate
 from schemas.trace import TraceCreate
@@ -25,7 +26,7 @@ from services.stores import Stores
 from storage import jobs, leases
 from storage.database import Database, open_database
 from storage.settings import Settings
-from storage.tables import AssessmentRow, ModelRow, ModelVersionRow, utc_now
+from storage.tables import AssessmentRow, ModelRow, ModelVersionRow, ShardRow, utc_now
 
 REPORT: dict[str, Any] = {
     "scene": "tiny bar",
@@ -162,6 +163,26 @@ def test_what_is_not_there_yet_is_said(
     for part in ("report", "curve", "cloud"):
         assert client.get(f"/dashboard/traces/{pending}/{part}").status_code == 404
     assert client.get("/dashboard/traces/trc_none").status_code == 404
+
+
+def test_a_failed_job_has_a_button_that_retries_it(
+    client: httpx.Client, world: tuple[Settings, Database, Stores]
+) -> None:
+    _, database, stores = world
+    with database.session() as session:
+        job = jobs.create_fit(session, register(tiny_scene(), database, stores.artifacts), FitConfig())
+    page = f"/dashboard/jobs/{job.id}"
+    assert "/retry" not in client.get(page).text
+    with database.session() as session:
+        for shard in session.scalars(select(ShardRow).where(ShardRow.job_id == job.id)):
+            lease = leases.claim(session, shard.id, "test", 30.0)
+            assert lease is not None
+            leases.fail(session, lease, Problem(title="Boom", status=500, code="boom"), retry=False)
+    assert f'action="{page}/retry"' in client.get(page).text
+    own = {"origin": str(client.base_url).rstrip("/")}
+    assert client.post(f"{page}/retry", headers=own).status_code == 303
+    with database.reading() as session:
+        assert jobs.get_job(session, job.id).state == "queued"
 
 
 def test_a_pipeline_that_closes_the_loop_shows_the_stage(
