@@ -42,6 +42,7 @@ MESSAGE_BYTES = 64 * 1024
 FIRST_MESSAGE_BYTES = 64 * 2**20  # it lists the body's points as text; the SDK reads as much
 POLICY, UNAVAILABLE, TOO_BIG, TOO_SLOW = 1008, 1013, 1009, 4409
 OPEN_S = 60.0  # the inference service loads torch at its first session
+CLOSE_S = 1.0  # for the inference service to take leave; it may be held up by frames that nobody reads
 SEND_S, CLOSE_S = 10.0, 1.0
 PASSED_CODES = frozenset({1000, 1001, 1007, 1008, 1013, *range(4000, 5000)})
 
@@ -115,6 +116,7 @@ async def live(socket: WebSocket) -> None:
                 compression=None,
                 proxy=None,
                 open_timeout=OPEN_S,
+                close_timeout=CLOSE_S,
                 max_queue=2,
                 max_size=FIRST_MESSAGE_BYTES,
             ) as inner,

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import gc
 import json
 import struct
 import time
-import warnings
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 from urllib.parse import urlencode
@@ -35,18 +33,6 @@ SINGLE_PRECISION_M = 2e-6
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     with serve_inference(tmp_path_factory.mktemp("data")) as served:
         yield served
-
-
-@pytest.fixture(scope="module", autouse=True)
-def collected() -> Iterator[None]:
-    """Transports whose server cut them off while their client did not read are closed by the collector, here.
-
-    asyncio warns of each (ResourceWarning), which would otherwise fail whatever test runs when the collector does.
-    """
-    yield
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ResourceWarning)
-        gc.collect()
 
 
 def path_of(served: Served) -> str:
