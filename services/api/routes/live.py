@@ -110,8 +110,8 @@ async def live(socket: WebSocket) -> None:
     endings: Endings = socket.app.state.endings
     address = f"{settings.inference_url.replace('http', 'ws', 1)}/live?{urlencode(inner_query)}"
     try:
-        async with (
-            connect(
+        async with endings.of(credential) as ended:
+            inner = await connect(
                 address,
                 compression=None,
                 proxy=None,
@@ -119,10 +119,12 @@ async def live(socket: WebSocket) -> None:
                 close_timeout=CLOSE_S,
                 max_queue=2,
                 max_size=FIRST_MESSAGE_BYTES,
-            ) as inner,
-            endings.of(credential) as ended,
-        ):
-            await _relay(socket, inner, ended)
+            )
+            try:
+                await _relay(socket, inner, ended)
+                await inner.close()
+            finally:  # also where the server is stopping and nothing may be waited for
+                inner.transport.abort()
     except (OSError, TimeoutError, WebSocketException) as error:
         log.warning("live_session_not_opened", error=str(error))
         with suppress(RuntimeError):
