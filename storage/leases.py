@@ -344,9 +344,11 @@ def _reap(session: Session, job: JobRow, shard: ShardRow, now: datetime) -> None
         session.flush()
         settle_cancel(session, job, now)
         return
-    if shard.claimed_at is not None:
-        shard.losses = losses.with_this_one(shard)
-    lost = shard.losses or []
+    if shard.claimed_at is None:  # the whole service was stopped: nobody's loss
+        _requeue(shard, not_before=None)
+        session.flush()
+        return
+    shard.losses = lost = losses.with_this_one(shard)
     if losses.deadly(lost):
         problem = Problem(
             type="urn:physworld:problem:work_kills_its_workers",

@@ -8,9 +8,9 @@ A shard that itself kills its worker (memory, a crash in native code) dies at th
 the work is taken to be deadly when it was lost ``ALIKE`` times in a row, by as many workers, without getting further
 than before (by more than ``FURTHER`` of its whole), each time after about the same time (the longest at most ``SPREAD``
 times the shortest, and ``SLACK_S``, within which renewals do not tell times apart). Workers that are killed at random
-die at different places: of ``ALIKE`` kills at uniformly distributed times the chance to be so alike is below 1 in 1000,
-if every single attempt is killed and none gets further; work of seconds would have to be hit ``ALIKE`` times within
-its seconds, with pauses between that grow to a minute.
+die at different places: of ``ALIKE`` kills at uniformly distributed times of ten minutes the chance to be so alike is
+below 1 in 1000, if every single attempt is killed and none gets further; work of seconds would have to be hit
+``ALIKE`` times within its seconds, with pauses between that grow to a minute.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A failed job is taken up again: what is stored stays, what failed is queued with fresh counters.
 
 Finished shards (stored episodes among them), journals and checkpoints in the scratch are kept for a failed job
-(``workers.dispatcher``), so that a retry goes on where the job ended. A pipeline and its children are one piece of
+(``workers.housekeeping``), so that a retry goes on where the job ended. A pipeline and its children are one piece of
 work: to retry one of them retries every child that failed, and the pipeline goes on after them.
 """
 
@@ -40,12 +40,12 @@ def retry_job(session: Session, job_id: str) -> JobRow:
     root = job if job.parent_id is None else session.get_one(JobRow, job.parent_id)
     if root.state not in {"failed", "running"}:
         raise Conflict(f"job {job_id} belongs to pipeline {root.id}, which is {root.state}")
-    children = list(session.scalars(select(JobRow).where(JobRow.parent_id == root.id).with_for_update()))
-    for row in children if root.kind == "pipeline" else [root]:
-        if row.state == "failed":
-            _reopen(session, row, "queued")
-            _reopen_shards(session, row)
-            _reopen_output(session, row)
+    failed = select(JobRow).where(JobRow.parent_id == root.id, JobRow.state == "failed")
+    locked = failed.with_for_update(key_share=True).execution_options(populate_existing=True)
+    for row in session.scalars(locked).all() if root.kind == "pipeline" else [root]:
+        _reopen(session, row, "queued")
+        _reopen_shards(session, row)
+        _reopen_output(session, row)
     if root.kind == "pipeline" and root.state == "failed":
         _reopen(session, root, "running")
     session.flush()

@@ -317,7 +317,7 @@ def initdb_binary() -> str | None:
 
 def _at(url: object, proxy: RefusingProxy) -> str:
     """The same address through the proxy."""
-    return make_url(url).set(host="127.0.0.1", port=proxy.port).render_as_string(hide_password=False)  # type: ignore[arg-type]
+    return make_url(url).set(host="127.0.0.1", port=proxy.port).render_as_string(hide_password=False)
 
 
 def _ask(server: str, statement: str) -> bool:

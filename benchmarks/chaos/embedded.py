@@ -86,7 +86,7 @@ class Embedded:
         """Whether this start of the supervisor serves."""
         state = self._state()
         running = self._process is not None and self._process.poll() is None
-        return running and state.get("pid") == self._process.pid and bool(state.get("ready"))  # type: ignore[union-attr]
+        return running and state.get("pid") == self._process.pid and bool(state.get("ready"))
 
     def mend(self) -> None:
         """Start the service again when it has ended."""
@@ -106,7 +106,7 @@ class Embedded:
             return processes.stop(self._find(fault))
         if fault.kind == "clock" and self._clock is not None:
             self._clock.step(fault.step_s)
-            return lambda: self._clock.step(0.0)  # type: ignore[union-attr]
+            return lambda: self._clock.step(0.0)
         if fault.kind == "disk_full":
             return self._fill() if self._mounted else self._limit_files()
         if fault.kind == "read_only":

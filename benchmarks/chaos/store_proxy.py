@@ -32,7 +32,7 @@ class RefusingProxy(FrozenProxy):
 
     def _pump(self, source: socket.socket, sink: socket.socket) -> None:
         asks = sink.getpeername()[1] == self._target[1]
-        super()._pump(_Asking(self, source) if asks else source, sink)  # type: ignore[arg-type]
+        super()._pump(_Asking(self, source) if asks else source, sink)
 
 
 class _Asking:

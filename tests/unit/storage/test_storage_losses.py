@@ -98,7 +98,14 @@ def test_stops_of_the_whole_service_are_nobodys_losses(work: Work) -> None:
     assert work.finish(job).state == "succeeded"
 
 
-def test_the_pauses_grow_to_a_minute(work: Work) -> None:
+def test_kills_at_random_times_are_seldom_alike() -> None:
+    """Kills at uniformly distributed times of ten minutes: taken for deadly work in fewer than 1 of 1000 cases."""
+    dice = random.Random(0)
+    drawn = ([{"ran_s": dice.uniform(0.0, 600.0)} for _ in range(losses.ALIKE)] for _ in range(20_000))
+    assert 0 < sum(losses.deadly(times) for times in drawn) < 20
+
+
+def test_the_pauses_grow_to_a_minute() -> None:
     counted = [losses.pause_s([{}] * count) for count in range(1, 10)]
     assert counted == [0, 1, 2, 4, 8, 16, 32, 60, 60]
 

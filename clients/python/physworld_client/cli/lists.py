@@ -316,11 +316,7 @@ def jobs_retry(
 ) -> None:
     """Take a failed job up again; what it stored is kept."""
     with service.connect(url, token, data) as client:
-        job = client.jobs.retry(job_id)
-    if json:
-        print_json(job)
-    else:
-        stdout.print(f"{job.id} is {job.state}")
+        _print_state(client.jobs.retry(job_id), json)
 
 
 @jobs.command("cancel")
@@ -329,7 +325,10 @@ def jobs_cancel(
 ) -> None:
     """Cancel a job and everything it started."""
     with service.connect(url, token, data) as client:
-        job = client.jobs.cancel(job_id)
+        _print_state(client.jobs.cancel(job_id), json)
+
+
+def _print_state(job: Job, json: bool) -> None:
     if json:
         print_json(job)
     else:
