@@ -36,7 +36,7 @@ COPY services/api/ services/api/
 COPY services/dashboard/ services/dashboard/
 USER 10001:10001
 EXPOSE 8000
-CMD ["python", "-m", "services.web", "--host", "0.0.0.0", "--port", "8000"]
+CMD ["python", "-m", "physworld_services.web", "--host", "0.0.0.0", "--port", "8000"]
 
 FROM base AS worker
 ARG PIP_INDEX_URL=
@@ -49,7 +49,7 @@ COPY storage/ storage/
 COPY physworld/ physworld/
 COPY workers/ workers/
 USER 10001:10001
-CMD ["python", "-m", "workers"]
+CMD ["python", "-m", "physworld_workers"]
 
 FROM base AS trainer
 ARG PIP_INDEX_URL=
@@ -65,7 +65,7 @@ COPY workers/ workers/
 COPY services/__init__.py services/
 COPY services/trainer/ services/trainer/
 USER 10001:10001
-CMD ["python", "-m", "services.trainer"]
+CMD ["python", "-m", "physworld_services.trainer"]
 
 FROM base AS inference
 ARG PIP_INDEX_URL=
@@ -82,4 +82,4 @@ COPY services/__init__.py services/
 COPY services/inference/ services/inference/
 USER 10001:10001
 EXPOSE 8100
-CMD ["python", "-m", "services.inference", "serve", "--host", "0.0.0.0"]
+CMD ["python", "-m", "physworld_services.inference", "serve", "--host", "0.0.0.0"]

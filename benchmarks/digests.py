@@ -29,13 +29,13 @@ from physworld_client.client import Client
 from safetensors.numpy import load_file
 
 from benchmarks.harness import describe_machine
-from benchmarks.trace_power_objects import OBJECTS, observed, recorded
+from benchmarks.trace.power_objects import OBJECTS, observed, recorded
 from physworld.effects.registry import effect
-from schemas.dataset import DatasetConfig
-from schemas.fit import FitConfig
-from schemas.model import TrainingConfig
-from schemas.pipeline import PipelineCreate
-from storage.scene_bundle import write_bundle
+from physworld_scenes.bundle import write_bundle
+from physworld_schemas.dataset import DatasetConfig
+from physworld_schemas.fit import FitConfig
+from physworld_schemas.model import TrainingConfig
+from physworld_schemas.pipeline import PipelineCreate
 
 BODIES = ("beam", "rope", "sheet")
 DRAG_PER_S = 3.0

@@ -7,8 +7,8 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from schemas.base import Lineage, Request, Resource
-from schemas.trace import TraceConfig
+from physworld_schemas.base import Lineage, Request, Resource
+from physworld_schemas.trace import TraceConfig
 
 Outcome = Literal["within_noise", "as_expected", "worse_than_expected"]
 

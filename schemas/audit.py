@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import Field
 
-from schemas.base import Resource
+from physworld_schemas.base import Resource
 
 
 class AuditEntry(Resource):

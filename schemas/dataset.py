@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator
 
-from schemas.base import Artifact, Lineage, Request, Resource, Seed
+from physworld_schemas.base import Artifact, Lineage, Request, Resource, Seed
 
 Pattern = Literal["single", "lift", "push", "stretch", "twist", "together", "bimanual", "hold_one"]
 Property = Literal["stiffness", "density", "friction"]

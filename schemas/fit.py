@@ -8,7 +8,7 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from schemas.base import Artifact, Lineage, Request, Resource
+from physworld_schemas.base import Artifact, Lineage, Request, Resource
 
 ElasticLaw = Literal[
     "auto", "neo_hookean", "fixed_corotated", "st_venant_kirchhoff", "hencky", "drucker_prager_elastic",

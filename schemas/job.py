@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from schemas.base import Problem, Reference, Resource
+from physworld_schemas.base import Problem, Reference, Resource
 
 JobKind = Literal["fit", "trace", "dataset", "training", "assessment", "rollout", "plan", "pipeline"]
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelling", "cancelled"]

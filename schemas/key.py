@@ -7,7 +7,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from schemas.base import Request, Resource
+from physworld_schemas.base import Request, Resource
 
 Role = Literal["read", "write", "admin"]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from schemas.base import Resource
+from physworld_schemas.base import Resource
 
 
 class Material(Resource):

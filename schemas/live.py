@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from datetime import datetime
 
-from schemas.base import Request, Resource
-from schemas.rollout import ModelName, Version
+from physworld_schemas.base import Request, Resource
+from physworld_schemas.rollout import ModelName, Version
 
 MOST_REASON_BYTES = 123  # RFC 6455, section 5.5: a control frame has 125, two of them the code's
 

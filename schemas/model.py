@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field
 
-from schemas.base import Artifact, Lineage, Request, Resource, Seed
+from physworld_schemas.base import Artifact, Lineage, Request, Resource, Seed
 
 Format = Literal["torch_export", "onnx"]
 FORMATS: tuple[Format, ...] = get_args(Format)

@@ -6,11 +6,11 @@ from typing import Any, Self
 
 from pydantic import Field, model_validator
 
-from schemas.base import Request, Resource
-from schemas.dataset import DatasetConfig
-from schemas.fit import FitConfig
-from schemas.model import TrainingConfig
-from schemas.trace import NO_OTHER_PHYSICS, TraceConfig
+from physworld_schemas.base import Request, Resource
+from physworld_schemas.dataset import DatasetConfig
+from physworld_schemas.fit import FitConfig
+from physworld_schemas.model import TrainingConfig
+from physworld_schemas.trace import NO_OTHER_PHYSICS, TraceConfig
 
 
 class PipelineCreate(Request):

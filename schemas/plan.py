@@ -7,9 +7,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from schemas.arrays import FARTHEST_M, ArrayInput
-from schemas.base import Artifact, Lineage, Request, Resource, Seed
-from schemas.rollout import ModelName, RunState, Version
+from physworld_schemas.arrays import FARTHEST_M, ArrayInput
+from physworld_schemas.base import Artifact, Lineage, Request, Resource, Seed
+from physworld_schemas.rollout import ModelName, RunState, Version
 
 MAX_HORIZON, MAX_SAMPLES, MAX_ITERATIONS, MAX_PLAN_STEPS = 300, 8192, 100, 20_000_000
 

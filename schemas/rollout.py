@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from schemas.arrays import MAX_LISTED_VALUES, ArrayInput, EncodedArray
-from schemas.base import Artifact, Lineage, Request, Resource
+from physworld_schemas.arrays import MAX_LISTED_VALUES, ArrayInput, EncodedArray
+from physworld_schemas.base import Artifact, Lineage, Request, Resource
 
 MAX_CANDIDATES, MAX_TICKS = 4096, 3000
 MAX_STEPS, MAX_VALUES = 500_000, 2**26

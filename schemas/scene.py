@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from schemas.base import Artifact, Request, Resource
+from physworld_schemas.base import Artifact, Request, Resource
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 

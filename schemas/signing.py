@@ -7,7 +7,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from schemas.base import Resource
+from physworld_schemas.base import Resource
 
 SIGNATURE_NAME = "manifest.sig.json"
 

@@ -7,8 +7,8 @@ from typing import Any, Literal, Self
 
 from pydantic import ConfigDict, Field, model_validator
 
-from schemas.base import Artifact, Lineage, Request, Resource, Seed
-from schemas.fit import FitConfig
+from physworld_schemas.base import Artifact, Lineage, Request, Resource, Seed
+from physworld_schemas.fit import FitConfig
 
 Verdict = Literal[
     "named", "equivalent_set", "data_issue", "numerical_issue", "unexplained", "nothing_to_explain"

@@ -25,7 +25,7 @@ from matplotlib.patches import FancyBboxPatch
 from physworld.evaluate.baselines import rigid_follow, static
 from physworld.evaluate.metrics import track_error_per_frame
 from physworld.scene import Scene
-from storage.scene_bundle import read_bundle
+from physworld_scenes.bundle import read_bundle
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENE = ROOT / "sample" / "soft_beam"

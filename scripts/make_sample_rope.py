@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Scene
-from storage.scene_bundle import checked, write_bundle
+from physworld_scenes.bundle import checked, write_bundle
 
 NAME = "hanging_rope"
 TARGET = Path(__file__).resolve().parents[1] / "sample" / NAME

@@ -24,7 +24,7 @@ import mujoco
 import numpy as np
 
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Scene
-from storage.scene_bundle import checked, write_bundle
+from physworld_scenes.bundle import checked, write_bundle
 
 NAME = "soft_beam"
 TARGET = Path(__file__).resolve().parents[1] / "sample" / NAME

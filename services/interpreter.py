@@ -11,8 +11,8 @@ FIXED_IN = {(3, 11): 10, (3, 12): 6, (3, 13): 0}
 def warning(version: tuple[int, int, int] = sys.version_info[:3]) -> str | None:
     """A sentence for whoever starts the service, or None. Distributions port fixes back, so it is no refusal.
 
-    Uploads are safe without the fix too: long headers are refused before tarfile sees them (``storage.archives``), and
-    what reads them may take some seconds of processor time only.
+    Uploads are safe without the fix too: long headers are refused before tarfile sees them
+    (``physworld_scenes.archives``), and what reads them may take some seconds of processor time only.
     """
     fixed = FIXED_IN.get(version[:2])
     if fixed is None or version[2] >= fixed:

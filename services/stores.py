@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from storage.artifacts import ArtifactStore
-from storage.database import Database, open_database
-from storage.episodes import EpisodeStore
-from storage.patience import ANSWERING
-from storage.settings import Settings
+from physworld_storage.artifacts import ArtifactStore
+from physworld_storage.database import Database, open_database
+from physworld_storage.episodes import EpisodeStore
+from physworld_storage.patience import ANSWERING
+from physworld_storage.settings import Settings
 
 THREADS = 48
 """That use the database at once: anyio's 40, and those of followed jobs, uploads, probes and the metrics."""

@@ -1,7 +1,7 @@
 """The web process: REST API, dashboard and documentation in one application.
 
-``python -m services.web --host 127.0.0.1 --port 8000``, or any ASGI server on the factory
-``services.web:create_app``. It reads and writes the database and the store; it never talks to the broker.
+``python -m physworld_services.web --host 127.0.0.1 --port 8000``, or any ASGI server on the factory
+``physworld_services.web:create_app``. It reads and writes the database and the store; it never talks to the broker.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ import uvicorn
 from fastapi import FastAPI
 from fastapi.responses import RedirectResponse
 
-from services import interpreter
-from services.api.app import create_api
-from services.api.logs import configure_logs
-from services.connections import Connection, Session
-from services.dashboard.app import mount as mount_dashboard
-from services.stores import open_all
-from storage.settings import Settings, get_settings
+from physworld_services import interpreter
+from physworld_services.api.app import create_api
+from physworld_services.api.logs import configure_logs
+from physworld_services.connections import Connection, Session
+from physworld_services.dashboard.app import mount as mount_dashboard
+from physworld_services.stores import open_all
+from physworld_storage.settings import Settings, get_settings
 
 GRACEFUL_SHUTDOWN_S = 5
 
@@ -60,7 +60,7 @@ def proxy_options(settings: Settings) -> dict[str, Any]:
 def main(arguments: list[str] | None = None) -> int:
     """Serve until told to stop."""
     parser = argparse.ArgumentParser(
-        prog="python -m services.web", description="Serve the API and the dashboard."
+        prog="python -m physworld_services.web", description="Serve the API and the dashboard."
     )
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1)")
     parser.add_argument("--port", type=int, default=8000, help="port to listen on (default: 8000)")

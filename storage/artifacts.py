@@ -13,11 +13,11 @@ from pathlib import Path
 
 import obstore
 
-from schemas.base import Artifact
-from storage.errors import ArtifactCorrupt, NotFound
-from storage.patience import WORKING, Patience
-from storage.settings import Settings
-from storage.store import open_store, reading, writing
+from physworld_schemas.base import Artifact
+from physworld_storage.errors import ArtifactCorrupt, NotFound
+from physworld_storage.patience import WORKING, Patience
+from physworld_storage.settings import Settings
+from physworld_storage.store import open_store, reading, writing
 
 CHUNK_BYTES = 1 << 20
 DEFAULT_MEDIA_TYPE = "application/octet-stream"

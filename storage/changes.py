@@ -19,8 +19,8 @@ from typing import Any
 from sqlalchemy import text
 from sqlalchemy.orm import Session
 
-from storage.database import Database
-from storage.errors import DatabaseUnavailable
+from physworld_storage.database import Database
+from physworld_storage.errors import DatabaseUnavailable
 
 POSTGRES = "postgresql"
 CHANNEL = "physworld_shards"

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from schemas.model import (
+from physworld_schemas.model import (
     ComparedError,
     Difference,
     ErrorCurves,
@@ -19,7 +19,7 @@ from schemas.model import (
     ModelComparison,
     ModelVersion,
 )
-from storage.errors import Conflict
+from physworld_storage.errors import Conflict
 
 METRICS = ("track_m", "chamfer_phystwin_m", "chamfer_l2_m")
 FIGURES = (

@@ -2,8 +2,8 @@
 
 SQLite (one host, WAL) begins every writing transaction with ``BEGIN IMMEDIATE``: writers queue up at the
 start instead of failing in the middle, so a read followed by a write in one transaction is a law, not a race.
-Postgres locks rows instead (``storage.locks.lock_job``). A killed process loses no committed transaction; with
-SQLite's ``synchronous=NORMAL`` a power cut may lose the last moments but never the consistency.
+Postgres locks rows instead (``physworld_storage.jobs.locks.lock_job``). A killed process loses no committed
+transaction; with SQLite's ``synchronous=NORMAL`` a power cut may lose the last moments but never the consistency.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.orm import Session
 
-from storage.clock import CLOCK, Clock
-from storage.errors import DatabaseUnavailable
-from storage.patience import GRACE_S, WORKING, Patience, Silence
-from storage.settings import Settings
+from physworld_storage.clock import CLOCK, Clock
+from physworld_storage.errors import DatabaseUnavailable
+from physworld_storage.patience import GRACE_S, WORKING, Patience, Silence
+from physworld_storage.settings import Settings
 
 FEW_THREADS = 8
 KEPT_CONNECTIONS = 10
@@ -189,7 +189,7 @@ def _create_engine(address: str, threads: int, patience: Patience, silence: Sile
         event.listen(engine, "connect", functools.partial(_prepare_sqlite, patience))
         event.listen(engine, "begin", _Lock(patience))
         return engine
-    from storage import postgres  # the driver, which SQLite does not need
+    from physworld_storage import postgres  # the driver, which SQLite does not need
 
     if url.drivername in {"postgresql", "postgres"}:
         url = url.set(drivername="postgresql+psycopg")

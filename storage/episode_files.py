@@ -27,7 +27,7 @@ from zarr.codecs import BloscCodec
 from zarr.core.buffer import Buffer, default_buffer_prototype
 from zarr.storage import LocalStore, MemoryStore, ObjectStore
 
-from storage.store import Store
+from physworld_storage.store import Store
 
 T = TypeVar("T")
 

@@ -33,13 +33,13 @@ from numpy.typing import NDArray
 from obstore.exceptions import NotFoundError
 from pydantic import ValidationError
 
-from schemas.base import Artifact, Resource
-from schemas.dataset import Episode
-from storage.artifacts import ArtifactStore
-from storage.errors import EpisodeCorrupt, NotFound
-from storage.patience import WORKING, Patience
-from storage.settings import Settings
-from storage.store import open_store, reading, writing
+from physworld_schemas.base import Artifact, Resource
+from physworld_schemas.dataset import Episode
+from physworld_storage.artifacts import ArtifactStore
+from physworld_storage.errors import EpisodeCorrupt, NotFound
+from physworld_storage.patience import WORKING, Patience
+from physworld_storage.settings import Settings
+from physworld_storage.store import open_store, reading, writing
 
 if TYPE_CHECKING:
     import zarr
@@ -98,7 +98,9 @@ class EpisodeStore:
 
         Raises StoreWriteFailed or StoreFull; nothing of it is then there.
         """
-        from storage.episode_files import packed  # zarr takes as long to import as the API's own routes
+        from physworld_storage.episode_files import (
+            packed,  # zarr takes as long to import as the API's own routes
+        )
 
         path = episode_path(dataset_id, index, epoch)
         plain = {name: _plain(name, array) for name, array in arrays.items()}
@@ -220,7 +222,7 @@ class EpisodeStore:
 
     def _group(self, path: str) -> zarr.Group:
         """The episode's group, whose arrays are read when they are asked for."""
-        from storage.episode_files import open_folder, open_packed
+        from physworld_storage.episode_files import open_folder, open_packed
 
         if path.endswith(FILE):
             return open_packed(self._store, path)

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from schemas.base import FieldError
+from physworld_schemas.base import FieldError
 
 
 class StorageError(Exception):

@@ -22,8 +22,8 @@ from typing import Any, cast
 from sqlalchemy import CursorResult, and_, delete, func
 from sqlalchemy.orm import Session
 
-from storage.errors import Conflict, IdempotencyMismatch, NotFound
-from storage.tables import IdempotencyRow, insert_if_absent, utc_now
+from physworld_storage.errors import Conflict, IdempotencyMismatch, NotFound
+from physworld_storage.tables import IdempotencyRow, insert_if_absent, utc_now
 
 MAX_KEY_LENGTH = 255
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from sqlalchemy import func, select
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
-from schemas.base import Page
-from schemas.job import TERMINAL_STATES, Event, Job
-from storage.pages import page_of
-from storage.tables import (
+from physworld_schemas.base import Page
+from physworld_schemas.job import TERMINAL_STATES, Event, Job
+from physworld_storage.pages import page_of
+from physworld_storage.tables import (
     DatasetRow,
     EventRow,
     FitRow,

@@ -12,9 +12,9 @@ from typing import Any, TypeVar
 from sqlalchemy import Select, tuple_
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
-from schemas.base import Page, holds_unstorable_characters
-from storage.errors import InvalidCursor
-from storage.tables import Base
+from physworld_schemas.base import Page, holds_unstorable_characters
+from physworld_storage.errors import InvalidCursor
+from physworld_storage.tables import Base
 
 MAX_LIMIT = 1000
 LARGEST_KEY = 2**31 - 1

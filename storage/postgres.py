@@ -15,7 +15,7 @@ from typing import Any
 import psycopg
 from psycopg import errors
 
-from storage.patience import GRACE_S, Patience, Silence
+from physworld_storage.patience import GRACE_S, Patience, Silence
 
 TCP = {"keepalives": 1, "keepalives_idle": 15, "keepalives_interval": 5, "keepalives_count": 3}
 """A host that vanished under an idle connection (one that listens, say) is noticed within half a minute."""

@@ -12,11 +12,11 @@ from typing import Any
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from schemas.base import Artifact, Lineage, Page
-from schemas.model import Model, ModelVersion, TrainingConfig, VersionPatch
-from storage.errors import Conflict, NotFound
-from storage.pages import page_of
-from storage.tables import (
+from physworld_schemas.base import Artifact, Lineage, Page
+from physworld_schemas.model import Model, ModelVersion, TrainingConfig, VersionPatch
+from physworld_storage.errors import Conflict, NotFound
+from physworld_storage.pages import page_of
+from physworld_storage.tables import (
     AliasRow,
     DatasetRow,
     FitRow,
@@ -27,7 +27,7 @@ from storage.tables import (
     insert_if_absent,
     utc_now,
 )
-from storage.traces import fit_digest, leaves_twin
+from physworld_storage.traces import fit_digest, leaves_twin
 
 LATEST = "latest"
 MOST_DIGITS = 9  # of a version's number: the column holds no more

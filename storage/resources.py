@@ -1,7 +1,7 @@
 """Scenes, fits, datasets and episodes: rows in, wire models out.
 
-A fit, a dataset and a model version are born pending with their job (``storage.opening``) and filled in by
-the commit of its last shard (``storage.flow``); what is ready or sealed never changes again.
+A fit, a dataset and a model version are born pending with their job (``physworld_storage.jobs.opening``) and filled in
+by the commit of its last shard (``physworld_storage.jobs.flow``); what is ready or sealed never changes again.
 """
 
 from __future__ import annotations
@@ -11,14 +11,22 @@ from typing import Any, TypeVar
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session, defer
 
-from schemas.base import Artifact, Lineage, Page
-from schemas.dataset import Dataset, Episode
-from schemas.fit import Fit, Parameter
-from schemas.ids import new_id
-from schemas.scene import Scene
-from storage.errors import Conflict, NotFound, ResultInvalid
-from storage.pages import page_of
-from storage.tables import DatasetRow, EpisodeRow, FitRow, SceneRow, columns_of, insert_if_absent, utc_now
+from physworld_schemas.base import Artifact, Lineage, Page
+from physworld_schemas.dataset import Dataset, Episode
+from physworld_schemas.fit import Fit, Parameter
+from physworld_schemas.ids import new_id
+from physworld_schemas.scene import Scene
+from physworld_storage.errors import Conflict, NotFound, ResultInvalid
+from physworld_storage.pages import page_of
+from physworld_storage.tables import (
+    DatasetRow,
+    EpisodeRow,
+    FitRow,
+    SceneRow,
+    columns_of,
+    insert_if_absent,
+    utc_now,
+)
 
 Row = TypeVar("Row", SceneRow, FitRow, DatasetRow)
 _LIFTED = (

@@ -8,12 +8,12 @@ from pydantic import BaseModel
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from schemas.base import Artifact, Lineage, Page
-from schemas.plan import Plan
-from schemas.rollout import Rollout
-from storage.errors import Conflict, NotFound
-from storage.pages import page_of
-from storage.tables import RunRow, columns_of
+from physworld_schemas.base import Artifact, Lineage, Page
+from physworld_schemas.plan import Plan
+from physworld_schemas.rollout import Rollout
+from physworld_storage.errors import Conflict, NotFound
+from physworld_storage.pages import page_of
+from physworld_storage.tables import RunRow, columns_of
 
 RunKind = Literal["rollout", "plan"]
 Wire = TypeVar("Wire", Rollout, Plan)

@@ -10,9 +10,9 @@ import re
 
 import obstore
 
-from storage.errors import NotFound
-from storage.settings import Settings
-from storage.store import open_store, reading, writing
+from physworld_storage.errors import NotFound
+from physworld_storage.settings import Settings
+from physworld_storage.store import open_store, reading, writing
 
 _JOB = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")

@@ -10,7 +10,7 @@ Embedded and distributed differ here and nowhere else::
     PHYSWORLD_INFERENCE_URL  http://host:port of the inference service   none (the embedded service sets it)
     PHYSWORLD_DEVICE         of the simulations, cpu or cuda:0          cpu
     PHYSWORLD_TRUSTED_PROXIES  whose word on client and scheme counts     none
-    PHYSWORLD_SIGNING_KEY    base64 of an Ed25519 key (32 bytes)        made in data_dir (``storage.signing``)
+    PHYSWORLD_SIGNING_KEY    base64 of an Ed25519 key (32 bytes)        made in data_dir (``physworld_storage.signing``)
     PHYSWORLD_SIGNING_KEY_FILE  a file that holds it                    none
 """
 
@@ -24,7 +24,7 @@ from urllib.parse import unquote, urlsplit
 from pydantic import Field, SecretStr, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-from storage.errors import ConfigurationError
+from physworld_storage.errors import ConfigurationError
 
 DATABASE_SCHEMES = ("sqlite", "postgresql", "postgres", "postgresql+psycopg")
 STORE_SCHEMES = ("file", "s3")

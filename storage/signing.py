@@ -26,12 +26,12 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from schemas.base import Page
-from schemas.signing import ManifestSignature, SigningKey
-from storage.errors import ConfigurationError
-from storage.pages import page_of
-from storage.settings import Settings
-from storage.tables import SigningKeyRow, insert_if_absent, utc_now
+from physworld_schemas.base import Page
+from physworld_schemas.signing import ManifestSignature, SigningKey
+from physworld_storage.errors import ConfigurationError
+from physworld_storage.pages import page_of
+from physworld_storage.settings import Settings
+from physworld_storage.tables import SigningKeyRow, insert_if_absent, utc_now
 
 KEY_BYTES = 32
 KEY_FILE = "signing-key"

@@ -23,9 +23,15 @@ from urllib.parse import urlsplit
 from obstore.exceptions import BaseError, NotFoundError
 from obstore.store import LocalStore, S3Store
 
-from storage.errors import ConfigurationError, NotFound, StoreFull, StoreReadFailed, StoreWriteFailed
-from storage.patience import WORKING, Patience, Silence
-from storage.settings import STORE_SCHEMES, Settings
+from physworld_storage.errors import (
+    ConfigurationError,
+    NotFound,
+    StoreFull,
+    StoreReadFailed,
+    StoreWriteFailed,
+)
+from physworld_storage.patience import WORKING, Patience, Silence
+from physworld_storage.settings import STORE_SCHEMES, Settings
 
 WHOLE_REQUEST = timedelta(days=1)
 """Of one request with its body, however slowly it gets on."""

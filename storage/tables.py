@@ -46,7 +46,7 @@ class UtcDateTime(TypeDecorator[datetime]):
 
     @property
     def python_type(self) -> type[datetime]:
-        """What a value is in Python; ``storage.pages`` reads cursors by it."""
+        """What a value is in Python; ``physworld_storage.pages`` reads cursors by it."""
         return datetime
 
     def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:
@@ -151,7 +151,8 @@ class ShardRow(Base):
     """One unit that a worker executes under a lease; ``epoch`` is the fencing token, it only grows.
 
     ``attempt`` counts claims, ``failures`` those that failed; ``losses`` are those that were lost since the shard last
-    got on (``storage.losses``), ``claimed_at``, ``renewed_at`` and ``progress`` say where the present attempt is.
+    got on (``physworld_storage.jobs.losses``), ``claimed_at``, ``renewed_at`` and ``progress`` say where the present
+    attempt is.
     """
 
     __tablename__ = "shards"

@@ -7,12 +7,12 @@ from typing import Any
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from schemas.assessment import Assessment
-from schemas.base import Artifact, Lineage, Page
-from schemas.trace import Trace
-from storage.errors import Conflict, NotFound
-from storage.pages import page_of
-from storage.tables import AssessmentRow, FitRow, TraceRow, columns_of
+from physworld_schemas.assessment import Assessment
+from physworld_schemas.base import Artifact, Lineage, Page
+from physworld_schemas.trace import Trace
+from physworld_storage.errors import Conflict, NotFound
+from physworld_storage.pages import page_of
+from physworld_storage.tables import AssessmentRow, FitRow, TraceRow, columns_of
 
 TWIN = "twin.npz"
 TRACKS = "tracks.npz"

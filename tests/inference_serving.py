@@ -15,13 +15,13 @@ import httpx
 import uvicorn
 from published_tiny import publish_tiny
 
-from services.connections import Session
-from services.inference.app import create_app as create_inference
-from services.web import create_app as create_web
-from storage import api_keys
-from storage.database import Database, open_database
-from storage.settings import Settings
-from workers.stores import Stores
+from physworld_services.connections import Session
+from physworld_services.inference.app import create_app as create_inference
+from physworld_services.web import create_app as create_web
+from physworld_storage.access import api_keys
+from physworld_storage.database import Database, open_database
+from physworld_storage.settings import Settings
+from physworld_workers.stores import Stores
 
 
 @dataclass

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from physworld.scene import Body, Scene
-from physworld.twin import Twin
+from physworld.twin.twin import Twin
 
 FPS = 30.0
 GRAVITY = np.array([0.0, 0.0, -9.81])

@@ -7,11 +7,10 @@ from dataclasses import replace
 import numpy as np
 from sagging_bar import BUDGET, SIGMA, TRUE_PA, sagging
 
-from physworld.build import build_twin
 from physworld.calibrate.parameters import parameters_of
 from physworld.effects.base import Effect
 from physworld.effects.registry import effect
-from physworld.simulations import Job
+from physworld.estimation.simulations import Job
 from physworld.trace.candidates import Candidate, candidates
 from physworld.trace.comparison import cross_validated
 from physworld.trace.confirm import Confirmation, Model
@@ -20,7 +19,8 @@ from physworld.trace.refit import Refit
 from physworld.trace.sensitivity import sensitivities
 from physworld.trace.unknowns import Unknown, of_parameter
 from physworld.trace.whitening import whitener
-from physworld.twin import Twin
+from physworld.twin.build import build_twin
+from physworld.twin.twin import Twin
 
 
 class Bar:

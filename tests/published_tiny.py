@@ -12,21 +12,22 @@ import numpy as np
 from safetensors.numpy import save as save_tensors
 from tiny_scene import register, tiny_scene
 
-from physworld.build import build_twin
 from physworld.demonstrate import DemonstrationConfig, derived_seed, make_episode
 from physworld.scene import Scene
-from physworld.twin import Twin
-from physworld.worldmodel.config import TrainingConfig, WorldModelConfig
+from physworld.twin.build import build_twin
+from physworld.twin.twin import Twin
 from physworld.worldmodel.dataset import read_track
+from physworld.worldmodel.model.config import TrainingConfig, WorldModelConfig
 from physworld.worldmodel.published import PublishedModel
 from physworld.worldmodel.scene_view import view_scene
 from physworld.worldmodel.training import train
-from schemas.base import Lineage
-from schemas.fit import FitConfig
-from schemas.model import TrainingConfig as WireConfig
-from storage import jobs, leases, registry
-from storage.artifacts import ArtifactStore
-from storage.database import Database
+from physworld_schemas.base import Lineage
+from physworld_schemas.fit import FitConfig
+from physworld_schemas.model import TrainingConfig as WireConfig
+from physworld_storage import registry
+from physworld_storage.artifacts import ArtifactStore
+from physworld_storage.database import Database
+from physworld_storage.jobs import jobs, leases
 
 NAME = "tiny-bar"
 FRAMES, EPISODES = 24, 6

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from made_scene import box_body, made_scene
 
-from physworld.build import build_twin
 from physworld.effects.base import Effect
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
+from physworld.twin.build import build_twin
 
 BUDGET, TRUE_PA, SIGMA = 60, 5e4, 5e-4
 

@@ -15,10 +15,10 @@ from typing import Any
 
 import psutil
 
-from storage import jobs
-from storage.database import Database, open_database
-from storage.settings import Settings
-from workers.stores import Stores
+from physworld_storage.database import Database, open_database
+from physworld_storage.jobs import jobs
+from physworld_storage.settings import Settings
+from physworld_workers.stores import Stores
 
 START_WITHIN_S = 120.0
 END_WITHIN_S = 30.0
@@ -26,7 +26,7 @@ POLL_S = 0.05
 
 
 class ServiceProcess:
-    """``python -m services.embedded`` on a data folder, in a session of its own; ended with the block."""
+    """``python -m physworld_services.embedded`` on a data folder, in a session of its own; ended with the block."""
 
     def __init__(self, data: Path, *options: str, variables: dict[str, str] | None = None) -> None:
         self.data = data
@@ -49,7 +49,14 @@ class ServiceProcess:
         """Start and wait until it says that it is ready."""
         with self.output.open("ab") as output:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "services.embedded", "--data", str(self.data), *self.options],
+                [
+                    sys.executable,
+                    "-m",
+                    "physworld_services.embedded",
+                    "--data",
+                    str(self.data),
+                    *self.options,
+                ],
                 cwd=Path(__file__).resolve().parents[1],
                 env={**environment(), **self.variables},
                 stdin=subprocess.DEVNULL,

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Scene
-from storage import resources
-from storage.artifacts import ArtifactStore
-from storage.database import Database
-from storage.scene_bundle import canonical_archive
+from physworld_scenes.bundle import canonical_archive
+from physworld_storage import resources
+from physworld_storage.artifacts import ArtifactStore
+from physworld_storage.database import Database
 
 FRAMES, FPS = 12, 30.0
 LENGTH_M, SIDE_M = 0.12, 0.03

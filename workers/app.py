@@ -23,8 +23,8 @@ from typing import Any
 from celery import Celery, signals
 from kombu import Exchange, Queue
 
-from schemas.queues import INFERENCE, SIMULATION, TASK_NAME, TRAINING
-from storage.settings import Settings
+from physworld_schemas.queues import INFERENCE, SIMULATION, TASK_NAME, TRAINING
+from physworld_storage.settings import Settings
 
 HARD_LIMIT_S = 12 * 3600
 SOFT_LIMIT_S = HARD_LIMIT_S - 60
@@ -107,7 +107,7 @@ def run_worker(settings: Settings, queue: str, name: str) -> int:
 
 
 def _run_shard(shard_id: str) -> None:
-    from workers.execute import process_runtime, run_shard
+    from physworld_workers.execute import process_runtime, run_shard
 
     run_shard(process_runtime(), shard_id)
 

@@ -14,12 +14,12 @@ import threading
 import time
 from types import TracebackType
 
-from schemas.job import Progress
-from storage import leases
-from storage.database import Database
-from storage.errors import DatabaseUnavailable
-from storage.settings import Settings
-from workers.errors import Cancelled, LeaseLost
+from physworld_schemas.job import Progress
+from physworld_storage.database import Database
+from physworld_storage.errors import DatabaseUnavailable
+from physworld_storage.jobs import leases
+from physworld_storage.settings import Settings
+from physworld_workers.errors import Cancelled, LeaseLost
 
 logger = logging.getLogger(__name__)
 

@@ -1,11 +1,11 @@
-"""Moves work from the database to the broker, and back when somebody dies: ``python -m workers.dispatcher``.
+"""Moves work from the database to the broker, and back when somebody dies: ``python -m physworld_workers.dispatcher``.
 
-Whenever somebody commits (``storage.changes``), ten times a second at most: publish the shards that wait (an outbox:
-publish first, then mark; a crash in between publishes twice, which a claim by compare-and-set makes harmless). Every
-second while shards wait or run: publish those whose time has come, take back leases that ran out, at once those whose
-owner on this host is provably dead, and look how deep the broker's queues are. While there is no work: one question to
-the database every two seconds, should a change have gone unheard, and none to the broker. Every five minutes: forget
-the idempotency keys of more than a day ago, and remove what jobs that have ended left in the scratch.
+Whenever somebody commits (``physworld_storage.changes``), ten times a second at most: publish the shards that wait (an
+outbox: publish first, then mark; a crash in between publishes twice, which a claim by compare-and-set makes harmless).
+Every second while shards wait or run: publish those whose time has come, take back leases that ran out, at once those
+whose owner on this host is provably dead, and look how deep the broker's queues are. While there is no work: one
+question to the database every two seconds, should a change have gone unheard, and none to the broker. Every five
+minutes: forget the idempotency keys of more than a day ago, and remove what jobs that have ended left in the scratch.
 
 A queue that is empty in two looks while shards of it wait has lost their messages: they are published again
 after two seconds instead of ``republish_seconds``. A queue that is deep gets nothing more, so the broker
@@ -30,16 +30,17 @@ from celery import Celery
 from kombu.exceptions import OperationalError as BrokerError
 from redis.exceptions import RedisError
 
-from schemas.queues import INFERENCE, SIMULATION, TASK_NAME, TRAINING
-from storage import idempotency, leases
-from storage.changes import Changes
-from storage.database import Database, open_database
-from storage.errors import DatabaseUnavailable, StoreError
-from storage.scratch import ScratchStore
-from storage.settings import Settings, get_settings
-from workers.app import READY_FILE_VARIABLE, create_app
-from workers.housekeeping import remove_ended_scratch, remove_orphan_episodes
-from workers.owner import owner_is_gone
+from physworld_schemas.queues import INFERENCE, SIMULATION, TASK_NAME, TRAINING
+from physworld_storage import idempotency
+from physworld_storage.changes import Changes
+from physworld_storage.database import Database, open_database
+from physworld_storage.errors import DatabaseUnavailable, StoreError
+from physworld_storage.jobs import leases
+from physworld_storage.scratch import ScratchStore
+from physworld_storage.settings import Settings, get_settings
+from physworld_workers.app import READY_FILE_VARIABLE, create_app
+from physworld_workers.housekeeping import remove_ended_scratch, remove_orphan_episodes
+from physworld_workers.owner import owner_is_gone
 
 logger = logging.getLogger(__name__)
 

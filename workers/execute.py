@@ -21,18 +21,18 @@ from celery.exceptions import SoftTimeLimitExceeded
 from physworld.errors import Cancelled as LibraryCancelled
 from physworld.errors import PhysworldError
 from physworld.worldmodel.errors import WorldModelError
-from schemas.base import Problem
-from schemas.job import TERMINAL_STATES
-from storage import leases
-from storage.database import Database, open_database
-from storage.errors import DatabaseUnavailable, StorageError, StoreReadFailed, StoreWriteFailed
-from storage.settings import Settings, get_settings
-from storage.tables import JobRow
-from workers.context import TaskContext
-from workers.errors import Cancelled, LeaseLost, NotEnoughDisk, UnknownShardKind, WorkerError
-from workers.owner import process_owner
-from workers.registry import Handler, HandlerResult, handler_of
-from workers.stores import Stores
+from physworld_schemas.base import Problem
+from physworld_schemas.job import TERMINAL_STATES
+from physworld_storage.database import Database, open_database
+from physworld_storage.errors import DatabaseUnavailable, StorageError, StoreReadFailed, StoreWriteFailed
+from physworld_storage.jobs import leases
+from physworld_storage.settings import Settings, get_settings
+from physworld_storage.tables import JobRow
+from physworld_workers.context import TaskContext
+from physworld_workers.errors import Cancelled, LeaseLost, NotEnoughDisk, UnknownShardKind, WorkerError
+from physworld_workers.owner import process_owner
+from physworld_workers.registry import Handler, HandlerResult, handler_of
+from physworld_workers.stores import Stores
 
 logger = logging.getLogger(__name__)
 

@@ -6,13 +6,13 @@ from datetime import timedelta
 
 from sqlalchemy import select
 
-from schemas.job import TERMINAL_STATES
-from storage import resources
-from storage.clock import database_now
-from storage.database import Database
-from storage.scratch import ScratchStore
-from storage.settings import Settings
-from storage.tables import DatasetRow, JobRow
+from physworld_schemas.job import TERMINAL_STATES
+from physworld_storage import resources
+from physworld_storage.clock import database_now
+from physworld_storage.database import Database
+from physworld_storage.scratch import ScratchStore
+from physworld_storage.settings import Settings
+from physworld_storage.tables import DatasetRow, JobRow
 
 FAILED_KEPT = timedelta(days=7)  # journals and checkpoints of a failed job
 SWEPT_FOR = timedelta(days=1)  # a dataset that failed or was cancelled, so long after its end
@@ -50,7 +50,7 @@ def remove_orphan_episodes(settings: Settings, database: Database) -> list[str]:
         }
     if not kept:
         return []
-    from storage.episodes import EpisodeStore  # zarr, which the dispatcher seldom needs
+    from physworld_storage.episodes import EpisodeStore  # zarr, which the dispatcher seldom needs
 
     episodes = EpisodeStore(settings)
     return [path for dataset_id, paths in kept.items() for path in episodes.remove_orphans(dataset_id, paths)]

@@ -9,10 +9,10 @@ from physworld.calibrate import CalibrationConfig, Journal
 from physworld.calibrate.global_stage import prior_twin
 from physworld.calibrate.law_choice import PURELY_ELASTIC, LawChoice, choose_law
 from physworld.calibrate.search import Progress
+from physworld.estimation.simulations import Runner, in_turn
 from physworld.scene import Scene
-from physworld.simulations import Runner, in_turn
-from workers.law_endpoint import law_endpoint
-from workers.motion_picture import motion_pictures
+from physworld_workers.law_endpoint import law_endpoint
+from physworld_workers.motion_picture import motion_pictures
 
 AUTO = "auto"
 

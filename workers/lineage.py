@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import physworld
-from schemas.base import Lineage, Reference
+from physworld_schemas.base import Lineage, Reference
 
 
 def lineage_of(

@@ -8,12 +8,12 @@ from dataclasses import replace
 from physworld.calibrate import CalibrationConfig, FitResult, Journal, calibrate_in_stages
 from physworld.calibrate.search import Progress
 from physworld.calibrate.stages import GLOBAL, Stages
-from physworld.mpm.triangles import Mesh, mesh_of
+from physworld.engine.thin.triangles import Mesh, mesh_of
+from physworld.estimation.simulations import Drive, Runner, in_turn
 from physworld.scene import Scene
-from physworld.simulations import Drive, Runner, in_turn
 from physworld.trace.meshes import recorded_as
 from physworld.trace.simulations import Simulations
-from physworld.twin import Twin
+from physworld.twin.twin import Twin
 
 AUTO, PLATE = "auto", "plate"
 _MISFIT = "chi2_per_residual"
@@ -37,7 +37,7 @@ def fitted_as_recorded(
     misfit is taken. A body that is no such sheet, or is asked for with other physics, is fitted as without it.
 
     Args:
-        asked: None or "plate", a mesh as :meth:`physworld.mpm.triangles.Mesh.read` takes it, or "auto".
+        asked: None or "plate", a mesh as :meth:`physworld.engine.thin.triangles.Mesh.read` takes it, or "auto".
         config: settings of the calibration; its mesh is replaced.
         stages, progress, cancelled, journal, runner: of :func:`physworld.calibrate.calibrate_in_stages`.
 

@@ -2,7 +2,7 @@
 
 A handler is ``run(context: TaskContext, stores: Stores) -> HandlerResult``. The table holds import strings,
 so that starting a worker imports neither ``torch`` nor ``warp``, and so that a service can add its own
-kinds (``services.trainer`` registers ``training``) without the workers knowing of it.
+kinds (``physworld_services.trainer`` registers ``training``) without the workers knowing of it.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from workers.errors import UnknownShardKind
+from physworld_workers.errors import UnknownShardKind
 
 if TYPE_CHECKING:
-    from workers.context import TaskContext
-    from workers.stores import Stores
+    from physworld_workers.context import TaskContext
+    from physworld_workers.stores import Stores
 
 
 @dataclass(frozen=True)
@@ -30,12 +30,12 @@ class HandlerResult:
 Handler = Callable[["TaskContext", "Stores"], HandlerResult]
 
 _HANDLERS: dict[str, str] = {
-    "fit": "workers.tasks.fit:run",
-    "trace": "workers.tasks.trace:run",
-    "simulation": "workers.tasks.shared_runs:simulate",
-    "dataset_plan": "workers.tasks.dataset:plan",
-    "episode": "workers.tasks.dataset:episode",
-    "dataset_seal": "workers.tasks.dataset:seal",
+    "fit": "physworld_workers.tasks.fit:run",
+    "trace": "physworld_workers.tasks.trace:run",
+    "simulation": "physworld_workers.tasks.shared_runs:simulate",
+    "dataset_plan": "physworld_workers.tasks.dataset:plan",
+    "episode": "physworld_workers.tasks.dataset:episode",
+    "dataset_seal": "physworld_workers.tasks.dataset:seal",
 }
 
 

@@ -6,11 +6,11 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from typing import Any, TypeVar
 
-from storage.artifacts import ArtifactStore
-from storage.database import Database
-from storage.episodes import EpisodeStore
-from storage.scratch import ScratchStore
-from storage.settings import Settings
+from physworld_storage.artifacts import ArtifactStore
+from physworld_storage.database import Database
+from physworld_storage.episodes import EpisodeStore
+from physworld_storage.scratch import ScratchStore
+from physworld_storage.settings import Settings
 
 Value = TypeVar("Value")
 CACHE_ENTRIES = 4

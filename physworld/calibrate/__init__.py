@@ -2,8 +2,8 @@
 
 from physworld.calibrate.estimates import Correlations, Estimate
 from physworld.calibrate.global_stage import CalibrationConfig, FitResult, calibrate
-from physworld.calibrate.journal import Journal
 from physworld.calibrate.stages import Stages, calibrate_in_stages
+from physworld.estimation.journal import Journal
 
 __all__ = [
     "CalibrationConfig",

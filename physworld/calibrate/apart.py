@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from physworld.calibrate.least_squares import most_runs
 from physworld.calibrate.optimum import Descent, Optimum, Place
 from physworld.calibrate.search import Search
 from physworld.calibrate.side_by_side import in_step, measured_together
-from physworld.simulations import in_turn
+from physworld.estimation.least_squares import most_runs
+from physworld.estimation.simulations import in_turn
 
 
 def solve_apart(asked: list[tuple[Search, Descent]]) -> list[Optimum]:

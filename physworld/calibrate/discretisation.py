@@ -18,9 +18,9 @@ import numpy as np
 
 from physworld.calibrate.estimates import Estimate
 from physworld.calibrate.global_stage import FitResult
+from physworld.estimation.simulations import Drive, Job, Runner, in_turn
 from physworld.evaluate.numerics import REFINEMENT, refined, trusted_tracks
 from physworld.scene import Scene
-from physworld.simulations import Drive, Job, Runner, in_turn
 
 _ORDER = 2
 _DOUBT = 0.5  # of the correction

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from physworld.calibrate.least_squares import Solution, block_covariance, correlations, interval_factor
 from physworld.calibrate.parameters import Parameter
+from physworld.estimation.least_squares import Solution, block_covariance, correlations, interval_factor
 from physworld.scene import Scene
-from physworld.twin import Twin
+from physworld.twin.twin import Twin
 
 UNIDENTIFIED_HALF_WIDTH = {"log": 1.5, "linear": 0.25}
 """Half width of a 95 % interval, in the scale of the search, beyond which the data do not fix a value."""

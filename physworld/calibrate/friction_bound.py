@@ -3,8 +3,8 @@
 Friction that is proportional to stiffness damps the lattice's fastest motions most, and an explicit step has to
 resolve that: beyond a point the stable time step is inversely proportional to it. A recording shows nothing of these
 motions. So the search ends where that step is ``SLOWEST`` times smaller than without friction; a value found there is
-reported to be at the bound of its search. Beyond it a run takes sub-steps of friction (:mod:`physworld.mpm.relaxation`)
-and twice the time and more.
+reported to be at the bound of its search. Beyond it a run takes sub-steps of friction
+(:mod:`physworld.engine.total.relaxation`) and twice the time and more.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from dataclasses import replace
 from scipy.optimize import brentq
 
 from physworld.calibrate.parameters import Parameter
-from physworld.mpm.total_lagrangian import TotalLagrangian
+from physworld.engine.total.formulation import TotalLagrangian
 from physworld.scene import Scene
-from physworld.twin import Twin
+from physworld.twin.twin import Twin
 
 SLOWEST = 8.0  # times
 _NAMES = ("relaxation_s", "viscosity_pa_s")

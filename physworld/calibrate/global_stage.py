@@ -16,7 +16,7 @@
 
 Only training frames enter. The simulation's budget counts every run. A search that it cut short at any step, in which
 anything was left out for want of runs, has no intervals and did not converge. A journal of the finished steps makes it
-resumable: see :mod:`physworld.calibrate.journal`.
+resumable: see :mod:`physworld.estimation.journal`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from physworld.build import build_twin
 from physworld.calibrate.estimates import (
     NOT_CONVERGED,
     UNIDENTIFIED_HALF_WIDTH,
@@ -40,18 +39,19 @@ from physworld.calibrate.estimates import (
 )
 from physworld.calibrate.fibres import free_fibres
 from physworld.calibrate.friction_bound import affordable
-from physworld.calibrate.journal import Journal
-from physworld.calibrate.least_squares import Solution
 from physworld.calibrate.local_stage import LocalResult
 from physworld.calibrate.losses import training_losses
 from physworld.calibrate.optimum import Descent, Optimum
 from physworld.calibrate.parameters import Parameter, flow_law, parameters_of
 from physworld.calibrate.search import Progress, Search
+from physworld.engine.thin.triangles import Mesh
+from physworld.estimation.journal import Journal
+from physworld.estimation.least_squares import Solution
+from physworld.estimation.simulations import Runner, in_turn
 from physworld.materials.library import with_law
-from physworld.mpm.triangles import Mesh
 from physworld.scene import Scene
-from physworld.simulations import Runner, in_turn
-from physworld.twin import Twin
+from physworld.twin.build import build_twin
+from physworld.twin.twin import Twin
 
 _LEAST_SCREENED = (
     0.1  # share of the gain that it needs which a parameter must show to first order to be tried
@@ -74,11 +74,12 @@ class CalibrationConfig:
         damping: "auto" adds drag and internal friction where the data ask; "none" keeps the declared physics only.
         bending: "auto" frees how a sheet bends where the data ask; "declared" keeps what its thickness says.
         law: name of the elastic law (:mod:`physworld.materials.library`); None for the shape's usual one.
-        formulation: "auto", "total_lagrangian" or "updated_lagrangian": see :mod:`physworld.mpm.choose`.
+        formulation: "auto", "total_lagrangian" or "updated_lagrangian": see :mod:`physworld.engine.choose`.
         transfer: of the updated Lagrangian form, "apic" or "asflip".
         plasticity: name of the flow law (:mod:`physworld.materials.plastic`), whose yield is searched too; None for an
             elastic body.
-        mesh: of a sheet, the mesh of triangles that recorded it (:mod:`physworld.mpm.triangles`); None for a plate.
+        mesh: of a sheet, the mesh of triangles that recorded it (:mod:`physworld.engine.thin.triangles`); None for a
+        plate.
     """
 
     particle_budget: int = 2000

@@ -29,13 +29,13 @@ from physworld.calibrate.global_stage import (
     searched_parameters,
     select,
 )
-from physworld.calibrate.journal import Journal
 from physworld.calibrate.optimum import Descent, Optimum
 from physworld.calibrate.parameters import WEAVE, Parameter
 from physworld.calibrate.search import Progress, Search
 from physworld.errors import LawAnswerRefused, LawAnswerUnavailable, SceneUnsupported
+from physworld.estimation.journal import Journal
+from physworld.estimation.simulations import Runner, in_turn
 from physworld.scene import Scene
-from physworld.simulations import Runner, in_turn
 
 PROMPT = """Analyze the video of object-hand interaction and recommend optimal MPM constitutive models from the following library:
 - Elastic Models: FCR, Neo-Hookean, St. Venant-Kirchhoff, Anisotropic Hyperelastic

@@ -15,17 +15,17 @@ from typing import Any
 import numpy as np
 from scipy.optimize import OptimizeResult, minimize
 
-from physworld.calibrate.journal import Journal
+from physworld.engine.gradients.gradient_twin import TwinRun
 from physworld.errors import CalibrationError, Cancelled, SimulationError
+from physworld.estimation.journal import Journal
+from physworld.estimation.simulations import Drive, Job, Runner, in_turn
 from physworld.geometry.features import carry_features, part_features
-from physworld.mpm.gradient_twin import TwinRun
-from physworld.properties import together
 from physworld.scene import Scene
-from physworld.simulations import Drive, Job, Runner, in_turn
-from physworld.twin import Twin
+from physworld.twin.properties import together
+from physworld.twin.twin import Twin
 
 FIELDS = ("stiffness", "density", "friction")
-"""Columns of the properties of :meth:`physworld.twin.Twin.simulate`."""
+"""Columns of the properties of :meth:`physworld.twin.twin.Twin.simulate`."""
 _INDUCING = 300  # particles that the modes are computed from
 _FAILED = 1e3  # value of a run that blew up, in units of the homogeneous fit's error
 _FARTHEST = (

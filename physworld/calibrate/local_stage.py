@@ -8,8 +8,8 @@ is minimised over the training frames is
 
     mean squared error / that of the homogeneous fit + strength * |z|^2
 
-by BFGS with the reverse-mode gradient (:mod:`physworld.mpm.gradient_twin`). The modulus itself outweighs every mode a
-hundredfold, so the first Hessian is that of Gauss and Newton, from one run a coefficient.
+by BFGS with the reverse-mode gradient (:mod:`physworld.engine.gradients.gradient_twin`). The modulus itself outweighs
+every mode a hundredfold, so the first Hessian is that of Gauss and Newton, from one run a coefficient.
 
 A field of the friction under a body is searched only if the data know it: what they say of its best coefficient, the
 others marginalised, is weighed against the prior (:meth:`FieldSearch.known`); else it is held at its prior and reported
@@ -26,12 +26,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from physworld.calibrate.journal import Journal
 from physworld.calibrate.local_search import FieldSearch, LocalConfig
 from physworld.errors import CalibrationError, SimulationError
+from physworld.estimation.journal import Journal
+from physworld.estimation.simulations import Runner, in_turn
 from physworld.scene import Scene
-from physworld.simulations import Runner, in_turn
-from physworld.twin import Twin
+from physworld.twin.twin import Twin
 
 _WORTH = 0.9  # of the validation error is what a weaker prior may leave at most
 _KNOWN = (

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from physworld.twin import Twin
+from physworld.twin.twin import Twin
 
 _BESIDE = 0.1  # of a cell: how far beside a point its neighbours are followed
 

@@ -32,7 +32,7 @@ from physworld.materials.plastic import (
 )
 from physworld.materials.sheet import OrthotropicSheetLaw
 from physworld.materials.transversely_isotropic import TransverselyIsotropic
-from physworld.twin import Twin
+from physworld.twin.twin import Twin
 
 TWIST_RATIO = "bending_twist_ratio"
 BENDING_RATIO = "bending_ratio"  # D over K h^2 / 12

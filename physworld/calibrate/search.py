@@ -16,17 +16,17 @@ from typing import Any
 
 import numpy as np
 
-from physworld.calibrate.journal import Journal
-from physworld.calibrate.least_squares import Descent as LeastSquares
-from physworld.calibrate.least_squares import Solution, descent, differences, most_runs, probes_of
 from physworld.calibrate.material_frames import material_frames
 from physworld.calibrate.optimum import Descended, Descent, Optimum, Place, cost_of
 from physworld.calibrate.parameters import Parameter
 from physworld.calibrate.side_by_side import in_step, measured_together
 from physworld.errors import CalibrationError, Cancelled, SimulationError
+from physworld.estimation.journal import Journal
+from physworld.estimation.least_squares import Descent as LeastSquares
+from physworld.estimation.least_squares import Solution, descent, differences, most_runs, probes_of
+from physworld.estimation.simulations import Drive, Job, Runner, in_turn
 from physworld.scene import UNDEFORMED_AT_REST, Scene
-from physworld.simulations import Drive, Job, Runner, in_turn
-from physworld.twin import Twin
+from physworld.twin.twin import Twin
 
 Progress = Callable[[int, int, str], None]
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from physworld.calibrate.optimum import Descended, Descent, Optimum, Place
-from physworld.simulations import idle_beside
+from physworld.estimation.simulations import idle_beside
 
 if TYPE_CHECKING:
     from physworld.calibrate.search import Search

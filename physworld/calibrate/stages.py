@@ -14,14 +14,14 @@ from typing import Literal, get_args
 import numpy as np
 
 from physworld.calibrate.global_stage import CalibrationConfig, FitResult, calibrate, prior_twin
-from physworld.calibrate.journal import Journal
 from physworld.calibrate.local_search import LocalConfig
 from physworld.calibrate.local_stage import LocalResult, fit_fields
 from physworld.calibrate.losses import training_losses
 from physworld.calibrate.search import Progress
 from physworld.errors import CalibrationError, NotDifferentiable, SceneUnsupported
+from physworld.estimation.journal import Journal
+from physworld.estimation.simulations import Runner, in_turn
 from physworld.scene import Scene
-from physworld.simulations import Runner, in_turn
 
 Stages = Literal["global", "global+local"]
 GLOBAL: Stages = "global"

@@ -43,7 +43,7 @@ from physworld.scene import Scene
 from physworld.worldmodel.clock import model_dt
 
 if TYPE_CHECKING:
-    from physworld.twin import Twin
+    from physworld.twin.twin import Twin
 
 Progress = Callable[[int, int], None]
 

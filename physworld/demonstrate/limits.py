@@ -24,7 +24,7 @@ from physworld.scene import Scene
 from physworld.worldmodel.clock import model_dt, resample
 
 if TYPE_CHECKING:
-    from physworld.twin import Twin
+    from physworld.twin.twin import Twin
 
 REACH_FLOOR = 0.25  # in object sizes: the smallest reach in every direction
 SPEED_FLOOR = 1.5  # in object sizes per second

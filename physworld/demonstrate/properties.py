@@ -24,7 +24,7 @@ from physworld.geometry.features import carry_features, part_features
 from physworld.scene import Scene
 
 if TYPE_CHECKING:
-    from physworld.twin import Twin
+    from physworld.twin.twin import Twin
 
 NEIGHBOURS = 4
 Z95 = 1.959964  # half-width of a 95 % interval in standard deviations

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from physworld.batch import Episode, simulate_batch
 from physworld.demonstrate.config import DemonstrationConfig
 from physworld.demonstrate.episode import (
     EpisodePlan,
@@ -25,9 +24,10 @@ from physworld.demonstrate.episode import (
 )
 from physworld.errors import BatchRefused, SimulationError
 from physworld.scene import Scene
+from physworld.twin.batch import Episode, simulate_batch
 
 if TYPE_CHECKING:
-    from physworld.twin import Twin
+    from physworld.twin.twin import Twin
 
 Made = tuple[dict[str, np.ndarray], dict[str, Any]]
 

@@ -17,16 +17,16 @@ import warp as wp
 from physworld.effects.base import Effect, Strength
 from physworld.effects.ground_friction import no_ground
 from physworld.effects.places import body_size, gravity_size
+from physworld.engine.lattice.bspline import GAUSS_POINTS
+from physworld.engine.problem import Problem
+from physworld.engine.terms.contact import GroundContact, surface_points
+from physworld.engine.terms.term import BoundTerm
+from physworld.engine.total.node_kernels import weighted_sum
+from physworld.engine.updated.terms import ParticleBody
 from physworld.errors import SceneUnsupported
-from physworld.mpm.bspline import GAUSS_POINTS
-from physworld.mpm.contact import GroundContact, surface_points
-from physworld.mpm.node_kernels import weighted_sum
-from physworld.mpm.particle_terms import ParticleBody
-from physworld.mpm.problem import Problem
-from physworld.mpm.terms import BoundTerm
 
 if TYPE_CHECKING:
-    from physworld.twin import Twin
+    from physworld.twin.twin import Twin
 
 
 @wp.kernel

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from physworld.effects.base import Effect, Strength
-from physworld.mpm.particle_terms import ParticleBody
-from physworld.mpm.problem import Problem
-from physworld.mpm.terms import BoundTerm
+from physworld.engine.problem import Problem
+from physworld.engine.terms.term import BoundTerm
+from physworld.engine.updated.terms import ParticleBody
 
 if TYPE_CHECKING:
-    from physworld.twin import Twin
+    from physworld.twin.twin import Twin
 
 
 @wp.kernel

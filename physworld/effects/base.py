@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 
-from physworld.mpm.problem import HeldNodes, Problem
+from physworld.engine.problem import HeldNodes, Problem
 
 if TYPE_CHECKING:
-    from physworld.twin import Twin
+    from physworld.twin.twin import Twin
 
 Kind = Literal["force", "stress", "boundary", "field", "measurement"]
 

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from physworld.effects.base import Effect, Strength
-from physworld.mpm.problem import Problem
+from physworld.engine.problem import Problem
 
 if TYPE_CHECKING:
-    from physworld.twin import Twin
+    from physworld.twin.twin import Twin
 
 
 @dataclass(frozen=True)

@@ -20,10 +20,10 @@ from scipy.spatial.transform import Rotation
 
 from physworld.effects.base import Effect, Strength
 from physworld.effects.places import body_size, held_count
-from physworld.mpm.problem import Problem
+from physworld.engine.problem import Problem
 
 if TYPE_CHECKING:
-    from physworld.twin import Twin
+    from physworld.twin.twin import Twin
 
 _LEAST_COMPLIANCE = 0.25
 

@@ -18,14 +18,14 @@ from scipy.spatial import cKDTree
 
 from physworld.effects.base import Effect, Strength
 from physworld.effects.places import gravity_size, held_count
-from physworld.mpm.node_kernels import on_path
-from physworld.mpm.particle_grips import particle_grips
-from physworld.mpm.particle_terms import ParticleBody
-from physworld.mpm.problem import HeldNodes, Problem, nodal_mass
-from physworld.mpm.terms import BoundTerm
+from physworld.engine.problem import HeldNodes, Problem, nodal_mass
+from physworld.engine.terms.term import BoundTerm
+from physworld.engine.total.node_kernels import on_path
+from physworld.engine.updated.grips import particle_grips
+from physworld.engine.updated.terms import ParticleBody
 
 if TYPE_CHECKING:
-    from physworld.twin import Twin
+    from physworld.twin.twin import Twin
 
 
 _SOFT = 1 / 200  # cells: softer grips are no small change from springs on nodes that are all held

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING
 
 from physworld.effects.base import Effect, Strength
 from physworld.effects.places import body_size
-from physworld.mpm.contact import GroundContact
-from physworld.mpm.problem import Problem
+from physworld.engine.problem import Problem
+from physworld.engine.terms.contact import GroundContact
 
 if TYPE_CHECKING:
-    from physworld.twin import Twin
+    from physworld.twin.twin import Twin
 
 
 @dataclass(frozen=True)

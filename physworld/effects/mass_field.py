@@ -15,10 +15,10 @@ import numpy as np
 
 from physworld.effects.base import Effect, Strength
 from physworld.effects.stiffness_field import field_strengths, log_field
-from physworld.mpm.problem import Problem
+from physworld.engine.problem import Problem
 
 if TYPE_CHECKING:
-    from physworld.twin import Twin
+    from physworld.twin.twin import Twin
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from scipy.interpolate import PchipInterpolator
 from physworld.effects.base import Effect, Strength
 
 if TYPE_CHECKING:
-    from physworld.twin import Twin
+    from physworld.twin.twin import Twin
 
 
 @dataclass(frozen=True)

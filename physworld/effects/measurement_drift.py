@@ -13,7 +13,7 @@ import numpy as np
 from physworld.effects.base import Effect, Strength
 
 if TYPE_CHECKING:
-    from physworld.twin import Twin
+    from physworld.twin.twin import Twin
 
 
 @dataclass(frozen=True)

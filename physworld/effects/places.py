@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from physworld.mpm.lattice import Lattice
+from physworld.engine.lattice.lattice import Lattice
 
 if TYPE_CHECKING:
-    from physworld.twin import Twin
+    from physworld.twin.twin import Twin
 
 
 def body_size(twin: Twin) -> float:

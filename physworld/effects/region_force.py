@@ -15,12 +15,12 @@ import warp as wp
 
 from physworld.effects.base import Effect, Strength
 from physworld.effects.places import body_size, free_end, gravity_size, region_shares, region_weights
-from physworld.mpm.particle_terms import ParticleBody
-from physworld.mpm.problem import Problem
-from physworld.mpm.terms import BoundTerm
+from physworld.engine.problem import Problem
+from physworld.engine.terms.term import BoundTerm
+from physworld.engine.updated.terms import ParticleBody
 
 if TYPE_CHECKING:
-    from physworld.twin import Twin
+    from physworld.twin.twin import Twin
 
 _RADIUS = 0.1  # of the body's size
 

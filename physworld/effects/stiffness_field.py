@@ -15,11 +15,11 @@ import numpy as np
 
 from physworld.effects.base import Effect, Strength
 from physworld.effects.places import unit_coordinates
-from physworld.mpm.lattice import Lattice
-from physworld.mpm.problem import Problem
+from physworld.engine.lattice.lattice import Lattice
+from physworld.engine.problem import Problem
 
 if TYPE_CHECKING:
-    from physworld.twin import Twin
+    from physworld.twin.twin import Twin
 
 _AXES = ("x", "y", "z")
 

@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from physworld.effects.base import Effect, Strength
-from physworld.mpm.problem import Problem
-from physworld.mpm.stress import StressTerm
-from physworld.mpm.stress_kernels import rod_model, sheet_model, solid_model
+from physworld.engine.problem import Problem
+from physworld.engine.total.stress import StressTerm
+from physworld.engine.total.stress_kernels import rod_model, sheet_model, solid_model
 
 if TYPE_CHECKING:
-    from physworld.twin import Twin
+    from physworld.twin.twin import Twin
 
 _DESIGN_STRAIN = (
     0.15  # strain up to which the stable time step is safe; beyond it the run may stop with an error

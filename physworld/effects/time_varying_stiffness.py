@@ -15,17 +15,17 @@ import numpy as np
 import warp as wp
 
 from physworld.effects.base import Effect, Strength
+from physworld.engine.problem import Problem
+from physworld.engine.terms.term import BoundTerm
+from physworld.engine.total.forces import InternalForces
+from physworld.engine.total.stability import fastest_frequency
+from physworld.engine.updated.stress_kernels import grow_stress
+from physworld.engine.updated.terms import BoundParticleStress, ParticleBody
 from physworld.errors import CFLViolation
 from physworld.materials.laws import friction_law
-from physworld.mpm.forces import InternalForces
-from physworld.mpm.particle_stress_kernels import grow_stress
-from physworld.mpm.particle_terms import BoundParticleStress, ParticleBody
-from physworld.mpm.problem import Problem
-from physworld.mpm.stability import fastest_frequency
-from physworld.mpm.terms import BoundTerm
 
 if TYPE_CHECKING:
-    from physworld.twin import Twin
+    from physworld.twin.twin import Twin
 
 _COVERED = 2.0  # growth of the stiffness that the stable time step's own margin covers
 

@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING
 
 from physworld.effects.base import Effect, Strength
 from physworld.effects.places import body_size, gravity_size
-from physworld.mpm.problem import Problem
-from physworld.mpm.stress import StressTerm
-from physworld.mpm.stress_kernels import rod_model, sheet_model, solid_model
+from physworld.engine.problem import Problem
+from physworld.engine.total.stress import StressTerm
+from physworld.engine.total.stress_kernels import rod_model, sheet_model, solid_model
 
 if TYPE_CHECKING:
-    from physworld.twin import Twin
+    from physworld.twin.twin import Twin
 
 _MODELS = {
     3: solid_model(

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING
 
 from physworld.effects.base import Effect, Strength
 from physworld.effects.places import body_size, gravity_size
-from physworld.mpm.problem import Problem
+from physworld.engine.problem import Problem
 
 if TYPE_CHECKING:
-    from physworld.twin import Twin
+    from physworld.twin.twin import Twin
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,10 @@ import numpy as np
 
 from physworld.effects.base import Effect, Strength
 from physworld.effects.places import gravity_size
-from physworld.mpm.problem import Problem
+from physworld.engine.problem import Problem
 
 if TYPE_CHECKING:
-    from physworld.twin import Twin
+    from physworld.twin.twin import Twin
 
 
 @dataclass(frozen=True)

@@ -20,17 +20,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from physworld.build import build_twin
+from physworld.engine.total.energy import EnergyLedger, run_with_ledger
+from physworld.engine.total.formulation import TotalLagrangian
+from physworld.engine.updated.energy import ParticleLedger, run_particles_with_ledger
 from physworld.errors import SceneUnsupported, SimulationError
-from physworld.integration import Integration
+from physworld.estimation.simulations import Drive, Job, Runner, in_turn
 from physworld.materials.laws import without_friction
-from physworld.mpm.energy import EnergyLedger, run_with_ledger
-from physworld.mpm.particle_energy import ParticleLedger, run_particles_with_ledger
-from physworld.mpm.total_lagrangian import TotalLagrangian
-from physworld.properties import carried
 from physworld.scene import Scene
-from physworld.simulations import Drive, Job, Runner, in_turn
-from physworld.twin import Twin
+from physworld.twin.build import build_twin
+from physworld.twin.integration import Integration
+from physworld.twin.properties import carried
+from physworld.twin.twin import Twin
 
 REFINEMENT = 1.5  # cells of the finer lattice are this many times smaller
 _STILL = 1e-3  # a free run whose points move less than this share of the body's size is kicked

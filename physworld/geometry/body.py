@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from physworld.mpm.lattice import Lattice
+from physworld.engine.lattice.lattice import Lattice
 from physworld.scene import Scene
 
 _NEIGHBOURS = 6  # points that tell where another one was before it was seen

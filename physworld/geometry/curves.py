@@ -11,8 +11,8 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
+from physworld.engine.lattice.lattice import Lattice
 from physworld.errors import SceneUnsupported
-from physworld.mpm.lattice import Lattice
 from physworld.scene import Scene
 
 _VELOCITY_WINDOW_S = 0.06  # frames within this time of the first give the start's velocity

@@ -16,6 +16,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from physworld.engine.lattice.lattice import Lattice, lattice_from_cells
+from physworld.engine.thin.triangles import Mesh
 from physworld.errors import SceneUnsupported
 from physworld.geometry.alignment import cells_along, faces_along
 from physworld.geometry.body import ReferenceBody, first_points
@@ -23,8 +25,6 @@ from physworld.geometry.curves import fit_nodes, straight_extent
 from physworld.geometry.declared import grips_of, load_of
 from physworld.geometry.filling import filled_body, inside_surface_points
 from physworld.geometry.sheet_body import SHEET_KINDS, THIN, plane_of, sheet_body
-from physworld.mpm.lattice import Lattice, lattice_from_cells
-from physworld.mpm.triangles import Mesh
 from physworld.scene import AS_MEASURED, Scene
 
 ROD_KINDS = ("rope", "rod")

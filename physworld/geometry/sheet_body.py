@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import ConvexHull
 
+from physworld.engine.lattice.lattice import Lattice
+from physworld.engine.thin.triangles import Mesh, triangle_lattice
 from physworld.errors import SceneUnsupported
 from physworld.geometry.body import ReferenceBody, first_points
 from physworld.geometry.curves import fit_nodes
 from physworld.geometry.sheet_cells import grips_in_plane, sheet_lattice
-from physworld.mpm.lattice import Lattice
-from physworld.mpm.triangles import Mesh, triangle_lattice
 from physworld.scene import Scene
 
 SHEET_KINDS = ("sheet", "cloth")

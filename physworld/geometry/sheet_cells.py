@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from physworld.engine.lattice.lattice import Lattice, lattice_from_cells
 from physworld.geometry.alignment import cells_along, faces_along
 from physworld.geometry.declared import grips_of
-from physworld.mpm.lattice import Lattice, lattice_from_cells
 from physworld.scene import Grip, Scene
 
 _FEWEST_CELLS = 3

@@ -3,7 +3,7 @@
     W = EA/2 (|x'| - 1)^2 + B/2 |k|^2       k = x' x x'' / |x'|^3       B = EI
 
 The rod is isotropic about its axis. Its twist decouples from the centre line but for the two ends of a piece that is
-held at both (Bergou et al. 2008): there GJ = ``torsion_ratio`` EI counts, as :mod:`physworld.mpm.twist` has it.
+held at both (Bergou et al. 2008): there GJ = ``torsion_ratio`` EI counts, as :mod:`physworld.engine.thin.twist` has it.
 """
 
 from __future__ import annotations

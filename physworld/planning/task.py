@@ -15,7 +15,7 @@ from physworld.demonstrate.limits import limits_of
 from physworld.errors import SceneUnsupported
 from physworld.planning.limits import GripLimits
 from physworld.scene import Scene
-from physworld.twin import Twin
+from physworld.twin.twin import Twin
 from physworld.worldmodel.clock import resample
 from physworld.worldmodel.published import PublishedModel
 

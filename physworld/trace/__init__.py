@@ -1,6 +1,6 @@
 """From a residual to a named effect: see :func:`physworld.trace.run.trace`."""
 
-from physworld.simulations import Workers
+from physworld.estimation.simulations import Workers
 from physworld.trace.config import TraceConfig
 from physworld.trace.report import document
 from physworld.trace.result import Named, Number, TraceResult

@@ -16,7 +16,7 @@ from physworld.effects.base import Strength
 from physworld.effects.places import body_size, middle_of_free_end
 from physworld.effects.registry import EFFECTS
 from physworld.trace.unknowns import Unknown, of_strength, with_strengths
-from physworld.twin import Twin
+from physworld.twin.twin import Twin
 
 Shape = dict[str, float]
 Mirror = Callable[[Shape], Shape]

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from physworld.simulations import Job
+from physworld.estimation.simulations import Job
 from physworld.trace.candidates import Candidate
 from physworld.trace.comparison import CrossValidation, better_beyond_chance, cross_validated
 from physworld.trace.holds import clamped_otherwise, held_otherwise

@@ -23,12 +23,12 @@ from typing import Any
 
 import numpy as np
 
+from physworld.estimation.simulations import Drive
 from physworld.scene import Scene
-from physworld.simulations import Drive
 from physworld.trace.experiment_search import ExperimentConfig, Search, Tried
 from physworld.trace.rivals import Rival, rival_of
 from physworld.trace.simulations import Simulations
-from physworld.twin import Twin
+from physworld.twin.twin import Twin
 
 __all__ = ["Experiment", "ExperimentConfig", "Rival", "propose", "rival_of"]
 

@@ -14,14 +14,14 @@ from itertools import permutations
 import numpy as np
 
 from physworld.demonstrate.limits import MotionLimits, limits_of
+from physworld.estimation.simulations import Drive, Job
 from physworld.scene import Scene
-from physworld.simulations import Drive, Job
 from physworld.trace.probing import COORDINATES, Motion, Probe, motion_of, nudged, random_probe
 from physworld.trace.rivals import Rival, reconciled, refit_of
 from physworld.trace.sensitivity import refinement_of
 from physworld.trace.simulations import Simulations
 from physworld.trace.unknowns import at
-from physworld.twin import Twin
+from physworld.twin.twin import Twin
 
 STAGE = "experiment"
 NUMERICS_AMPLITUDE = 3.0  # deviation of the solver's own error, over the change by finer cells

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from physworld.mpm.soft_grips import AS_HELD
+from physworld.engine.terms.soft_grips import AS_HELD
 from physworld.trace.refit import Refit, refit
 from physworld.trace.simulations import Simulations
 from physworld.trace.unknowns import REACH, SOFTNESS

@@ -11,7 +11,7 @@ from physworld.trace.confirm import Model
 from physworld.trace.refit import Refit, prior_rows
 from physworld.trace.result import Named, Number
 from physworld.trace.unknowns import Unknown, at
-from physworld.twin import Twin
+from physworld.twin.twin import Twin
 
 _STEP = 0.01  # of an unknown's step: what it changes in a derived number
 _TWO_SIDED = 1.96  # standard deviations of a 95 % interval

@@ -14,15 +14,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from physworld.build import build_twin
 from physworld.effects.registry import effect
+from physworld.engine.thin.triangles import Mesh
+from physworld.estimation.simulations import Job
 from physworld.geometry.sheet_body import possible_meshes
 from physworld.materials.sheet import SheetLaw
-from physworld.mpm.triangles import Mesh
 from physworld.scene import Scene
-from physworld.simulations import Job
 from physworld.trace.simulations import Simulations
-from physworld.twin import Twin
+from physworld.twin.build import build_twin
+from physworld.twin.twin import Twin
 
 _WINDOWS = (0.375, 0.5, 0.625, 0.75)  # shares of the training frames, from their beginning
 _STIFFNESSES = tuple(0.05 * k for k in range(-5, 6))  # logarithms, over the plate's

@@ -17,16 +17,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from physworld.build import build_twin
+from physworld.engine.thin.triangles import mesh_of
 from physworld.errors import SceneUnsupported
+from physworld.estimation.simulations import Drive, Job, Runner, in_turn, nodes_of
 from physworld.evaluate.numerics import refined
-from physworld.mpm.triangles import mesh_of
 from physworld.scene import Scene
-from physworld.simulations import Drive, Job, Runner, in_turn, nodes_of
 from physworld.trace.simulations import Memory, Progress, Simulations
 from physworld.trace.split import Split, freeze
 from physworld.trace.whitening import moved, responses
-from physworld.twin import Twin
+from physworld.twin.build import build_twin
+from physworld.twin.twin import Twin
 
 FITTED, HELD_OUT = "fitted", "held_out"
 

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from physworld.simulations import Job
+from physworld.estimation.simulations import Job
 from physworld.trace.sensitivity import sensitivities
 from physworld.trace.simulations import Simulations
 from physworld.trace.unknowns import Unknown, at
 from physworld.trace.whitening import Whitener
-from physworld.twin import Twin
+from physworld.twin.twin import Twin
 
 _SCALES = (1.0, 0.3)  # of a Gauss-Newton step, tried together
 _TOLERANCE = 2e-3  # relative fall of the cost that ends the search

@@ -13,7 +13,7 @@ from physworld.trace.held_out import HeldOut
 from physworld.trace.score import Scores
 from physworld.trace.split import Split
 from physworld.trace.verdict import DATA, NOTHING, Verdict
-from physworld.twin import Twin
+from physworld.twin.twin import Twin
 
 
 @dataclass(frozen=True)

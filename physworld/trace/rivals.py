@@ -16,7 +16,7 @@ from physworld.effects.registry import EFFECTS
 from physworld.trace.confirm import Model
 from physworld.trace.refit import prior_rows
 from physworld.trace.unknowns import Unknown, at
-from physworld.twin import Twin
+from physworld.twin.twin import Twin
 
 _RIDGE = 1e-9
 _AFFORDABLE, _AFFORDABLE_SHARE = (

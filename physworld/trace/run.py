@@ -18,10 +18,10 @@ import numpy as np
 
 from physworld.calibrate import Journal
 from physworld.calibrate.parameters import BENDING_COUPLING, BENDING_RATIO, TWIST_RATIO, parameters_of
+from physworld.engine.thin.triangles import TriangleLattice
 from physworld.errors import SceneUnsupported
-from physworld.mpm.triangles import TriangleLattice
+from physworld.estimation.simulations import Job, Runner, in_turn, stage_s
 from physworld.scene import Scene
-from physworld.simulations import Job, Runner, in_turn, stage_s
 from physworld.trace.beginning import Beginning
 from physworld.trace.candidates import Candidate, candidates
 from physworld.trace.comparison import cross_validated
@@ -76,7 +76,7 @@ from physworld.trace.verdict import (
     simplest_first,
 )
 from physworld.trace.whitening import Whitener, whitener
-from physworld.twin import Twin
+from physworld.twin.twin import Twin
 
 _POISSON_SPREAD = 0.08  # of what is known of a soft solid's Poisson's ratio beforehand
 _TWIST_SPREAD = 0.7  # of the logarithm of a sheet's twisting stiffness over an isotropic one's

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from physworld.simulations import Job
+from physworld.estimation.simulations import Job
 from physworld.trace.candidates import Candidate
 from physworld.trace.comparison import better_beyond_chance, cross_validated
 from physworld.trace.config import TraceConfig
@@ -26,7 +26,7 @@ from physworld.trace.simulations import Simulations
 from physworld.trace.unknowns import with_strengths
 from physworld.trace.verdict import accounts, as_good, simplest_first
 from physworld.trace.whitening import Whitener
-from physworld.twin import Twin
+from physworld.twin.twin import Twin
 
 Values = dict[tuple[str, ...], dict[str, float]]
 _AGREEMENT = 0.25  # share by which what an effect does may move with the resolution

@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from physworld.estimation.simulations import Job
 from physworld.evaluate.numerics import refined
 from physworld.scene import Scene
-from physworld.simulations import Job
 from physworld.trace.candidates import Candidate
 from physworld.trace.simulations import Simulations
 from physworld.trace.unknowns import Unknown, already, at
 from physworld.trace.whitening import Whitener
-from physworld.twin import Twin
+from physworld.twin.twin import Twin
 
 
 @dataclass(frozen=True)

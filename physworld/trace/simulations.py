@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from physworld.errors import Cancelled
-from physworld.simulations import Drive, Job, Runner, in_turn
+from physworld.estimation.simulations import Drive, Job, Runner, in_turn
 
 Progress = Callable[[int, int, str], None]
 

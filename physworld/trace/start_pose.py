@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from physworld.scene import AS_MEASURED, Scene
-from physworld.twin import Twin
+from physworld.twin.twin import Twin
 
 _LEAST_LEVER = 0.05  # of the body's size: points nearer to an axis than this say nothing of a turn about it
 

@@ -11,8 +11,8 @@ from physworld.calibrate.parameters import BENDING_RATIO, Parameter, bending_rat
 from physworld.effects.base import Strength
 from physworld.effects.places import gravity_size
 from physworld.effects.registry import EFFECTS
-from physworld.mpm.soft_grips import AS_HELD
-from physworld.twin import Twin
+from physworld.engine.terms.soft_grips import AS_HELD
+from physworld.twin.twin import Twin
 
 CLAMP = "clamp_offset"
 SOFTNESS = "grip_softness"

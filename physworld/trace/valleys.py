@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from physworld.simulations import Job
+from physworld.estimation.simulations import Job
 from physworld.trace.candidates import Candidate
 from physworld.trace.confirm import Confirmation, Model
 from physworld.trace.refit import Refit

@@ -14,7 +14,7 @@ import numpy as np
 
 from physworld.scene import Scene
 from physworld.trace.split import Split
-from physworld.twin import Twin
+from physworld.twin.twin import Twin
 
 _SHIFT_M = 1e-4  # of a tracked point, to see how its track answers
 

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from physworld.video.gaussians import Gaussians
-from physworld.worldmodel.skinning import (
+from physworld.worldmodel.model.skinning import (
     inverse_distance_weights,
     local_rotations,
     neighbourhoods,

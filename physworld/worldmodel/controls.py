@@ -8,7 +8,7 @@ from scipy.sparse.csgraph import connected_components
 
 from physworld.worldmodel.clock import clock_times, resample
 from physworld.worldmodel.errors import ControlsInvalid
-from physworld.worldmodel.graph import GraphSpec
+from physworld.worldmodel.model.graph import GraphSpec
 
 
 def grip_groups(spec: GraphSpec, controllers: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -11,10 +11,10 @@
 
 float32 but for the indices. V, C, n and h are the model's; the number of edges E is free, so that another graph over
 the same vertices (an edge that tore, a contact) can be given at each step; ``edge_list`` is the model's own. A model
-whose NEAR edges are those of the current shape (``physworld.worldmodel.nearest``) is given them by its caller: the
-search is no part of the program. The equations are those of ``physworld.worldmodel.model``, written edge by edge: the
-split form keeps its constants per graph and would freeze E. The substeps of a rope's chain are unrolled: one to two
-thousand operations more.
+whose NEAR edges are those of the current shape (``physworld.worldmodel.model.nearest``) is given them by its caller:
+the search is no part of the program. The equations are those of ``physworld.worldmodel.model.model``, written edge by
+edge: the split form keeps its constants per graph and would freeze E. The substeps of a rope's chain are unrolled: one
+to two thousand operations more.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from physworld.worldmodel.chain_step import ChainStep
-from physworld.worldmodel.graph import EDGE_KINDS, NEAR, GraphSpec
-from physworld.worldmodel.model import WorldModel
-from physworld.worldmodel.nearest import cut_rest_length, cut_strain, near_ends
+from physworld.worldmodel.model.graph import EDGE_KINDS, NEAR, GraphSpec
+from physworld.worldmodel.model.model import WorldModel
+from physworld.worldmodel.model.nearest import cut_rest_length, cut_strain, near_ends
+from physworld.worldmodel.priors.chain_step import ChainStep
 
 INPUTS = ("window", "control_next", "phi", "senders", "receivers", "kinds", "rest_relative")
 OUTPUT = "next"

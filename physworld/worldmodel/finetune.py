@@ -23,12 +23,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from physworld.worldmodel.config import FineTuneConfig
 from physworld.worldmodel.dataset import graph_origin
-from physworld.worldmodel.engine import RolloutEngine
 from physworld.worldmodel.errors import TrainingCancelled
-from physworld.worldmodel.model import PROPERTY_COUNT, WorldModel
-from physworld.worldmodel.skinning import Skin
+from physworld.worldmodel.model.config import FineTuneConfig
+from physworld.worldmodel.model.model import PROPERTY_COUNT, WorldModel
+from physworld.worldmodel.model.skinning import Skin
+from physworld.worldmodel.native.engine import RolloutEngine
 
 CHECK_EVERY = 5
 PATIENCE_CHECKS = 4

@@ -11,16 +11,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from physworld.build import PRIOR_FRICTION, build_twin
-from physworld.colliders import twin_colliders
 from physworld.errors import SceneUnsupported
 from physworld.geometry.rigid import rigid_motion
-from physworld.grips import soft_regions, with_touched_nodes
 from physworld.scene import Scene
-from physworld.twin import Twin
+from physworld.twin.build import PRIOR_FRICTION, build_twin
+from physworld.twin.colliders import twin_colliders
+from physworld.twin.grips import soft_regions, with_touched_nodes
+from physworld.twin.twin import Twin
 from physworld.worldmodel.clock import clock_times, resample, resample_smooth
+from physworld.worldmodel.model.skinning import affine_skin
 from physworld.worldmodel.published import PublishedModel
-from physworld.worldmodel.skinning import affine_skin
 
 _SKIN_STATES = 24
 _OTHER_SHAPE = 0.1  # of the body's size: a start that is farther away is another shape, not noise

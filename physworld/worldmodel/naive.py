@@ -1,7 +1,7 @@
 """The same network written the usual way: edge features concatenated with both ends' states, edge by edge.
 
 It shares a ``WorldModel``'s weights. It is the oracle of the tests and the yardstick of the benchmark, not
-meant to be used: it is several times slower. Equations and names: ``physworld.worldmodel.model``.
+meant to be used: it is several times slower. Equations and names: ``physworld.worldmodel.model.model``.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ import torch
 from torch import Tensor, nn
 
 from physworld.worldmodel.export import edge_list
-from physworld.worldmodel.graph import EDGE_KINDS, NEAR
-from physworld.worldmodel.model import WorldModel
-from physworld.worldmodel.nearest import cut_rest_length, cut_strain
+from physworld.worldmodel.model.graph import EDGE_KINDS, NEAR
+from physworld.worldmodel.model.model import WorldModel
+from physworld.worldmodel.model.nearest import cut_rest_length, cut_strain
 
 
 class NaiveWorldModel(nn.Module):

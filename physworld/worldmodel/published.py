@@ -1,6 +1,6 @@
 """A world model with everything that its scene needs, as named tensors and plain facts.
 
-Beside the network's tensors (``physworld.worldmodel.model``) a version holds, float32 unless said:
+Beside the network's tensors (``physworld.worldmodel.model.model``) a version holds, float32 unless said:
     rest.vertices (n, 3)          undeformed places of the object vertices [m]
     particle.index (n,) int64     the twin's particle that each object vertex is
     control.index (C,) int64      the controller that each control vertex is
@@ -27,16 +27,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from physworld.worldmodel.chain import ChainPrior
-from physworld.worldmodel.config import WorldModelConfig
-from physworld.worldmodel.engine import RolloutEngine
 from physworld.worldmodel.errors import VersionUnreadable, WorldModelError
-from physworld.worldmodel.graph import EDGE_KINDS, GraphSpec
-from physworld.worldmodel.inertia import InertialPrior
-from physworld.worldmodel.modal import ModalPrior
-from physworld.worldmodel.model import WorldModel
+from physworld.worldmodel.model.config import WorldModelConfig
+from physworld.worldmodel.model.graph import EDGE_KINDS, GraphSpec
+from physworld.worldmodel.model.inertia import InertialPrior
+from physworld.worldmodel.model.model import WorldModel
+from physworld.worldmodel.model.skinning import Skin
+from physworld.worldmodel.native.engine import RolloutEngine
+from physworld.worldmodel.priors.chain import ChainPrior
+from physworld.worldmodel.priors.modal import ModalPrior
 from physworld.worldmodel.rollout import rollout, rollout_batch
-from physworld.worldmodel.skinning import Skin
 
 CARD_SCHEMA = 1
 _OWN = ("rest.", "particle.", "control.", "phi", "start.", "skin.", "graph.")

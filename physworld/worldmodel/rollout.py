@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 
 from physworld.worldmodel.dataset import Track, graph_origin
-from physworld.worldmodel.engine import RolloutEngine
 from physworld.worldmodel.errors import GraphInvalid
-from physworld.worldmodel.graph import GraphSpec
-from physworld.worldmodel.model import WorldModel
+from physworld.worldmodel.model.graph import GraphSpec
+from physworld.worldmodel.model.model import WorldModel
+from physworld.worldmodel.native.engine import RolloutEngine
 
 Step = Callable[[Tensor, Tensor, Tensor], Tensor]
 """All vertices at t + 1 (V, B, 3) from a window (h+1, V, B, 3), control vertices at t + 1 and Φ (n, B, ·)."""

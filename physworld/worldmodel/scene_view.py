@@ -15,15 +15,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from physworld.scene import Scene
-from physworld.twin import Twin
+from physworld.twin.twin import Twin
 from physworld.worldmodel.clock import clock_times, model_dt, resample, resample_smooth
-from physworld.worldmodel.config import WorldModelConfig
 from physworld.worldmodel.errors import GraphInvalid
 from physworld.worldmodel.finetune import Recording
-from physworld.worldmodel.graph import GraphSpec, build_graph
-from physworld.worldmodel.model import WorldModel
+from physworld.worldmodel.model.config import WorldModelConfig
+from physworld.worldmodel.model.graph import GraphSpec, build_graph
+from physworld.worldmodel.model.model import WorldModel
+from physworld.worldmodel.model.skinning import Skin, affine_skin
 from physworld.worldmodel.published import PublishedModel
-from physworld.worldmodel.skinning import Skin, affine_skin
 
 SKIN_STATES = 24
 

@@ -33,7 +33,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from physworld.worldmodel.config import TrainingConfig, WorldModelConfig
 from physworld.worldmodel.dataset import Track, WindowSampler, measure_scales, split_tracks
 from physworld.worldmodel.errors import (
     CheckpointMismatch,
@@ -41,10 +40,11 @@ from physworld.worldmodel.errors import (
     TrainingCancelled,
     TrainingDiverged,
 )
-from physworld.worldmodel.graph import GraphSpec
-from physworld.worldmodel.model import Normalisation, WorldModel
-from physworld.worldmodel.prior_step import prior_step
-from physworld.worldmodel.priors import Prior, fit_priors, prior_error
+from physworld.worldmodel.model.config import TrainingConfig, WorldModelConfig
+from physworld.worldmodel.model.graph import GraphSpec
+from physworld.worldmodel.model.model import Normalisation, WorldModel
+from physworld.worldmodel.priors.choose import Prior, fit_priors, prior_error
+from physworld.worldmodel.priors.prior_step import prior_step
 from physworld.worldmodel.rollout import mean_error, rollout_tracks
 
 WARM_UP_SHARE = 0.1

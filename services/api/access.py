@@ -13,9 +13,9 @@ import structlog
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from schemas.ids import new_id
-from services.api.metrics import Metrics
-from services.api.security import address_of
+from physworld_schemas.ids import new_id
+from physworld_services.api.metrics import Metrics
+from physworld_services.api.security import address_of
 
 _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 _METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})

@@ -9,18 +9,18 @@ import anyio
 from fastapi import APIRouter, FastAPI
 from fastapi_offline import FastAPIOffline
 
-from services.api import errors
-from services.api.access import Access
-from services.api.attempts import Attempts
-from services.api.closing import Closing
-from services.api.ending import Endings, EndWithCredential
-from services.api.feed import Feed
-from services.api.limits import BodyLimit
-from services.api.metrics import Metrics
-from services.api.openapi import describe
-from services.api.parsing import Parsers
-from services.api.probes import Probe
-from services.api.routes import (
+from physworld_services.api import errors
+from physworld_services.api.access import Access
+from physworld_services.api.attempts import Attempts
+from physworld_services.api.closing import Closing
+from physworld_services.api.ending import Endings, EndWithCredential
+from physworld_services.api.feed import Feed
+from physworld_services.api.limits import BodyLimit
+from physworld_services.api.metrics import Metrics
+from physworld_services.api.openapi import describe
+from physworld_services.api.parsing import Parsers
+from physworld_services.api.probes import Probe
+from physworld_services.api.routes import (
     artifacts,
     assessments,
     audit,
@@ -39,10 +39,10 @@ from services.api.routes import (
     signing_keys,
     traces,
 )
-from services.api.security import Authentication, Gate, bearer
-from services.stores import Stores
-from storage.database import Database
-from storage.settings import Settings
+from physworld_services.api.security import Authentication, Gate, bearer
+from physworld_services.stores import Stores
+from physworld_storage.database import Database
+from physworld_storage.settings import Settings
 
 VERSION = "0.1.0"
 PREFIX = "/v1"

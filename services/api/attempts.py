@@ -19,7 +19,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable
 
-from storage.api_keys import digest_of
+from physworld_storage.access.api_keys import digest_of
 
 WINDOW_S = 60.0
 PER_ADDRESS, OVERALL = 10, 600

@@ -12,7 +12,8 @@ from starlette.concurrency import run_in_threadpool
 
 
 class LongBodyRoute(APIRoute):
-    """A route whose JSON body is parsed off the event loop. ``services.api.limits`` bounds how long that takes."""
+    """A route whose JSON body is parsed off the event loop. ``physworld_services.api.limits`` bounds how long that
+    takes."""
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
         """The route's handler on a request that parses elsewhere."""

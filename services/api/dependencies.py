@@ -7,12 +7,12 @@ from typing import Annotated, cast
 
 from fastapi import Depends, Path, Query, Request
 
-from services.api.feed import Feed
-from services.api.security import Principal, address_of
-from services.stores import Stores
-from storage.audit import Actor
-from storage.database import Database
-from storage.settings import Settings
+from physworld_services.api.feed import Feed
+from physworld_services.api.security import Principal, address_of
+from physworld_services.stores import Stores
+from physworld_storage.access.audit import Actor
+from physworld_storage.database import Database
+from physworld_storage.settings import Settings
 
 DEFAULT_LIMIT = 50
 MAX_LIMIT = 200

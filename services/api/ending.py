@@ -17,9 +17,9 @@ from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from storage import credentials
-from storage.database import Database
-from storage.errors import StorageError
+from physworld_storage.access import credentials
+from physworld_storage.database import Database
+from physworld_storage.errors import StorageError
 
 CHECK_S = 2.0
 

@@ -18,8 +18,8 @@ from fastapi.responses import JSONResponse
 from sqlalchemy.exc import DataError
 from starlette.exceptions import HTTPException
 
-from schemas.base import FieldError, Problem
-from storage.errors import (
+from physworld_schemas.base import FieldError, Problem
+from physworld_storage.errors import (
     ArtifactCorrupt,
     Conflict,
     DatabaseUnavailable,
@@ -143,7 +143,7 @@ def answer(problem: ApiProblem, scope: Mapping[str, Any]) -> JSONResponse:
 
 
 def request_id_of(scope: Mapping[str, Any]) -> str | None:
-    """The id that the access log gave this request (``services.api.access``)."""
+    """The id that the access log gave this request (``physworld_services.api.access``)."""
     return scope.get("state", {}).get("request_id")
 
 

@@ -23,12 +23,12 @@ import structlog
 from sse_starlette import ServerSentEvent
 from starlette.concurrency import run_in_threadpool
 
-from schemas.job import TERMINAL_STATES, Event, Job
-from services.api.closing import Closing
-from services.api.errors import ApiProblem
-from storage import events, jobs
-from storage.database import Database
-from storage.errors import StorageError
+from physworld_schemas.job import TERMINAL_STATES, Event, Job
+from physworld_services.api.closing import Closing
+from physworld_services.api.errors import ApiProblem
+from physworld_storage.database import Database
+from physworld_storage.errors import StorageError
+from physworld_storage.jobs import events, jobs
 
 POLL_S = 0.25
 AWAY_S = 2.0

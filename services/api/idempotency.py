@@ -15,11 +15,11 @@ from fastapi import Depends, Header, Request, Response
 from pydantic import BaseModel
 from sqlalchemy.orm import Session
 
-from schemas.job import Job
-from services.api.dependencies import DatabaseDep, PrincipalDep
-from storage import idempotency
-from storage.database import Database
-from storage.idempotency import Answer
+from physworld_schemas.job import Job
+from physworld_services.api.dependencies import DatabaseDep, PrincipalDep
+from physworld_storage import idempotency
+from physworld_storage.database import Database
+from physworld_storage.idempotency import Answer
 
 RETRY_AFTER_S = "1"
 JSON = "application/json"

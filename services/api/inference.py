@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import httpx
 
-from schemas.base import FieldError
-from schemas.rollout import Rollout, RolloutCreate
-from services.api.errors import ApiProblem
-from storage import tickets
-from storage.database import Database
+from physworld_schemas.base import FieldError
+from physworld_schemas.rollout import Rollout, RolloutCreate
+from physworld_services.api.errors import ApiProblem
+from physworld_storage.access import tickets
+from physworld_storage.database import Database
 
 TIMEOUT_S = 60.0
 TICKET_HEADER = "X-Physworld-Ticket"

@@ -9,9 +9,9 @@ from __future__ import annotations
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from schemas.arrays import MAX_LISTED_VALUES
-from schemas.rollout import MAX_REQUEST_BYTES
-from services.api.errors import ApiProblem, answer
+from physworld_schemas.arrays import MAX_LISTED_VALUES
+from physworld_schemas.rollout import MAX_REQUEST_BYTES
+from physworld_services.api.errors import ApiProblem, answer
 
 JSON_LIMIT_BYTES = 1024 * 1024
 MULTIPART_OVERHEAD_BYTES = 64 * 1024

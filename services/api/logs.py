@@ -8,7 +8,7 @@ from typing import Any
 
 import structlog
 
-from storage.tickets import hide_tickets
+from physworld_storage.access.tickets import hide_tickets
 
 
 def _hide_tickets(logger: Any, name: str, entry: structlog.typing.EventDict) -> structlog.typing.EventDict:

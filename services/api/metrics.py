@@ -15,11 +15,11 @@ from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
-from schemas.queues import QUEUE_OF_SHARD
-from services.api.probes import Probe
-from storage.counts import count_jobs, count_shards
-from storage.database import Database
-from storage.errors import StorageError
+from physworld_schemas.queues import QUEUE_OF_SHARD
+from physworld_services.api.probes import Probe
+from physworld_storage.database import Database
+from physworld_storage.errors import StorageError
+from physworld_storage.jobs.counts import count_jobs, count_shards
 
 WAITING = "QUEUED"
 COUNT_S = 2.0

@@ -1,6 +1,6 @@
 """Bring the database to this code's tables and register the first API key; run once before the web process.
 
-``python -m services.api.migrate``. The key's token is PHYSWORLD_ADMIN_TOKEN, a secret of the deployment;
+``python -m physworld_services.api.migrate``. The key's token is PHYSWORLD_ADMIN_TOKEN, a secret of the deployment;
 without the variable no key is registered. Running it again changes nothing. A token whose key was revoked or rotated
 away stays ended and keeps nothing from starting: that is said, with the command that makes another key.
 """
@@ -10,11 +10,11 @@ from __future__ import annotations
 import os
 import sys
 
-from services.api.recover_key import COMMAND
-from storage.api_keys import count_active_admins, ensure_key
-from storage.database import Database, open_database
-from storage.errors import KeyEnded, StorageError
-from storage.settings import get_settings
+from physworld_services.api.recover_key import COMMAND
+from physworld_storage.access.api_keys import count_active_admins, ensure_key
+from physworld_storage.database import Database, open_database
+from physworld_storage.errors import KeyEnded, StorageError
+from physworld_storage.settings import get_settings
 
 ADMIN_TOKEN = "PHYSWORLD_ADMIN_TOKEN"
 

@@ -7,8 +7,8 @@ from typing import Any
 from fastapi import FastAPI
 from pydantic.json_schema import models_json_schema
 
-from schemas.base import Problem
-from services.api.errors import documented
+from physworld_schemas.base import Problem
+from physworld_services.api.errors import documented
 
 REFERENCE = "#/components/schemas/{model}"
 

@@ -1,4 +1,5 @@
-"""The process that reads uploads: ``python -m services.api.parser_process``, started by ``services.api.parsing``.
+"""The process that reads uploads: ``python -m physworld_services.api.parser_process``, started by
+``physworld_services.api.parsing``.
 
 It has imported what the importers need and then, for each line on its standard input, forks a child that reads one
 upload under limits which the kernel keeps, waits for it, and answers with a line. The limits, of processor seconds,
@@ -25,11 +26,11 @@ from typing import Any
 import scipy.spatial  # noqa: F401  so that a child need not
 import trimesh  # noqa: F401
 
-from schemas.base import FieldError
-from storage.errors import SceneInvalid
-from storage.importers import ImportOptions, import_any
-from storage.importers.c3d import limit_here
-from storage.scene_bundle import canonical_archive, checked
+from physworld_scenes.bundle import canonical_archive, checked
+from physworld_scenes.importers import ImportOptions, import_any
+from physworld_scenes.importers.c3d import limit_here
+from physworld_schemas.base import FieldError
+from physworld_storage.errors import SceneInvalid
 
 UPLOAD, ARCHIVE, FOUND = "upload", "scene.zip", "found.json"
 MEBIBYTE = 1 << 20

@@ -1,4 +1,5 @@
-"""Reading of uploads in other processes, from the web process's side: ``services.api.parser_process`` does the work.
+"""Reading of uploads in other processes, from the web process's side: ``physworld_services.api.parser_process`` does
+the work.
 
 The web process never holds an upload's content: it hands over a file and takes back a file and a page of facts. A file
 that goes beyond its limits, or crashes its reader, is a refusal like any other, with the limit in it.
@@ -19,9 +20,9 @@ from typing import Any
 
 import structlog
 
-from schemas.base import FieldError
-from services.api.errors import ApiProblem
-from storage.errors import SceneInvalid
+from physworld_schemas.base import FieldError
+from physworld_services.api.errors import ApiProblem
+from physworld_storage.errors import SceneInvalid
 
 ROOT = Path(__file__).parents[2]
 PASSED_ON = ("PATH", "HOME", "TMPDIR", "LANG", "LC_ALL", "PYTHONPATH", "VIRTUAL_ENV", "LD_LIBRARY_PATH")
@@ -59,7 +60,7 @@ class Parsers:
         Args:
             filename: what the sender calls it.
             name: the scene's name, where it is not to be the file's.
-            options: keyword arguments of ``storage.importers.ImportOptions``.
+            options: keyword arguments of ``physworld_scenes.importers.ImportOptions``.
 
         Raises:
             SceneInvalid: with every fault, or the limit that it went beyond.
@@ -139,7 +140,7 @@ class _Parser:
         if self._process is None or self._process.poll() is not None:
             self.close()
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "services.api.parser_process"],
+                [sys.executable, "-m", "physworld_services.api.parser_process"],
                 cwd=ROOT,
                 env={name: os.environ[name] for name in PASSED_ON if name in os.environ}
                 | {"OMP_NUM_THREADS": "1"},

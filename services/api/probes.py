@@ -16,7 +16,7 @@ from typing import Generic, TypeVar
 
 import structlog
 
-from storage.errors import StorageError
+from physworld_storage.errors import StorageError
 
 Answer = TypeVar("Answer")
 READY_S = 1.5

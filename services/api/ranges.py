@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import re
 
-from services.api.errors import ApiProblem
+from physworld_services.api.errors import ApiProblem
 
 _RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})", re.ASCII)  # more digits than any file has bytes
 

@@ -1,4 +1,4 @@
-"""Make an admin key when no other is left: ``python -m services.api.recover_key [--data DIR] [--name NAME]``.
+"""Make an admin key when no other is left: ``python -m physworld_services.api.recover_key [--data DIR] [--name NAME]``.
 
 It needs what the service itself has, the database (the data folder, or PHYSWORLD_DATABASE_URL), and no key. The token
 is printed once. The key has no end and stands in the audit log as ``key.recovered``. The service may run meanwhile.
@@ -10,13 +10,13 @@ import argparse
 import sys
 from pathlib import Path
 
-from storage import api_keys, audit
-from storage.audit import LOCAL
-from storage.database import open_database
-from storage.errors import StorageError
-from storage.settings import Settings
+from physworld_storage.access import api_keys, audit
+from physworld_storage.access.audit import LOCAL
+from physworld_storage.database import open_database
+from physworld_storage.errors import StorageError
+from physworld_storage.settings import Settings
 
-COMMAND = "python -m services.api.recover_key"
+COMMAND = "python -m physworld_services.api.recover_key"
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -21,14 +21,14 @@ from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from schemas.key import Role
-from services.api.attempts import PER_ADDRESS, WINDOW_S, Attempts
-from services.api.errors import ApiProblem, answer
-from storage import api_keys, audit
-from storage.api_keys import ApiKey as Principal
-from storage.audit import Actor
-from storage.database import Database
-from storage.errors import StorageError
+from physworld_schemas.key import Role
+from physworld_services.api.attempts import PER_ADDRESS, WINDOW_S, Attempts
+from physworld_services.api.errors import ApiProblem, answer
+from physworld_storage.access import api_keys, audit
+from physworld_storage.access.api_keys import ApiKey as Principal
+from physworld_storage.access.audit import Actor
+from physworld_storage.database import Database
+from physworld_storage.errors import StorageError
 
 _READING = frozenset({"GET", "HEAD", "OPTIONS"})
 _CHALLENGE = {"WWW-Authenticate": 'Bearer realm="physworld"'}
@@ -53,7 +53,8 @@ class Gate:
     def key_of(self, token: str, address: str | None) -> Principal | None:
         """The key behind a token, None when there is none.
 
-        Raises ApiProblem, 429, for an address that tried too many (``services.api.attempts``), and StorageError.
+        Raises ApiProblem, 429, for an address that tried too many (``physworld_services.api.attempts``), and
+        StorageError.
         """
         wait = self._attempts.wait_s(address, token)
         if wait:

@@ -1,4 +1,4 @@
-"""The event stream of a job as an answer (server-sent events); ``services.api.feed`` has the events.
+"""The event stream of a job as an answer (server-sent events); ``physworld_services.api.feed`` has the events.
 
 Each event carries its ``seq`` as the SSE id; a client that reconnects with ``Last-Event-ID`` misses nothing
 and sees nothing twice. The stream ends after the event that ends the job, or when the server stops (the

@@ -1,7 +1,7 @@
 """A scene file on its way in: multipart parts to a temporary file, parsed, named, made canonical.
 
 The file is read while it streams into a temporary file (``limits`` bounds it), then parsed in another process
-(``services.api.parsing``). The temporary files are gone when the request is.
+(``physworld_services.api.parsing``). The temporary files are gone when the request is.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from fastapi import Request
 from pydantic import ValidationError
 from starlette.datastructures import FormData, UploadFile
 
-from schemas.base import FieldError
-from schemas.scene import SceneImport
-from services.api.errors import ApiProblem
-from services.api.limits import too_large
-from services.api.parsing import Found, Parsers
-from storage.scene_declaration import KINDS
+from physworld_scenes.declaration import KINDS
+from physworld_schemas.base import FieldError
+from physworld_schemas.scene import SceneImport
+from physworld_services.api.errors import ApiProblem
+from physworld_services.api.limits import too_large
+from physworld_services.api.parsing import Found, Parsers
 
 FIELDS = frozenset({"bundle", "name", "options"})
 FIELD_LIMIT_BYTES = 64 * 1024

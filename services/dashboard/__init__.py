@@ -5,6 +5,6 @@ Reads the database and the artifact store; the one thing that it changes is a jo
 
 from __future__ import annotations
 
-from services.dashboard.app import mount
+from physworld_services.dashboard.app import mount
 
 __all__ = ["mount"]

@@ -1,8 +1,8 @@
 """Who may look: an API key typed into a form opens a session, which every page asks for.
 
-The session lies in the database (``storage.sessions``); the cookie holds a random text and nothing else, is HttpOnly
-and SameSite=Strict, and of no use to the REST API. A log-out or a revoked key ends it at once, on every web process.
-What changes something must come from one of our own pages (``require_same_origin``).
+The session lies in the database (``physworld_storage.access.sessions``); the cookie holds a random text and nothing
+else, is HttpOnly and SameSite=Strict, and of no use to the REST API. A log-out or a revoked key ends it at once, on
+every web process. What changes something must come from one of our own pages (``require_same_origin``).
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from fastapi import APIRouter, Depends, Form, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from starlette.exceptions import HTTPException
 
-from services.api.errors import ApiProblem
-from services.api.security import Gate, address_of
-from services.dashboard.site import BASE, Site
-from storage import api_keys, sessions
-from storage.audit import Actor
-from storage.database import Database
+from physworld_services.api.errors import ApiProblem
+from physworld_services.api.security import Gate, address_of
+from physworld_services.dashboard.site import BASE, Site
+from physworld_storage.access import api_keys, sessions
+from physworld_storage.access.audit import Actor
+from physworld_storage.database import Database
 
 COOKIE = "physworld_session"
 SECURE_COOKIE = f"__Host-{COOKIE}"  # a browser takes this name over TLS only, from this host, for this host

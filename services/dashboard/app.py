@@ -18,9 +18,9 @@ from starlette.middleware.gzip import GZipMiddleware
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from services.api.attempts import Attempts
-from services.api.security import Gate
-from services.dashboard import (
+from physworld_services.api.attempts import Attempts
+from physworld_services.api.security import Gate
+from physworld_services.dashboard import (
     access,
     pages_datasets,
     pages_files,
@@ -30,10 +30,10 @@ from services.dashboard import (
     pages_sessions,
     pages_traces,
 )
-from services.dashboard.site import BASE, STATIC, Site
-from services.stores import Stores
-from storage.database import Database
-from storage.errors import (
+from physworld_services.dashboard.site import BASE, STATIC, Site
+from physworld_services.stores import Stores
+from physworld_storage.database import Database
+from physworld_storage.errors import (
     ArtifactCorrupt,
     Conflict,
     DatabaseUnavailable,
@@ -43,7 +43,7 @@ from storage.errors import (
     StorageError,
     StoreError,
 )
-from storage.settings import Settings
+from physworld_storage.settings import Settings
 
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; font-src 'self'; "

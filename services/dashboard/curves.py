@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from schemas.model import ModelComparison
+from physworld_schemas.model import ModelComparison
 
 if TYPE_CHECKING:
     from physworld.scene import Scene

@@ -15,7 +15,7 @@ import structlog
 from sse_starlette import EventSourceResponse, ServerSentEvent
 from starlette.concurrency import run_in_threadpool
 
-from storage.errors import StorageError
+from physworld_storage.errors import StorageError
 
 POLL_SECONDS = 0.5
 LIFETIME_SECONDS = 300.0  # then the browser connects again, and its session is checked again

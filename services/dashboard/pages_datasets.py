@@ -9,12 +9,12 @@ import numpy as np
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import HTMLResponse, JSONResponse, Response
 
-from services.dashboard import live
-from services.dashboard.clouds import Cloud, Layer, thinned
-from services.dashboard.pages_scenes import layer_response
-from services.dashboard.site import BASE, Site
-from storage import overview, resources
-from storage.errors import NotFound
+from physworld_services.dashboard import live
+from physworld_services.dashboard.clouds import Cloud, Layer, thinned
+from physworld_services.dashboard.pages_scenes import layer_response
+from physworld_services.dashboard.site import BASE, Site
+from physworld_storage import overview, resources
+from physworld_storage.errors import NotFound
 
 PAGE_SIZE = 50
 COVERAGE = "coverage.svg"

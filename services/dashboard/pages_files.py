@@ -8,8 +8,8 @@ from urllib.parse import quote
 from fastapi import APIRouter, Path, Query
 from fastapi.responses import Response, StreamingResponse
 
-from services.dashboard.site import Site
-from storage.errors import NotFound
+from physworld_services.dashboard.site import Site
+from physworld_storage.errors import NotFound
 
 
 def router(site: Site) -> APIRouter:

@@ -10,13 +10,15 @@ from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from sqlalchemy.orm import Session
 
-from schemas.base import Reference
-from schemas.job import TERMINAL_STATES, Event, Job
-from services.dashboard import live
-from services.dashboard.access import actor_of, require_same_origin, require_writer
-from services.dashboard.site import BASE, Site
-from services.dashboard.text import figure
-from storage import audit, jobs, overview, runs
+from physworld_schemas.base import Reference
+from physworld_schemas.job import TERMINAL_STATES, Event, Job
+from physworld_services.dashboard import live
+from physworld_services.dashboard.access import actor_of, require_same_origin, require_writer
+from physworld_services.dashboard.site import BASE, Site
+from physworld_services.dashboard.text import figure
+from physworld_storage import overview, runs
+from physworld_storage.access import audit
+from physworld_storage.jobs import jobs
 
 PAGE_SIZE = 20
 EVENTS_SHOWN = 100

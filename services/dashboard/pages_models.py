@@ -10,18 +10,19 @@ from urllib.parse import urlencode
 from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import HTMLResponse, JSONResponse, Response
 
-from schemas.model import Model, ModelComparison, ModelVersion
-from services.dashboard.access import require_same_origin, require_writer
-from services.dashboard.clouds import Cloud, Layer, measured_layers, resampled, scene_cloud, thinned
-from services.dashboard.curves import chart, comparison_chart, given_curves
-from services.dashboard.pages_scenes import PREDICTION, layer_response, recording_of
-from services.dashboard.site import BASE, Site
-from services.dashboard.tables import held_out_of
-from storage import registry, resources, tickets
-from storage.api_keys import ApiKey
-from storage.comparison import compare_versions
-from storage.errors import NotFound
-from storage.opening_runs import ready_version
+from physworld_schemas.model import Model, ModelComparison, ModelVersion
+from physworld_services.dashboard.access import require_same_origin, require_writer
+from physworld_services.dashboard.clouds import Cloud, Layer, measured_layers, resampled, scene_cloud, thinned
+from physworld_services.dashboard.curves import chart, comparison_chart, given_curves
+from physworld_services.dashboard.pages_scenes import PREDICTION, layer_response, recording_of
+from physworld_services.dashboard.site import BASE, Site
+from physworld_services.dashboard.tables import held_out_of
+from physworld_storage import registry, resources
+from physworld_storage.access import tickets
+from physworld_storage.access.api_keys import ApiKey
+from physworld_storage.comparison import compare_versions
+from physworld_storage.errors import NotFound
+from physworld_storage.jobs.opening_runs import ready_version
 
 PAGE_SIZE = 50
 

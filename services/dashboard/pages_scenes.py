@@ -8,9 +8,9 @@ import numpy as np
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
 
-from schemas.fit import Fit
-from schemas.scene import Scene as SceneRecord
-from services.dashboard.clouds import (
+from physworld_schemas.fit import Fit
+from physworld_schemas.scene import Scene as SceneRecord
+from physworld_services.dashboard.clouds import (
     Cloud,
     Layer,
     measured_layers,
@@ -18,10 +18,10 @@ from services.dashboard.clouds import (
     scene_cloud,
     thinned,
 )
-from services.dashboard.curves import chart, frame_errors, given_curves, onto
-from services.dashboard.site import BASE, Site
-from storage import resources, traces
-from storage.errors import NotFound
+from physworld_services.dashboard.curves import chart, frame_errors, given_curves, onto
+from physworld_services.dashboard.site import BASE, Site
+from physworld_storage import resources, traces
+from physworld_storage.errors import NotFound
 
 if TYPE_CHECKING:
     from physworld.scene import Scene

@@ -5,9 +5,9 @@ from __future__ import annotations
 from fastapi import APIRouter, Depends, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 
-from services.dashboard.access import actor_of, require_same_origin
-from services.dashboard.site import BASE, Site
-from storage import sessions
+from physworld_services.dashboard.access import actor_of, require_same_origin
+from physworld_services.dashboard.site import BASE, Site
+from physworld_storage.access import sessions
 
 
 def router(site: Site) -> APIRouter:

@@ -7,14 +7,14 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import HTMLResponse, JSONResponse, Response
 
-from schemas.scene import Scene as SceneRecord
-from schemas.trace import Trace
-from services.dashboard.clouds import Cloud, Layer, measured_layers, resampled, scene_cloud, thinned
-from services.dashboard.curves import chart, frame_errors
-from services.dashboard.pages_scenes import layer_response, recording_of, split_time
-from services.dashboard.site import BASE, Site
-from storage import overview, resources, traces
-from storage.errors import NotFound
+from physworld_schemas.scene import Scene as SceneRecord
+from physworld_schemas.trace import Trace
+from physworld_services.dashboard.clouds import Cloud, Layer, measured_layers, resampled, scene_cloud, thinned
+from physworld_services.dashboard.curves import chart, frame_errors
+from physworld_services.dashboard.pages_scenes import layer_response, recording_of, split_time
+from physworld_services.dashboard.site import BASE, Site
+from physworld_storage import overview, resources, traces
+from physworld_storage.errors import NotFound
 
 PAGE_SIZE = 50
 # The page of a trace brings its own scripts: it gets no access to this site, whatever it holds.

@@ -14,16 +14,16 @@ from fastapi import Request
 from fastapi.responses import HTMLResponse
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from schemas.base import Artifact
-from schemas.job import Job
-from services.dashboard import text
-from services.dashboard.byte_cache import ByteCache
-from services.dashboard.tables import held_out_columns, held_out_of, held_out_rows, noise_floor_of
-from services.stores import Stores
-from storage.api_keys import ApiKey
-from storage.database import Database
-from storage.scene_bundle import bundle_from_bytes
-from storage.settings import Settings
+from physworld_scenes.bundle import bundle_from_bytes
+from physworld_schemas.base import Artifact
+from physworld_schemas.job import Job
+from physworld_services.dashboard import text
+from physworld_services.dashboard.byte_cache import ByteCache
+from physworld_services.dashboard.tables import held_out_columns, held_out_of, held_out_rows, noise_floor_of
+from physworld_services.stores import Stores
+from physworld_storage.access.api_keys import ApiKey
+from physworld_storage.database import Database
+from physworld_storage.settings import Settings
 
 if TYPE_CHECKING:
     from physworld.scene import Scene

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from services.dashboard.curves import LABELS, PREDICTORS
+from physworld_services.dashboard.curves import LABELS, PREDICTORS
 
 METRICS = ("track_m", "chamfer_phystwin_m", "chamfer_l2_m")
 HeldOut = Mapping[str, Mapping[str, float | None]]

@@ -1,4 +1,4 @@
-"""``python -m services.embedded --data DIR [--workers 2] [--port 0]``: the whole service on this machine.
+"""``python -m physworld_services.embedded --data DIR [--workers 2] [--port 0]``: the whole service on this machine.
 
 Exit codes: 0 ended by a signal, 1 could not start, 3 already running on this folder.
 """
@@ -10,12 +10,12 @@ import shutil
 import sys
 from pathlib import Path
 
-from services.embedded.broker import NoBroker
-from services.embedded.folder import AlreadyRunning, StillAlive
-from services.embedded.supervisor import Options, StartFailed, Stopped, Supervisor
-from storage.errors import StorageError
-from storage.settings import Settings
-from storage.store import FULL_ERRNO
+from physworld_services.embedded.broker import NoBroker
+from physworld_services.embedded.folder import AlreadyRunning, StillAlive
+from physworld_services.embedded.supervisor import Options, StartFailed, Stopped, Supervisor
+from physworld_storage.errors import StorageError
+from physworld_storage.settings import Settings
+from physworld_storage.store import FULL_ERRNO
 
 ALREADY_RUNNING = 3
 SQLITE_FULL = "database or disk is full"
@@ -23,7 +23,7 @@ SQLITE_FULL = "database or disk is full"
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the service until Ctrl-C."""
-    parser = argparse.ArgumentParser(prog="python -m services.embedded", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m physworld_services.embedded", description=__doc__)
     parser.add_argument("--data", type=Path, default=None, help="data folder (default: PHYSWORLD_DATA_DIR)")
     parser.add_argument("--workers", type=int, default=2, help="simulation worker processes (default: 2)")
     parser.add_argument(

@@ -22,7 +22,7 @@ import redis
 from redis.backoff import NoBackoff
 from redis.retry import Retry
 
-from services.embedded.folder import DataFolder, write_private
+from physworld_services.embedded.folder import DataFolder, write_private
 
 PASSWORD_BYTES = 24
 ANSWER_WITHIN_S = 2.0

@@ -13,8 +13,8 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from services.embedded import forked, logs
-from services.embedded.forked import PR_SET_PDEATHSIG, Forked
+from physworld_services.embedded import forked, logs
+from physworld_services.embedded.forked import PR_SET_PDEATHSIG, Forked
 
 FIRST_PAUSE_S = 0.5
 LONGEST_PAUSE_S = 30.0

@@ -30,11 +30,11 @@ SHARED = (
     "celery.concurrency.prefork",
     "celery.worker.consumer",
     "kombu.transport.redis",
-    "storage.changes",
-    "storage.idempotency",
-    "storage.leases",
-    "storage.scratch",
-    "workers.app",
+    "physworld_storage.changes",
+    "physworld_storage.idempotency",
+    "physworld_storage.jobs.leases",
+    "physworld_storage.scratch",
+    "physworld_workers.app",
 )
 """What children have in common."""
 POLL_S = 0.02

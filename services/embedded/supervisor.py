@@ -27,17 +27,19 @@ from types import FrameType
 from pydantic import SecretStr
 from sqlalchemy.orm import Session
 
-from schemas.queues import SIMULATION
-from services import interpreter
-from services.embedded import logs
-from services.embedded.broker import Broker, choose_broker
-from services.embedded.child import Child, Program
-from services.embedded.folder import DataFolder, FolderLocks, write_private
-from services.embedded.forked import import_shared
-from storage import api_keys, leases, signing
-from storage.database import open_database
-from storage.errors import KeyEnded
-from storage.settings import Settings
+from physworld_schemas.queues import SIMULATION
+from physworld_services import interpreter
+from physworld_services.embedded import logs
+from physworld_services.embedded.broker import Broker, choose_broker
+from physworld_services.embedded.child import Child, Program
+from physworld_services.embedded.folder import DataFolder, FolderLocks, write_private
+from physworld_services.embedded.forked import import_shared
+from physworld_storage import signing
+from physworld_storage.access import api_keys
+from physworld_storage.database import open_database
+from physworld_storage.errors import KeyEnded
+from physworld_storage.jobs import leases
+from physworld_storage.settings import Settings
 
 WATCH_S = 0.2
 STARTING_S = 0.05
@@ -144,8 +146,8 @@ class Supervisor:
         self, environment: dict[str, str], listening: socket.socket, inference: socket.socket
     ) -> list[Program]:
         programs = [
-            _server("web", "services.embedded.web", (), environment, listening),
-            self._consumer("dispatcher", "workers.dispatcher", (), environment, signal.SIGTERM),
+            _server("web", "physworld_services.embedded.web", (), environment, listening),
+            self._consumer("dispatcher", "physworld_workers.dispatcher", (), environment, signal.SIGTERM),
         ]
         for number in range(1, self._options.workers + 1):
             name = f"worker-{number}"
@@ -153,9 +155,9 @@ class Supervisor:
             programs.append(self._consumer(name, "workers", serve, environment))
         if self._options.trainer:
             train = ("--name", "trainer")
-            programs.append(self._consumer("trainer", "services.trainer", train, environment))
+            programs.append(self._consumer("trainer", "physworld_services.trainer", train, environment))
         if self._options.inference:
-            module = "services.inference"
+            module = "physworld_services.inference"
             programs.append(_server("inference", module, ("serve",), environment, inference))
             work = ("work", "--name", "planner")
             programs.append(self._consumer("planner", module, work, environment))

@@ -12,17 +12,17 @@ import sys
 
 import uvicorn
 
-from services.api.logs import configure_logs
-from services.connections import Connection, Session
-from services.web import create_app, proxy_options
-from storage.settings import get_settings
+from physworld_services.api.logs import configure_logs
+from physworld_services.connections import Connection, Session
+from physworld_services.web import create_app, proxy_options
+from physworld_storage.settings import get_settings
 
 GRACE_S = 3
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Serve until SIGTERM."""
-    parser = argparse.ArgumentParser(prog="python -m services.embedded.web")
+    parser = argparse.ArgumentParser(prog="python -m physworld_services.embedded.web")
     parser.add_argument("--fd", type=int, required=True, help="descriptor of the listening socket")
     options = parser.parse_args(arguments)
     settings = get_settings()

@@ -1,5 +1,6 @@
 """Inference: rollouts, plans and live sessions of published models.
 
-``python -m services.inference serve`` answers small rollouts and live sessions for the API, which holds no torch;
-``python -m services.inference work`` is a worker on the ``infer`` queue for long rollouts and for plans.
+``python -m physworld_services.inference serve`` answers small rollouts and live sessions for the API, which holds no
+torch; ``python -m physworld_services.inference work`` is a worker on the ``infer`` queue for long rollouts and for
+plans.
 """

@@ -1,4 +1,5 @@
-"""``python -m services.inference serve [--host H] [--port P | --fd N]`` and ``python -m services.inference work``."""
+"""``python -m physworld_services.inference serve [--host H] [--port P | --fd N]`` and ``python -m
+physworld_services.inference work``."""
 
 from __future__ import annotations
 
@@ -8,14 +9,14 @@ import os
 import socket
 import sys
 
-from storage.settings import Settings, get_settings
+from physworld_storage.settings import Settings, get_settings
 
 GRACE_S = 2
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Serve, or work on the queue, until told to stop."""
-    parser = argparse.ArgumentParser(prog="python -m services.inference", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m physworld_services.inference", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     serve = commands.add_parser("serve", help="answer rollouts and live sessions for the API")
     serve.add_argument("--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1)")
@@ -33,22 +34,22 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _work(settings: Settings, name: str) -> int:
-    from schemas.queues import INFERENCE
-    from workers.app import run_worker
-    from workers.registry import register
+    from physworld_schemas.queues import INFERENCE
+    from physworld_workers.app import run_worker
+    from physworld_workers.registry import register
 
     settings.check()
-    register("rollout", "services.inference.jobs:rollout")
-    register("plan", "services.inference.jobs:plan")
+    register("rollout", "physworld_services.inference.jobs:rollout")
+    register("plan", "physworld_services.inference.jobs:plan")
     return run_worker(settings, INFERENCE, name)
 
 
 def _serve(settings: Settings, options: argparse.Namespace) -> int:
     import uvicorn
 
-    from services.connections import Session
-    from services.inference.lazy import LazyApp
-    from storage.tickets import TicketFilter
+    from physworld_services.connections import Session
+    from physworld_services.inference.lazy import LazyApp
+    from physworld_storage.access.tickets import TicketFilter
 
     config = uvicorn.Config(
         LazyApp(settings),

@@ -4,8 +4,9 @@
 ``WS /live``         a live session (``live``)
 ``GET /health``      200
 
-Every request carries a ticket that the API issued for it (``storage.tickets``): the service trusts nobody for being on
-the same network. Rollouts run in a thread of their own, one at a time, so that sessions keep their pace.
+Every request carries a ticket that the API issued for it (``physworld_storage.access.tickets``): the service trusts
+nobody for being on the same network. Rollouts run in a thread of their own, one at a time, so that sessions keep their
+pace.
 """
 
 from __future__ import annotations
@@ -22,18 +23,18 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route, WebSocketRoute
 
 from physworld.worldmodel.errors import ControlsInvalid, VersionUnreadable, WorldModelError
-from schemas.arrays import EncodedArray
-from schemas.base import FieldError, Problem
-from schemas.rollout import MAX_REQUEST_BYTES, Rollout, RolloutCreate
-from services.inference import rollouts
-from services.inference.live import LiveSessions
-from services.inference.models import Models
-from storage import tickets
-from storage.artifacts import ArtifactStore
-from storage.database import Database
-from storage.errors import ArtifactCorrupt, Conflict, NotFound, StorageError
-from storage.patience import ANSWERING
-from storage.settings import Settings
+from physworld_schemas.arrays import EncodedArray
+from physworld_schemas.base import FieldError, Problem
+from physworld_schemas.rollout import MAX_REQUEST_BYTES, Rollout, RolloutCreate
+from physworld_services.inference import rollouts
+from physworld_services.inference.live import LiveSessions
+from physworld_services.inference.models import Models
+from physworld_storage.access import tickets
+from physworld_storage.artifacts import ArtifactStore
+from physworld_storage.database import Database
+from physworld_storage.errors import ArtifactCorrupt, Conflict, NotFound, StorageError
+from physworld_storage.patience import ANSWERING
+from physworld_storage.settings import Settings
 
 TICKET_HEADER = "X-Physworld-Ticket"
 PARALLEL_ROLLOUTS = 1

@@ -1,25 +1,25 @@
 """The ``rollout`` and ``plan`` shards of the ``infer`` queue.
 
 Files: ``rollout.npz`` with ``times`` (S,) f8 [s] and, as asked for, ``points`` (B, S, N, 3) and ``vertices``
-(B, S, n, 3) f4 [m]; ``plan.npz`` as ``services.inference.plans`` says.
+(B, S, n, 3) f4 [m]; ``plan.npz`` as ``physworld_services.inference.plans`` says.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-from schemas.base import Reference
-from schemas.plan import PlanCreate
-from schemas.rollout import RolloutCreate
-from services.inference import rollouts
-from services.inference.models import Models
-from storage import registry
-from storage.runs import RESULT
-from workers.context import TaskContext
-from workers.lineage import lineage_of
-from workers.registry import HandlerResult
-from workers.stores import Stores
-from workers.tasks.inputs import made_from, npz_bytes
+from physworld_schemas.base import Reference
+from physworld_schemas.plan import PlanCreate
+from physworld_schemas.rollout import RolloutCreate
+from physworld_services.inference import rollouts
+from physworld_services.inference.models import Models
+from physworld_storage import registry
+from physworld_storage.runs import RESULT
+from physworld_workers.context import TaskContext
+from physworld_workers.lineage import lineage_of
+from physworld_workers.registry import HandlerResult
+from physworld_workers.stores import Stores
+from physworld_workers.tasks.inputs import made_from, npz_bytes
 
 NPZ = "application/vnd.numpy.npz"
 
@@ -45,7 +45,7 @@ def rollout(context: TaskContext, stores: Stores) -> HandlerResult:
 
 def plan(context: TaskContext, stores: Stores) -> HandlerResult:
     """Search a motion, execute it in the twin, say how far both end from the goal."""
-    from services.inference.plans import make
+    from physworld_services.inference.plans import make
 
     payload = context.lease.payload
     asked = PlanCreate.model_validate_json(stores.artifacts.read_bytes(payload["request"]))

@@ -8,14 +8,14 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
-from storage.settings import Settings
+from physworld_storage.settings import Settings
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Receive, Scope, Send
 
 
 class LazyApp:
-    """ASGI application that stands in for ``services.inference.app`` until somebody asks."""
+    """ASGI application that stands in for ``physworld_services.inference.app`` until somebody asks."""
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
@@ -39,10 +39,10 @@ class LazyApp:
 def _build(settings: Settings) -> ASGIApp:
     import torch
 
-    from services.inference.app import create_app
-    from services.stores import THREADS
-    from storage.database import open_database
-    from storage.patience import ANSWERING
+    from physworld_services.inference.app import create_app
+    from physworld_services.stores import THREADS
+    from physworld_storage.database import open_database
+    from physworld_storage.patience import ANSWERING
 
     torch.set_num_threads(1)
     return create_app(settings, open_database(settings, threads=THREADS, patience=ANSWERING))

@@ -25,12 +25,12 @@ from starlette.concurrency import run_in_threadpool
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from physworld.worldmodel.errors import VersionUnreadable
-from schemas.live import close_reason
-from services.inference.models import Models
-from services.inference.session import Control, ControlRefused, LiveSession
-from storage import tickets
-from storage.database import Database
-from storage.errors import StorageError
+from physworld_schemas.live import close_reason
+from physworld_services.inference.models import Models
+from physworld_services.inference.session import Control, ControlRefused, LiveSession
+from physworld_storage.access import tickets
+from physworld_storage.database import Database
+from physworld_storage.errors import StorageError
 
 MOST_SESSIONS, THREADS = 4, 2
 IDLE_S, SEND_S, CLOSE_S, HOLD_S = 120.0, 10.0, 1.0, 0.3

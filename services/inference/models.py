@@ -11,11 +11,11 @@ from safetensors.numpy import load as load_tensors
 
 from physworld.worldmodel.errors import VersionUnreadable
 from physworld.worldmodel.published import PublishedModel
-from schemas.model import ModelVersion
-from storage import registry
-from storage.artifacts import ArtifactStore
-from storage.database import Database
-from storage.errors import Conflict, NotFound
+from physworld_schemas.model import ModelVersion
+from physworld_storage import registry
+from physworld_storage.artifacts import ArtifactStore
+from physworld_storage.database import Database
+from physworld_storage.errors import Conflict, NotFound
 
 KEPT_MODELS = 4
 

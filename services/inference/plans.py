@@ -21,11 +21,11 @@ from physworld.planning.goals import Goal, GoalPoints, GoalShape
 from physworld.planning.mppi import Found, MppiConfig, search
 from physworld.planning.task import PlanningTask
 from physworld.worldmodel.published import PublishedModel
-from schemas.arrays import FARTHEST_M, array_of
-from schemas.plan import PlanCreate, PlanLimits, PointGoal
-from workers.context import TaskContext
-from workers.stores import Stores
-from workers.tasks.inputs import scene_of, twin_of
+from physworld_schemas.arrays import FARTHEST_M, array_of
+from physworld_schemas.plan import PlanCreate, PlanLimits, PointGoal
+from physworld_workers.context import TaskContext
+from physworld_workers.stores import Stores
+from physworld_workers.tasks.inputs import scene_of, twin_of
 
 
 def make(

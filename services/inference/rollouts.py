@@ -14,8 +14,15 @@ import numpy as np
 from physworld.worldmodel.controls import on_clock, peak_speed
 from physworld.worldmodel.errors import ControlsInvalid, WorldModelError
 from physworld.worldmodel.published import PublishedModel
-from schemas.arrays import FARTHEST_M, ArrayInput, array_of
-from schemas.rollout import MAX_CANDIDATES, MAX_LOG_RATIO, MAX_STEPS, MAX_TICKS, MAX_VALUES, RolloutCreate
+from physworld_schemas.arrays import FARTHEST_M, ArrayInput, array_of
+from physworld_schemas.rollout import (
+    MAX_CANDIDATES,
+    MAX_LOG_RATIO,
+    MAX_STEPS,
+    MAX_TICKS,
+    MAX_VALUES,
+    RolloutCreate,
+)
 
 CLOCK_TOLERANCE = 1e-3
 CHUNK_STEPS = 2000  # between two looks at whether the job was cancelled

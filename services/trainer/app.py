@@ -6,15 +6,15 @@ its training job, so the trainer starts as soon as there is something to learn f
 
 from __future__ import annotations
 
-from schemas.queues import TRAINING
-from storage import signing
-from storage.settings import Settings
-from workers.app import run_worker
-from workers.registry import register
+from physworld_schemas.queues import TRAINING
+from physworld_storage import signing
+from physworld_storage.settings import Settings
+from physworld_workers.app import run_worker
+from physworld_workers.registry import register
 
 HANDLERS = {
-    "training": "services.trainer.training:run",
-    "assessment": "services.trainer.assessment:run",
+    "training": "physworld_services.trainer.training:run",
+    "assessment": "physworld_services.trainer.assessment:run",
 }
 
 

@@ -17,14 +17,14 @@ import numpy as np
 from physworld.evaluate.blocks import mean_with_interval, paired_gain
 from physworld.evaluate.metrics import track_error_per_frame
 from physworld.scene import Scene
-from physworld.twin import Twin
+from physworld.twin.twin import Twin
 from physworld.worldmodel.clock import resample_smooth
-from physworld.worldmodel.config import WorldModelConfig
+from physworld.worldmodel.model.config import WorldModelConfig
 from physworld.worldmodel.scene_view import view_scene
-from schemas.trace import Trace
-from storage import registry, traces
-from workers.stores import Stores
-from workers.tasks.inputs import npz_arrays, scene_of, twin_of
+from physworld_schemas.trace import Trace
+from physworld_storage import registry, traces
+from physworld_workers.stores import Stores
+from physworld_workers.tasks.inputs import npz_arrays, scene_of, twin_of
 
 METRIC = "track_m"
 WORLD_MODEL = "world_model_finetuned"

@@ -16,16 +16,16 @@ import numpy as np
 from physworld.demonstrate.config import StrengthRange
 from physworld.demonstrate.perturbation import BOUND_SIGMAS
 from physworld.worldmodel.dataset import VERTEX_ARRAYS, Track, has_vertices, read_track
-from physworld.worldmodel.graph import GraphSpec
-from physworld.worldmodel.model import PROPERTY_COUNT
-from schemas.base import Reference
-from schemas.dataset import Dataset, Episode
-from storage import resources
-from storage.errors import NotFound
-from workers.context import TaskContext
-from workers.errors import DatasetIncomplete
-from workers.stores import Stores
-from workers.tasks.dataset import demonstration_of
+from physworld.worldmodel.model.graph import GraphSpec
+from physworld.worldmodel.model.model import PROPERTY_COUNT
+from physworld_schemas.base import Reference
+from physworld_schemas.dataset import Dataset, Episode
+from physworld_storage import resources
+from physworld_storage.errors import NotFound
+from physworld_workers.context import TaskContext
+from physworld_workers.errors import DatasetIncomplete
+from physworld_workers.stores import Stores
+from physworld_workers.tasks.dataset import demonstration_of
 
 POLL_S = 0.5
 

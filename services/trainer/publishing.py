@@ -13,14 +13,14 @@ from safetensors.numpy import save as save_tensors
 from physworld.worldmodel import export
 from physworld.worldmodel.published import PublishedModel
 from physworld.worldmodel.scene_view import SceneView
-from schemas.base import Artifact
-from schemas.model import TrainingConfig
-from schemas.signing import SIGNATURE_NAME
-from services.trainer.measuring import Measured
-from services.trainer.settings import translate
-from storage import signing
-from workers.stores import Stores
-from workers.tasks.inputs import npz_bytes
+from physworld_schemas.base import Artifact
+from physworld_schemas.model import TrainingConfig
+from physworld_schemas.signing import SIGNATURE_NAME
+from physworld_services.trainer.measuring import Measured
+from physworld_services.trainer.settings import translate
+from physworld_storage import signing
+from physworld_workers.stores import Stores
+from physworld_workers.tasks.inputs import npz_bytes
 
 MANIFEST_NAME = "manifest.json"
 PROGRAMS = {"torch_export": ("step.pt2", export.torch_program), "onnx": ("step.onnx", export.onnx_program)}

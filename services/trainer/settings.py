@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 
-from physworld.worldmodel import config as settings_of
-from schemas.model import TrainingConfig
+from physworld.worldmodel.model import config as settings_of
+from physworld_schemas.model import TrainingConfig
 
 
 def translate(

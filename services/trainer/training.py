@@ -1,18 +1,18 @@
 """The ``training`` shard: from a dataset to a published world model.
 
-Reads the episodes (``services.trainer.episodes``), trains with a checkpoint every few hundred steps, kept in the
-scratch store (a killed trainer, or another one in its place, carries on from the last one), fine-tunes the properties
-on the recording's training frames, measures everything open loop on the frames that were held out, and stores the
-version's files:
+Reads the episodes (``physworld_services.trainer.episodes``), trains with a checkpoint every few hundred steps, kept in
+the scratch store (a killed trainer, or another one in its place, carries on from the last one), fine-tunes the
+properties on the recording's training frames, measures everything open loop on the frames that were held out, and
+stores the version's files:
 
-* ``model.safetensors``: see ``physworld.worldmodel.model`` and ``.published``;
+* ``model.safetensors``: see ``physworld.worldmodel.model.model`` and ``.published``;
 * ``step.pt2``, ``step.onnx``: one step as a program (``physworld.worldmodel.export``);
 * ``card.json``: lineage, architecture, metrics, seeds, versions, intended use, limits;
 * ``prediction.npz``: ``times`` (T,) f8 [s], ``tracks`` and ``tracks_calibrated`` (T, N, 3) f4 [m] after and
   before fine-tuning, ``twin_tracks``; ``tick_times`` (S,) f8 and ``vertices`` (S, n, 3) f4 on the model's
   clock;
 * ``manifest.json``: sha256 and size of each of them; its digest is the version's;
-* ``manifest.sig.json``: the installation's signature of the manifest (``storage.signing``).
+* ``manifest.sig.json``: the installation's signature of the manifest (``physworld_storage.signing``).
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ import numpy as np
 import torch
 
 from physworld.demonstrate.config import StrengthRange
-from physworld.worldmodel import config as settings_of
 from physworld.worldmodel.errors import CheckpointMismatch, TrainingCancelled
 from physworld.worldmodel.finetune import FineTuneResult, fine_tune
+from physworld.worldmodel.model import config as settings_of
 from physworld.worldmodel.scene_view import SceneView, view_scene
 from physworld.worldmodel.training import TrainingResult, first_episodes, train
-from schemas.model import TrainingConfig
-from services.trainer.closed_loop import closed_loop
-from services.trainer.episodes import Episodes
-from services.trainer.measuring import Measured, json_safe, measure
-from services.trainer.publishing import MANIFEST_NAME, card_of, store_version
-from services.trainer.settings import translate
-from storage import traces
-from workers.context import TaskContext
-from workers.lineage import lineage_of
-from workers.registry import HandlerResult
-from workers.stores import Stores
-from workers.tasks.dataset import strength_ranges
-from workers.tasks.inputs import made_from, scene_of, twin_of
+from physworld_schemas.model import TrainingConfig
+from physworld_services.trainer.closed_loop import closed_loop
+from physworld_services.trainer.episodes import Episodes
+from physworld_services.trainer.measuring import Measured, json_safe, measure
+from physworld_services.trainer.publishing import MANIFEST_NAME, card_of, store_version
+from physworld_services.trainer.settings import translate
+from physworld_storage import traces
+from physworld_workers.context import TaskContext
+from physworld_workers.lineage import lineage_of
+from physworld_workers.registry import HandlerResult
+from physworld_workers.stores import Stores
+from physworld_workers.tasks.dataset import strength_ranges
+from physworld_workers.tasks.inputs import made_from, scene_of, twin_of
 
 logger = logging.getLogger(__name__)
 

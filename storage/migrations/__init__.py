@@ -1,1 +1,1 @@
-"""Alembic migrations of the database; applied by ``storage.database.Database.upgrade``."""
+"""Alembic migrations of the database; applied by ``physworld_storage.database.Database.upgrade``."""

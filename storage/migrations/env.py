@@ -5,7 +5,7 @@ from __future__ import annotations
 from alembic import context
 from sqlalchemy import text
 
-from storage.tables import Base
+from physworld_storage.tables import Base
 
 UPGRADE_LOCK = 0x70687973  # "phys": one upgrade at a time on Postgres; SQLite's BEGIN IMMEDIATE does the same
 

@@ -175,12 +175,24 @@ def test_named_volumes_are_declared(text: str) -> None:
 @pytest.mark.parametrize(
     ("target", "modules", "absent"),
     [
-        ("api", "services.web services.api.migrate", "torch warp celery kombu workers benchmarks"),
-        ("worker", "workers.__main__ workers.dispatcher workers.app", "torch warp services benchmarks"),
-        ("trainer", "services.trainer.__main__ workers.app", "torch warp fastapi benchmarks"),
+        (
+            "api",
+            "physworld_services.web physworld_services.api.migrate",
+            "torch warp celery kombu workers benchmarks",
+        ),
+        (
+            "worker",
+            "physworld_workers.__main__ physworld_workers.dispatcher physworld_workers.app",
+            "torch warp services benchmarks",
+        ),
+        (
+            "trainer",
+            "physworld_services.trainer.__main__ physworld_workers.app",
+            "torch warp fastapi benchmarks",
+        ),
         (
             "inference",
-            "services.inference.__main__ services.inference.lazy workers.app",
+            "physworld_services.inference.__main__ physworld_services.inference.lazy physworld_workers.app",
             "torch warp benchmarks",
         ),
     ],

@@ -7,13 +7,13 @@ import signal
 import sys
 from pathlib import Path
 
-from storage.database import open_database
-from storage.settings import Settings
-from workers.context import TaskContext
-from workers.execute import Runtime, run_shard
-from workers.owner import process_owner
-from workers.registry import HandlerResult
-from workers.stores import Stores
+from physworld_storage.database import open_database
+from physworld_storage.settings import Settings
+from physworld_workers.context import TaskContext
+from physworld_workers.execute import Runtime, run_shard
+from physworld_workers.owner import process_owner
+from physworld_workers.registry import HandlerResult
+from physworld_workers.stores import Stores
 
 
 def deadly(context: TaskContext, stores: Stores) -> HandlerResult:

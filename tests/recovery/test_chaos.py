@@ -14,9 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.chaos import plan
-from benchmarks.chaos.distributed import initdb_binary
-from benchmarks.chaos.store_proxy import RefusingProxy
+from benchmarks.service.chaos import plan
+from benchmarks.service.chaos.distributed import initdb_binary
+from benchmarks.service.chaos.store_proxy import RefusingProxy
 
 KILLS, SEED = 8, 1
 NOTHING = (
@@ -28,7 +28,15 @@ NOTHING = (
 def ledger_of(deployment: str, repository: Path, folder: Path) -> dict[str, object]:
     """Run the command as a person would, in a process of its own."""
     file = folder / "ledger.json"
-    command = [sys.executable, "-m", "benchmarks.chaos", "--deployment", deployment, "--seed", str(SEED)]
+    command = [
+        sys.executable,
+        "-m",
+        "benchmarks.service.chaos",
+        "--deployment",
+        deployment,
+        "--seed",
+        str(SEED),
+    ]
     limits = ["--kills", str(KILLS), "--minutes", "4", "--settle", "180", "--json", str(file)]
     done = subprocess.run([*command, *limits], cwd=repository, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr

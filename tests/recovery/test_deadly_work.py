@@ -12,13 +12,13 @@ from service_process import environment
 from sqlalchemy import select
 from tiny_scene import register, tiny_scene
 
-from schemas.fit import FitConfig
-from storage import jobs, leases, losses
-from storage.database import open_database
-from storage.settings import Settings
-from storage.tables import ShardRow
-from workers.owner import owner_is_gone
-from workers.stores import Stores
+from physworld_schemas.fit import FitConfig
+from physworld_storage.database import open_database
+from physworld_storage.jobs import jobs, leases, losses
+from physworld_storage.settings import Settings
+from physworld_storage.tables import ShardRow
+from physworld_workers.owner import owner_is_gone
+from physworld_workers.stores import Stores
 
 PROCESS = Path(__file__).with_name("deadly_process.py")
 

@@ -8,10 +8,11 @@ import pytest
 from service_process import ServiceProcess, until, wait_for_job
 from tiny_scene import register, tiny_scene
 
-from schemas.dataset import DatasetConfig, Episode
-from schemas.fit import FitConfig
-from storage import jobs, resources
-from storage.database import Database
+from physworld_schemas.dataset import DatasetConfig, Episode
+from physworld_schemas.fit import FitConfig
+from physworld_storage import resources
+from physworld_storage.database import Database
+from physworld_storage.jobs import jobs
 
 EPISODES = 40
 FRAMES = 60

@@ -16,17 +16,18 @@ import pytest
 from safetensors.numpy import load
 from tiny_scene import register, tiny_scene
 
-from schemas.dataset import DatasetConfig
-from schemas.fit import FitConfig
-from schemas.job import Job
-from schemas.model import TrainingConfig, TrainingCreate
-from services.trainer.training import CHECKPOINT
-from storage import jobs, leases, registry
-from storage.database import open_database
-from storage.settings import Settings
-from workers.execute import Runtime, run_shard
-from workers.owner import process_owner
-from workers.stores import Stores
+from physworld_schemas.dataset import DatasetConfig
+from physworld_schemas.fit import FitConfig
+from physworld_schemas.job import Job
+from physworld_schemas.model import TrainingConfig, TrainingCreate
+from physworld_services.trainer.training import CHECKPOINT
+from physworld_storage import registry
+from physworld_storage.database import open_database
+from physworld_storage.jobs import jobs, leases
+from physworld_storage.settings import Settings
+from physworld_workers.execute import Runtime, run_shard
+from physworld_workers.owner import process_owner
+from physworld_workers.stores import Stores
 
 PROCESS = Path(__file__).with_name("trainer_process.py")
 WITHIN_S = 120.0

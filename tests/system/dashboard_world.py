@@ -16,18 +16,20 @@ import numpy as np
 
 from physworld.demonstrate.coverage import Coverage
 from physworld.scene import Body, Scene
-from schemas.base import Artifact, Problem
-from schemas.dataset import DatasetConfig
-from schemas.fit import FitConfig
-from schemas.job import Job, Progress
-from schemas.model import TrainingConfig
-from schemas.pipeline import PipelineCreate
-from services.stores import Stores
-from storage import api_keys, jobs, leases, resources
-from storage.database import Database, open_database
-from storage.scene_bundle import canonical_archive
-from storage.settings import Settings
-from workers.tasks.dataset_card import store_card
+from physworld_scenes.bundle import canonical_archive
+from physworld_schemas.base import Artifact, Problem
+from physworld_schemas.dataset import DatasetConfig
+from physworld_schemas.fit import FitConfig
+from physworld_schemas.job import Job, Progress
+from physworld_schemas.model import TrainingConfig
+from physworld_schemas.pipeline import PipelineCreate
+from physworld_services.stores import Stores
+from physworld_storage import resources
+from physworld_storage.access import api_keys
+from physworld_storage.database import Database, open_database
+from physworld_storage.jobs import jobs, leases
+from physworld_storage.settings import Settings
+from physworld_workers.tasks.dataset_card import store_card
 
 FRAMES, POINTS, PARTICLES = 90, 24, 300
 FIRST_HELD_OUT = 63

@@ -27,13 +27,13 @@ from physworld_client.world_model import WorldModel
 from service_process import until
 from tiny_scene import tiny_scene
 
-from schemas.dataset import DatasetConfig
-from schemas.fit import FitConfig
-from schemas.model import TrainingConfig
-from schemas.pipeline import PipelineCreate
-from schemas.plan import PlanConfig
-from schemas.signing import SIGNATURE_NAME
-from storage.scene_bundle import canonical_archive
+from physworld_scenes.bundle import canonical_archive
+from physworld_schemas.dataset import DatasetConfig
+from physworld_schemas.fit import FitConfig
+from physworld_schemas.model import TrainingConfig
+from physworld_schemas.pipeline import PipelineCreate
+from physworld_schemas.plan import PlanConfig
+from physworld_schemas.signing import SIGNATURE_NAME
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(2400)]
 

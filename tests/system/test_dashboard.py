@@ -19,10 +19,11 @@ from fastapi import FastAPI
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 from serving import serve
 
-from schemas.fit import FitConfig
-from schemas.pipeline import PipelineCreate
-from services.dashboard import mount
-from storage import jobs, resources
+from physworld_schemas.fit import FitConfig
+from physworld_schemas.pipeline import PipelineCreate
+from physworld_services.dashboard import mount
+from physworld_storage import resources
+from physworld_storage.jobs import jobs
 
 pytestmark = pytest.mark.browser
 

@@ -18,12 +18,13 @@ import redis
 from service_process import END_WITHIN_S, ServiceProcess, environment, until, wait_for_job
 from tiny_scene import register, tiny_scene
 
-from schemas.fit import FitConfig
-from schemas.job import Job
-from services.embedded.broker import choose_broker
-from services.embedded.folder import DataFolder
-from storage import api_keys, jobs
-from storage.tables import ApiKeyRow, ShardRow
+from physworld_schemas.fit import FitConfig
+from physworld_schemas.job import Job
+from physworld_services.embedded.broker import choose_broker
+from physworld_services.embedded.folder import DataFolder
+from physworld_storage.access import api_keys
+from physworld_storage.jobs import jobs
+from physworld_storage.tables import ApiKeyRow, ShardRow
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
 
@@ -59,7 +60,7 @@ def test_start_look_start_again_and_ctrl_c(tmp_path: Path) -> None:
         assert _status(f"{state['api_url']}/v1/jobs", key_file.read_text().strip()) == 200
 
         second = subprocess.run(
-            [sys.executable, "-m", "services.embedded", "--data", str(service.data)],
+            [sys.executable, "-m", "physworld_services.embedded", "--data", str(service.data)],
             env=environment(),
             capture_output=True,
             text=True,
@@ -198,7 +199,7 @@ def test_a_port_that_somebody_has_is_named(tmp_path: Path) -> None:
             [
                 sys.executable,
                 "-m",
-                "services.embedded",
+                "physworld_services.embedded",
                 "--data",
                 str(tmp_path / "data"),
                 "--port",
@@ -215,7 +216,14 @@ def test_a_port_that_somebody_has_is_named(tmp_path: Path) -> None:
 
 def test_settings_that_cannot_work_end_the_start_with_their_names(tmp_path: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "services.embedded", "--data", str(tmp_path / "data"), "--no-trainer"],
+        [
+            sys.executable,
+            "-m",
+            "physworld_services.embedded",
+            "--data",
+            str(tmp_path / "data"),
+            "--no-trainer",
+        ],
         env={**environment(), "PHYSWORLD_BROKER_URL": "http://not-a-broker"},
         capture_output=True,
         text=True,
@@ -231,7 +239,14 @@ def test_nobody_survives_a_supervisor_killed_while_it_starts(tmp_path: Path) -> 
     service = ServiceProcess(tmp_path / "data", "--workers", "1", "--no-trainer")
     with service.output.open("wb") as output:
         process = subprocess.Popen(
-            [sys.executable, "-m", "services.embedded", "--data", str(service.data), *service.options],
+            [
+                sys.executable,
+                "-m",
+                "physworld_services.embedded",
+                "--data",
+                str(service.data),
+                *service.options,
+            ],
             env=environment(),
             stdout=output,
             stderr=subprocess.STDOUT,

@@ -10,7 +10,7 @@ from physworld_client import Client
 from published_tiny import publish_tiny, tiny_model
 from service_process import ServiceProcess, until
 
-from schemas.plan import PlanConfig
+from physworld_schemas.plan import PlanConfig
 
 SINGLE_PRECISION_M = 2e-6
 

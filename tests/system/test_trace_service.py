@@ -15,11 +15,11 @@ from physworld_client import Client
 from service_process import ServiceProcess, until
 from tiny_scene import register, tiny_scene
 
-from schemas.fit import FitConfig
-from schemas.job import TERMINAL_STATES, Job
-from schemas.trace import TraceConfig
-from storage.helpers import SIMULATION
-from storage.tables import ShardRow
+from physworld_schemas.fit import FitConfig
+from physworld_schemas.job import TERMINAL_STATES, Job
+from physworld_schemas.trace import TraceConfig
+from physworld_storage.jobs.helpers import SIMULATION
+from physworld_storage.tables import ShardRow
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
 

@@ -13,10 +13,10 @@ import pytest
 from physworld_client.cli.app import app
 from typer.testing import CliRunner
 
-from services.web import create_app
-from storage.scene_bundle import FIELD_OF_ARRAY
-from storage.scene_declaration import BodyForm, ColliderForm, Declaration, GripForm, GroundForm
-from storage.settings import Settings
+from physworld_scenes.bundle import FIELD_OF_ARRAY
+from physworld_scenes.declaration import BodyForm, ColliderForm, Declaration, GripForm, GroundForm
+from physworld_services.web import create_app
+from physworld_storage.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])

@@ -1,4 +1,4 @@
 """Work without the service: one process, files in, files out.
 
-``physworld NAME`` becomes ``python -m workers.commands.NAME``.
+``physworld NAME`` becomes ``python -m physworld_workers.commands.NAME``.
 """

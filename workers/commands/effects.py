@@ -1,4 +1,5 @@
-"""``python -m workers.commands.effects [SCENE] [--json]``: the registry of effects, with strengths, units and bounds.
+"""``python -m physworld_workers.commands.effects [SCENE] [--json]``: the registry of effects, with strengths, units and
+bounds.
 
 Bounds follow the body. Without a scene they are those of three bodies of everyday size, a beam, a sheet and a rope;
 with one they are those of the twin that the scene gives before calibration.
@@ -19,7 +20,7 @@ from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Ground, Scene
 
 if TYPE_CHECKING:
     from physworld.effects.base import Effect
-    from physworld.twin import Twin
+    from physworld.twin.twin import Twin
 
 SCHEMA_VERSION = 1
 _PARTICLES = 300  # bounds do not depend on the resolution, except for a grip's and a clamp's, by the cell
@@ -32,7 +33,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("scene", type=Path, nargs="?", help="folder, archive, final_data.pkl or C3D file")
     parser.add_argument("--json", action="store_true", help="print JSON")
     given = parser.parse_args(arguments)
-    from workers.commands.terminal import guarded
+    from physworld_workers.commands.terminal import guarded
 
     return guarded(lambda: _list(given))
 
@@ -41,8 +42,8 @@ def _list(given: argparse.Namespace) -> None:
     import warp as wp
 
     wp.config.log_level = wp.LOG_WARNING  # before the first import that starts it
-    from physworld.build import build_twin
-    from workers.commands.terminal import read_scene
+    from physworld.twin.build import build_twin
+    from physworld_workers.commands.terminal import read_scene
 
     scenes = everyday_scenes() if given.scene is None else {"scene": read_scene(given.scene)}
     document = effects_document({name: build_twin(scene, _PARTICLES) for name, scene in scenes.items()})

@@ -1,4 +1,4 @@
-"""``python -m workers.commands.effects_wire``: write the registry of effects in the form that the API serves.
+"""``python -m physworld_workers.commands.effects_wire``: write the registry of effects in the form that the API serves.
 
 The web process holds neither warp nor the registry, so it reads ``services/api/effects.json``; a test compares the two.
 """
@@ -14,12 +14,12 @@ FILE = Path(__file__).parents[2] / "services" / "api" / "effects.json"
 
 
 def wire_effects() -> list[dict[str, Any]]:
-    """Every effect as ``schemas.library.Effect``: name, title, kind, law, unit of each strength."""
+    """Every effect as ``physworld_schemas.library.Effect``: name, title, kind, law, unit of each strength."""
     import warp as wp
 
     wp.config.log_level = wp.LOG_WARNING  # before the first import that starts it
-    from physworld.build import build_twin
-    from workers.commands.effects import effects_document, everyday_scenes
+    from physworld.twin.build import build_twin
+    from physworld_workers.commands.effects import effects_document, everyday_scenes
 
     document = effects_document({name: build_twin(scene, 300) for name, scene in everyday_scenes().items()})
     return [

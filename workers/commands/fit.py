@@ -1,11 +1,11 @@
-"""``python -m workers.commands.fit SCENE --json FILE``: calibrate a twin in this process and measure it.
+"""``python -m physworld_workers.commands.fit SCENE --json FILE``: calibrate a twin in this process and measure it.
 
 The figures are those of :func:`fit_document`; ``--out DIR`` also keeps the twin and its prediction, the files of
 the service's fit. Ctrl-C cancels; nothing is written before the end but the finished steps, in the file of
 ``--resume``, from which the next call goes on.
 
 ``--law auto`` chooses the law first: by the model behind PHYSWORLD_LAW_URL where one is set (see
-:mod:`workers.law_endpoint`), else by cross-validation.
+:mod:`physworld_workers.law_endpoint`), else by cross-validation.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ SCHEMA_VERSION = 1
 def main(arguments: list[str] | None = None) -> int:
     """Parse the command line, fit, write."""
     given = _parser().parse_args(arguments)
-    from workers.commands.terminal import guarded
+    from physworld_workers.commands.terminal import guarded
 
     return guarded(lambda: _fit(given), lambda: _kept(given.resume))
 
@@ -73,14 +73,14 @@ def _fit(given: argparse.Namespace) -> None:
     wp.config.quiet = True  # before the first import that starts it
     from physworld.calibrate import CalibrationConfig
     from physworld.calibrate.stages import GLOBAL
-    from physworld.simulations import Workers, in_turn
-    from workers.commands.steps import journal_in
-    from workers.commands.terminal import progress_bar, read_scene
-    from workers.law_choice import AUTO, chosen_laws
-    from workers.mesh_choice import AUTO as AUTO_MESH
-    from workers.mesh_choice import PLATE, fitted_as_recorded, named_mesh
-    from workers.tasks.fit_accuracy import fit_accuracy, not_measured
-    from workers.tasks.fit_report import fit_files, fit_report
+    from physworld.estimation.simulations import Workers, in_turn
+    from physworld_workers.commands.steps import journal_in
+    from physworld_workers.commands.terminal import progress_bar, read_scene
+    from physworld_workers.law_choice import AUTO, chosen_laws
+    from physworld_workers.mesh_choice import AUTO as AUTO_MESH
+    from physworld_workers.mesh_choice import PLATE, fitted_as_recorded, named_mesh
+    from physworld_workers.tasks.fit_accuracy import fit_accuracy, not_measured
+    from physworld_workers.tasks.fit_report import fit_files, fit_report
 
     _refuse_places(given)
     scene = read_scene(given.scene)
@@ -130,7 +130,7 @@ def _refuse_places(given: argparse.Namespace) -> None:
 
 def _kept(path: Path | None) -> str:
     """What an interrupted fit leaves behind."""
-    from workers.commands.terminal import NOTHING_WRITTEN
+    from physworld_workers.commands.terminal import NOTHING_WRITTEN
 
     if path is None or not path.exists():
         return NOTHING_WRITTEN

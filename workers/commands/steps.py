@@ -5,10 +5,10 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
-from physworld.calibrate.journal import JOURNAL_BEGINS, Journal
+from physworld.estimation.journal import JOURNAL_BEGINS, Journal
+from physworld.estimation.simulations import engine
 from physworld.scene import Scene
-from physworld.simulations import engine
-from storage.scene_bundle import canonical_archive
+from physworld_scenes.bundle import canonical_archive
 
 
 def journal_in(path: Path, scene: Scene, settings: str) -> Journal:

@@ -17,9 +17,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from physworld.errors import Cancelled, PhysworldError
 from physworld.scene import Scene
-from storage.errors import StorageError
-from storage.importers import import_any
-from storage.scene_bundle import read_bundle
+from physworld_scenes.bundle import read_bundle
+from physworld_scenes.importers import import_any
+from physworld_storage.errors import StorageError
 
 FAILED, INTERRUPTED = 2, 130
 PLAIN_INTERVAL_S = 5.0

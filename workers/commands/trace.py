@@ -1,4 +1,5 @@
-"""``python -m workers.commands.trace SCENE --out report.json``: trace a recording's residual to a named effect.
+"""``python -m physworld_workers.commands.trace SCENE --out report.json``: trace a recording's residual to a named
+effect.
 
 Several recordings of one object are fitted together (``trace A B``); those after ``--held-out`` are only predicted, for
 the report. The tracks and the page are those of the first recording; with several, the tracks of the k-th (those that
@@ -28,7 +29,7 @@ MINUTES = 10.0
 def main(arguments: list[str] | None = None) -> int:
     """Parse the command line, trace, write."""
     given = _parser().parse_args(arguments)
-    from workers.commands.terminal import NOTHING_WRITTEN, guarded
+    from physworld_workers.commands.terminal import NOTHING_WRITTEN, guarded
 
     def left() -> str:
         if given.resume is None or not given.resume.exists():
@@ -103,11 +104,11 @@ def _trace(given: argparse.Namespace) -> None:
     import numpy as np
 
     from physworld.calibrate import CalibrationConfig
-    from physworld.simulations import in_turn
+    from physworld.estimation.simulations import in_turn
+    from physworld.report import render
     from physworld.trace import Memory, TraceConfig, Workers, document, trace
-    from physworld.trace.html import render
-    from workers.commands.steps import journal_in
-    from workers.commands.terminal import progress_bar, read_scene
+    from physworld_workers.commands.steps import journal_in
+    from physworld_workers.commands.terminal import progress_bar, read_scene
 
     scenes = [read_scene(path) for path in given.scenes]
     held_out = [read_scene(path) for path in given.held_out]

@@ -1,4 +1,5 @@
-"""``python -m workers.commands.video MOTION.npz --out film.mp4``: draw a motion as a film, and score it against frames.
+"""``python -m physworld_workers.commands.video MOTION.npz --out film.mp4``: draw a motion as a film, and score it
+against frames.
 
 MOTION.npz holds ``vertices``, ``particles``, ``tracks`` or ``points``, (T, n, 3) [m] or a batch of them, with ``times``
 (T,) [s] or ``dt_s``: what ``physworld rollout``, ``physworld fit --out`` and ``physworld trace --predictions`` write.
@@ -30,7 +31,7 @@ _SHOWN = 3000  # points of a motion that are drawn where there is no splat
 def main(arguments: list[str] | None = None) -> int:
     """Parse the command line, draw, write."""
     given = _parser().parse_args(arguments)
-    from workers.commands.terminal import guarded
+    from physworld_workers.commands.terminal import guarded
 
     return guarded(lambda: _film(given))
 
@@ -69,7 +70,7 @@ def _film(given: argparse.Namespace) -> None:
         from_ply,
         gaussians_at_points,
     )
-    from workers.commands.terminal import progress_bar
+    from physworld_workers.commands.terminal import progress_bar
 
     moved, rest, times = _motion(given.motion, given.number)
     camera = _camera(given, moved)

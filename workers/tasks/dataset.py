@@ -4,7 +4,7 @@ An episode is written under the epoch of its lease and exists once its shard is 
 or overtaken worker wrote belongs to nobody and is removed at sealing. Its seed follows from the dataset's
 and its index alone, so a second attempt makes the same episode; an episode that is rejected (unstable, out of the
 workspace) is drawn anew from the seed of its next try, and its reasons are kept. The seal reads every episode again,
-compares digests, and writes the card of what they cover (:mod:`workers.tasks.dataset_card`).
+compares digests, and writes the card of what they cover (:mod:`physworld_workers.tasks.dataset_card`).
 
 On a GPU the first shard of a block simulates the whole block side by side, and the process keeps the rest for the
 shards that follow; whoever makes an episode, its block is the same.
@@ -33,18 +33,18 @@ from physworld.demonstrate.episode import episode_frames
 from physworld.demonstrate.side_by_side import make_episodes
 from physworld.errors import SimulationError
 from physworld.scene import Scene
-from physworld.twin import Twin
-from physworld.worldmodel.graph import MOST_KEPT, kept_vertices
-from schemas.dataset import DatasetConfig, Episode
-from schemas.trace import FoundEffect
-from storage import resources, traces
-from workers.context import TaskContext
-from workers.errors import DatasetIncomplete, NotEnoughDisk
-from workers.lineage import lineage_of
-from workers.registry import HandlerResult
-from workers.stores import Stores
-from workers.tasks.dataset_card import store_card
-from workers.tasks.inputs import made_from, scene_of, twin_of
+from physworld.twin.twin import Twin
+from physworld.worldmodel.model.graph import MOST_KEPT, kept_vertices
+from physworld_schemas.dataset import DatasetConfig, Episode
+from physworld_schemas.trace import FoundEffect
+from physworld_storage import resources, traces
+from physworld_workers.context import TaskContext
+from physworld_workers.errors import DatasetIncomplete, NotEnoughDisk
+from physworld_workers.lineage import lineage_of
+from physworld_workers.registry import HandlerResult
+from physworld_workers.stores import Stores
+from physworld_workers.tasks.dataset_card import store_card
+from physworld_workers.tasks.inputs import made_from, scene_of, twin_of
 
 FLOAT_BYTES = 4
 STORE_OVERHEAD = 1.05

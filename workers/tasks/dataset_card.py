@@ -6,11 +6,11 @@ import json
 from typing import Any
 
 from physworld.demonstrate.coverage import Coverage
-from schemas.base import Artifact
-from schemas.dataset import DatasetConfig
-from storage.artifacts import ArtifactStore
-from workers.coverage_picture import coverage_pictures
-from workers.tasks.fit_report import json_safe
+from physworld_schemas.base import Artifact
+from physworld_schemas.dataset import DatasetConfig
+from physworld_storage.artifacts import ArtifactStore
+from physworld_workers.coverage_picture import coverage_pictures
+from physworld_workers.tasks.fit_report import json_safe
 
 CARD, SVG, PNG = "card.json", "coverage.svg", "coverage.png"
 

@@ -1,25 +1,26 @@
 """Calibrates a twin on a scene's training frames and measures it on the frames that were held out.
 
-Artifacts: ``twin.npz``, ``prediction.npz`` and ``report.json``, see :mod:`workers.tasks.fit_report`. The journal of
-the search lies in the job's scratch folder: a killed worker's fit goes on where it was, on any host. Simulations that
-do not depend on each other are shared with whatever worker is free (:mod:`workers.tasks.shared_runs`).
+Artifacts: ``twin.npz``, ``prediction.npz`` and ``report.json``, see :mod:`physworld_workers.tasks.fit_report`. The
+journal of the search lies in the job's scratch folder: a killed worker's fit goes on where it was, on any host.
+Simulations that do not depend on each other are shared with whatever worker is free
+(:mod:`physworld_workers.tasks.shared_runs`).
 """
 
 from __future__ import annotations
 
 from physworld.calibrate import CalibrationConfig
-from schemas.fit import FitConfig
-from storage import helpers
-from workers.context import TaskContext
-from workers.law_choice import chosen_laws
-from workers.lineage import lineage_of
-from workers.mesh_choice import fitted_as_recorded, named_mesh
-from workers.registry import HandlerResult
-from workers.stores import Stores
-from workers.tasks.fit_accuracy import fit_accuracy, not_measured
-from workers.tasks.fit_report import MEDIA_TYPES, fit_files, fit_report
-from workers.tasks.inputs import scene_of, scene_reference
-from workers.tasks.shared_runs import SharedRunner, stored_journal
+from physworld_schemas.fit import FitConfig
+from physworld_storage.jobs import helpers
+from physworld_workers.context import TaskContext
+from physworld_workers.law_choice import chosen_laws
+from physworld_workers.lineage import lineage_of
+from physworld_workers.mesh_choice import fitted_as_recorded, named_mesh
+from physworld_workers.registry import HandlerResult
+from physworld_workers.stores import Stores
+from physworld_workers.tasks.fit_accuracy import fit_accuracy, not_measured
+from physworld_workers.tasks.fit_report import MEDIA_TYPES, fit_files, fit_report
+from physworld_workers.tasks.inputs import scene_of, scene_reference
+from physworld_workers.tasks.shared_runs import SharedRunner, stored_journal
 
 WORTH_SHARING_S = 0.3  # to hand a simulation to another worker takes some hundredths of a second
 

@@ -14,10 +14,10 @@ from physworld.calibrate import FitResult, Journal
 from physworld.calibrate.discretisation import converged_parameters
 from physworld.calibrate.search import Progress
 from physworld.errors import Cancelled, SceneUnsupported, SimulationError
+from physworld.estimation.simulations import Runner, in_turn
 from physworld.evaluate.numerics import measure_numerics, refined_tracks_of
 from physworld.scene import Scene
-from physworld.simulations import Runner, in_turn
-from workers.tasks.fit_report import json_safe, parameter_json
+from physworld_workers.tasks.fit_report import json_safe, parameter_json
 
 MEASURED_RUNS = 4
 

@@ -20,8 +20,8 @@ from physworld.calibrate.local_search import FIELDS
 from physworld.calibrate.local_stage import LocalResult
 from physworld.evaluate.table import held_out_table
 from physworld.scene import Scene
-from schemas.fit import Parameter
-from workers.tasks.inputs import TWIN, npz_bytes
+from physworld_schemas.fit import Parameter
+from physworld_workers.tasks.inputs import TWIN, npz_bytes
 
 PREDICTION = "prediction.npz"
 REPORT = "report.json"
@@ -38,7 +38,7 @@ def fit_report(
         scene: the recording.
         fitted: its calibration.
         law: how the law was chosen; None: it is the usual one.
-        accuracy: of :func:`workers.tasks.fit_accuracy.fit_accuracy`.
+        accuracy: of :func:`physworld_workers.tasks.fit_accuracy.fit_accuracy`.
     """
     law = law or LawChoice(fitted.twin.law.name)
     open_ones = {**fitted.open, **({} if law.ended else {"law": law.reason})}

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from physworld.scene import Scene
-from schemas.base import Artifact, Reference
-from storage import resources, traces
-from storage.errors import Conflict, NotFound
-from storage.scene_bundle import bundle_from_bytes
-from workers.stores import Stores
+from physworld_scenes.bundle import bundle_from_bytes
+from physworld_schemas.base import Artifact, Reference
+from physworld_storage import resources, traces
+from physworld_storage.errors import Conflict, NotFound
+from physworld_workers.stores import Stores
 
 if TYPE_CHECKING:
-    from physworld.twin import Twin
+    from physworld.twin.twin import Twin
 
 TWIN = "twin.npz"
 
@@ -90,7 +90,7 @@ def _read_scene(stores: Stores, scene_id: str) -> Scene:
 
 
 def _read_twin(stores: Stores, fit_id: str, trace_id: str | None) -> Twin:
-    from physworld.twin import Twin
+    from physworld.twin.twin import Twin
 
     with stores.database.reading() as session:
         fit = resources.get_fit(session, fit_id)

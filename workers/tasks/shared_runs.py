@@ -2,8 +2,8 @@
 
 The shard that decides (the driver: a trace, a fit) puts simulations that do not depend on each other up as
 ``simulation`` shards of its own job, which other workers take from the queue and the driver takes itself
-(``storage.helpers``). Every simulation is kept in the job's scratch folder under its fingerprint, and so is the
-journal of the driver's calibration.
+(``physworld_storage.jobs.helpers``). Every simulation is kept in the job's scratch folder under its fingerprint, and so
+is the journal of the driver's calibration.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from typing import Any
 import numpy as np
 
 from physworld.calibrate import Journal
-from physworld.simulations import Drive, Job, engine, tracks_of
+from physworld.estimation.simulations import Drive, Job, engine, tracks_of
 from physworld.trace import Memory, TimeUp
-from physworld.twin import Twin
-from storage import helpers
-from storage.errors import NotFound
-from storage.opening import DONE, QUEUED
-from workers.context import TaskContext
-from workers.errors import Cancelled
-from workers.execute import Runtime, run_shard
-from workers.owner import process_owner
-from workers.registry import HandlerResult
-from workers.stores import Stores
-from workers.tasks.inputs import npz_arrays, npz_bytes
+from physworld.twin.twin import Twin
+from physworld_storage.errors import NotFound
+from physworld_storage.jobs import helpers
+from physworld_storage.jobs.opening import DONE, QUEUED
+from physworld_workers.context import TaskContext
+from physworld_workers.errors import Cancelled
+from physworld_workers.execute import Runtime, run_shard
+from physworld_workers.owner import process_owner
+from physworld_workers.registry import HandlerResult
+from physworld_workers.stores import Stores
+from physworld_workers.tasks.inputs import npz_arrays, npz_bytes
 
 JOURNAL = "calibration.json"
 LOOK_S = 0.1

@@ -2,8 +2,8 @@
 
 One ``trace`` shard, the driver, does all that decides. Simulations that do not depend on each other are put up as
 ``simulation`` shards of the same job, which other workers take from the queue and the driver takes itself
-(``storage.helpers``). Every simulation is kept in the job's scratch folder under its fingerprint, and so is the
-calibration's journal: a trace whose worker was killed goes on where it was, on any host.
+(``physworld_storage.jobs.helpers``). Every simulation is kept in the job's scratch folder under its fingerprint, and so
+is the calibration's journal: a trace whose worker was killed goes on where it was, on any host.
 """
 
 from __future__ import annotations
@@ -18,18 +18,19 @@ from physworld.calibrate import CalibrationConfig
 from physworld.calibrate.parameters import bending_ratio
 from physworld.materials.laws import SheetLaw
 from physworld.trace import TraceConfig, trace
-from physworld.twin import Twin
-from schemas.base import Reference
-from schemas.fit import FitConfig
-from schemas.trace import TraceConfig as WireConfig
-from storage import helpers, resources
-from workers.context import TaskContext
-from workers.lineage import lineage_of
-from workers.registry import HandlerResult
-from workers.stores import Stores
-from workers.tasks.inputs import fit_reference, scene_of, scene_reference, twin_of
-from workers.tasks.shared_runs import SharedMemory, SharedRunner, stored_journal
-from workers.tasks.trace_report import trace_files, trace_report
+from physworld.twin.twin import Twin
+from physworld_schemas.base import Reference
+from physworld_schemas.fit import FitConfig
+from physworld_schemas.trace import TraceConfig as WireConfig
+from physworld_storage import resources
+from physworld_storage.jobs import helpers
+from physworld_workers.context import TaskContext
+from physworld_workers.lineage import lineage_of
+from physworld_workers.registry import HandlerResult
+from physworld_workers.stores import Stores
+from physworld_workers.tasks.inputs import fit_reference, scene_of, scene_reference, twin_of
+from physworld_workers.tasks.shared_runs import SharedMemory, SharedRunner, stored_journal
+from physworld_workers.tasks.trace_report import trace_files, trace_report
 
 if TYPE_CHECKING:
     from physworld.scene import Scene

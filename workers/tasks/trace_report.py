@@ -12,10 +12,10 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any
 
+from physworld.report import render
 from physworld.trace import document
-from physworld.trace.html import render
-from storage.traces import DECLARED, PAGE, REPORT, TRACKS, TWIN
-from workers.tasks.inputs import npz_bytes
+from physworld_storage.traces import DECLARED, PAGE, REPORT, TRACKS, TWIN
+from physworld_workers.tasks.inputs import npz_bytes
 
 if TYPE_CHECKING:
     from physworld.scene import Scene

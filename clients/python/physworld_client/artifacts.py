@@ -10,7 +10,7 @@ import httpx
 
 from physworld_client import calls, transport
 from physworld_client.partial import PartialFile
-from schemas.base import Artifact
+from physworld_schemas.base import Artifact
 
 if TYPE_CHECKING:
     from physworld_client.client import Client

@@ -14,10 +14,10 @@ from physworld_client.arrays import arrays_of
 from physworld_client.async_resources import AsyncResource
 from physworld_client.pages import AsyncListPage
 from physworld_client.resources import LATEST
-from schemas.assessment import Assessment
-from schemas.fit import FitConfig
-from schemas.job import Job
-from schemas.trace import Trace, TraceConfig
+from physworld_schemas.assessment import Assessment
+from physworld_schemas.fit import FitConfig
+from physworld_schemas.job import Job
+from physworld_schemas.trace import Trace, TraceConfig
 
 
 class AsyncTraces(AsyncResource):

@@ -14,9 +14,9 @@ from physworld_client.async_resources import AsyncResource
 from physworld_client.pages import AsyncListPage
 from physworld_client.predictions import Planned, Predicted
 from physworld_client.resources import LATEST
-from schemas.job import Job
-from schemas.plan import Plan, PlanConfig, PlanLimits
-from schemas.rollout import Part, Rollout, Start
+from physworld_schemas.job import Job
+from physworld_schemas.plan import Plan, PlanConfig, PlanLimits
+from physworld_schemas.rollout import Part, Rollout, Start
 
 
 class AsyncRollouts(AsyncResource):

@@ -22,13 +22,13 @@ from physworld_client.pages import AsyncListPage
 from physworld_client.signatures import given_key
 from physworld_client.stream import HEARTBEAT_S, IDLE_LIMIT_S, EventDecoder, ends_job
 from physworld_client.waiting import Patience, job_id_of, require_success
-from schemas.dataset import Dataset, DatasetConfig, Episode
-from schemas.fit import Fit, FitConfig
-from schemas.job import TERMINAL_STATES, Event, Job
-from schemas.model import Model, ModelComparison, ModelVersion, TrainingConfig
-from schemas.pipeline import PipelineCreate
-from schemas.scene import Scene
-from schemas.signing import SigningKey
+from physworld_schemas.dataset import Dataset, DatasetConfig, Episode
+from physworld_schemas.fit import Fit, FitConfig
+from physworld_schemas.job import TERMINAL_STATES, Event, Job
+from physworld_schemas.model import Model, ModelComparison, ModelVersion, TrainingConfig
+from physworld_schemas.pipeline import PipelineCreate
+from physworld_schemas.scene import Scene
+from physworld_schemas.signing import SigningKey
 
 if TYPE_CHECKING:
     from physworld_client.async_client import AsyncClient

@@ -13,12 +13,12 @@ from urllib.parse import quote
 from pydantic import BaseModel, TypeAdapter
 
 from physworld_client.bundle import Upload
-from schemas.assessment import Assessment, AssessmentCreate
-from schemas.base import Page
-from schemas.dataset import Dataset, DatasetConfig, DatasetCreate, Episode
-from schemas.fit import Fit, FitConfig, FitCreate
-from schemas.job import Job
-from schemas.model import (
+from physworld_schemas.assessment import Assessment, AssessmentCreate
+from physworld_schemas.base import Page
+from physworld_schemas.dataset import Dataset, DatasetConfig, DatasetCreate, Episode
+from physworld_schemas.fit import Fit, FitConfig, FitCreate
+from physworld_schemas.job import Job
+from physworld_schemas.model import (
     AliasSet,
     Model,
     ModelComparison,
@@ -27,10 +27,10 @@ from schemas.model import (
     TrainingCreate,
     VersionPatch,
 )
-from schemas.pipeline import PipelineCreate
-from schemas.scene import Scene
-from schemas.signing import SigningKey
-from schemas.trace import Trace, TraceConfig, TraceCreate
+from physworld_schemas.pipeline import PipelineCreate
+from physworld_schemas.scene import Scene
+from physworld_schemas.signing import SigningKey
+from physworld_schemas.trace import Trace, TraceConfig, TraceCreate
 
 Answer = TypeVar("Answer")
 Item = TypeVar("Item")

@@ -1,7 +1,7 @@
 """The chain prior of a rope's world model in NumPy: where its vertices will be one clock tick later.
 
-Equations and tensors are those of ``physworld.worldmodel.chain``; this file is written from them alone, in double
-precision.
+Equations and tensors are those of ``physworld.worldmodel.priors.chain``; this file is written from them alone, in
+double precision.
 
 Legend: n object vertices, C control vertices, G grips, K nodes along the rope.
 """

@@ -33,8 +33,8 @@ from __future__ import annotations
 
 from http import HTTPStatus
 
-from schemas.base import Problem
-from schemas.job import Job
+from physworld_schemas.base import Problem
+from physworld_schemas.job import Job
 
 MAX_DETAIL_CHARACTERS = 500
 

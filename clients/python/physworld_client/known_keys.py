@@ -25,7 +25,7 @@ from typing import Any
 from physworld_client.errors import ModelUnreadable, SignatureInvalid
 from physworld_client.locks import locked
 from physworld_client.signatures import TrustedKeys, fingerprint_of, given_key, keys_by_id, listed_keys
-from schemas.signing import SigningKey
+from physworld_schemas.signing import SigningKey
 
 FORMAT = 2
 FINGERPRINT = re.compile(r"[0-9a-f]{64}")

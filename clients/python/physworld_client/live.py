@@ -23,7 +23,7 @@ from physworld_client.errors import ConnectionFailed, RequestTimedOut
 from physworld_client.live_frames import LiveFrame, LiveStart
 from physworld_client.resources import LATEST, Resource
 from physworld_client.transport import is_loopback
-from schemas.rollout import Part
+from physworld_schemas.rollout import Part
 
 
 class LiveSession:

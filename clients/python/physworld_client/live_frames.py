@@ -14,8 +14,8 @@ from websockets.exceptions import ConnectionClosed
 
 from physworld_client.calls import Call
 from physworld_client.errors import LiveSessionEnded, PhysWorldError
-from schemas.live import LiveTicket, LiveTicketCreate
-from schemas.rollout import Part
+from physworld_schemas.live import LiveTicket, LiveTicketCreate
+from physworld_schemas.rollout import Part
 
 MOST_BYTES = 64 * 2**20
 """Of one message; the first one lists the body's points as text."""

@@ -15,8 +15,8 @@ from pydantic import BaseModel, ValidationError
 from physworld_client.errors import DigestMismatch, ModelUnreadable
 from physworld_client.partial import sha256_of
 from physworld_client.signatures import TrustedKeys, verify_signature
-from schemas.base import Artifact
-from schemas.model import ModelVersion
+from physworld_schemas.base import Artifact
+from physworld_schemas.model import ModelVersion
 
 MANIFEST_NAME = "manifest.json"
 WEIGHTS_NAME = "model.safetensors"

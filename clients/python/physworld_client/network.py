@@ -1,10 +1,10 @@
 """The graph network of a world model in NumPy: one step, for one body, without a gradient.
 
-The equations and the names of the tensors are those of ``physworld.worldmodel.model``; this file is written
+The equations and the names of the tensors are those of ``physworld.worldmodel.model.model``; this file is written
 from them alone and needs neither torch nor the library. Geometry is computed in double precision, the layers
 in single precision, as they were trained.
 
-The NEAR edges of a model that finds them at every step are those of ``physworld.worldmodel.nearest``.
+The NEAR edges of a model that finds them at every step are those of ``physworld.worldmodel.model.nearest``.
 
 Legend: n object vertices, C control vertices, V = n + C; E directed edges, sorted by receiver and kind; H
 width; h history; L message passing steps; F edge features, 3h + 8.

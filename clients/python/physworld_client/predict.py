@@ -13,9 +13,9 @@ from physworld_client import predictions
 from physworld_client.pages import ListPage
 from physworld_client.predictions import Planned, Predicted
 from physworld_client.resources import LATEST, Resource
-from schemas.job import Job
-from schemas.plan import Plan, PlanConfig, PlanLimits
-from schemas.rollout import Part, Rollout, Start
+from physworld_schemas.job import Job
+from physworld_schemas.plan import Plan, PlanConfig, PlanLimits
+from physworld_schemas.rollout import Part, Rollout, Start
 
 
 class Rollouts(Resource):

@@ -13,11 +13,11 @@ from pydantic import TypeAdapter
 from physworld_client.arrays import arrays_of
 from physworld_client.calls import BYTES, Call, _given, _part, artifact_path
 from physworld_client.errors import DigestMismatch, ModelUnreadable
-from schemas.arrays import EncodedArray
-from schemas.base import Artifact, Page
-from schemas.job import Job
-from schemas.plan import Plan, PlanConfig, PlanCreate, PlanLimits, PointGoal, ShapeGoal
-from schemas.rollout import Part, Rollout, RolloutCreate, Start
+from physworld_schemas.arrays import EncodedArray
+from physworld_schemas.base import Artifact, Page
+from physworld_schemas.job import Job
+from physworld_schemas.plan import Plan, PlanConfig, PlanCreate, PlanLimits, PointGoal, ShapeGoal
+from physworld_schemas.rollout import Part, Rollout, RolloutCreate, Start
 
 _ROLLOUT = TypeAdapter(Rollout)
 _ROLLOUTS = TypeAdapter(Page[Rollout])
@@ -52,7 +52,7 @@ class Planned:
 
     Attributes:
         plan: the service's answer: errors, limits, cost history.
-        arrays: everything of ``plan.npz`` by name; ``services.inference.plans`` lists it.
+        arrays: everything of ``plan.npz`` by name; ``physworld_services.inference.plans`` lists it.
     """
 
     plan: Plan

@@ -23,7 +23,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from pydantic import ValidationError
 
 from physworld_client.errors import ModelUnreadable, SignatureInvalid, SigningKeyUntrusted
-from schemas.signing import SIGNATURE_NAME, ManifestSignature, SigningKey
+from physworld_schemas.signing import SIGNATURE_NAME, ManifestSignature, SigningKey
 
 KEY_BYTES = 32
 LONGEST_KEY_FILE = 4096

@@ -5,7 +5,7 @@
     points = model.track(vertices)             # (T, N, 3), the scene's measured points
 
 Signature and digests are checked before anything of the files is read. Needs numpy, safetensors and cryptography. The
-tensors and their meaning: ``physworld.worldmodel.model`` and ``physworld.worldmodel.published``.
+tensors and their meaning: ``physworld.worldmodel.model.model`` and ``physworld.worldmodel.published``.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from physworld_client.errors import ModelUnreadable
 from physworld_client.known_keys import trusted_keys
 from physworld_client.manifest import CARD_NAME, WEIGHTS_NAME, verify_folder
 from physworld_client.network import PROPERTY_COUNT, Network
-from schemas.arrays import FARTHEST_M
+from physworld_schemas.arrays import FARTHEST_M
 
 CARD_SCHEMA = 1
 

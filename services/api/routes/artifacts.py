@@ -7,10 +7,10 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Header, Path, Request, Response
 from fastapi.responses import StreamingResponse
 
-from services.api.dependencies import StoresDep
-from services.api.errors import documented
-from services.api.ranges import digest_field, etag, parse_range, tag_matches
-from storage.errors import NotFound
+from physworld_services.api.dependencies import StoresDep
+from physworld_services.api.errors import documented
+from physworld_services.api.ranges import digest_field, etag, parse_range, tag_matches
+from physworld_storage.errors import NotFound
 
 router = APIRouter(prefix="/artifacts", tags=["artifacts"])
 

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from fastapi import APIRouter, Response
 
-from schemas.assessment import Assessment, AssessmentCreate
-from schemas.base import Page
-from schemas.job import Job
-from services.api.dependencies import DatabaseDep, ModelName, ObjectId, PageDep
-from services.api.errors import documented
-from services.api.idempotency import IdempotencyDep, accepted
-from services.api.routes.models import Version
-from services.api.routes.traces import require_known
-from storage import jobs, registry, traces
+from physworld_schemas.assessment import Assessment, AssessmentCreate
+from physworld_schemas.base import Page
+from physworld_schemas.job import Job
+from physworld_services.api.dependencies import DatabaseDep, ModelName, ObjectId, PageDep
+from physworld_services.api.errors import documented
+from physworld_services.api.idempotency import IdempotencyDep, accepted
+from physworld_services.api.routes.models import Version
+from physworld_services.api.routes.traces import require_known
+from physworld_storage import registry, traces
+from physworld_storage.jobs import jobs
 
 router = APIRouter(tags=["assessments"])
 

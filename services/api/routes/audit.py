@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from fastapi import APIRouter
 
-from schemas.audit import AuditEntry
-from schemas.base import Page
-from services.api.dependencies import DatabaseDep, PageDep
-from services.api.errors import documented
-from storage import audit
+from physworld_schemas.audit import AuditEntry
+from physworld_schemas.base import Page
+from physworld_services.api.dependencies import DatabaseDep, PageDep
+from physworld_services.api.errors import documented
+from physworld_storage.access import audit
 
 router = APIRouter(prefix="/audit", tags=["keys"])
 

@@ -9,13 +9,14 @@ from typing import Annotated, Literal
 import numpy as np
 from fastapi import APIRouter, Path, Query, Response
 
-from schemas.base import Page
-from schemas.dataset import Dataset, DatasetCreate, Episode
-from schemas.job import Job
-from services.api.dependencies import ID_PATTERN, DatabaseDep, ObjectId, PageDep, StoresDep
-from services.api.errors import documented
-from services.api.idempotency import IdempotencyDep, accepted
-from storage import jobs, resources
+from physworld_schemas.base import Page
+from physworld_schemas.dataset import Dataset, DatasetCreate, Episode
+from physworld_schemas.job import Job
+from physworld_services.api.dependencies import ID_PATTERN, DatabaseDep, ObjectId, PageDep, StoresDep
+from physworld_services.api.errors import documented
+from physworld_services.api.idempotency import IdempotencyDep, accepted
+from physworld_storage import resources
+from physworld_storage.jobs import jobs
 
 router = APIRouter(prefix="/datasets", tags=["datasets"])
 

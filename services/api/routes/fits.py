@@ -6,13 +6,14 @@ from typing import Annotated, Literal
 
 from fastapi import APIRouter, Query, Response
 
-from schemas.base import Page
-from schemas.fit import Fit, FitCreate
-from schemas.job import Job
-from services.api.dependencies import ID_PATTERN, DatabaseDep, ObjectId, PageDep
-from services.api.errors import documented
-from services.api.idempotency import IdempotencyDep, accepted
-from storage import jobs, resources
+from physworld_schemas.base import Page
+from physworld_schemas.fit import Fit, FitCreate
+from physworld_schemas.job import Job
+from physworld_services.api.dependencies import ID_PATTERN, DatabaseDep, ObjectId, PageDep
+from physworld_services.api.errors import documented
+from physworld_services.api.idempotency import IdempotencyDep, accepted
+from physworld_storage import resources
+from physworld_storage.jobs import jobs
 
 router = APIRouter(prefix="/fits", tags=["fits"])
 

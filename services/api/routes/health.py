@@ -11,9 +11,9 @@ from fastapi import APIRouter, Request, Response
 from prometheus_client import CONTENT_TYPE_LATEST
 from pydantic import Field
 
-from schemas.base import Resource
-from services.api.errors import documented, problem_response, request_id_of
-from services.api.probes import READY_S
+from physworld_schemas.base import Resource
+from physworld_services.api.errors import documented, problem_response, request_id_of
+from physworld_services.api.probes import READY_S
 
 router = APIRouter(tags=["health"])
 

@@ -9,15 +9,23 @@ from sqlalchemy.orm import Session
 from sse_starlette import EventSourceResponse
 from starlette.concurrency import run_in_threadpool
 
-from schemas.base import Page
-from schemas.job import TERMINAL_STATES, Job, JobKind, JobState
-from services.api.dependencies import ActorDep, DatabaseDep, FeedDep, ObjectId, PageDep, PrincipalDep
-from services.api.errors import documented
-from services.api.idempotency import IdempotencyDep, accepted, job_links
-from services.api.sse import event_response
-from storage import audit, events, jobs
-from storage.database import Database
-from storage.idempotency import Answer
+from physworld_schemas.base import Page
+from physworld_schemas.job import TERMINAL_STATES, Job, JobKind, JobState
+from physworld_services.api.dependencies import (
+    ActorDep,
+    DatabaseDep,
+    FeedDep,
+    ObjectId,
+    PageDep,
+    PrincipalDep,
+)
+from physworld_services.api.errors import documented
+from physworld_services.api.idempotency import IdempotencyDep, accepted, job_links
+from physworld_services.api.sse import event_response
+from physworld_storage.access import audit
+from physworld_storage.database import Database
+from physworld_storage.idempotency import Answer
+from physworld_storage.jobs import events, jobs
 
 router = APIRouter(prefix="/jobs", tags=["jobs"])
 

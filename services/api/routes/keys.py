@@ -11,13 +11,13 @@ from datetime import datetime, timedelta
 from fastapi import APIRouter, Response
 from sqlalchemy.orm import Session
 
-from schemas.base import Page
-from schemas.key import ApiKey, KeyCreate, KeyRotate
-from services.api.dependencies import ActorDep, DatabaseDep, ObjectId, PageDep
-from services.api.errors import documented
-from services.api.idempotency import IdempotencyDep, answer_of
-from storage import api_keys
-from storage.idempotency import Answer
+from physworld_schemas.base import Page
+from physworld_schemas.key import ApiKey, KeyCreate, KeyRotate
+from physworld_services.api.dependencies import ActorDep, DatabaseDep, ObjectId, PageDep
+from physworld_services.api.errors import documented
+from physworld_services.api.idempotency import IdempotencyDep, answer_of
+from physworld_storage.access import api_keys
+from physworld_storage.idempotency import Answer
 
 router = APIRouter(prefix="/keys", tags=["keys"])
 

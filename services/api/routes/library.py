@@ -8,9 +8,9 @@ from pathlib import Path
 from fastapi import APIRouter
 from pydantic import TypeAdapter
 
-from schemas.base import Page
-from schemas.library import Effect, Material
-from services.api.errors import documented
+from physworld_schemas.base import Page
+from physworld_schemas.library import Effect, Material
+from physworld_services.api.errors import documented
 
 router = APIRouter(tags=["library"], responses=documented(401, 403))
 
@@ -67,5 +67,5 @@ def list_effects() -> Page[Effect]:
 
 @cache
 def known_effects() -> list[Effect]:
-    """The registry, as the file beside this package has it (``workers.commands.effects_wire`` writes it)."""
+    """The registry, as the file beside this package has it (``physworld_workers.commands.effects_wire`` writes it)."""
     return TypeAdapter(list[Effect]).validate_json((Path(__file__).parents[1] / "effects.json").read_bytes())

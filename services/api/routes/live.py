@@ -3,7 +3,8 @@
 A program may connect with its key in the header instead of a ticket. Nothing is computed here: frames pass as they
 come, and a client that reads slowly slows the inner connection, whose sender then leaves frames out. One that takes
 nothing for ``SEND_S`` is let go here as there: its own connection may hang for minutes before the system gives it up.
-A session ends (1008) within seconds of the key, token or browser's session that opened it (``services.api.ending``).
+A session ends (1008) within seconds of the key, token or browser's session that opened it
+(``physworld_services.api.ending``).
 """
 
 from __future__ import annotations
@@ -20,20 +21,21 @@ from starlette.websockets import WebSocketState
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, WebSocketException
 
-from schemas.live import LiveTicket, LiveTicketCreate, close_reason
-from services.api.dependencies import DatabaseDep, PrincipalDep, SettingsDep
-from services.api.ending import Endings
-from services.api.errors import ApiProblem, documented
-from services.api.idempotency import IdempotencyDep, answer_of
-from services.api.inference import unavailable
-from services.api.routes.rollouts import ready_version
-from services.api.security import Gate, address_of
-from storage import registry, tickets
-from storage.api_keys import ApiKey
-from storage.database import Database
-from storage.errors import NotFound, StorageError
-from storage.idempotency import Answer
-from storage.settings import Settings
+from physworld_schemas.live import LiveTicket, LiveTicketCreate, close_reason
+from physworld_services.api.dependencies import DatabaseDep, PrincipalDep, SettingsDep
+from physworld_services.api.ending import Endings
+from physworld_services.api.errors import ApiProblem, documented
+from physworld_services.api.idempotency import IdempotencyDep, answer_of
+from physworld_services.api.inference import unavailable
+from physworld_services.api.routes.rollouts import ready_version
+from physworld_services.api.security import Gate, address_of
+from physworld_storage import registry
+from physworld_storage.access import tickets
+from physworld_storage.access.api_keys import ApiKey
+from physworld_storage.database import Database
+from physworld_storage.errors import NotFound, StorageError
+from physworld_storage.idempotency import Answer
+from physworld_storage.settings import Settings
 
 router = APIRouter(prefix="/live", tags=["live"])
 sockets = APIRouter()
@@ -84,7 +86,7 @@ def issue(
 
 @sockets.websocket("/live")
 async def live(socket: WebSocket) -> None:
-    """A live session of a model version; ``schemas.live`` and docs/rollouts.md tell the messages."""
+    """A live session of a model version; ``physworld_schemas.live`` and docs/rollouts.md tell the messages."""
     settings: Settings = socket.app.state.settings
     database: Database = socket.app.state.database
     query = socket.query_params

@@ -6,14 +6,23 @@ from typing import Annotated, Literal
 
 from fastapi import APIRouter, Path, Query, Response
 
-from schemas.base import Page
-from schemas.job import Job
-from schemas.model import AliasSet, Model, ModelComparison, ModelVersion, TrainingCreate, VersionPatch
-from services.api.dependencies import ActorDep, DatabaseDep, ModelName, PageDep
-from services.api.errors import documented
-from services.api.idempotency import IdempotencyDep, accepted
-from storage import audit, jobs, registry
-from storage.comparison import compare_versions
+from physworld_schemas.base import Page
+from physworld_schemas.job import Job
+from physworld_schemas.model import (
+    AliasSet,
+    Model,
+    ModelComparison,
+    ModelVersion,
+    TrainingCreate,
+    VersionPatch,
+)
+from physworld_services.api.dependencies import ActorDep, DatabaseDep, ModelName, PageDep
+from physworld_services.api.errors import documented
+from physworld_services.api.idempotency import IdempotencyDep, accepted
+from physworld_storage import registry
+from physworld_storage.access import audit
+from physworld_storage.comparison import compare_versions
+from physworld_storage.jobs import jobs
 
 router = APIRouter(prefix="/models", tags=["models"])
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from fastapi import APIRouter, Response
 
-from schemas.job import Job
-from schemas.pipeline import PipelineCreate
-from services.api.errors import documented
-from services.api.idempotency import IdempotencyDep, accepted
-from services.api.routes.traces import require_known
-from storage import jobs
+from physworld_schemas.job import Job
+from physworld_schemas.pipeline import PipelineCreate
+from physworld_services.api.errors import documented
+from physworld_services.api.idempotency import IdempotencyDep, accepted
+from physworld_services.api.routes.traces import require_known
+from physworld_storage.jobs import jobs
 
 router = APIRouter(prefix="/pipelines", tags=["pipelines"])
 

@@ -6,16 +6,17 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query, Response
 
-from schemas.arrays import FARTHEST_M, EncodedArray
-from schemas.base import Page
-from schemas.job import Job, Progress
-from schemas.plan import Plan, PlanCreate, ShapeGoal
-from services.api.bodies import LongBodyRoute
-from services.api.dependencies import DatabaseDep, ObjectId, PageDep, StoresDep
-from services.api.errors import documented
-from services.api.idempotency import IdempotencyDep, accepted
-from services.api.routes.rollouts import invalid, read_array, ready_version
-from storage import jobs, registry, resources, runs
+from physworld_schemas.arrays import FARTHEST_M, EncodedArray
+from physworld_schemas.base import Page
+from physworld_schemas.job import Job, Progress
+from physworld_schemas.plan import Plan, PlanCreate, ShapeGoal
+from physworld_services.api.bodies import LongBodyRoute
+from physworld_services.api.dependencies import DatabaseDep, ObjectId, PageDep, StoresDep
+from physworld_services.api.errors import documented
+from physworld_services.api.idempotency import IdempotencyDep, accepted
+from physworld_services.api.routes.rollouts import invalid, read_array, ready_version
+from physworld_storage import registry, resources, runs
+from physworld_storage.jobs import jobs
 
 router = APIRouter(prefix="/plans", tags=["plans"], route_class=LongBodyRoute)
 

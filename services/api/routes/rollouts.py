@@ -7,11 +7,11 @@ from typing import Annotated, Any
 import numpy as np
 from fastapi import APIRouter, Query, Response
 
-from schemas.arrays import FARTHEST_M, ArrayInput, EncodedArray, array_of
-from schemas.base import FieldError, Page
-from schemas.job import Progress
-from schemas.model import ModelVersion
-from schemas.rollout import (
+from physworld_schemas.arrays import FARTHEST_M, ArrayInput, EncodedArray, array_of
+from physworld_schemas.base import FieldError, Page
+from physworld_schemas.job import Progress
+from physworld_schemas.model import ModelVersion
+from physworld_schemas.rollout import (
     MAX_CANDIDATES,
     MAX_LOG_RATIO,
     MAX_STEPS,
@@ -21,12 +21,20 @@ from schemas.rollout import (
     Rollout,
     RolloutCreate,
 )
-from services.api.bodies import LongBodyRoute
-from services.api.dependencies import DatabaseDep, ObjectId, PageDep, PrincipalDep, SettingsDep, StoresDep
-from services.api.errors import ApiProblem, documented
-from services.api.idempotency import IdempotencyDep, accepted, answer_of
-from services.api.inference import roll_out
-from storage import jobs, registry, resources, runs
+from physworld_services.api.bodies import LongBodyRoute
+from physworld_services.api.dependencies import (
+    DatabaseDep,
+    ObjectId,
+    PageDep,
+    PrincipalDep,
+    SettingsDep,
+    StoresDep,
+)
+from physworld_services.api.errors import ApiProblem, documented
+from physworld_services.api.idempotency import IdempotencyDep, accepted, answer_of
+from physworld_services.api.inference import roll_out
+from physworld_storage import registry, resources, runs
+from physworld_storage.jobs import jobs
 
 router = APIRouter(prefix="/rollouts", tags=["rollouts"], route_class=LongBodyRoute)
 

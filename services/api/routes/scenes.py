@@ -8,16 +8,16 @@ import anyio
 from fastapi import APIRouter, Query, Request, Response
 from sqlalchemy.orm import Session
 
-from schemas.base import Page
-from schemas.scene import Scene
-from services.api.dependencies import DatabaseDep, ObjectId, PageDep, SettingsDep, StoresDep
-from services.api.errors import documented
-from services.api.idempotency import Idempotency, IdempotencyDep, answer_of
-from services.api.parsing import Parsers
-from services.api.uploads import MULTIPART_BODY, Upload, parsed, read_form, upload_of
-from services.stores import Stores
-from storage import resources
-from storage.idempotency import Answer
+from physworld_schemas.base import Page
+from physworld_schemas.scene import Scene
+from physworld_services.api.dependencies import DatabaseDep, ObjectId, PageDep, SettingsDep, StoresDep
+from physworld_services.api.errors import documented
+from physworld_services.api.idempotency import Idempotency, IdempotencyDep, answer_of
+from physworld_services.api.parsing import Parsers
+from physworld_services.api.uploads import MULTIPART_BODY, Upload, parsed, read_form, upload_of
+from physworld_services.stores import Stores
+from physworld_storage import resources
+from physworld_storage.idempotency import Answer
 
 router = APIRouter(prefix="/scenes", tags=["scenes"])
 

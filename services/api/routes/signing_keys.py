@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from fastapi import APIRouter
 
-from schemas.base import Page
-from schemas.signing import SigningKey
-from services.api.dependencies import DatabaseDep, PageDep
-from services.api.errors import documented
-from storage import signing
+from physworld_schemas.base import Page
+from physworld_schemas.signing import SigningKey
+from physworld_services.api.dependencies import DatabaseDep, PageDep
+from physworld_services.api.errors import documented
+from physworld_storage import signing
 
 router = APIRouter(prefix="/signing-keys", tags=["models"])
 

@@ -7,16 +7,17 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Response
 from fastapi.responses import StreamingResponse
 
-from schemas.base import FieldError, Page
-from schemas.job import Job
-from schemas.trace import Trace, TraceConfig, TraceCreate, TraceState, Verdict
-from services.api.dependencies import ID_PATTERN, DatabaseDep, ObjectId, PageDep, StoresDep
-from services.api.errors import ApiProblem, documented
-from services.api.idempotency import IdempotencyDep, accepted
-from services.api.ranges import etag
-from services.api.routes.library import known_effects
-from storage import jobs, traces
-from storage.errors import Conflict
+from physworld_schemas.base import FieldError, Page
+from physworld_schemas.job import Job
+from physworld_schemas.trace import Trace, TraceConfig, TraceCreate, TraceState, Verdict
+from physworld_services.api.dependencies import ID_PATTERN, DatabaseDep, ObjectId, PageDep, StoresDep
+from physworld_services.api.errors import ApiProblem, documented
+from physworld_services.api.idempotency import IdempotencyDep, accepted
+from physworld_services.api.ranges import etag
+from physworld_services.api.routes.library import known_effects
+from physworld_storage import traces
+from physworld_storage.errors import Conflict
+from physworld_storage.jobs import jobs
 
 router = APIRouter(prefix="/traces", tags=["traces"])
 

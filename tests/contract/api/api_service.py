@@ -14,12 +14,12 @@ import httpx
 import numpy as np
 from fastapi import FastAPI
 
-from services.stores import Stores
-from storage import leases
-from storage.api_keys import Role, create_key
-from storage.database import Database
-from storage.leases import Lease
-from storage.settings import Settings
+from physworld_services.stores import Stores
+from physworld_storage.access.api_keys import Role, create_key
+from physworld_storage.database import Database
+from physworld_storage.jobs import leases
+from physworld_storage.jobs.leases import Lease
+from physworld_storage.settings import Settings
 
 LEASE_S = 30.0
 FRAMES, POINTS = 20, 9

@@ -16,10 +16,10 @@ import uvicorn
 from api_service import Service
 from sqlalchemy import create_engine, make_url, text
 
-from services.stores import Stores
-from services.web import create_app
-from storage.database import open_database
-from storage.settings import Settings
+from physworld_services.stores import Stores
+from physworld_services.web import create_app
+from physworld_storage.database import open_database
+from physworld_storage.settings import Settings
 
 POSTGRES_VARIABLE = "PHYSWORLD_TEST_POSTGRES_URL"
 START_WITHIN_S = 60.0

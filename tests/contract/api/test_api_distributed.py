@@ -15,8 +15,8 @@ from api_service import Service, ask, assert_problem, bundle, scene_id, upload
 from conftest import serve
 from moto.server import ThreadedMotoServer
 
-from services.web import create_app
-from storage.settings import get_settings
+from physworld_services.web import create_app
+from physworld_storage.settings import get_settings
 
 
 @pytest.fixture(scope="module")

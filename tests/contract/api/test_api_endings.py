@@ -17,7 +17,7 @@ from serving import log_in
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed
 
-from storage import api_keys
+from physworld_storage.access import api_keys
 
 WITHIN_S = 5.0
 BUSY_S = 10.0  # more, on a machine that does other things

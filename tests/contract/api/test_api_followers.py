@@ -11,9 +11,9 @@ import httpx
 import pytest
 from api_service import Service, assert_problem, scene_id
 
-from services.api import feed
-from services.api.feed import Feed
-from storage import events
+from physworld_services.api import feed
+from physworld_services.api.feed import Feed
+from physworld_storage.jobs import events
 
 FOLLOWERS = 50
 LONG = 3000

@@ -13,10 +13,10 @@ import pytest
 from api_service import Service, assert_problem, bundle, upload
 from conftest import MAX_UPLOAD_BYTES
 
-from benchmarks.hostile_files.bombs import BOMBS, unzipped, zipped
-from benchmarks.hostile_files.corpus import sound_bundle
-from benchmarks.hostile_files.cost import run
-from services.api import parsing
+from benchmarks.service.hostile_files.bombs import BOMBS, unzipped, zipped
+from benchmarks.service.hostile_files.corpus import sound_bundle
+from benchmarks.service.hostile_files.cost import run
+from physworld_services.api import parsing
 
 MOST_CPU_S = 5.0
 FILES = 55
@@ -64,7 +64,7 @@ def test_what_a_limit_stopped_is_a_refusal_with_its_numbers(
 def test_a_parser_that_was_killed_is_started_again(service: Service, client: httpx.Client) -> None:
     assert upload(client, bundle("before")).status_code == 201
     me = psutil.Process()
-    parsers = [child for child in me.children() if "services.api.parser_process" in child.cmdline()]
+    parsers = [child for child in me.children() if "physworld_services.api.parser_process" in child.cmdline()]
     assert parsers
     for parser in parsers:
         parser.kill()
@@ -81,7 +81,7 @@ def test_arrays_of_objects_never_come_to_life(client: httpx.Client) -> None:
 
 
 def test_a_corpus_of_hostile_files_costs_little_and_leaves_no_trace(tmp_path: Path) -> None:
-    """The short form of ``python -m benchmarks.hostile_files``: known bombs and five files of each family."""
+    """The short form of ``python -m benchmarks.service.hostile_files``: known bombs and five files of each family."""
     ledger = run(FILES, seed=1, folder=tmp_path, bundle=sound_bundle())
     assert ledger["files"] == FILES + len(BOMBS)
     assert (ledger["beyond"], ledger["files_outside"], ledger["errors_of_the_service"]) == ([], [], 0)

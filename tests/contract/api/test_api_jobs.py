@@ -10,9 +10,9 @@ import httpx
 import pytest
 from api_service import Service, assert_problem, scene_id
 
-from schemas.base import Problem
-from services.api import sse
-from storage import leases
+from physworld_schemas.base import Problem
+from physworld_services.api import sse
+from physworld_storage.jobs import leases
 
 WAIT_S = 20.0
 

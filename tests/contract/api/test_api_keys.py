@@ -13,9 +13,9 @@ import pytest
 from api_service import Service, assert_problem
 from conftest import serve
 
-from services.api import attempts
-from storage import api_keys
-from storage.settings import Settings
+from physworld_services.api import attempts
+from physworld_storage.access import api_keys
+from physworld_storage.settings import Settings
 
 
 @pytest.fixture

@@ -18,12 +18,13 @@ from serving import log_in
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 
-from schemas.model import TrainingConfig
-from services.api.attempts import PER_ADDRESS
-from services.api.routes import live as api_live
-from services.inference import live
-from services.inference.session import HEAD
-from storage import api_keys, registry
+from physworld_schemas.model import TrainingConfig
+from physworld_services.api.attempts import PER_ADDRESS
+from physworld_services.api.routes import live as api_live
+from physworld_services.inference import live
+from physworld_services.inference.session import HEAD
+from physworld_storage import registry
+from physworld_storage.access import api_keys
 
 WITHIN_S = 20.0
 SINGLE_PRECISION_M = 2e-6

@@ -15,10 +15,10 @@ from api_service import assert_problem
 from fastapi import APIRouter, FastAPI
 from pydantic import BaseModel
 
-from schemas.arrays import MAX_LISTED_VALUES, EncodedArray
-from schemas.plan import PlanCreate
-from schemas.rollout import MAX_REQUEST_BYTES, RolloutCreate
-from services.api.bodies import LongBodyRoute
+from physworld_schemas.arrays import MAX_LISTED_VALUES, EncodedArray
+from physworld_schemas.plan import PlanCreate
+from physworld_schemas.rollout import MAX_REQUEST_BYTES, RolloutCreate
+from physworld_services.api.bodies import LongBodyRoute
 
 CHECKED_WITHIN_S = 0.05
 """Of processor time, for 32 MiB of base64: 1.5 ms here; 220 ms when an expression searched the text."""
@@ -81,7 +81,7 @@ def test_a_long_body_is_parsed_in_another_thread(monkeypatch: pytest.MonkeyPatch
             return await client.post("/sum", content=data, headers={"Content-Type": "application/json"})
 
     with monkeypatch.context() as patch:
-        patch.setattr("services.api.bodies.json.loads", spied)
+        patch.setattr("physworld_services.api.bodies.json.loads", spied)
         answer = asyncio.run(ask(b'{"values": [1, 2, 3.5]}'))
         wrong = asyncio.run(ask(b'{"values": [1, 2'))
     assert (answer.status_code, answer.text) == (200, "6.5")

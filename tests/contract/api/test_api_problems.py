@@ -13,12 +13,12 @@ import pytest
 import structlog
 from api_service import Service, ask, assert_problem, scene_id
 
-from schemas.base import FieldError
-from services.api.errors import problem_response
-from services.api.logs import configure_logs
-from services.web import create_app
-from storage.database import open_database
-from storage.settings import Settings
+from physworld_schemas.base import FieldError
+from physworld_services.api.errors import problem_response
+from physworld_services.api.logs import configure_logs
+from physworld_services.web import create_app
+from physworld_storage.database import open_database
+from physworld_storage.settings import Settings
 
 
 def test_the_framework_answers_in_the_same_form(client: httpx.Client) -> None:
@@ -107,7 +107,7 @@ def test_an_unexpected_fault_is_a_problem_without_a_traceback(
     settings = Settings(data_dir=tmp_path)
     open_database(settings).upgrade()
     app = create_app(settings)
-    monkeypatch.setattr("storage.database.Database.check", broken)
+    monkeypatch.setattr("physworld_storage.database.Database.check", broken)
     response = ask(app, "/health/ready")
     problem = assert_problem(response, 500, "internal_error")
     assert "secret address" not in json.dumps(problem)

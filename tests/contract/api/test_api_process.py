@@ -20,12 +20,12 @@ START_WITHIN_S = 60.0
 
 def test_waiting_answers_are_given_when_the_process_is_told_to_stop(tmp_path: Path) -> None:
     environment = os.environ | {"PHYSWORLD_DATA_DIR": str(tmp_path), "PHYSWORLD_ADMIN_TOKEN": TOKEN}
-    migrate = [sys.executable, "-m", "services.api.migrate"]
+    migrate = [sys.executable, "-m", "physworld_services.api.migrate"]
     subprocess.run(migrate, env=environment, check=True, capture_output=True)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    web = [sys.executable, "-m", "services.web", "--port", str(port)]
+    web = [sys.executable, "-m", "physworld_services.web", "--port", str(port)]
     with subprocess.Popen(web, env=environment, stderr=subprocess.PIPE) as process:
         try:
             answers = _wait_and_stop(f"http://127.0.0.1:{port}", process)

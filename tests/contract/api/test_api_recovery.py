@@ -13,14 +13,14 @@ from published_tiny import publish_tiny
 from web_process import command, free_port, process, until_answer, web_process
 from websockets.asyncio.client import connect
 
-from services.api import attempts
-from storage import api_keys
-from storage.database import open_database
-from storage.settings import Settings
-from workers.stores import Stores
+from physworld_services.api import attempts
+from physworld_storage.access import api_keys
+from physworld_storage.database import open_database
+from physworld_storage.settings import Settings
+from physworld_workers.stores import Stores
 
 DEPLOYMENT = "deployment-0123456789abcdef0123456789"
-RECOVER = "services.api.recover_key"
+RECOVER = "physworld_services.api.recover_key"
 
 
 def bearer(token: str) -> dict[str, str]:
@@ -41,9 +41,9 @@ def end_deployment_key(folder: Path) -> None:
 def test_a_deployment_whose_first_key_was_ended_starts_and_says_how_to_get_in(tmp_path: Path) -> None:
     folder = tmp_path / "data"
     given = {"PHYSWORLD_ADMIN_TOKEN": DEPLOYMENT}
-    assert command(folder, "services.api.migrate", **given).returncode == 0
+    assert command(folder, "physworld_services.api.migrate", **given).returncode == 0
     end_deployment_key(folder)
-    again = command(folder, "services.api.migrate", **given)
+    again = command(folder, "physworld_services.api.migrate", **given)
     assert again.returncode == 0, again.stderr
     assert "revoked at" in again.stdout and "Admin keys that are good: 1" in again.stdout
     assert f"docker compose run --rm migrate python -m {RECOVER}" in again.stdout
@@ -59,7 +59,7 @@ def test_a_deployment_whose_first_key_was_ended_starts_and_says_how_to_get_in(tm
 
 
 def test_a_token_that_cannot_be_a_key_still_ends_the_migration(tmp_path: Path) -> None:
-    refused = command(tmp_path, "services.api.migrate", PHYSWORLD_ADMIN_TOKEN="short")
+    refused = command(tmp_path, "physworld_services.api.migrate", PHYSWORLD_ADMIN_TOKEN="short")
     assert refused.returncode == 1
     assert "5 characters; at least 32" in refused.stderr
 
@@ -74,7 +74,7 @@ def test_a_key_is_recovered_only_where_there_is_a_database(tmp_path: Path) -> No
 def test_an_address_is_believed_of_a_trusted_proxy_only(
     tmp_path: Path, trusted: str, statuses: set[int]
 ) -> None:
-    assert command(tmp_path, "services.api.migrate").returncode == 0
+    assert command(tmp_path, "physworld_services.api.migrate").returncode == 0
     with web_process(tmp_path, tmp_path / "web.log", PHYSWORLD_TRUSTED_PROXIES=trusted) as url:
         answers = [
             httpx.get(
@@ -107,7 +107,7 @@ def test_no_log_holds_a_ticket_or_a_key(tmp_path: Path, level: str) -> None:
     database.dispose()
     port = free_port()
     inner = {"PHYSWORLD_INFERENCE_URL": f"http://127.0.0.1:{port}", "PHYSWORLD_LOG_LEVEL": level}
-    serve = ("services.inference", "serve", "--port", str(port))
+    serve = ("physworld_services.inference", "serve", "--port", str(port))
     with process(folder, log, *serve, **inner) as inference, web_process(folder, log, **inner) as url:
         until_answer(f"http://127.0.0.1:{port}/health", inference)
         asked = httpx.post(

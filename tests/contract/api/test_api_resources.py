@@ -14,7 +14,7 @@ import pytest
 from api_service import EPISODE, Service, assert_problem, scene_id, sha256
 from serving import log_in
 
-from storage import resources
+from physworld_storage import resources
 
 CONTENT = bytes(range(256)) * 40
 

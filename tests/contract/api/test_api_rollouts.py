@@ -12,13 +12,13 @@ from inference_serving import Served, serve_inference
 from published_tiny import publish_tiny, tiny_model
 
 from physworld.worldmodel.errors import ControlsInvalid
-from schemas.arrays import EncodedArray
-from schemas.rollout import SYNC_STEPS, RolloutCreate
-from services.inference import rollouts
-from services.inference.models import Models
-from storage import leases
-from workers.execute import Runtime, run_shard
-from workers.registry import register
+from physworld_schemas.arrays import EncodedArray
+from physworld_schemas.rollout import SYNC_STEPS, RolloutCreate
+from physworld_services.inference import rollouts
+from physworld_services.inference.models import Models
+from physworld_storage.jobs import leases
+from physworld_workers.execute import Runtime, run_shard
+from physworld_workers.registry import register
 
 SINGLE_PRECISION_M = 2e-6
 
@@ -54,7 +54,7 @@ def absurd(controllers: np.ndarray) -> np.ndarray:
 
 
 def _work(served: Served, ends: str = "done") -> None:
-    register("rollout", "services.inference.jobs:rollout")
+    register("rollout", "physworld_services.inference.jobs:rollout")
     runtime = Runtime(served.settings, served.database, served.stores, "test")
     while True:
         with served.database.session() as session:
@@ -292,7 +292,7 @@ def test_a_prediction_that_leaves_the_numbers_says_when_after_what_was_asked_for
 
 
 def test_unknown_models_and_readers_are_refused(served: Served) -> None:
-    from storage import api_keys
+    from physworld_storage.access import api_keys
 
     with served.database.session() as session:
         _, reader = api_keys.create_key(session, "reader", "read")

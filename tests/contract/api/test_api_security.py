@@ -6,7 +6,7 @@ import httpx
 import pytest
 from api_service import Service, assert_problem
 
-from services.api.security import required_role
+from physworld_services.api.security import required_role
 
 
 @pytest.mark.parametrize(

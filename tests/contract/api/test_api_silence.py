@@ -20,8 +20,8 @@ from api_service import Service, assert_problem, bundle, upload
 from conftest import serve
 from sqlalchemy import make_url
 
-from benchmarks.chaos.proxy import FrozenProxy
-from storage.settings import Settings
+from benchmarks.service.chaos.proxy import FrozenProxy
+from physworld_storage.settings import Settings
 
 WITHIN_S = 15.0
 """Of a request; it should take 8 s at most, and the machine may do other things."""

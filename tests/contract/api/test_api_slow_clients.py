@@ -13,10 +13,10 @@ import httpx
 import pytest
 import uvicorn
 
-from services import connections
-from services.web import create_app
-from storage.database import open_database
-from storage.settings import Settings
+from physworld_services import connections
+from physworld_services.web import create_app
+from physworld_storage.database import open_database
+from physworld_storage.settings import Settings
 
 HALF = b"GET /health/live HTTP/1.1\r\nHost: here\r\nX-Never: "
 SOCKETS = 60

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from api_service import REPORT, TRACKS, Service, assert_problem, scene_id
 
-from schemas.trace import TraceCreate
+from physworld_schemas.trace import TraceCreate
 
 
 @pytest.fixture(autouse=True)

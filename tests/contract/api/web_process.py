@@ -32,7 +32,7 @@ def command(folder: Path, *words: str, **variables: str) -> subprocess.Completed
 def web_process(folder: Path, log: Path, **variables: str) -> Iterator[str]:
     """The address of a web process on a data folder, once it is ready; what it writes goes to ``log``."""
     port = free_port()
-    with process(folder, log, "services.web", "--port", str(port), **variables) as running:
+    with process(folder, log, "physworld_services.web", "--port", str(port), **variables) as running:
         url = f"http://127.0.0.1:{port}"
         until_answer(f"{url}/health/ready", running)
         yield url

@@ -12,11 +12,11 @@ import uvicorn
 from physworld_client import Client
 from sdk_service import Service
 
-from services.stores import Stores
-from services.web import create_app
-from storage.api_keys import create_key
-from storage.database import open_database
-from storage.settings import Settings
+from physworld_services.stores import Stores
+from physworld_services.web import create_app
+from physworld_storage.access.api_keys import create_key
+from physworld_storage.database import open_database
+from physworld_storage.settings import Settings
 
 START_WITHIN_S = 60.0
 

@@ -16,10 +16,11 @@ from typing import Any
 import numpy as np
 from physworld_client import Client
 
-from schemas.base import Artifact, Problem
-from services.stores import Stores
-from storage import leases, signing
-from storage.database import Database
+from physworld_schemas.base import Artifact, Problem
+from physworld_services.stores import Stores
+from physworld_storage import signing
+from physworld_storage.database import Database
+from physworld_storage.jobs import leases
 
 LEASE_S = 30.0
 METRICS = ("track_m", "chamfer_phystwin_m", "chamfer_l2_m")

@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 from sdk_service import METRICS, ROWS, Service, write_scene
 
-from schemas.base import Problem
-from storage import leases
+from physworld_schemas.base import Problem
+from physworld_storage.jobs import leases
 
 COMMAND = Path(sys.executable).with_name("physworld")
 WITHIN_S = 120.0

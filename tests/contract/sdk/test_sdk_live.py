@@ -22,7 +22,7 @@ from physworld_client import (
 from physworld_client.live import LiveSession
 from published_tiny import publish_tiny
 
-from services.inference import live
+from physworld_services.inference import live
 
 UP, STILL = (0.0, 0.0, 0.1), (0.0, 0.0, 0.0)  # m/s
 

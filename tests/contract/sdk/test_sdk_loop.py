@@ -12,9 +12,9 @@ from physworld_client.errors import Conflict, NotFound
 from sdk_service import Service, write_scene
 from test_command_line import output_of, physworld, worker
 
-from schemas.dataset import DatasetConfig
-from schemas.fit import FitConfig
-from schemas.trace import TraceConfig
+from physworld_schemas.dataset import DatasetConfig
+from physworld_schemas.fit import FitConfig
+from physworld_schemas.trace import TraceConfig
 
 
 def test_a_trace_step_by_step(service: Service, client: Client, tmp_path: Path) -> None:

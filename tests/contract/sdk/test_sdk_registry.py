@@ -18,9 +18,9 @@ from physworld_client.signatures import fingerprint_of
 from sdk_service import Service, write_scene
 from typer.testing import CliRunner
 
-from schemas.dataset import DatasetConfig
-from schemas.model import TrainingConfig
-from storage import registry
+from physworld_schemas.dataset import DatasetConfig
+from physworld_schemas.model import TrainingConfig
+from physworld_storage import registry
 
 
 @pytest.fixture(scope="module")

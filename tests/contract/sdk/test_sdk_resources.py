@@ -19,9 +19,9 @@ from physworld_client.errors import (
 )
 from sdk_service import Service, write_scene
 
-from schemas.dataset import DatasetConfig
-from schemas.model import TrainingConfig
-from schemas.pipeline import PipelineCreate
+from physworld_schemas.dataset import DatasetConfig
+from physworld_schemas.model import TrainingConfig
+from physworld_schemas.pipeline import PipelineCreate
 
 
 def test_the_whole_chain_step_by_step(service: Service, client: Client, tmp_path: Path) -> None:

@@ -20,9 +20,9 @@ from physworld_client.errors import (
 )
 from sdk_service import Service, write_scene
 
-from schemas.base import Problem
-from schemas.dataset import DatasetConfig
-from schemas.job import Job
+from physworld_schemas.base import Problem
+from physworld_schemas.dataset import DatasetConfig
+from physworld_schemas.job import Job
 
 
 class Faulty(httpx.HTTPTransport):

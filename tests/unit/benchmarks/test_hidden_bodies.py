@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.finite_elements import Acting
-from benchmarks.flex_blocks import Block
-from benchmarks.hidden_bodies import OBJECTS, Motion
+from benchmarks.peers.finite_elements import Acting
+from benchmarks.peers.flex_blocks import Block
+from benchmarks.trace.hidden_bodies import OBJECTS, Motion
 
 
 def test_a_hand_starts_from_rest_and_may_be_late() -> None:

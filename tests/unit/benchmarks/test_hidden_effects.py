@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks.hidden_effects import cases, page, scored
+from benchmarks.trace.hidden_effects import cases, page, scored
 
 CASES = {case.name: case for case in cases()}
 

@@ -13,15 +13,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.hostile_files import bombs
-from benchmarks.hostile_files.__main__ import main
-from benchmarks.hostile_files.corpus import Corpus, sound_bundle
-from benchmarks.hostile_files.cost import Meter
-from benchmarks.hostile_files.ledger import MOST_BYTES, Cost, Ledger
-from benchmarks.hostile_files.pieces import CANARY, VALUES, value
-from benchmarks.hostile_files.traces import Traces
-from benchmarks.web_process import WebProcess, serving
-from services.api.parser_process import MEMORY_BYTES
+from benchmarks.service.hostile_files import bombs
+from benchmarks.service.hostile_files.__main__ import main
+from benchmarks.service.hostile_files.corpus import Corpus, sound_bundle
+from benchmarks.service.hostile_files.cost import Meter
+from benchmarks.service.hostile_files.ledger import MOST_BYTES, Cost, Ledger
+from benchmarks.service.hostile_files.pieces import CANARY, VALUES, value
+from benchmarks.service.hostile_files.traces import Traces
+from benchmarks.service.web_process import WebProcess, serving
+from physworld_services.api.parser_process import MEMORY_BYTES
 
 BUNDLE = sound_bundle()
 DECLARATIONS = range(2, 11 * 250, 11)

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from made_scene import made_scene
 
-from benchmarks import paper_tables, unseen_motion
-from benchmarks.paper_models import filled_in
-from benchmarks.paper_relations import ALONE, CONDITIONS, RELATIONS, SEEDS, Relation, hold
-from benchmarks.paper_tables import Cells, plan, summarise
+from benchmarks.paper import tables as paper_tables
+from benchmarks.paper import unseen_motion
+from benchmarks.paper.models import filled_in
+from benchmarks.paper.relations import ALONE, CONDITIONS, RELATIONS, SEEDS, Relation, hold
+from benchmarks.paper.tables import Cells, plan, summarise
 
 
 def cell(model: float, tuned: float, twin: float = 0.002) -> dict[str, Any]:

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.outside_effects import OUTSIDE, Gust, RollingShutter, among_the_known
-from benchmarks.trace_outside import BODIES, forced, keys, page
-from benchmarks.trace_power_effects import inject
-from benchmarks.trace_power_objects import OBJECTS, observed
+from benchmarks.trace.outside import BODIES, forced, keys, page
+from benchmarks.trace.outside_effects import OUTSIDE, Gust, RollingShutter, among_the_known
+from benchmarks.trace.power_effects import inject
+from benchmarks.trace.power_objects import OBJECTS, observed
 from physworld.effects.registry import EFFECTS
 
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.trace_power import tasks
-from benchmarks.trace_power_effects import inject, refusal
-from benchmarks.trace_power_objects import OBJECTS, observed
-from benchmarks.trace_power_picture import draw
-from benchmarks.trace_power_report import RIGHT, SET, WRONG, interval, limit, outcome, page, summary
+from benchmarks.trace.power import tasks
+from benchmarks.trace.power_effects import inject, refusal
+from benchmarks.trace.power_objects import OBJECTS, observed
+from benchmarks.trace.power_picture import draw
+from benchmarks.trace.power_report import RIGHT, SET, WRONG, interval, limit, outcome, page, summary
 from physworld.effects.registry import EFFECTS
 
 DRAG = "air_drag_linear"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from benchmarks.harness import Report, write_section
-from benchmarks.verification import CASES, _with_rows_of
+from benchmarks.verification.run import CASES, _with_rows_of
 
 
 def report(rows: list[list[str]]) -> Report:

@@ -18,7 +18,7 @@ def world_model() -> ModuleType:
     pytest.importorskip(
         "torch_geometric", reason="PyTorch Geometric, the peer of this benchmark, is not installed"
     )
-    from benchmarks import world_model
+    from benchmarks.speed import world_model
 
     return world_model
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from made_scene import box_body, made_scene, recorded_by
 
-from physworld.build import build_twin
 from physworld.calibrate import CalibrationConfig, calibrate
 from physworld.calibrate.fibres import angles_of, directions
 from physworld.calibrate.law_choice import cross_validate
 from physworld.materials.library import with_law
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
+from physworld.twin.build import build_twin
 
 SIZE = np.array([0.14, 0.07, 0.03])
 MODULUS_PA, FIBRES_PA, AZIMUTH_RAD = 4e4, 6e4, 0.6

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.calibration_known import BAR_PA, SIGMA_M, bar, linear_draw, predicted
-from physworld.build import build_twin
+from benchmarks.verification.calibration_known import BAR_PA, SIGMA_M, bar, linear_draw, predicted
 from physworld.calibrate.discretisation import converged_parameters
 from physworld.calibrate.estimates import Correlations, Estimate
 from physworld.calibrate.global_stage import FitResult
-from physworld.calibrate.least_squares import Solution, block_covariance, correlations
 from physworld.calibrate.parameters import parameters_of
+from physworld.estimation.least_squares import Solution, block_covariance, correlations
 from physworld.evaluate.numerics import refined
+from physworld.twin.build import build_twin
 
 DRAWS, COVERED = 100, 90
 BUDGET = 500  # particles of the coarse twin

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from made_scene import box_body, made_scene
 
-from physworld.build import build_twin
 from physworld.calibrate.friction_bound import SLOWEST, affordable
 from physworld.calibrate.parameters import parameters_of
-from physworld.mpm.total_lagrangian import TotalLagrangian
+from physworld.engine.total.formulation import TotalLagrangian
 from physworld.scene import UNDEFORMED_AT_REST, Scene
-from physworld.twin import Twin
+from physworld.twin.build import build_twin
+from physworld.twin.twin import Twin
 
 LOW, HIGH = np.array([0.0, -0.015, -0.015]), np.array([0.12, 0.015, 0.015])
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from made_scene import box_body, made_scene, recorded_by
 
-from physworld.build import build_twin
 from physworld.calibrate import CalibrationConfig, Journal, calibrate
 from physworld.calibrate.search import Search
 from physworld.errors import CalibrationError, Cancelled, SceneUnsupported
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Scene
-from physworld.twin import Twin
+from physworld.twin.build import build_twin
+from physworld.twin.twin import Twin
 
 FRAMES, FPS = 40, 30.0
 SIGMA_M = 2e-4

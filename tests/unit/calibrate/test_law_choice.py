@@ -10,13 +10,13 @@ import pytest
 from made_scene import box_body, made_scene, recorded_by
 from test_shared_search import Together
 
-from physworld.build import build_twin
 from physworld.calibrate import CalibrationConfig, Journal, law_choice
 from physworld.calibrate.law_choice import PROMPT, choose_law, cross_validate, parse_answer
 from physworld.errors import Cancelled, LawAnswerRefused, LawAnswerUnavailable
+from physworld.estimation.simulations import Drive, Job, in_turn
 from physworld.materials.library import with_law
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
-from physworld.simulations import Drive, Job, in_turn
+from physworld.twin.build import build_twin
 
 LOW, HIGH = np.array([0.0, -0.02, -0.02]), np.array([0.16, 0.02, 0.02])
 CONFIG = CalibrationConfig(particle_budget=64, max_simulations=60, damping="none")

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from made_scene import made_scene
 
-from physworld.build import build_twin
 from physworld.calibrate.local_search import FieldSearch, LocalConfig
 from physworld.calibrate.local_stage import fit_fields
 from physworld.errors import SceneUnsupported
 from physworld.scene import UNDEFORMED_AT_REST, Body, Ground, Scene
-from physworld.twin import Twin
+from physworld.twin.build import build_twin
+from physworld.twin.twin import Twin
 
 LENGTH, RADIUS = 0.4, 0.004
 NOISE_M, FRAMES = 5e-5, 30

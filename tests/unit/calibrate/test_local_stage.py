@@ -10,14 +10,14 @@ import pytest
 from made_scene import box_body, made_scene
 from test_shared_search import Together
 
-from physworld.build import build_twin
 from physworld.calibrate.local_search import FieldSearch, LocalConfig, field_modes
 from physworld.calibrate.local_stage import fit_fields
+from physworld.engine.gradients.soft_grips_derivatives import same_soft_grips
+from physworld.engine.terms.soft_grips import AS_HELD
 from physworld.errors import CalibrationError, Cancelled, UnstableSimulation
-from physworld.mpm.soft_grips import AS_HELD
-from physworld.mpm.soft_grips_derivatives import same_soft_grips
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
-from physworld.twin import Twin
+from physworld.twin.build import build_twin
+from physworld.twin.twin import Twin
 
 SIZE = np.array([0.16, 0.02, 0.02])
 MODULUS_PA, NOISE_M = 4e5, 2e-5

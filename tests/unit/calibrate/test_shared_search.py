@@ -11,11 +11,11 @@ from made_scene import recorded_by
 from test_journal import bar as bar
 from test_torsion import BENDING_N_M2, TORSION, two_hands
 
-from physworld.build import build_twin
 from physworld.calibrate import CalibrationConfig, FitResult, Journal, calibrate
 from physworld.errors import Cancelled
+from physworld.estimation.simulations import Drive, Job, Workers, in_turn
 from physworld.scene import Scene
-from physworld.simulations import Drive, Job, Workers, in_turn
+from physworld.twin.build import build_twin
 
 CONFIG = CalibrationConfig(particle_budget=60, max_simulations=140)
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from made_scene import made_scene, recorded_by
 
-from physworld.build import build_twin
 from physworld.calibrate import CalibrationConfig, calibrate
 from physworld.calibrate.parameters import bending_ratio, parameters_of
 from physworld.materials.library import with_law
 from physworld.materials.sheet import SheetLaw
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Scene
-from physworld.twin import Twin
+from physworld.twin.build import build_twin
+from physworld.twin.twin import Twin
 
 SIDE, THICKNESS, HELD, FRAMES = 0.24, 0.005, 0.03, 30
 MODULUS_PA, SIGMA_M = 1.8e5, 5e-4

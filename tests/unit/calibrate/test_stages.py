@@ -13,10 +13,10 @@ from physworld.calibrate import CalibrationConfig, FitResult, Journal, calibrate
 from physworld.calibrate.local_stage import fit_fields
 from physworld.errors import Cancelled, SceneUnsupported
 from physworld.evaluate.numerics import refined
-from physworld.properties import carried, together
 from physworld.scene import Scene
 from physworld.trace import trace
-from physworld.twin import Twin
+from physworld.twin.properties import carried, together
+from physworld.twin.twin import Twin
 
 CONFIG = CalibrationConfig(particle_budget=100, max_simulations=60, damping="none")
 

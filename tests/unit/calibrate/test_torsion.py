@@ -7,9 +7,9 @@ import pytest
 from made_scene import made_scene, recorded_by
 from scipy.spatial.transform import Rotation
 
-from physworld.build import build_twin
 from physworld.calibrate import CalibrationConfig, calibrate
 from physworld.scene import UNDEFORMED_AT_REST, Body, Scene
+from physworld.twin.build import build_twin
 
 LENGTH, ARM, FRAMES = 0.4, 0.02, 40
 BENDING_N_M2, TORSION = 2e-3, 0.4

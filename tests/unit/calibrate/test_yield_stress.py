@@ -6,11 +6,11 @@ import pytest
 from made_scene import recorded_by
 from test_global_stage import CONFIG, SIGMA_M, YOUNGS_MODULUS_PA, shaken_bar
 
-from physworld.build import build_twin
 from physworld.calibrate import CalibrationConfig, FitResult, calibrate
 from physworld.calibrate.parameters import flow_law
 from physworld.materials.plastic import VonMises
 from physworld.scene import Scene
+from physworld.twin.build import build_twin
 
 YIELD_STRESS_PA = 700.0
 FLOWING = CalibrationConfig(particle_budget=CONFIG.particle_budget, plasticity="von_mises")

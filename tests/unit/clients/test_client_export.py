@@ -17,7 +17,7 @@ from physworld_client.export import lerobot as lerobot_module
 from physworld_client.export import open_export
 from physworld_client.export.sampling import spread_points
 
-from schemas.dataset import Dataset, DatasetConfig
+from physworld_schemas.dataset import Dataset, DatasetConfig
 
 FRAMES, PARTICLES, CONTROLS = 7, 40, 3
 STEP_S = 1.0 / 30.0

@@ -14,8 +14,8 @@ from physworld_client.known_keys import KnownKeys, known_keys_file, trusted_keys
 from physworld_client.signatures import fingerprint_of, verify_signature
 from physworld_client.transport import service_name
 
-from schemas.signing import SigningKey
-from storage.signing import Signer, signer_of
+from physworld_schemas.signing import SigningKey
+from physworld_storage.signing import Signer, signer_of
 
 OURS = signer_of(base64.b64encode(bytes(range(32))).decode(), "ours")
 THEIRS = signer_of(base64.b64encode(bytes(range(1, 33))).decode(), "theirs")

@@ -11,8 +11,8 @@ import pytest
 from physworld_client.errors import DigestMismatch, ModelUnreadable
 from physworld_client.manifest import artifacts_of, verify_folder
 
-from schemas.base import Artifact
-from schemas.model import ModelVersion
+from physworld_schemas.base import Artifact
+from physworld_schemas.model import ModelVersion
 
 CONTENT = {"model.safetensors": b"weights", "card.json": b"{}"}
 

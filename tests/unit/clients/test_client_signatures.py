@@ -12,7 +12,7 @@ from physworld_client.errors import DigestMismatch, SignatureInvalid, SigningKey
 from physworld_client.known_keys import KnownKeys, trusted_keys
 from physworld_client.manifest import verify_folder
 
-from storage.signing import Signer, signer_of
+from physworld_storage.signing import Signer, signer_of
 
 OURS = signer_of(base64.b64encode(bytes(range(32))).decode(), "ours")
 THEIRS = signer_of(base64.b64encode(bytes(range(1, 33))).decode(), "theirs")

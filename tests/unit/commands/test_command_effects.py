@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from physworld.effects.registry import EFFECTS
-from workers.commands.effects import main
-from workers.commands.effects_wire import FILE, wire_effects
+from physworld_workers.commands.effects import main
+from physworld_workers.commands.effects_wire import FILE, wire_effects
 
 ROOT = Path(__file__).resolve().parents[3]
 PAGE = (ROOT / "docs" / "effects.md").read_text()
@@ -62,4 +62,6 @@ def test_the_page_has_every_effect_with_its_strengths() -> None:
 
 
 def test_the_api_serves_this_registry() -> None:
-    assert json.loads(FILE.read_text(encoding="utf-8")) == wire_effects(), "run workers.commands.effects_wire"
+    assert json.loads(FILE.read_text(encoding="utf-8")) == wire_effects(), (
+        "run physworld_workers.commands.effects_wire"
+    )

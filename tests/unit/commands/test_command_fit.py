@@ -17,17 +17,17 @@ import pytest
 from chat_model import serving
 from made_scene import box_body, made_scene, recorded_by
 
-from physworld.build import build_twin
 from physworld.calibrate import CalibrationConfig, calibrate
 from physworld.calibrate.discretisation import converged_parameters
+from physworld.estimation.simulations import Workers
 from physworld.scene import UNDEFORMED_AT_REST, Grip
-from physworld.simulations import Workers
-from physworld.twin import Twin
-from storage.scene_bundle import read_bundle, write_bundle
-from workers.commands import fit
-from workers.law_choice import chosen_laws
-from workers.tasks.fit_accuracy import fit_accuracy, not_measured
-from workers.tasks.fit_report import fit_report, parameter_json
+from physworld.twin.build import build_twin
+from physworld.twin.twin import Twin
+from physworld_scenes.bundle import read_bundle, write_bundle
+from physworld_workers.commands import fit
+from physworld_workers.law_choice import chosen_laws
+from physworld_workers.tasks.fit_accuracy import fit_accuracy, not_measured
+from physworld_workers.tasks.fit_report import fit_report, parameter_json
 
 FRAMES, BUDGET, SIMULATIONS = 16, 60, 100
 YOUNGS_MODULUS_PA = 4e4
@@ -152,7 +152,12 @@ def test_a_scene_that_no_law_covers_is_one_line_and_exit_code_2(
 
 def test_an_interrupt_cancels_and_says_so(bundle: Path, tmp_path: Path) -> None:
     figures = tmp_path / "fit.json"
-    command = [sys.executable, "-m", "workers.commands.fit", *arguments(bundle, "--json", str(figures))]
+    command = [
+        sys.executable,
+        "-m",
+        "physworld_workers.commands.fit",
+        *arguments(bundle, "--json", str(figures)),
+    ]
     command[-1:] = [str(figures), "--particles", "4000"]  # slow enough to be met while it works
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=dict(os.environ)) as process:
         assert process.stderr is not None
@@ -166,7 +171,12 @@ def test_an_interrupt_cancels_and_says_so(bundle: Path, tmp_path: Path) -> None:
 
 def test_an_interrupt_says_that_finished_steps_are_kept(bundle: Path, tmp_path: Path) -> None:
     journal = tmp_path / "steps.json"
-    command = [sys.executable, "-m", "workers.commands.fit", *arguments(bundle, "--resume", str(journal))]
+    command = [
+        sys.executable,
+        "-m",
+        "physworld_workers.commands.fit",
+        *arguments(bundle, "--resume", str(journal)),
+    ]
     command += ["--particles", "4000"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=dict(os.environ)) as process:
         assert process.stderr is not None

@@ -13,13 +13,13 @@ from physworld_client.cli import trace as command
 from physworld_client.cli.app import app
 from typer.testing import CliRunner
 
-from physworld.build import build_twin
 from physworld.calibrate import Journal
 from physworld.errors import Cancelled
 from physworld.scene import UNDEFORMED_AT_REST, Grip
-from storage.scene_bundle import read_bundle, write_bundle
-from workers.commands import trace
-from workers.commands.terminal import INTERRUPTED
+from physworld.twin.build import build_twin
+from physworld_scenes.bundle import read_bundle, write_bundle
+from physworld_workers.commands import trace
+from physworld_workers.commands.terminal import INTERRUPTED
 
 BUDGET, FRAMES = 60, 10
 

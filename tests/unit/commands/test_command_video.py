@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 
 from physworld.video import gaussians_at_points, orbit_view, to_ply
-from workers.commands import video
+from physworld_workers.commands import video
 
 FRAMES = 5
 

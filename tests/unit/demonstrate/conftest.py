@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from physworld.build import build_twin
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Ground, Scene
-from physworld.twin import Twin
+from physworld.twin.build import build_twin
+from physworld.twin.twin import Twin
 
 LENGTH, SIDE = 0.2, 0.05
 FPS = 30.0

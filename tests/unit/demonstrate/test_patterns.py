@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from physworld.build import build_twin
 from physworld.demonstrate import DemonstrationConfig, plan_episode
 from physworld.demonstrate.limits import limits_of
 from physworld.demonstrate.motion import LINEAR, broken_limit, random_motion
@@ -19,6 +18,7 @@ from physworld.demonstrate.patterns import axis_of, check_weights, patterns_for,
 from physworld.errors import SceneUnsupported
 from physworld.geometry.rigid import rigid_motion
 from physworld.scene import DeclaredCollider
+from physworld.twin.build import build_twin
 
 TIMES = np.arange(0.0, 3.0, 1.0 / 120.0)
 SEEDS = range(4)

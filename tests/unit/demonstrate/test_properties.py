@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from physworld.build import build_twin
 from physworld.demonstrate import DemonstrationConfig, StrengthRange, make_episode, plan_episode
 from physworld.demonstrate.perturbation import check_field
 from physworld.demonstrate.properties import draw_properties, draw_strength, property_field, ranges_of
@@ -16,6 +15,7 @@ from physworld.demonstrate.side_by_side import make_episodes
 from physworld.effects.registry import effect
 from physworld.errors import BatchRefused, SceneUnsupported, UnstableSimulation
 from physworld.scene import Ground
+from physworld.twin.build import build_twin
 
 DRAG = StrengthRange("air_drag_linear", "rate_per_s", 2.0, 1.0, 3.5)
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 from made_scene import FPS, box_body, made_scene
 
-from physworld.build import build_twin
-from physworld.mpm.problem import nodal_mass
+from physworld.engine.problem import nodal_mass
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Ground, Scene
-from physworld.twin import Twin
+from physworld.twin.build import build_twin
+from physworld.twin.twin import Twin
 
 FRAMES = 8
 SIZE = np.array([0.16, 0.04, 0.04])

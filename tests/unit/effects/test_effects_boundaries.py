@@ -13,11 +13,11 @@ from scipy.sparse import csr_matrix
 
 from physworld.effects.registry import effect
 from physworld.effects.time_varying_stiffness import GrowingStiffness
+from physworld.engine.problem import Problem, nodal_mass
+from physworld.engine.terms.contact import GroundContact
+from physworld.engine.total.formulation import TotalLagrangian
 from physworld.errors import CFLViolation
-from physworld.mpm.contact import GroundContact
-from physworld.mpm.problem import Problem, nodal_mass
-from physworld.mpm.total_lagrangian import TotalLagrangian
-from physworld.twin import Twin
+from physworld.twin.twin import Twin
 
 FIRST_ROOT = 1.8751  # of cos x cosh x = -1, the clamped-free beam
 

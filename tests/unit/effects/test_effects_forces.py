@@ -10,7 +10,7 @@ from effect_twins import SCENES, centroid, loose, moved
 from scipy.spatial.transform import Rotation
 
 from physworld.effects.registry import effect
-from physworld.twin import Twin
+from physworld.twin.twin import Twin
 
 GRAVITY = (0.0, 0.0, -9.81)
 FLIGHT = 2e-3  # share of the longest way

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from effect_twins import SCENES, TWINS, simulated
 
-from physworld.build import build_twin
 from physworld.effects.registry import effect
+from physworld.twin.build import build_twin
 
 TIMES = np.linspace(0.0, 2.0, 41)
 TWIN = TWINS["rope"]

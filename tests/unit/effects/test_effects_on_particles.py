@@ -14,7 +14,7 @@ from physworld.effects.base import Effect
 from physworld.effects.registry import EFFECTS, effect
 from physworld.errors import SceneUnsupported
 from physworld.materials.plastic import VonMises
-from physworld.twin import Twin
+from physworld.twin.twin import Twin
 
 TIMES = np.linspace(0.0, 0.4, 9)
 SETTLED = np.linspace(0.0, 1.0, 3)

@@ -15,7 +15,7 @@ from effect_twins import SCENES, TWINS, simulated
 from physworld.effects.base import Effect
 from physworld.effects.registry import EFFECTS, effect
 from physworld.errors import EffectRefused, UnknownEffect
-from physworld.twin import Twin
+from physworld.twin.twin import Twin
 
 CASES = [
     pytest.param(name, body, id=f"{name}-{body}")

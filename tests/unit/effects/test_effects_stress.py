@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from physworld.effects.base import Effect
 from physworld.effects.registry import effect
+from physworld.engine.gradients.gradient import internal_forces
+from physworld.engine.problem import Problem
+from physworld.engine.terms.term import BoundTerm
 from physworld.materials.library import with_law
-from physworld.mpm.gradient import internal_forces
-from physworld.mpm.problem import Problem
-from physworld.mpm.terms import BoundTerm
-from physworld.twin import Twin
+from physworld.twin.twin import Twin
 
 SINGLE_PRECISION = 3e-4  # solids carry strains in float32; relative to the largest nodal force
 DOUBLE = 2e-6

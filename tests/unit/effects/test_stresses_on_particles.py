@@ -11,8 +11,8 @@ from effect_twins import TWINS
 
 from physworld.effects.base import Effect
 from physworld.effects.registry import effect
-from physworld.mpm.problem import Problem
-from physworld.mpm.updated_lagrangian import UpdatedLagrangian
+from physworld.engine.problem import Problem
+from physworld.engine.updated.formulation import UpdatedLagrangian
 
 SINGLE = 2e-5
 """Strains and stresses are single precision."""

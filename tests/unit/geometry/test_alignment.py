@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from made_scene import box_body, made_scene
 
-from physworld.build import build_twin
 from physworld.geometry.alignment import Face, cells_along, faces_along
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip
+from physworld.twin.build import build_twin
 
 REACH = 0.5 / np.sqrt(3.0)
 

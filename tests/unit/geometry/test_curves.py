@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from made_scene import made_scene
 
+from physworld.engine.lattice.lattice import box_lattice
 from physworld.errors import SceneUnsupported
 from physworld.geometry.curves import fit_nodes
-from physworld.mpm.lattice import box_lattice
 
 FPS = 200.0
 RADIUS = 0.5

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from made_scene import box_body, made_scene
 
-from physworld.build import build_twin
 from physworld.errors import SceneUnsupported
 from physworld.geometry.declared import grips_of, load_of
 from physworld.scene import UNDEFORMED_AT_REST, DeclaredCollider, Scene
-from physworld.twin import Twin
+from physworld.twin.build import build_twin
+from physworld.twin.twin import Twin
 
 LOW, HIGH = np.array([-0.12, 0.0, 0.0]), np.array([0.0, 0.02, 0.02])
 BESIDE = np.array([[-0.118, -0.01, 0.0], [-0.118, 0.03, 0.0], [-0.118, 0.03, 0.02]])

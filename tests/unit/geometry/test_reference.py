@@ -9,10 +9,10 @@ import pytest
 from made_scene import box_body, made_scene
 from scipy.spatial.transform import Rotation
 
-from physworld.build import build_twin
 from physworld.errors import SceneUnsupported
 from physworld.geometry.reference import ReferenceBody, reference_body
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Scene
+from physworld.twin.build import build_twin
 
 BUDGET = 400
 SIZE = np.array([0.3, 0.1, 0.05])

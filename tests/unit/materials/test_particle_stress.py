@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import warp as wp
 
+from physworld.engine.updated.stress import ParticleStress, padded
 from physworld.materials.library import SOLID_LAWS
-from physworld.mpm.particle_stress import ParticleStress, padded
 
 COUNT = 21  # not a multiple of the lanes
 SINGLE = 2e-5  # stresses are single precision, of strains of a tenth

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import warp as wp
 
+from physworld.engine.updated.stress import ParticleStress, padded
 from physworld.materials.laws import SolidLaw
 from physworld.materials.plastic import DruckerPrager, Identity, Plasticity, StVenantKirchhoff, VonMises
-from physworld.mpm.particle_stress import ParticleStress, padded
 
 LAW = SolidLaw(1e5, 0.3)
 MU, LAM = LAW.lame

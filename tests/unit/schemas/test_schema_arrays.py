@@ -7,7 +7,7 @@ import base64
 import numpy as np
 import pytest
 
-from schemas.arrays import PIECE_BYTES, EncodedArray, array_of
+from physworld_schemas.arrays import PIECE_BYTES, EncodedArray, array_of
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 3, PIECE_BYTES // 4, PIECE_BYTES // 4 + 1, PIECE_BYTES // 2 + 7])

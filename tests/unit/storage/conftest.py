@@ -18,16 +18,17 @@ import pytest
 from moto.server import ThreadedMotoServer
 from sqlalchemy import create_engine, make_url, text
 
-from schemas.base import Problem
-from schemas.dataset import DatasetConfig
-from schemas.fit import FitConfig
-from schemas.job import Job
-from schemas.pipeline import PipelineCreate
-from schemas.scene import Scene
-from storage import jobs, leases, resources
-from storage.database import Database, open_database
-from storage.leases import Lease
-from storage.settings import Settings
+from physworld_schemas.base import Problem
+from physworld_schemas.dataset import DatasetConfig
+from physworld_schemas.fit import FitConfig
+from physworld_schemas.job import Job
+from physworld_schemas.pipeline import PipelineCreate
+from physworld_schemas.scene import Scene
+from physworld_storage import resources
+from physworld_storage.database import Database, open_database
+from physworld_storage.jobs import jobs, leases
+from physworld_storage.jobs.leases import Lease
+from physworld_storage.settings import Settings
 
 POSTGRES_VARIABLE = "PHYSWORLD_TEST_POSTGRES_URL"
 BACKENDS = ["sqlite", *(["postgres"] if os.environ.get(POSTGRES_VARIABLE) else [])]

@@ -12,9 +12,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pydantic import SecretStr
 
-from storage.artifacts import ArtifactStore
-from storage.errors import ArtifactCorrupt, NotFound, StoreReadFailed, StoreWriteFailed
-from storage.settings import Settings
+from physworld_storage.artifacts import ArtifactStore
+from physworld_storage.errors import ArtifactCorrupt, NotFound, StoreReadFailed, StoreWriteFailed
+from physworld_storage.settings import Settings
 
 BIG_BYTES = 7_000_001  # more than one part of a multipart upload, and no round number
 
@@ -154,7 +154,7 @@ def test_a_bucket_that_is_not_there_is_said_plainly(s3_endpoint: str, tmp_path: 
 
 
 def test_a_server_that_is_away_is_not_a_missing_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("storage.store.MAX_RETRIES", 0)
+    monkeypatch.setattr("physworld_storage.store.MAX_RETRIES", 0)
     with socket.socket() as unused:
         unused.bind(("127.0.0.1", 0))
         port = unused.getsockname()[1]

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 import pytest
 from sqlalchemy import text
 
-from schemas.fit import FitConfig
-from storage import jobs, leases
-from storage.changes import Changes
-from storage.database import Database
-from storage.errors import DatabaseUnavailable
-from storage.settings import Settings
+from physworld_schemas.fit import FitConfig
+from physworld_storage.changes import Changes
+from physworld_storage.database import Database
+from physworld_storage.errors import DatabaseUnavailable
+from physworld_storage.jobs import jobs, leases
+from physworld_storage.settings import Settings
 
 if TYPE_CHECKING:
     from conftest import Work

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from schemas.base import Lineage, Reference
-from schemas.model import ModelVersion, TrainingConfig
-from storage.comparison import compare_versions
-from storage.errors import Conflict
+from physworld_schemas.base import Lineage, Reference
+from physworld_schemas.model import ModelVersion, TrainingConfig
+from physworld_storage.comparison import compare_versions
+from physworld_storage.errors import Conflict
 
 FRAMES = 40
 NOW = datetime(2026, 1, 1, tzinfo=UTC)

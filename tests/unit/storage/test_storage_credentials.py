@@ -11,13 +11,13 @@ from pathlib import Path
 import pytest
 from sqlalchemy import select
 
-from storage import api_keys, audit, credentials, sessions
-from storage.audit import LOCAL, Actor
-from storage.database import Database
-from storage.errors import Conflict, KeyEnded, NotFound
-from storage.settings import Settings
-from storage.store import open_store
-from storage.tables import ApiKeyRow, AuditRow, SessionRow, utc_now
+from physworld_storage.access import api_keys, audit, credentials, sessions
+from physworld_storage.access.audit import LOCAL, Actor
+from physworld_storage.database import Database
+from physworld_storage.errors import Conflict, KeyEnded, NotFound
+from physworld_storage.settings import Settings
+from physworld_storage.store import open_store
+from physworld_storage.tables import ApiKeyRow, AuditRow, SessionRow, utc_now
 
 BROWSER = Actor("key_x", "192.0.2.7")
 

@@ -16,12 +16,12 @@ from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
 from sqlalchemy import func, select, text
 
-from schemas.fit import FitConfig
-from storage import jobs
-from storage.database import MIGRATIONS, Database, newest_revision, ping
-from storage.errors import DatabaseUnavailable
-from storage.patience import WORKING
-from storage.tables import Base, JobRow, SceneRow, utc_now
+from physworld_schemas.fit import FitConfig
+from physworld_storage.database import MIGRATIONS, Database, newest_revision, ping
+from physworld_storage.errors import DatabaseUnavailable
+from physworld_storage.jobs import jobs
+from physworld_storage.patience import WORKING
+from physworld_storage.tables import Base, JobRow, SceneRow, utc_now
 
 if TYPE_CHECKING:
     from conftest import Work
@@ -54,7 +54,7 @@ def test_the_newest_revision_is_known_without_the_migration_tool(database_url: s
     scripts = ScriptDirectory(str(MIGRATIONS))
     assert newest_revision() == scripts.get_current_head()
     code = (
-        "import sys; from storage.database import Database\n"
+        "import sys; from physworld_storage.database import Database\n"
         "database = Database(sys.argv[1]); database.upgrade(); database.check()\n"
         "assert 'alembic' not in sys.modules"
     )
@@ -82,7 +82,7 @@ def test_a_database_without_tables_is_not_ready(tmp_path: Path) -> None:
 def test_migrations_travel_with_the_package(tmp_path: Path, repository: Path) -> None:
     script = (
         "import sys; sys.path.insert(0, sys.argv[2]);"
-        "from storage.database import Database;"
+        "from physworld_storage.database import Database;"
         "d = Database('sqlite:///' + sys.argv[1]); d.upgrade(); d.check()"
     )
     command = [sys.executable, "-c", script, str(tmp_path / "elsewhere.db"), str(repository)]

@@ -23,11 +23,11 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays_of
 
-from schemas.dataset import Episode
-from storage.episodes import Arrays, EpisodeStore, arrays_digest, episode_path
-from storage.errors import EpisodeCorrupt, NotFound
-from storage.settings import Settings
-from storage.store import open_store
+from physworld_schemas.dataset import Episode
+from physworld_storage.episodes import Arrays, EpisodeStore, arrays_digest, episode_path
+from physworld_storage.errors import EpisodeCorrupt, NotFound
+from physworld_storage.settings import Settings
+from physworld_storage.store import open_store
 
 DATASET = "dst_01TEST"
 
@@ -383,10 +383,10 @@ def test_orphans_go_and_the_committed_stay(episodes: EpisodeStore) -> None:
 
 FILL = """
 import sys, numpy as np
-from storage.episodes import EpisodeStore
-from storage.errors import StoreFull
-from storage.settings import Settings
-from storage.store import open_store
+from physworld_storage.episodes import EpisodeStore
+from physworld_storage.errors import StoreFull
+from physworld_storage.settings import Settings
+from physworld_storage.store import open_store
 store = EpisodeStore(Settings(data_dir=sys.argv[1]))
 noise = np.random.default_rng(0).random((64, 4096, 3)).astype(np.float32)
 try:

@@ -6,19 +6,20 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from schemas.dataset import DatasetConfig
-from schemas.fit import FitConfig
-from schemas.model import TrainingCreate
-from schemas.pipeline import PipelineCreate
-from storage import jobs, leases, opening, registry, resources
-from storage.counts import count_shards
-from storage.errors import Conflict, NotFound, ResultInvalid
-from storage.opening import STAGE_WINDOW, model_name_of
+from physworld_schemas.dataset import DatasetConfig
+from physworld_schemas.fit import FitConfig
+from physworld_schemas.model import TrainingCreate
+from physworld_schemas.pipeline import PipelineCreate
+from physworld_storage import registry, resources
+from physworld_storage.errors import Conflict, NotFound, ResultInvalid
+from physworld_storage.jobs import jobs, leases, opening
+from physworld_storage.jobs.counts import count_shards
+from physworld_storage.jobs.opening import STAGE_WINDOW, model_name_of
 
 if TYPE_CHECKING:
     from conftest import Work
 
-    from schemas.job import Job
+    from physworld_schemas.job import Job
 
 
 def child_of(work: Work, parent: Job, kind: str) -> Job:

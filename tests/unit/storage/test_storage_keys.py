@@ -8,11 +8,12 @@ from datetime import timedelta
 import pytest
 from sqlalchemy import select
 
-from storage import api_keys, credentials, idempotency
-from storage.database import Database
-from storage.errors import Conflict, IdempotencyMismatch, KeyEnded, NotFound
-from storage.idempotency import Answer, fingerprint
-from storage.tables import ApiKeyRow, utc_now
+from physworld_storage import idempotency
+from physworld_storage.access import api_keys, credentials
+from physworld_storage.database import Database
+from physworld_storage.errors import Conflict, IdempotencyMismatch, KeyEnded, NotFound
+from physworld_storage.idempotency import Answer, fingerprint
+from physworld_storage.tables import ApiKeyRow, utc_now
 
 ANSWER = Answer(202, {"Location": "/v1/jobs/job_1"}, b'{"id": "job_1"}')
 REQUEST = fingerprint("post", "/v1/fits", b"{}")

@@ -10,20 +10,21 @@ from typing import TYPE_CHECKING
 import pytest
 from sqlalchemy.orm import Session
 
-from schemas.base import Problem
-from schemas.job import Progress
-from schemas.model import TrainingCreate
-from schemas.queues import SIMULATION, TRAINING
-from storage import jobs, leases, resources
-from storage.clock import CLOCK
-from storage.database import Database
-from storage.errors import ResultInvalid
-from storage.tables import ShardRow, utc_now
+from physworld_schemas.base import Problem
+from physworld_schemas.job import Progress
+from physworld_schemas.model import TrainingCreate
+from physworld_schemas.queues import SIMULATION, TRAINING
+from physworld_storage import resources
+from physworld_storage.clock import CLOCK
+from physworld_storage.database import Database
+from physworld_storage.errors import ResultInvalid
+from physworld_storage.jobs import jobs, leases
+from physworld_storage.tables import ShardRow, utc_now
 
 if TYPE_CHECKING:
     from conftest import Work
 
-    from storage.leases import Lease
+    from physworld_storage.jobs.leases import Lease
 
 LEASE_SECONDS = 30.0
 

@@ -7,18 +7,19 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from schemas.dataset import DatasetConfig
-from schemas.job import Job
-from schemas.model import TrainingConfig
-from schemas.pipeline import PipelineCreate
-from schemas.trace import TraceCreate
-from storage import helpers, jobs, leases, registry, traces
-from storage.clock import CLOCK
-from storage.database import Database
-from storage.errors import Conflict, ResultInvalid
-from storage.scratch import ScratchStore
-from storage.settings import Settings
-from storage.tables import ShardRow, utc_now
+from physworld_schemas.dataset import DatasetConfig
+from physworld_schemas.job import Job
+from physworld_schemas.model import TrainingConfig
+from physworld_schemas.pipeline import PipelineCreate
+from physworld_schemas.trace import TraceCreate
+from physworld_storage import registry, traces
+from physworld_storage.clock import CLOCK
+from physworld_storage.database import Database
+from physworld_storage.errors import Conflict, ResultInvalid
+from physworld_storage.jobs import helpers, jobs, leases
+from physworld_storage.scratch import ScratchStore
+from physworld_storage.settings import Settings
+from physworld_storage.tables import ShardRow, utc_now
 
 if TYPE_CHECKING:
     from conftest import Work

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from schemas.job import Progress
-from storage import leases, losses
-from storage.clock import CLOCK
-from storage.tables import ShardRow, utc_now
+from physworld_schemas.job import Progress
+from physworld_storage.clock import CLOCK
+from physworld_storage.jobs import leases, losses
+from physworld_storage.tables import ShardRow, utc_now
 
 if TYPE_CHECKING:
     from conftest import Work
 
-    from schemas.job import Job
+    from physworld_schemas.job import Job
 
 LEASE_S = 30.0
 KILLS = 40

@@ -24,13 +24,13 @@ from hypothesis.stateful import (
 )
 from sqlalchemy import func, select
 
-from schemas.base import Problem
-from schemas.job import TERMINAL_STATES
-from storage import jobs, leases
-from storage.database import Database
-from storage.errors import Conflict
-from storage.leases import Lease
-from storage.tables import DatasetRow, EpisodeRow, FitRow, JobRow, ShardRow, utc_now
+from physworld_schemas.base import Problem
+from physworld_schemas.job import TERMINAL_STATES
+from physworld_storage.database import Database
+from physworld_storage.errors import Conflict
+from physworld_storage.jobs import jobs, leases
+from physworld_storage.jobs.leases import Lease
+from physworld_storage.tables import DatasetRow, EpisodeRow, FitRow, JobRow, ShardRow, utc_now
 
 if TYPE_CHECKING:
     from conftest import Work

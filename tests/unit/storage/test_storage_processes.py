@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING
 
 from sqlalchemy import func, select
 
-from storage import leases, resources
-from storage.database import Database
-from storage.tables import EpisodeRow, JobRow, ShardRow
+from physworld_storage import resources
+from physworld_storage.database import Database
+from physworld_storage.jobs import leases
+from physworld_storage.tables import EpisodeRow, JobRow, ShardRow
 
 if TYPE_CHECKING:
     from ctypes import c_int

@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING
 import pytest
 from pydantic import TypeAdapter
 
-from schemas.base import Lineage, Page
-from schemas.model import TrainingConfig
-from schemas.scene import Scene
-from storage import registry, resources
-from storage.errors import Conflict, InvalidCursor, NotFound, ResultInvalid
-from storage.results import parse_result
+from physworld_schemas.base import Lineage, Page
+from physworld_schemas.model import TrainingConfig
+from physworld_schemas.scene import Scene
+from physworld_storage import registry, resources
+from physworld_storage.errors import Conflict, InvalidCursor, NotFound, ResultInvalid
+from physworld_storage.jobs.results import parse_result
 
 if TYPE_CHECKING:
     from conftest import Work
 
-    from storage.database import Database
+    from physworld_storage.database import Database
 
 
 def publish(database: Database, name: str, *, ready: bool = True) -> int:

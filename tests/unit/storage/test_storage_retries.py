@@ -6,14 +6,15 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from storage import jobs, resources
-from storage.errors import Conflict, NotFound
-from storage.tables import ShardRow
+from physworld_storage import resources
+from physworld_storage.errors import Conflict, NotFound
+from physworld_storage.jobs import jobs
+from physworld_storage.tables import ShardRow
 
 if TYPE_CHECKING:
     from conftest import Work
 
-    from schemas.job import Job
+    from physworld_schemas.job import Job
 
 
 def _retry(work: Work, job_id: str) -> Job:

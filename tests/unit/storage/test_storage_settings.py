@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from storage.errors import ConfigurationError
-from storage.settings import Settings
+from physworld_storage.errors import ConfigurationError
+from physworld_storage.settings import Settings
 
 
 @pytest.fixture(autouse=True)

@@ -10,11 +10,11 @@ import pytest
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
-from schemas.signing import ManifestSignature
-from storage.database import Database
-from storage.errors import ConfigurationError
-from storage.settings import Settings
-from storage.signing import list_signing_keys, open_signer, register
+from physworld_schemas.signing import ManifestSignature
+from physworld_storage.database import Database
+from physworld_storage.errors import ConfigurationError
+from physworld_storage.settings import Settings
+from physworld_storage.signing import list_signing_keys, open_signer, register
 
 SEED = base64.b64encode(bytes(range(32))).decode()
 

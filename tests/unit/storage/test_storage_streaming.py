@@ -7,14 +7,15 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from schemas.base import Problem
-from schemas.dataset import DatasetConfig
-from schemas.job import Job
-from schemas.model import TrainingConfig, TrainingCreate
-from schemas.pipeline import PipelineCreate
-from storage import jobs, leases, registry
-from storage.errors import Conflict
-from storage.tables import JobRow, ShardRow
+from physworld_schemas.base import Problem
+from physworld_schemas.dataset import DatasetConfig
+from physworld_schemas.job import Job
+from physworld_schemas.model import TrainingConfig, TrainingCreate
+from physworld_schemas.pipeline import PipelineCreate
+from physworld_storage import registry
+from physworld_storage.errors import Conflict
+from physworld_storage.jobs import jobs, leases
+from physworld_storage.tables import JobRow, ShardRow
 
 if TYPE_CHECKING:
     from conftest import Work

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 from sqlalchemy import select
 
-from storage import api_keys, tickets
-from storage.database import Database, open_database
-from storage.settings import Settings
-from storage.tables import TicketRow, utc_now
+from physworld_storage.access import api_keys, tickets
+from physworld_storage.database import Database, open_database
+from physworld_storage.settings import Settings
+from physworld_storage.tables import TicketRow, utc_now
 
 
 @pytest.fixture

@@ -9,7 +9,6 @@ import pytest
 from modelled_bar import Bar
 from sagging_bar import BUDGET, TRUE_PA, sagging
 
-from physworld.build import build_twin
 from physworld.effects.places import middle_of_free_end
 from physworld.effects.registry import effect
 from physworld.trace.candidates import candidates
@@ -17,6 +16,7 @@ from physworld.trace.compound import in_parts
 from physworld.trace.config import TraceConfig
 from physworld.trace.confirm import Confirmation, Model
 from physworld.trace.selection import Selection
+from physworld.twin.build import build_twin
 
 VISCOSITY_PA_S, FAR_PA, STIFF_N_M = 120.0, 1.2e5, 3.0
 

@@ -9,18 +9,17 @@ import numpy as np
 import pytest
 from made_scene import box_body, made_scene
 
-from physworld.build import build_twin
 from physworld.calibrate import CalibrationConfig
 from physworld.calibrate.parameters import parameters_of
 from physworld.demonstrate.limits import limits_of
 from physworld.demonstrate.motion import broken_limit
 from physworld.effects.registry import effect
+from physworld.estimation.simulations import Drive, Job, nodes_of
+from physworld.report import render
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
-from physworld.simulations import Drive, Job, nodes_of
 from physworld.trace import TraceConfig, document, trace
 from physworld.trace.experiment import Experiment, ExperimentConfig, Rival, propose
 from physworld.trace.experiment_search import clock_of
-from physworld.trace.html import render
 from physworld.trace.probing import COORDINATES, motion_of, nudged, random_probe
 from physworld.trace.refit import Refit, refit
 from physworld.trace.rivals import reconciled, refit_of
@@ -28,7 +27,8 @@ from physworld.trace.simulations import Simulations
 from physworld.trace.split import Split
 from physworld.trace.unknowns import Unknown, of_parameter, of_strength
 from physworld.trace.whitening import responses, whitener
-from physworld.twin import Twin
+from physworld.twin.build import build_twin
+from physworld.twin.twin import Twin
 
 LOW, HIGH = np.array([0.0, -0.015, -0.015]), np.array([0.16, 0.015, 0.015])
 FRAMES, SIGMA, YOUNGS_MODULUS_PA = 30, 5e-4, 4e4

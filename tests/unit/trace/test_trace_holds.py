@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from made_scene import box_body, made_scene
 
-from physworld.build import build_twin
 from physworld.calibrate.parameters import parameters_of
-from physworld.grips import softly_held
-from physworld.mpm.soft_grips import AS_HELD
+from physworld.engine.terms.soft_grips import AS_HELD
+from physworld.estimation.simulations import Job
 from physworld.scene import UNDEFORMED_AT_REST, Grip
-from physworld.simulations import Job
 from physworld.trace.holds import held_otherwise
 from physworld.trace.recordings import JointSimulations, Recordings
 from physworld.trace.refit import Refit
 from physworld.trace.sensitivity import sensitivities
 from physworld.trace.unknowns import SOFTNESS, grip_softness, of_parameter
 from physworld.trace.whitening import whitener
+from physworld.twin.build import build_twin
+from physworld.twin.grips import softly_held
 
 BUDGET, TRUE_PA, HARD, SIGMA = 200, 4e4, 0.3 * AS_HELD, 5e-4
 

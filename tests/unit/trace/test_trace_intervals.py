@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from sagging_bar import BUDGET, sagging
 
-from physworld.build import build_twin
 from physworld.effects.registry import effect
 from physworld.trace.candidates import candidates
 from physworld.trace.intervals import spread_of
 from physworld.trace.refit import Refit
 from physworld.trace.unknowns import Unknown
+from physworld.twin.build import build_twin
 
 ROWS = 60
 TIMES = np.linspace(0.0, 1.0, ROWS)

@@ -8,26 +8,26 @@ import numpy as np
 import pytest
 from made_scene import recorded_by
 
-from benchmarks.flex_sheet import FlexSheet, record
-from physworld.batch import Episode, simulate_batch
-from physworld.build import build_twin
+from benchmarks.peers.flex_sheet import FlexSheet, record
 from physworld.calibrate.parameters import parameters_of
 from physworld.effects.actuation_lag import ActuationLag
 from physworld.effects.air_drag_quadratic import AirDragQuadratic
 from physworld.effects.anisotropy import Anisotropy
+from physworld.engine.gradients.gradient_twin import TwinRun
+from physworld.engine.thin.triangles import Mesh, TriangleLattice, mesh_of
 from physworld.errors import BatchRefused, EffectRefused, NotDifferentiable, SceneUnsupported
+from physworld.estimation.simulations import Job
 from physworld.evaluate.numerics import measure_numerics, refined
 from physworld.geometry.body import first_points
 from physworld.geometry.sheet_body import possible_meshes
-from physworld.mpm.gradient_twin import TwinRun
-from physworld.mpm.triangles import Mesh, TriangleLattice, mesh_of
 from physworld.scene import Ground, Scene
-from physworld.simulations import Job
 from physworld.trace import meshes
 from physworld.trace.candidates import candidates
 from physworld.trace.meshes import recorded_as, taken_as
 from physworld.trace.recordings import JointSimulations, Recordings
-from physworld.twin import Twin
+from physworld.twin.batch import Episode, simulate_batch
+from physworld.twin.build import build_twin
+from physworld.twin.twin import Twin
 
 SHEET = FlexSheet(frames=16, noise_sigma_m=5e-4, seed=1)
 MESH = Mesh((16, 15))

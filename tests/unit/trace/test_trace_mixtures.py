@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from made_scene import box_body, made_scene
 
-from physworld.build import build_twin
 from physworld.calibrate import CalibrationConfig
 from physworld.effects.registry import effect
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
 from physworld.trace import TraceConfig, TraceResult, document, trace
+from physworld.twin.build import build_twin
 
 LOW, HIGH = np.array([0.0, -0.02, -0.02]), np.array([0.2, 0.02, 0.02])
 FRAMES, SIGMA = 36, 1e-3

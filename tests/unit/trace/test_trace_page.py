@@ -17,13 +17,13 @@ import pytest
 from made_scene import made_scene
 from PIL import Image
 
+from physworld.report import render
+from physworld.report.curves import per_frame, residuals
+from physworld.report.markup import Html, tag
+from physworld.report.pictures import png
+from physworld.report.svg import decades, round_ticks
+from physworld.report.words import VERDICTS, headline, interval, label, number, quantity
 from physworld.scene import Scene
-from physworld.trace.html import render
-from physworld.trace.html.curves import per_frame, residuals
-from physworld.trace.html.markup import Html, tag
-from physworld.trace.html.pictures import png
-from physworld.trace.html.svg import decades, round_ticks
-from physworld.trace.html.words import VERDICTS, headline, interval, label, number, quantity
 
 FRAMES, SPLIT = 20, 14
 NAMES = {

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from made_scene import made_scene
 
-from physworld.build import build_twin
 from physworld.calibrate.parameters import BENDING_RATIO, TWIST_RATIO, parameters_of
+from physworld.estimation.simulations import Job
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Scene
-from physworld.simulations import Job
 from physworld.trace.plates import as_a_plate
 from physworld.trace.recordings import JointSimulations, Recordings
 from physworld.trace.refit import Refit
 from physworld.trace.sensitivity import sensitivities
 from physworld.trace.unknowns import clamp_reach, of_parameter
 from physworld.trace.whitening import whitener
+from physworld.twin.build import build_twin
 
 SIDE, THICKNESS, HELD, FRAMES = 0.2, 0.016, 0.04, 20
 BUDGET, TRUE_PA, SIGMA = 500, 2e5, 5e-4

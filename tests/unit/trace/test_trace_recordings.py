@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from made_scene import box_body, made_scene
 
-from physworld.build import build_twin
 from physworld.calibrate import CalibrationConfig
 from physworld.effects.registry import effect
 from physworld.errors import SceneUnsupported
+from physworld.estimation.simulations import Job
 from physworld.materials.plastic.von_mises import VonMises
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
-from physworld.simulations import Job
 from physworld.trace import TraceConfig, document, trace
 from physworld.trace.candidates import candidates
 from physworld.trace.recordings import (
@@ -27,6 +26,7 @@ from physworld.trace.recordings import (
 )
 from physworld.trace.simulations import Simulations
 from physworld.trace.unknowns import with_strengths
+from physworld.twin.build import build_twin
 
 LOW, HIGH = np.array([0.0, -0.015, -0.015]), np.array([0.16, 0.015, 0.015])
 SIGMA, YOUNGS_MODULUS_PA, BUDGET = 5e-4, 1.5e5, 120

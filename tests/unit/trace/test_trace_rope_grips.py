@@ -9,13 +9,13 @@ import pytest
 from made_scene import made_scene
 from sagging_bar import sagging
 
-from physworld.build import build_twin
 from physworld.calibrate import CalibrationConfig
 from physworld.effects.registry import effect
 from physworld.scene import UNDEFORMED_AT_REST, Body, Scene
 from physworld.trace import TraceConfig, TraceResult, trace
 from physworld.trace.unknowns import grip_compliance
-from physworld.twin import Twin
+from physworld.twin.build import build_twin
+from physworld.twin.twin import Twin
 
 LENGTH, RADIUS, DENSITY, SIGMA, FRAMES = 0.4, 0.0075, 900.0, 2e-4, 40
 YOUNG_PA, POISSON, SHEAR_SHARE = 1e6, 0.4, 0.9

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from made_scene import box_body, made_scene
 
-from benchmarks.flex_sheet import FlexSheet, record
-from physworld.build import build_twin
+from benchmarks.peers.flex_sheet import FlexSheet, record
 from physworld.calibrate import CalibrationConfig
 from physworld.effects.registry import effect
+from physworld.engine.thin.triangles import Mesh
 from physworld.errors import Cancelled
-from physworld.mpm.triangles import Mesh
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
 from physworld.trace import Memory, TraceConfig, TraceResult, document, trace
-from physworld.twin import Twin
+from physworld.twin.build import build_twin
+from physworld.twin.twin import Twin
 
 LOW, HIGH = np.array([0.0, -0.015, -0.015]), np.array([0.16, 0.015, 0.015])
 FRAMES, SIGMA, YOUNGS_MODULUS_PA = 32, 1e-3, 1.5e5

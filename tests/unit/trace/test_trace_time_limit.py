@@ -9,14 +9,14 @@ import pytest
 from modelled_bar import Bar
 from sagging_bar import BUDGET, sagging
 
-from physworld.build import build_twin
 from physworld.calibrate import CalibrationConfig
 from physworld.effects.registry import effect
-from physworld.simulations import Drive, Job, Workers
+from physworld.estimation.simulations import Drive, Job, Workers
 from physworld.trace import Memory, TraceConfig, document, trace
 from physworld.trace.simulations import Ledger, Simulations, TimeUp
 from physworld.trace.time_limit import CONFIRMATION, SELECTION, Clock
 from physworld.trace.verdict import NAMED, NOTHING, UNEXPLAINED, Verdict
+from physworld.twin.build import build_twin
 
 CONFIG = TraceConfig(
     calibration=CalibrationConfig(particle_budget=BUDGET, damping="none"),

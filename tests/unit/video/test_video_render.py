@@ -9,7 +9,7 @@ from scipy.special import sph_harm_y
 from physworld.video import Camera, Gaussians, Renderer, gaussians_at_points, look_at, orbit_view
 from physworld.video.gaussians import SH_DC
 from physworld.video.render import _basis, rotation_matrices
-from physworld.worldmodel.skinning import quaternion_of, quaternion_product
+from physworld.worldmodel.model.skinning import quaternion_of, quaternion_product
 
 
 def some(count: int, harmonics: int = 16, seed: int = 0) -> Gaussians:

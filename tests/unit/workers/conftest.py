@@ -10,15 +10,15 @@ from pathlib import Path
 import pytest
 from tiny_scene import register, tiny_scene
 
-from services.embedded.broker import choose_broker
-from services.embedded.child import Child, Program
-from services.embedded.folder import DataFolder
-from storage.database import open_database
-from storage.settings import Settings
-from workers.execute import Runtime
-from workers.owner import process_owner
-from workers.registry import Handler
-from workers.stores import Stores
+from physworld_services.embedded.broker import choose_broker
+from physworld_services.embedded.child import Child, Program
+from physworld_services.embedded.folder import DataFolder
+from physworld_storage.database import open_database
+from physworld_storage.settings import Settings
+from physworld_workers.execute import Runtime
+from physworld_workers.owner import process_owner
+from physworld_workers.registry import Handler
+from physworld_workers.stores import Stores
 
 BROKER_WITHIN_S = 20.0
 RuntimeOf = Callable[..., Runtime]

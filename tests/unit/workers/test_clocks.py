@@ -16,13 +16,13 @@ from pydantic import SecretStr
 from sqlalchemy import create_engine, make_url, text
 from tiny_scene import register, tiny_scene
 
-from schemas.fit import FitConfig
-from storage import jobs, leases
-from storage.artifacts import ArtifactStore
-from storage.clock import database_now
-from storage.database import Database, open_database
-from storage.settings import Settings
-from storage.tables import ShardRow
+from physworld_schemas.fit import FitConfig
+from physworld_storage.artifacts import ArtifactStore
+from physworld_storage.clock import database_now
+from physworld_storage.database import Database, open_database
+from physworld_storage.jobs import jobs, leases
+from physworld_storage.settings import Settings
+from physworld_storage.tables import ShardRow
 
 POSTGRES_VARIABLE = "PHYSWORLD_TEST_POSTGRES_URL"
 HOST = Path(__file__).with_name("wrong_clock.py")

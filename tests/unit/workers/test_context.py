@@ -7,14 +7,14 @@ from collections.abc import Callable
 
 import pytest
 
-from schemas.fit import FitConfig
-from schemas.job import Job
-from storage import jobs, leases
-from storage.settings import Settings
-from storage.tables import ShardRow
-from workers.context import TaskContext
-from workers.errors import Cancelled, LeaseLost
-from workers.stores import Stores
+from physworld_schemas.fit import FitConfig
+from physworld_schemas.job import Job
+from physworld_storage.jobs import jobs, leases
+from physworld_storage.settings import Settings
+from physworld_storage.tables import ShardRow
+from physworld_workers.context import TaskContext
+from physworld_workers.errors import Cancelled, LeaseLost
+from physworld_workers.stores import Stores
 
 WITHIN_S = 10.0
 LEASE_S = 2.0

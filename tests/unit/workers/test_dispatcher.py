@@ -16,15 +16,16 @@ import redis
 from pydantic import SecretStr
 from sqlalchemy import event
 
-import workers.dispatcher
-from schemas.fit import FitConfig
-from schemas.queues import SIMULATION
-from storage import idempotency, jobs, leases
-from storage.settings import Settings
-from storage.tables import IdempotencyRow, ShardRow
-from workers.app import create_app
-from workers.dispatcher import FORGET_EVERY_S, IDLE_SWEEP_S, MAX_DEPTH, Dispatcher
-from workers.stores import Stores
+import physworld_workers.dispatcher
+from physworld_schemas.fit import FitConfig
+from physworld_schemas.queues import SIMULATION
+from physworld_storage import idempotency
+from physworld_storage.jobs import jobs, leases
+from physworld_storage.settings import Settings
+from physworld_storage.tables import IdempotencyRow, ShardRow
+from physworld_workers.app import create_app
+from physworld_workers.dispatcher import FORGET_EVERY_S, IDLE_SWEEP_S, MAX_DEPTH, Dispatcher
+from physworld_workers.stores import Stores
 
 WITHIN_S = 20.0
 
@@ -166,7 +167,7 @@ def test_a_dispatcher_without_work_asks_the_database_seldom_and_the_broker_never
 def test_a_shard_that_is_queued_while_nobody_looks_is_published_without_waiting_for_the_next_look(
     stores: Stores, scene_id: str, broker: redis.Redis, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(workers.dispatcher, "IDLE_SWEEP_S", 3600.0)
+    monkeypatch.setattr(physworld_workers.dispatcher, "IDLE_SWEEP_S", 3600.0)
     time.sleep(IDLE_SWEEP_S + 1.0)  # the look that sets the next one an hour from now
     _create_fits(stores, scene_id, 1)
     _until(lambda: broker.llen(SIMULATION) == 1)
@@ -177,7 +178,7 @@ def test_a_shard_that_is_queued_while_nobody_looks_is_published_without_waiting_
 def test_the_shard_of_a_killed_worker_comes_back_before_its_lease_ends(
     stores: Stores, scene_id: str, broker: redis.Redis
 ) -> None:
-    code = "from workers.owner import process_owner; print(process_owner(), flush=True); input()"
+    code = "from physworld_workers.owner import process_owner; print(process_owner(), flush=True); input()"
     with subprocess.Popen(
         [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as worker:

@@ -10,17 +10,17 @@ from typing import Any
 import pytest
 
 from physworld.errors import CFLViolation, UnstableSimulation
-from schemas.fit import FitConfig
-from schemas.job import Job
-from storage import jobs, leases
-from storage.errors import DatabaseUnavailable, StoreReadFailed, StoreWriteFailed
-from storage.tables import ShardRow
-from workers import execute
-from workers.context import TaskContext
-from workers.errors import Cancelled
-from workers.execute import Runtime, problem_of, run_shard
-from workers.registry import HandlerResult
-from workers.stores import Stores
+from physworld_schemas.fit import FitConfig
+from physworld_schemas.job import Job
+from physworld_storage.errors import DatabaseUnavailable, StoreReadFailed, StoreWriteFailed
+from physworld_storage.jobs import jobs, leases
+from physworld_storage.tables import ShardRow
+from physworld_workers import execute
+from physworld_workers.context import TaskContext
+from physworld_workers.errors import Cancelled
+from physworld_workers.execute import Runtime, problem_of, run_shard
+from physworld_workers.registry import HandlerResult
+from physworld_workers.stores import Stores
 
 FIT_RESULT = {"parameters": {}, "metrics": {}, "artifacts": []}
 

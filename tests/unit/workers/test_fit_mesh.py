@@ -7,16 +7,16 @@ from dataclasses import replace
 import pytest
 from pydantic import ValidationError
 
-from benchmarks.flex_cloths import Mesh as Recorder
-from benchmarks.flex_sheet import record
+from benchmarks.peers.flex_cloths import Mesh as Recorder
+from benchmarks.peers.flex_sheet import record
 from physworld.calibrate import CalibrationConfig, Journal, calibrate, calibrate_in_stages
 from physworld.calibrate.global_stage import prior_twin, searched_parameters
+from physworld.engine.thin.triangles import Mesh, mesh_of
 from physworld.errors import SceneUnsupported
-from physworld.mpm.triangles import Mesh, mesh_of
-from schemas.fit import FitConfig
-from schemas.pipeline import PipelineCreate
-from workers.mesh_choice import fitted_as_recorded
-from workers.tasks.fit_accuracy import fit_accuracy
+from physworld_schemas.fit import FitConfig
+from physworld_schemas.pipeline import PipelineCreate
+from physworld_workers.mesh_choice import fitted_as_recorded
+from physworld_workers.tasks.fit_accuracy import fit_accuracy
 
 
 def test_a_request_names_a_mesh_or_is_refused() -> None:

@@ -15,8 +15,8 @@ from made_scene import made_scene
 from PIL import Image
 
 from physworld.errors import LawAnswerUnavailable
-from workers.law_endpoint import LawEndpoint, law_endpoint
-from workers.motion_picture import motion_pictures
+from physworld_workers.law_endpoint import LawEndpoint, law_endpoint
+from physworld_workers.motion_picture import motion_pictures
 
 ANSWER = "Elastic: FCR | Plastic: Purely Elastic | Reason: it turns more than it stretches"
 KEY = "secret-of-the-test"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from workers.lineage import code_version
+from physworld_workers.lineage import code_version
 
 
 def test_the_version_in_a_lineage_is_the_projects_installed_or_not(

@@ -7,14 +7,14 @@ import sys
 
 import pytest
 
-from workers.owner import owner_is_gone, process_owner
+from physworld_workers.owner import owner_is_gone, process_owner
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="owners are told apart through /proc")
 
 
 def _child_owner() -> tuple[subprocess.Popen[str], str]:
     code = (
-        "from workers.owner import process_owner; import sys\n"
+        "from physworld_workers.owner import process_owner; import sys\n"
         "print(process_owner(), flush=True); sys.stdin.read()"
     )
     process = subprocess.Popen(

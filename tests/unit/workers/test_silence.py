@@ -14,20 +14,20 @@ import redis
 from pydantic import SecretStr
 from sqlalchemy import create_engine, make_url, text
 
-import workers.context
-from benchmarks.chaos.proxy import FrozenProxy
-from schemas.fit import FitConfig
-from schemas.queues import SIMULATION
-from storage import jobs, leases
-from storage.database import Database
-from storage.patience import Patience
-from storage.settings import Settings
-from storage.tables import JobRow, ShardRow, utc_now
-from workers.app import create_app
-from workers.context import TaskContext
-from workers.dispatcher import Dispatcher
-from workers.errors import LeaseLost
-from workers.stores import Stores
+import physworld_workers.context
+from benchmarks.service.chaos.proxy import FrozenProxy
+from physworld_schemas.fit import FitConfig
+from physworld_schemas.queues import SIMULATION
+from physworld_storage.database import Database
+from physworld_storage.jobs import jobs, leases
+from physworld_storage.patience import Patience
+from physworld_storage.settings import Settings
+from physworld_storage.tables import JobRow, ShardRow, utc_now
+from physworld_workers.app import create_app
+from physworld_workers.context import TaskContext
+from physworld_workers.dispatcher import Dispatcher
+from physworld_workers.errors import LeaseLost
+from physworld_workers.stores import Stores
 
 WITHIN_S = 25.0
 SHORT = Patience(
@@ -97,7 +97,7 @@ def test_a_worker_whose_renewals_hang_stops_in_time_and_leaves_its_task(
         database = Database(behind.render_as_string(hide_password=False), patience=SHORT)
         database.upgrade()
         lease = _claimed(database)
-        monkeypatch.setattr(workers.context, "JOIN_S", 1.0)
+        monkeypatch.setattr(physworld_workers.context, "JOIN_S", 1.0)
         with pytest.raises(LeaseLost):
             with TaskContext(lease, database, settings) as context:
                 time.sleep(1.0)

@@ -14,19 +14,20 @@ from pydantic import ValidationError
 from tiny_scene import register, tiny_scene
 
 from physworld.effects.registry import effect
-from schemas.dataset import Dataset, DatasetConfig
-from schemas.fit import FitConfig
-from schemas.job import Job
-from schemas.trace import FoundEffect, TraceCreate
-from storage import jobs, leases, resources
-from storage.database import open_database
-from storage.settings import Settings
-from storage.tables import TraceRow
-from workers.execute import Runtime, run_shard
-from workers.owner import process_owner
-from workers.stores import Stores
-from workers.tasks.dataset import strength_ranges
-from workers.tasks.inputs import named, npz_bytes, twin_of
+from physworld_schemas.dataset import Dataset, DatasetConfig
+from physworld_schemas.fit import FitConfig
+from physworld_schemas.job import Job
+from physworld_schemas.trace import FoundEffect, TraceCreate
+from physworld_storage import resources
+from physworld_storage.database import open_database
+from physworld_storage.jobs import jobs, leases
+from physworld_storage.settings import Settings
+from physworld_storage.tables import TraceRow
+from physworld_workers.execute import Runtime, run_shard
+from physworld_workers.owner import process_owner
+from physworld_workers.stores import Stores
+from physworld_workers.tasks.dataset import strength_ranges
+from physworld_workers.tasks.inputs import named, npz_bytes, twin_of
 
 FIT = FitConfig(particle_budget=60, max_simulations=6)
 
@@ -187,7 +188,7 @@ def soften(runtime: Runtime, fit_id: str, monkeypatch: pytest.MonkeyPatch, share
     twin = twin_of(runtime.stores, fit_id)
     modulus = twin.parameters["youngs_modulus_pa"]
     soft = twin.with_parameters(youngs_modulus_pa=share * modulus)
-    monkeypatch.setattr("workers.tasks.dataset.twin_of", lambda *_: soft)
+    monkeypatch.setattr("physworld_workers.tasks.dataset.twin_of", lambda *_: soft)
 
 
 def found(name: str, **strengths: tuple) -> FoundEffect:

@@ -11,12 +11,13 @@ from test_tasks import _drain, _make_dataset
 from physworld.calibrate import Journal
 from physworld.materials.library import ROD_LAWS, SHEET_LAWS, SOLID_LAWS
 from physworld.materials.plastic import PLASTICITIES
-from schemas.fit import ElasticLaw, Fit, FitConfig, FlowLaw
-from schemas.pipeline import PipelineCreate
-from schemas.trace import TraceCreate
-from storage import jobs, resources
-from workers.law_choice import AUTO, chosen_laws
-from workers.stores import Stores
+from physworld_schemas.fit import ElasticLaw, Fit, FitConfig, FlowLaw
+from physworld_schemas.pipeline import PipelineCreate
+from physworld_schemas.trace import TraceCreate
+from physworld_storage import resources
+from physworld_storage.jobs import jobs
+from physworld_workers.law_choice import AUTO, chosen_laws
+from physworld_workers.stores import Stores
 
 SMALL = {"particle_budget": 60, "max_simulations": 8, "damping": "none"}
 

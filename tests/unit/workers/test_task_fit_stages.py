@@ -9,16 +9,17 @@ from pydantic import ValidationError
 from test_tasks import _drain, _make_dataset
 from tiny_scene import register
 
-from physworld.build import build_twin
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
-from physworld.twin import Twin
-from schemas.fit import Fit, FitConfig
-from schemas.pipeline import PipelineCreate
-from schemas.trace import TraceCreate
-from storage import jobs, resources
-from storage.errors import Conflict
-from workers.stores import Stores
-from workers.tasks.inputs import named, npz_arrays
+from physworld.twin.build import build_twin
+from physworld.twin.twin import Twin
+from physworld_schemas.fit import Fit, FitConfig
+from physworld_schemas.pipeline import PipelineCreate
+from physworld_schemas.trace import TraceCreate
+from physworld_storage import resources
+from physworld_storage.errors import Conflict
+from physworld_storage.jobs import jobs
+from physworld_workers.stores import Stores
+from physworld_workers.tasks.inputs import named, npz_arrays
 
 SIZE = np.array([0.16, 0.02, 0.02])
 CONFIG = FitConfig(

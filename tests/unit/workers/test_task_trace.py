@@ -11,24 +11,25 @@ import numpy as np
 import pytest
 from tiny_scene import register, tiny_scene
 
-from physworld.build import build_twin
 from physworld.scene import Body
 from physworld.trace import Memory
 from physworld.trace import TraceConfig as LibraryConfig
 from physworld.trace.time_limit import Clock
-from physworld.twin import Twin
-from schemas.dataset import DatasetConfig
-from schemas.fit import FitConfig
-from schemas.job import Job
-from schemas.trace import Trace, TraceConfig, TraceCreate
-from storage import helpers, jobs, leases, resources, traces
-from storage.clock import CLOCK
-from storage.tables import JobRow, ShardRow, TraceRow, utc_now
-from workers.execute import Runtime, run_shard
-from workers.housekeeping import remove_ended_scratch
-from workers.stores import Stores
-from workers.tasks import trace as task
-from workers.tasks.inputs import named, npz_arrays, npz_bytes, twin_of
+from physworld.twin.build import build_twin
+from physworld.twin.twin import Twin
+from physworld_schemas.dataset import DatasetConfig
+from physworld_schemas.fit import FitConfig
+from physworld_schemas.job import Job
+from physworld_schemas.trace import Trace, TraceConfig, TraceCreate
+from physworld_storage import resources, traces
+from physworld_storage.clock import CLOCK
+from physworld_storage.jobs import helpers, jobs, leases
+from physworld_storage.tables import JobRow, ShardRow, TraceRow, utc_now
+from physworld_workers.execute import Runtime, run_shard
+from physworld_workers.housekeeping import remove_ended_scratch
+from physworld_workers.stores import Stores
+from physworld_workers.tasks import trace as task
+from physworld_workers.tasks.inputs import named, npz_arrays, npz_bytes, twin_of
 
 SMALL = TraceConfig(candidates=["air_drag_linear"], confirmed=1, iterations=1, resamples=100)
 FIT = FitConfig(particle_budget=60, max_simulations=2, damping="none")

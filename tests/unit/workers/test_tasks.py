@@ -11,20 +11,21 @@ import pytest
 from sqlalchemy import select
 from tiny_scene import FRAMES, tiny_scene
 
-from physworld.twin import Twin
-from schemas.dataset import Dataset, DatasetConfig
-from schemas.fit import Fit, FitConfig
-from schemas.job import Job
-from storage import helpers, jobs, leases, resources
-from storage.clock import CLOCK
-from storage.tables import EpisodeRow, ShardRow
-from workers.execute import Runtime, run_shard
-from workers.housekeeping import remove_orphan_episodes
-from workers.stores import Stores
-from workers.tasks import dataset as dataset_task
-from workers.tasks import fit as fit_task
-from workers.tasks.inputs import named, npz_arrays, npz_bytes
-from workers.tasks.shared_runs import JOURNAL, stored_journal
+from physworld.twin.twin import Twin
+from physworld_schemas.dataset import Dataset, DatasetConfig
+from physworld_schemas.fit import Fit, FitConfig
+from physworld_schemas.job import Job
+from physworld_storage import resources
+from physworld_storage.clock import CLOCK
+from physworld_storage.jobs import helpers, jobs, leases
+from physworld_storage.tables import EpisodeRow, ShardRow
+from physworld_workers.execute import Runtime, run_shard
+from physworld_workers.housekeeping import remove_orphan_episodes
+from physworld_workers.stores import Stores
+from physworld_workers.tasks import dataset as dataset_task
+from physworld_workers.tasks import fit as fit_task
+from physworld_workers.tasks.inputs import named, npz_arrays, npz_bytes
+from physworld_workers.tasks.shared_runs import JOURNAL, stored_journal
 
 EPISODES = 3
 

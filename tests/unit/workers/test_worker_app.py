@@ -8,11 +8,11 @@ import sys
 import pytest
 from pydantic import SecretStr
 
-from schemas.queues import INFERENCE, SIMULATION, TASK_NAME, TRAINING
-from storage.settings import Settings
-from workers import registry
-from workers.app import HARD_LIMIT_S, create_app
-from workers.errors import UnknownShardKind
+from physworld_schemas.queues import INFERENCE, SIMULATION, TASK_NAME, TRAINING
+from physworld_storage.settings import Settings
+from physworld_workers import registry
+from physworld_workers.app import HARD_LIMIT_S, create_app
+from physworld_workers.errors import UnknownShardKind
 
 
 @pytest.fixture
@@ -52,12 +52,14 @@ def test_an_application_needs_a_broker(tmp_path) -> None:
         create_app(Settings(data_dir=tmp_path))
 
 
-@pytest.mark.parametrize("module", ["workers.__main__", "workers.dispatcher", "services.trainer.app"])
+@pytest.mark.parametrize(
+    "module", ["physworld_workers.__main__", "physworld_workers.dispatcher", "physworld_services.trainer.app"]
+)
 def test_neither_torch_nor_warp_is_loaded_when_a_worker_starts(module: str) -> None:
     code = (
-        f"import sys, {module}, workers.app, workers.execute\n"
-        "from pydantic import SecretStr; from storage.settings import Settings\n"
-        "workers.app.create_app(Settings(broker_url=SecretStr('redis://127.0.0.1:1/0')))\n"
+        f"import sys, {module}, physworld_workers.app, physworld_workers.execute\n"
+        "from pydantic import SecretStr; from physworld_storage.settings import Settings\n"
+        "physworld_workers.app.create_app(Settings(broker_url=SecretStr('redis://127.0.0.1:1/0')))\n"
         "loaded = {'torch', 'warp'} & set(sys.modules)\n"
         "assert not loaded, loaded"
     )

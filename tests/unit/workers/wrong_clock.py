@@ -10,11 +10,11 @@ import datetime
 import sys
 from typing import Any
 
-import storage.tables
-import workers.dispatcher
-from storage import leases
-from storage.database import open_database
-from storage.settings import get_settings
+import physworld_storage.tables
+import physworld_workers.dispatcher
+from physworld_storage.database import open_database
+from physworld_storage.jobs import leases
+from physworld_storage.settings import get_settings
 
 
 def put_wrong(seconds: float) -> None:
@@ -29,7 +29,7 @@ def put_wrong(seconds: float) -> None:
     for name, module in list(sys.modules.items()):
         if name.partition(".")[0] in {"storage", "workers"} and vars(module).get("datetime") is right:
             vars(module)["datetime"] = Wrong
-    assert abs((storage.tables.utc_now() - right.now(datetime.UTC)).total_seconds() - seconds) < 5.0
+    assert abs((physworld_storage.tables.utc_now() - right.now(datetime.UTC)).total_seconds() - seconds) < 5.0
 
 
 def claim(shard_id: str, lease_seconds: float) -> Any:
@@ -44,5 +44,5 @@ def claim(shard_id: str, lease_seconds: float) -> Any:
 if __name__ == "__main__":
     put_wrong(float(sys.argv[1]))
     if sys.argv[2] == "dispatch":
-        sys.exit(workers.dispatcher.main())
+        sys.exit(physworld_workers.dispatcher.main())
     claim(sys.argv[3], float(sys.argv[4]))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from physworld.worldmodel.config import WorldModelConfig
-from physworld.worldmodel.graph import GraphSpec, build_graph
+from physworld.worldmodel.model.config import WorldModelConfig
+from physworld.worldmodel.model.graph import GraphSpec, build_graph
 
 DT_S = 1.0 / 30.0
 SPACING_M = 0.02

@@ -11,10 +11,10 @@ from held_bar import SMALL, graph
 
 from physworld.worldmodel.errors import GraphInvalid
 from physworld.worldmodel.live import LiveRollout
-from physworld.worldmodel.model import Normalisation, WorldModel
+from physworld.worldmodel.model.model import Normalisation, WorldModel
+from physworld.worldmodel.model.skinning import affine_skin
 from physworld.worldmodel.published import PublishedModel
 from physworld.worldmodel.rollout import rollout, unroll
-from physworld.worldmodel.skinning import affine_skin
 
 SINGLE_PRECISION_M = 2e-6  # over 12 steps, of a body of 0.16 m
 CANDIDATES, FRAMES = 5, 15

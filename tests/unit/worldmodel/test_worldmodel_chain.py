@@ -15,18 +15,18 @@ from held_bar import graph as bar_graph
 from physworld_client.network import Network
 
 from physworld.worldmodel import PublishedModel, affine_skin
-from physworld.worldmodel.chain import ChainPhysics, ChainPrior, chain_of
-from physworld.worldmodel.chain_fit import fit_chain
-from physworld.worldmodel.chain_layout import Held, arc_lengths, grip_frames, lay_out
-from physworld.worldmodel.chain_native import ChainRoller
-from physworld.worldmodel.chain_step import ChainStep
-from physworld.worldmodel.config import TrainingConfig
 from physworld.worldmodel.dataset import Track, read_track
-from physworld.worldmodel.engine import RolloutEngine
 from physworld.worldmodel.errors import VersionUnreadable
 from physworld.worldmodel.export import edge_list, onnx_program, torch_program
-from physworld.worldmodel.model import Normalisation, WorldModel
-from physworld.worldmodel.priors import fit_priors, prior_error
+from physworld.worldmodel.model.config import TrainingConfig
+from physworld.worldmodel.model.model import Normalisation, WorldModel
+from physworld.worldmodel.native.chain_native import ChainRoller
+from physworld.worldmodel.native.engine import RolloutEngine
+from physworld.worldmodel.priors.chain import ChainPhysics, ChainPrior, chain_of
+from physworld.worldmodel.priors.chain_fit import fit_chain
+from physworld.worldmodel.priors.chain_layout import Held, arc_lengths, grip_frames, lay_out
+from physworld.worldmodel.priors.chain_step import ChainStep
+from physworld.worldmodel.priors.choose import fit_priors, prior_error
 from physworld.worldmodel.rollout import unroll
 from physworld.worldmodel.training import train
 

@@ -10,7 +10,7 @@ from held_bar import SMALL, lattice
 
 from physworld.worldmodel.controls import grip_groups, on_clock, peak_speed
 from physworld.worldmodel.errors import ControlsInvalid
-from physworld.worldmodel.graph import build_graph
+from physworld.worldmodel.model.graph import build_graph
 
 DT = 1 / 30
 

@@ -17,10 +17,10 @@ from safetensors.numpy import save_file
 
 from physworld.worldmodel import PublishedModel, affine_skin
 from physworld.worldmodel.dataset import Track
-from physworld.worldmodel.engine import RolloutEngine
 from physworld.worldmodel.export import INPUTS, edge_list, onnx_program, torch_program
-from physworld.worldmodel.modal import fit_prior
-from physworld.worldmodel.model import Normalisation, WorldModel
+from physworld.worldmodel.model.model import Normalisation, WorldModel
+from physworld.worldmodel.native.engine import RolloutEngine
+from physworld.worldmodel.priors.modal import fit_prior
 
 AGREEMENT_M = 1e-5
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "models.md"

@@ -9,14 +9,14 @@ import pytest
 import torch
 from held_bar import SMALL, graph
 
-from physworld.worldmodel.config import FineTuneConfig, TrainingConfig
 from physworld.worldmodel.dataset import Track, read_track
 from physworld.worldmodel.errors import VersionUnreadable
 from physworld.worldmodel.finetune import Recording, fine_tune
-from physworld.worldmodel.model import WorldModel
+from physworld.worldmodel.model.config import FineTuneConfig, TrainingConfig
+from physworld.worldmodel.model.model import WorldModel
+from physworld.worldmodel.model.skinning import affine_skin
 from physworld.worldmodel.published import PublishedModel
 from physworld.worldmodel.rollout import rollout, unroll
-from physworld.worldmodel.skinning import affine_skin
 from physworld.worldmodel.training import train
 
 TRAINING = TrainingConfig(

@@ -9,15 +9,15 @@ import pytest
 import torch
 from tiny_scene import tiny_scene
 
-from benchmarks.flex_sheet import FlexSheet, record
-from physworld.build import build_twin
+from benchmarks.peers.flex_sheet import FlexSheet, record
 from physworld.effects.registry import effect
+from physworld.engine.thin.triangles import Mesh, mesh_of
 from physworld.errors import SceneUnsupported
-from physworld.mpm.triangles import Mesh, mesh_of
 from physworld.scene import Body, Ground, Scene
-from physworld.worldmodel.config import WorldModelConfig
+from physworld.twin.build import build_twin
 from physworld.worldmodel.foreign import predict, start_mismatch, twin_on
-from physworld.worldmodel.model import WorldModel
+from physworld.worldmodel.model.config import WorldModelConfig
+from physworld.worldmodel.model.model import WorldModel
 from physworld.worldmodel.scene_view import view_scene
 
 TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from held_bar import SMALL, graph, lattice
 
-from physworld.worldmodel.config import WorldModelConfig
 from physworld.worldmodel.errors import GraphInvalid
-from physworld.worldmodel.graph import (
+from physworld.worldmodel.model.config import WorldModelConfig
+from physworld.worldmodel.model.graph import (
     COARSE,
     GRIP,
     NEAR,

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from physworld.worldmodel.modal import ModalPrior, fit_prior
-from physworld.worldmodel.modal_places import mean_placing
-from physworld.worldmodel.modal_poles import growth, without_growth
+from physworld.worldmodel.priors.modal import ModalPrior, fit_prior
+from physworld.worldmodel.priors.modal_places import mean_placing
+from physworld.worldmodel.priors.modal_poles import growth, without_growth
 
 FRAMES, HISTORY, VERTICES = 40, 2, 4
 OMEGA = 0.4  # radians a step

@@ -9,12 +9,12 @@ import pytest
 import torch
 from held_bar import SMALL, graph
 
-from physworld.worldmodel.engine import RolloutEngine
-from physworld.worldmodel.graph import EDGE_KINDS, GraphSpec
-from physworld.worldmodel.messages import EdgeList, mean_messages, mean_messages_torch
-from physworld.worldmodel.modal import rigid_prior
-from physworld.worldmodel.model import Normalisation, WorldModel
+from physworld.worldmodel.model.graph import EDGE_KINDS, GraphSpec
+from physworld.worldmodel.model.model import Normalisation, WorldModel
 from physworld.worldmodel.naive import NaiveWorldModel
+from physworld.worldmodel.native.engine import RolloutEngine
+from physworld.worldmodel.native.messages import EdgeList, mean_messages, mean_messages_torch
+from physworld.worldmodel.priors.modal import rigid_prior
 from physworld.worldmodel.rollout import unroll
 
 SAME_FUNCTION = 1e-5  # of outputs of order one, in single precision

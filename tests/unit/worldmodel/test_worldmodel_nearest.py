@@ -11,14 +11,14 @@ import torch
 from held_bar import SMALL, graph
 from scipy.spatial import cKDTree
 
-from physworld.worldmodel.config import TrainingConfig, WorldModelConfig
 from physworld.worldmodel.dataset import Track, measure_scales, read_track
-from physworld.worldmodel.engine import RolloutEngine
 from physworld.worldmodel.export import INPUTS, StepProgram, edge_list, onnx_program
-from physworld.worldmodel.graph import NEAR, GraphSpec
-from physworld.worldmodel.model import Normalisation, WorldModel
+from physworld.worldmodel.model.config import TrainingConfig, WorldModelConfig
+from physworld.worldmodel.model.graph import NEAR, GraphSpec
+from physworld.worldmodel.model.model import Normalisation, WorldModel
+from physworld.worldmodel.model.nearest import find_nearest
 from physworld.worldmodel.naive import NaiveWorldModel
-from physworld.worldmodel.nearest import find_nearest
+from physworld.worldmodel.native.engine import RolloutEngine
 from physworld.worldmodel.rollout import unroll
 from physworld.worldmodel.training import train
 

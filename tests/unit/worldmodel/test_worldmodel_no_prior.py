@@ -8,13 +8,13 @@ import torch
 from held_bar import SMALL, episode, graph
 
 from physworld.worldmodel import PublishedModel, affine_skin
-from physworld.worldmodel.config import FineTuneConfig, TrainingConfig
 from physworld.worldmodel.dataset import Track, read_track
-from physworld.worldmodel.engine import RolloutEngine
 from physworld.worldmodel.export import INPUTS, StepProgram, edge_list
 from physworld.worldmodel.finetune import Recording, fine_tune
-from physworld.worldmodel.inertia import InertialPrior, InertialStep
-from physworld.worldmodel.model import Normalisation, WorldModel
+from physworld.worldmodel.model.config import FineTuneConfig, TrainingConfig
+from physworld.worldmodel.model.inertia import InertialPrior, InertialStep
+from physworld.worldmodel.model.model import Normalisation, WorldModel
+from physworld.worldmodel.native.engine import RolloutEngine
 from physworld.worldmodel.rollout import unroll
 from physworld.worldmodel.training import TrainingResult, open_loop_error, train
 

@@ -9,8 +9,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from physworld.worldmodel import skinning
-from physworld.worldmodel.skinning import (
+from physworld.worldmodel.model import skinning
+from physworld.worldmodel.model.skinning import (
     Skin,
     affine_skin,
     linear_blend,

@@ -10,7 +10,6 @@ import torch
 from held_bar import SMALL, graph
 
 from physworld.worldmodel import training as training_module
-from physworld.worldmodel.config import TrainingConfig
 from physworld.worldmodel.dataset import Track, WindowSampler, read_track, split_tracks
 from physworld.worldmodel.errors import (
     CheckpointMismatch,
@@ -18,6 +17,7 @@ from physworld.worldmodel.errors import (
     TrainingCancelled,
     TrainingDiverged,
 )
+from physworld.worldmodel.model.config import TrainingConfig
 from physworld.worldmodel.rollout import rollout
 from physworld.worldmodel.training import train
 

@@ -9,7 +9,7 @@ import typer
 
 from physworld_client.cli.fit import become
 
-MODULE = "workers.commands.effects"
+MODULE = "physworld_workers.commands.effects"
 
 effects = typer.Typer(no_args_is_help=True, help="Effects that a twin may have beside its declared physics.")
 

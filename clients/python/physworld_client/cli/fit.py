@@ -1,7 +1,7 @@
 """``physworld fit SCENE``: calibrate a twin without the service.
 
-This process becomes the command (``python -m workers.commands.fit``), so that Ctrl-C reaches exactly one process,
-its exit code is this one's, and the client imports no engine.
+This process becomes the command (``python -m physworld_workers.commands.fit``), so that Ctrl-C reaches exactly one
+process, its exit code is this one's, and the client imports no engine.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import typer
 
 from physworld_client.errors import PhysWorldError
 
-MODULE = "workers.commands.fit"
+MODULE = "physworld_workers.commands.fit"
 
 
 def fit(
@@ -75,7 +75,7 @@ def fit(
 
 def become(module: str, arguments: list[str]) -> None:
     """Replace this process by ``python -m module``. Raises PhysWorldError where only the client is installed."""
-    if importlib.util.find_spec("workers") is None or importlib.util.find_spec("warp") is None:
+    if importlib.util.find_spec("physworld_workers") is None or importlib.util.find_spec("warp") is None:
         raise PhysWorldError(
             "the engine is not installed here, only the client: install the distribution physworld with the "
             "extras api and sim"

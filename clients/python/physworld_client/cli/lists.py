@@ -21,12 +21,12 @@ from physworld_client.cli.output import ago, print_fields, print_json, print_tab
 from physworld_client.client import Client
 from physworld_client.manifest import checked_name
 from physworld_client.resources import LATEST
-from schemas.base import Artifact
-from schemas.dataset import Dataset
-from schemas.fit import Fit
-from schemas.job import Job
-from schemas.model import Model, ModelVersion
-from schemas.scene import Scene
+from physworld_schemas.base import Artifact
+from physworld_schemas.dataset import Dataset
+from physworld_schemas.fit import Fit
+from physworld_schemas.job import Job
+from physworld_schemas.model import Model, ModelVersion
+from physworld_schemas.scene import Scene
 
 Item = TypeVar("Item", bound=BaseModel)
 DEFAULT_LIMIT = 20

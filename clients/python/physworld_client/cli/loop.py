@@ -25,9 +25,9 @@ from physworld_client.cli.lists import (
 from physworld_client.cli.options import Data, Json, Limit, Token, Url
 from physworld_client.cli.output import ago, print_json, stdout
 from physworld_client.resources import LATEST
-from schemas.assessment import Assessment
-from schemas.fit import FitConfig
-from schemas.trace import FoundEffect, Trace, TraceConfig
+from physworld_schemas.assessment import Assessment
+from physworld_schemas.fit import FitConfig
+from physworld_schemas.trace import FoundEffect, Trace, TraceConfig
 
 traces = typer.Typer(help="Residuals traced to effects.", no_args_is_help=True)
 

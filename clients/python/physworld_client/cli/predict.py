@@ -16,8 +16,8 @@ from physworld_client.cli.options import Data, Json, Token, Url
 from physworld_client.cli.output import print_json, stderr, stdout
 from physworld_client.errors import PhysWorldError
 from physworld_client.resources import LATEST
-from schemas.plan import Plan, PlanConfig, PlanLimits
-from schemas.rollout import Part
+from physworld_schemas.plan import Plan, PlanConfig, PlanLimits
+from physworld_schemas.rollout import Part
 
 Version = Annotated[str, typer.Option(help="Number, alias or latest.")]
 

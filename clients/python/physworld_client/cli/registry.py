@@ -15,8 +15,8 @@ from physworld_client.known_keys import trusted_keys
 from physworld_client.manifest import verify_folder
 from physworld_client.resources import LATEST
 from physworld_client.signatures import fingerprint_of
-from schemas.model import MeasuredError, ModelComparison
-from schemas.signing import SigningKey
+from physworld_schemas.model import MeasuredError, ModelComparison
+from physworld_schemas.signing import SigningKey
 
 PublicKey = Annotated[
     str | None, typer.Option("--public-key", help="The only key that may have signed: base64, or a file.")

@@ -12,10 +12,10 @@ from rich.text import Text
 
 from physworld_client.cli.output import stdout
 from physworld_client.errors import PhysWorldError
-from schemas.fit import Fit
-from schemas.job import Job
-from schemas.model import ModelVersion
-from schemas.pipeline import ModelReference, RunReport
+from physworld_schemas.fit import Fit
+from physworld_schemas.job import Job
+from physworld_schemas.model import ModelVersion
+from physworld_schemas.pipeline import ModelReference, RunReport
 
 METRICS = {
     "track_m": "track",

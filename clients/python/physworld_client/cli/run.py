@@ -20,11 +20,11 @@ from physworld_client.client import Client
 from physworld_client.errors import JobFailed, PhysWorldError
 from physworld_client.transport import DEFAULT_MAX_RETRIES
 from physworld_client.waiting import require_success
-from schemas.dataset import DatasetConfig
-from schemas.fit import FitConfig
-from schemas.job import TERMINAL_STATES, Job
-from schemas.model import TrainingConfig
-from schemas.pipeline import PipelineCreate, RunReport
+from physworld_schemas.dataset import DatasetConfig
+from physworld_schemas.fit import FitConfig
+from physworld_schemas.job import TERMINAL_STATES, Job
+from physworld_schemas.model import TrainingConfig
+from physworld_schemas.pipeline import PipelineCreate, RunReport
 
 CANCEL_WAIT_S = 30.0
 

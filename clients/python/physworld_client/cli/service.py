@@ -1,7 +1,7 @@
 """Which service a command talks to: a given one, the one on the data folder, or one started for it.
 
 The embedded service writes ``DATA/run/state.json`` (its addresses, its process id) and ``DATA/api-key``. It
-is started as ``python -m services.embedded``: the client imports nothing of it, and the SDK installs alone.
+is started as ``python -m physworld_services.embedded``: the client imports nothing of it, and the SDK installs alone.
 """
 
 from __future__ import annotations
@@ -151,7 +151,7 @@ class Embedded:
 def embedded_command(data: Path, workers: int, port: int) -> list[str]:
     """The command that runs the embedded service in the foreground."""
     options = ["--data", str(data), "--workers", str(workers), "--port", str(port)]
-    return [sys.executable, "-m", "services.embedded", *options]
+    return [sys.executable, "-m", "physworld_services.embedded", *options]
 
 
 def _running_on(data: Path, pid: int | None = None) -> Address | None:

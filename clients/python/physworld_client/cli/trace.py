@@ -13,7 +13,7 @@ from typer.core import TyperCommand
 
 from physworld_client.cli.fit import become
 
-MODULE = "workers.commands.trace"
+MODULE = "physworld_workers.commands.trace"
 HELD_OUT = "--held-out"
 
 

@@ -33,7 +33,10 @@ def up(
 
 def require_service_code() -> None:
     """Raises PhysWorldError where only the client is installed."""
-    if importlib.util.find_spec("services") is None or importlib.util.find_spec("services.embedded") is None:
+    if (
+        importlib.util.find_spec("physworld_services") is None
+        or importlib.util.find_spec("physworld_services.embedded") is None
+    ):
         raise PhysWorldError(
             "the service is not installed here, only its client: install the distribution physworld with the "
             "extras api, sim and train, or give --url of a running service"

@@ -9,7 +9,7 @@ import typer
 
 from physworld_client.cli.fit import become
 
-MODULE = "workers.commands.video"
+MODULE = "physworld_workers.commands.video"
 
 
 def video(

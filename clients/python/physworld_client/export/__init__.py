@@ -17,7 +17,7 @@ from physworld_client.errors import ExportRefused
 from physworld_client.export.lerobot import LeRobotWriter
 from physworld_client.export.npz import NpzWriter
 from physworld_client.export.ply import PlyWriter
-from schemas.dataset import Dataset
+from physworld_schemas.dataset import Dataset
 
 Format = Literal["npz", "ply", "lerobot"]
 FORMATS: dict[str, Callable[[Path, int | None], Writer]] = {

@@ -1,0 +1,300 @@
+"""``python -m benchmarks.trace.real --json FILE``: what a trace says of measured objects.
+
+Every case fits some recordings, or the first part of one, and is measured on recordings and frames that were not used.
+Two questions are asked of each: what is the verdict; and, because real objects seldom come within the noise of a motion
+capture system, what would the best supported model change where the verdict names none. The second is no claim: the
+rows say so.
+
+The noise that a recording declares is that of its cameras. Where an experiment was repeated the two recordings also say
+how well it repeats, and the case is run again with that as the noise: nothing finer can be asked of a model.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.harness import Report, describe_machine, write_section
+from physworld.calibrate import CalibrationConfig, Journal
+from physworld.errors import PhysworldError
+from physworld.scene import Scene
+from physworld.trace import Memory, TraceConfig, TraceResult, document, trace
+from physworld.trace.confirm import Model
+from physworld.trace.held_out import measure
+from physworld.trace.recordings import HELD_OUT, JointSimulations, Recordings
+from physworld_scenes.bundle import read_bundle
+
+SHARED = Path(__file__).resolve().parents[2] / "shared" / "data" / "real"
+BUDGET = 200
+_MOVED = 0.05  # share of the whole motion that marks the release
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is fitted, what is held out, frames a second that are kept (None: all) and seconds of each (None: all)."""
+
+    name: str
+    fitted: tuple[str, ...]
+    held_out: tuple[str, ...] = ()
+    every: int = 1
+    seconds: float | None = None
+    repeats: tuple[str, str] | None = None
+
+
+CASES = (
+    Case("beam", ("beam_free_a",), ("beam_free_b", "beam_load52"), every=2, seconds=3.0),
+    Case("beam, noise of the repeat", ("beam_free_a",), ("beam_free_b", "beam_load52"), every=2, seconds=3.0,
+         repeats=("beam_free_a", "beam_free_b")),
+    Case("beam, free and loaded", ("beam_free_a", "beam_load52"), ("beam_free_b",), every=2, seconds=3.0,
+         repeats=("beam_free_a", "beam_free_b")),
+    Case("noodle, gentle", ("noodle_gentle",), ("noodle_hard",), every=4, seconds=10.0),
+    Case("noodle, both", ("noodle_gentle", "noodle_hard"), every=4, seconds=10.0),
+    Case("rope, whipped", ("rope_a_whip",), ("rope_a_ring",), every=2),
+    Case("cloth, swung", ("cloth_swing",)),
+)  # fmt: skip
+
+
+def read(name: str, case: Case, folder: Path) -> Scene:
+    """A recording, thinned and cut as the case says; its split keeps its shares."""
+    scene = read_bundle(folder / name)
+    end = scene.frame_count
+    if case.seconds is not None:
+        end = int(np.searchsorted(scene.times, case.seconds, side="right"))
+    kept = np.arange(0, end, case.every)
+    share = scene.train[1] / scene.frame_count
+    last = round(share * len(kept))
+    ctrl = scene.control_times is not None
+    return replace(
+        scene,
+        points=scene.points[kept],
+        visible=scene.visible[kept],
+        controllers=scene.controllers[kept],
+        times=scene.times[kept],
+        train=(0, last),
+        test=(last, len(kept)),
+        fps=scene.fps / case.every if scene.fps else scene.fps,
+        # the grips keep the rate at which they were measured
+        control_times=scene.control_times if ctrl else scene.times[:end],
+        control_points=scene.control_points if ctrl else scene.controllers[:end],
+    )
+
+
+def repeatability(first: Scene, second: Scene) -> float:
+    """How well an experiment repeats [m]: each recording's share of their difference, per axis, aligned at the release.
+
+    Displacements from the first frame are compared over the common time; the root mean square of their difference over
+    the square root of two is one recording's share.
+    """
+    moves = []
+    for scene in (first, second):
+        moved = scene.points - scene.points[0]
+        size = np.linalg.norm(moved, axis=2).mean(axis=1)
+        start = scene.times[int(np.argmax(size > _MOVED * size.max()))]
+        moves.append((scene.times - start, moved))
+    (t1, m1), (t2, m2) = moves
+    common = t1[(t1 >= 0) & (t1 <= t2[-1])]
+    both = [
+        np.stack([np.interp(common, t, m[:, n, i]) for n in range(m.shape[1]) for i in range(3)], axis=1)
+        for t, m in ((t1, m1), (t2, m2))
+    ]
+    return float(np.sqrt(np.mean((both[0] - both[1]) ** 2) / 2.0))
+
+
+def run(case: Case, folder: Path, memory: Path | None) -> dict[str, Any]:
+    """The figures of one case."""
+    fitted, unseen = ([read(n, case, folder) for n in names] for names in (case.fitted, case.held_out))
+    if case.repeats is not None:
+        sigma = repeatability(*(read(name, case, folder) for name in case.repeats))
+        fitted, unseen = ([replace(s, noise_sigma_m=sigma) for s in many] for many in (fitted, unseen))
+    config = TraceConfig(
+        calibration=CalibrationConfig(particle_budget=BUDGET, damping="none"), experiment=None
+    )
+    known = (
+        Memory(memory / case.name.replace(", ", "-").replace(" ", "_")) if memory is not None else Memory()
+    )
+    journal = None
+    if memory is not None:
+        stored = memory / f"{case.name}.calibration.json"
+        journal = Journal(
+            repr((case, config.calibration)),
+            stored.read_text() if stored.exists() else None,
+            stored.write_text,
+        )
+    begun, cpu = time.perf_counter(), time.process_time()
+    result = trace(fitted, config, held_out=unseen, memory=known, journal=journal)
+    report = document(result)
+    best = best_supported(result)
+    out = {
+        "case": case.name,
+        "verdict": report["verdict"],
+        "reason": report["reason"],
+        "effects": report["effects"],
+        "equivalent": report["equivalent"],
+        "noise_m": result.sigma,
+        "misfit_before": report["training"]["misfit_before"],
+        "misfit_after": report["training"]["misfit_after"],
+        "numerics": report["training"]["numerics"],
+        "recordings": report["recordings"],
+        "calibrated": report["calibrated"],
+        "unexplained": report["unexplained"],
+        "candidates": report["candidates"][:6],
+        "best_supported": None,
+    }
+    if best is not None:
+        out["best_supported"] = {
+            "effects": list(best.names),
+            "misfit": best.fitted.misfit,
+            "values": {u.name: best.fitted.value(u.name) for u in best.fitted.unknowns},
+            "units": {u.name: u.unit for u in best.fitted.unknowns},
+            "errors": _errors_of(best, result, fitted, unseen, config, known),
+        }
+    return out | {
+        "simulations": result.simulations,
+        "wall_s": time.perf_counter() - begun,
+        "cpu_s": time.process_time() - cpu,
+    }
+
+
+def best_supported(result: TraceResult) -> Model | None:
+    """The model that the verdict takes; where it takes none, the one that predicts left-out training blocks best."""
+    if result.effects:
+        return result.verdict.model
+    tried = [model for step in result.path for model in step.tried]
+    better = [model for model in tried if model.validated.mean < result.declared.validated.mean]
+    return min(better, key=lambda model: model.validated.mean) if better else None
+
+
+def _errors_of(
+    model: Model,
+    result: TraceResult,
+    fitted: list[Scene],
+    unseen: list[Scene],
+    config: TraceConfig,
+    known: Memory,
+) -> list[float | None]:
+    """Errors of every recording on frames that were not used, with the model; None where it cannot be simulated [m]."""
+    recordings = Recordings(fitted, unseen, config.blocks, config.shortest_block)
+    simulations = JointSimulations(recordings, model.fitted.twin, BUDGET, config.refinement, memory=known)
+    places = np.zeros((recordings.scene.points.shape[1], 3))
+    found: list[float | None] = []
+    every = [*recordings.fitted, *recordings.held_out]
+    for recording, tracks in zip(every, simulations.predictions(model.fitted.twin, places), strict=True):
+        if tracks is None:
+            found.append(None)
+            continue
+        errors = measure(recording.scene, recording.split, tracks, tracks, result.sigma, 2, 0)
+        found.append(errors.after)
+    return found
+
+
+def page(rows: list[dict[str, Any]]) -> Report:
+    """One line a recording."""
+    table = []
+    for row in rows:
+        best = row["best_supported"]
+        for k, known in enumerate(row["recordings"]):
+            base = known["baselines"]
+            would = None if best is None else best["errors"][k]
+            what = "not used" if known["role"] == HELD_OUT else "its last part"
+            table.append(
+                [
+                    row["case"] if k == 0 else "",
+                    _answer(row) if k == 0 else "",
+                    f"{row['misfit_before']:.4g}" if k == 0 else "",
+                    "" if k or best is None else f"{' + '.join(best['effects'])}: {best['misfit']:.4g}",
+                    f"{known['scene']} ({what})",
+                    _mm(known["noise_floor"]),
+                    _mm(known["before"]),
+                    _mm(known["after"]) if row["effects"] else "-",
+                    _mm(would),
+                    _mm(min(v for v in base.values() if v is not None)),
+                ]
+            )
+    notes = []
+    for row in rows:
+        best = row["best_supported"]
+        strengths = "" if best is None else _strengths(best)
+        notes.append(
+            f"{row['case']}: {row['reason']}. {strengths}What remains: {row['unexplained']['description']}."
+        )
+    return Report(
+        name="trace_real",
+        title="Measured objects",
+        figures={"cases": rows},
+        header=["fitted", "verdict", "misfit / noise", "best supported: misfit", "measured on", "noise", "before",
+                "after", "would be", "best baseline"],
+        rows=table,
+        notes=[
+            "Errors in mm, root mean square per axis, open loop, on recordings or frames that no step has seen. "
+            "After: with what the verdict names. Would be: with the model that predicts left-out training blocks best, "
+            "whether or not it may be named, without what training frames say of the points' places; no claim. Best "
+            "baseline: the best of static, rigid follow and constant velocity.",
+            *notes,
+            *_not_run(rows),
+        ],
+    )  # fmt: skip
+
+
+def _not_run(rows: list[dict[str, Any]]) -> list[str]:
+    missing = [case.name for case in CASES if case.name not in {row["case"] for row in rows}]
+    return [f"Not run yet: {'; '.join(missing)}."] if missing else []
+
+
+def _answer(row: dict[str, Any]) -> str:
+    names = " + ".join(effect["name"] for effect in row["effects"])
+    others = ", ".join(effect["name"] for effect in row["equivalent"])
+    return row["verdict"] + (f": {names}" if names else "") + (f" (or {others})" if others else "")
+
+
+def _strengths(best: dict[str, Any]) -> str:
+    own = [f"{n} {v:.3g} {best['units'][n]}" for n, v in best["values"].items() if "." in n and v]
+    return f"Best supported: {', '.join(own)}. " if own else ""
+
+
+def _mm(value: float | None) -> str:
+    return "-" if value is None else f"{1e3 * value:.3g}"
+
+
+def main() -> int:
+    """Run the cases, write what there is after each."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.trace.real", description=__doc__)
+    parser.add_argument(
+        "--json", type=Path, required=True, help="all figures; cases that it has are not run again"
+    )
+    parser.add_argument("--docs", type=Path, default=None, help="Markdown file whose section is replaced")
+    parser.add_argument("--only", nargs="*", default=[], help="names of cases; none: all")
+    parser.add_argument("--resume", type=Path, default=None, help="folder that remembers simulations")
+    parser.add_argument("--set", type=Path, default=SHARED, help="folder of the recordings")
+    given = parser.parse_args()
+    if not (given.set / "beam_free_a" / "scene.json").exists():
+        print(f"no recordings in {given.set}", file=sys.stderr)
+        return 1
+    if given.resume is not None:
+        given.resume.mkdir(parents=True, exist_ok=True)
+    done = {}
+    if given.json.exists():
+        done = {row["case"]: row for row in json.loads(given.json.read_text())["cases"]}
+    for case in CASES:
+        if case.name not in done and (not given.only or case.name in given.only):
+            try:
+                done[case.name] = json.loads(json.dumps(run(case, given.set, given.resume), default=float))
+            except PhysworldError as failure:
+                print(f"{case.name}: {type(failure).__name__}: {failure}", file=sys.stderr)
+                continue
+            print(json.dumps(done[case.name]), flush=True)
+        rows = [done[c.name] for c in CASES if c.name in done]
+        given.json.write_text(json.dumps({"cases": rows, "machine": describe_machine()}, indent=2) + "\n")
+    if given.docs is not None:
+        write_section(page([done[c.name] for c in CASES if c.name in done]), given.docs)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

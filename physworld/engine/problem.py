@@ -1,0 +1,83 @@
+"""What a formulation integrates, and what it promises: the interface that both formulations stand behind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from physworld.engine.lattice.lattice import Lattice
+from physworld.engine.terms.term import Term
+from physworld.materials.laws import Law
+
+
+@dataclass(frozen=True)
+class HeldNodes:
+    """Nodes that gripped material touches: their numbers (H,) and their paths at the frames, (T, H, 3) [m], [m/s]."""
+
+    nodes: np.ndarray
+    positions: np.ndarray
+    velocities: np.ndarray
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What a formulation integrates.
+
+    Attributes:
+        lattice, law: the reference body and its constitutive parameters.
+        rest: nodal positions without stress, in the world [m], (n, 3).
+        gravity_m_s2: (3,).
+        drag_per_s: linear drag rate c of every node [1/s].
+        stiffness_factor, density_factor: fields over the particles, (P,), or None for 1.
+        friction_factor: of the ground under them, likewise.
+        added_mass: lumped masses that hang from the nodes [kg], (n,), or None.
+        terms: what else acts on the nodes, contacts and effects, in the order of their launches.
+        span_s: first and last time of the run, for terms that change in time; None where nobody says.
+    """
+
+    lattice: Lattice
+    law: Law
+    rest: np.ndarray
+    gravity_m_s2: np.ndarray
+    drag_per_s: float = 0.0
+    stiffness_factor: np.ndarray | None = None
+    density_factor: np.ndarray | None = None
+    added_mass: np.ndarray | None = None
+    terms: tuple[Term, ...] = ()
+    friction_factor: np.ndarray | None = None
+    span_s: tuple[float, float] | None = None
+    device: str = field(default="cpu")
+
+    def nodal_mass(self) -> np.ndarray:
+        """Lumped nodal masses [kg], (n,)."""
+        mass = nodal_mass(self.lattice, self.law, self.density_factor)
+        return mass if self.added_mass is None else mass + self.added_mass
+
+
+class Formulation(Protocol):
+    """One way to integrate a :class:`Problem`; the engine chooses by the scene."""
+
+    time_step_s: float
+
+    def run(
+        self,
+        x: np.ndarray,
+        v: np.ndarray,
+        held: HeldNodes,
+        times: np.ndarray,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> np.ndarray:
+        """Nodal positions at ``times``, (T, n, 3)."""
+        ...
+
+
+def nodal_mass(lattice: Lattice, law: Law, density_factor: np.ndarray | None) -> np.ndarray:
+    """Lumped nodal masses [kg], (n,): rows of the mass matrix summed."""
+    density = {3: "density_kg_m3", 2: "density_kg_m2", 1: "density_kg_m"}[lattice.dim]
+    particle_mass = getattr(law, density) * lattice.particle_measures
+    if density_factor is not None:
+        particle_mass = particle_mass * density_factor
+    return lattice.lumped(particle_mass)

@@ -1,0 +1,206 @@
+"""Simulations that do not depend on each other, run wherever there is room: in this process, in others, or by workers.
+
+A job says what to simulate; a *runner* maps jobs to tracks. The same jobs give the same tracks under every runner.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from functools import cache
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from physworld.engine.total.formulation import TotalLagrangian, run_again_if_blown_up
+from physworld.errors import CFLViolation, SimulationError, WorkerLost
+from physworld.twin.twin import Twin
+
+_ENGINE = ("effects", "geometry", "materials", "mpm")  # beside the modules next to this one
+
+
+@dataclass(frozen=True)
+class Job:
+    """One simulation.
+
+    Attributes:
+        twin: what moves.
+        frames: from the first frame to before this one.
+        step_share: time step over the stable one.
+        least_step_s: a twin that gets less far by one evaluation of its forces is not run.
+    """
+
+    twin: Twin
+    frames: int
+    step_share: float = 1.0
+    least_step_s: float = 0.0
+
+    def fingerprint(self, drive: bytes) -> str:
+        """Digest of everything that the result depends on; ``drive`` stands for times and controls.
+
+        Also on the engine: a memory that is kept over a change of it starts afresh.
+        """
+        digest = hashlib.sha256(drive + engine().encode())
+        arrays = self.twin.to_arrays()
+        for name in sorted(arrays):
+            value = np.ascontiguousarray(arrays[name])
+            digest.update(f"{name} {value.dtype} {value.shape}".encode())
+            digest.update(value.tobytes())
+        digest.update(json.dumps([self.frames, self.step_share]).encode())
+        return digest.hexdigest()
+
+
+@cache
+def engine() -> str:
+    """Digest of the sources that decide what a simulation gives; read once in a process."""
+    home = Path(__file__).parent
+    sources = [*home.glob("*.py"), *(source for room in _ENGINE for source in (home / room).rglob("*.py"))]
+    digest = hashlib.sha256()
+    for source in sorted(sources):
+        content = source.read_bytes()
+        digest.update(f"{source.relative_to(home).as_posix()} {len(content)}\n".encode() + content)
+    return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What drives every simulation of a scene: control track (Tc,), (Tc, K, 3) and frame times (T,)."""
+
+    control_times: np.ndarray
+    control_points: np.ndarray
+    times: np.ndarray
+
+    def digest(self) -> bytes:
+        """Fingerprint."""
+        digest = hashlib.sha256()
+        for value in (self.control_times, self.control_points, self.times):
+            digest.update(np.ascontiguousarray(value, dtype=float).tobytes())
+        return digest.digest()
+
+
+def nodes_of(job: Job, drive: Drive, poll: Callable[[int, int], None] | None = None) -> np.ndarray:
+    """Carriers (frames, n, 3) [m] of a job. Raises SimulationError."""
+    twin = job.twin
+    run = twin.integration(drive.control_times, drive.control_points, drive.times[: job.frames])
+    start = twin.body.start
+    if twin.formulation != "total_lagrangian":
+        form = twin.flowing_form(run.problem)
+        if job.step_share != 1.0:
+            form = twin.flowing_form(run.problem, job.step_share * form.time_step_s)
+        solid = form.run_particles(start, run.velocity, run.held, run.knots, poll)
+        return run.at_frames(twin.particles_start, twin.with_empty_particles(form.solid, solid))
+    solver = TotalLagrangian(run.problem)
+    if solver.stage_s < job.least_step_s:
+        raise CFLViolation(
+            f"{solver.stage_s:.3g} s for an evaluation of the forces is below {job.least_step_s:.3g} s, which a "
+            "trace waits for"
+        )
+    if job.step_share != 1.0:
+        solver = TotalLagrangian(run.problem, job.step_share * solver.time_step_s)
+    nodes = run_again_if_blown_up(solver, start, run.velocity, run.held, run.knots, poll)
+    return run.at_frames(start, nodes)
+
+
+def stage_s(twin: Twin, drive: Drive) -> float:
+    """How far one evaluation of its forces brings a twin [s]: its stable time step, or a stage of its friction."""
+    run = twin.integration(drive.control_times, drive.control_points, drive.times[:2])
+    return TotalLagrangian(run.problem).stage_s
+
+
+def tracks_of(job: Job, drive: Drive, poll: Callable[[int, int], None] | None = None) -> np.ndarray | None:
+    """Observed points (frames, N, 3) [m] of a job; None where the run cannot be trusted."""
+    try:
+        nodes = nodes_of(job, drive, poll)
+    except SimulationError:
+        return None
+    tracks = job.twin.observe(nodes, drive.times[: job.frames])
+    # in one order in memory wherever it was run, for sums depend on it in their last digits
+    return np.ascontiguousarray(tracks) if np.isfinite(tracks).all() else None
+
+
+class Runner(Protocol):
+    """Yields the tracks of jobs in their order; None for a run that cannot be trusted. ``poll`` may raise to stop."""
+
+    def __call__(
+        self, jobs: Sequence[Job], drive: Drive, poll: Callable[[], None]
+    ) -> Iterator[np.ndarray | None]: ...
+
+
+def in_turn(jobs: Sequence[Job], drive: Drive, poll: Callable[[], None]) -> Iterator[np.ndarray | None]:
+    """The runner of this process."""
+    for job in jobs:
+        yield tracks_of(job, drive, lambda done, total: poll())
+
+
+def idle_beside(runner: Runner, jobs: int) -> int:
+    """Processes of a runner that wait while the last of so many simulations run; 0 where it does not say how many."""
+    return -jobs % int(getattr(runner, "processes", 1))
+
+
+class Workers:
+    """A runner over processes of its own, which share Warp's cache of kernels; a context manager.
+
+    Attributes:
+        processes: how many.
+    """
+
+    def __init__(self, processes: int = 2) -> None:
+        self.processes = processes
+        self._pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=_begin)
+
+    def __enter__(self) -> Workers:
+        return self
+
+    def __exit__(self, *failure: object) -> None:
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def __call__(
+        self, jobs: Sequence[Job], drive: Drive, poll: Callable[[], None]
+    ) -> Iterator[np.ndarray | None]:
+        """Every job in a process; ``poll`` is called before each is waited for. Where it raises, jobs that have not
+        begun never do.
+
+        Raises:
+            WorkerLost: a process ended, by the system's hand or another's.
+        """
+        futures: list[Future[np.ndarray | None]] = []
+        try:
+            for job in jobs:
+                facts = (job.twin.to_arrays(), job.twin.device, _facts(job), drive)
+                futures.append(self._pool.submit(_work, *facts))
+            for future in futures:
+                poll()
+                yield future.result()
+        except BrokenProcessPool as error:
+            raise WorkerLost(
+                f"one of {self.processes} processes that share the simulations ended ({len(jobs)} were asked for): "
+                "was it out of memory?"
+            ) from error
+        finally:
+            for future in futures:
+                future.cancel()
+
+
+def _begin() -> None:
+    """A process of the pool says nothing, and leaves Ctrl-C to the process that waits for it."""
+    import warp as wp
+
+    wp.config.quiet = True
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _facts(job: Job) -> tuple[int, float, float]:
+    return job.frames, job.step_share, job.least_step_s
+
+
+def _work(
+    arrays: dict[str, np.ndarray], device: str, facts: tuple[int, float, float], drive: Drive
+) -> np.ndarray | None:
+    return tracks_of(Job(Twin.from_arrays(arrays, device), *facts), drive)

@@ -1,0 +1,259 @@
+"""The pictures of a trace's page, each from the report or the residuals alone."""
+
+from __future__ import annotations
+
+import base64
+import math
+import struct
+import zlib
+from typing import Any
+
+import numpy as np
+
+from physworld.report.curves import Residuals, carpet, mean_component, per_frame
+from physworld.report.markup import Child, Html, tag
+from physworld.report.svg import Axes, Series, legend_of, line_chart, picture, short
+from physworld.report.words import number, title
+
+MM = 1e3
+MOST_FRAMES = 600
+LEAST_SHARE = 0.005  # of the residual: candidates below it share a line
+_HEAT = (224, 72, 47)  # on white and on black; its opacity is the value
+_UNSEEN = (128, 128, 128, 46)
+_BASELINE_ROLES = {
+    "static": ("stay as in frame 0", "static", "2 4"),
+    "rigid_follow": ("follow the grips rigidly", "rigid", "7 3"),
+    "constant_velocity": ("keep the first velocity", "velocity", "7 3 2 3"),
+}
+
+
+def horizon(found: Residuals, sigma: float | None) -> Html:
+    """Error of the open-loop predictions against the horizon, with baselines and the noise floor."""
+    picked = _picked(found)
+    series = [
+        Series(label, role, _mm(found.baselines[name][picked]), 1.4, dash)
+        for name, (label, role, dash) in _BASELINE_ROLES.items()
+        if name in found.baselines
+    ]
+    if sigma:
+        series.append(Series("noise floor", "noise", [MM * sigma] * len(picked), 1.6, "3 3"))
+    series.append(
+        Series("before" if not found.same else "twin", "before", _mm(per_frame(found.before)[picked]))
+    )
+    if not found.same:
+        series.append(Series("after", "after", _mm(per_frame(found.after)[picked])))
+    return line_chart(
+        found.times[picked], series, title="Error against horizon", x_label="time since frame 0 [s]",
+        y_label="rms error [mm]", split=found.split_s, log_y=True, height=340, width=1080,
+    )  # fmt: skip
+
+
+def components(found: Residuals) -> Html:
+    """Mean residual along x, y and z over time: a missing force shows as a direction."""
+    picked = _picked(found)
+    charts = []
+    for axis, name in enumerate("xyz"):
+        was = _mm(mean_component(found.before, axis)[picked])
+        series = [Series("twin" if found.same else "before", "before", was, 1.8)]
+        if not found.same:
+            series.append(Series("after", "after", _mm(mean_component(found.after, axis)[picked]), 1.8))
+        charts.append(
+            line_chart(
+                found.times[picked], series, title=f"Mean residual along {name}", x_label="time [s]",
+                y_label=f"along {name} [mm]", split=found.split_s, height=230, width=380, symmetric=True, named=False,
+            )
+        )  # fmt: skip
+    return tag("div", tag("div", *charts, class_="three"), legend_of(series))
+
+
+def carpets(found: Residuals) -> Html:
+    """Length of the residual of every point in every frame, before and after in one scale."""
+    values = {"before": found.before} if found.same else {"before": found.before, "after": found.after}
+    maps = {name: carpet(residual, found.order) for name, residual in values.items()}
+    finite = np.concatenate([m[np.isfinite(m)] for m in maps.values()])
+    top = float(np.quantile(finite, 0.99)) if finite.size else 1.0
+    figures = [
+        tag("figure", tag("figcaption", _CARPET_TITLES[name] if not found.same else "Twin"), _carpet(m, top, found))
+        for name, m in maps.items()
+    ]  # fmt: skip
+    scale = tag(
+        "div", tag("span", "0"), tag("i", class_="ramp"), tag("span", f"{number(MM * top)} mm"),
+        tag("span", "not seen", class_="unseen"), class_="legend",
+    )  # fmt: skip
+    return tag("div", tag("div", *figures, class_="two"), scale)
+
+
+_CARPET_TITLES = {"before": "Before: declared physics, calibrated", "after": "After: with what was found"}
+
+
+def candidates(report: dict[str, Any]) -> Html:
+    """Scores of all candidates with the threshold and the decoys."""
+    rows = report.get("candidates", [])
+    if not rows:
+        return tag("p", "No candidate was scored.", class_="quiet")
+    threshold = float(rows[0].get("threshold") or 0.0)
+    absorbed = any(row.get("absorbed") is not None for row in rows)
+    also = {effect.get("name") for effect in report.get("equivalent", [])}
+    head = ["candidate", "share of the residual it explains beyond re-tuning", "p"]
+    if absorbed:
+        head.append("re-tuning could absorb")
+    shown = [row for row in rows if _telling(row, also)]
+    quiet = [row for row in rows if not _telling(row, also)]
+    body = [_candidate(row, threshold, also, absorbed) for row in shown]
+    decoys = [float(d) for d in report.get("decoys", []) if d is not None]
+    if decoys:
+        dots = [tag("i", class_="decoy", style=f"left:{_percent(d)}") for d in decoys]
+        bar = tag("div", _mark(threshold), dots, class_="bar", title=f"best decoy {max(decoys):.3f}")
+        cells = [
+            tag("td", f"{len(decoys)} decoys, which must not score"),
+            tag("td", bar, class_="bars"),
+            tag("td"),
+        ]
+        body.append(tag("tr", cells, tag("td") if absorbed else None, class_="quiet"))
+    cells = [tag("th", h, class_="right" if h == "p" else None) for h in head]
+    table = tag("table", tag("thead", tag("tr", cells)), tag("tbody", body), class_="scores")
+    note = f"The line at {threshold:.2f}: what the best of all candidates would reach by chance in one case of twenty."
+    rest = None
+    if quiet:
+        few = f"{len(quiet)} more explain less than {LEAST_SHARE:.1%}"
+        rest = tag(
+            "details", tag("summary", few), tag("p", ", ".join(title(row) for row in quiet), class_="quiet")
+        )
+    return tag("div", tag("div", table, class_="scroll"), tag("p", note, class_="quiet small"), rest)
+
+
+def strength(figure: dict[str, Any]) -> Html | str:
+    """A number's interval on a line with zero; nothing without an interval."""
+    ends, value = figure.get("ci95"), figure.get("value")
+    if not ends or value is None or any(end is None for end in ends):
+        return ""
+    low, high = min(0.0, *ends, value), max(0.0, *ends, value)
+    axes = Axes(220, 26, (low, high), (0, 1), left=8, right=8, top=0, bottom=0)
+    return picture(
+        220, 26, f"{value:.4g} within {ends[0]:.4g} to {ends[1]:.4g}",
+        tag("line", class_="axis", x1=8, x2=212, y1=13, y2=13),
+        tag("line", class_="axis", x1=axes.x(0), x2=axes.x(0), y1=6, y2=20),
+        tag("line", class_="interval", x1=axes.x(ends[0]), x2=axes.x(ends[1]), y1=13, y2=13),
+        tag("circle", class_="after fill", cx=axes.x(value), cy=13, r=4.5),
+    )  # fmt: skip
+
+
+def experiment(suggested: dict[str, Any], sigma: float | None) -> Html | None:
+    """The proposed motion of the grips, and how far apart the models' predictions come."""
+    controllers = np.asarray(suggested.get("controllers") or np.empty((0, 0, 3)), dtype=float)
+    if controllers.ndim != 3 or len(controllers) < 2 or not controllers.shape[1]:
+        return None
+    moves = MM * (controllers - controllers[0])
+    furthest = int(np.argmax(np.abs(moves).max(axis=(0, 2))))
+    lines = [
+        Series(name, role, list(moves[:, furthest, axis]))
+        for axis, (name, role) in enumerate((("x", "measured"), ("y", "before"), ("z", "after")))
+    ]
+    charts = [
+        line_chart(
+            suggested["times_s"], lines, title="Proposed motion of a control point", x_label="time [s]",
+            y_label="displacement [mm]", height=250, width=540, symmetric=True,
+        )
+    ]  # fmt: skip
+    difference = suggested.get("difference_m") or []
+    if len(difference) > 1:
+        series = [Series("difference of the predictions", "after", [MM * d for d in difference])]
+        if sigma:
+            series.append(Series("noise", "noise", [MM * sigma] * len(difference), 1.6, "3 3"))
+        charts.append(
+            line_chart(
+                suggested["frame_times_s"], series, title="Predicted difference", x_label="time [s]",
+                y_label="rms difference [mm]", height=250, width=540,
+            )
+        )  # fmt: skip
+    return tag("div", *charts, class_="two")
+
+
+def png(rgba: np.ndarray) -> str:
+    """A picture (H, W, 4) uint8 as a data address."""
+    height, width, _ = rgba.shape
+    rows = np.concatenate([np.zeros((height, 1), np.uint8), rgba.reshape(height, -1)], axis=1)
+    chunks = [
+        (b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 6, 0, 0, 0)),
+        (b"IDAT", zlib.compress(rows.tobytes(), 9)),
+        (b"IEND", b""),
+    ]
+    data = b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+        for kind, body in chunks
+    )
+    return "data:image/png;base64," + base64.b64encode(data).decode()
+
+
+def _carpet(values: np.ndarray, top: float, found: Residuals) -> Html:
+    """Points (rows) over frames (columns); uneven times are drawn as they are."""
+    points, frames = values.shape
+    rgba = np.zeros((points, frames, 4), np.uint8)
+    rgba[..., :3] = _HEAT
+    seen = np.isfinite(values)
+    rgba[..., 3] = np.where(seen, 255 * np.sqrt(np.clip(np.where(seen, values, 0.0) / (top or 1.0), 0, 1)), 0)
+    rgba[~seen] = _UNSEEN
+    times = found.times
+    axes = Axes(540, 230, (float(times[0]), float(times[-1])), (0.0, float(points)))
+    evenly = np.linspace(times[0], times[-1], min(max(frames, 2), MOST_FRAMES))
+    column = np.clip(np.searchsorted(times, evenly, side="right") - 1, 0, frames - 1)
+    parts: list[Child] = [
+        tag("image", x=axes.left, y=axes.top, width=axes.width - axes.left - axes.right,
+            height=axes.height - axes.top - axes.bottom, preserveAspectRatio="none", class_="pixels",
+            href=png(rgba[::-1][:, column])),
+        *(p for p in axes.grid("time [s]", "points along the body") if "grid" not in p[:20]),
+    ]  # fmt: skip
+    if found.split_s is not None:
+        x = axes.x(found.split_s)
+        parts.append(tag("line", class_="split", x1=x, x2=x, y1=axes.top, y2=axes.height - axes.bottom))
+    return picture(axes.width, axes.height, "Residual over points and time", *parts)
+
+
+def _telling(row: dict[str, Any], also: set[Any]) -> bool:
+    """Whether a candidate is worth a line: it explains something, or is in the answer."""
+    return (
+        bool(row.get("selected")) or row.get("name") in also or float(row.get("score") or 0.0) >= LEAST_SHARE
+    )
+
+
+def _candidate(row: dict[str, Any], threshold: float, also: set[Any], absorbed: bool) -> Html:
+    role = "chosen" if row.get("selected") else "also" if row.get("name") in also else "other"
+    score = max(float(row.get("score") or 0.0), 0.0)
+    variant = tag("span", f" {row['variant']}", class_="quiet") if row.get("variant") else None
+    bar = tag("div", tag("i", class_=role, style=f"width:{_percent(score)}"), _mark(threshold), class_="bar")
+    p_value = row.get("p_value")
+    cells = [
+        tag("td", title(row), variant),
+        tag("td", bar, tag("span", f"{score:.3f}", class_="value"), class_="bars"),
+        tag("td", "–" if p_value is None else short(round(p_value, 4)), class_="right"),
+    ]
+    if absorbed:
+        share = row.get("absorbed")
+        inner = None if share is None else tag("i", class_="other", style=f"width:{_percent(float(share))}")
+        shown = "–" if share is None else f"{float(share):.0%}"
+        cells.append(
+            tag(
+                "td",
+                tag("div", inner, class_="bar narrow"),
+                tag("span", shown, class_="value"),
+                class_="bars",
+            )
+        )
+    return tag("tr", cells, class_=role)
+
+
+def _mark(threshold: float) -> Html:
+    return tag("b", class_="mark", style=f"left:{_percent(threshold)}")
+
+
+def _percent(share: float) -> str:
+    return f"{100 * min(max(share, 0.0), 1.0):.1f}%"
+
+
+def _picked(found: Residuals) -> np.ndarray:
+    count = len(found.times)
+    return np.unique(np.linspace(0, count - 1, min(count, MOST_FRAMES)).round().astype(int))
+
+
+def _mm(values: np.ndarray) -> list[float | None]:
+    return [MM * v if math.isfinite(v) else None for v in values.tolist()]

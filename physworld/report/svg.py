@@ -1,0 +1,192 @@
+"""Charts as SVG that follow the page's colours: axes, lines, bars, intervals. No network, no script."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from physworld.report.markup import Child, Html, tag
+from physworld.report.words import number
+
+TICKS = 5
+
+
+@dataclass(frozen=True)
+class Series:
+    """A line: values (None or NaN: a gap) over the chart's x, its colour's role, and how it is drawn."""
+
+    label: str
+    role: str
+    values: Sequence[float | None]
+    width: float = 2.0
+    dash: str | None = None
+
+
+@dataclass(frozen=True)
+class Axes:
+    """A drawing area with its scales; lengths in the picture's own units (pixels at full width)."""
+
+    width: float
+    height: float
+    x_range: tuple[float, float]
+    y_range: tuple[float, float]
+    left: float = 54.0
+    right: float = 14.0
+    top: float = 18.0
+    bottom: float = 40.0
+    log_y: bool = False
+
+    def x(self, value: float) -> float:
+        """Place across."""
+        low, high = self.x_range
+        return self.left + (value - low) / (high - low or 1.0) * (self.width - self.left - self.right)
+
+    def y(self, value: float) -> float:
+        """Place down; below the range of a logarithmic axis at its foot."""
+        low, high = self.y_range
+        if self.log_y:
+            value, low, high = (math.log10(max(v, self.y_range[0])) for v in (value, low, high))
+        return (
+            self.height
+            - self.bottom
+            - (value - low) / (high - low or 1.0) * (self.height - self.top - self.bottom)
+        )
+
+    def grid(self, x_label: str, y_label: str) -> list[Html]:
+        """Lines and numbers of both axes."""
+        parts = []
+        ticks = decades(*self.y_range) if self.log_y else round_ticks(*self.y_range)
+        for tick in ticks:
+            y = self.y(tick)
+            parts.append(tag("line", class_="grid", x1=self.left, x2=self.width - self.right, y1=y, y2=y))
+            parts.append(tag("text", short(tick), class_="tick", x=self.left - 8, y=y + 4, text_anchor="end"))
+        foot = self.height - self.bottom
+        for tick in round_ticks(*self.x_range):
+            x = self.x(tick)
+            parts.append(tag("line", class_="axis", x1=x, x2=x, y1=foot, y2=foot + 4))
+            parts.append(tag("text", short(tick), class_="tick", x=x, y=foot + 17, text_anchor="middle"))
+        parts.append(tag("line", class_="axis", x1=self.left, x2=self.width - self.right, y1=foot, y2=foot))
+        middle = 0.5 * (self.left + self.width - self.right)
+        parts.append(tag("text", x_label, class_="label", x=middle, y=self.height - 5, text_anchor="middle"))
+        parts.append(
+            tag("text", y_label, class_="label", transform=f"translate(13 {0.5 * (self.top + foot):.1f}) rotate(-90)",
+                text_anchor="middle")
+        )  # fmt: skip
+        return parts
+
+    def line(self, x: Sequence[float], series: Series) -> Html:
+        """A line with gaps where values are missing."""
+        path, pen = [], "M"
+        for at, value in zip(x, series.values, strict=True):
+            if value is None or not math.isfinite(value):
+                pen = "M"
+                continue
+            path.append(f"{pen}{self.x(at):.1f} {self.y(value):.1f}")
+            pen = "L"
+        return tag(
+            "path", class_=f"line {series.role}", d="".join(path), stroke_width=series.width,
+            stroke_dasharray=series.dash,
+        )  # fmt: skip
+
+
+def picture(width: float, height: float, title: str, *children: Child, **attributes: str) -> Html:
+    """An SVG element with a name for those who hear the page."""
+    return tag(
+        "svg", tag("title", title), *children, class_="chart", viewBox=f"0 0 {width:g} {height:g}", role="img",
+        **attributes,
+    )  # fmt: skip
+
+
+def legend(entries: Sequence[tuple[str, str, str | None]]) -> Html:
+    """Labels with samples of their lines: (label, role, dash)."""
+    items = [
+        tag(
+            "span",
+            tag(
+                "svg",
+                tag("line", class_=f"line {role}", x1=0, x2=22, y1=6, y2=6, stroke_width=2.5, stroke_dasharray=dash),
+                viewBox="0 0 22 12", aria_hidden="true",
+            ),
+            label,
+        )
+        for label, role, dash in entries
+    ]  # fmt: skip
+    return tag("div", *items, class_="legend")
+
+
+def legend_of(series: Sequence[Series]) -> Html | None:
+    """The legend of lines; none for a single one."""
+    return legend([(s.label, s.role, s.dash) for s in series]) if len(series) > 1 else None
+
+
+def line_chart(
+    x: Sequence[float],
+    series: Sequence[Series],
+    *,
+    title: str,
+    x_label: str,
+    y_label: str,
+    split: float | None = None,
+    log_y: bool = False,
+    height: float = 270.0,
+    width: float = 720.0,
+    symmetric: bool = False,
+    named: bool = True,
+) -> Html:
+    """Lines over x, with a legend if ``named``; what lies after ``split`` is shaded as held out."""
+    values = [v for s in series for v in s.values if v is not None and math.isfinite(v)]
+    x_range = (float(x[0]), float(x[-1])) if len(x) > 1 else (0.0, 1.0)
+    axes = Axes(width, height, x_range, _range(values, log_y, symmetric), log_y=log_y)
+    parts: list[Child] = []
+    if split is not None and x_range[0] < split < x_range[1]:
+        left = axes.x(split)
+        parts.append(
+            tag("rect", class_="held", x=left, y=axes.top, width=axes.width - axes.right - left,
+                height=axes.height - axes.top - axes.bottom)
+        )  # fmt: skip
+        parts.append(tag("text", "held out", class_="note", x=left + 2, y=axes.top - 4))
+    parts += axes.grid(x_label, y_label)
+    parts += [axes.line(x, one) for one in series]
+    foot = axes.height - axes.bottom
+    parts.append(tag("line", class_="playhead", x1=axes.left, x2=axes.left, y1=axes.top, y2=foot))
+    drawn = picture(
+        axes.width, axes.height, title, *parts, data_time=f"{x_range[0]:.6g} {x_range[1]:.6g}",
+        data_span=f"{axes.left:g} {axes.width - axes.right:g}",
+    )  # fmt: skip
+    return tag("figure", tag("div", drawn, class_="scroll"), legend_of(series) if named else None)
+
+
+def round_ticks(low: float, high: float, count: int = TICKS) -> list[float]:
+    """Round numbers within a range, about ``count``."""
+    if not high > low:
+        return [low]
+    rough = (high - low) / count
+    power = 10.0 ** math.floor(math.log10(rough))
+    step = next(f * power for f in (1, 2, 2.5, 5, 10) if f * power >= rough * 0.999)
+    first = math.ceil(low / step - 1e-9)
+    return [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)]
+
+
+def decades(low: float, high: float) -> list[float]:
+    """1, 2 and 5 of every power of ten within a range; powers only where those are many."""
+    powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    factors = (1,) if high > 100.0 * low else (1, 2, 5)
+    return [f * 10.0**p for p in powers for f in factors if low <= f * 10.0**p <= high]
+
+
+def short(value: float) -> str:
+    """A tick's number."""
+    return f"{value:.6g}" if 1e-4 <= abs(value) < 1e6 or value == 0 else number(value, 2)
+
+
+def _range(values: list[float], log_y: bool, symmetric: bool) -> tuple[float, float]:
+    high, low = max(values, default=1.0), min(values, default=0.0)
+    if log_y:
+        positive = [v for v in values if v > 0]
+        low = min(positive, default=0.1)
+        return max(0.8 * low, 1e-3 * high or 1e-3), 1.25 * high or 1.0
+    if symmetric:
+        most = 1.08 * max(abs(low), abs(high)) or 1.0
+        return -most, most
+    return min(low, 0.0), 1.08 * high if high > 0 else 1.0

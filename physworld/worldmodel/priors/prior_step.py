@@ -1,0 +1,65 @@
+"""The step of a prior as a module of the network: what x̂^{t+1} is computed with, by the kind of prior."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from physworld.worldmodel.model.inertia import InertialPrior, InertialStep, one_step_residual
+from physworld.worldmodel.priors.chain import ChainPrior
+from physworld.worldmodel.priors.chain_step import ChainStep
+from physworld.worldmodel.priors.modal import ModalPrior
+
+
+def prior_step(
+    prior: ModalPrior | ChainPrior | InertialPrior, history: int
+) -> PriorStep | ChainStep | InertialStep:
+    """The module that computes x̂^{t+1} from ``prior``."""
+    if isinstance(prior, InertialPrior):
+        return InertialStep(prior, history)
+    return ChainStep(prior, history) if isinstance(prior, ChainPrior) else PriorStep(prior, history)
+
+
+class PriorStep(nn.Module):
+    """The modal prior's step, in single precision; tensors ``prior.*``."""
+
+    def __init__(self, prior: ModalPrior, history: int) -> None:
+        super().__init__()
+        self.history = history
+        for name in ModalPrior.__dataclass_fields__:
+            self.register_buffer(name, _single(getattr(prior, name)))
+
+    def forward(self, window: Tensor, control_next: Tensor, phi: Tensor) -> Tensor:
+        """x̂^{t+1} (n, B, 3) from x^{t-h} … x^t (h+1, V, B, 3), c^{t+1} (C, B, 3) and Φ (n, B, 2)."""
+        n, batch = self.mean.shape[0], window.shape[2]
+        controls = torch.cat([control_next[None], window[:, n:].flip(0)])
+        centre = controls.mean(dim=1)
+        relative = window[:, :n].flip(0) - centre[1:, None] - self.mean[:, None]
+        amplitudes = torch.tensordot(relative, self.basis, dims=([1, 3], [1, 2]))
+        shapes = controls - centre[:, None] - self.shape[:, None]
+        path = torch.cat([centre[:1], centre[2:]]) - centre[1]
+        regressors = torch.cat(
+            [
+                amplitudes.transpose(0, 1).reshape(batch, -1),
+                shapes.permute(2, 0, 1, 3).reshape(batch, -1),
+                path.transpose(0, 1).reshape(batch, -1),
+                path.new_ones(batch, 1),
+            ],
+            dim=1,
+        )
+        lagged = regressors[:, : self.response.shape[2] - 1]
+        first, second = (lagged @ part[:, :-1].T + part[:, -1] for part in self.response)
+        softness = (phi[..., :2] * self.placing[:, None]).sum(dim=(0, 2))
+        softness = torch.minimum(torch.maximum(softness, self.span[0]), self.span[1])[:, None]
+        next_amplitudes = regressors @ self.weight.T + softness * (first + softness * second)
+        ahead = torch.tensordot(next_amplitudes, self.basis, dims=1)
+        return ahead.transpose(0, 1) + self.mean[:, None] + centre[0]
+
+    def residual(self, positions: Tensor, phi: Tensor) -> Tensor:
+        """What the prior leaves of each step of a track (T, V, 3) with Φ (n, 2): x^{t+1} - x̂^{t+1}, (n, T-1-h, 3)."""
+        return one_step_residual(self, positions, phi, self.mean.shape[0], self.history)
+
+
+def _single(values: np.ndarray) -> Tensor:
+    return torch.as_tensor(values, dtype=torch.float32)

@@ -1,0 +1,67 @@
+"""What a person knows of a foreign recording and its file does not say."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from physworld_scenes.declaration import Kind
+
+TRAIN_FRACTION = 0.7
+"""PhysTwin's split: train on frames [0, int(0.7 T)), hold out the rest."""
+
+THIRD_DIFFERENCE_GAIN = 20.0
+"""Variance of the third difference of white noise of unit variance: 1 + 9 + 9 + 1."""
+GAUSSIAN_MAD = 0.6745
+"""Median absolute value of a Gaussian of unit deviation."""
+
+
+@dataclass(frozen=True)
+class ImportOptions:
+    """Facts that complete an import; None takes the importer's default.
+
+    Attributes:
+        name, kind: of the scene.
+        fps: frame rate [Hz], where the file has none (PhysTwin: 30).
+        noise_sigma_m: tracking noise per axis [m]; None estimates it from third differences.
+        gravity_m_s2: in the scene's frame, z up.
+        body: keys of ``scene.json``'s ``body``.
+        controllers: C3D: labels of the driven or clamped markers.
+        up: C3D: the axis of the recording that points up, one of x, y, z, -x, -y, -z.
+    """
+
+    name: str | None = None
+    kind: Kind | None = None
+    fps: float | None = None
+    noise_sigma_m: float | None = None
+    gravity_m_s2: tuple[float, float, float] = (0.0, 0.0, -9.81)
+    body: dict[str, Any] = field(default_factory=dict)
+    controllers: tuple[str, ...] | None = None
+    up: str = "z"
+
+
+def split_of(frames: int) -> dict[str, list[int]]:
+    """PhysTwin's split of T frames, at least one frame on either side."""
+    last = min(max(int(TRAIN_FRACTION * frames), 1), frames - 1)
+    return {"train": [0, last], "test": [last, frames]}
+
+
+def estimate_noise(points: np.ndarray, visible: np.ndarray) -> float | None:
+    """White noise per axis [m] from third differences; None if no point is seen in four frames running.
+
+    Motion adds to it, so it is an upper estimate; the median keeps jumps out.
+
+    Args:
+        points: (T, N, 3) [m].
+        visible: (T, N) bool.
+    """
+    if len(points) < 4:
+        return None
+    seen = visible[:-3] & visible[1:-2] & visible[2:-1] & visible[3:]
+    third = np.abs(np.diff(points, n=3, axis=0)[seen])
+    if not third.size:
+        return None
+    sigma = float(np.median(third)) / GAUSSIAN_MAD / THIRD_DIFFERENCE_GAIN**0.5
+    return sigma if sigma > 0.0 else None

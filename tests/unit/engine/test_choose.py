@@ -1,0 +1,47 @@
+"""The choice of a formulation, and its reason."""
+
+from __future__ import annotations
+
+import pytest
+
+from physworld.engine.choose import choose_formulation
+from physworld.errors import SceneUnsupported
+from physworld.materials.plastic import DruckerPrager, Identity, VonMises
+
+
+def test_elastic_bodies_are_integrated_without_transfers() -> None:
+    for dimension, kind in ((3, "beam"), (2, "cloth"), (1, "rope")):
+        assert choose_formulation(dimension, kind, {}).formulation == "total_lagrangian"
+
+
+@pytest.mark.parametrize(
+    ("kind", "declared", "plasticity", "why"),
+    [
+        ("block", {}, VonMises(1e3), "von_mises"),
+        ("block", {}, DruckerPrager(0.5), "drucker_prager"),
+        ("block", {}, Identity(), "return mapping"),
+        ("sand", {}, None, "sand"),
+        ("toy", {"body": {"self_contact": True}}, None, "self_contact"),
+        ("toy", {"body": {"topology_change": True}}, None, "topology_change"),
+    ],
+)
+def test_what_flows_parts_or_touches_itself_is_carried_by_particles(
+    kind: str, declared: dict, plasticity: object, why: str
+) -> None:
+    choice = choose_formulation(3, kind, declared, plasticity)  # type: ignore[arg-type]
+    assert choice.formulation == "updated_lagrangian"
+    assert why in choice.reason
+
+
+def test_a_person_may_overrule_the_choice() -> None:
+    assert choose_formulation(3, "sand", {}, asked="total_lagrangian").formulation == "total_lagrangian"
+    assert choose_formulation(3, "beam", {}, asked="updated_lagrangian").reason == "asked for"
+
+
+def test_what_cannot_be_is_refused() -> None:
+    with pytest.raises(SceneUnsupported, match="dimension 2"):
+        choose_formulation(2, "cloth", {}, asked="updated_lagrangian")
+    with pytest.raises(SceneUnsupported, match="von_mises flow needs"):
+        choose_formulation(3, "beam", {}, VonMises(1.0), asked="total_lagrangian")
+    with pytest.raises(ValueError, match="no formulation is called 'eulerian'"):
+        choose_formulation(3, "beam", {}, asked="eulerian")

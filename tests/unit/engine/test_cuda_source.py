@@ -1,0 +1,47 @@
+"""The kernels' CUDA text compiles (no GPU is needed for that); what it computes is tested where a GPU is."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+import warp as wp
+
+from physworld.engine.gradients.solid_tangent_kernels import solid_tangent
+from physworld.engine.total.solid_kernels import solid_forces
+from physworld.materials.library import SOLID_LAWS
+
+
+def compiles(module: object, folder: Path) -> bool:
+    wp.init()
+    wp.compile_aot_module(module, arch=80, module_dir=str(folder), use_ptx=True)
+    return bool(list(folder.glob("*.ptx")))
+
+
+PLAIN = (
+    "sheet_kernels",
+    "rod_kernels",
+    "thin_tangent_kernels",
+    "node_kernels",
+    "twist_kernels",
+    "ground_kernels",
+    "energy_kernels",
+    "self_contact_kernels",
+    "self_contact_search",
+    "friction_kernels",
+    "relaxation_kernels",
+    "particle_energy_kernels",
+)
+
+
+@pytest.mark.parametrize("name", PLAIN)
+def test_the_kernels_compile_for_cuda(name: str, tmp_path: Path) -> None:
+    assert compiles(import_module(f"physworld.engine.{name}"), tmp_path)
+
+
+@pytest.mark.parametrize("name", sorted({law.stress.name for law in SOLID_LAWS.values()}))
+def test_the_kernels_of_every_stress_of_solids_compile_for_cuda(name: str, tmp_path: Path) -> None:
+    law = SOLID_LAWS[name](1e5)
+    assert compiles(solid_forces(law.stress, len(law.moduli)).module, tmp_path)
+    assert compiles(solid_tangent(law.stress, len(law.moduli)).module, tmp_path / "tangent")

@@ -1,0 +1,133 @@
+"""C3D motion capture written by ezc3d and read back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import ezc3d
+import numpy as np
+import pytest
+
+from physworld_scenes.importers import ImportOptions, import_any
+from physworld_scenes.importers.c3d import ROTATION_FROM_UP, fill_gaps
+from physworld_storage.errors import SceneInvalid
+
+FRAMES = 30
+LABELS = ["tip1", "tip2", "tip3", "base1", "base2", "base3"]
+FLOAT32 = 1e-6  # metres: C3D stores float32 millimetres
+
+
+def markers() -> np.ndarray:
+    """A tip that swings 10 cm from a fixed base [m], (T, 6, 3)."""
+    t = np.arange(FRAMES) / 100.0
+    base = np.array([[0.0, 0.0, 1.0], [0.0, 0.03, 1.0], [0.0, 0.0, 1.03]])
+    tip = base + np.array([0.1, 0.0, 0.0])
+    swing = np.zeros((FRAMES, 1, 3))
+    swing[:, 0, 2] = 0.01 * np.sin(20 * t)
+    return np.concatenate([tip + swing, np.repeat(base[None], FRAMES, axis=0)], axis=1)
+
+
+def write(
+    path: Path,
+    positions: np.ndarray,
+    *,
+    labels: list[str] | None = None,
+    units: str = "mm",
+    per_metre: float = 1000.0,
+    gaps: list[tuple[int, int]] | None = None,
+) -> bytes:
+    """A C3D file of (T, N, 3) metres; ``gaps`` are (frame, marker)."""
+    names = LABELS if labels is None else labels
+    c3d = ezc3d.c3d()
+    c3d["parameters"]["POINT"]["RATE"]["value"] = [100.0]
+    c3d["parameters"]["POINT"]["LABELS"]["value"] = names
+    c3d.add_parameter("POINT", "UNITS", [units])
+    content = np.ones((4, len(names), len(positions)))
+    content[:3] = positions.transpose(2, 1, 0) * per_metre
+    for frame, marker in gaps or []:
+        content[:3, marker, frame] = np.nan
+    c3d["data"]["points"] = content
+    c3d.write(str(path))
+    return path.read_bytes()
+
+
+def test_millimetres_become_metres_and_base_markers_controllers(tmp_path: Path) -> None:
+    data = write(tmp_path / "swing.c3d", markers())
+    scene, warnings = import_any(data, "swing.c3d", ImportOptions(kind="beam", body={"length_m": 0.1}))
+    assert (scene.name, scene.kind, scene.fps) == ("swing", "beam", 100.0)
+    assert np.allclose(scene.points, markers()[:, :3], atol=FLOAT32)
+    assert np.allclose(scene.controllers, markers()[:, 3:], atol=FLOAT32)
+    assert scene.visible.all()
+    assert scene.times[-1] == pytest.approx(0.29)
+    assert scene.declared["notes"]["controller_labels"] == ["base1", "base2", "base3"]
+    assert not [w for w in warnings if "controllers" in w]
+
+
+def test_gaps_are_invisible_and_interpolated(tmp_path: Path) -> None:
+    data = write(tmp_path / "gaps.c3d", markers(), gaps=[(5, 0), (6, 0), (9, 4)])
+    scene, _ = import_any(data, "gaps.c3d")
+    assert np.argwhere(~scene.visible).tolist() == [[5, 0], [6, 0]]
+    one, two = scene.points[4, 0], scene.points[7, 0]
+    assert np.allclose(scene.points[5, 0], one + (two - one) / 3, atol=FLOAT32)
+    assert np.allclose(scene.controllers[9, 1], markers()[9, 4], atol=FLOAT32)
+    assert scene.declared["notes"]["controller_samples_interpolated"] == 1
+
+
+def test_controllers_must_be_told_and_the_labels_are_listed(tmp_path: Path) -> None:
+    data = write(tmp_path / "a.c3d", markers(), labels=["a", "b", "c", "d", "e", "f"])
+    with pytest.raises(SceneInvalid, match="a, b, c, d, e, f"):
+        import_any(data, "a.c3d")
+    scene, _ = import_any(data, "a.c3d", ImportOptions(controllers=("d", "e", "f")))
+    assert np.allclose(scene.controllers, markers()[:, 3:], atol=FLOAT32)
+    with pytest.raises(SceneInvalid, match="no marker x"):
+        import_any(data, "a.c3d", ImportOptions(controllers=("d", "x")))
+    with pytest.raises(SceneInvalid, match="none is left on the object"):
+        import_any(data, "a.c3d", ImportOptions(controllers=("a", "b", "c", "d", "e", "f")))
+
+
+@pytest.mark.parametrize("up", ["x", "y", "z", "-x", "-y", "-z"])
+def test_the_named_axis_points_up_afterwards(up: str, tmp_path: Path) -> None:
+    rotation = ROTATION_FROM_UP[up]
+    axis = "xyz".index(up[-1])
+    assert rotation @ (np.eye(3)[axis] * (-1 if up[0] == "-" else 1)) == pytest.approx([0, 0, 1])
+    assert np.linalg.det(rotation) == pytest.approx(1.0)
+    data = write(tmp_path / "up.c3d", markers() @ rotation)  # R^-1 x for rows
+    scene, _ = import_any(data, "up.c3d", ImportOptions(up=up))
+    assert np.allclose(scene.points, markers()[:, :3], atol=FLOAT32)
+
+
+def test_an_unknown_unit_or_axis_is_named(tmp_path: Path) -> None:
+    data = write(tmp_path / "u.c3d", markers(), units="furlong")
+    with pytest.raises(SceneInvalid, match="furlong"):
+        import_any(data, "u.c3d")
+    with pytest.raises(SceneInvalid, match="'w'"):
+        import_any(write(tmp_path / "w.c3d", markers()), "w.c3d", ImportOptions(up="w"))
+
+
+def test_metres_called_millimetres_are_noticed(tmp_path: Path) -> None:
+    data = write(tmp_path / "m.c3d", markers(), units="mm", per_metre=1.0)
+    with pytest.raises(SceneInvalid, match=r"less than 0\.001 m"):
+        import_any(data, "m.c3d")
+
+
+@pytest.mark.parametrize("keep", [100, 512, 1024, 2500])
+def test_a_file_cut_short_is_named(keep: int, tmp_path: Path) -> None:
+    data = write(tmp_path / "cut.c3d", markers())
+    assert keep < len(data)
+    with pytest.raises(SceneInvalid):
+        import_any(data[:keep], "cut.c3d")
+
+
+def test_a_forged_header_ends_the_child_and_not_this_process(tmp_path: Path) -> None:
+    data = bytearray(write(tmp_path / "forged.c3d", markers()))
+    data[512 + 4 : 700] = bytes([0xFF]) * (700 - 516)
+    with pytest.raises(SceneInvalid) as caught:
+        import_any(bytes(data), "forged.c3d")
+    assert caught.value.faults[0].loc == ["c3d"]
+
+
+def test_gaps_at_the_ends_are_held() -> None:
+    positions: Any = np.arange(5.0)[:, None, None] * np.ones((1, 1, 3))
+    valid = np.array([[False], [True], [False], [True], [False]])
+    assert fill_gaps(positions, valid)[:, 0, 0].tolist() == [1, 1, 2, 3, 3]

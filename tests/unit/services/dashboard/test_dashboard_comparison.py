@@ -1,0 +1,97 @@
+"""The page that holds two versions of a model side by side."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+from fastapi import FastAPI
+from serving import serve
+from test_dashboard_access import browser_at, login
+
+from physworld_schemas.base import Lineage
+from physworld_schemas.model import TrainingConfig
+from physworld_services.dashboard import mount
+from physworld_services.stores import Stores
+from physworld_storage import registry
+from physworld_storage.database import open_database
+from physworld_storage.settings import Settings
+
+CARD = {
+    "intended_use": "Predict <this> object.",
+    "limits": "Turns are extrapolated.",
+    "trained_on": {"statistics": {"motions": {"lift": 7, "hold_one": 3}}},
+}
+STRENGTHS = {"air_drag_linear.rate_per_s": {"calibrated": 1.9, "ci95": [1.6, 2.2], "tuned": 2.05}}
+
+
+@pytest.fixture
+def client(tmp_path: Path) -> Iterator[httpx.Client]:
+    """A browser on a dashboard with two ready versions of ``beam`` and one of ``lonely``."""
+    settings = Settings(data_dir=tmp_path)
+    database = open_database(settings)
+    database.upgrade()
+    stores = Stores(settings)
+    with database.session() as session:
+        for name, error_m in (("beam", 0.004), ("beam", 0.0031), ("lonely", 0.001)):
+            curves = {name: [error_m, error_m, None] for name in ("twin", "world_model_finetuned", "static")}
+            table = {
+                "track_m": dict.fromkeys(curves, error_m),
+                "frames": [10, 13],
+                "per_frame": {"times_s": [0.3, 0.4, 0.5], "track_m": curves},
+            }
+            row = registry.allot_version(session, name, config=TrainingConfig(seed=round(1e5 * error_m)))
+            registry.publish(
+                session,
+                name,
+                row.version,
+                artifacts=[stores.artifacts.put_bytes(json.dumps(CARD).encode(), "card.json")],
+                sha256="e" * 64,
+                metrics={"held_out": table, "fine_tuning": {"strengths": STRENGTHS}},
+                lineage=Lineage(),
+            )
+        registry.set_alias(session, "beam", "champion", 2)
+    app = FastAPI()
+    mount(app, settings, database, stores)
+    with serve(app) as origin, browser_at(origin) as browser:
+        login(browser, database)
+        yield browser
+    database.dispose()
+
+
+def test_two_versions_are_held_side_by_side(client: httpx.Client) -> None:
+    assert 'href="/dashboard/models/beam/compare"' in client.get("/dashboard/models/beam").text
+    page = client.get("/dashboard/models/beam/compare?a=1&b=champion")
+    assert page.status_code == 200
+    for text in ("Version 1", "Version 2", "4.00", "3.10", "0.900", "config.seed", "400", "310"):
+        assert text in page.text, text
+    curve = client.get("/dashboard/models/beam/compare/curve?a=1&b=2").json()
+    lines = {line["label"]: line["values"] for line in curve["series"]}
+    assert lines["World model, fine-tuned, version 1"] == [4.0, 4.0, None]
+    assert lines["World model, fine-tuned, version 2"] == [3.1, 3.1, None]
+    assert len({line["role"] for line in curve["series"]}) == len(lines) == 4
+
+
+def test_without_a_choice_the_two_newest_are_taken(client: httpx.Client) -> None:
+    page = client.get("/dashboard/models/beam/compare").text
+    assert '<option value="1" selected>' in page and '<option value="2" selected>' in page
+    assert client.get("/dashboard/models/lonely/compare").status_code == 200
+    assert client.get("/dashboard/models/beam/compare?a=1&b=nobody").status_code == 404
+
+
+def test_a_page_of_a_version_answers_to_its_alias(client: httpx.Client) -> None:
+    assert "version 2" in client.get("/dashboard/models/beam/champion").text
+
+
+def test_the_page_of_a_version_says_what_it_is_for_and_where_it_ends(client: httpx.Client) -> None:
+    page = client.get("/dashboard/models/beam/2").text
+    for text in (
+        "Predict &lt;this&gt; object.",
+        "Turns are extrapolated.",
+        "7 lift, 3 hold one",
+        "stands at 2.05",
+    ):
+        assert text in page, text
