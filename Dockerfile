@@ -28,12 +28,13 @@ ARG PIP_INDEX_URL=
 ARG PIP_EXTRA_INDEX_URL=
 RUN python requirements.py api > requirements.txt \
     && pip install --no-deps --require-hashes -r requirements.txt
-COPY schemas/ schemas/
-COPY storage/ storage/
+COPY schemas/ physworld_schemas/
+COPY storage/ physworld_storage/
+COPY scenes/ physworld_scenes/
 COPY physworld/ physworld/
-COPY services/__init__.py services/connections.py services/interpreter.py services/stores.py services/web.py services/
-COPY services/api/ services/api/
-COPY services/dashboard/ services/dashboard/
+COPY services/__init__.py services/connections.py services/interpreter.py services/stores.py services/web.py physworld_services/
+COPY services/api/ physworld_services/api/
+COPY services/dashboard/ physworld_services/dashboard/
 USER 10001:10001
 EXPOSE 8000
 CMD ["python", "-m", "physworld_services.web", "--host", "0.0.0.0", "--port", "8000"]
@@ -44,10 +45,11 @@ ARG PIP_EXTRA_INDEX_URL=
 RUN python requirements.py api sim > requirements.txt \
     && pip install --no-deps --require-hashes -r requirements.txt
 ENV MPLCONFIGDIR=/var/cache/physworld/matplotlib
-COPY schemas/ schemas/
-COPY storage/ storage/
+COPY schemas/ physworld_schemas/
+COPY storage/ physworld_storage/
+COPY scenes/ physworld_scenes/
 COPY physworld/ physworld/
-COPY workers/ workers/
+COPY workers/ physworld_workers/
 USER 10001:10001
 CMD ["python", "-m", "physworld_workers"]
 
@@ -58,12 +60,13 @@ RUN python requirements.py api sim train > requirements.txt \
     && pip install --no-deps --require-hashes -r requirements.txt \
     && ./install_torch.sh python
 ENV MPLCONFIGDIR=/var/cache/physworld/matplotlib
-COPY schemas/ schemas/
-COPY storage/ storage/
+COPY schemas/ physworld_schemas/
+COPY storage/ physworld_storage/
+COPY scenes/ physworld_scenes/
 COPY physworld/ physworld/
-COPY workers/ workers/
-COPY services/__init__.py services/
-COPY services/trainer/ services/trainer/
+COPY workers/ physworld_workers/
+COPY services/__init__.py physworld_services/
+COPY services/trainer/ physworld_services/trainer/
 USER 10001:10001
 CMD ["python", "-m", "physworld_services.trainer"]
 
@@ -74,12 +77,13 @@ RUN python requirements.py api sim train > requirements.txt \
     && pip install --no-deps --require-hashes -r requirements.txt \
     && ./install_torch.sh python
 ENV MPLCONFIGDIR=/var/cache/physworld/matplotlib
-COPY schemas/ schemas/
-COPY storage/ storage/
+COPY schemas/ physworld_schemas/
+COPY storage/ physworld_storage/
+COPY scenes/ physworld_scenes/
 COPY physworld/ physworld/
-COPY workers/ workers/
-COPY services/__init__.py services/
-COPY services/inference/ services/inference/
+COPY workers/ physworld_workers/
+COPY services/__init__.py physworld_services/
+COPY services/inference/ physworld_services/inference/
 USER 10001:10001
 EXPOSE 8100
 CMD ["python", "-m", "physworld_services.inference", "serve", "--host", "0.0.0.0"]

@@ -17,20 +17,20 @@ from benchmarks.harness import REPEATS, Report, read_json, write_section
 
 DOCS = Path(__file__).resolve().parents[1] / "docs" / "benchmarks.md"
 BENCHMARKS = (
-    "mpm",
-    "batch",
-    "gradients",
-    "transfers",
-    "laws",
-    "effects",
-    "friction",
-    "contact",
-    "self_contact",
-    "world_model",
-    "factory",
-    "idle_and_start",
-    "api_load",
-    "video",
+    "speed.mpm",
+    "speed.batch",
+    "speed.gradients",
+    "verification.transfers",
+    "speed.laws",
+    "speed.effects",
+    "speed.friction",
+    "speed.contact",
+    "speed.self_contact",
+    "speed.world_model",
+    "service.factory",
+    "service.idle_and_start",
+    "service.api_load",
+    "speed.video",
 )
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 HEAD = """# Benchmarks

@@ -73,7 +73,7 @@ case "${1:-}" in
     *) fail "unknown option $1" ;;
 esac
 STAMP=$VENV/.bootstrap-stamp
-WANTED=$(cat pyproject.toml clients/python/pyproject.toml requirements.lock scripts/*.sh scripts/requirements.py | sha256sum | cut -c1-64)
+WANTED=$(cat pyproject.toml setup.py clients/python/pyproject.toml requirements.lock scripts/*.sh scripts/requirements.py | sha256sum | cut -c1-64)
 
 [ "${1:-}" = --dev ] && install_chromium
 present=
@@ -97,5 +97,6 @@ say "installing torch"
 scripts/install_torch.sh "$VENV/bin/python"
 say "installing PhysWorld and its client"
 "${PIP[@]}" --no-build-isolation --editable . --editable clients/python
+"$VENV/bin/python" scripts/package_links.py
 printf '%s %s\n' "$WANTED" "$EXTRAS" >"$STAMP"
 say "done: $VENV"

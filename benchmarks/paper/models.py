@@ -33,7 +33,7 @@ from physworld.worldmodel.scene_view import SceneView, view_scene
 from physworld.worldmodel.training import TrainingResult, train
 from physworld_scenes.bundle import read_bundle
 
-REPOSITORY = Path(__file__).resolve().parents[1]
+REPOSITORY = Path(__file__).resolve().parents[2]
 SHARED = REPOSITORY.parent / "shared" / "data"
 SCENES = {
     "soft_beam": REPOSITORY / "sample" / "soft_beam",

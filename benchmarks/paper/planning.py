@@ -39,7 +39,7 @@ from physworld.worldmodel.scene_view import view_scene
 from physworld.worldmodel.training import train
 from physworld_scenes.bundle import read_bundle
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 SCENES = {"rope": "hanging_rope", "soft body": "soft_beam"}
 IMAGES = ROOT / "docs" / "images"
 HORIZON, SLOW_HORIZON = 45, 150

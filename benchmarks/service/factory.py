@@ -34,7 +34,7 @@ from physworld_schemas.fit import FitConfig
 from physworld_storage.episodes import EpisodeStore
 from physworld_storage.settings import Settings
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 SCENE = ROOT / "sample" / "soft_beam"
 MAKE_SCENE = ROOT / "scripts" / "make_sample_scene.py"
 SAMPLE_CELLS, LONG_CELLS = 24, (32, 4, 4)  # along x; along x, y, z

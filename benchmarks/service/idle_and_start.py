@@ -28,7 +28,7 @@ from physworld_client import Client
 from benchmarks.harness import Report, run_alone, summarise
 from physworld_schemas.fit import FitConfig
 
-SCENE = Path(__file__).resolve().parents[1] / "sample" / "soft_beam"
+SCENE = Path(__file__).resolve().parents[2] / "sample" / "soft_beam"
 SETTLE_S, IDLE_S = 10.0, 60.0
 MOST_RESTARTS = 3
 WAITING_JOBS, WARM_UP = 10, 6

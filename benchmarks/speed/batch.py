@@ -26,7 +26,7 @@ from physworld.twin.integration import Integration
 from physworld.twin.twin import Twin
 from physworld_scenes.bundle import read_bundle
 
-SCENE = Path(__file__).resolve().parents[1] / "sample" / "soft_beam"
+SCENE = Path(__file__).resolve().parents[2] / "sample" / "soft_beam"
 BUDGETS = (500, 2000)
 WIDTHS = (1, 4, 16)
 EPISODES = max(WIDTHS)

@@ -139,7 +139,7 @@ def _answer(found: TraceResult) -> dict[str, Any]:
 
 def commit() -> dict[str, Any]:
     """Commit of the method, and whether its files differ from it."""
-    root = Path(__file__).resolve().parents[1]
+    root = Path(__file__).resolve().parents[2]
     try:
         head = subprocess.run(
             ["git", "rev-parse", "--short", "HEAD"], cwd=root, capture_output=True, text=True, check=True

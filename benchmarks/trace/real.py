@@ -31,7 +31,7 @@ from physworld.trace.held_out import measure
 from physworld.trace.recordings import HELD_OUT, JointSimulations, Recordings
 from physworld_scenes.bundle import read_bundle
 
-SHARED = Path(__file__).resolve().parents[2] / "shared" / "data" / "real"
+SHARED = Path(__file__).resolve().parents[3] / "shared" / "data" / "real"
 BUDGET = 200
 _MOVED = 0.05  # share of the whole motion that marks the release
 

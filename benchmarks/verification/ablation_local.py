@@ -28,7 +28,7 @@ from physworld.twin.build import build_twin
 from physworld.twin.twin import Twin
 from physworld_scenes.bundle import read_bundle
 
-SHARED = Path(__file__).parents[2] / "shared" / "data" / "real"
+SHARED = Path(__file__).parents[3] / "shared" / "data" / "real"
 MEASURED = ("beam_free_a", "cloth_swing")
 SIZE = np.array([0.24, 0.03, 0.03])
 GRIPPED_M = 0.03

@@ -26,7 +26,7 @@ from benchmarks.verification import (
     calibration_sheets,
 )
 
-SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 PARTS: dict[str, Callable[..., Report]] = {
     "recovery": calibration_known.recovery,
     "descent": calibration_descent.descent,

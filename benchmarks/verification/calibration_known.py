@@ -17,7 +17,7 @@ from physworld.twin.build import build_twin
 from physworld.twin.twin import Twin
 from physworld_scenes.bundle import read_bundle
 
-SAMPLE = Path(__file__).resolve().parents[1] / "sample" / "soft_beam"
+SAMPLE = Path(__file__).resolve().parents[2] / "sample" / "soft_beam"
 SAMPLE_TRUE_PA, SAMPLE_CONVERGED_PA = 2.5e5, 2.85e5
 SIGMA_M = 1e-3
 OWN_PA, OWN_BUDGET, OWN_REFINEMENT = 2.5e5, 1000, 1.5

@@ -23,7 +23,7 @@ from physworld.engine.total.formulation import TotalLagrangian, run_again_if_blo
 from physworld.errors import CFLViolation, SimulationError, WorkerLost
 from physworld.twin.twin import Twin
 
-_ENGINE = ("effects", "geometry", "materials", "mpm")  # beside the modules next to this one
+_ENGINE = ("effects", "engine", "geometry", "materials", "twin")  # and the modules of ``physworld`` itself
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Job:
 @cache
 def engine() -> str:
     """Digest of the sources that decide what a simulation gives; read once in a process."""
-    home = Path(__file__).parent
+    home = Path(__file__).parents[1]
     sources = [*home.glob("*.py"), *(source for room in _ENGINE for source in (home / room).rglob("*.py"))]
     digest = hashlib.sha256()
     for source in sorted(sources):

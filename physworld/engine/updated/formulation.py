@@ -33,7 +33,7 @@ from physworld.errors import CFLViolation, SceneUnsupported
 from physworld.materials.laws import SolidLaw
 from physworld.materials.plastic import DruckerPrager, Identity, Plasticity
 
-_LIMIT = 0.9  # stable dt in units of dx / c, measured on the full lattice (tests/unit/engine/test_updated_lagrangian.py)
+_LIMIT = 0.9  # stable dt in units of dx / c, measured on the full lattice (tests/unit/engine)
 _SAFETY = 0.45  # share of the limit that is used: dt = 0.4 dx / c
 _CROSSING = 0.4  # share of a cell that the fastest particle may be expected to cross in a substep
 _GRAIN_SHARE = 0.99  # of a velocity that the grid does not see, kept a substep (Fei et al. 2021)

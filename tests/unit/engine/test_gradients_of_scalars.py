@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-sys.path.append(str(Path(__file__).parents[1] / "unit" / "effects"))
+sys.path.append(str(Path(__file__).parents[1] / "effects"))
 from effect_twins import SCENES, TWINS
 
 from physworld.calibrate.parameters import flow_law

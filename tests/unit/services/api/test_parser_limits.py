@@ -11,7 +11,7 @@ import pytest
 
 from physworld_services.api.parser_process import CPU_S, MEBIBYTE, MEMORY_BYTES, Limits
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 
 
 def _under(limits: Limits, work: str) -> int:
