@@ -20,18 +20,18 @@ def compiles(module: object, folder: Path) -> bool:
 
 
 PLAIN = (
-    "sheet_kernels",
-    "rod_kernels",
-    "thin_tangent_kernels",
-    "node_kernels",
-    "twist_kernels",
-    "ground_kernels",
-    "energy_kernels",
-    "self_contact_kernels",
-    "self_contact_search",
-    "friction_kernels",
-    "relaxation_kernels",
-    "particle_energy_kernels",
+    "thin.sheet_kernels",
+    "thin.rod_kernels",
+    "gradients.thin_tangent_kernels",
+    "total.node_kernels",
+    "thin.twist_kernels",
+    "terms.ground_kernels",
+    "total.energy_kernels",
+    "thin.self_contact_kernels",
+    "thin.self_contact_search",
+    "total.friction_kernels",
+    "total.relaxation_kernels",
+    "updated.energy_kernels",
 )
 
 

@@ -24,12 +24,12 @@ def compiled(module: object, folder: Path) -> bool:
 @pytest.mark.parametrize(
     "name",
     [
-        "transfer_kernels",
-        "grid_kernels",
-        "grid_contact_kernels",
-        "particle_kernels",
-        "particle_stress_kernels",
-        "hencky_kernels",
+        "updated.transfer_kernels",
+        "updated.grid_kernels",
+        "updated.contact_kernels",
+        "updated.force_kernels",
+        "updated.stress_kernels",
+        "updated.hencky_kernels",
     ],
 )
 def test_the_transfers_compile_for_cuda(name: str, tmp_path: Path) -> None:
