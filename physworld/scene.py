@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.geometry.surface_mesh import SurfaceMesh
 
 UNDEFORMED_AT_REST = "undeformed"
@@ -35,17 +36,17 @@ class Body:
             left and the j-th from the top.
     """
 
-    size_m: np.ndarray | None = None
-    box_min_m: np.ndarray | None = None
-    box_max_m: np.ndarray | None = None
+    size_m: Array | None = None
+    box_min_m: Array | None = None
+    box_max_m: Array | None = None
     length_m: float | None = None
     side_m: float | None = None
     thickness_m: float | None = None
     radius_m: float | None = None
     density_kg_m3: float | None = None
     mass_kg: float | None = None
-    segment_rest_lengths_m: np.ndarray | None = None
-    edges: np.ndarray | None = None
+    segment_rest_lengths_m: Array | None = None
+    edges: Array | None = None
     grid_shape: tuple[int, int] | None = None
 
 
@@ -70,8 +71,8 @@ class Grip:
     """
 
     controllers: tuple[int, ...]
-    region_min_m: np.ndarray | None = None
-    region_max_m: np.ndarray | None = None
+    region_min_m: Array | None = None
+    region_max_m: Array | None = None
     points: tuple[int, ...] = ()
     radius_m: float | None = None
 
@@ -98,13 +99,13 @@ class DeclaredCollider:
 
     name: str
     shape: str
-    size_m: np.ndarray | None = None
+    size_m: Array | None = None
     radius_m: float | None = None
     length_m: float | None = None
     mesh: SurfaceMesh | None = None
     friction: float | None = None
-    position_m: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    quaternion_wxyz: np.ndarray = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
+    position_m: Array = field(default_factory=lambda: np.zeros(3))
+    quaternion_wxyz: Array = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
     controllers: tuple[int, ...] = ()
     poses: str | None = None
 
@@ -134,11 +135,11 @@ class Scene:
 
     name: str
     kind: str
-    points: np.ndarray
-    visible: np.ndarray
-    controllers: np.ndarray
-    times: np.ndarray
-    gravity_m_s2: np.ndarray
+    points: Array
+    visible: Array
+    controllers: Array
+    times: Array
+    gravity_m_s2: Array
     noise_sigma_m: float | None
     train: tuple[int, int]
     test: tuple[int, int]
@@ -149,14 +150,14 @@ class Scene:
     ground: Ground | None = None
     grips: tuple[Grip, ...] = ()
     colliders: tuple[DeclaredCollider, ...] = ()
-    controller_velocities: np.ndarray | None = None
-    control_times: np.ndarray | None = None
-    control_points: np.ndarray | None = None
-    rest_volume_points: np.ndarray | None = None
-    surface_points: np.ndarray | None = None
-    colors: np.ndarray | None = None
-    part_features: np.ndarray | None = None
-    extra_arrays: dict[str, np.ndarray] = field(default_factory=dict)
+    controller_velocities: Array | None = None
+    control_times: Array | None = None
+    control_points: Array | None = None
+    rest_volume_points: Array | None = None
+    surface_points: Array | None = None
+    colors: Array | None = None
+    part_features: Array | None = None
+    extra_arrays: dict[str, Array] = field(default_factory=dict)
     declared: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -164,7 +165,7 @@ class Scene:
         """T."""
         return self.points.shape[0]
 
-    def control_track(self) -> tuple[np.ndarray, np.ndarray]:
+    def control_track(self) -> tuple[Array, Array]:
         """Times (Tc,) [s] and controller positions (Tc, K, 3) [m] at the best rate, none before the first frame."""
         clock, points = self.control_times, self.control_points
         if clock is None or points is None:

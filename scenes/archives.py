@@ -27,6 +27,8 @@ from typing import IO
 
 import numpy as np
 
+from physworld.arrays import Array
+
 GIBIBYTE = 1 << 30
 MEBIBYTE = 1 << 20
 CHUNK_BYTES = MEBIBYTE
@@ -135,7 +137,7 @@ def read_archive(
         raise ArchiveRefused(f"the archive of {len(data)} bytes is damaged or truncated: {error}") from error
 
 
-def read_arrays(data: bytes, limits: ArchiveLimits = DEFAULT_LIMITS) -> dict[str, np.ndarray]:
+def read_arrays(data: bytes, limits: ArchiveLimits = DEFAULT_LIMITS) -> dict[str, Array]:
     """The numeric arrays of an ``npz``, as stored.
 
     Raises:
@@ -152,7 +154,7 @@ def read_arrays(data: bytes, limits: ArchiveLimits = DEFAULT_LIMITS) -> dict[str
     return {name.removesuffix(".npy"): _parse_array(name, content) for name, content in files.items()}
 
 
-def write_arrays(arrays: dict[str, np.ndarray]) -> bytes:
+def write_arrays(arrays: dict[str, Array]) -> bytes:
     """An ``npz`` whose bytes depend on the arrays alone: sorted, stored, no timestamps."""
     files = {}
     for name, array in arrays.items():
@@ -376,7 +378,7 @@ def _check_total(total: int, packed: int, limits: ArchiveLimits, verb: str) -> N
         )
 
 
-def _parse_array(name: str, content: bytes) -> np.ndarray:
+def _parse_array(name: str, content: bytes) -> Array:
     """One ``npy`` file; plain numbers only."""
     stream = io.BytesIO(content)
     try:

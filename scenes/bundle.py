@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.geometry.surface_mesh import SurfaceMesh
 from physworld.scene import AS_MEASURED, UNDEFORMED_AT_REST, Body, Grip, Ground, Scene
 from physworld_scenes.archives import (
@@ -133,7 +134,7 @@ def scene_from_files(
         SceneInvalid: with every fault that the reading found.
     """
     declared, faults = parse_json(json_text)
-    arrays: dict[str, np.ndarray] = {}
+    arrays: dict[str, Array] = {}
     try:
         arrays = read_arrays(npz, limits)
     except ArchiveRefused as error:
@@ -181,7 +182,7 @@ def write_bundle(scene: Scene, folder: Path | str) -> None:
 
 
 def scene_from_parts(
-    declared: dict[str, Any], arrays: dict[str, np.ndarray], meshes: dict[str, SurfaceMesh] | None = None
+    declared: dict[str, Any], arrays: dict[str, Array], meshes: dict[str, SurfaceMesh] | None = None
 ) -> Scene:
     """A ``Scene`` out of parts that have passed the validator."""
     fields: dict[str, Any] = {}
@@ -211,7 +212,7 @@ def scene_from_parts(
     )
 
 
-def parts_of(scene: Scene) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def parts_of(scene: Scene) -> tuple[dict[str, Any], dict[str, Array]]:
     """What ``scene.json`` and ``scene.npz`` hold for this scene: the fields over what was declared."""
     arrays = {
         name: np.asarray(getattr(scene, field))
@@ -251,7 +252,7 @@ def _files_of(scene: Scene) -> dict[str, bytes]:
     }
 
 
-def _stored(name: str, array: np.ndarray) -> np.ndarray:
+def _stored(name: str, array: Array) -> Array:
     """Little endian; measured doubles as float32 when that loses nothing."""
     if name in FIELD_OF_ARRAY and name not in CLOCKS and array.dtype == np.float64:
         with np.errstate(over="ignore"):
@@ -261,7 +262,7 @@ def _stored(name: str, array: np.ndarray) -> np.ndarray:
     return array.astype(array.dtype.newbyteorder("<"), copy=False)
 
 
-def _without_gaps(points: np.ndarray, visible: np.ndarray) -> np.ndarray:
+def _without_gaps(points: Array, visible: Array) -> Array:
     """Invisible values that are not numbers would spread through masked sums: the last seen one stands."""
     if np.isfinite(points).all():
         return points
@@ -341,7 +342,7 @@ def _grip_facts(grips: tuple[Grip, ...], declared: list[Any] | None) -> list[dic
     ]
 
 
-def _float64(values: Any) -> np.ndarray:
+def _float64(values: Any) -> Array:
     return np.asarray(values, dtype=np.float64)
 
 
@@ -349,7 +350,7 @@ def _number(value: Any) -> float | None:
     return None if value is None else float(value)
 
 
-def _list(values: np.ndarray | None) -> list[float] | None:
+def _list(values: Array | None) -> list[float] | None:
     return None if values is None else _float64(values).tolist()
 
 

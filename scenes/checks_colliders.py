@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.geometry.surface_mesh import SurfaceMesh
 from physworld_scenes.checks_measured import Findings, Measured
 from physworld_scenes.declaration import ColliderForm, Declaration
@@ -27,7 +28,7 @@ Where = list[str | int]
 
 def check_colliders(
     declaration: Declaration,
-    arrays: dict[str, np.ndarray],
+    arrays: dict[str, Array],
     meshes: dict[str, SurfaceMesh],
     measured: Measured,
     object_size_m: float,
@@ -115,7 +116,7 @@ def _check_carriers(
         findings.warn(place, f"are {len(collider.controllers)}: three or more show a full rotation")
 
 
-def _check_poses(name: str, arrays: dict[str, np.ndarray], where: Where, findings: Findings) -> None:
+def _check_poses(name: str, arrays: dict[str, Array], where: Where, findings: Findings) -> None:
     place = [*where, "poses"]
     poses = arrays.get(name)
     if poses is None:
@@ -143,7 +144,7 @@ def _check_poses(name: str, arrays: dict[str, np.ndarray], where: Where, finding
     _check_quaternions(np.asarray(poses[:, 3:], dtype=float), place, findings)
 
 
-def _check_quaternions(quaternions: np.ndarray, where: Where, findings: Findings) -> None:
+def _check_quaternions(quaternions: Array, where: Where, findings: Findings) -> None:
     lengths = np.linalg.norm(quaternions, axis=1)
     worst = int(np.argmax(np.abs(lengths - 1.0)))
     if not math.isclose(lengths[worst], 1.0, abs_tol=UNIT_TOLERANCE):

@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld_scenes.checks_measured import Findings, Measured
 from physworld_scenes.declaration import BodyForm, Declaration, GripForm, GroundForm
 
@@ -127,7 +128,7 @@ def check_body(declaration: Declaration, measured: Measured, findings: Findings)
 
 
 def check_grips(
-    declaration: Declaration, arrays: dict[str, np.ndarray], measured: Measured, findings: Findings
+    declaration: Declaration, arrays: dict[str, Array], measured: Measured, findings: Findings
 ) -> None:
     """Indices in range, each controller in one grip, boxes that hold material."""
     owner: dict[int, int] = {}
@@ -275,7 +276,7 @@ def _check_extent(declaration: Declaration, measured: Measured, findings: Findin
 def _check_region(
     grip: GripForm,
     declaration: Declaration,
-    arrays: dict[str, np.ndarray],
+    arrays: dict[str, Array],
     measured: Measured,
     where: list[str | int],
     findings: Findings,

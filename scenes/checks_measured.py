@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld_schemas.base import FieldError
 
 LARGEST_OBJECT_M = 20.0
@@ -81,10 +82,10 @@ class Measured:
             0 when none does.
     """
 
-    points: np.ndarray
-    seen: np.ndarray
-    controllers: np.ndarray
-    times: np.ndarray
+    points: Array
+    seen: Array
+    controllers: Array
+    times: Array
     size_m: float
 
     @property
@@ -93,7 +94,7 @@ class Measured:
         return int(np.argmax(self.seen.any(axis=1)))
 
 
-def check_arrays(arrays: dict[str, np.ndarray], findings: Findings) -> Measured | None:
+def check_arrays(arrays: dict[str, Array], findings: Findings) -> Measured | None:
     """Shapes, types and values; the arrays to go on with, or None when they cannot be read together."""
     for name in REQUIRED:
         if name not in arrays:
@@ -126,7 +127,7 @@ def check_arrays(arrays: dict[str, np.ndarray], findings: Findings) -> Measured 
     return _measure(arrays, findings)
 
 
-def check_times(times: np.ndarray, fps: float | None, findings: Findings) -> None:
+def check_times(times: Array, fps: float | None, findings: Findings) -> None:
     """Strictly increasing seconds from the first frame, at the declared rate."""
     where = ["scene.npz", "times"]
     if not np.isfinite(times).all():
@@ -254,7 +255,7 @@ def check_controllers(measured: Measured, object_size_m: float, findings: Findin
             return
 
 
-def check_control_times(arrays: dict[str, np.ndarray], times: np.ndarray, findings: Findings) -> None:
+def check_control_times(arrays: dict[str, Array], times: Array, findings: Findings) -> None:
     """The controllers' own clock runs forward and covers the recording to within a frame."""
     where = ["scene.npz", "ctrl_times"]
     if "ctrl_times" not in arrays or arrays["ctrl_times"].ndim != 1 or not len(arrays["ctrl_times"]):
@@ -274,7 +275,7 @@ def check_control_times(arrays: dict[str, np.ndarray], times: np.ndarray, findin
         )
 
 
-def hold(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
+def hold(values: Array, valid: Array) -> Array:
     """``values`` (T, N, 3) where ``valid`` (T, N), else the last valid one, before any the first, else 0."""
     frames = np.arange(len(valid))[:, None]
     last = np.maximum.accumulate(np.where(valid, frames, -1), axis=0)
@@ -292,7 +293,7 @@ def unit_hint(size_m: float) -> str:
 
 def _check_shape(
     name: str,
-    array: np.ndarray,
+    array: Array,
     wanted: tuple[str | int, ...],
     lengths: dict[str, tuple[int, str]],
     findings: Findings,
@@ -326,7 +327,7 @@ def _check_shape(
     return agrees
 
 
-def _check_others(arrays: dict[str, np.ndarray], findings: Findings) -> None:
+def _check_others(arrays: dict[str, Array], findings: Findings) -> None:
     """Arrays of more than one allowed shape, and those that no code here reads: plain numbers at least."""
     points = arrays.get("points")
     for name, array in arrays.items():
@@ -345,7 +346,7 @@ def _check_others(arrays: dict[str, np.ndarray], findings: Findings) -> None:
                 _check_finite(name, array, findings)
 
 
-def _check_finite(name: str, array: np.ndarray, findings: Findings) -> None:
+def _check_finite(name: str, array: Array, findings: Findings) -> None:
     bad = ~np.isfinite(np.asarray(array, dtype=np.float64))
     if bad.any():
         first = tuple(int(i) for i in np.argwhere(bad)[0])
@@ -356,10 +357,10 @@ def _check_finite(name: str, array: np.ndarray, findings: Findings) -> None:
         )
 
 
-def _measure(arrays: dict[str, np.ndarray], findings: Findings) -> Measured:
+def _measure(arrays: dict[str, Array], findings: Findings) -> Measured:
     points = np.asarray(arrays["points"], dtype=np.float64)
     visible = np.asarray(arrays["visible"]).astype(bool)
-    finite: np.ndarray = np.all(np.isfinite(points), axis=2)
+    finite: Array = np.all(np.isfinite(points), axis=2)
     lost = visible & ~finite
     if lost.any():
         t, i = np.argwhere(lost)[0]
@@ -371,7 +372,7 @@ def _measure(arrays: dict[str, np.ndarray], findings: Findings) -> Measured:
     seen = visible & finite
     cleaned = np.where(seen[..., None], points, 0.0)
     controllers = np.asarray(arrays["controllers"], dtype=np.float64)
-    known: np.ndarray = np.all(np.isfinite(controllers), axis=2)
+    known: Array = np.all(np.isfinite(controllers), axis=2)
     controllers = hold(controllers, known)
     shown = seen.any(axis=1)
     size = 0.0
@@ -382,7 +383,7 @@ def _measure(arrays: dict[str, np.ndarray], findings: Findings) -> Measured:
     return Measured(cleaned, seen, controllers, times, size)
 
 
-def _name_jumps(where: list[str], speed: np.ndarray, bad: np.ndarray, limit: str, findings: Findings) -> None:
+def _name_jumps(where: list[str], speed: Array, bad: Array, limit: str, findings: Findings) -> None:
     if not bad.any():
         return
     t, i = np.unravel_index(int(np.argmax(np.where(bad, speed, 0.0))), speed.shape)
@@ -395,6 +396,6 @@ def _name_jumps(where: list[str], speed: np.ndarray, bad: np.ndarray, limit: str
     )
 
 
-def _some(indices: np.ndarray) -> str:
+def _some(indices: Array) -> str:
     shown = ", ".join(str(int(i)) for i in indices[:NAMED_AT_MOST])
     return shown if len(indices) <= NAMED_AT_MOST else f"{shown}, … ({len(indices)} in all)"

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld_scenes.checks_measured import Findings, Measured, unit_hint
 from physworld_schemas.arrays import FARTHEST_M
 
 PLACES = ("points", "controllers", "ctrl_points", "rest_volume_points", "surface_points")
 
 
-def check_places(arrays: dict[str, np.ndarray], measured: Measured, findings: Findings) -> bool:
+def check_places(arrays: dict[str, Array], measured: Measured, findings: Findings) -> bool:
     """Whether all places are within ``FARTHEST_M`` of the origin along each axis; the others are named."""
     near = True
     cleaned = {"points": measured.points, "controllers": measured.controllers}

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.geometry.surface_mesh import SurfaceMesh
 from physworld_scenes.checks_colliders import check_colliders
 from physworld_scenes.checks_declared import (
@@ -38,7 +39,7 @@ from physworld_schemas.base import FieldError
 
 
 def check_scene(
-    declared: dict[str, Any], arrays: dict[str, np.ndarray], meshes: dict[str, SurfaceMesh] | None = None
+    declared: dict[str, Any], arrays: dict[str, Array], meshes: dict[str, SurfaceMesh] | None = None
 ) -> tuple[list[FieldError], list[str]]:
     """Faults and warnings of a scene as it lies in its files.
 
@@ -60,7 +61,7 @@ def check_scene(
 
 def _check_measured(
     declaration: Declaration | None,
-    arrays: dict[str, np.ndarray],
+    arrays: dict[str, Array],
     meshes: dict[str, SurfaceMesh],
     measured: Measured,
     findings: Findings,

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld_schemas.model import (
     ComparedError,
     Difference,
@@ -78,9 +79,7 @@ def _errors(a: ModelVersion, b: ModelVersion, same: bool) -> Iterator[ComparedEr
             )
 
 
-def _mean(
-    table: Mapping[str, Any], metric: str, predictor: str, curve: np.ndarray | None
-) -> MeasuredError | None:
+def _mean(table: Mapping[str, Any], metric: str, predictor: str, curve: Array | None) -> MeasuredError | None:
     value = table.get(metric, {}).get(predictor)
     if value is None:
         return None
@@ -93,7 +92,7 @@ def _mean(
     return MeasuredError(value=value, ci95=mean_with_interval(curve).ci95)
 
 
-def _gain(a: np.ndarray | None, b: np.ndarray | None) -> MeasuredError | None:
+def _gain(a: Array | None, b: Array | None) -> MeasuredError | None:
     if a is None or b is None or not np.isfinite(a - b).any():
         return None
     from physworld.evaluate.blocks import paired_gain
@@ -126,7 +125,7 @@ def _curves(version: ModelVersion) -> ErrorCurves:
     return ErrorCurves(times_s=per_frame.get("times_s", []), track_m=per_frame.get("track_m", {}))
 
 
-def _curve(table: Mapping[str, Any], metric: str, predictor: str) -> np.ndarray | None:
+def _curve(table: Mapping[str, Any], metric: str, predictor: str) -> Array | None:
     curve = table.get("per_frame", {}).get(metric, {}).get(predictor)
     if curve is None:
         return None

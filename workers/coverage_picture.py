@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.demonstrate.coverage import Coverage
 
 if TYPE_CHECKING:
@@ -95,7 +96,7 @@ def _stiffness(axes: Axes, coverage: Coverage) -> None:
     )
 
 
-def _occupancy(axes: Axes, places: np.ndarray, across: int, up: int) -> None:
+def _occupancy(axes: Axes, places: Array, across: int, up: int) -> None:
     counts, x, y = np.histogram2d(places[:, across], places[:, up], bins=GRID)
     shown = np.log10(np.where(counts > 0.0, counts, np.nan)).T
     axes.pcolormesh(x, y, shown, cmap="Blues", vmin=-1.0, rasterized=True)

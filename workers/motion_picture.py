@@ -11,6 +11,7 @@ import io
 import numpy as np
 from PIL import Image, ImageDraw
 
+from physworld.arrays import Array
 from physworld.scene import Scene
 
 COLUMNS, ROWS, SIDE = 4, 2, 320
@@ -27,7 +28,7 @@ def motion_pictures(scene: Scene) -> list[bytes]:
     low, span = shown.min(axis=0), max(float(np.ptp(shown, axis=0).max()), 1e-9)
     scale = SIDE * (1 - 2 * MARGIN) / span
 
-    def pixel(place: np.ndarray) -> tuple[float, float]:
+    def pixel(place: Array) -> tuple[float, float]:
         x, y = (place - low) * scale + SIDE * MARGIN
         return float(x), float(SIDE - y)
 
@@ -55,7 +56,7 @@ def motion_pictures(scene: Scene) -> list[bytes]:
     return [buffer.getvalue()]
 
 
-def _page(scene: Scene) -> np.ndarray:
+def _page(scene: Scene) -> Array:
     """Horizontal and vertical unit vectors of the page, (2, 3)."""
     moved = np.where(scene.visible[..., None], scene.points - scene.points[0], 0.0).reshape(-1, 3)
     size = np.abs(np.ptp(scene.points[0][scene.visible[0]], axis=0)) if scene.visible[0].any() else np.ones(3)

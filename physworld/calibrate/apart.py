@@ -5,8 +5,7 @@ Their simulations are under the same controls, so a runner may share them as it 
 
 from __future__ import annotations
 
-import numpy as np
-
+from physworld.arrays import Array
 from physworld.calibrate.optimum import Descent, Optimum, Place
 from physworld.calibrate.search import Search
 from physworld.calibrate.side_by_side import in_step, measured_together
@@ -26,6 +25,6 @@ def solve_apart(asked: list[tuple[Search, Descent]]) -> list[Optimum]:
     return [made.optimum for made in in_step(asked)]
 
 
-def residuals_apart(asked: list[tuple[Search, Place]]) -> list[np.ndarray]:
+def residuals_apart(asked: list[tuple[Search, Place]]) -> list[Array]:
     """Residuals [m] of places of such searches; NaN where the run failed. Nothing is counted."""
     return [residual for residual, _ in measured_together(asked)]

@@ -16,6 +16,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.calibrate.estimates import Estimate
 from physworld.calibrate.global_stage import FitResult
 from physworld.estimation.simulations import Drive, Job, Runner, in_turn
@@ -33,7 +34,7 @@ def converged_parameters(
     refinement: float = REFINEMENT,
     poll: Callable[[int, int], None] | None = None,
     runner: Runner = in_turn,
-    finer_tracks: np.ndarray | None = None,
+    finer_tracks: Array | None = None,
 ) -> dict[str, Estimate]:
     """Estimates of the searched parameters without the error of the lattice.
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.calibrate.parameters import Parameter
 from physworld.estimation.least_squares import Solution, block_covariance, correlations, interval_factor
 from physworld.scene import Scene
@@ -40,11 +41,11 @@ class Correlations:
     """Correlations of the searched parameters: names (p) and matrix (p, p)."""
 
     names: tuple[str, ...]
-    matrix: np.ndarray
+    matrix: Array
 
 
 def estimates(
-    parameters: list[Parameter], solution: Solution, frames: np.ndarray, points: np.ndarray, measured: bool
+    parameters: list[Parameter], solution: Solution, frames: Array, points: Array, measured: bool
 ) -> tuple[dict[str, Estimate], Correlations]:
     """Estimates and correlations of the searched parameters.
 

@@ -13,6 +13,7 @@ from itertools import product
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.calibrate.optimum import Descent, Optimum, cost_of
 from physworld.calibrate.parameters import Parameter
 from physworld.calibrate.search import Search
@@ -25,14 +26,14 @@ _TRIED, _TURNED, _FOLLOWED = (
 )  # starts whose moduli, whose direction, and that over all frames, are searched
 
 
-def directions() -> np.ndarray:
+def directions() -> Array:
     """Unit vectors (13, 3) along edges and diagonals of a cube, one of every two that are opposite."""
     found = [v for v in product((-1, 0, 1), repeat=3) if v > (0, 0, 0)]
     vectors = np.array(found, dtype=float)
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def angles_of(vector: np.ndarray) -> tuple[float, float]:
+def angles_of(vector: Array) -> tuple[float, float]:
     """Azimuth and elevation [rad] of a unit vector (3,)."""
     return float(np.arctan2(vector[1], vector[0])), float(np.arcsin(np.clip(vector[2], -1.0, 1.0)))
 
@@ -74,7 +75,7 @@ def free_fibres(
     return together, best, {}
 
 
-def _starts(kept: list[Parameter], optimum: Optimum, fibres: list[Parameter]) -> list[np.ndarray]:
+def _starts(kept: list[Parameter], optimum: Optimum, fibres: list[Parameter]) -> list[Array]:
     """Where the searched numbers may start, every direction after the other."""
     modulus = fibres[0]
     found = []
@@ -93,7 +94,7 @@ def _starts(kept: list[Parameter], optimum: Optimum, fibres: list[Parameter]) ->
 
 
 def _along(
-    search: Search, kept: list[Parameter], fibres: list[Parameter], theta: np.ndarray, window: int
+    search: Search, kept: list[Parameter], fibres: list[Parameter], theta: Array, window: int
 ) -> Optimum:
     """The optimum over the window with the fibres' direction as it is; all numbers are in its theta."""
     modulus, *angles = fibres

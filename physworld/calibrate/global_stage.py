@@ -28,6 +28,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.calibrate.estimates import (
     NOT_CONVERGED,
     UNIDENTIFIED_HALF_WIDTH,
@@ -120,8 +121,8 @@ class FitResult:
     parameters: dict[str, Estimate]
     searched: tuple[Parameter, ...]
     correlations: Correlations
-    tracks: np.ndarray
-    particles: np.ndarray
+    tracks: Array
+    particles: Array
     losses: dict[str, Any]
     simulations: int
     seconds: float
@@ -130,7 +131,7 @@ class FitResult:
     open: dict[str, str] = field(default_factory=dict)
     rejected: dict[str, float] = field(default_factory=dict)
     local: LocalResult | None = None
-    homogeneous: np.ndarray | None = None
+    homogeneous: Array | None = None
 
 
 def calibrate(
@@ -286,7 +287,7 @@ def _groups(kept: list[Parameter]) -> list[list[Parameter]]:
     return [*alone, fibres] if fibres else alone
 
 
-def _followed(search: Search, parameters: list[Parameter], theta: np.ndarray) -> Optimum:
+def _followed(search: Search, parameters: list[Parameter], theta: Array) -> Optimum:
     """An optimum over a window that grows to all training frames: phases that slip make a long one's cost rugged."""
     window = search.first_window()
     for end, iterations in ((window, 4), ((window + search.end) // 2, 3)):

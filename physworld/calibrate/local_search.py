@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import OptimizeResult, minimize
 
+from physworld.arrays import Array
 from physworld.engine.gradients.gradient_twin import TwinRun
 from physworld.errors import CalibrationError, Cancelled, SimulationError
 from physworld.estimation.journal import Journal
@@ -69,7 +70,7 @@ class LocalConfig:
     memory_mb: float = 100.0
 
 
-def field_modes(twin: Twin, scene: Scene, config: LocalConfig) -> np.ndarray:
+def field_modes(twin: Twin, scene: Scene, config: LocalConfig) -> Array:
     """Modes (P, k) of a smooth field over the particles, scaled by the prior's standard deviation, without their mean.
 
     The process has a squared-exponential covariance over part features: those of the scene, or the spectral ones of
@@ -83,7 +84,7 @@ def field_modes(twin: Twin, scene: Scene, config: LocalConfig) -> np.ndarray:
     count = len(particles)
     chosen = np.linspace(0, count - 1, min(_INDUCING, count)).astype(int)
 
-    def covariance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    def covariance(a: Array, b: Array) -> Array:
         square = np.sum((a[:, None] - b[None]) ** 2, axis=2)
         return np.exp(-0.5 * square / config.length**2)
 
@@ -135,7 +136,7 @@ class FieldSearch:
         self.modes = field_modes(twin, scene, config)
         constant = np.ones((len(self.modes), 1))
         self._basis = np.concatenate([constant, self.modes], axis=1)
-        self._curvatures: dict[int, np.ndarray] = {}
+        self._curvatures: dict[int, Array] = {}
         self.runs = self.simulations = 0
         self._runner = runner
         self.stage, self._progress, self._journal = "local stage", progress, journal or Journal()
@@ -176,7 +177,7 @@ class FieldSearch:
         self._curvatures = {end: known[np.ix_(others, others)] for end, known in self._curvatures.items()}
         self.fields = tuple(field for field in self.fields if field != name)
 
-    def _slots(self, name: str) -> np.ndarray:
+    def _slots(self, name: str) -> Array:
         """Which coefficients are a field's, (size,) bool."""
         return np.repeat([field == name for field in self.fields], self._basis.shape[1])
 
@@ -195,17 +196,17 @@ class FieldSearch:
                 )
         return split
 
-    def properties(self, z: np.ndarray) -> np.ndarray:
+    def properties(self, z: Array) -> Array:
         """Log factors of coefficients, (P, 2), or with the friction (P, 3)."""
         found = np.zeros((len(self._basis), 3 if "friction" in self.fields else 2))
         for name, part in zip(self.fields, z.reshape(len(self.fields), -1), strict=True):
             found[:, FIELDS.index(name)] = self._basis @ part
         return found
 
-    def _too_far(self, z: np.ndarray) -> bool:
+    def _too_far(self, z: Array) -> bool:
         return not np.abs(self.properties(z)).max() <= _FARTHEST
 
-    def errors(self, z: np.ndarray, end: int) -> np.ndarray:
+    def errors(self, z: Array, end: int) -> Array:
         """Mean squared error [m^2] of every training frame up to ``end``; NaN where the run fails."""
         times, controls = self.scene.control_track()
         self.simulations += 1
@@ -221,7 +222,7 @@ class FieldSearch:
         error, seen = self._residual(self.twin.observe(nodes, self.scene.times[:end]), end)
         return np.sum(error**2, axis=(1, 2)) / np.maximum(3 * seen.sum(axis=1), 1)
 
-    def validation_error(self, z: np.ndarray, split: int) -> float:
+    def validation_error(self, z: Array, split: int) -> float:
         """Mean squared error [m^2] on the validation frames; infinite where the run fails."""
 
         def measured() -> dict[str, float]:
@@ -230,16 +231,14 @@ class FieldSearch:
         found = self._step(f"field error from {split}", measured)["error"]
         return float("inf") if found is None else found
 
-    def descend(
-        self, z: np.ndarray, end: int, scale: float, strength: float | None
-    ) -> tuple[np.ndarray, float]:
+    def descend(self, z: Array, end: int, scale: float, strength: float | None) -> tuple[Array, float]:
         """Coefficients that minimise the objective over the frames up to ``end``; without a strength only constants."""
         constants = np.zeros(self.size, dtype=bool)
         constants[:: self._basis.shape[1]] = True
         free = constants if strength is None else np.ones(self.size, dtype=bool)
         weight = np.where(constants, _LOOSE, strength or 0.0)
 
-        def objective(part: np.ndarray) -> tuple[float, np.ndarray]:
+        def objective(part: Array) -> tuple[float, Array]:
             full = z.copy()
             full[free] = part
             value, slope = self._value(full, end)
@@ -271,7 +270,7 @@ class FieldSearch:
         best[free] = found["z"]
         return best, float("inf") if found["value"] is None else found["value"]
 
-    def _curvature(self, z: np.ndarray, end: int) -> np.ndarray:
+    def _curvature(self, z: Array, end: int) -> Array:
         """Gauss-Newton's Hessian of the mean squared error [m^2], (k, k), by one run a coefficient; kept."""
         if end not in self._curvatures:
             self.stage = "sensitivities of the field"
@@ -279,7 +278,7 @@ class FieldSearch:
             self._curvatures[end] = np.array(found["hessian"])
         return self._curvatures[end]
 
-    def _hessian(self, z: np.ndarray, end: int) -> np.ndarray:
+    def _hessian(self, z: Array, end: int) -> Array:
         here, *there = self._seen_at([z, *(z + _PROBE * one for one in np.eye(self.size))], end)
         columns = [(tracks - here) / _PROBE for tracks in there]
         jacobian = np.nan_to_num(np.array(columns).T)
@@ -300,7 +299,7 @@ class FieldSearch:
             done = self.runs + self.simulations
             self._progress(done, max(self.most, done), self.stage)
 
-    def _seen_at(self, places: list[np.ndarray], end: int) -> list[np.ndarray]:
+    def _seen_at(self, places: list[Array], end: int) -> list[Array]:
         """Predicted coordinates that were seen in the frames up to ``end``, flat, at each of several coefficients.
 
         NaN where a run fails. The runs do not depend on each other, so they go to the runner together.
@@ -323,7 +322,7 @@ class FieldSearch:
             )
         return found
 
-    def _value(self, z: np.ndarray, end: int) -> tuple[float, np.ndarray]:
+    def _value(self, z: Array, end: int) -> tuple[float, Array]:
         """Mean squared error [m^2] up to ``end`` and its gradient by the coefficients."""
         properties = self.properties(z)
         times, controls = self.scene.control_track()
@@ -349,7 +348,7 @@ class FieldSearch:
         slope = np.concatenate([self._basis.T @ by_field[name] for name in self.fields])
         return float(np.sum(error**2)) / count, slope
 
-    def _residual(self, tracks: np.ndarray, end: int) -> tuple[np.ndarray, np.ndarray]:
+    def _residual(self, tracks: Array, end: int) -> tuple[Array, Array]:
         frames = slice(self.begin, end)
         seen = self.scene.visible[frames]
         return np.where(seen[..., None], tracks[frames] - self.scene.points[frames], 0.0), seen

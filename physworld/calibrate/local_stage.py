@@ -26,6 +26,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.calibrate.local_search import FieldSearch, LocalConfig
 from physworld.errors import CalibrationError, SimulationError
 from physworld.estimation.journal import Journal
@@ -58,18 +59,18 @@ class LocalResult:
         reason: a sentence.
     """
 
-    properties: np.ndarray
+    properties: Array
     fields: tuple[str, ...]
     held: dict[str, str]
     kept: bool
     strength: float | None
     validation: dict[float, float]
-    tracks: np.ndarray
+    tracks: Array
     runs: int
     simulations: int
     seconds: float
     reason: str
-    modes: np.ndarray = field(repr=False, default_factory=lambda: np.empty((0, 0)))
+    modes: Array = field(repr=False, default_factory=lambda: np.empty((0, 0)))
 
 
 def fit_fields(
@@ -153,7 +154,7 @@ def _unknown(search: FieldSearch, split: int, variance: float) -> dict[str, str]
 
 def _result(
     search: FieldSearch,
-    final: np.ndarray,
+    final: Array,
     strength: float | None,
     validation: dict[float, float],
     held: dict[str, str],

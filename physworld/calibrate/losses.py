@@ -12,13 +12,14 @@ from typing import Any
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.evaluate.metrics import chamfer_l2
 from physworld.scene import Scene
 
 CHAMFER_WEIGHT, TRACK_WEIGHT = 1.0, 0.1
 
 
-def training_losses(scene: Scene, tracks: np.ndarray) -> dict[str, Any]:
+def training_losses(scene: Scene, tracks: Array) -> dict[str, Any]:
     """Losses of predicted tracks (T, N, 3) on the training frames, frame 0 left out.
 
     Returns:

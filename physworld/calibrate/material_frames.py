@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.twin.twin import Twin
 
 _BESIDE = 0.1  # of a cell: how far beside a point its neighbours are followed
 
 
-def material_frames(twin: Twin, carriers: np.ndarray) -> np.ndarray:
+def material_frames(twin: Twin, carriers: Array) -> Array:
     """Where material directions point, (T, N, 3, 3): columns of the deformation gradient; a sheet's normal last.
 
     Carriers that are particles have no shape functions that last: neighbours of a point are followed instead.

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.calibrate.parameters import Parameter
 
-Place = tuple[list[Parameter], np.ndarray, int | None]
+Place = tuple[list[Parameter], Array, int | None]
 """Parameters, their values in the scale of the search, and the end of the frames (None: all training frames)."""
 
 
@@ -16,7 +17,7 @@ Place = tuple[list[Parameter], np.ndarray, int | None]
 class Optimum:
     """Where a descent ended: theta (p,) in the scale of the search, and the mean squared residual there [m^2]."""
 
-    theta: np.ndarray
+    theta: Array
     cost: float
 
 
@@ -25,7 +26,7 @@ class Descent:
     """A descent that is asked for: what it searches, from where, in how many iterations, over frames up to ``end``."""
 
     parameters: list[Parameter]
-    theta: np.ndarray
+    theta: Array
     iterations: int
     end: int | None = None
 

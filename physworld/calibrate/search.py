@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.calibrate.material_frames import material_frames
 from physworld.calibrate.optimum import Descended, Descent, Optimum, Place, cost_of
 from physworld.calibrate.parameters import Parameter
@@ -78,32 +79,32 @@ class Search:
         end = int(np.searchsorted(path, _FIRST_WINDOW * path[-1])) + 2
         return min(max(end, self.begin + _FIRST_WINDOW_FRAMES), self.end)
 
-    def frame_of_residual(self, end: int) -> np.ndarray:
+    def frame_of_residual(self, end: int) -> Array:
         """Frame of every entry of a residual over the frames up to ``end``."""
         visible = self.scene.visible[self.begin : end]
         frames = np.broadcast_to(np.arange(self.begin, end)[:, None], visible.shape)
         return np.repeat(frames[visible], 3)
 
-    def point_of_residual(self) -> np.ndarray:
+    def point_of_residual(self) -> Array:
         """Tracked point of every entry of a residual over all training frames."""
         visible = self.scene.visible[self.begin : self.end]
         points = np.broadcast_to(np.arange(visible.shape[1]), visible.shape)
         return np.repeat(points[visible], 3)
 
-    def twin_at(self, parameters: list[Parameter], theta: np.ndarray) -> Twin:
+    def twin_at(self, parameters: list[Parameter], theta: Array) -> Twin:
         twin = self.twin
         for parameter, searched in zip(parameters, theta, strict=True):
             twin = parameter.apply(twin, parameter.value(float(searched)))
         return twin
 
-    def residual(self, parameters: list[Parameter], theta: np.ndarray, end: int | None = None) -> np.ndarray:
+    def residual(self, parameters: list[Parameter], theta: Array, end: int | None = None) -> Array:
         """Predicted minus measured [m] over the training frames up to ``end``, flat.
 
         NaN where the run blew up or the budget (``limit``) is spent.
         """
         return self.residuals([(parameters, theta, end)])[0]
 
-    def residuals(self, places: list[Place]) -> list[np.ndarray]:
+    def residuals(self, places: list[Place]) -> list[Array]:
         """:meth:`residual` at places (parameters, theta, end) that do not depend on each other."""
         allowed = max(0, self.limit - self.simulations)
         self.cut_short |= len(places) > allowed
@@ -141,7 +142,7 @@ class Search:
         return min(self.solve_each([Descent(parameters, s.theta, 5) for s in distinct[:2]]), key=cost_of)
 
     def costs(
-        self, name: str, parameters: list[Parameter], starts: list[np.ndarray], end: int
+        self, name: str, parameters: list[Parameter], starts: list[Array], end: int
     ) -> list[float | None]:
         """Mean squared residual [m^2] at every start over the frames up to ``end``; None where the run failed."""
 
@@ -153,7 +154,7 @@ class Search:
         return costs
 
     def solve(
-        self, parameters: list[Parameter], theta: np.ndarray, iterations: int, end: int | None = None
+        self, parameters: list[Parameter], theta: Array, iterations: int, end: int | None = None
     ) -> Optimum:
         """Gauss-Newton over the frames up to ``end`` (all training frames by default)."""
         return self.solve_each([Descent(parameters, theta, iterations, end)])[0]
@@ -249,7 +250,7 @@ class Search:
         found = self.step("screen " + " ".join(c.name for c in candidates), measure)["gains"]
         return {name: float("nan") if gain is None else gain for name, gain in found.items()}
 
-    def shift_points(self, parameters: list[Parameter], theta: np.ndarray) -> bool:
+    def shift_points(self, parameters: list[Parameter], theta: Array) -> bool:
         """Move the tracked points by their mean residual: inside a solid, within a sheet and across it."""
         sigma = self.scene.noise_sigma_m
         lattice = self.twin.lattice
@@ -265,7 +266,7 @@ class Search:
         self.twin = replace(self.twin, body=body)
         return True
 
-    def _mean_offsets(self, parameters: list[Parameter], theta: np.ndarray, sigma: float) -> list | None:
+    def _mean_offsets(self, parameters: list[Parameter], theta: Array, sigma: float) -> list | None:
         """Mean residual of every point in the material's frame [m], (N, 3), clipped; None where it cannot be had."""
         if not self._reaches(2 + len(parameters)):
             return None  # the search on the moved points needs a residual and a Jacobian of its own
@@ -306,7 +307,7 @@ class Search:
         self.cut_short |= not reaches
         return reaches
 
-    def _measured(self, places: list[Place]) -> Iterator[tuple[np.ndarray, float | None]]:
+    def _measured(self, places: list[Place]) -> Iterator[tuple[Array, float | None]]:
         """Residuals at places and their root mean squares [m], None where the run failed; nothing is counted."""
         return measured_together([(self, place) for place in places])
 
@@ -315,12 +316,12 @@ class Search:
         parameters, theta, end = place
         return Job(self.twin_at(parameters, theta), self.end if end is None else end)
 
-    def run(self, jobs: list[Job]) -> Iterator[np.ndarray | None]:
+    def run(self, jobs: list[Job]) -> Iterator[Array | None]:
         """Tracks of simulations under this scene's controls, by the runner."""
         drive = Drive(*self.scene.control_track(), self.scene.times)
         return self.runner(jobs, drive, self._poll) if jobs else iter(())
 
-    def compared(self, job: Job, tracks: np.ndarray | None) -> tuple[np.ndarray, float | None]:
+    def compared(self, job: Job, tracks: Array | None) -> tuple[Array, float | None]:
         """Residual and root mean square [m] of tracks, None where the run failed."""
         if tracks is None:
             return self._nothing(job.frames), None
@@ -329,7 +330,7 @@ class Search:
         residual = (tracks[self.begin :][visible] - target[visible]).reshape(-1)
         return residual, float(np.sqrt(np.mean(residual**2)))
 
-    def _nothing(self, end: int | None) -> np.ndarray:
+    def _nothing(self, end: int | None) -> Array:
         """The residual of a run that failed."""
         visible = self.scene.visible[self.begin : self.end if end is None else end]
         return np.full(3 * int(visible.sum()), np.nan)
@@ -345,7 +346,7 @@ class Search:
             self.progress(done, self.max_simulations, f"{loss * 1e3:.2f} mm at {values}")
 
     @staticmethod
-    def _high(parameters: list[Parameter]) -> np.ndarray:
+    def _high(parameters: list[Parameter]) -> Array:
         return np.array([p.searched(p.high) for p in parameters])
 
     def _poll(self, *frames: int) -> None:
@@ -360,5 +361,5 @@ def _probe(candidate: Parameter) -> float:
     return searched if candidate.prior == 0.0 else searched + 2 * candidate.step
 
 
-def _steps(parameters: list[Parameter]) -> np.ndarray:
+def _steps(parameters: list[Parameter]) -> Array:
     return np.array([p.step for p in parameters])

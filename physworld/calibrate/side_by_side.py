@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-import numpy as np
-
+from physworld.arrays import Array
 from physworld.calibrate.optimum import Descended, Descent, Optimum, Place
 from physworld.estimation.simulations import idle_beside
 
@@ -14,7 +13,7 @@ if TYPE_CHECKING:
     from physworld.calibrate.search import Search
 
 
-def measured_together(asked: list[tuple[Search, Place]]) -> Iterator[tuple[np.ndarray, float | None]]:
+def measured_together(asked: list[tuple[Search, Place]]) -> Iterator[tuple[Array, float | None]]:
     """Residuals and their root mean squares [m] of places of searches with one drive."""
     jobs = [search.job(place) for search, place in asked]
     made = asked[0][0].run(jobs) if asked else iter(())
@@ -32,7 +31,7 @@ def in_step(several: list[tuple[Search, Descent]]) -> list[Descended]:
     asked = {k: next(one) for k, one in enumerate(asking)}
     runs, losses = [0] * len(several), [[] for _ in several]  # type: ignore[var-annotated]
     found: dict[int, Optimum] = {}
-    known: dict[tuple[int, bytes], tuple[np.ndarray, float | None]] = {}
+    known: dict[tuple[int, bytes], tuple[Array, float | None]] = {}
     while asked:
         needed = [(k, theta) for k, (places, _) in asked.items() for theta in places]
         missing = [(k, theta) for k, theta in needed if (k, theta.tobytes()) not in known]

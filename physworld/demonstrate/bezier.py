@@ -14,6 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physworld.arrays import Array
+
 GAUSS_NODES, GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(12)
 GAUSS_NODES = 0.5 * (GAUSS_NODES + 1.0)  # moved from [-1, 1] to [0, 1]
 GAUSS_WEIGHTS = 0.5 * GAUSS_WEIGHTS
@@ -30,29 +32,29 @@ class DegenerateCurve(ValueError):
 class CubicBezier:
     """One cubic segment; ``points`` are p₀..p₃ [m], (4, 3) float64."""
 
-    points: np.ndarray
+    points: Array
 
-    def position(self, u: np.ndarray) -> np.ndarray:
+    def position(self, u: Array) -> Array:
         """B(u) [m], (n, 3)."""
         u = np.asarray(u, dtype=np.float64)[..., None]
         v = 1.0 - u
         p0, p1, p2, p3 = self.points
         return v**3 * p0 + 3.0 * v**2 * u * p1 + 3.0 * v * u**2 * p2 + u**3 * p3
 
-    def derivative(self, u: np.ndarray) -> np.ndarray:
+    def derivative(self, u: Array) -> Array:
         """B'(u) [m], (n, 3)."""
         u = np.asarray(u, dtype=np.float64)[..., None]
         v = 1.0 - u
         d0, d1, d2 = np.diff(self.points, axis=0)
         return 3.0 * (v**2 * d0 + 2.0 * v * u * d1 + u**2 * d2)
 
-    def second_derivative(self, u: np.ndarray) -> np.ndarray:
+    def second_derivative(self, u: Array) -> Array:
         """B''(u) [m], (n, 3)."""
         u = np.asarray(u, dtype=np.float64)[..., None]
         e0, e1 = np.diff(self.points, n=2, axis=0)
         return 6.0 * ((1.0 - u) * e0 + u * e1)
 
-    def curvature(self, u: np.ndarray) -> np.ndarray:
+    def curvature(self, u: Array) -> Array:
         """κ(u) [1/m], (n,); infinite where the curve stands still."""
         first, second = self.derivative(u), self.second_derivative(u)
         numerator = np.linalg.norm(np.cross(first, second), axis=-1)
@@ -95,13 +97,13 @@ class ArcLength:
         self._cumulative = np.concatenate([[0.0], np.cumsum(lengths)])
         self.length = float(self._cumulative[-1])
 
-    def at(self, u: np.ndarray) -> np.ndarray:
+    def at(self, u: Array) -> Array:
         """Arc length s(u) [m] from the start, (n,)."""
         u = np.clip(np.asarray(u, dtype=np.float64), 0.0, 1.0)
         panel = np.clip(np.searchsorted(self._edges, u, side="right") - 1, 0, len(self._edges) - 2)
         return self._cumulative[panel] + self._between(self._edges[panel], u)
 
-    def parameter(self, s: np.ndarray) -> np.ndarray:
+    def parameter(self, s: Array) -> Array:
         """u with arc length ``s`` [m] from the start, (n,); s outside [0, length] is clipped."""
         s = np.clip(np.asarray(s, dtype=np.float64), 0.0, self.length)
         panel = np.clip(np.searchsorted(self._cumulative, s, side="right") - 1, 0, len(self._edges) - 2)
@@ -123,7 +125,7 @@ class ArcLength:
             f"inverting the arc length left {float(np.abs(error).max()):.2e} m of {self.length:g} m"
         )
 
-    def _between(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    def _between(self, low: Array, high: Array) -> Array:
         """Length of the curve over each [low, high], (n,)."""
         low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
         u = low[..., None] + (high - low)[..., None] * GAUSS_NODES
@@ -131,12 +133,12 @@ class ArcLength:
         return (high - low) * (speed @ GAUSS_WEIGHTS)
 
 
-def straight(start: np.ndarray, end: np.ndarray) -> CubicBezier:
+def straight(start: Array, end: Array) -> CubicBezier:
     """The straight segment from ``start`` to ``end`` (3,) at constant |B'|."""
     return bent(start, end, np.zeros((2, 3)))
 
 
-def bent(start: np.ndarray, end: np.ndarray, offsets: np.ndarray) -> CubicBezier:
+def bent(start: Array, end: Array, offsets: Array) -> CubicBezier:
     """A segment whose inner control points leave the chord's thirds by ``offsets`` [m], (2, 3)."""
     start, end = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
     third = (end - start) / 3.0
@@ -144,13 +146,13 @@ def bent(start: np.ndarray, end: np.ndarray, offsets: np.ndarray) -> CubicBezier
 
 
 def random_bezier(
-    start: np.ndarray,
-    end: np.ndarray,
+    start: Array,
+    end: Array,
     generator: np.random.Generator,
     *,
     bend: float = 0.5,
     curvature_limit: float = 6.0,
-    box: tuple[np.ndarray, np.ndarray] | None = None,
+    box: tuple[Array, Array] | None = None,
 ) -> CubicBezier:
     """A random curve from ``start`` to ``end`` (3,) with bounded curvature.
 

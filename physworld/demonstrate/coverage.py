@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from physworld.arrays import Array
+
 MOST_PLACES = 200_000
 PLACES_PER_EPISODE = 1500
 MOST_REJECTIONS = 200
@@ -35,13 +37,13 @@ class Coverage:
         self._places_each = int(np.clip(MOST_PLACES // max(expected, 1), 20, PLACES_PER_EPISODE))
         self.motions: Counter[str] = Counter()
         self.rows: list[dict[str, float | str]] = []
-        self.places: list[np.ndarray] = []
-        self.speeds: list[np.ndarray] = []
-        self.log_modulus: list[np.ndarray] = []
+        self.places: list[Array] = []
+        self.speeds: list[Array] = []
+        self.log_modulus: list[Array] = []
         self.rejections: list[dict[str, Any]] = []
         self._strengths: dict[str, list[float]] = {}
 
-    def add(self, arrays: Mapping[str, np.ndarray], attributes: Mapping[str, Any]) -> None:
+    def add(self, arrays: Mapping[str, Array], attributes: Mapping[str, Any]) -> None:
         """Count one episode: its stored arrays and attributes."""
         particles, controllers = arrays["particles"], arrays["controllers"].astype(np.float64)
         properties, times = arrays["properties"].astype(np.float64), arrays["times"]
@@ -77,7 +79,7 @@ class Coverage:
         for one in attributes.get("rejected", []):
             self.rejections.append({"episode": attributes.get("index", len(self.rows) - 1), **one})
 
-    def column(self, name: str) -> np.ndarray:
+    def column(self, name: str) -> Array:
         """One figure of every episode, (episodes,)."""
         return np.array([row[name] for row in self.rows], dtype=np.float64)
 
@@ -115,7 +117,7 @@ class Coverage:
         }
 
 
-def workspace(places: np.ndarray) -> dict[str, Any]:
+def workspace(places: Array) -> dict[str, Any]:
     """Box of places (n, 3) [m] and the share of its voxels that are visited."""
     low, high = places.min(axis=0).astype(float), places.max(axis=0).astype(float)
     voxel = max(float((high - low).max()) / VOXELS, 1e-9)
@@ -130,12 +132,12 @@ def workspace(places: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _of_column(values: np.ndarray, column: int, figure: Callable[[np.ndarray], Any]) -> float:
+def _of_column(values: Array, column: int, figure: Callable[[Array], Any]) -> float:
     """A figure of a column of (P, ·), no number where there is no such column."""
     return float(figure(values[:, column])) if values.shape[1] > column else float("nan")
 
 
-def _percentiles(values: np.ndarray) -> dict[str, float]:
+def _percentiles(values: Array) -> dict[str, float]:
     """Minimum, 5th, median, 95th, maximum."""
     found = np.percentile(np.asarray(values, dtype=np.float64), PERCENTILES)
     return {f"p{p}": float(v) for p, v in zip(PERCENTILES, found, strict=True)}

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.demonstrate.config import DemonstrationConfig
 from physworld.demonstrate.limits import MotionLimits, limits_of, pushers_of, training_track
 from physworld.demonstrate.motion import random_motion
@@ -66,19 +67,19 @@ class EpisodePlan:
         size_m: the object's size, for the workspace check.
     """
 
-    times: np.ndarray
-    controllers: np.ndarray
+    times: Array
+    controllers: Array
     drawn: Drawn
     motion: str
     seed: int
-    control_times: np.ndarray
-    control_points: np.ndarray
+    control_times: Array
+    control_points: Array
     from_rest: bool
     scale: float
     size_m: float
 
     @property
-    def properties(self) -> np.ndarray:
+    def properties(self) -> Array:
         """log(E/E_fit) and log(ρ/ρ_fit), and log(μ/μ_fit) where it is perturbed, (P, 2 or 3) float64."""
         return self.drawn.fields
 
@@ -136,7 +137,7 @@ def plan_episode(scene: Scene, twin: Twin, config: DemonstrationConfig, seed: in
     )
 
 
-def run_episode(twin: Twin, plan: EpisodePlan, progress: Progress | None = None) -> dict[str, np.ndarray]:
+def run_episode(twin: Twin, plan: EpisodePlan, progress: Progress | None = None) -> dict[str, Array]:
     """Simulate a plan: times (T,) f8; f4: particles (T, P, 3), controllers (T, K, 3), properties (P, 2 or 3)."""
     particles = plan.drawn.twin(twin).simulate(
         plan.control_times,
@@ -149,7 +150,7 @@ def run_episode(twin: Twin, plan: EpisodePlan, progress: Progress | None = None)
     return episode_arrays(plan, particles)
 
 
-def episode_arrays(plan: EpisodePlan, particles: np.ndarray) -> dict[str, np.ndarray]:
+def episode_arrays(plan: EpisodePlan, particles: Array) -> dict[str, Array]:
     """What is stored of a simulated plan, as :func:`run_episode` gives it; refuses what ``check_episode`` refuses."""
     check_episode(particles, plan)
     return {
@@ -162,7 +163,7 @@ def episode_arrays(plan: EpisodePlan, particles: np.ndarray) -> dict[str, np.nda
 
 def make_episode(
     scene: Scene, twin: Twin, config: DemonstrationConfig, seed: int, progress: Progress | None = None
-) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+) -> tuple[dict[str, Array], dict[str, Any]]:
     """Arrays and attributes of an accepted episode; the rejected ones before it are in ``rejected``.
 
     Raises:
@@ -205,7 +206,7 @@ def all_rejected(seed: int, rejected: Sequence[dict[str, Any]]) -> EpisodeReject
     )
 
 
-def check_episode(particles: np.ndarray, plan: EpisodePlan) -> None:
+def check_episode(particles: Array, plan: EpisodePlan) -> None:
     """Refuse particles (T, P, 3) that are not finite or leave the workspace."""
     margin = WORKSPACE_MARGIN * plan.size_m
     corners = np.concatenate([particles[0], plan.control_points.reshape(-1, 3)])
@@ -243,7 +244,7 @@ def derived_seed(seed: int, index: int) -> int:
     return int(np.random.SeedSequence([seed, index]).generate_state(1, np.uint64)[0] >> np.uint64(11))
 
 
-def _control_times(duration_s: float, dt: float, substeps: int) -> np.ndarray:
+def _control_times(duration_s: float, dt: float, substeps: int) -> Array:
     """Ticks up to ``duration_s`` with ``substeps`` control points each, (S,); at least one tick."""
     ticks = max(1, int(np.floor(duration_s / dt + 1e-6)))
     return np.arange(ticks * substeps + 1) * (dt / substeps)
@@ -257,7 +258,7 @@ def _replay(
     rate: float,
     duration_s: float,
     substeps: int,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[Array, Array]:
     """Control times (S,) and points (S, K, 3) of a variant of the training track, cut at ``duration_s``."""
     dt = model_dt(scene.fps)
     track_times, track = training_track(scene)

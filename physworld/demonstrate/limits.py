@@ -19,6 +19,7 @@ from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from physworld.arrays import Array
 from physworld.geometry.rigid import rigid_motion
 from physworld.scene import Scene
 from physworld.worldmodel.clock import model_dt, resample
@@ -61,23 +62,23 @@ class MotionLimits:
         stretch: how far a stretch may draw grips apart beyond ``spread_max_m``, as a share of it.
     """
 
-    grips: tuple[np.ndarray, ...]
-    reach_min_m: np.ndarray
-    reach_max_m: np.ndarray
+    grips: tuple[Array, ...]
+    reach_min_m: Array
+    reach_max_m: Array
     speed_m_s: float
     acceleration_m_s2: float
     turn_rad: float
-    spread_min_m: np.ndarray
-    spread_max_m: np.ndarray
+    spread_min_m: Array
+    spread_max_m: Array
     floor_m: float
     size_m: float
-    pushers: tuple[np.ndarray, ...] = ()
-    object_centre_m: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    up: np.ndarray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    pushers: tuple[Array, ...] = ()
+    object_centre_m: Array = field(default_factory=lambda: np.zeros(3))
+    up: Array = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     stretch: float = 0.0
 
     @property
-    def bodies(self) -> tuple[np.ndarray, ...]:
+    def bodies(self) -> tuple[Array, ...]:
         """Everything that may move: grips, then pushers."""
         return (*self.grips, *self.pushers)
 
@@ -117,20 +118,20 @@ def limits_of(scene: Scene, twin: Twin) -> MotionLimits:
     )
 
 
-def pushers_of(scene: Scene) -> tuple[np.ndarray, ...]:
+def pushers_of(scene: Scene) -> tuple[Array, ...]:
     """Controllers that carry a collider, an index array for each such collider."""
     return tuple(
         np.array(collider.controllers, dtype=np.int64) for collider in scene.colliders if collider.controllers
     )
 
 
-def up_of(scene: Scene) -> np.ndarray:
+def up_of(scene: Scene) -> Array:
     """The unit vector against gravity, (3,); z where there is none."""
     strength = float(np.linalg.norm(scene.gravity_m_s2))
     return -scene.gravity_m_s2 / strength if strength > 0.0 else np.array([0.0, 0.0, 1.0])
 
 
-def training_track(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+def training_track(scene: Scene) -> tuple[Array, Array]:
     """Control times (S,) [s] and points (S, K, 3) [m] of the training frames only, at the best rate."""
     start, end = scene.times[scene.train[0]], scene.times[scene.train[1] - 1]
     times, points = scene.control_track()
@@ -139,7 +140,7 @@ def training_track(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     return all_times - start, resample(points, times, all_times)
 
 
-def material_paths(rest: np.ndarray, start: np.ndarray, control_points: np.ndarray) -> np.ndarray:
+def material_paths(rest: Array, start: Array, control_points: Array) -> Array:
     """Shortest paths [m] through the rest shape between what the control points hold, (K, K); inf: none.
 
     Particles ``rest`` and ``start`` (P, 3) are the same material; each of the ``control_points`` (K, 3)
@@ -150,7 +151,7 @@ def material_paths(rest: np.ndarray, start: np.ndarray, control_points: np.ndarr
 
 
 @lru_cache(maxsize=4)
-def _material_paths(rest_bytes: bytes, start_bytes: bytes, control_bytes: bytes) -> np.ndarray:
+def _material_paths(rest_bytes: bytes, start_bytes: bytes, control_bytes: bytes) -> Array:
     """``material_paths`` of float64 points: the same for every episode of a twin, and most of its plan's cost."""
     rest, start, control_points = (
         np.frombuffer(part).reshape(-1, 3) for part in (rest_bytes, start_bytes, control_bytes)
@@ -164,7 +165,7 @@ def _material_paths(rest_bytes: bytes, start_bytes: bytes, control_bytes: bytes)
     return csgraph.dijkstra(graph.maximum(graph.T), directed=False, indices=nearest)[:, nearest]
 
 
-def material_between(grips: Sequence[np.ndarray], paths: np.ndarray) -> np.ndarray:
+def material_between(grips: Sequence[Array], paths: Array) -> Array:
     """Mean material path [m] between grips, (G, G), zero on the diagonal."""
     if not grips:
         return np.zeros((0, 0))
@@ -173,9 +174,7 @@ def material_between(grips: Sequence[np.ndarray], paths: np.ndarray) -> np.ndarr
     return means
 
 
-def _joined_grips(
-    groups: Sequence[np.ndarray], track: np.ndarray, paths: np.ndarray, size: float
-) -> tuple[np.ndarray, ...]:
+def _joined_grips(groups: Sequence[Array], track: Array, paths: Array, size: float) -> tuple[Array, ...]:
     """Groups that move as one body: those on the same small piece of material.
 
     Groups are joined when the material between them is short, or shorter than half the object while the
@@ -192,12 +191,12 @@ def _joined_grips(
     return tuple(np.concatenate([groups[g] for g in np.flatnonzero(labels == c)]) for c in range(count))
 
 
-def _centres(track: np.ndarray, bodies: Sequence[np.ndarray]) -> np.ndarray:
+def _centres(track: Array, bodies: Sequence[Array]) -> Array:
     """Centres of bodies of control points (S, K, 3), (S, G, 3)."""
     return np.stack([track[:, body].mean(axis=1) for body in bodies], axis=1) if bodies else track[:, :0]
 
 
-def _turn(grips: Sequence[np.ndarray], track: np.ndarray) -> float:
+def _turn(grips: Sequence[Array], track: Array) -> float:
     """A high percentile of the grips' rotation from their first pose [rad]."""
     angles = [
         Rotation.from_matrix(rigid_motion(track[0, grip], track[:, grip])[0]).magnitude()
@@ -207,7 +206,7 @@ def _turn(grips: Sequence[np.ndarray], track: np.ndarray) -> float:
     return float(np.percentile(np.concatenate(angles), SPEED_PERCENTILE)) if angles else 0.0
 
 
-def _speed_and_acceleration(scene: Scene, times: np.ndarray, track: np.ndarray) -> tuple[float, float]:
+def _speed_and_acceleration(scene: Scene, times: Array, track: Array) -> tuple[float, float]:
     """High percentiles over the training track, differenced at the model's clock against tracking noise."""
     dt = model_dt(scene.fps)
     ticks = np.arange(0.0, times[-1] + 1e-9, dt)
@@ -219,7 +218,7 @@ def _speed_and_acceleration(scene: Scene, times: np.ndarray, track: np.ndarray) 
     return float(np.percentile(speed, SPEED_PERCENTILE)), float(np.percentile(acceleration, SPEED_PERCENTILE))
 
 
-def _floor(scene: Scene, track: np.ndarray, size: float) -> float:
+def _floor(scene: Scene, track: Array, size: float) -> float:
     """Lowest height for a control point: just above the ground, or as low as the recording went."""
     if scene.ground is None:
         return -np.inf

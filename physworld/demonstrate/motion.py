@@ -20,6 +20,7 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from physworld.arrays import Array
 from physworld.demonstrate.limits import MotionLimits
 from physworld.demonstrate.paths import VMP, Allowed, GripPath, PathStyle, random_path
 from physworld.demonstrate.patterns import (
@@ -51,7 +52,7 @@ class Motion:
     """
 
     pattern: str
-    points: np.ndarray
+    points: Array
     scale: float
 
 
@@ -74,9 +75,9 @@ class _Drawn:
 
 
 def random_motion(
-    first_pose: np.ndarray,
+    first_pose: Array,
     limits: MotionLimits,
-    times: np.ndarray,
+    times: Array,
     generator: np.random.Generator,
     pattern: str | None = None,
     *,
@@ -105,7 +106,7 @@ def random_motion(
     common_move, common_turn = drawn.common.pose(times)
     relative_move, relative_turn = drawn.relative.pose(times)
 
-    def place(scale: float) -> np.ndarray:
+    def place(scale: float) -> Array:
         """Control points with every displacement and turn times ``scale``."""
         points = np.repeat(first_pose[None], len(times), axis=0)
         if drawn.as_one:
@@ -125,7 +126,7 @@ def random_motion(
     return Motion(pattern, place(scale), scale)
 
 
-def broken_limit(points: np.ndarray, limits: MotionLimits, times: np.ndarray) -> str | None:
+def broken_limit(points: Array, limits: MotionLimits, times: Array) -> str | None:
     """The first limit that control points (T, K, 3) pass, with its numbers; None when they keep all."""
     bodies = np.stack([points[:, body].mean(axis=1) for body in limits.bodies], axis=1)
     centres = bodies[:, : len(limits.grips)]
@@ -147,7 +148,7 @@ def broken_limit(points: np.ndarray, limits: MotionLimits, times: np.ndarray) ->
     return None
 
 
-def rigid_points(first_pose: np.ndarray, displacement: np.ndarray, turn: np.ndarray) -> np.ndarray:
+def rigid_points(first_pose: Array, displacement: Array, turn: Array) -> Array:
     """Points (n, 3) moved as one rigid body about their centre: (T, n, 3)."""
     centre = first_pose.mean(axis=0)
     rotations = Rotation.from_rotvec(turn).as_matrix()
@@ -171,7 +172,7 @@ def largest_share(kept: Callable[[float], bool]) -> float:
 
 def _draw(
     pattern: str,
-    first_pose: np.ndarray,
+    first_pose: Array,
     limits: MotionLimits,
     duration: float,
     generator: np.random.Generator,
@@ -226,11 +227,11 @@ def _draw(
     return _Drawn(relative=relative, movers=movers)
 
 
-def _spread_check(first_pose: np.ndarray, movers: tuple[int, ...], limits: MotionLimits) -> Allowed:
+def _spread_check(first_pose: Array, movers: tuple[int, ...], limits: MotionLimits) -> Allowed:
     """Whether displacements of the ``movers`` against the other grips keep every pair's spread."""
     first = np.stack([first_pose[grip].mean(axis=0) for grip in limits.grips])
 
-    def allowed(displacement: np.ndarray) -> bool:
+    def allowed(displacement: Array) -> bool:
         centres = np.repeat(first[None], len(displacement), axis=0)
         centres[:, list(movers)] += displacement[:, None]
         return _keeps_spread(centres, limits)
@@ -238,7 +239,7 @@ def _spread_check(first_pose: np.ndarray, movers: tuple[int, ...], limits: Motio
     return allowed
 
 
-def _keeps_spread(centres: np.ndarray, limits: MotionLimits) -> bool:
+def _keeps_spread(centres: Array, limits: MotionLimits) -> bool:
     """Whether grip centres (T, G, 3) stay within the allowed distances of each other."""
     slack = 1e-9 * max(limits.size_m, 1e-3)
     spread = np.linalg.norm(centres[:, :, None] - centres[:, None], axis=-1)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.demonstrate.bezier import ArcLength, CubicBezier, random_bezier, straight
 from physworld.demonstrate.limits import MotionLimits
 from physworld.demonstrate.speed_profile import ConstantSpeed, SpeedProfile, profile_for
@@ -29,8 +30,8 @@ SHORTEST_TURN_RAD = 0.05
 CANDIDATES = 40  # ends drawn before the body goes home instead
 CHECKED_POINTS = 33
 
-Allowed = Callable[[np.ndarray], bool]  # displacements (n, 3) of a body: do they keep their limits?
-Stroke = Callable[[np.ndarray, np.ndarray, int, np.random.Generator], tuple[np.ndarray, np.ndarray]]
+Allowed = Callable[[Array], bool]  # displacements (n, 3) of a body: do they keep their limits?
+Stroke = Callable[[Array, Array, int, np.random.Generator], tuple[Array, Array]]
 
 
 @dataclass(frozen=True)
@@ -50,11 +51,11 @@ class Segment:
     curve: CubicBezier | None
     arc: ArcLength | None
     profile: SpeedProfile | ConstantSpeed
-    turn_from: np.ndarray
-    turn_to: np.ndarray
-    place: np.ndarray | None = None
+    turn_from: Array
+    turn_to: Array
+    place: Array | None = None
 
-    def displacement(self, share: np.ndarray) -> np.ndarray:
+    def displacement(self, share: Array) -> Array:
         """Where ``share`` (n,) of the way leads [m], (n, 3)."""
         if self.curve is None or self.arc is None:
             return np.repeat(np.zeros((1, 3)) if self.place is None else self.place[None], len(share), axis=0)
@@ -67,7 +68,7 @@ class GripPath:
 
     segments: tuple[Segment, ...] = ()
 
-    def pose(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def pose(self, times: Array) -> tuple[Array, Array]:
         """Displacement [m] (T, 3) and rotation vector [rad] (T, 3)."""
         displacement, turn = np.zeros((len(times), 3)), np.zeros((len(times), 3))
         starts = [segment.start_s for segment in self.segments]
@@ -154,35 +155,33 @@ def random_path(
     return GripPath(tuple(segments))
 
 
-def free_stroke(box: tuple[np.ndarray, np.ndarray], turn_rad: float) -> Stroke:
+def free_stroke(box: tuple[Array, Array], turn_rad: float) -> Stroke:
     """Ends anywhere in the box, with a random rotation of at most ``turn_rad``."""
 
-    def stroke(
-        place: np.ndarray, turn: np.ndarray, number: int, generator: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def stroke(place: Array, turn: Array, number: int, generator: np.random.Generator) -> tuple[Array, Array]:
         target = generator.uniform(*box)
         return target, random_turn(turn_rad, generator) if turn_rad > 0.0 else turn
 
     return stroke
 
 
-def random_turn(limit_rad: float, generator: np.random.Generator) -> np.ndarray:
+def random_turn(limit_rad: float, generator: np.random.Generator) -> Array:
     """A rotation vector with uniform direction and an angle up to the limit."""
     axis = generator.standard_normal(3)
     return axis / np.linalg.norm(axis) * limit_rad * generator.uniform()
 
 
 def _next_curve(
-    place: np.ndarray,
-    turn: np.ndarray,
+    place: Array,
+    turn: Array,
     number: int,
-    box: tuple[np.ndarray, np.ndarray],
+    box: tuple[Array, Array],
     shortest_share: float,
     generator: np.random.Generator,
     allowed: Allowed | None,
     draw: Stroke,
     style: PathStyle,
-) -> tuple[CubicBezier | None, np.ndarray] | None:
+) -> tuple[CubicBezier | None, Array] | None:
     """A curve that is allowed and the turn at its end; else straight home; None when it is there already.
 
     The curve is None where the stroke is a turn in place.

@@ -19,6 +19,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.demonstrate.limits import MotionLimits
 from physworld.demonstrate.paths import Stroke
 from physworld.errors import SceneUnsupported
@@ -33,7 +34,7 @@ TWIST_RAD = 1.2
 LEVER_SHARE = 1e-3  # control points nearer to a twist's axis than this share of the object are on it
 
 
-def patterns_for(limits: MotionLimits, first_pose: np.ndarray) -> tuple[str, ...]:
+def patterns_for(limits: MotionLimits, first_pose: Array) -> tuple[str, ...]:
     """The patterns that make sense for these bodies at ``first_pose`` (K, 3), in the order of ``PATTERNS``."""
     grips = len(limits.grips)
     sensible = {
@@ -49,7 +50,7 @@ def patterns_for(limits: MotionLimits, first_pose: np.ndarray) -> tuple[str, ...
     return tuple(name for name in PATTERNS if sensible[name])
 
 
-def weighted(names: tuple[str, ...], weights: Mapping[str, float] | None) -> np.ndarray:
+def weighted(names: tuple[str, ...], weights: Mapping[str, float] | None) -> Array:
     """Chances of the patterns ``names``, (n,), by ``weights``; without them the ``FREE`` ones alike, or all if none is.
 
     Raises:
@@ -72,14 +73,14 @@ def check_weights(weights: Mapping[str, float]) -> None:
         raise ValueError(f"weights {dict(weights)} must be finite, not negative, and one of them positive")
 
 
-def axis_of(limits: MotionLimits, first_pose: np.ndarray, grip: int) -> np.ndarray:
+def axis_of(limits: MotionLimits, first_pose: Array, grip: int) -> Array:
     """Unit vector from the other grips (else the object's middle) to grip number ``grip``, (3,)."""
     centre = first_pose[limits.grips[grip]].mean(axis=0)
     others = [first_pose[body].mean(axis=0) for g, body in enumerate(limits.grips) if g != grip]
     return _unit(centre - (np.mean(others, axis=0) if others else limits.object_centre_m), limits)
 
 
-def lever_of(limits: MotionLimits, first_pose: np.ndarray, grip: int) -> float:
+def lever_of(limits: MotionLimits, first_pose: Array, grip: int) -> float:
     """Largest distance [m] of the grip's control points from the axis of its twist."""
     points = first_pose[limits.grips[grip]]
     arms = points - points.mean(axis=0)
@@ -87,7 +88,7 @@ def lever_of(limits: MotionLimits, first_pose: np.ndarray, grip: int) -> float:
     return float(np.linalg.norm(arms - np.outer(arms @ axis, axis), axis=1).max())
 
 
-def can_twist(limits: MotionLimits, first_pose: np.ndarray, grip: int) -> bool:
+def can_twist(limits: MotionLimits, first_pose: Array, grip: int) -> bool:
     """Whether a turn about the axis moves any control point of the grip."""
     return lever_of(limits, first_pose, grip) > LEVER_SHARE * limits.size_m
 
@@ -97,7 +98,7 @@ def lift_stroke(limits: MotionLimits) -> Stroke:
     return _there_and_back(limits, limits.up, room_along(limits, limits.up), 0.0)
 
 
-def push_stroke(limits: MotionLimits, first_pose: np.ndarray, body: np.ndarray, *, pusher: bool) -> Stroke:
+def push_stroke(limits: MotionLimits, first_pose: Array, body: Array, *, pusher: bool) -> Stroke:
     """Towards the object's middle, level for a grip, and back.
 
     A pusher may run through the middle; a grip goes at most as near as ``spread_min_m`` lets it come to the others.
@@ -113,7 +114,7 @@ def push_stroke(limits: MotionLimits, first_pose: np.ndarray, body: np.ndarray, 
     return _there_and_back(limits, way, room, 0.0)
 
 
-def stretch_stroke(limits: MotionLimits, first_pose: np.ndarray, grip: int) -> Stroke:
+def stretch_stroke(limits: MotionLimits, first_pose: Array, grip: int) -> Stroke:
     """Away from the others as far as material and its extra strain allow, and in again."""
     way = axis_of(limits, first_pose, grip)
     outwards, inwards = room_along(limits, way), room_along(limits, -way)
@@ -126,20 +127,18 @@ def stretch_stroke(limits: MotionLimits, first_pose: np.ndarray, grip: int) -> S
     return _there_and_back(limits, way, max(outwards, 0.0), 0.3 * max(inwards, 0.0), sideways=0.0)
 
 
-def twist_stroke(limits: MotionLimits, axis: np.ndarray) -> Stroke:
+def twist_stroke(limits: MotionLimits, axis: Array) -> Stroke:
     """Turns in place about ``axis``, to one side and then to the other."""
     most = max(TWIST_RAD, limits.turn_rad)
 
-    def stroke(
-        place: np.ndarray, turn: np.ndarray, number: int, generator: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def stroke(place: Array, turn: Array, number: int, generator: np.random.Generator) -> tuple[Array, Array]:
         side = -np.sign(turn @ axis) if number else generator.choice((-1.0, 1.0))
         return place, side * generator.uniform(SHORTEST_STROKE, 1.0) * most * axis
 
     return stroke
 
 
-def room_along(limits: MotionLimits, way: np.ndarray) -> float:
+def room_along(limits: MotionLimits, way: Array) -> float:
     """How far [m] the reach box extends from the start along the unit vector ``way`` (3,)."""
     ends = np.where(way > 0.0, limits.reach_max_m, limits.reach_min_m)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -148,14 +147,12 @@ def room_along(limits: MotionLimits, way: np.ndarray) -> float:
 
 
 def _there_and_back(
-    limits: MotionLimits, way: np.ndarray, room: float, back: float, sideways: float = SIDEWAYS
+    limits: MotionLimits, way: Array, room: float, back: float, sideways: float = SIDEWAYS
 ) -> Stroke:
     """Even strokes end from ``SHORTEST_STROKE`` to all of ``room`` along ``way``, odd ones up to ``back`` behind."""
     spread = sideways * min(room, float(np.abs(limits.reach_max_m - limits.reach_min_m).max()))
 
-    def stroke(
-        place: np.ndarray, turn: np.ndarray, number: int, generator: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def stroke(place: Array, turn: Array, number: int, generator: np.random.Generator) -> tuple[Array, Array]:
         if number % 2 == 0:
             along = generator.uniform(SHORTEST_STROKE, 1.0) * room
         else:
@@ -166,7 +163,7 @@ def _there_and_back(
     return stroke
 
 
-def _unit(vector: np.ndarray, limits: MotionLimits) -> np.ndarray:
+def _unit(vector: Array, limits: MotionLimits) -> Array:
     """The direction of ``vector``; level, across gravity, where it has none."""
     length = float(np.linalg.norm(vector))
     if length > 1e-6 * limits.size_m:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.errors import UnstableSimulation
 
 KEEP_SHARE = 2.0 / 3.0  # of the bound: up to there samples are left alone
@@ -25,15 +26,13 @@ MOST_LANDMARKS = 768
 JUMP_SIGMAS = 6.0
 
 
-def similarity(first: np.ndarray, second: np.ndarray, length_scale: float) -> np.ndarray:
+def similarity(first: Array, second: Array, length_scale: float) -> Array:
     """S between features (A, F) and (B, F): (A, B) in (0, 1]."""
     squared = np.sum(first**2, axis=1)[:, None] + np.sum(second**2, axis=1)[None, :] - 2.0 * first @ second.T
     return np.exp(-np.maximum(squared, 0.0) / (2.0 * length_scale**2))
 
 
-def with_space(
-    features: np.ndarray, points: np.ndarray, length_scale: float, space_scale_m: float
-) -> np.ndarray:
+def with_space(features: Array, points: Array, length_scale: float, space_scale_m: float) -> Array:
     """Features (P, F + 3) whose kernel at ``length_scale`` is that of features times that of ``points`` (P, 3) [m]."""
     if not space_scale_m > 0.0:
         raise ValueError(f"length scale in space {space_scale_m:g} m is not positive")
@@ -50,7 +49,7 @@ class PropertyField:
     """
 
     def __init__(
-        self, features: np.ndarray, length_scale: float, landmarks: int = 96, unresolved: float = 1.0
+        self, features: Array, length_scale: float, landmarks: int = 96, unresolved: float = 1.0
     ) -> None:
         features = np.asarray(features, dtype=np.float64)
         if features.ndim != 2 or not np.isfinite(features).all():
@@ -71,13 +70,13 @@ class PropertyField:
             landmarks *= 2
         # A particle far from every landmark has a row of nearly zero length; the floor keeps the division finite.
         self.factor = factor / np.maximum(norms, 1e-6)[:, None]
-        self._steps: tuple[np.ndarray, np.ndarray] | None = None
+        self._steps: tuple[Array, Array] | None = None
 
-    def sample(self, generator: np.random.Generator) -> np.ndarray:
+    def sample(self, generator: np.random.Generator) -> Array:
         """One draw of N(0, S), (P,)."""
         return self.factor @ generator.standard_normal(self.factor.shape[1])
 
-    def step_sizes(self, pairs: np.ndarray) -> np.ndarray:
+    def step_sizes(self, pairs: Array) -> Array:
         """Standard deviation of δ_i - δ_j over σ for pairs (M, 2) of particles, (M,); kept for the same pairs."""
         if self._steps is None or self._steps[0] is not pairs:
             apart = np.linalg.norm(self.factor[pairs[:, 0]] - self.factor[pairs[:, 1]], axis=1)
@@ -85,7 +84,7 @@ class PropertyField:
         return self._steps[1]
 
 
-def bounded(values: np.ndarray, most: float = BOUND_SIGMAS) -> np.ndarray:
+def bounded(values: Array, most: float = BOUND_SIGMAS) -> Array:
     """Values within ±``most``: identity up to two thirds of it, then a tanh that joins it with equal slope."""
     keep = KEEP_SHARE * most
     over = np.maximum(np.abs(values) - keep, 0.0)
@@ -100,7 +99,7 @@ def perturb(
     field: PropertyField | None,
     generator: np.random.Generator,
     largest_factor: float = np.inf,
-) -> np.ndarray:
+) -> Array:
     """Log factors of one property, (P,) float64.
 
     Args:
@@ -125,9 +124,9 @@ def perturb(
 
 
 def check_field(
-    values: np.ndarray,
+    values: Array,
     sigma: float,
-    neighbours: np.ndarray,
+    neighbours: Array,
     field: PropertyField | None,
     largest_factor: float = np.inf,
 ) -> float:
@@ -162,7 +161,7 @@ def check_field(
     return float(np.sqrt(np.mean(steps**2)) / sigma)
 
 
-def farthest_points(features: np.ndarray, count: int) -> np.ndarray:
+def farthest_points(features: Array, count: int) -> Array:
     """Indices of ``count`` rows spread by farthest-point sampling from the one nearest the mean."""
     count = min(count, features.shape[0])
     first = int(np.argmin(np.sum((features - features.mean(axis=0)) ** 2, axis=1)))

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import ndtr, ndtri
 
+from physworld.arrays import Array
 from physworld.demonstrate.config import DemonstrationConfig, StrengthRange
 from physworld.demonstrate.perturbation import PropertyField, check_field, perturb, with_space
 from physworld.effects.registry import effect
@@ -43,7 +44,7 @@ class Drawn:
         unresolved: share of variance that the Nyström approximation misses at worst.
     """
 
-    fields: np.ndarray
+    fields: Array
     parameters: dict[str, float] = field(default_factory=dict)
     strengths: dict[str, float] = field(default_factory=dict)
     roughness: tuple[float, ...] = (0.0, 0.0)
@@ -162,7 +163,7 @@ def property_field(scene: Scene, twin: Twin, config: DemonstrationConfig) -> Pro
     return _supplied_field(_key(twin), *shapes, *settings)
 
 
-def _supplied(scene: Scene, features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _supplied(scene: Scene, features: Array) -> tuple[Array, Array]:
     """Places [m] and features of what the scene brings: of its volume points, else of its visible tracked points."""
     features = np.ascontiguousarray(features, dtype=np.float64)
     if scene.rest_volume_points is not None and len(features) == len(scene.rest_volume_points):
@@ -205,7 +206,7 @@ def _supplied_field(
 
 
 def _field(
-    features: np.ndarray, rest: np.ndarray, length: float, space: float, landmarks: int, unresolved: float
+    features: Array, rest: Array, length: float, space: float, landmarks: int, unresolved: float
 ) -> PropertyField:
     if space > 0.0:
         size = float(np.ptp(rest, axis=0).max())
@@ -214,7 +215,7 @@ def _field(
 
 
 @lru_cache(maxsize=4)
-def _pairs(points: bytes) -> np.ndarray:
+def _pairs(points: bytes) -> Array:
     """Pairs (M, 2) of particles side by side: each with its nearest."""
     places = np.frombuffer(points).reshape(-1, 3)
     near = min(NEIGHBOURS, len(places) - 1)

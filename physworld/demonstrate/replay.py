@@ -15,6 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from physworld.arrays import Array
 from physworld.demonstrate.motion import rigid_points
 from physworld.geometry.rigid import rigid_motion
 from physworld.worldmodel.clock import resample
@@ -25,7 +26,7 @@ ROUNDING_S = 1e-6  # a clock in single precision is so far off its ticks
 WARP = (0.6, 1.5)
 
 
-def playback_clock(times: np.ndarray, rate: float, ease_s: float = EASE_S) -> np.ndarray:
+def playback_clock(times: Array, rate: float, ease_s: float = EASE_S) -> Array:
     """Track time at ``times`` (T,) [s]: the rate rises smoothly (3x² - 2x³) from 0 within ``ease_s``."""
     x = np.clip(times / ease_s, 0.0, 1.0)
     eased = ease_s * (x**3 - 0.5 * x**4)
@@ -37,9 +38,7 @@ def playback_duration(track_s: float, rate: float, ease_s: float = EASE_S) -> fl
     return track_s / rate + 0.5 * ease_s
 
 
-def mirrored(
-    track: np.ndarray, groups: Sequence[np.ndarray], object_centre: np.ndarray, up: np.ndarray
-) -> np.ndarray:
+def mirrored(track: Array, groups: Sequence[Array], object_centre: Array, up: Array) -> Array:
     """Control points (S, K, 3) reflected about their first pose, every group a rigid body.
 
     Args:
@@ -64,7 +63,7 @@ def mirrored(
     return result
 
 
-def replayed(track_times: np.ndarray, track: np.ndarray, times: np.ndarray) -> np.ndarray:
+def replayed(track_times: Array, track: Array, times: Array) -> Array:
     """Control points (T, K, 3) of the track at its own ``times`` (T,) [s]; never past its end but by a rounding."""
     if times[-1] > track_times[-1] + ROUNDING_S:
         raise ValueError(f"replay up to {times[-1]:.4f} s of a track that ends at {track_times[-1]:.4f} s")

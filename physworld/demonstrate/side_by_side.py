@@ -9,8 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
+from physworld.arrays import Array
 from physworld.demonstrate.config import DemonstrationConfig
 from physworld.demonstrate.episode import (
     EpisodePlan,
@@ -29,7 +28,7 @@ from physworld.twin.batch import Episode, simulate_batch
 if TYPE_CHECKING:
     from physworld.twin.twin import Twin
 
-Made = tuple[dict[str, np.ndarray], dict[str, Any]]
+Made = tuple[dict[str, Array], dict[str, Any]]
 
 
 def make_episodes(
@@ -83,7 +82,7 @@ def _starting_together(twin: Twin, plans: dict[int, EpisodePlan]) -> list[list[i
 
 def _simulated(
     twin: Twin, plans: dict[int, EpisodePlan], progress: Progress | None
-) -> dict[int, dict[str, np.ndarray] | SimulationError]:
+) -> dict[int, dict[str, Array] | SimulationError]:
     """Arrays of the plans, or why they cannot be trusted."""
     episodes = [
         Episode(
@@ -96,7 +95,7 @@ def _simulated(
         )
         for plan in plans.values()
     ]
-    results: dict[int, dict[str, np.ndarray] | SimulationError] = {}
+    results: dict[int, dict[str, Array] | SimulationError] = {}
     outcomes = simulate_batch(twin, episodes, progress=progress)
     for (place, plan), outcome in zip(plans.items(), outcomes, strict=True):
         try:

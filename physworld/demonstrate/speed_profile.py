@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physworld.arrays import Array
+
 PEAK_SLOPE = 1.5  # max of h'
 
 
@@ -51,19 +53,19 @@ class SpeedProfile:
         """1.5·V over the shorter ramp."""
         return PEAK_SLOPE * self.cruise_m_s / min(self.accelerate_s, self.decelerate_s)
 
-    def speed(self, t: np.ndarray) -> np.ndarray:
+    def speed(self, t: Array) -> Array:
         """v(t) [m/s]; zero outside [0, D]."""
         rise, fall = self._phases(t)
         return self.cruise_m_s * np.minimum(_ramp(rise), _ramp(fall))
 
-    def acceleration(self, t: np.ndarray) -> np.ndarray:
+    def acceleration(self, t: Array) -> Array:
         """dv/dt [m/s²]."""
         rise, fall = self._phases(t)
         up = 6.0 * rise * (1.0 - rise) / self.accelerate_s
         down = 6.0 * fall * (1.0 - fall) / self.decelerate_s
         return self.cruise_m_s * (up - down)
 
-    def distance(self, t: np.ndarray) -> np.ndarray:
+    def distance(self, t: Array) -> Array:
         """∫₀ᵗ v [m], held at the total after the end."""
         t = np.clip(np.asarray(t, dtype=np.float64), 0.0, self.duration_s)
         rise, fall = self._phases(t)
@@ -71,11 +73,11 @@ class SpeedProfile:
         travelled = self.accelerate_s * _ramp_integral(rise) + cruise
         return self.cruise_m_s * (travelled + self.decelerate_s * (0.5 - _ramp_integral(fall)))
 
-    def progress(self, t: np.ndarray) -> np.ndarray:
+    def progress(self, t: Array) -> Array:
         """Normalised arc length s(t) = ∫₀ᵗ v / ∫₀ᴰ v in [0, 1]."""
         return np.clip(self.distance(t) / self.total_distance_m, 0.0, 1.0)
 
-    def _phases(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _phases(self, t: Array) -> tuple[Array, Array]:
         """Fractions of the two ramps that are done and still to come, each in [0, 1]."""
         t = np.asarray(t, dtype=np.float64)
         rise = np.clip(t / self.accelerate_s, 0.0, 1.0)
@@ -89,7 +91,7 @@ class ConstantSpeed:
 
     duration_s: float
 
-    def progress(self, t: np.ndarray) -> np.ndarray:
+    def progress(self, t: Array) -> Array:
         """Share of the way, t/D in [0, 1]."""
         return np.clip(np.asarray(t, dtype=np.float64) / self.duration_s, 0.0, 1.0)
 
@@ -128,11 +130,11 @@ def profile_for(
     )
 
 
-def _ramp(x: np.ndarray) -> np.ndarray:
+def _ramp(x: Array) -> Array:
     """h(x) = 3x² - 2x³ on [0, 1]."""
     return x * x * (3.0 - 2.0 * x)
 
 
-def _ramp_integral(x: np.ndarray) -> np.ndarray:
+def _ramp_integral(x: Array) -> Array:
     """∫₀ˣ h."""
     return x**3 * (1.0 - 0.5 * x)

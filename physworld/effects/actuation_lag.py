@@ -11,8 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numpy as np
-
+from physworld.arrays import Array
 from physworld.effects.base import Effect, Strength
 
 if TYPE_CHECKING:
@@ -42,6 +41,6 @@ class ActuationLag(Effect):
         held = sum(len(nodes) for nodes in twin.held_nodes)
         return f"{held} nodes are held: no grip that could lag" if held == 0 else None
 
-    def controls(self, times: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def controls(self, times: Array, points: Array) -> tuple[Array, Array]:
         """The same points, later."""
         return times + self.lag_s, points

@@ -32,18 +32,18 @@ if TYPE_CHECKING:
 @wp.kernel
 def adhesion(
     # model
-    row_start: wp.array(dtype=wp.int32),
-    columns: wp.array(dtype=wp.int32),
-    weights: wp.array(dtype=wp.float64),
-    area: wp.array(dtype=wp.float64),
-    surface: wp.array(dtype=wp.float64),
+    row_start: wp.array[wp.int32],
+    columns: wp.array[wp.int32],
+    weights: wp.array[wp.float64],
+    area: wp.array[wp.float64],
+    surface: wp.array[wp.float64],
     traction: wp.float64,
     reach: wp.float64,
     # in
-    x: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
     # out
-    force: wp.array(dtype=wp.float64),
-):
+    force: wp.array[wp.float64],
+) -> None:
     """Pull one surface point towards the ground."""
     point = wp.tid()
     here = weighted_sum(x, columns, weights, row_start[point], row_start[point + 1])

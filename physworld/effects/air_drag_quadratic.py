@@ -23,13 +23,13 @@ if TYPE_CHECKING:
 @wp.kernel
 def quadratic_drag(
     # model
-    mass: wp.array(dtype=wp.float64),
+    mass: wp.array[wp.float64],
     coefficient: wp.float64,
     # in
-    v: wp.array(dtype=wp.float64),
+    v: wp.array[wp.float64],
     # out
-    force: wp.array(dtype=wp.float64),
-):
+    force: wp.array[wp.float64],
+) -> None:
     """Add -m k |v| v at one node."""
     node = wp.tid()
     velocity = wp.vec3d(v[3 * node], v[3 * node + 1], v[3 * node + 2])

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.effects.base import Effect, Strength
 from physworld.engine.problem import Problem
 from physworld.engine.total.stress import StressTerm
@@ -76,7 +77,7 @@ class Anisotropy(Effect):
         """A rod."""
         return "a rod has one material direction; fibres need two" if twin.lattice.dim == 1 else None
 
-    def fibre(self) -> np.ndarray:
+    def fibre(self) -> Array:
         """Unit vector in material axes, (3,)."""
         level = np.cos(self.elevation_rad)
         return np.array(

@@ -15,8 +15,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-import numpy as np
-
+from physworld.arrays import Array
 from physworld.engine.problem import HeldNodes, Problem
 
 if TYPE_CHECKING:
@@ -102,7 +101,7 @@ class Effect:
         """The same with the places that ``None`` leaves to the twin."""
         return self
 
-    def controls(self, times: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def controls(self, times: Array, points: Array) -> tuple[Array, Array]:
         """The control track (Tc,) [s], (Tc, K, 3) [m] that the body really followed."""
         return times, points
 
@@ -122,6 +121,6 @@ class Effect:
         """The twin whose tracked points are followed: other ones where the first frame shows them wrongly."""
         return twin
 
-    def measured(self, times: np.ndarray, tracks: np.ndarray, twin: Twin) -> np.ndarray:
+    def measured(self, times: Array, tracks: Array, twin: Twin) -> Array:
         """What the camera reports at ``times`` (T,) [s] of true ``tracks`` (T, N, 3) [m]."""
         return tracks

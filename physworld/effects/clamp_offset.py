@@ -18,6 +18,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from physworld.arrays import Array
 from physworld.effects.base import Effect, Strength
 from physworld.effects.places import body_size, held_count
 from physworld.engine.problem import Problem
@@ -96,7 +97,7 @@ class ClampOffset(Effect):
         return replace(twin, held_nodes=tuple(held), body=replace(twin.body, start=start))
 
 
-def _held_cells(twin: Twin) -> np.ndarray:
+def _held_cells(twin: Twin) -> Array:
     """Cells all of whose nodes are held, (C,) bool; where a clamp ends within the first cell, those that are half held.
 
     A clamp that is known by a few points near the body's face holds the nodes about them and no cell whole.
@@ -108,7 +109,7 @@ def _held_cells(twin: Twin) -> np.ndarray:
     return share == 1.0 if np.any(share == 1.0) else share >= 0.5
 
 
-def _gaps(twin: Twin) -> tuple[np.ndarray, float]:
+def _gaps(twin: Twin) -> tuple[Array, float]:
     """Length of free material between the clamp and every particle's near edge [m], (P,), and the cell there [m].
 
     Particles stand for half a cell along the body each: 0 in the first half, dx/2 in the second, and so on.
@@ -125,7 +126,7 @@ def _gaps(twin: Twin) -> tuple[np.ndarray, float]:
     return gap, cell
 
 
-def _covered_nodes(twin: Twin, reach: float) -> np.ndarray:
+def _covered_nodes(twin: Twin, reach: float) -> Array:
     if reach <= 0:
         return np.empty(0, dtype=int)
     gap, cell = _gaps(twin)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from physworld.arrays import Array
 from physworld.effects.base import Effect, Strength
 from physworld.engine.problem import Problem
 
@@ -62,7 +63,7 @@ class GravityTilt(Effect):
         return replace(problem, gravity_m_s2=(1.0 + self.magnitude) * turn.apply(gravity))
 
 
-def horizontal_axes(gravity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def horizontal_axes(gravity: Array) -> tuple[Array, Array]:
     """Two unit vectors across ``gravity`` (3,): x and y for gravity along -z."""
     down = gravity / np.linalg.norm(gravity)
     start = np.eye(3)[0] if abs(down[0]) < 0.9 else np.eye(3)[1]

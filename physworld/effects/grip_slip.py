@@ -16,6 +16,7 @@ import numpy as np
 import warp as wp
 from scipy.spatial import cKDTree
 
+from physworld.arrays import Array
 from physworld.effects.base import Effect, Strength
 from physworld.effects.places import gravity_size, held_count
 from physworld.engine.problem import HeldNodes, Problem, nodal_mass
@@ -34,19 +35,19 @@ _SOFT = 1 / 200  # cells: softer grips are no small change from springs on nodes
 @wp.kernel
 def pull_of_grip(
     # model
-    nodes: wp.array(dtype=wp.int32),
-    stiffness: wp.array(dtype=wp.float64),
-    friction: wp.array(dtype=wp.float64),
-    path_x: wp.array2d(dtype=wp.float64),
-    path_v: wp.array2d(dtype=wp.float64),
-    clock: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
+    nodes: wp.array[wp.int32],
+    stiffness: wp.array[wp.float64],
+    friction: wp.array[wp.float64],
+    path_x: wp.array2d[wp.float64],
+    path_v: wp.array2d[wp.float64],
+    clock: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
     # in
-    x: wp.array(dtype=wp.float64),
-    v: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
+    v: wp.array[wp.float64],
     # out
-    force: wp.array(dtype=wp.float64),
-):
+    force: wp.array[wp.float64],
+) -> None:
     """Pull one held node towards its path."""
     held = wp.tid()
     node = nodes[held]
@@ -69,7 +70,7 @@ class GripSprings:
     """
 
     held: HeldNodes
-    grips: tuple[np.ndarray, ...]
+    grips: tuple[Array, ...]
     compliance_m_n: float
     damping_ratio: float
 
@@ -84,7 +85,7 @@ class GripSprings:
         gripped = HeldNodes(grips.particles, grips.positions, grips.velocities)
         return self._bound(body.problem, body.mass, gripped)
 
-    def _bound(self, problem: Problem, masses: np.ndarray, held: HeldNodes) -> BoundGripSprings:
+    def _bound(self, problem: Problem, masses: Array, held: HeldNodes) -> BoundGripSprings:
         device, frames = problem.device, len(held.positions)
         mass = masses[held.nodes]
         gaps = np.stack([cKDTree(places).query(held.positions[0])[0] for places in self.grips])

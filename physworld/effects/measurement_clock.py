@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
+from physworld.arrays import Array
 from physworld.effects.base import Effect, Strength
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ class MeasurementClock(Effect):
         """Up to 0.3 s."""
         return (Strength("offset_s", "s", -0.3, 0.3, 0.005),)
 
-    def measured(self, times: np.ndarray, tracks: np.ndarray, twin: Twin) -> np.ndarray:
+    def measured(self, times: Array, tracks: Array, twin: Twin) -> Array:
         """Read at other times."""
         if len(times) < 2:
             return tracks

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.effects.base import Effect, Strength
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ class MeasurementDrift(Effect):
         """Up to 5 cm/s."""
         return tuple(Strength(f"{axis}_m_s", "m/s", -0.05, 0.05, 1e-3) for axis in "xyz")
 
-    def measured(self, times: np.ndarray, tracks: np.ndarray, twin: Twin) -> np.ndarray:
+    def measured(self, times: Array, tracks: Array, twin: Twin) -> Array:
         """Shifted in proportion to the time."""
         velocity = np.array([self.x_m_s, self.y_m_s, self.z_m_s])
         return tracks + (times - times[0])[:, None, None] * velocity

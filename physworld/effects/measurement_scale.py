@@ -14,8 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-import numpy as np
-
+from physworld.arrays import Array
 from physworld.effects.base import Effect, Strength
 
 if TYPE_CHECKING:
@@ -49,13 +48,13 @@ class MeasurementScale(Effect):
         )  # material coordinates are the start's
         return replace(twin, body=replace(twin.body, points=points))
 
-    def measured(self, times: np.ndarray, tracks: np.ndarray, twin: Twin) -> np.ndarray:
+    def measured(self, times: Array, tracks: Array, twin: Twin) -> Array:
         """Stretched about the centre."""
         centre = _centre(twin)
         return centre + (1.0 + self.scale) * (tracks - centre)
 
 
-def _centre(twin: Twin) -> np.ndarray:
+def _centre(twin: Twin) -> Array:
     """What the camera shows in its true place [m], (3,) or (N, 3): see the module's text; unheld solids' middle."""
     if twin.lattice.dim < 3:
         return twin.track_nodes(twin.body.start[None])[0]

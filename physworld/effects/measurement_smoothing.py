@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.effects.base import Effect, Strength
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ class MeasurementSmoothing(Effect):
         """Up to 0.3 s."""
         return (Strength("time_constant_s", "s", 0.0, 0.3, 0.005),)
 
-    def measured(self, times: np.ndarray, tracks: np.ndarray, twin: Twin) -> np.ndarray:
+    def measured(self, times: Array, tracks: Array, twin: Twin) -> Array:
         """Filtered, frame after frame."""
         tau, out = self.time_constant_s, tracks.copy()
         if tau <= 0:

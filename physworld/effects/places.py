@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.engine.lattice.lattice import Lattice
 
 if TYPE_CHECKING:
@@ -23,13 +24,13 @@ def gravity_size(twin: Twin) -> float:
     return size if size > 1e-6 else 9.81
 
 
-def free_end(twin: Twin) -> np.ndarray:
+def free_end(twin: Twin) -> Array:
     """Start of the material that lies farthest from what is held [m], (3,); of nothing is held, from the middle."""
     particles = twin.particles_start[twin.particle_mass > 0]
     return particles[int(np.argmax(_from_held(twin, particles)))]
 
 
-def middle_of_free_end(twin: Twin) -> np.ndarray:
+def middle_of_free_end(twin: Twin) -> Array:
     """Centre of the particles that lie as far from what is held as :func:`free_end` within half a cell [m], (3,).
 
     Where those are ends apart, with their centre less than half as far, it is :func:`free_end` alone.
@@ -40,7 +41,7 @@ def middle_of_free_end(twin: Twin) -> np.ndarray:
     return middle if _from_held(twin, middle[None])[0] >= 0.5 * gap.max() else free_end(twin)
 
 
-def _from_held(twin: Twin, places: np.ndarray) -> np.ndarray:
+def _from_held(twin: Twin, places: Array) -> Array:
     """Distance of places (P, 3) from what is held, or from the body's middle, (P,) [m]."""
     held = np.concatenate([np.empty(0, dtype=int), *twin.held_nodes]).astype(int)
     middle = twin.particles_start[twin.particle_mass > 0].mean(axis=0, keepdims=True)
@@ -48,7 +49,7 @@ def _from_held(twin: Twin, places: np.ndarray) -> np.ndarray:
     return np.linalg.norm(places[:, None] - known[None], axis=2).min(axis=1)
 
 
-def region_weights(twin: Twin, centre: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+def region_weights(twin: Twin, centre: Array, radius: float) -> tuple[Array, Array]:
     """Nodes (k,) and weights (k,), summing to 1, of the centroid of the material that :func:`region_shares` names."""
     rows = twin.lattice.interpolation(twin.lattice.particle_coordinates)
     weights = np.asarray(rows.T @ region_shares(twin, centre, radius))
@@ -56,7 +57,7 @@ def region_weights(twin: Twin, centre: np.ndarray, radius: float) -> tuple[np.nd
     return nodes, weights[nodes]
 
 
-def region_shares(twin: Twin, centre: np.ndarray, radius: float) -> np.ndarray:
+def region_shares(twin: Twin, centre: Array, radius: float) -> Array:
     """Shares of the particles, (P,), summing to 1, in the centroid of the material within ``radius`` [m] of ``centre``.
 
     Places are those of the start; where nothing lies so near, the nearest particle is the region.
@@ -69,7 +70,7 @@ def region_shares(twin: Twin, centre: np.ndarray, radius: float) -> np.ndarray:
     return np.where(inside, mass, 0.0) / mass[inside].sum()
 
 
-def unit_coordinates(lattice: Lattice) -> np.ndarray:
+def unit_coordinates(lattice: Lattice) -> Array:
     """Material coordinates of the particles, -1 to 1 over the body along every axis, (P, d)."""
     places = lattice.particle_coordinates
     filled = places[lattice.particle_measures > 0]

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.effects.base import Effect, Strength
 from physworld.effects.places import body_size, free_end, gravity_size, region_shares, region_weights
 from physworld.engine.problem import Problem
@@ -28,11 +29,11 @@ _RADIUS = 0.1  # of the body's size
 @wp.kernel
 def push_nodes(
     # model
-    nodes: wp.array(dtype=wp.int32),
-    push: wp.array(dtype=wp.vec3d),
+    nodes: wp.array[wp.int32],
+    push: wp.array[wp.vec3d],
     # out
-    force: wp.array(dtype=wp.float64),
-):
+    force: wp.array[wp.float64],
+) -> None:
     """Add a fixed force to one node of the region."""
     k = wp.tid()
     for i in range(3):
@@ -43,9 +44,9 @@ def push_nodes(
 class RegionForceTerm:
     """Term of :class:`RegionForce`: nodes (k,) and their forces (k, 3) [N]; forces on particles (P, 3) [N]."""
 
-    nodes: np.ndarray
-    push: np.ndarray
-    particle_push: np.ndarray
+    nodes: Array
+    push: Array
+    particle_push: Array
 
     def bind(self, problem: Problem) -> BoundRegionForce:
         """Device arrays."""

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.effects.base import Effect, Strength
 from physworld.effects.places import unit_coordinates
 from physworld.engine.lattice.lattice import Lattice
@@ -66,7 +67,7 @@ def field_strengths(dim: int) -> tuple[Strength, ...]:
     )
 
 
-def log_field(lattice: Lattice, effect: Effect) -> np.ndarray:
+def log_field(lattice: Lattice, effect: Effect) -> Array:
     """Log factor of every particle, (P,), of an effect with slopes and a bump."""
     xi = unit_coordinates(lattice)
     axes = _AXES[: lattice.dim]

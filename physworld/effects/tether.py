@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.effects.base import Effect, Strength
 from physworld.effects.places import (
     body_size,
@@ -37,16 +38,16 @@ _RADIUS = 0.1  # of the body's size
 @wp.kernel
 def pull_of_tether(
     # model
-    nodes: wp.array(dtype=wp.int32),
-    weights: wp.array(dtype=wp.float64),
+    nodes: wp.array[wp.int32],
+    weights: wp.array[wp.float64],
     anchor: wp.vec3d,
     stiffness: wp.float64,
     rest_length: wp.float64,
     # in
-    x: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
     # out
-    force: wp.array(dtype=wp.float64),
-):
+    force: wp.array[wp.float64],
+) -> None:
     """Add the spring's force to the nodes of its region, in one thread: there are few."""
     gap = weighted_sum(x, nodes, weights, 0, nodes.shape[0]) - anchor
     length = wp.length(gap) + wp.float64(1.0e-12)
@@ -60,10 +61,10 @@ def pull_of_tether(
 class TetherTerm:
     """Term of :class:`Tether`: region (k,), (k,), the particles' shares in it (P,), anchor (3,) [m]."""
 
-    nodes: np.ndarray
-    weights: np.ndarray
-    shares: np.ndarray
-    anchor: np.ndarray
+    nodes: Array
+    weights: Array
+    shares: Array
+    anchor: Array
     stiffness_n_m: float
     rest_length_m: float
 
@@ -77,7 +78,7 @@ class TetherTerm:
         region = np.flatnonzero(shares)
         return self._bound(body.problem, region, shares[region])
 
-    def _bound(self, problem: Problem, numbers: np.ndarray, weights: np.ndarray) -> BoundTether:
+    def _bound(self, problem: Problem, numbers: Array, weights: Array) -> BoundTether:
         device = problem.device
         inputs = [
             wp.array(numbers, dtype=wp.int32, device=device),
@@ -135,7 +136,7 @@ class Tether(Effect):
             Strength("rest_length_m", "m", 0.0, 3 * size, 0.02 * size, gate=False),
         )
 
-    def places(self, twin: Twin) -> tuple[np.ndarray, np.ndarray]:
+    def places(self, twin: Twin) -> tuple[Array, Array]:
         """Anchor and centre of the material at the start [m], (3,) each."""
         end = middle_of_free_end(twin)
         given = [(self.attach_x_m, self.attach_y_m, self.attach_z_m)]

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.effects.base import Effect, Strength
 from physworld.engine.problem import Problem
 from physworld.engine.terms.term import BoundTerm
@@ -33,13 +34,13 @@ _COVERED = 2.0  # growth of the stiffness that the stable time step's own margin
 @wp.kernel
 def scale_forces(
     # model
-    times: wp.array(dtype=wp.float64),
+    times: wp.array[wp.float64],
     rate: wp.float64,
-    clock: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
+    clock: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
     # in, out
-    force: wp.array(dtype=wp.float64),
-):
+    force: wp.array[wp.float64],
+) -> None:
     """Multiply one component of the internal forces by exp(rate t)."""
     k = wp.tid()
     time = times[counter[0]] + wp.float64(counter[1]) * clock[2]
@@ -75,7 +76,7 @@ class BoundGrowth(BoundTerm):
     times: wp.array | None = None
     multiplies: bool = True
 
-    def begin(self, times: np.ndarray) -> None:
+    def begin(self, times: Array) -> None:
         """Take the times. Raises CFLViolation where the stiffness would outgrow the time step."""
         _check(times, self.rate_per_s, self.covered)
         self.times = wp.array(times, dtype=wp.float64, device=self.device)
@@ -96,7 +97,7 @@ class BoundStressGrowth(BoundParticleStress):
         self.frequency_rad_s, self.friction_per_s = frequency_rad_s, friction_per_s
         self._times = wp.zeros(1, dtype=wp.float64, device=device)
 
-    def begin(self, times: np.ndarray) -> None:
+    def begin(self, times: Array) -> None:
         """Take the times. Raises CFLViolation where the stiffness would outgrow the time step."""
         _check(times, self._rate, self._covered)
         self._times = wp.array(times, dtype=wp.float64, device=self._device)
@@ -107,7 +108,7 @@ class BoundStressGrowth(BoundParticleStress):
         wp.launch(grow_stress, dim=len(stress), inputs=inputs, outputs=[stress], device=self._device)
 
 
-def _growth(rate_per_s: float, times: np.ndarray) -> float:
+def _growth(rate_per_s: float, times: Array) -> float:
     """Largest stiffness over the first frame's, at ``times``."""
     return float(np.exp(rate_per_s * times).max())
 
@@ -128,7 +129,7 @@ def _faster(problem: Problem, rate_per_s: float) -> tuple[float, float, float]:
     return growth, float(np.sqrt(more * squares[0])), more * squares[1]
 
 
-def _check(times: np.ndarray, rate_per_s: float, covered: float) -> None:
+def _check(times: Array, rate_per_s: float, covered: float) -> None:
     growth = _growth(rate_per_s, times)
     if growth > covered * (1 + 1e-9):
         raise CFLViolation(

@@ -6,8 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
-import numpy as np
-
+from physworld.arrays import Array
 from physworld.engine.lattice.lattice import Lattice
 from physworld.engine.terms.term import Term
 from physworld.materials.laws import Law
@@ -17,9 +16,9 @@ from physworld.materials.laws import Law
 class HeldNodes:
     """Nodes that gripped material touches: their numbers (H,) and their paths at the frames, (T, H, 3) [m], [m/s]."""
 
-    nodes: np.ndarray
-    positions: np.ndarray
-    velocities: np.ndarray
+    nodes: Array
+    positions: Array
+    velocities: Array
 
 
 @dataclass(frozen=True)
@@ -40,18 +39,18 @@ class Problem:
 
     lattice: Lattice
     law: Law
-    rest: np.ndarray
-    gravity_m_s2: np.ndarray
+    rest: Array
+    gravity_m_s2: Array
     drag_per_s: float = 0.0
-    stiffness_factor: np.ndarray | None = None
-    density_factor: np.ndarray | None = None
-    added_mass: np.ndarray | None = None
+    stiffness_factor: Array | None = None
+    density_factor: Array | None = None
+    added_mass: Array | None = None
     terms: tuple[Term, ...] = ()
-    friction_factor: np.ndarray | None = None
+    friction_factor: Array | None = None
     span_s: tuple[float, float] | None = None
     device: str = field(default="cpu")
 
-    def nodal_mass(self) -> np.ndarray:
+    def nodal_mass(self) -> Array:
         """Lumped nodal masses [kg], (n,)."""
         mass = nodal_mass(self.lattice, self.law, self.density_factor)
         return mass if self.added_mass is None else mass + self.added_mass
@@ -64,17 +63,17 @@ class Formulation(Protocol):
 
     def run(
         self,
-        x: np.ndarray,
-        v: np.ndarray,
+        x: Array,
+        v: Array,
         held: HeldNodes,
-        times: np.ndarray,
+        times: Array,
         progress: Callable[[int, int], None] | None = None,
-    ) -> np.ndarray:
+    ) -> Array:
         """Nodal positions at ``times``, (T, n, 3)."""
         ...
 
 
-def nodal_mass(lattice: Lattice, law: Law, density_factor: np.ndarray | None) -> np.ndarray:
+def nodal_mass(lattice: Lattice, law: Law, density_factor: Array | None) -> Array:
     """Lumped nodal masses [kg], (n,): rows of the mass matrix summed."""
     density = {3: "density_kg_m3", 2: "density_kg_m2", 1: "density_kg_m"}[lattice.dim]
     particle_mass = getattr(law, density) * lattice.particle_measures

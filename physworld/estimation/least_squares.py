@@ -14,7 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import t as student
 
-Residual = Callable[[np.ndarray], np.ndarray]
+from physworld.arrays import Array
+
+Residual = Callable[[Array], Array]
 
 _TOLERANCE = 2e-4  # relative fall of the cost that ends the search
 _MAX_STEP = 1.5  # in the logarithm
@@ -34,13 +36,13 @@ class Solution:
         jacobian: (m, p).
     """
 
-    theta: np.ndarray
+    theta: Array
     cost: float
-    residual: np.ndarray
-    jacobian: np.ndarray
+    residual: Array
+    jacobian: Array
 
 
-Asked = tuple[list[np.ndarray], list[np.ndarray]]
+Asked = tuple[list[Array], list[Array]]
 """Places whose residuals are needed now, and those that will be needed next if nothing speaks against them."""
 
 Descent = Generator[Asked, list[np.ndarray], Solution]
@@ -48,10 +50,10 @@ Descent = Generator[Asked, list[np.ndarray], Solution]
 
 def gauss_newton(
     residual: Residual,
-    theta: np.ndarray,
-    low: np.ndarray,
-    high: np.ndarray,
-    steps: np.ndarray,
+    theta: Array,
+    low: Array,
+    high: Array,
+    steps: Array,
     max_iterations: int = 6,
 ) -> Solution:
     """Minimise the mean square of ``residual`` from ``theta`` within [low, high].
@@ -69,9 +71,7 @@ def gauss_newton(
             return found
 
 
-def descent(
-    theta: np.ndarray, low: np.ndarray, high: np.ndarray, steps: np.ndarray, max_iterations: int = 6
-) -> Descent:
+def descent(theta: Array, low: Array, high: Array, steps: Array, max_iterations: int = 6) -> Descent:
     """:func:`gauss_newton` for whoever runs its simulations: yields places that do not depend on each other and those
     that it will likely ask for next, is sent the residuals of the former, in their order, and returns the solution."""
     theta = np.clip(theta, low, high)
@@ -105,13 +105,13 @@ def descent(
 
 
 def _trial(
-    theta: np.ndarray,
-    normal: np.ndarray,
-    gradient: np.ndarray,
+    theta: Array,
+    normal: Array,
+    gradient: Array,
     damping: float,
-    low: np.ndarray,
-    high: np.ndarray,
-) -> np.ndarray:
+    low: Array,
+    high: Array,
+) -> Array:
     """Where a damped step from ``theta`` (p,) leads."""
     scaled = normal + damping * np.diag(np.diag(normal) + 1e-12 * np.trace(normal) + 1e-30)
     step = np.clip(np.linalg.solve(scaled, -gradient), -_MAX_STEP, _MAX_STEP)
@@ -123,7 +123,7 @@ def most_runs(parameters: int, max_iterations: int) -> int:
     return 1 + max_iterations * (parameters + _TRIALS)
 
 
-def probes_of(theta: np.ndarray, high: np.ndarray, steps: np.ndarray) -> list[np.ndarray]:
+def probes_of(theta: Array, high: Array, steps: Array) -> list[Array]:
     """Places beside ``theta`` (p,) that finite differences need, one a parameter, below it at its upper bound."""
     found = []
     for k in range(len(theta)):
@@ -134,12 +134,12 @@ def probes_of(theta: np.ndarray, high: np.ndarray, steps: np.ndarray) -> list[np
 
 
 def differences(
-    theta: np.ndarray,
-    now: np.ndarray,
-    steps: np.ndarray,
-    probes: list[np.ndarray],
-    residuals: list[np.ndarray],
-) -> np.ndarray:
+    theta: Array,
+    now: Array,
+    steps: Array,
+    probes: list[Array],
+    residuals: list[Array],
+) -> Array:
     """Jacobian (m, p) at ``theta``, whose residual is ``now``; a column that blew up is zero."""
     jacobian = np.zeros((len(now), len(theta)))
     for k, (probe, there) in enumerate(zip(probes, residuals, strict=True)):
@@ -148,8 +148,8 @@ def differences(
 
 
 def block_covariance(
-    solution: Solution, frame_of_residual: np.ndarray, point_of_residual: np.ndarray | None = None
-) -> np.ndarray:
+    solution: Solution, frame_of_residual: Array, point_of_residual: Array | None = None
+) -> Array:
     """Covariance of theta, (p, p): the correlations of the sensitivities, with the variances that clusters show.
 
     Args:
@@ -177,7 +177,7 @@ def block_covariance(
     return _rescaled(usual, variance)
 
 
-def correlations(covariance: np.ndarray) -> np.ndarray:
+def correlations(covariance: Array) -> Array:
     """Correlation matrix (p, p); zero beside a parameter without variance."""
     scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     outer = np.outer(scale, scale)
@@ -192,7 +192,7 @@ def interval_factor(frames: int, parameters: int) -> float:
     return float(student.ppf(0.975, blocks - 1)) if blocks > parameters else float("inf")
 
 
-def _sandwich(inverse: np.ndarray, scores: np.ndarray, cluster: np.ndarray, parameters: int) -> np.ndarray:
+def _sandwich(inverse: Array, scores: Array, cluster: Array, parameters: int) -> Array:
     count = int(cluster.max()) + 1
     sums = np.zeros((count, scores.shape[1]))
     np.add.at(sums, cluster, scores)
@@ -200,7 +200,7 @@ def _sandwich(inverse: np.ndarray, scores: np.ndarray, cluster: np.ndarray, para
     return correction * inverse @ (sums.T @ sums) @ inverse
 
 
-def _rescaled(covariance: np.ndarray, variance: np.ndarray) -> np.ndarray:
+def _rescaled(covariance: Array, variance: Array) -> Array:
     """The matrix with the same correlations and the given diagonal."""
     now = np.diag(covariance)
     factor = np.sqrt(np.divide(variance, now, out=np.zeros_like(variance), where=now > 0))

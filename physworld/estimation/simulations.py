@@ -19,6 +19,7 @@ from typing import Protocol
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.engine.total.formulation import TotalLagrangian, run_again_if_blown_up
 from physworld.errors import CFLViolation, SimulationError, WorkerLost
 from physworld.twin.twin import Twin
@@ -73,9 +74,9 @@ def engine() -> str:
 class Drive:
     """What drives every simulation of a scene: control track (Tc,), (Tc, K, 3) and frame times (T,)."""
 
-    control_times: np.ndarray
-    control_points: np.ndarray
-    times: np.ndarray
+    control_times: Array
+    control_points: Array
+    times: Array
 
     def digest(self) -> bytes:
         """Fingerprint."""
@@ -85,7 +86,7 @@ class Drive:
         return digest.digest()
 
 
-def nodes_of(job: Job, drive: Drive, poll: Callable[[int, int], None] | None = None) -> np.ndarray:
+def nodes_of(job: Job, drive: Drive, poll: Callable[[int, int], None] | None = None) -> Array:
     """Carriers (frames, n, 3) [m] of a job. Raises SimulationError."""
     twin = job.twin
     run = twin.integration(drive.control_times, drive.control_points, drive.times[: job.frames])
@@ -114,7 +115,7 @@ def stage_s(twin: Twin, drive: Drive) -> float:
     return TotalLagrangian(run.problem).stage_s
 
 
-def tracks_of(job: Job, drive: Drive, poll: Callable[[int, int], None] | None = None) -> np.ndarray | None:
+def tracks_of(job: Job, drive: Drive, poll: Callable[[int, int], None] | None = None) -> Array | None:
     """Observed points (frames, N, 3) [m] of a job; None where the run cannot be trusted."""
     try:
         nodes = nodes_of(job, drive, poll)
@@ -130,10 +131,10 @@ class Runner(Protocol):
 
     def __call__(
         self, jobs: Sequence[Job], drive: Drive, poll: Callable[[], None]
-    ) -> Iterator[np.ndarray | None]: ...
+    ) -> Iterator[Array | None]: ...
 
 
-def in_turn(jobs: Sequence[Job], drive: Drive, poll: Callable[[], None]) -> Iterator[np.ndarray | None]:
+def in_turn(jobs: Sequence[Job], drive: Drive, poll: Callable[[], None]) -> Iterator[Array | None]:
     """The runner of this process."""
     for job in jobs:
         yield tracks_of(job, drive, lambda done, total: poll())
@@ -161,16 +162,14 @@ class Workers:
     def __exit__(self, *failure: object) -> None:
         self._pool.shutdown(wait=True, cancel_futures=True)
 
-    def __call__(
-        self, jobs: Sequence[Job], drive: Drive, poll: Callable[[], None]
-    ) -> Iterator[np.ndarray | None]:
+    def __call__(self, jobs: Sequence[Job], drive: Drive, poll: Callable[[], None]) -> Iterator[Array | None]:
         """Every job in a process; ``poll`` is called before each is waited for. Where it raises, jobs that have not
         begun never do.
 
         Raises:
             WorkerLost: a process ended, by the system's hand or another's.
         """
-        futures: list[Future[np.ndarray | None]] = []
+        futures: list[Future[Array | None]] = []
         try:
             for job in jobs:
                 facts = (job.twin.to_arrays(), job.twin.device, _facts(job), drive)
@@ -201,6 +200,6 @@ def _facts(job: Job) -> tuple[int, float, float]:
 
 
 def _work(
-    arrays: dict[str, np.ndarray], device: str, facts: tuple[int, float, float], drive: Drive
-) -> np.ndarray | None:
+    arrays: dict[str, Array], device: str, facts: tuple[int, float, float], drive: Drive
+) -> Array | None:
     return tracks_of(Job(Twin.from_arrays(arrays, device), *facts), drive)

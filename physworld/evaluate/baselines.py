@@ -13,6 +13,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.scene import Scene
 
 VELOCITY_FRAMES = 4
@@ -30,12 +31,12 @@ it is unknown and taken as zero."""
 BLENDED_GRIPS = 2
 
 
-def static(scene: Scene) -> np.ndarray:
+def static(scene: Scene) -> Array:
     """Every point stays where it was in frame 0."""
     return np.repeat(start_positions(scene)[None], scene.frame_count, axis=0)
 
 
-def rigid_follow(scene: Scene) -> np.ndarray:
+def rigid_follow(scene: Scene) -> Array:
     """Every point is carried by the rigid motion of its grip, blended over the two nearest grips.
 
     The blend weighs each grip's motion by the inverse squared distance of the point to the grip's nearest
@@ -55,7 +56,7 @@ def rigid_follow(scene: Scene) -> np.ndarray:
     return predicted
 
 
-def constant_velocity(scene: Scene) -> np.ndarray:
+def constant_velocity(scene: Scene) -> Array:
     """Every point keeps the velocity that a line through its visible places in frames 0..3 has.
 
     A point seen in fewer than two of these frames stays at rest.
@@ -74,7 +75,7 @@ def constant_velocity(scene: Scene) -> np.ndarray:
     return start[None] + elapsed[:, None, None] * velocity[None]
 
 
-def persistence(scene: Scene) -> np.ndarray:
+def persistence(scene: Scene) -> Array:
     """Every point follows its measured places through the training frames and then stays at the last one.
 
     In a frame without a measurement it stays at the last place that was seen (before any: at the start).
@@ -88,7 +89,7 @@ def persistence(scene: Scene) -> np.ndarray:
     return predicted
 
 
-BASELINES: dict[str, Callable[[Scene], np.ndarray]] = {
+BASELINES: dict[str, Callable[[Scene], Array]] = {
     "static": static,
     "rigid_follow": rigid_follow,
     "constant_velocity": constant_velocity,
@@ -96,7 +97,7 @@ BASELINES: dict[str, Callable[[Scene], np.ndarray]] = {
 }
 
 
-def start_positions(scene: Scene) -> np.ndarray:
+def start_positions(scene: Scene) -> Array:
     """Where each tracked point starts [m], (N, 3).
 
     Its place in frame 0; if it is hidden there, its first visible place among the training frames; if it is
@@ -114,7 +115,7 @@ def start_positions(scene: Scene) -> np.ndarray:
     return start
 
 
-def controller_groups(scene: Scene) -> list[np.ndarray]:
+def controller_groups(scene: Scene) -> list[Array]:
     """Controller indices of each rigid grip: the declared grips, or those that keep their distances."""
     if scene.grips:
         declared = [np.asarray(grip.controllers, dtype=np.int64) for grip in scene.grips]
@@ -132,7 +133,7 @@ def controller_groups(scene: Scene) -> list[np.ndarray]:
     return [np.asarray(group, dtype=np.int64) for group in groups]
 
 
-def rigid_motion(rest: np.ndarray, now: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def rigid_motion(rest: Array, now: Array) -> tuple[Array, Array, Array]:
     """Best rigid motion of points (K, 3): rotation (3, 3), centre at rest (3,), centre now (3,).
 
     A point x moves to ``rotation @ (x - centre) + centre_now``. Three points or more that span a plane:
@@ -150,7 +151,7 @@ def rigid_motion(rest: np.ndarray, now: np.ndarray) -> tuple[np.ndarray, np.ndar
     return u @ handed @ vt, centre, centre_now
 
 
-def _smallest_rotation(direction: np.ndarray, towards: np.ndarray) -> np.ndarray:
+def _smallest_rotation(direction: Array, towards: Array) -> Array:
     """Rotation (3, 3) by the smallest angle that turns the unit vector ``direction`` along ``towards``."""
     length = np.linalg.norm(towards)
     if length == 0.0:
@@ -166,7 +167,7 @@ def _smallest_rotation(direction: np.ndarray, towards: np.ndarray) -> np.ndarray
     return np.eye(3) + skew + skew @ skew / (1.0 + cosine)
 
 
-def _grip_weights(start: np.ndarray, controllers: np.ndarray, groups: list[np.ndarray]) -> np.ndarray:
+def _grip_weights(start: Array, controllers: Array, groups: list[Array]) -> Array:
     """Weight of each grip for each point, (G, N), columns sum to 1, zero beyond the nearest two grips."""
     distance = np.stack(
         [np.linalg.norm(start[:, None] - controllers[None, g], axis=-1).min(axis=1) for g in groups]
@@ -179,7 +180,7 @@ def _grip_weights(start: np.ndarray, controllers: np.ndarray, groups: list[np.nd
     return weight / weight.sum(axis=0)
 
 
-def _keeps_distance(a: np.ndarray, b: np.ndarray) -> bool:
+def _keeps_distance(a: Array, b: Array) -> bool:
     """Whether two controller paths (T, 3) keep their distance, within the tolerance of one rigid grip."""
     distance = np.linalg.norm(a - b, axis=-1)
     return bool(np.ptp(distance) <= max(RIGID_TOLERANCE_M, RIGID_TOLERANCE_RELATIVE * float(distance[0])))

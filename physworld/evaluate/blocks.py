@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import norm, t
 
+from physworld.arrays import Array
+
 RESAMPLES = 2000
 _SHORTEST_BLOCK = 3
 _TAILS = (0.025, 0.975)
@@ -47,7 +49,7 @@ class Comparison:
     excess_ci95: tuple[float, float]
 
 
-def mean_with_interval(curve: np.ndarray, seed: int = 0) -> Mean:
+def mean_with_interval(curve: Array, seed: int = 0) -> Mean:
     """Mean of an error curve (F,) [m]; NaN where a frame has no error. Raises ValueError when none has."""
     seen = _seen(curve)
     value = float(seen.mean())
@@ -60,15 +62,15 @@ def mean_with_interval(curve: np.ndarray, seed: int = 0) -> Mean:
     return Mean(value, (float(low), float(high)), len(seen))
 
 
-def paired_gain(before: np.ndarray, after: np.ndarray, seed: int = 0) -> Mean:
+def paired_gain(before: Array, after: Array, seed: int = 0) -> Mean:
     """Mean of ``before - after`` (F,) [m], the same frames drawn for both; above zero: after is better."""
     return mean_with_interval(np.asarray(before, dtype=float) - np.asarray(after, dtype=float), seed)
 
 
 def compare(
-    measured: np.ndarray,
+    measured: Array,
     measured_floor: float | None,
-    expected: np.ndarray,
+    expected: Array,
     expected_floor: float | None,
     seed: int = 0,
 ) -> Comparison:
@@ -93,12 +95,12 @@ def compare(
     return Comparison(outcome, new, old, excess, (float(low), float(high)))
 
 
-def _without_noise(error: np.ndarray | float, floor: float) -> np.ndarray:
+def _without_noise(error: Array | float, floor: float) -> Array:
     """What remains of a mean error when noise is taken off in squares [m]."""
     return np.sqrt(np.maximum(np.square(error) - floor**2, 0.0))
 
 
-def _seen(curve: np.ndarray) -> np.ndarray:
+def _seen(curve: Array) -> Array:
     values = np.asarray(curve, dtype=float)
     seen = values[np.isfinite(values)]
     if not len(seen):
@@ -117,7 +119,7 @@ def _widening(count: int) -> float:
     return float(t.ppf(_TAILS[1], blocks - 1) / norm.ppf(_TAILS[1]) * (blocks / (blocks - 1)) ** 0.5)
 
 
-def _means(values: np.ndarray, seed: int) -> np.ndarray:
+def _means(values: Array, seed: int) -> Array:
     """Means of resamples of whole length, (RESAMPLES,)."""
     count = len(values)
     length = _length(count)

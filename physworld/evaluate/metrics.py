@@ -18,6 +18,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from physworld.arrays import Array
+
 L1 = 1
 L2 = 2
 
@@ -25,7 +27,7 @@ MEAN_DISTANCE_PER_SIGMA = float(np.sqrt(8.0 / np.pi))
 """Mean length of a 3-D Gaussian vector of unit deviation per axis (the Maxwell distribution's mean)."""
 
 
-def track_error_per_frame(predicted: np.ndarray, measured: np.ndarray, visible: np.ndarray) -> np.ndarray:
+def track_error_per_frame(predicted: Array, measured: Array, visible: Array) -> Array:
     """Mean Euclidean error over the visible points of each frame [m], shape (T,); NaN where none is visible.
 
     Args:
@@ -39,19 +41,17 @@ def track_error_per_frame(predicted: np.ndarray, measured: np.ndarray, visible: 
     return np.where(count > 0, distance.sum(axis=1) / np.maximum(count, 1), np.nan)
 
 
-def track_error(predicted: np.ndarray, measured: np.ndarray, visible: np.ndarray) -> float:
+def track_error(predicted: Array, measured: Array, visible: Array) -> float:
     """Mean of ``track_error_per_frame`` over the frames with a visible point [m]; NaN when there is none."""
     return mean_over_frames(track_error_per_frame(predicted, measured, visible))
 
 
-def track_error_phystwin(predicted: np.ndarray, measured: np.ndarray, visible: np.ndarray) -> float:
+def track_error_phystwin(predicted: Array, measured: Array, visible: Array) -> float:
     """PhysTwin's variant: a frame in which nothing was seen counts as error 0 [m]."""
     return float(np.nan_to_num(track_error_per_frame(predicted, measured, visible), nan=0.0).mean())
 
 
-def chamfer_phystwin_per_frame(
-    predicted: np.ndarray, measured: np.ndarray, visible: np.ndarray
-) -> np.ndarray:
+def chamfer_phystwin_per_frame(predicted: Array, measured: Array, visible: Array) -> Array:
     """One-way L1 Chamfer distance of each frame [m], shape (T,); NaN where nothing is visible.
 
     Args:
@@ -67,12 +67,12 @@ def chamfer_phystwin_per_frame(
     return error
 
 
-def chamfer_phystwin(predicted: np.ndarray, measured: np.ndarray, visible: np.ndarray) -> float:
+def chamfer_phystwin(predicted: Array, measured: Array, visible: Array) -> float:
     """Mean of ``chamfer_phystwin_per_frame`` over the frames with a visible point [m]."""
     return mean_over_frames(chamfer_phystwin_per_frame(predicted, measured, visible))
 
 
-def chamfer_l2_per_frame(predicted: np.ndarray, measured: np.ndarray, visible: np.ndarray) -> np.ndarray:
+def chamfer_l2_per_frame(predicted: Array, measured: Array, visible: Array) -> Array:
     """Two-way Euclidean Chamfer distance of each frame [m], shape (T,): the sum of both directions' means.
 
     Takes what ``chamfer_phystwin_per_frame`` takes. Every predicted point counts in the way back, also one
@@ -87,12 +87,12 @@ def chamfer_l2_per_frame(predicted: np.ndarray, measured: np.ndarray, visible: n
     return error
 
 
-def chamfer_l2(predicted: np.ndarray, measured: np.ndarray, visible: np.ndarray) -> float:
+def chamfer_l2(predicted: Array, measured: Array, visible: Array) -> float:
     """Mean of ``chamfer_l2_per_frame`` over the frames with a visible point [m]."""
     return mean_over_frames(chamfer_l2_per_frame(predicted, measured, visible))
 
 
-def mean_over_frames(per_frame: np.ndarray) -> float:
+def mean_over_frames(per_frame: Array) -> float:
     """Mean of the frames that have a value; NaN when none has one."""
     known = per_frame[~np.isnan(per_frame)]
     return float(known.mean()) if known.size else float("nan")
@@ -103,7 +103,7 @@ def noise_floor(noise_sigma_m: float) -> float:
     return noise_sigma_m * MEAN_DISTANCE_PER_SIGMA
 
 
-def nearest_at_start(surface: np.ndarray, points: np.ndarray) -> np.ndarray:
+def nearest_at_start(surface: Array, points: Array) -> Array:
     """Index of the predicted vertex that stands for each measured point: the nearest at frame 0.
 
     Args:
@@ -117,19 +117,19 @@ def nearest_at_start(surface: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.asarray(index, dtype=np.int64)
 
 
-def _mean_nearest(points: np.ndarray, targets: np.ndarray, norm: int) -> float:
+def _mean_nearest(points: Array, targets: Array, norm: int) -> float:
     """Mean distance of ``points`` to their nearest of ``targets`` in the given Minkowski norm."""
     distance, _ = cKDTree(targets).query(points, p=norm)
     return float(np.mean(distance))
 
 
-def _check_tracks(predicted: np.ndarray, measured: np.ndarray, visible: np.ndarray) -> None:
+def _check_tracks(predicted: Array, measured: Array, visible: Array) -> None:
     if predicted.shape != measured.shape:
         raise ValueError(f"predicted tracks have shape {predicted.shape}, measured {measured.shape}")
     _check_clouds(predicted, measured, visible)
 
 
-def _check_clouds(predicted: np.ndarray, measured: np.ndarray, visible: np.ndarray) -> None:
+def _check_clouds(predicted: Array, measured: Array, visible: Array) -> None:
     if measured.ndim != 3 or measured.shape[2] != 3 or visible.shape != measured.shape[:2]:
         raise ValueError(f"measured points have shape {measured.shape}, visible {visible.shape}")
     if predicted.ndim != 3 or predicted.shape[2] != 3 or len(predicted) != len(measured):

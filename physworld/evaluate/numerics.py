@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.engine.total.energy import EnergyLedger, run_with_ledger
 from physworld.engine.total.formulation import TotalLagrangian
 from physworld.engine.updated.energy import ParticleLedger, run_particles_with_ledger
@@ -139,8 +140,8 @@ class RefinedTracks:
         particles: of the finer lattice.
     """
 
-    half_step: np.ndarray
-    finer_cells: np.ndarray
+    half_step: Array
+    finer_cells: Array
     particles: int
 
 
@@ -168,7 +169,7 @@ def refined_tracks_of(
 
 def trusted_tracks(
     jobs: dict[str, Job], drive: Drive, poll: Poll | None = None, runner: Runner = in_turn
-) -> list[np.ndarray]:
+) -> list[Array]:
     """Tracks (frames, N, 3) [m] of jobs by what they are, in their order. Raises SimulationError where one failed."""
     found = []
     asked = runner(list(jobs.values()), drive, lambda: None if poll is None else poll(len(found), len(jobs)))
@@ -269,7 +270,7 @@ def free_swing(
     return FreeSwing(drag, dominant_frequency(scene.times, tracks), ledger)
 
 
-def dominant_frequency(times: np.ndarray, tracks: np.ndarray) -> float | None:
+def dominant_frequency(times: Array, tracks: Array) -> float | None:
     """Strongest frequency [Hz] of the first principal motion of tracks (T, N, 3); None below 1.5 periods.
 
     Args:
@@ -300,10 +301,10 @@ def dominant_frequency(times: np.ndarray, tracks: np.ndarray) -> float | None:
 def _run_with_ledger(
     twin: Twin,
     run: Integration,
-    velocity: np.ndarray,
+    velocity: Array,
     time_step_s: float | None = None,
     poll: Poll | None = None,
-) -> tuple[np.ndarray, EnergyLedger | ParticleLedger, float]:
+) -> tuple[Array, EnergyLedger | ParticleLedger, float]:
     """Carriers at the frames (T, n, 3), the ledger at the knots, and the largest time step [s]."""
     start = twin.body.start
     if twin.formulation == "total_lagrangian":
@@ -318,7 +319,7 @@ def _run_with_ledger(
     return carriers, account, form.time_step_s
 
 
-def _across(start: np.ndarray, gravity: np.ndarray) -> np.ndarray:
+def _across(start: Array, gravity: Array) -> Array:
     """The level direction in which the body is thinnest: unit vector (3,)."""
     down = gravity / max(float(np.linalg.norm(gravity)), 1e-12)
     spread = start - start.mean(axis=0)
@@ -327,6 +328,6 @@ def _across(start: np.ndarray, gravity: np.ndarray) -> np.ndarray:
     return np.linalg.eigh(level.T @ level + blocked)[1][:, 0]
 
 
-def _rms(difference: np.ndarray) -> float:
+def _rms(difference: Array) -> float:
     """Root mean squared length of vectors (T, N, 3)."""
     return float(np.sqrt(np.mean(np.sum(difference**2, axis=-1))))

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.evaluate.baselines import BASELINES
 from physworld.evaluate.metrics import (
     chamfer_l2_per_frame,
@@ -28,7 +29,7 @@ PER_FRAME_METRICS = {
 }
 
 
-def held_out_table(scene: Scene, predictions: dict[str, np.ndarray]) -> dict[str, Any]:
+def held_out_table(scene: Scene, predictions: dict[str, Array]) -> dict[str, Any]:
     """Errors of the baselines and of ``predictions`` (name to (T, N, 3) positions [m]) on the test frames.
 
     Returns:

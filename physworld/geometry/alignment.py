@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.scene import Grip
 
 _COVERED = 0.9  # a grip that covers this share of an axis holds all of it
@@ -35,7 +36,7 @@ class Face:
     depth: float
 
 
-def faces_along(axis: int, low: np.ndarray, high: np.ndarray, grips: tuple[Grip, ...]) -> list[Face]:
+def faces_along(axis: int, low: Array, high: Array, grips: tuple[Grip, ...]) -> list[Face]:
     """Faces of the grips' regions along an axis of a body from ``low`` to ``high`` (d,), from low to high."""
     body = (float(low[axis]), float(high[axis]))
     slack = _SAME * (body[1] - body[0])

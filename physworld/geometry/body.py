@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.engine.lattice.lattice import Lattice
 from physworld.scene import Scene
 
@@ -29,14 +30,14 @@ class ReferenceBody:
     """
 
     lattice: Lattice
-    rest: np.ndarray
-    start: np.ndarray
-    start_velocity: np.ndarray
-    points: np.ndarray
-    offsets: np.ndarray
+    rest: Array
+    start: Array
+    start_velocity: Array
+    points: Array
+    offsets: Array
     thickness_m: float
     notes: tuple[str, ...] = ()
-    added_mass: np.ndarray | None = None
+    added_mass: Array | None = None
 
     @property
     def half_thickness_m(self) -> float:
@@ -44,7 +45,7 @@ class ReferenceBody:
         return {3: 0.0, 2: 0.5, 1: 1.0}[self.lattice.dim] * self.thickness_m
 
 
-def first_points(scene: Scene) -> np.ndarray:
+def first_points(scene: Scene) -> Array:
     """Tracked points at the first frame, (N, 3) [m].
 
     A point that was not seen then is where its first sight was, less what its neighbours have moved until then.

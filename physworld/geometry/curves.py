@@ -11,6 +11,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
+from physworld.arrays import Array
 from physworld.engine.lattice.lattice import Lattice
 from physworld.errors import SceneUnsupported
 from physworld.scene import Scene
@@ -25,7 +26,7 @@ _GAUSS_NEWTON_STEPS = 12
 _LONGER = 1.02  # times the extent of a straight rod's points: a declared length beyond it reaches past them
 
 
-def fit_nodes(scene: Scene, lattice: Lattice, material: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def fit_nodes(scene: Scene, lattice: Lattice, material: Array) -> tuple[Array, Array]:
     """Nodal positions [m] and velocities [m/s] at the first frame, both (n, 3).
 
     Args:
@@ -54,7 +55,7 @@ def fit_nodes(scene: Scene, lattice: Lattice, material: np.ndarray) -> tuple[np.
 
 
 def straight_extent(
-    scene: Scene, along: np.ndarray, centre: np.ndarray, direction: np.ndarray, notes: list[str]
+    scene: Scene, along: Array, centre: Array, direction: Array, notes: list[str]
 ) -> tuple[float, float]:
     """Where a straight rod begins along ``direction`` from ``centre``, and its length [m].
 
@@ -76,9 +77,7 @@ def straight_extent(
     return begin - lead, float(declared)
 
 
-def _start_velocity(
-    scene: Scene, lattice: Lattice, material: np.ndarray, bending: sparse.csr_matrix
-) -> np.ndarray:
+def _start_velocity(scene: Scene, lattice: Lattice, material: Array, bending: sparse.csr_matrix) -> Array:
     frames = max(_MIN_WINDOW_FRAMES, int(np.searchsorted(scene.times, _VELOCITY_WINDOW_S)) + 1)
     frames = min(frames, scene.train[1])
     if frames < 3:
@@ -115,8 +114,8 @@ def _slopes(lattice: Lattice) -> list[sparse.csr_matrix]:
 
 
 def _unstretch(
-    x: np.ndarray, data: sparse.csr_matrix, target: np.ndarray, bending: sparse.csr_matrix, slopes: list
-) -> np.ndarray:
+    x: Array, data: sparse.csr_matrix, target: Array, bending: sparse.csr_matrix, slopes: list
+) -> Array:
     """One Gauss-Newton step on data, bending and (|x_,j| - 1)."""
     n = len(x)
     rows, residuals = [], []

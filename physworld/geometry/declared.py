@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.errors import SceneUnsupported
 from physworld.scene import Grip, Scene
 
@@ -29,7 +30,7 @@ class Load:
     """A lumped mass [kg] spread evenly over material points of the undeformed body, (M, 3) [m]."""
 
     mass_kg: float
-    points: np.ndarray
+    points: Array
 
 
 def grips_of(scene: Scene) -> tuple[Grip, ...]:

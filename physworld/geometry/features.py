@@ -18,11 +18,13 @@ from scipy.sparse import csgraph
 from scipy.sparse.linalg import eigsh
 from scipy.spatial import cKDTree
 
+from physworld.arrays import Array
+
 DENSE_LIMIT = 400  # up to here a dense eigenproblem is faster than Lanczos, and exact
 START_SEED = 20250901  # Lanczos' start vector: the embedding is a pure function of its points
 
 
-def part_features(points: np.ndarray, k: int = 8, *, neighbors: int = 12) -> np.ndarray:
+def part_features(points: Array, k: int = 8, *, neighbors: int = 12) -> Array:
     """Spectral part features of ``points`` [m] (P, 3): float64 (P, k), zero mean, unit RMS distance.
 
     Columns past the number of non-trivial eigenvectors (P - 1) are zero. Disconnected parts are joined by one
@@ -45,7 +47,7 @@ def part_features(points: np.ndarray, k: int = 8, *, neighbors: int = 12) -> np.
     return standardise(features)
 
 
-def carry_features(sources: np.ndarray, features: np.ndarray, targets: np.ndarray) -> np.ndarray:
+def carry_features(sources: Array, features: Array, targets: Array) -> Array:
     """Features (S, F) of ``sources`` (S, 3) at ``targets`` (P, 3) by nearest neighbour; standardised."""
     sources, features = np.asarray(sources, dtype=np.float64), np.asarray(features, dtype=np.float64)
     if features.ndim != 2 or features.shape[0] != sources.shape[0]:
@@ -56,7 +58,7 @@ def carry_features(sources: np.ndarray, features: np.ndarray, targets: np.ndarra
     return standardise(features[nearest])
 
 
-def standardise(features: np.ndarray) -> np.ndarray:
+def standardise(features: Array) -> Array:
     """Features (P, F) with zero mean, scaled so that two random particles are at RMS distance 1."""
     centred = features - features.mean(axis=0)
     # E|F_i - F_j|² = 2·E|F_i - mean|²
@@ -64,7 +66,7 @@ def standardise(features: np.ndarray) -> np.ndarray:
     return centred / scale if scale > 0.0 else centred
 
 
-def neighbor_graph(points: np.ndarray, neighbors: int) -> sparse.csr_matrix:
+def neighbor_graph(points: Array, neighbors: int) -> sparse.csr_matrix:
     """Symmetric connected graph of ``points`` (P, 3), weights exp(-d²/2h²), h the mean neighbour distance.
 
     Every point is joined to its ``neighbors`` nearest; parts that stay apart get one bridge of unit weight
@@ -88,7 +90,7 @@ def neighbor_graph(points: np.ndarray, neighbors: int) -> sparse.csr_matrix:
     return graph
 
 
-def _bridges(points: np.ndarray, graph: sparse.csr_matrix) -> np.ndarray:
+def _bridges(points: Array, graph: sparse.csr_matrix) -> Array:
     """Pairs (B, 2) of points that join the graph's components into one, nearest component first."""
     parts, labels = csgraph.connected_components(graph, directed=False)
     pairs = []
@@ -102,7 +104,7 @@ def _bridges(points: np.ndarray, graph: sparse.csr_matrix) -> np.ndarray:
     return np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
 
-def _lowest_eigenpairs(laplacian: sparse.csr_matrix, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _lowest_eigenpairs(laplacian: sparse.csr_matrix, count: int) -> tuple[Array, Array]:
     """The ``count`` smallest eigenvalues, ascending, and their unit eigenvectors (P, count)."""
     size = laplacian.shape[0]
     if size <= max(DENSE_LIMIT, 3 * count):
@@ -116,7 +118,7 @@ def _lowest_eigenpairs(laplacian: sparse.csr_matrix, count: int) -> tuple[np.nda
     return values[order], vectors[:, order]
 
 
-def _with_fixed_signs(vectors: np.ndarray) -> np.ndarray:
+def _with_fixed_signs(vectors: Array) -> Array:
     """Eigenvectors whose largest component is positive, so that equal inputs give equal features."""
     largest = np.abs(vectors).argmax(axis=0)
     signs = np.sign(vectors[largest, np.arange(vectors.shape[1])])

@@ -18,6 +18,8 @@ import numpy as np
 from scipy.ndimage import binary_fill_holes, distance_transform_edt, gaussian_filter, map_coordinates
 from scipy.spatial import Delaunay, cKDTree
 
+from physworld.arrays import Array
+
 _ALPHA = 2.5  # circumradius limit in point distances
 _DEEP = 1.0  # points this many distances inside the shape show the volume of one point
 _FEW = 50  # with fewer such points the usual growth is taken
@@ -48,30 +50,30 @@ class FilledBody:
     """
 
     mesh: Delaunay
-    kept: np.ndarray
+    kept: Array
     surface: cKDTree
     growth_m: float
     volume_m3: float
 
-    def contains(self, query: np.ndarray) -> np.ndarray:
+    def contains(self, query: Array) -> Array:
         """Which of ``query`` (Q, 3) lie inside, (Q,) bool."""
         inside = self._inside_shape(query)
         gap, _ = self.surface.query(query[~inside], distance_upper_bound=self.growth_m * (1 + 1e-9))
         inside[~inside] = gap <= self.growth_m
         return inside
 
-    def _inside_shape(self, query: np.ndarray) -> np.ndarray:
+    def _inside_shape(self, query: Array) -> Array:
         found = self.mesh.find_simplex(query)
         return (found >= 0) & self.kept[np.maximum(found, 0)]
 
 
-def median_spacing(points: np.ndarray) -> float:
+def median_spacing(points: Array) -> float:
     """Median distance of a point to its nearest other point [m]; (M, 3) with M >= 2."""
     distance, _ = cKDTree(points).query(points, k=2)
     return float(np.median(distance[:, 1]))
 
 
-def filled_body(points: np.ndarray) -> FilledBody:
+def filled_body(points: Array) -> FilledBody:
     """The body that ``points`` (M, 3) fill; M >= 10, not all in a plane."""
     spacing = float(np.median(cKDTree(points).query(points, k=9)[0][:, 8])) / _EIGHTH
     mesh = Delaunay(points)
@@ -95,12 +97,12 @@ def filled_body(points: np.ndarray) -> FilledBody:
     return _grown(shape, points, spacing, (len(points) * float(share[deep].mean()), len(points) * error))
 
 
-def inside_volume_points(points: np.ndarray, query: np.ndarray) -> np.ndarray:
+def inside_volume_points(points: Array, query: Array) -> Array:
     """Which of ``query`` (Q, 3) lie inside the body that ``points`` (M, 3) fill; (Q,) bool."""
     return filled_body(points).contains(np.asarray(query, dtype=float))
 
 
-def inside_surface_points(points: np.ndarray, query: np.ndarray, cell: float) -> np.ndarray:
+def inside_surface_points(points: Array, query: Array, cell: float) -> Array:
     """Which of ``query`` (Q, 3) lie inside the surface sampled by ``points`` (M, 3), at voxel size ``cell`` [m].
 
     Voxels of one and a half to seven point distances are tried, and the finest that closes is taken; the planes through
@@ -120,7 +122,7 @@ def inside_surface_points(points: np.ndarray, query: np.ndarray, cell: float) ->
     return _held(filled, (query - low) / size)
 
 
-def _voxels(points: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+def _voxels(points: Array, size: float) -> tuple[Array, Array, Array, float]:
     """Voxels that the points enclose, those with what they lie in, the corner of the first [m], and their size [m]."""
     low = points.min(axis=0) - 2 * size
     shape = np.ceil((points.max(axis=0) + 2 * size - low) / size).astype(int) + 1
@@ -130,7 +132,7 @@ def _voxels(points: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray, np
     return filled & ~shell, filled, low, size
 
 
-def _held(voxels: np.ndarray, places: np.ndarray) -> np.ndarray:
+def _held(voxels: Array, places: Array) -> Array:
     """Which of ``places`` (Q, 3), in voxels, lie in one that is true."""
     index = np.floor(places).astype(int)
     within = np.all((index >= 0) & (index < voxels.shape), axis=1)
@@ -138,13 +140,13 @@ def _held(voxels: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 
 def _inside_closed(
-    points: np.ndarray,
-    query: np.ndarray,
-    query_voxels: np.ndarray,
-    point_voxels: np.ndarray,
-    core: np.ndarray,
-    filled: np.ndarray,
-) -> np.ndarray:
+    points: Array,
+    query: Array,
+    query_voxels: Array,
+    point_voxels: Array,
+    core: Array,
+    filled: Array,
+) -> Array:
     """Inside of a closed shell: the core, and of the shell what lies on the core's side of the points' planes."""
     tree = cKDTree(points)
     _, near = tree.query(points, k=min(_NEIGHBOURS, len(points)))
@@ -169,7 +171,7 @@ def _inside_closed(
 
 
 def _grown(
-    shape: FilledBody, points: np.ndarray, spacing: float, estimate: tuple[float, float] | None
+    shape: FilledBody, points: Array, spacing: float, estimate: tuple[float, float] | None
 ) -> FilledBody:
     """The shape grown to an estimated volume and error [m^3], as far as these beat the usual growth."""
     query, each = _probes(points, spacing)
@@ -186,7 +188,7 @@ def _grown(
     return FilledBody(shape.mesh, shape.kept, shape.surface, growth, held)
 
 
-def _probes(points: np.ndarray, spacing: float) -> tuple[np.ndarray, float]:
+def _probes(points: Array, spacing: float) -> tuple[Array, float]:
     """Places (Q, 3) spread over the box of the points and the most that may be added, and the volume of each [m^3]."""
     margin = _MOST_GROWTH * spacing
     low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
@@ -194,7 +196,7 @@ def _probes(points: np.ndarray, spacing: float) -> tuple[np.ndarray, float]:
     return query, float(np.prod(high - low)) / _PROBES
 
 
-def _boundary_samples(points: np.ndarray, mesh: Delaunay, kept: np.ndarray, step: float) -> np.ndarray:
+def _boundary_samples(points: Array, mesh: Delaunay, kept: Array, step: float) -> Array:
     """Points (S, 3) on the triangles between kept tetrahedra and everything else, no farther than ``step`` apart."""
     beyond = (mesh.neighbors < 0) | ~kept[np.maximum(mesh.neighbors, 0)]
     tetrahedron, opposite = np.nonzero(kept[:, None] & beyond)

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.engine.lattice.lattice import Lattice, lattice_from_cells
 from physworld.engine.thin.triangles import Mesh
 from physworld.errors import SceneUnsupported
@@ -104,7 +105,7 @@ def _solid(scene: Scene, budget: int) -> ReferenceBody:
             notes.append("the volume was filled from points on the surface")
             cell = float((np.prod(np.ptp(cloud, axis=0)) / budget) ** (1 / 3))
 
-            def test(q: np.ndarray) -> np.ndarray:
+            def test(q: Array) -> Array:
                 return inside_surface_points(cloud, q, cell)
 
             reach = 0.0
@@ -138,7 +139,7 @@ def _solid(scene: Scene, budget: int) -> ReferenceBody:
     )
 
 
-def _hanging_mass(scene: Scene, lattice: Lattice, notes: list[str]) -> np.ndarray | None:
+def _hanging_mass(scene: Scene, lattice: Lattice, notes: list[str]) -> Array | None:
     """The declared load on the nodes of a solid [kg], (n,)."""
     load = load_of(scene)
     if load is None:
@@ -148,7 +149,7 @@ def _hanging_mass(scene: Scene, lattice: Lattice, notes: list[str]) -> np.ndarra
     return np.asarray(weights.sum(axis=0)).reshape(-1) * (load.mass_kg / len(load.points))
 
 
-def _require_volume(cloud: np.ndarray, kind: str) -> None:
+def _require_volume(cloud: Array, kind: str) -> None:
     extent = np.linalg.svd(cloud - cloud.mean(axis=0), compute_uv=False)
     if extent[2] <= THIN * extent[0]:
         raise SceneUnsupported(
@@ -157,7 +158,7 @@ def _require_volume(cloud: np.ndarray, kind: str) -> None:
         )
 
 
-def _solid_lattice(scene: Scene, low: np.ndarray, high: np.ndarray, test, budget: int) -> Lattice:
+def _solid_lattice(scene: Scene, low: Array, high: Array, test, budget: int) -> Lattice:
     size = np.maximum(high - low, 1e-9)
     cell = float((8 * np.prod(size) / budget) ** (1 / 3))
     grips = grips_of(scene)
@@ -176,21 +177,19 @@ def _solid_lattice(scene: Scene, low: np.ndarray, high: np.ndarray, test, budget
     return lattice_from_cells(origin, spacing, cells[present], np.clip(fill[present], 0.0, 1.0))
 
 
-def _octants(cells: np.ndarray) -> np.ndarray:
+def _octants(cells: Array) -> Array:
     """Lower corners of every cell's 8 octants in cell units, (C, 8, 3), in the order of the particles."""
     corner = np.stack(np.meshgrid([0, 0.5], [0, 0.5], [0, 0.5], indexing="ij"), axis=-1).reshape(8, 3)
     return cells[:, None, :] + corner[None]
 
 
-def _box_fill(
-    cells: np.ndarray, origin: np.ndarray, spacing: np.ndarray, low: np.ndarray, high: np.ndarray
-) -> np.ndarray:
+def _box_fill(cells: Array, origin: Array, spacing: Array, low: Array, high: Array) -> Array:
     begin = origin + _octants(cells) * spacing
     overlap = np.minimum(begin + 0.5 * spacing, high) - np.maximum(begin, low)
     return np.prod(np.clip(overlap / (0.5 * spacing), 0.0, 1.0), axis=2)
 
 
-def _sampled_fill(cells: np.ndarray, origin: np.ndarray, spacing: np.ndarray, test) -> np.ndarray:
+def _sampled_fill(cells: Array, origin: Array, spacing: Array, test) -> Array:
     inner = np.stack(np.meshgrid(*[[0.125, 0.375]] * 3, indexing="ij"), axis=-1).reshape(8, 3)
     samples = origin + (_octants(cells)[:, :, None, :] + inner[None, None]) * spacing
     return test(samples.reshape(-1, 3)).reshape(len(cells), 8, 8).mean(axis=2)
@@ -237,7 +236,7 @@ def _rod(scene: Scene, refinement: float) -> ReferenceBody:
     return ReferenceBody(lattice, rest, start, velocity, arc[:, None], offsets, radius, tuple(notes))
 
 
-def _marker_arc_lengths(scene: Scene, points: np.ndarray) -> tuple[np.ndarray, float]:
+def _marker_arc_lengths(scene: Scene, points: Array) -> tuple[Array, float]:
     lengths = scene.body.segment_rest_lengths_m
     if lengths is not None:
         if len(lengths) != len(points) - 1:

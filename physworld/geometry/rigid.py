@@ -10,11 +10,13 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
+from physworld.arrays import Array
+
 _COLLINEAR = 1e-3  # second singular value below this share of the first: the markers lie on a line
 _RIGID_STRAIN = 0.05  # distances within a gripper vary by less than this share (standard deviation)
 
 
-def least_rotation(start: np.ndarray, goal: np.ndarray) -> np.ndarray:
+def least_rotation(start: Array, goal: Array) -> Array:
     """Rotation of least angle that takes the directions ``start`` to ``goal``, both (..., 3): (..., 3, 3)."""
     a = start / np.linalg.norm(start, axis=-1, keepdims=True)
     b = goal / np.linalg.norm(goal, axis=-1, keepdims=True)
@@ -31,7 +33,7 @@ def least_rotation(start: np.ndarray, goal: np.ndarray) -> np.ndarray:
     return rotation
 
 
-def rigid_motion(reference: np.ndarray, tracks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def rigid_motion(reference: Array, tracks: Array) -> tuple[Array, Array]:
     """Rotation and translation that carry ``reference`` to each frame of ``tracks`` in the least-squares sense.
 
     Args:
@@ -57,7 +59,7 @@ def rigid_motion(reference: np.ndarray, tracks: np.ndarray) -> tuple[np.ndarray,
     return rotations, centres - rotations @ centre
 
 
-def rigid_groups(tracks: np.ndarray, reach_m: float) -> list[np.ndarray]:
+def rigid_groups(tracks: Array, reach_m: float) -> list[Array]:
     """Controllers that keep their distances and lie within ``reach_m`` of each other: one gripper each.
 
     Args:
@@ -78,7 +80,7 @@ def rigid_groups(tracks: np.ndarray, reach_m: float) -> list[np.ndarray]:
     return sorted(members, key=lambda m: int(m[0]))
 
 
-def _skew(v: np.ndarray) -> np.ndarray:
+def _skew(v: Array) -> Array:
     zero = np.zeros_like(v[..., 0])
     rows = [[zero, -v[..., 2], v[..., 1]], [v[..., 2], zero, -v[..., 0]], [-v[..., 1], v[..., 0], zero]]
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)

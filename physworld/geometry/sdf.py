@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.errors import SceneUnsupported
 from physworld.geometry import sdf_kernels as kernels
 from physworld.geometry.surface_mesh import SurfaceMesh, require_closed
@@ -35,11 +36,11 @@ class Shape:
     """
 
     kind: int
-    size: np.ndarray
+    size: Array
     inner_m: float
     reach_m: float
-    values: np.ndarray
-    low: np.ndarray
+    values: Array
+    low: Array
     spacing_m: float
 
     @property
@@ -47,11 +48,11 @@ class Shape:
         """Whether its distances are true ones: they change by no more than a point moves."""
         return self.kind != kernels.SAMPLED
 
-    def distance(self, points: np.ndarray) -> np.ndarray:
+    def distance(self, points: Array) -> Array:
         """Signed distances [m], (M,), at ``points`` (M, 3) [m]; far outside of a sampled grid 1e6 m."""
         return self._evaluate(points)[:, 3]
 
-    def normal(self, points: np.ndarray) -> np.ndarray:
+    def normal(self, points: Array) -> Array:
         """Outward unit normals (M, 3) of the level sets through ``points`` (M, 3) [m]."""
         gradient = self._evaluate(points)[:, :3]
         return gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-30)
@@ -66,7 +67,7 @@ class Shape:
             wp.vec3d(*np.full(3, 1.0 / self.spacing_m)),
         ]
 
-    def _evaluate(self, points: np.ndarray) -> np.ndarray:
+    def _evaluate(self, points: Array) -> Array:
         points = np.ascontiguousarray(np.asarray(points, dtype=float).reshape(-1, 3))
         found = wp.zeros(len(points), dtype=wp.vec4d, device="cpu")
         inputs = [*self.on_device("cpu"), wp.array(points, dtype=wp.vec3d, device="cpu")]
@@ -79,7 +80,7 @@ def sphere(radius_m: float) -> Shape:
     return _primitive(kernels.SPHERE, (radius_m, 0.0, 0.0), radius_m, radius_m)
 
 
-def box(size_m: np.ndarray | tuple[float, float, float]) -> Shape:
+def box(size_m: Array | tuple[float, float, float]) -> Shape:
     """Box of sides ``size_m`` about the origin."""
     half = 0.5 * np.asarray(size_m, dtype=float)
     return _primitive(kernels.BOX, half, float(half.min()), float(np.linalg.norm(half)))

@@ -69,9 +69,7 @@ def _disc(p: wp.vec3d, radius: wp.float64, half_length: wp.float64) -> wp.vec4d:
 
 
 @wp.func
-def _trilinear(
-    values: wp.array3d(dtype=wp.float32), low: wp.vec3d, inverse: wp.vec3d, p: wp.vec3d
-) -> wp.vec4d:
+def _trilinear(values: wp.array3d[wp.float32], low: wp.vec3d, inverse: wp.vec3d, p: wp.vec3d) -> wp.vec4d:
     """Interpolant and its exact gradient."""
     t = wp.cw_mul(p - low, inverse)
     i = int(wp.floor(t[0]))
@@ -109,7 +107,7 @@ def _trilinear(
 def signed_distance(
     kind: int,
     size: wp.vec3d,
-    values: wp.array3d(dtype=wp.float32),
+    values: wp.array3d[wp.float32],
     low: wp.vec3d,
     inverse: wp.vec3d,
     p: wp.vec3d,
@@ -130,7 +128,7 @@ def signed_distance(
 
 
 @wp.kernel
-def sample_mesh(mesh: wp.uint64, low: wp.vec3f, spacing: wp.float32, values: wp.array3d(dtype=wp.float32)):
+def sample_mesh(mesh: wp.uint64, low: wp.vec3f, spacing: wp.float32, values: wp.array3d[wp.float32]) -> None:
     """Signed distance of every grid point to a closed mesh; the sign by a vote of three rays."""
     i, j, k = wp.tid()
     p = low + spacing * wp.vec3f(wp.float32(i), wp.float32(j), wp.float32(k))
@@ -143,13 +141,13 @@ def sample_mesh(mesh: wp.uint64, low: wp.vec3f, spacing: wp.float32, values: wp.
 def evaluate(
     kind: int,
     size: wp.vec3d,
-    values: wp.array3d(dtype=wp.float32),
+    values: wp.array3d[wp.float32],
     low: wp.vec3d,
     inverse: wp.vec3d,
-    points: wp.array(dtype=wp.vec3d),
+    points: wp.array[wp.vec3d],
     # out
-    found: wp.array(dtype=wp.vec4d),
-):
+    found: wp.array[wp.vec4d],
+) -> None:
     """Gradient and distance at many points."""
     m = wp.tid()
     found[m] = signed_distance(kind, size, values, low, inverse, points[m])

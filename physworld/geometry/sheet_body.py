@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import ConvexHull
 
+from physworld.arrays import Array
 from physworld.engine.lattice.lattice import Lattice
 from physworld.engine.thin.triangles import Mesh, triangle_lattice
 from physworld.errors import SceneUnsupported
@@ -113,7 +114,7 @@ def possible_meshes(scene: Scene) -> list[Mesh]:
     return [Mesh(shape, odd) for shape in sorted(squarest[: _MOST_MESHES // 2]) for odd in (False, True)]
 
 
-def _counts_through(faces: np.ndarray, side: float) -> list[int]:
+def _counts_through(faces: Array, side: float) -> list[int]:
     """Numbers of cells along a side [m] whose lines all inner ``faces`` (F,) lie on; empty where there is none."""
     inner = faces[(faces > _ON_LINE * side) & (faces < (1 - _ON_LINE) * side)]
     if not len(inner):
@@ -122,15 +123,13 @@ def _counts_through(faces: np.ndarray, side: float) -> list[int]:
     return [n for n in tried if np.all(np.abs(inner * n / side - np.round(inner * n / side)) < _ON_LINE)]
 
 
-def _grip_faces(scene: Scene, flat_map: tuple[np.ndarray, np.ndarray] | None) -> np.ndarray:
+def _grip_faces(scene: Scene, flat_map: tuple[Array, Array] | None) -> Array:
     """Where the declared grips end along both axes of a sheet [m], (F, 2)."""
     boxes = [(grip.region_min_m, grip.region_max_m) for grip in grips_in_plane(scene, flat_map)]
     return np.array(boxes, dtype=float).reshape(-1, 2)
 
 
-def _declared_extent(
-    scene: Scene, flat_map: tuple[np.ndarray, np.ndarray] | None, size: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _declared_extent(scene: Scene, flat_map: tuple[Array, Array] | None, size: Array) -> tuple[Array, Array]:
     """Lower corner (2,) and sides (2,) [m] as declared, where the points' extents ``size`` (2,) agree; else these.
 
     Points seldom lie on the edges, so an edge is where a grip ends beside one; without such a grip the middles agree.
@@ -152,7 +151,7 @@ def _declared_extent(
     return begin, sides
 
 
-def plane_of(scene: Scene, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+def plane_of(scene: Scene, points: Array) -> tuple[Array, Array, Array, float]:
     """Corner (3,), axes (3, 3), the last one normal, and sides (2,) of a sheet's plane; rms distance from it [m]."""
     cloud = points if scene.rest_volume_points is None else scene.rest_volume_points
     centre = cloud.mean(axis=0)
@@ -175,7 +174,7 @@ def plane_of(scene: Scene, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
     return centre + local[:, :2].min(axis=0) @ axes[:2], axes, size, float(np.sqrt(np.mean(local[:, 2] ** 2)))
 
 
-def _tightest_turn(plane: np.ndarray) -> np.ndarray:
+def _tightest_turn(plane: Array) -> Array:
     """Rotation (2, 2) after which points (M, 2) fill their bounding rectangle best: the principal axes of a square
     sheet are arbitrary. None is needed where it would gain less than a few percent.
     """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.engine.lattice.lattice import Lattice, lattice_from_cells
 from physworld.geometry.alignment import cells_along, faces_along
 from physworld.geometry.declared import grips_of
@@ -15,7 +16,7 @@ _LEAST_FILL = 0.05  # cells of a sheet that hold less are left out
 _DIGITS = 9  # of a fill: a full cell is full
 
 
-def grips_in_plane(scene: Scene, flat_map: tuple[np.ndarray, np.ndarray] | None) -> tuple[Grip, ...]:
+def grips_in_plane(scene: Scene, flat_map: tuple[Array, Array] | None) -> tuple[Grip, ...]:
     """The grips' boxes in the sheet's own two coordinates; none where its edges do not lie along the world's axes.
 
     Args:
@@ -31,7 +32,7 @@ def grips_in_plane(scene: Scene, flat_map: tuple[np.ndarray, np.ndarray] | None)
     return tuple(found)
 
 
-def sheet_lattice(size: np.ndarray, cell: float, grips: tuple[Grip, ...]) -> Lattice:
+def sheet_lattice(size: Array, cell: float, grips: tuple[Grip, ...]) -> Lattice:
     """Cells of about ``cell`` [m] over a sheet from (0, 0) to ``size`` (2,) [m], at its edges filled in part.
 
     A thin sheet's clamp fixes its slope, as held splines do, so cell faces lie on the grips' own.

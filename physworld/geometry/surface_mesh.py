@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.errors import SceneUnsupported
 
 
@@ -18,11 +19,11 @@ class SurfaceMesh:
         faces: (F, 3) int64, counter-clockwise seen from outside.
     """
 
-    vertices: np.ndarray
-    faces: np.ndarray
+    vertices: Array
+    faces: Array
 
     @property
-    def size_m(self) -> np.ndarray:
+    def size_m(self) -> Array:
         """Extents of the bounding box [m], (3,)."""
         return np.ptp(self.vertices, axis=0)
 
@@ -59,7 +60,7 @@ class SurfaceMesh:
         return None
 
 
-def merged(vertices: np.ndarray, faces: np.ndarray) -> SurfaceMesh:
+def merged(vertices: Array, faces: Array) -> SurfaceMesh:
     """The mesh with equal vertices made one, faces without area dropped, and faces turned to look outwards.
 
     Applied to its own result it changes nothing, bit for bit.
@@ -83,5 +84,5 @@ def require_closed(mesh: SurfaceMesh, name: str) -> SurfaceMesh:
     return mesh
 
 
-def _edge_numbers(edges: np.ndarray, vertices: int) -> np.ndarray:
+def _edge_numbers(edges: Array, vertices: int) -> Array:
     return edges[:, 0] * vertices + edges[:, 1]

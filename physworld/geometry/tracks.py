@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.geometry.body import ReferenceBody
 from physworld.geometry.rigid import least_rotation
 
 
-def material_tracks(body: ReferenceBody, nodes: np.ndarray) -> np.ndarray:
+def material_tracks(body: ReferenceBody, nodes: Array) -> Array:
     """Tracked points (T, N, 3) of the nodes' trajectories (T, n, 3) [m].
 
     Points beside a sheet's middle surface move along its normal, those beside a rope's centre line with its section.
@@ -29,7 +30,7 @@ def material_tracks(body: ReferenceBody, nodes: np.ndarray) -> np.ndarray:
     return tracks
 
 
-def applied(matrix: Any, nodes: np.ndarray) -> np.ndarray:
+def applied(matrix: Any, nodes: Array) -> Array:
     """Sparse (M, n) times trajectories (T, n, 3): (T, M, 3)."""
     frames, n, _ = nodes.shape
     flat = matrix @ nodes.transpose(1, 0, 2).reshape(n, -1)

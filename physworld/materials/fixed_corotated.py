@@ -18,6 +18,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.materials.solid import SolidLaw
 from physworld.materials.stress import Stress
 
@@ -63,7 +64,7 @@ class FixedCorotated(SolidLaw):
     name: ClassVar[str] = "fixed_corotated"
     stress: ClassVar[Stress] = STRESS
 
-    def energy_density(self, F: np.ndarray) -> np.ndarray:
+    def energy_density(self, F: Array) -> Array:
         """Stored energy [J/m^3] of deformation gradients (..., 3, 3)."""
         mu, lam = self.lame
         J = np.linalg.det(F)

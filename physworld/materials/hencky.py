@@ -15,6 +15,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.materials.solid import SolidLaw
 from physworld.materials.stress import Stress
 
@@ -119,7 +120,7 @@ class Hencky(SolidLaw):
     name: ClassVar[str] = "hencky"
     stress: ClassVar[Stress] = STRESS
 
-    def energy_density(self, F: np.ndarray) -> np.ndarray:
+    def energy_density(self, F: Array) -> Array:
         """Stored energy [J/m^3] of deformation gradients (..., 3, 3); infinite where J <= 0."""
         mu, lam = self.lame
         J = np.linalg.det(F)

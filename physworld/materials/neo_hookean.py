@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.materials.stress import Stress
 
 STRESS = Stress(
@@ -23,7 +24,7 @@ STRESS = Stress(
 )
 
 
-def energy_density(F: np.ndarray, mu: float, lam: float) -> np.ndarray:
+def energy_density(F: Array, mu: float, lam: float) -> Array:
     """Stored energy [J/m^3] of deformation gradients (..., 3, 3); infinite where J <= 0."""
     J = np.linalg.det(F)
     log_j = np.log(np.where(J > 0, J, 1.0))

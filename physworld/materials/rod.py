@@ -13,6 +13,8 @@ from typing import ClassVar
 
 import numpy as np
 
+from physworld.arrays import Array
+
 
 @dataclass(frozen=True)
 class RodLaw:
@@ -45,12 +47,12 @@ class RodLaw:
         """Speed of stretch waves [m/s]."""
         return float(np.sqrt(self.stretching_n / self.density_kg_m))
 
-    def energy_density(self, strain: np.ndarray, curvature: np.ndarray) -> np.ndarray:
+    def energy_density(self, strain: Array, curvature: Array) -> Array:
         """Stored energy [J/m] of strains |x'| - 1, (...), and curvature vectors [1/m], (..., 3)."""
         return 0.5 * self.stretching_n * strain**2 + 0.5 * self.bending_n_m2 * np.sum(curvature**2, axis=-1)
 
 
-def rod_strains(derivatives: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def rod_strains(derivatives: Array) -> tuple[Array, Array]:
     """Strain |x'| - 1, (...), and curvature vector x' x x'' / |x'|^3 [1/m], (..., 3).
 
     Args:

@@ -16,6 +16,8 @@ from typing import ClassVar
 
 import numpy as np
 
+from physworld.arrays import Array
+
 
 @dataclass(frozen=True)
 class SheetLaw:
@@ -60,7 +62,7 @@ class SheetLaw:
         stiffest = max(self.membrane_shape[:2])
         return float(np.sqrt(self.membrane_n_m * stiffest / self.density_kg_m2))
 
-    def energy_density(self, strain: np.ndarray, curvature: np.ndarray) -> np.ndarray:
+    def energy_density(self, strain: Array, curvature: Array) -> Array:
         """Stored energy [J/m^2] of strains (e11, e22, e12) and curvatures (k11, k22, k12) [1/m], both (..., 3)."""
         return 0.5 * self.membrane_n_m * _quadratic(self.membrane_shape, strain) + (
             0.5 * self.bending_n_m * _quadratic(self.bending_shape, curvature)
@@ -97,7 +99,7 @@ class OrthotropicSheetLaw(SheetLaw):
         return 1.0, ratio, coupling, (1.0 - nu) * self.bending_twist_ratio
 
 
-def sheet_strains(derivatives: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def sheet_strains(derivatives: Array) -> tuple[Array, Array]:
     """Strains (e11, e22, e12) and curvatures (k11, k22, k12) [1/m], both (..., 3).
 
     Args:
@@ -117,7 +119,7 @@ def sheet_strains(derivatives: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return strain, np.einsum("...i,...ki->...k", normal, derivatives[..., 2:, :])
 
 
-def _quadratic(shape: tuple[float, float, float, float], s: np.ndarray) -> np.ndarray:
+def _quadratic(shape: tuple[float, float, float, float], s: Array) -> Array:
     c11, c22, c12, c33 = shape
     return (
         c11 * s[..., 0] ** 2

@@ -11,6 +11,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.materials import neo_hookean
 from physworld.materials.stress import Stress
 
@@ -56,6 +57,6 @@ class SolidLaw:
         mu, lam = self.lame
         return float(np.sqrt((lam + 2 * mu) / self.density_kg_m3))
 
-    def energy_density(self, F: np.ndarray) -> np.ndarray:
+    def energy_density(self, F: Array) -> Array:
         """Stored energy [J/m^3] of deformation gradients (..., 3, 3), without the stiffness field's factor."""
         return neo_hookean.energy_density(F, *self.lame)

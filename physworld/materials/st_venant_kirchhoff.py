@@ -13,6 +13,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.materials.solid import SolidLaw
 from physworld.materials.stress import Stress
 
@@ -45,7 +46,7 @@ class StVenantKirchhoff(SolidLaw):
     name: ClassVar[str] = "st_venant_kirchhoff"
     stress: ClassVar[Stress] = STRESS
 
-    def energy_density(self, F: np.ndarray) -> np.ndarray:
+    def energy_density(self, F: Array) -> Array:
         """Stored energy [J/m^3] of deformation gradients (..., 3, 3)."""
         mu, lam = self.lame
         E = 0.5 * (np.swapaxes(F, -1, -2) @ F - np.eye(3))

@@ -14,6 +14,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.materials import neo_hookean
 from physworld.materials.solid import SolidLaw
 from physworld.materials.stress import Stress
@@ -73,7 +74,7 @@ class TransverselyIsotropic(SolidLaw):
         mu, lam = self.lame
         return float(np.sqrt((lam + 2 * mu + self.fibre_modulus_pa) / self.density_kg_m3))
 
-    def energy_density(self, F: np.ndarray) -> np.ndarray:
+    def energy_density(self, F: Array) -> Array:
         """Stored energy [J/m^3] of deformation gradients (..., 3, 3); infinite where J <= 0."""
         stretched = np.sum((F @ np.array(self.numbers)) ** 2, axis=-1)
         return super().energy_density(F) + self.fibre_modulus_pa / 8 * (stretched - 1) ** 2

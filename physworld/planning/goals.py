@@ -11,13 +11,15 @@ from typing import Protocol
 import numpy as np
 from scipy.spatial import cKDTree
 
+from physworld.arrays import Array
+
 MOST_COMPARED = 256  # points of either side of a Chamfer distance in the search
 
 
 class Goal(Protocol):
     """A distance to be made small."""
 
-    def distance(self, points: np.ndarray) -> np.ndarray:
+    def distance(self, points: Array) -> Array:
         """Mean distance [m] of points (…, N, 3) to the goal, (…)."""
 
 
@@ -25,10 +27,10 @@ class Goal(Protocol):
 class GoalPoints:
     """Points ``index`` (M,) at ``places`` (M, 3) [m]: the mean Euclidean distance."""
 
-    index: np.ndarray
-    places: np.ndarray
+    index: Array
+    places: Array
 
-    def distance(self, points: np.ndarray) -> np.ndarray:
+    def distance(self, points: Array) -> Array:
         """See :class:`Goal`."""
         return np.linalg.norm(points[..., self.index, :] - self.places, axis=-1).mean(axis=-1)
 
@@ -40,9 +42,9 @@ class GoalShape:
     Both sides are thinned to ``MOST_COMPARED`` points that are spread by their order.
     """
 
-    shape: np.ndarray
+    shape: Array
 
-    def distance(self, points: np.ndarray) -> np.ndarray:
+    def distance(self, points: Array) -> Array:
         """See :class:`Goal`."""
         goal = _thinned(self.shape)
         tree = cKDTree(goal)
@@ -53,9 +55,9 @@ class GoalShape:
         return 0.5 * (there.mean(axis=-1) + back)
 
 
-def _spread(count: int) -> np.ndarray:
+def _spread(count: int) -> Array:
     return np.unique(np.linspace(0, count - 1, min(count, MOST_COMPARED)).round().astype(int))
 
 
-def _thinned(points: np.ndarray) -> np.ndarray:
+def _thinned(points: Array) -> Array:
     return points[_spread(len(points))]

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physworld.arrays import Array
+
 SPREAD_PASSES = 2
 ROUNDING = 1e-9
 
@@ -28,18 +30,18 @@ class GripLimits:
 
     speed_m_s: float
     acceleration_m_s2: float
-    box_min_m: np.ndarray
-    box_max_m: np.ndarray
-    spread_max_m: np.ndarray
-    centres_m: np.ndarray
-    start_m_s: np.ndarray | None = None
+    box_min_m: Array
+    box_max_m: Array
+    spread_max_m: Array
+    centres_m: Array
+    start_m_s: Array | None = None
 
     @property
-    def started_m_s(self) -> np.ndarray:
+    def started_m_s(self) -> Array:
         """Velocities of the grips where the plan starts, (G, 3)."""
         return np.zeros_like(self.centres_m) if self.start_m_s is None else self.start_m_s
 
-    def kept(self, velocities: np.ndarray, dt_s: float) -> np.ndarray:
+    def kept(self, velocities: Array, dt_s: float) -> Array:
         """Velocities (…, T, G, 3) cut to the limits, tick by tick: acceleration, speed, workspace, spread.
 
         The first tick's acceleration is from the velocities that the grips have where the plan starts.
@@ -60,13 +62,13 @@ class GripLimits:
             place = wanted
         return out
 
-    def _slowed(self, place: np.ndarray, wanted: np.ndarray, longest_m: float) -> np.ndarray:
+    def _slowed(self, place: Array, wanted: Array, longest_m: float) -> Array:
         """Places (…, G, 3) on the straight way to the wanted ones where no grip moves by more than ``longest_m``."""
         move = np.linalg.norm(wanted - place, axis=-1).max(axis=-1)[..., None, None]
         fast = move > longest_m * (1.0 + ROUNDING)
         return np.where(fast, place + (wanted - place) * (longest_m / np.maximum(move, 1e-300)), wanted)
 
-    def _apart(self, place: np.ndarray) -> np.ndarray:
+    def _apart(self, place: Array) -> Array:
         """Displacements (…, G, 3) with no two grips farther from each other than the material between them is long."""
         count = place.shape[-2]
         for _ in range(SPREAD_PASSES if count > 1 else 0):
@@ -81,6 +83,6 @@ class GripLimits:
         return place
 
 
-def _shortened(vectors: np.ndarray, longest: float) -> np.ndarray:
+def _shortened(vectors: Array, longest: float) -> Array:
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors * np.minimum(1.0, longest / np.maximum(length, 1e-300))

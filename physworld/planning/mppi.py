@@ -22,11 +22,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.errors import Cancelled, UnstableSimulation
 from physworld.planning.goals import Goal
 from physworld.planning.limits import GripLimits
 
-Predict = Callable[[np.ndarray], np.ndarray]
+Predict = Callable[[Array], Array]
 """Predicted points (B, T, N, 3) [m] for displacements (B, T, G, 3) [m] of the grips at ticks 1 … T."""
 
 
@@ -87,8 +88,8 @@ class Found:
         samples: motions rolled out.
     """
 
-    displacements: np.ndarray
-    points: np.ndarray
+    displacements: Array
+    points: Array
     distance_m: float
     costs: tuple[float, ...]
     samples: int
@@ -165,7 +166,7 @@ def search(
     return Found(dt_s * best.cumsum(axis=0), best_points, distance, tuple(costs), drawn)
 
 
-def coloured_noise(generator: np.random.Generator, shape: tuple[int, ...], colour: float) -> np.ndarray:
+def coloured_noise(generator: np.random.Generator, shape: tuple[int, ...], colour: float) -> Array:
     """Normal noise (K, T, …) whose power over axis 1 falls with 1/f^colour; variance 1 over the samples.
 
     It is cut from a longer period, so that its end does not return to its beginning.
@@ -183,14 +184,14 @@ def coloured_noise(generator: np.random.Generator, shape: tuple[int, ...], colou
 
 
 def _costs(
-    points: np.ndarray,
-    velocities: np.ndarray,
+    points: Array,
+    velocities: Array,
     goal: Goal,
     limits: GripLimits,
     dt_s: float,
     config: MppiConfig,
     still: float,
-) -> np.ndarray:
+) -> Array:
     """S of every motion [m]; infinite where the prediction is no number."""
     distance = goal.distance(np.where(np.isfinite(points), points, 1e6))
     first = np.broadcast_to(limits.started_m_s, (len(velocities), 1, *limits.started_m_s.shape))
@@ -201,11 +202,11 @@ def _costs(
     return np.where(np.isfinite(points).all(axis=(1, 2, 3)), total, np.inf)
 
 
-def _ending(distance: np.ndarray, config: MppiConfig) -> np.ndarray:
+def _ending(distance: Array, config: MppiConfig) -> Array:
     return distance[:, -config.settling :].mean(axis=1)
 
 
-def _weights(cost: np.ndarray, temperature: float) -> np.ndarray:
+def _weights(cost: Array, temperature: float) -> Array:
     better = np.sort(cost[np.isfinite(cost)])[: max(2, len(cost) // 2)]
     if len(better) < 2:
         return (cost == cost.min()) / (cost == cost.min()).sum()

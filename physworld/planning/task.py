@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.demonstrate.limits import limits_of
 from physworld.errors import SceneUnsupported
 from physworld.planning.limits import GripLimits
@@ -34,7 +35,7 @@ class PlanningTask:
     model: PublishedModel
     twin: Twin
     scene: Scene
-    grips: tuple[np.ndarray, ...]
+    grips: tuple[Array, ...]
     limits: GripLimits
     threads: int = 1
 
@@ -65,7 +66,7 @@ class PlanningTask:
         return self.model.spec.dt_s
 
     @property
-    def start_points(self) -> np.ndarray:
+    def start_points(self) -> Array:
         """Measured points where a plan begins [m], (N, 3), as the model carries them."""
         return self.model.skin.apply(self.model.start_history[-1])
 
@@ -73,8 +74,8 @@ class PlanningTask:
         self,
         speed_m_s: float | None = None,
         acceleration_m_s2: float | None = None,
-        box_min_m: np.ndarray | None = None,
-        box_max_m: np.ndarray | None = None,
+        box_min_m: Array | None = None,
+        box_max_m: Array | None = None,
     ) -> PlanningTask:
         """The task with other limits where they are given; boxes (3,) hold for every grip and hold its start."""
         old = self.limits
@@ -91,7 +92,7 @@ class PlanningTask:
             )
         return replace(self, limits=limits)
 
-    def controllers(self, displacements: np.ndarray) -> np.ndarray:
+    def controllers(self, displacements: Array) -> Array:
         """All controllers (…, h+1+T, K, 3) [m] for displacements (…, T, G, 3) of the grips after the history."""
         past = self.model.start_controllers
         lead, ticks = displacements.shape[:-3], displacements.shape[-3]
@@ -101,12 +102,12 @@ class PlanningTask:
             path[..., len(past) :, grip, :] += displacements[..., g, None, :]
         return path
 
-    def predict(self, displacements: np.ndarray) -> np.ndarray:
+    def predict(self, displacements: Array) -> Array:
         """Measured points (B, T, N, 3) [m] that the model predicts at the ticks of (B, T, G, 3)."""
         rolled = self.model.rollout_batch(self.controllers(displacements), threads=self.threads)
         return self.model.skin.apply(rolled[:, len(self.model.start_history) :])
 
-    def execute(self, displacements: np.ndarray) -> np.ndarray:
+    def execute(self, displacements: Array) -> Array:
         """Measured points (T, N, 3) [m] that the twin gives for (T, G, 3), from its own start.
 
         Raises SimulationError when the run cannot be trusted.

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.evaluate.baselines import constant_velocity, rigid_follow, static
 from physworld.scene import Scene
 
@@ -24,12 +25,12 @@ class Residuals:
         order: tracked points along the body's longest axis, (N,).
     """
 
-    times: np.ndarray
-    before: np.ndarray
-    after: np.ndarray
-    baselines: dict[str, np.ndarray]
+    times: Array
+    before: Array
+    after: Array
+    baselines: dict[str, Array]
     split: int
-    order: np.ndarray
+    order: Array
 
     @property
     def same(self) -> bool:
@@ -42,7 +43,7 @@ class Residuals:
         return float(self.times[self.split]) if self.split < len(self.times) else None
 
 
-def residuals(scene: Scene, before: np.ndarray, after: np.ndarray, split: int) -> Residuals:
+def residuals(scene: Scene, before: Array, after: Array, split: int) -> Residuals:
     """Residuals of two predictions (T, N, 3) [m].
 
     Raises:
@@ -67,22 +68,22 @@ def residuals(scene: Scene, before: np.ndarray, after: np.ndarray, split: int) -
     )
 
 
-def per_frame(residual: np.ndarray) -> np.ndarray:
+def per_frame(residual: Array) -> Array:
     """Root mean squared coordinate of (T, N, 3) in every frame, (T,); NaN where nothing was seen."""
     return _root_mean(residual, (1, 2))
 
 
-def per_point(residual: np.ndarray) -> np.ndarray:
+def per_point(residual: Array) -> Array:
     """Root mean squared coordinate of (T, N, 3) of every point, (N,); NaN where it was never seen."""
     return _root_mean(residual, (0, 2))
 
 
-def carpet(residual: np.ndarray, order: np.ndarray) -> np.ndarray:
+def carpet(residual: Array, order: Array) -> Array:
     """Length of the residual (T, N, 3) over points in their order and frames, (N, T)."""
     return np.linalg.norm(residual, axis=2).T[order]
 
 
-def mean_component(residual: np.ndarray, axis: int) -> np.ndarray:
+def mean_component(residual: Array, axis: int) -> Array:
     """Mean over the seen points of one component, (T,), with its sign."""
     values = residual[..., axis]
     seen = np.isfinite(values)
@@ -90,7 +91,7 @@ def mean_component(residual: np.ndarray, axis: int) -> np.ndarray:
     return np.where(seen.any(axis=1), total / np.maximum(seen.sum(axis=1), 1), np.nan)
 
 
-def _root_mean(residual: np.ndarray, axes: tuple[int, int]) -> np.ndarray:
+def _root_mean(residual: Array, axes: tuple[int, int]) -> Array:
     seen = np.isfinite(residual)
     count = seen.sum(axis=axes)
     square = np.where(seen, residual, 0.0) ** 2

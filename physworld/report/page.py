@@ -13,8 +13,7 @@ import json
 from importlib.resources import files
 from typing import Any
 
-import numpy as np
-
+from physworld.arrays import Array
 from physworld.report import pictures, words
 from physworld.report.curves import Residuals, residuals
 from physworld.report.markup import Child, Html, tag
@@ -25,7 +24,7 @@ _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-
 _CLAIMED = ("named", "equivalent_set", "data_issue", "numerical_issue")
 
 
-def render(report: dict[str, Any], scene: Scene, before: np.ndarray, after: np.ndarray) -> str:
+def render(report: dict[str, Any], scene: Scene, before: Array, after: Array) -> str:
     """The page as text.
 
     Args:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.report.curves import Residuals, carpet, mean_component, per_frame
 from physworld.report.markup import Child, Html, tag
 from physworld.report.svg import Axes, Series, legend_of, line_chart, picture, short
@@ -169,7 +170,7 @@ def experiment(suggested: dict[str, Any], sigma: float | None) -> Html | None:
     return tag("div", *charts, class_="two")
 
 
-def png(rgba: np.ndarray) -> str:
+def png(rgba: Array) -> str:
     """A picture (H, W, 4) uint8 as a data address."""
     height, width, _ = rgba.shape
     rows = np.concatenate([np.zeros((height, 1), np.uint8), rgba.reshape(height, -1)], axis=1)
@@ -185,7 +186,7 @@ def png(rgba: np.ndarray) -> str:
     return "data:image/png;base64," + base64.b64encode(data).decode()
 
 
-def _carpet(values: np.ndarray, top: float, found: Residuals) -> Html:
+def _carpet(values: Array, top: float, found: Residuals) -> Html:
     """Points (rows) over frames (columns); uneven times are drawn as they are."""
     points, frames = values.shape
     rgba = np.zeros((points, frames, 4), np.uint8)
@@ -250,10 +251,10 @@ def _percent(share: float) -> str:
     return f"{100 * min(max(share, 0.0), 1.0):.1f}%"
 
 
-def _picked(found: Residuals) -> np.ndarray:
+def _picked(found: Residuals) -> Array:
     count = len(found.times)
     return np.unique(np.linspace(0, count - 1, min(count, MOST_FRAMES)).round().astype(int))
 
 
-def _mm(values: np.ndarray) -> list[float | None]:
+def _mm(values: Array) -> list[float | None]:
     return [MM * v if math.isfinite(v) else None for v in values.tolist()]

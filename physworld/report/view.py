@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.report.curves import Residuals, per_point
 from physworld.report.markup import Html, tag
 from physworld.scene import Scene
@@ -18,7 +19,7 @@ _STEPS = 32767
 _MISSING = -32768
 
 
-def view(scene: Scene, before: np.ndarray, after: np.ndarray, found: Residuals) -> Html:
+def view(scene: Scene, before: Array, after: Array, found: Residuals) -> Html:
     """Canvases with their data and controls; the script is :func:`script`."""
     panes = [("before", "Twin" if found.same else "Before")] + ([] if found.same else [("after", "After")])
     canvases = [
@@ -60,7 +61,7 @@ def script() -> str:
     return files(__package__).joinpath("viewer.js").read_text()
 
 
-def _data(scene: Scene, before: np.ndarray, after: np.ndarray, found: Residuals) -> dict[str, Any]:
+def _data(scene: Scene, before: Array, after: Array, found: Residuals) -> dict[str, Any]:
     frames = np.unique(
         np.linspace(0, len(scene.times) - 1, min(len(scene.times), MOST_FRAMES)).round().astype(int)
     )
@@ -102,14 +103,14 @@ def _data(scene: Scene, before: np.ndarray, after: np.ndarray, found: Residuals)
     }
 
 
-def _packed(cloud: np.ndarray, low: np.ndarray, size: float) -> str:
+def _packed(cloud: Array, low: Array, size: float) -> str:
     """Places in steps of the view's size over 32767, little-endian int16, base64."""
     finite = np.isfinite(cloud)
     steps = np.clip(np.round((np.where(finite, cloud, low) - low) / size * _STEPS), -_STEPS, _STEPS)
     return base64.b64encode(np.where(finite, steps, _MISSING).astype("<i2").tobytes()).decode()
 
 
-def _edges(scene: Scene, points: np.ndarray) -> list[list[int]]:
+def _edges(scene: Scene, points: Array) -> list[list[int]]:
     """The declared topology between the points that are shown."""
     if scene.body.edges is None:
         return []

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.optimize import lsq_linear
 
+from physworld.arrays import Array
 from physworld.trace.refit import Refit, prior_rows
 
 MEANINGFUL = 2.0  # standard errors by which a model must predict better than a simpler one
@@ -23,8 +24,8 @@ _RIDGE = 1e-9  # of the normal matrix's diagonal
 class CrossValidation:
     """Mean squared whitened error of every block, (B,), and the blocks' sizes, (B,)."""
 
-    errors: np.ndarray
-    sizes: np.ndarray
+    errors: Array
+    sizes: Array
 
     @property
     def mean(self) -> float:
@@ -32,7 +33,7 @@ class CrossValidation:
         return float(np.average(self.errors, weights=self.sizes))
 
 
-def cross_validated(fitted: Refit, block_of_row: np.ndarray) -> CrossValidation:
+def cross_validated(fitted: Refit, block_of_row: Array) -> CrossValidation:
     """Leave-one-block-out errors of a refit."""
     blocks = np.unique(block_of_row)
     normal, gradient = [], []
@@ -54,7 +55,7 @@ def cross_validated(fitted: Refit, block_of_row: np.ndarray) -> CrossValidation:
     return CrossValidation(np.array(errors), np.array(sizes))
 
 
-def _within_bounds(normal: np.ndarray, gradient: np.ndarray, fitted: Refit) -> np.ndarray:
+def _within_bounds(normal: Array, gradient: Array, fitted: Refit) -> Array:
     """The step (p,) that minimises d.normal.d / 2 - gradient.d and leaves no unknown outside its bounds.
 
     A step that is clipped afterwards leaves the others where they made up for what was cut off.
@@ -70,7 +71,7 @@ def _within_bounds(normal: np.ndarray, gradient: np.ndarray, fitted: Refit) -> n
     return scale * lsq_linear(factor.T, target, bounds, method="bvls").x
 
 
-def seen_through(residual: np.ndarray, basis: np.ndarray, block_of_row: np.ndarray) -> CrossValidation:
+def seen_through(residual: Array, basis: Array, block_of_row: Array) -> CrossValidation:
     """Mean squared error of every block once the directions ``basis`` (M, k), orthonormal, are taken out."""
     left = (residual - basis @ (basis.T @ residual)) ** 2
     sizes = np.bincount(block_of_row)
@@ -97,7 +98,7 @@ def better_beyond_chance(better: CrossValidation, worse: CrossValidation) -> boo
     return gain > MEANINGFUL * spread and better.mean < worse.mean
 
 
-def _mean_with_error(values: np.ndarray, sizes: np.ndarray) -> tuple[float, float]:
+def _mean_with_error(values: Array, sizes: Array) -> tuple[float, float]:
     """Mean of the blocks' values (B,) weighted with their sizes, and its standard error; infinite for one block."""
     weights = sizes / sizes.sum()
     mean = float(weights @ values)
@@ -107,7 +108,7 @@ def _mean_with_error(values: np.ndarray, sizes: np.ndarray) -> tuple[float, floa
     return mean, spread
 
 
-def alikeness(first: np.ndarray, second: np.ndarray) -> float:
+def alikeness(first: Array, second: Array) -> float:
     """Absolute correlation of two explained residuals (M,)."""
     size = float(np.linalg.norm(first) * np.linalg.norm(second))
     return abs(float(first @ second)) / size if size > 0 else 0.0

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.estimation.simulations import Job
 from physworld.trace.candidates import Candidate
 from physworld.trace.comparison import CrossValidation, better_beyond_chance, cross_validated
@@ -73,12 +74,12 @@ class Confirmation:
 
     simulations: Simulations
     whitener: Whitener
-    block_of_row: np.ndarray
+    block_of_row: Array
     frames: int
     iterations: int
 
     def model(
-        self, base: Model, variants: list[Score], columns: dict[str, np.ndarray], best: Model | None = None
+        self, base: Model, variants: list[Score], columns: dict[str, Array], best: Model | None = None
     ) -> Model | None:
         """``base`` with one effect more, everything refitted; None where no run was usable.
 
@@ -246,7 +247,7 @@ class Confirmation:
             return model
         return Model(model.members, other, cross_validated(other, self.block_of_row))
 
-    def _costs(self, fitted: Refit, places: list[np.ndarray]) -> list[float]:
+    def _costs(self, fitted: Refit, places: list[Array]) -> list[float]:
         """Squared residuals at places (p,); infinite where a run cannot be trusted."""
         low, high = _bounds(fitted)
         twins = [at(fitted.twin, fitted.unknowns, np.clip(place, low, high)) for place in places]
@@ -254,7 +255,7 @@ class Confirmation:
         return [np.inf if t is None else float(np.sum(self.whitener.residual(t) ** 2)) for t in runs]
 
     def _with_gates(
-        self, base: Model, score: Score, columns: np.ndarray, alone: bool, hopeless: float
+        self, base: Model, score: Score, columns: Array, alone: bool, hopeless: float
     ) -> Refit | None:
         """The refit of a variant whose shape stays as it is."""
         candidate = score.candidate
@@ -287,7 +288,7 @@ class Confirmation:
         )  # fmt: skip
 
 
-def _one_by_one(fitted: Refit, columns: np.ndarray, gates: list[Unknown]) -> list[np.ndarray]:
+def _one_by_one(fitted: Refit, columns: Array, gates: list[Unknown]) -> list[Array]:
     """Linear estimates, (k,), with one gate open at a time: what two gates share may have gone to the wrong one."""
     basis = orthonormal(fitted.free_jacobian)
     free, left = project(basis, columns), project(basis, fitted.residual)
@@ -309,7 +310,7 @@ def _hopeless(base: Model, best: Model) -> float:
     return noise + max(_WORSE * left, _HALF * before)
 
 
-def _other_reaches(fitted: Refit) -> list[np.ndarray]:
+def _other_reaches(fitted: Refit) -> list[Array]:
     """Places (p,) with another reach of the clamp, the other unknowns where they then fit best to first order."""
     names = [unknown.name for unknown in fitted.unknowns]
     if REACH not in names:
@@ -326,11 +327,11 @@ def _other_reaches(fitted: Refit) -> list[np.ndarray]:
     return found
 
 
-def _bounds(fitted: Refit) -> tuple[np.ndarray, np.ndarray]:
+def _bounds(fitted: Refit) -> tuple[Array, Array]:
     return np.array([u.low for u in fitted.unknowns]), np.array([u.high for u in fitted.unknowns])
 
 
-def _linear(fitted: Refit, strengths: np.ndarray, columns: np.ndarray) -> np.ndarray:
+def _linear(fitted: Refit, strengths: Array, columns: Array) -> Array:
     """Where the base's unknowns go, to first order, once the candidate has its strengths; (p,)."""
     left = fitted.residual - columns @ strengths
     change = np.linalg.lstsq(fitted.jacobian, left, rcond=1e-8)[0]
@@ -339,7 +340,7 @@ def _linear(fitted: Refit, strengths: np.ndarray, columns: np.ndarray) -> np.nda
     return np.clip(fitted.theta + np.clip(change, -limit, limit), low, high)
 
 
-def _away_from_zero(strengths: np.ndarray, gates: list[Unknown]) -> np.ndarray:
+def _away_from_zero(strengths: Array, gates: list[Unknown]) -> Array:
     if np.any(np.abs(strengths) > _NUDGE):
         return strengths
     return np.array([_NUDGE if gate.high > 0 else -_NUDGE for gate in gates])
@@ -367,6 +368,6 @@ def best_variants(
     return list(taken.values())[:count]
 
 
-def explained_direction(model: Model, base: Model, basis: np.ndarray) -> np.ndarray:
+def explained_direction(model: Model, base: Model, basis: Array) -> Array:
     """What a model explains of the base's residual, (M,), after projection."""
     return project(basis, base.fitted.residual - model.fitted.residual)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.scene import Scene
 
 _STRONG = 0.4  # correlation worth a word
 
 
-def describe(scene: Scene, tracks: np.ndarray, frames: tuple[int, int], sigma: float) -> tuple[float, str]:
+def describe(scene: Scene, tracks: Array, frames: tuple[int, int], sigma: float) -> tuple[float, str]:
     """Root mean squared remainder per axis beyond the noise [m], and a description.
 
     Args:
@@ -30,7 +31,7 @@ def describe(scene: Scene, tracks: np.ndarray, frames: tuple[int, int], sigma: f
     return beyond, "; ".join(part for part in parts if part)
 
 
-def _when(square: np.ndarray, seen: np.ndarray) -> str:
+def _when(square: Array, seen: Array) -> str:
     per_frame = square.sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
     thirds = [float(np.sqrt(part.mean())) for part in np.array_split(per_frame, 3)]
     trend = (
@@ -39,7 +40,7 @@ def _when(square: np.ndarray, seen: np.ndarray) -> str:
     return f"it {trend} over time (thirds: {', '.join(f'{1e3 * t:.2g}' for t in thirds)} mm rms)"
 
 
-def _where(scene: Scene, square: np.ndarray, seen: np.ndarray) -> str:
+def _where(scene: Scene, square: Array, seen: Array) -> str:
     per_point = square.sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
     start = scene.points[0]
     worst = np.argsort(per_point)[-max(len(per_point) // 10, 1) :]
@@ -49,14 +50,14 @@ def _where(scene: Scene, square: np.ndarray, seen: np.ndarray) -> str:
     return f"a tenth of the points, about ({place}) m at the start, carries {share:.0%} of its square"
 
 
-def _along(error: np.ndarray) -> str:
+def _along(error: Array) -> str:
     values, vectors = np.linalg.eigh(error.T @ error)
     share = float(values[-1] / max(values.sum(), 1e-300))
     way = ", ".join(f"{c:+.2f}" for c in vectors[:, -1])
     return f"{share:.0%} of it along ({way})" if share > 0.5 else "it has no main direction"
 
 
-def _with(scene: Scene, tracks: np.ndarray, error: np.ndarray, seen: np.ndarray, window: slice) -> list[str]:
+def _with(scene: Scene, tracks: Array, error: Array, seen: Array, window: slice) -> list[str]:
     """Correlations with motions that a missing law would depend on."""
     velocity = np.gradient(tracks, scene.times, axis=0)
     acceleration = np.gradient(velocity, scene.times, axis=0)

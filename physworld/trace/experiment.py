@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.estimation.simulations import Drive
 from physworld.scene import Scene
 from physworld.trace.experiment_search import ExperimentConfig, Search, Tried
@@ -71,10 +72,10 @@ class Experiment:
     separates: bool
     description: str
     motion: str | None = None
-    times_s: np.ndarray = field(default_factory=lambda: np.empty(0))
-    controllers: np.ndarray = field(default_factory=lambda: np.empty((0, 0, 3)))
-    frame_times_s: np.ndarray = field(default_factory=lambda: np.empty(0))
-    difference_m: np.ndarray = field(default_factory=lambda: np.empty(0))
+    times_s: Array = field(default_factory=lambda: np.empty(0))
+    controllers: Array = field(default_factory=lambda: np.empty((0, 0, 3)))
+    frame_times_s: Array = field(default_factory=lambda: np.empty(0))
+    difference_m: Array = field(default_factory=lambda: np.empty(0))
     separation_sigmas: float = 0.0
     recording_sigmas: float | None = None
     tried: int = 0
@@ -176,7 +177,7 @@ def _of_recording(rivals: list[Rival]) -> float | None:
     return min(float(np.linalg.norm(a - b)) for k, a in enumerate(left) for b in left[:k])
 
 
-def _difference(tracks: tuple[np.ndarray, ...]) -> np.ndarray:
+def _difference(tracks: tuple[Array, ...]) -> Array:
     """Root mean squared coordinate difference of the two nearest predictions in every frame, (T,) [m]."""
     pairs = [a - b for k, a in enumerate(tracks) for b in tracks[:k]]
     nearest = min(pairs, key=lambda gap: float(np.linalg.norm(gap)))
@@ -225,6 +226,6 @@ def _otherwise(instead: tuple[str, ...]) -> str:
     return f" Instead: {'; '.join(instead)}." if instead else ""
 
 
-def _rounded(values: np.ndarray) -> list[Any]:
+def _rounded(values: Array) -> list[Any]:
     """Nested lists to a hundredth of a millimetre or millisecond and better."""
     return np.round(np.asarray(values, dtype=float), 6).tolist()

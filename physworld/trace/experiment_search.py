@@ -13,6 +13,7 @@ from itertools import permutations
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.demonstrate.limits import MotionLimits, limits_of
 from physworld.estimation.simulations import Drive, Job
 from physworld.scene import Scene
@@ -59,7 +60,7 @@ class Tried:
 
     probe: Probe
     motion: Motion
-    tracks: tuple[np.ndarray, ...]
+    tracks: tuple[Array, ...]
     plain: float
     refitted: float | None = None
 
@@ -158,7 +159,7 @@ class Search:
             least = min(least, self._imitated(tried, a, b, numerics))
         return replace(tried, refitted=least)
 
-    def _imitated(self, tried: Tried, truth: int, number: int, numerics: np.ndarray) -> float:
+    def _imitated(self, tried: Tried, truth: int, number: int, numerics: Array) -> float:
         """What is left of the prediction of ``truth`` after Gauss-Newton steps of the rival ``number``."""
         rival, tracks = self.rivals[number], tried.tracks[number]
         left = self._left(rival, tried.tracks[truth], tracks, numerics)
@@ -182,7 +183,7 @@ class Search:
             left, rival, tracks = best
         return left
 
-    def _left(self, rival: Rival, truth: np.ndarray, tracks: np.ndarray, numerics: np.ndarray) -> float:
+    def _left(self, rival: Rival, truth: Array, tracks: Array, numerics: Array) -> float:
         """Norm of the difference that the solver's error does not hide, with the way from the recording's optimum."""
         gap = (truth - tracks).reshape(-1) / self.sigma
         known, _ = _known(replace(rival, unknowns=(), information=None, offset=None), numerics.shape[1])
@@ -191,7 +192,7 @@ class Search:
         moved = 0.0 if rival.information is None else float(away @ rival.information @ away)
         return float(np.sqrt(open_**2 + moved))
 
-    def _slopes(self, tried: Tried, number: int, rival: Rival) -> np.ndarray | None:
+    def _slopes(self, tried: Tried, number: int, rival: Rival) -> Array | None:
         """Change of a rival's prediction per unknown over the noise, (M, p); None where a run fails."""
         steps = [-u.step if u.start + u.step > u.high else u.step for u in rival.unknowns]
         probes = zip(rival.unknowns, steps, strict=True)
@@ -204,14 +205,14 @@ class Search:
             columns.append((tracks - base).reshape(-1) / (step * self.sigma))
         return np.stack(columns, axis=1) if columns else np.empty((base.size, 0))
 
-    def _numerics(self, tried: Tried) -> np.ndarray | None:
+    def _numerics(self, tried: Tried) -> Array | None:
         """What finer cells change over the noise, (M, 1), or (M, 0) without them; None where the run fails."""
         if self.finer is None:
             return np.empty((tried.tracks[0].size, 0))
         (finer,) = self._simulate(tried.motion, [self.finer])
         return None if finer is None else (finer - tried.tracks[0]).reshape(-1, 1) / self.sigma
 
-    def _simulate(self, motion: Motion, twins: list[Twin]) -> list[np.ndarray | None]:
+    def _simulate(self, motion: Motion, twins: list[Twin]) -> list[Array | None]:
         # between the frames too: a clock that is off by a part of a frame must not show as interpolation
         there = self._simulations.elsewhere(Drive(self.control_times, motion.points, self.control_times))
         there.stage = STAGE
@@ -221,7 +222,7 @@ class Search:
         return [None if tracks is None else tracks[::every] for tracks in found]
 
 
-def _known(rival: Rival, numerics: int) -> tuple[np.ndarray, np.ndarray]:
+def _known(rival: Rival, numerics: int) -> tuple[Array, Array]:
     """What is known beforehand of a rival's unknowns and of the solver's error: information and offset."""
     count = len(rival.unknowns)
     known = np.diag(np.full(count + numerics, NUMERICS_AMPLITUDE**-2))
@@ -237,7 +238,7 @@ def from_rest(twin: Twin) -> Twin:
     return replace(twin, body=body, release_s=0.0)
 
 
-def clock_of(scene: Scene, longest_s: float) -> tuple[np.ndarray, np.ndarray]:
+def clock_of(scene: Scene, longest_s: float) -> tuple[Array, Array]:
     """Frame times (T,) and control times (S,) [s] of an experiment at the scene's frame rate."""
     duration = min(float(scene.times[-1] - scene.times[0]), longest_s)
     frames = max(round(duration * scene.fps), 4)

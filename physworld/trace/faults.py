@@ -15,6 +15,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial import cKDTree
 
+from physworld.arrays import Array
 from physworld.scene import Scene
 from physworld.trace.split import Split
 
@@ -32,7 +33,7 @@ _NAMED = 6  # faults that are told one by one
 class Faults:
     """Faulty sightings of one recording, (T, N) bool, and what they are, in words; no words where there are none."""
 
-    sightings: np.ndarray
+    sightings: Array
     words: str
 
     def __bool__(self) -> bool:
@@ -44,9 +45,7 @@ def without_faults(scene: Scene, faults: Faults) -> Scene:
     return replace(scene, visible=scene.visible & ~faults.sightings)
 
 
-def find_faults(
-    points: np.ndarray, visible: np.ndarray, tracks: np.ndarray, split: Split, sigma: float
-) -> Faults:
+def find_faults(points: Array, visible: Array, tracks: Array, split: Split, sigma: float) -> Faults:
     """Faulty sightings among the training frames.
 
     Args:
@@ -75,9 +74,7 @@ def find_faults(
     return Faults(found, _words(frames, markers))
 
 
-def _markers(
-    error: np.ndarray, trusted: np.ndarray, start: np.ndarray, sigma: float
-) -> dict[int, np.ndarray]:
+def _markers(error: Array, trusted: Array, start: Array, sigma: float) -> dict[int, Array]:
     """Frames (k,) in which points are astray from their neighbours, of whom ``trusted`` (frames, N, 3) is believed."""
     apart = error - _around(trusted, start)
     found = {}
@@ -89,7 +86,7 @@ def _markers(
     return found
 
 
-def _around(error: np.ndarray, start: np.ndarray) -> np.ndarray:
+def _around(error: Array, start: Array) -> Array:
     """Median residual of every point's nearest neighbours, (frames, N, 3); not a number where none of them is seen.
 
     Without a neighbour 0: there is one point only.
@@ -104,7 +101,7 @@ def _around(error: np.ndarray, start: np.ndarray) -> np.ndarray:
     return np.where(none, np.nan, median)
 
 
-def _off_frames(error: np.ndarray, seen: np.ndarray, sigma: float) -> np.ndarray:
+def _off_frames(error: Array, seen: Array, sigma: float) -> Array:
     """Frames in which the points are off together, and from which they come back, (k,)."""
     frames = np.flatnonzero(seen.any(axis=1))
     if not len(frames):
@@ -115,7 +112,7 @@ def _off_frames(error: np.ndarray, seen: np.ndarray, sigma: float) -> np.ndarray
     return np.concatenate([frames[:0], *back])
 
 
-def _astray(frames: np.ndarray, values: np.ndarray, sigma: float) -> list[tuple[int, int]]:
+def _astray(frames: Array, values: Array, sigma: float) -> list[tuple[int, int]]:
     """Half-open runs of a series (k, 3) at frames (k,) that lie beyond a leap from where it was, and are not back."""
     if len(values) < _FEWEST:
         return []
@@ -135,7 +132,7 @@ def _astray(frames: np.ndarray, values: np.ndarray, sigma: float) -> list[tuple[
     return runs
 
 
-def _words(frames: np.ndarray, markers: dict[int, np.ndarray]) -> str:
+def _words(frames: Array, markers: dict[int, Array]) -> str:
     parts = [f"all points in frame {frame}" for frame in frames]
     parts += [
         f"point {n} in frame {off[0]}"

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.evaluate.baselines import constant_velocity, rigid_follow, static
 from physworld.evaluate.metrics import chamfer_l2
 from physworld.scene import Scene
@@ -36,8 +37,8 @@ class HeldOut:
 def measure(
     scene: Scene,
     split: Split,
-    before: np.ndarray,
-    after: np.ndarray,
+    before: Array,
+    after: Array,
     sigma: float | None,
     resamples: int,
     seed: int,
@@ -52,19 +53,19 @@ class Unseen:
 
     scene: Scene
     split: Split
-    before: np.ndarray
-    after: np.ndarray
+    before: Array
+    after: Array
 
     @property
     def window(self) -> slice:
         """Its frames."""
         return slice(*self.split.test)
 
-    def squares(self, tracks: np.ndarray) -> np.ndarray:
+    def squares(self, tracks: Array) -> Array:
         """Sum of squared coordinate errors and their number in every frame, (F, 2)."""
         return _per_frame(self.scene, tracks, self.window)
 
-    def chamfer(self, tracks: np.ndarray) -> float:
+    def chamfer(self, tracks: Array) -> float:
         """Mean over its frames [m]."""
         return chamfer_l2(
             tracks[self.window], self.scene.points[self.window], self.scene.visible[self.window]
@@ -97,20 +98,20 @@ def measure_all(parts: Sequence[Unseen], sigma: float | None, resamples: int, se
     )
 
 
-def _per_frame(scene: Scene, tracks: np.ndarray, window: slice) -> np.ndarray:
+def _per_frame(scene: Scene, tracks: Array, window: slice) -> Array:
     """Sum of squared coordinate errors and their number in every frame, (F, 2)."""
     seen = scene.visible[window]
     square = np.where(seen[..., None], (tracks[window] - scene.points[window]) ** 2, 0.0)
     return np.stack([square.sum(axis=(1, 2)), 3.0 * seen.sum(axis=1)], axis=1)
 
 
-def _root(square: np.ndarray) -> float:
+def _root(square: Array) -> float:
     total = square.sum(axis=0)
     return float(np.sqrt(total[0] / total[1])) if total[1] else float("nan")
 
 
 def _intervals(
-    before: np.ndarray, after: np.ndarray, resamples: int, seed: int
+    before: Array, after: Array, resamples: int, seed: int
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Moving blocks of frames, the same for both predictions."""
     frames = len(before)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.effects.registry import EFFECTS
 from physworld.trace.confirm import Model
 from physworld.trace.refit import Refit, prior_rows
@@ -29,8 +30,8 @@ class Spread:
     """
 
     fitted: Refit
-    drawn: np.ndarray
-    covariance: np.ndarray
+    drawn: Array
+    covariance: Array
     finer: dict[str, float]
 
     def numbers(self) -> dict[str, Number]:
@@ -55,7 +56,7 @@ class Spread:
         """What an effect's numbers imply, with intervals to first order (the delta method)."""
         fitted, unknowns = self.fitted, self.fitted.unknowns
         implied = _implied(fitted.twin, name)
-        slopes: dict[str, np.ndarray] = {key: np.zeros(len(unknowns)) for key in implied}
+        slopes: dict[str, Array] = {key: np.zeros(len(unknowns)) for key in implied}
         for k, unknown in enumerate(unknowns):
             step = np.zeros(len(unknowns))
             step[k] = _STEP * unknown.step * (1.0 if fitted.theta[k] < unknown.high else -1.0)
@@ -84,7 +85,7 @@ class Spread:
 
 
 def spread_of(
-    fitted: Refit, block_of_row: np.ndarray, finer: dict[str, float], resamples: int, seed: int
+    fitted: Refit, block_of_row: Array, finer: dict[str, float], resamples: int, seed: int
 ) -> Spread:
     """How well an optimum is known, by resampling blocks of training frames, and by noise and sensitivities.
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.effects.registry import effect
 from physworld.engine.thin.triangles import Mesh
 from physworld.estimation.simulations import Job
@@ -99,7 +100,7 @@ class _Compared:
         step = _LAGS_S[best] - _LAGS_S[best - 1]
         return _LAGS_S[best] + 0.5 * step * float((before - after) / (before - 2.0 * least + after))
 
-    def followed_best(self, bodies: list[Twin], lag: float) -> tuple[np.ndarray, np.ndarray]:
+    def followed_best(self, bodies: list[Twin], lag: float) -> tuple[Array, Array]:
         """By which logarithm of its stiffness each body follows the first windows best, (B,), and its errors, (B,).
 
         Where the best is the last on either side it is looked for farther on: a plate may have made up for a coarse
@@ -118,7 +119,7 @@ class _Compared:
                 shifts[k], least[k] = own[np.argmin(found)], found.min()
         return shifts, least
 
-    def errors(self, twins: list[Twin], lag: float, windows: list[int]) -> np.ndarray:
+    def errors(self, twins: list[Twin], lag: float, windows: list[int]) -> Array:
         """Mean squared distances of the sightings from each twin's tracks [m^2], summed over windows; or infinite."""
         found = []
         points, seen = self.scene.points[: windows[-1]], self.scene.visible[: windows[-1]]

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.scene import Scene
 from physworld.trace.split import Split
 
@@ -56,7 +57,7 @@ def remarks(sigma: float | None, asked: bool, numerics: Mapping[str, float]) -> 
     ]
 
 
-def noise_sigma(scene: Scene, split: Split, tracks: np.ndarray) -> float | None:
+def noise_sigma(scene: Scene, split: Split, tracks: Array) -> float | None:
     """Deviation per axis [m]; None where too few points were seen in four training frames in a row.
 
     Args:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import numpy as np
-
+from physworld.arrays import Array
 from physworld.scene import Scene
 from physworld.trace.config import TraceConfig
 from physworld.trace.confirm import Model
@@ -57,7 +56,7 @@ class Outcomes:
     def _recordings_of(self, outcomes: list[Outcome]) -> tuple[Recording, ...]:
         return self.recordings.held_out if outcomes[0].role == HELD_OUT else self.recordings.fitted
 
-    def _predictions(self, model: Model, white: Whitener, recordings: list[Recording]) -> list[np.ndarray]:
+    def _predictions(self, model: Model, white: Whitener, recordings: list[Recording]) -> list[Array]:
         """Open loop over all frames, [(T, N, 3)], with the points' own places from the training frames."""
         places = white.place_errors(model.fitted.tracks)
         found = []

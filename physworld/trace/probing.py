@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.demonstrate.bezier import ArcLength, bent
 from physworld.demonstrate.limits import MotionLimits
 from physworld.demonstrate.motion import broken_limit, largest_share, rigid_points
@@ -34,7 +35,7 @@ _UP = np.array([0.0, 0.0, 1.0])
 _IN_TIME = 0.8  # share of the recording within which a lift or a carry arrives, if the speed limit lets it
 _MEAN_TO_PEAK = 0.7  # of the speed profile
 
-Planned = tuple[np.ndarray, np.ndarray, Callable[[str, float], str]]
+Planned = tuple[Array, Array, Callable[[str, float], str]]
 """Displacement (T, 3) [m], rotation vector (T, 3) [rad], and the words for which grips at which scale."""
 
 
@@ -44,14 +45,14 @@ class Probe:
 
     family: str
     grips: tuple[int, ...]
-    coordinates: np.ndarray
+    coordinates: Array
 
 
 @dataclass(frozen=True)
 class Motion:
     """A probe within the limits: points (T, K, 3) [m] and what it does, in words."""
 
-    points: np.ndarray
+    points: Array
     words: str
 
 
@@ -69,13 +70,13 @@ def nudged(probe: Probe, size: float, generator: np.random.Generator) -> Probe:
     return replace(probe, coordinates=1.0 - np.abs(1.0 - np.abs(moved)))
 
 
-def motion_of(probe: Probe, first_pose: np.ndarray, limits: MotionLimits, times: np.ndarray) -> Motion:
+def motion_of(probe: Probe, first_pose: Array, limits: MotionLimits, times: Array) -> Motion:
     """The motion of control points from ``first_pose`` (K, 3) at even ``times`` (T,) [s] from 0."""
     held = np.concatenate([limits.grips[g] for g in probe.grips])
     arm = float(np.linalg.norm(first_pose[held] - first_pose[held].mean(axis=0), axis=1).max())
     travel, turn, words = _FAMILIES[probe.family](probe.coordinates, limits, times, arm)
 
-    def place(scale: float) -> np.ndarray:
+    def place(scale: float) -> Array:
         points = np.repeat(first_pose[None], len(times), axis=0)
         points[:, held] = rigid_points(first_pose[held], scale * travel, scale * turn)
         return points
@@ -87,12 +88,12 @@ def motion_of(probe: Probe, first_pose: np.ndarray, limits: MotionLimits, times:
     return Motion(place(scale), words(which, scale))
 
 
-def _hold(u: np.ndarray, limits: MotionLimits, times: np.ndarray, arm: float) -> Planned:
+def _hold(u: Array, limits: MotionLimits, times: Array, arm: float) -> Planned:
     still = np.zeros((len(times), 3))
     return still, still, lambda which, scale: f"hold {which} still for {times[-1]:.2g} s"
 
 
-def _lift(u: np.ndarray, limits: MotionLimits, times: np.ndarray, arm: float) -> Planned:
+def _lift(u: Array, limits: MotionLimits, times: Array, arm: float) -> Planned:
     low, high = limits.reach_min_m[2], limits.reach_max_m[2]
     height = low + u[0] * (high - low)
     least = LEAST_TRAVEL * (high - low)
@@ -108,7 +109,7 @@ def _lift(u: np.ndarray, limits: MotionLimits, times: np.ndarray, arm: float) ->
     return *path.pose(times), words
 
 
-def _carry(u: np.ndarray, limits: MotionLimits, times: np.ndarray, arm: float) -> Planned:
+def _carry(u: Array, limits: MotionLimits, times: Array, arm: float) -> Planned:
     target = limits.reach_min_m + u[:3] * (limits.reach_max_m - limits.reach_min_m)
     least = LEAST_TRAVEL * float(np.linalg.norm(limits.reach_max_m - limits.reach_min_m))
     chord = float(np.linalg.norm(target))
@@ -128,7 +129,7 @@ def _carry(u: np.ndarray, limits: MotionLimits, times: np.ndarray, arm: float) -
     return *path.pose(times), words
 
 
-def _shake(u: np.ndarray, limits: MotionLimits, times: np.ndarray, arm: float) -> Planned:
+def _shake(u: Array, limits: MotionLimits, times: Array, arm: float) -> Planned:
     way = _direction(u[0], u[1])
     frequency, until, wave = _wave(u[3], u[4], times)
     rate = 2.0 * np.pi * frequency
@@ -149,7 +150,7 @@ def _shake(u: np.ndarray, limits: MotionLimits, times: np.ndarray, arm: float) -
     return travel, np.zeros_like(travel), words
 
 
-def _turn(u: np.ndarray, limits: MotionLimits, times: np.ndarray, arm: float) -> Planned:
+def _turn(u: Array, limits: MotionLimits, times: Array, arm: float) -> Planned:
     axis = _direction(u[0], u[1])
     frequency, until, wave = _wave(u[3], u[4], times)
     rate = 2.0 * np.pi * frequency
@@ -172,13 +173,13 @@ _FAMILIES = {"hold": _hold, "lift": _lift, "carry": _carry, "shake": _shake, "tu
 
 
 def _there_and_back(
-    target: np.ndarray,
-    bend: np.ndarray,
+    target: Array,
+    bend: Array,
     quick: float,
     rest: float,
     back: float,
     limits: MotionLimits,
-    times: np.ndarray,
+    times: Array,
 ) -> tuple[GripPath, float, float]:
     """A path to ``target`` (3,) and a rest, back if ``back`` > 0.5; with its peak speed [m/s] and the rest [s]."""
     curve = bent(np.zeros(3), target, bend)
@@ -198,7 +199,7 @@ def _there_and_back(
     return GripPath(tuple(segments)), profile.cruise_m_s, wait
 
 
-def _wave(pitch: float, share: float, times: np.ndarray) -> tuple[float, float, np.ndarray]:
+def _wave(pitch: float, share: float, times: Array) -> tuple[float, float, Array]:
     """Frequency [Hz], end of the shaking [s], and a sine that swells and fades over a period each, (T,)."""
     end = float(times[-1])
     slowest = FEWEST_PERIODS / end
@@ -210,7 +211,7 @@ def _wave(pitch: float, share: float, times: np.ndarray) -> tuple[float, float, 
     return frequency, until, rise**2 * (3.0 - 2.0 * rise) * np.sin(2.0 * np.pi * frequency * times)
 
 
-def _direction(azimuth: float, height: float) -> np.ndarray:
+def _direction(azimuth: float, height: float) -> Array:
     """A unit vector of the upper half sphere, evenly over it, (3,)."""
     flat = np.sqrt(1.0 - height**2)
     angle = 2.0 * np.pi * azimuth

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.engine.thin.triangles import mesh_of
 from physworld.errors import SceneUnsupported
 from physworld.estimation.simulations import Drive, Job, Runner, in_turn, nodes_of
@@ -110,7 +111,7 @@ class JointSimulations(Simulations):
             others = [_built_like(twin, r.scene, budget, factor) for r in recordings.fitted[1:]]
             self._levels.append((lead, others))
 
-    def run(self, jobs: Sequence[Job]) -> list[np.ndarray | None]:
+    def run(self, jobs: Sequence[Job]) -> list[Array | None]:
         """Tracks of every job, those of all recordings side by side; None where one cannot be trusted."""
         found = [
             self.under(drive, [self._cut(job, k) for job in jobs]) for k, drive in enumerate(self._drives)
@@ -122,7 +123,7 @@ class JointSimulations(Simulations):
             for job, own in zip(jobs, zip(*found, strict=True), strict=True)
         ]
 
-    def first_look(self, job: Job) -> tuple[np.ndarray, np.ndarray]:
+    def first_look(self, job: Job) -> tuple[Array, Array]:
         """Tracks (frames, N, 3) and how they answer to the points' own places, (frames, N, 3, 3).
 
         Raises:
@@ -136,14 +137,14 @@ class JointSimulations(Simulations):
             answers.append(responses(cut.twin, nodes))
         return side_by_side(tracks, job.frames), side_by_side(answers, job.frames)
 
-    def predictions(self, twin: Twin, places: np.ndarray) -> list[np.ndarray | None]:
+    def predictions(self, twin: Twin, places: Array) -> list[Array | None]:
         """Open loop over all frames of every recording, the held-out ones last, [(T, N, 3)].
 
         Args:
             twin: the lead's.
             places: errors of the fitted points' own places [m], (N, r); of recordings that are held out none are known.
         """
-        found: list[np.ndarray | None] = []
+        found: list[Array | None] = []
         for k, recording in enumerate(self.recordings.fitted):
             own = moved(self._twin_of(twin, k), places[recording.points])
             found += self.under(recording.drive, [Job(own, recording.scene.frame_count)])
@@ -190,7 +191,7 @@ def taken_over(twin: Twin, other: Twin) -> Twin:
     )
 
 
-def side_by_side(parts: Sequence[np.ndarray], frames: int) -> np.ndarray:
+def side_by_side(parts: Sequence[Array], frames: int) -> Array:
     """Arrays (T_k, N_k, …) as one (frames, N1 + N2 + …, …); after its end a recording repeats its last frame."""
     padded = [np.concatenate([p[:frames], np.repeat(p[-1:], max(frames - len(p), 0), axis=0)]) for p in parts]
     return padded[0] if len(padded) == 1 else np.concatenate(padded, axis=1)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.estimation.simulations import Job
 from physworld.trace.sensitivity import sensitivities
 from physworld.trace.simulations import Simulations
@@ -39,10 +40,10 @@ class Refit:
 
     unknowns: list[Unknown]
     twin: Twin
-    theta: np.ndarray
-    tracks: np.ndarray
-    residual: np.ndarray
-    jacobian: np.ndarray
+    theta: Array
+    tracks: Array
+    residual: Array
+    jacobian: Array
 
     @property
     def misfit(self) -> float:
@@ -50,7 +51,7 @@ class Refit:
         return float(np.sqrt(np.mean(self.residual**2)))
 
     @property
-    def free_jacobian(self) -> np.ndarray:
+    def free_jacobian(self) -> Array:
         """The sensitivities of the unknowns that no bound holds, (M, r)."""
         low, high = np.array([u.low for u in self.unknowns]), np.array([u.high for u in self.unknowns])
         room = 1e-3 * (high - low)
@@ -70,10 +71,10 @@ def refit(
     unknowns: list[Unknown],
     frames: int,
     iterations: int,
-    starts: list[np.ndarray] | None = None,
+    starts: list[Array] | None = None,
     hopeless: float = np.inf,
     brief: bool = False,
-    jacobian: np.ndarray | None = None,
+    jacobian: Array | None = None,
 ) -> Refit | None:
     """Minimise the whitened misfit and the priors over the unknowns, from the best of the starts.
 
@@ -131,7 +132,7 @@ def refit(
     return Refit(final, at(twin, unknowns, theta), theta, tracks, residual, slope)
 
 
-Found = tuple[np.ndarray, np.ndarray, np.ndarray, float]
+Found = tuple[Array, Array, Array, float]
 
 
 def _cost(found: Found) -> float:
@@ -143,7 +144,7 @@ def _looked(
     whitener: Whitener,
     twin: Twin,
     unknowns: list[Unknown],
-    places: list[np.ndarray],
+    places: list[Array],
     frames: int,
 ) -> list[Found]:
     """What the places (p,) give; those whose run cannot be trusted are left out."""
@@ -156,7 +157,7 @@ def _looked(
     return found
 
 
-def _secant(slope: np.ndarray, theta: np.ndarray, residual: np.ndarray, looked: list[Found]) -> np.ndarray:
+def _secant(slope: Array, theta: Array, residual: Array, looked: list[Found]) -> Array:
     """Sensitivities (M, p) that agree with the runs of a line search from ``theta``, with the best one exactly.
 
     Steps are measured by what each unknown does, so that units do not count.
@@ -170,7 +171,7 @@ def _secant(slope: np.ndarray, theta: np.ndarray, residual: np.ndarray, looked: 
     return slope
 
 
-def prior_rows(unknowns: list[Unknown], theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def prior_rows(unknowns: list[Unknown], theta: Array) -> tuple[Array, Array]:
     """Priors as rows of a least-squares problem: (p,) residuals (mean minus theta over deviation), (p, p) slopes."""
     residual, slope = np.zeros(len(unknowns)), np.zeros((len(unknowns), len(unknowns)))
     for k, unknown in enumerate(unknowns):
@@ -180,20 +181,20 @@ def prior_rows(unknowns: list[Unknown], theta: np.ndarray) -> tuple[np.ndarray, 
     return residual, slope
 
 
-def _prior_cost(unknowns: list[Unknown], theta: np.ndarray) -> float:
+def _prior_cost(unknowns: list[Unknown], theta: Array) -> float:
     residual, _ = prior_rows(unknowns, theta)
     return float(residual @ residual)
 
 
 def _step(
     unknowns: list[Unknown],
-    theta: np.ndarray,
-    residual: np.ndarray,
-    slope: np.ndarray,
+    theta: Array,
+    residual: Array,
+    slope: Array,
     damping: float,
-    low: np.ndarray,
-    high: np.ndarray,
-) -> np.ndarray:
+    low: Array,
+    high: Array,
+) -> Array:
     """Damped Gauss-Newton step (p,); an unknown that a bound holds back stays there."""
     prior_residual, prior_slope = prior_rows(unknowns, theta)
     normal = slope.T @ slope + prior_slope.T @ prior_slope

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import numpy as np
-
+from physworld.arrays import Array
 from physworld.trace.candidates import Candidate
 from physworld.trace.confirm import Model
 from physworld.trace.experiment import Experiment
@@ -50,8 +49,8 @@ class Outcome:
     scene: str
     role: str
     frames: tuple[int, int]
-    before: np.ndarray
-    after: np.ndarray
+    before: Array
+    after: Array
     held_out: HeldOut
 
 
@@ -102,8 +101,8 @@ class TraceResult:
     refused: dict[str, str]
     numerics: dict[str, float]
     finer: dict[tuple[str, ...], dict[str, float]]
-    before: np.ndarray
-    after: np.ndarray
+    before: Array
+    after: Array
     held_out: HeldOut
     remainder_m: float
     remainder: str

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.effects.registry import EFFECTS
 from physworld.trace.confirm import Model
 from physworld.trace.refit import prior_rows
@@ -42,9 +43,9 @@ class Rival:
     names: tuple[str, ...]
     twin: Twin
     unknowns: tuple[Unknown, ...] = ()
-    information: np.ndarray | None = None
-    residual: np.ndarray | None = None
-    offset: np.ndarray | None = None
+    information: Array | None = None
+    residual: Array | None = None
+    offset: Array | None = None
 
     @property
     def label(self) -> str:
@@ -52,11 +53,11 @@ class Rival:
         return " with ".join(EFFECTS[name].title for name in self.names) or "the declared physics"
 
     @property
-    def start(self) -> np.ndarray:
+    def start(self) -> Array:
         """Starts of the unknowns, (p,)."""
         return np.array([unknown.start for unknown in self.unknowns])
 
-    def moved(self, change: np.ndarray) -> Rival:
+    def moved(self, change: Array) -> Rival:
         """With its unknowns started elsewhere, (p,), within their bounds."""
         low, high = (np.array([getattr(u, end) for u in self.unknowns]) for end in ("low", "high"))
         there = np.clip(self.start + change, low, high)
@@ -112,11 +113,11 @@ def _towards(rival: Rival, first: Rival, cost: Callable[[Twin], float]) -> Rival
 
 
 def refit_of(
-    difference: np.ndarray,
-    slope: np.ndarray,
-    information: np.ndarray | None,
-    offset: np.ndarray | None = None,
-) -> tuple[np.ndarray, float]:
+    difference: Array,
+    slope: Array,
+    information: Array | None,
+    offset: Array | None = None,
+) -> tuple[Array, float]:
     """The change x (p,) of the unknowns that hides most of a difference, and the norm of what it cannot hide.
 
     Minimises |difference - slope x|^2 + (x + offset)^T information (x + offset).

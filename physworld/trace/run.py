@@ -16,6 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.calibrate import Journal
 from physworld.calibrate.parameters import BENDING_COUPLING, BENDING_RATIO, TWIST_RATIO, parameters_of
 from physworld.engine.thin.triangles import TriangleLattice
@@ -271,7 +272,7 @@ class _Trace:
         finer = self.twin.lattice.smooth  # a mesh of triangles has no finer cells to ask
         return best if best and finer and best.fitted.misfit <= self.config.near_floor else None
 
-    def _rms(self, tracks: np.ndarray) -> float:
+    def _rms(self, tracks: Array) -> float:
         """Root mean squared residual of the sightings per axis [m]."""
         seen = self.scene.visible[: self.frames]
         return float(np.sqrt(np.mean((tracks - self.scene.points[: self.frames])[seen] ** 2)))
@@ -307,7 +308,7 @@ class _Trace:
         cost = finer.lattice.fill.size * steps
         return numerics.get("finer cells", 0.0) > self.config.resolved and cost <= self.config.affordable
 
-    def _declared(self, white: Whitener, block_of_row: np.ndarray, shifts: tuple[float, ...]) -> Model:
+    def _declared(self, white: Whitener, block_of_row: Array, shifts: tuple[float, ...]) -> Model:
         """The declared physics under the trace's own misfit."""
         self.simulations.stage = "declared physics"
         unknowns = self._calibrated_unknowns(self.twin)
@@ -345,7 +346,7 @@ class _Trace:
         own = (reach, softness, grip_compliance(twin))
         return [*found, *(unknown for unknown in own if unknown is not None)]
 
-    def _turns(self, tracks: np.ndarray, sigma: float) -> list[np.ndarray]:
+    def _turns(self, tracks: Array, sigma: float) -> list[Array]:
         """What the uncertain pose of the start does to the prediction, (frames, N, 3) each."""
         if len(self.recordings.fitted) > 1:
             return []
@@ -357,7 +358,7 @@ class _Trace:
         verdict: Verdict,
         declared: Model,
         white: Whitener,
-        block_of_row: np.ndarray,
+        block_of_row: Array,
         sigma: float | None,
         path: tuple[Step, ...],
         chosen: list[Candidate],

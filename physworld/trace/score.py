@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import lsq_linear
 
+from physworld.arrays import Array
 from physworld.trace.candidates import Candidate
 from physworld.trace.sensitivity import Response
 
@@ -36,8 +37,8 @@ class Score:
 
     candidate: Candidate
     share: float
-    strengths: np.ndarray
-    direction: np.ndarray
+    strengths: Array
+    direction: Array
     p_value: float
     family: float = 0.0
     absorbed: float = 0.0
@@ -58,12 +59,12 @@ class Scores:
     decoys: list[float]
 
 
-def project(basis: np.ndarray, values: np.ndarray) -> np.ndarray:
+def project(basis: Array, values: Array) -> Array:
     """``values`` (M,) or (M, k) less what the orthonormal ``basis`` (M, p) spans."""
     return values - basis @ (basis.T @ values)
 
 
-def orthonormal(columns: np.ndarray) -> np.ndarray:
+def orthonormal(columns: Array) -> Array:
     """A basis of the columns' span, (M, r)."""
     if not columns.shape[1]:
         return columns
@@ -73,11 +74,11 @@ def orthonormal(columns: np.ndarray) -> np.ndarray:
 
 
 def scores(
-    residual: np.ndarray,
-    calibrated: np.ndarray,
+    residual: Array,
+    calibrated: Array,
     responses: list[Response],
-    decoys: list[np.ndarray],
-    block_of_row: np.ndarray,
+    decoys: list[Array],
+    block_of_row: Array,
     level: float,
     resamples: int,
     seed: int,
@@ -118,9 +119,9 @@ def scores(
     return Scores(ranked, float(np.quantile(best, 1.0 - level)), decoy_shares)
 
 
-def _families(responses: list[Response], basis: np.ndarray, left: np.ndarray) -> dict[str, float]:
+def _families(responses: list[Response], basis: Array, left: Array) -> dict[str, float]:
     """Squared residual that all variants with shapes of each effect explain together."""
-    columns: dict[str, list[np.ndarray]] = {}
+    columns: dict[str, list[Array]] = {}
     for response in responses:
         shaped = [response.columns] if response.candidate.shapes else []
         columns.setdefault(response.candidate.effect, []).extend(shaped)
@@ -130,7 +131,7 @@ def _families(responses: list[Response], basis: np.ndarray, left: np.ndarray) ->
     }
 
 
-def _bounded(columns: np.ndarray, left: np.ndarray, candidate: Candidate) -> tuple[float, np.ndarray]:
+def _bounded(columns: Array, left: Array, candidate: Candidate) -> tuple[float, Array]:
     """Fall of the squared residual, and the strengths (k,), of the best fit within the bounds."""
     normal, product = columns.T @ columns, columns.T @ left
     if not np.any(normal):
@@ -146,14 +147,12 @@ def _bounded(columns: np.ndarray, left: np.ndarray, candidate: Candidate) -> tup
     return float(2 * product @ found - found @ normal @ found), found
 
 
-def _explained(columns: np.ndarray, left: np.ndarray) -> float:
+def _explained(columns: Array, left: Array) -> float:
     normal, product = columns.T @ columns, columns.T @ left
     return float(product @ np.linalg.lstsq(normal, product, rcond=None)[0])
 
 
-def _flipped(
-    columns: np.ndarray, left: np.ndarray, block_of_row: np.ndarray, signs: np.ndarray, candidate: Candidate
-) -> np.ndarray:
+def _flipped(columns: Array, left: Array, block_of_row: Array, signs: Array, candidate: Candidate) -> Array:
     """Squared residual explained under every sign pattern, (R,); one-sided where a strength has one sign."""
     products = columns * left[:, None]
     by_block = np.zeros((signs.shape[1], columns.shape[1]))

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.estimation.simulations import Job
 from physworld.trace.candidates import Candidate
 from physworld.trace.comparison import better_beyond_chance, cross_validated
@@ -45,7 +46,7 @@ class SecondResolution:
 
     simulations: Simulations
     white: Whitener
-    block_of_row: np.ndarray
+    block_of_row: Array
     frames: int
     config: TraceConfig
     finer: Twin
@@ -173,7 +174,7 @@ class SecondResolution:
         )
 
 
-def _moved(coarse: np.ndarray, fine: np.ndarray) -> float:
+def _moved(coarse: Array, fine: Array) -> float:
     """Change of what an effect does, over what it does, both whitened (M,)."""
     return float(np.linalg.norm(fine - coarse) / max(float(np.linalg.norm(coarse)), np.finfo(float).tiny))
 

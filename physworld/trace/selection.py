@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.trace.comparison import alikeness, cross_validated
 from physworld.trace.compound import WHOLE, in_parts, is_in_parts
 from physworld.trace.config import TraceConfig
@@ -37,7 +38,7 @@ class Selection:
 
     simulations: Simulations
     white: Whitener
-    block_of_row: np.ndarray
+    block_of_row: Array
     frames: int
     config: TraceConfig
 
@@ -82,7 +83,7 @@ class Selection:
         confirmation: Confirmation,
         base: Model,
         hopeful: list[list[Score]],
-        columns: dict[str, np.ndarray],
+        columns: dict[str, Array],
         ranked: Scores,
     ) -> list[Model]:
         """The base with one more effect, each of the hopeful ones refitted from its linear scores."""
@@ -102,7 +103,7 @@ class Selection:
         confirmation: Confirmation,
         base: Model,
         ranked: Scores,
-        columns: dict[str, np.ndarray],
+        columns: dict[str, Array],
         usable: list[Response],
     ) -> tuple[tuple[str, Search], ...]:
         """What is done to the models with one more effect, in turn; the first to single effects only."""
@@ -219,7 +220,7 @@ class Selection:
         return found
 
     def _alike(
-        self, confirmation: Confirmation, base: Model, tried: list[Model], columns: dict[str, np.ndarray]
+        self, confirmation: Confirmation, base: Model, tried: list[Model], columns: dict[str, Array]
     ) -> list[Model]:
         """Models that to first order do what the best does, refitted from where that one fits.
 
@@ -313,7 +314,7 @@ def _one_a_valley(models: list[Model]) -> list[Model]:
     return found
 
 
-def _strengths(model: Model) -> np.ndarray:
+def _strengths(model: Model) -> Array:
     """Strengths of the last effect's gates in units of their probes, (k,)."""
     member, known = model.members[-1], model.fitted
     names = [unknown.name for unknown in known.unknowns]

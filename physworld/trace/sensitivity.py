@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.estimation.simulations import Job
 from physworld.evaluate.numerics import refined
 from physworld.scene import Scene
@@ -21,7 +22,7 @@ class Response:
     """A candidate's whitened sensitivities per unit of its unknowns, (M, k), and where one run failed."""
 
     candidate: Candidate
-    columns: np.ndarray
+    columns: Array
     failed: bool = False
 
 
@@ -29,10 +30,10 @@ def sensitivities(
     simulations: Simulations,
     whitener: Whitener,
     twin: Twin,
-    base: np.ndarray,
+    base: Array,
     unknowns: list[Unknown],
     frames: int,
-) -> tuple[np.ndarray, list[bool]]:
+) -> tuple[Array, list[bool]]:
     """Whitened change of the prediction per unit of every unknown at its start, (M, p), and which runs failed.
 
     Args:
@@ -59,7 +60,7 @@ def candidate_responses(
     simulations: Simulations,
     whitener: Whitener,
     twin: Twin,
-    base: np.ndarray,
+    base: Array,
     chosen: list[Candidate],
     frames: int,
 ) -> list[Response]:
@@ -76,7 +77,7 @@ def candidate_responses(
             jobs.append(Job(unknown.apply(prepared, here.start + step), frames))
             owners.append((number, step))
     found = simulations.run(jobs)
-    columns: list[list[np.ndarray]] = [[] for _ in chosen]
+    columns: list[list[Array]] = [[] for _ in chosen]
     failed = [False] * len(chosen)
     for (number, step), tracks in zip(owners, found, strict=True):
         failed[number] |= tracks is None
@@ -93,11 +94,11 @@ def numerical_directions(
     simulations: Simulations,
     scene: Scene,
     twin: Twin,
-    base: np.ndarray,
+    base: Array,
     budget: int,
     refinement: float,
     level: float = 1.0,
-) -> tuple[dict[str, np.ndarray], Twin]:
+) -> tuple[dict[str, Array], Twin]:
     """Changes of the prediction (frames, N, 3) that are the solver's own, by name; and the twin on finer cells.
 
     Of a mesh of triangles the cells are what is supposed of the recording: it has no finer ones, and is its own.
@@ -118,7 +119,7 @@ def numerical_directions(
 
 def decoys(
     responses: list[Response], whitener: Whitener, tracks_shape: tuple[int, int], count: int, seed: int
-) -> list[np.ndarray]:
+) -> list[Array]:
     """Sensitivities that are none, (M, 1): smooth in time and over the points, with the spectra of real ones.
 
     Phases of a real sensitivity's time courses are drawn anew for every point pattern, which leaves the size, the

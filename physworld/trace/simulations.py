@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.errors import Cancelled
 from physworld.estimation.simulations import Drive, Job, Runner, in_turn
 
@@ -28,7 +29,7 @@ class Memory:
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
 
-    def get(self, key: str) -> tuple[bool, np.ndarray | None]:
+    def get(self, key: str) -> tuple[bool, Array | None]:
         """Whether the run is known, and its tracks."""
         if key in self._known:
             return True, self._known[key]
@@ -40,7 +41,7 @@ class Memory:
             return False, None
         return True, tracks if tracks.size else None
 
-    def put(self, key: str, tracks: np.ndarray | None) -> None:
+    def put(self, key: str, tracks: Array | None) -> None:
         """Remember a run; one that failed as an empty array."""
         if self._folder is None:
             self._known[key] = tracks
@@ -106,11 +107,11 @@ class Simulations:
         except TimeUp:
             self.ledger.cut.append(stage)
 
-    def run(self, jobs: Sequence[Job]) -> list[np.ndarray | None]:
+    def run(self, jobs: Sequence[Job]) -> list[Array | None]:
         """Tracks of every job. Raises Cancelled, TimeUp."""
         return self.under(self.drive, jobs)
 
-    def under(self, drive: Drive, jobs: Sequence[Job]) -> list[np.ndarray | None]:
+    def under(self, drive: Drive, jobs: Sequence[Job]) -> list[Array | None]:
         """Tracks of every job under this drive. Raises Cancelled, TimeUp."""
         digest = drive.digest()
         keys = [job.fingerprint(digest) for job in jobs]
@@ -130,7 +131,7 @@ class Simulations:
                 self._progress(self.count, 0, self.stage)
         return tracks
 
-    def _timed(self, fresh: Iterator[np.ndarray | None]) -> Iterator[np.ndarray | None]:
+    def _timed(self, fresh: Iterator[Array | None]) -> Iterator[Array | None]:
         """The same, with its seconds in the ledger."""
         begun = time.perf_counter()
         for made in fresh:

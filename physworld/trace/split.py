@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.scene import Scene
 
 HELD_OUT_SHARE = 0.3
@@ -26,14 +27,14 @@ class Split:
 
     train: tuple[int, int]
     test: tuple[int, int]
-    edges: np.ndarray
+    edges: Array
 
     @property
     def blocks(self) -> int:
         """B."""
         return len(self.edges) - 1
 
-    def block_of(self, frames: np.ndarray) -> np.ndarray:
+    def block_of(self, frames: Array) -> Array:
         """Block of every frame."""
         return np.searchsorted(self.edges, frames, side="right") - 1
 

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.effects.places import middle_of_free_end
 from physworld.effects.registry import EFFECTS
 from physworld.trace.candidates import Candidate
@@ -52,14 +53,14 @@ class Start:
     """A tether to begin a refit with: its linear score, and its whitened sensitivity, (M, 1)."""
 
     score: Score
-    columns: np.ndarray
+    columns: Array
 
 
 def with_tethers(
     confirmation: Confirmation,
     base: Model,
     ranked: Scores,
-    columns: dict[str, np.ndarray],
+    columns: dict[str, Array],
     usable: list[Response],
     tried: list[Model],
     complete: float,
@@ -142,7 +143,7 @@ def tethers_between(fitted: Refit, responses: list[Response]) -> list[Start]:
     return sorted(found, key=lambda start: -start.score.share)
 
 
-def _anchored(candidate: Candidate, anchor: np.ndarray, way: np.ndarray) -> Candidate:
+def _anchored(candidate: Candidate, anchor: Array, way: Array) -> Candidate:
     fixed = candidate.fixed | {f"anchor_{a}_m": float(c) for a, c in zip("xyz", anchor, strict=True)}
     return replace(candidate, fixed=fixed, variant="towards " + " ".join(f"{c:+.2f}" for c in way))
 
@@ -163,13 +164,13 @@ def _any_length(confirmation: Confirmation, model: Model) -> Model:
     return longer if beats(longer, model) else model
 
 
-def _squares(ways: np.ndarray) -> np.ndarray:
+def _squares(ways: Array) -> Array:
     """Components xx, yy, zz, xy, xz, yz of n n^T of unit vectors (D, 3), (D, 6); those off the diagonal twice."""
     x, y, z = ways.T
     return np.stack([x * x, y * y, z * z, 2 * x * y, 2 * x * z, 2 * y * z], axis=1)
 
 
-def _sphere(count: int) -> np.ndarray:
+def _sphere(count: int) -> Array:
     """Directions, evenly over the sphere (a Fibonacci lattice), (count, 3)."""
     k = np.arange(count) + 0.5
     polar, around = np.arccos(1.0 - 2.0 * k / count), np.pi * (1.0 + np.sqrt(5.0)) * k

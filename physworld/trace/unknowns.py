@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.calibrate.parameters import BENDING_RATIO, Parameter, bending_ratio
 from physworld.effects.base import Strength
 from physworld.effects.places import gravity_size
@@ -166,7 +167,7 @@ def with_strengths(twin: Twin, effect: str, strengths: dict[str, float]) -> Twin
     return twin.with_effect(replace(now, **strengths))
 
 
-def at(twin: Twin, unknowns: list[Unknown], theta: np.ndarray) -> Twin:
+def at(twin: Twin, unknowns: list[Unknown], theta: Array) -> Twin:
     """The twin with every unknown at its place (p,)."""
     for unknown, searched in zip(unknowns, theta, strict=True):
         twin = unknown.apply(twin, float(searched))

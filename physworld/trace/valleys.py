@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.estimation.simulations import Job
 from physworld.trace.candidates import Candidate
 from physworld.trace.confirm import Confirmation, Model
@@ -44,7 +45,7 @@ class Valley:
 
     candidate: Candidate
     start: Refit
-    strengths: np.ndarray
+    strengths: Array
     cost: float
 
 
@@ -52,7 +53,7 @@ def with_valleys(
     confirmation: Confirmation,
     base: Model,
     ranked: Scores,
-    columns: dict[str, np.ndarray],
+    columns: dict[str, Array],
     tried: list[Model],
     complete: float,
 ) -> list[Model]:
@@ -114,7 +115,7 @@ def valleys(
                 strength = share * gate.high
                 tries.append((candidate, place, strength))
                 jobs.append(Job(gate.apply(there, strength), looked))
-    best: dict[str, tuple[float, Candidate, np.ndarray, float]] = {}
+    best: dict[str, tuple[float, Candidate, Array, float]] = {}
     for (candidate, place, strength), tracks in zip(tries, simulations.run(jobs), strict=True):
         if tracks is None:
             continue
@@ -133,7 +134,7 @@ def valleys(
 
 
 def _moved(
-    simulations: Simulations, whitener: Whitener, fitted: Refit, place: np.ndarray, frames: int
+    simulations: Simulations, whitener: Whitener, fitted: Refit, place: Array, frames: int
 ) -> Refit | None:
     """The declared physics at another place (p,), which is no optimum; None where it cannot be simulated."""
     unknowns = [u.starting(t) for u, t in zip(fitted.unknowns, place, strict=True)]

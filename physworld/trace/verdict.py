@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.trace.comparison import alikeness, better_beyond_chance, difference, seen_through
 from physworld.trace.compound import count_of_effects, is_in_parts, other_names
 from physworld.trace.config import TraceConfig
@@ -62,13 +63,13 @@ class Verdict:
 def decide(
     declared: Model,
     models: list[Model],
-    basis: np.ndarray,
+    basis: Array,
     agreement: dict[tuple[str, ...], bool],
     resolved: float,
     config: TraceConfig,
     tried: int,
-    solver: np.ndarray,
-    block_of_row: np.ndarray,
+    solver: Array,
+    block_of_row: Array,
     chance: Callable[[Model], bool] = lambda model: False,
 ) -> Verdict:
     """The verdict.
@@ -152,8 +153,8 @@ def claimable(
     declared: Model,
     models: list[Model],
     config: TraceConfig,
-    solver: np.ndarray,
-    block_of_row: np.ndarray,
+    solver: Array,
+    block_of_row: Array,
     chance: Callable[[Model], bool],
 ) -> list[Model]:
     """Models that help, also where the solver's own directions are taken out of what they explain.
@@ -171,9 +172,7 @@ def claimable(
     ]
 
 
-def survives(
-    model: Model, declared: Model, solver: np.ndarray, block_of_row: np.ndarray, config: TraceConfig
-) -> bool:
+def survives(model: Model, declared: Model, solver: Array, block_of_row: Array, config: TraceConfig) -> bool:
     """Whether what a model explains is more than what other cells and time steps would change."""
     before, after = (seen_through(m.fitted.residual, solver, block_of_row) for m in (declared, model))
     share = 1.0 - after.mean / before.mean
@@ -271,7 +270,7 @@ def within_noise(model: Model, best: Model) -> bool:
     return best.validated.mean < _BELOW_NOISE and model.validated.mean <= 1.0
 
 
-def richer_and_better(model: Model, best: Model, basis: np.ndarray, declared: Model, alike: float) -> bool:
+def richer_and_better(model: Model, best: Model, basis: Array, declared: Model, alike: float) -> bool:
     """Whether another explanation by as many effects predicts better than the simplest of those that are as good.
 
     By more than a standard error, and more than the noise is known: then it is the discrepancy allowed to a twin that
@@ -283,7 +282,7 @@ def richer_and_better(model: Model, best: Model, basis: np.ndarray, declared: Mo
     return len(model.members) == len(best.members) and gap > max(spread, _NOISE_KNOWN) and same <= alike
 
 
-def indistinguishable(model: Model, best: Model, basis: np.ndarray, declared: Model, alike: float) -> bool:
+def indistinguishable(model: Model, best: Model, basis: Array, declared: Model, alike: float) -> bool:
     """Whether another model that is no less simple does as well, and by explaining the same.
 
     As well: within one standard error, or within half of what the better one leaves above the noise, which may as well

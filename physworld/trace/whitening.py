@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.scene import Scene
 from physworld.trace.split import Split
 from physworld.twin.twin import Twin
@@ -26,10 +27,10 @@ class Place:
     ``response`` (3k, r) is G, ``basis`` (3k, r) spans it, ``shrink`` (r,) is what whitening takes from each direction.
     """
 
-    rows: np.ndarray
-    response: np.ndarray
-    basis: np.ndarray
-    shrink: np.ndarray
+    rows: Array
+    response: Array
+    basis: Array
+    shrink: Array
 
 
 @dataclass(frozen=True)
@@ -47,29 +48,29 @@ class Whitener:
         common: what all points share of an uncertain start: basis (M, k) and shrink (k,), after the places; or None.
     """
 
-    measured: np.ndarray
-    visible: np.ndarray
-    frames: np.ndarray
-    points: np.ndarray
+    measured: Array
+    visible: Array
+    frames: Array
+    points: Array
     sigma: float
     first: int
     places: tuple[Place, ...]
-    common: tuple[np.ndarray, np.ndarray] | None = None
+    common: tuple[Array, Array] | None = None
 
-    def residual(self, tracks: np.ndarray) -> np.ndarray:
+    def residual(self, tracks: Array) -> Array:
         """Whitened measured minus predicted, (M,), of tracks (frames, N, 3) from frame 0."""
         return self._whiten((self.measured - self._seen(tracks)) / self.sigma)
 
-    def change(self, difference: np.ndarray) -> np.ndarray:
+    def change(self, difference: Array) -> Array:
         """Whitened change of a prediction, (M,), of a difference of tracks (frames, N, 3)."""
         return self._whiten(self._seen(difference) / self.sigma)
 
     @property
-    def frame_of_row(self) -> np.ndarray:
+    def frame_of_row(self) -> Array:
         """Frame of every row, (M,)."""
         return np.repeat(self.frames, 3)
 
-    def place_errors(self, tracks: np.ndarray) -> np.ndarray:
+    def place_errors(self, tracks: Array) -> Array:
         """Most probable error of every point's own place [m], (N, r), given a prediction; within three sigma."""
         error = (self.measured - self._seen(tracks)) / self.sigma
         found = []
@@ -78,10 +79,10 @@ class Whitener:
             found.append(np.linalg.solve(normal, place.response.T @ error[place.rows].reshape(-1)))
         return np.clip(np.array(found), -3.0, 3.0) * self.sigma
 
-    def _seen(self, tracks: np.ndarray) -> np.ndarray:
+    def _seen(self, tracks: Array) -> Array:
         return tracks[self.first : self.first + len(self.visible)][self.visible]
 
-    def _whiten(self, values: np.ndarray) -> np.ndarray:
+    def _whiten(self, values: Array) -> Array:
         out = values.copy()
         for place in self.places:
             block = out[place.rows].reshape(-1)
@@ -92,7 +93,7 @@ class Whitener:
         basis, shrink = self.common
         return flat - basis @ (shrink * (basis.T @ flat))
 
-    def knowing(self, differences: list[np.ndarray]) -> Whitener:
+    def knowing(self, differences: list[Array]) -> Whitener:
         """With changes of the prediction, (frames, N, 3) each, that are as likely as not: one deviation each."""
         if not differences:
             return self
@@ -101,7 +102,7 @@ class Whitener:
         return replace(self, common=(u, 1.0 - 1.0 / np.sqrt(1.0 + s**2)))
 
 
-def whitener(scene: Scene, split: Split, sigma: float, responses: np.ndarray) -> Whitener:
+def whitener(scene: Scene, split: Split, sigma: float, responses: Array) -> Whitener:
     """The whitener of the training frames; a point that frame 0 does not show has no place of its own and is left out.
 
     Where frame 0 shows none, all are kept.
@@ -125,7 +126,7 @@ def whitener(scene: Scene, split: Split, sigma: float, responses: np.ndarray) ->
     return Whitener(measured, visible, frames + first, points, sigma, first, tuple(places))
 
 
-def responses(twin: Twin, nodes: np.ndarray) -> np.ndarray:
+def responses(twin: Twin, nodes: Array) -> Array:
     """Change of every track per change of its point's own place in the body, (frames, N, 3, r), r = 3.
 
     The place is its material coordinates, and for a sheet or a rod its offset from it.
@@ -136,7 +137,7 @@ def responses(twin: Twin, nodes: np.ndarray) -> np.ndarray:
     return np.stack(columns, axis=-1)
 
 
-def moved(twin: Twin, shift: np.ndarray) -> Twin:
+def moved(twin: Twin, shift: Array) -> Twin:
     """The twin with its tracked points at other places in the body: ``shift`` (3,) or (N, 3) [m]."""
     body = twin.body
     shift = np.broadcast_to(shift, (len(body.points), 3))

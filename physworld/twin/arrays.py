@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.effects.registry import effect
 from physworld.engine.lattice.lattice import Lattice
 from physworld.engine.thin.triangles import TriangleLattice
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 _BODY = ("rest", "start", "start_velocity", "points", "offsets")
 
 
-def arrays_of(twin: Twin) -> dict[str, np.ndarray]:
+def arrays_of(twin: Twin) -> dict[str, Array]:
     """Everything of a twin; what is no array is JSON under ``facts``."""
     lattice, body = twin.lattice, twin.body
     collider_facts, collider_arrays = to_parts(twin.colliders)
@@ -61,7 +62,7 @@ def arrays_of(twin: Twin) -> dict[str, np.ndarray]:
     }
 
 
-def parts_of(arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+def parts_of(arrays: dict[str, Array]) -> dict[str, Any]:
     """The arguments of :class:`physworld.twin.twin.Twin` but for its device; what older twins lack has its default."""
     facts = json.loads(str(arrays["facts"]))
     flow = facts.get("plasticity")

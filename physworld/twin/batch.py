@@ -10,8 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
-
+from physworld.arrays import Array
 from physworld.engine.total.batch import Batch
 from physworld.errors import BatchRefused, SimulationError
 from physworld.twin.twin import Progress, Twin
@@ -29,10 +28,10 @@ class Episode:
         from_rest: starts without the recording's initial velocity.
     """
 
-    control_times: np.ndarray
-    control_points: np.ndarray
-    frame_times: np.ndarray
-    properties: np.ndarray | None = None
+    control_times: Array
+    control_points: Array
+    frame_times: Array
+    properties: Array | None = None
     parameters: Mapping[str, float] = field(default_factory=dict)
     from_rest: bool = False
 
@@ -46,10 +45,10 @@ class Outcome:
         error: why it cannot; else None.
     """
 
-    nodes: np.ndarray | None
+    nodes: Array | None
     error: SimulationError | None
 
-    def trusted(self) -> np.ndarray:
+    def trusted(self) -> Array:
         """The carriers at the frames; raises the episode's error where there is one."""
         if self.error is not None:
             raise self.error

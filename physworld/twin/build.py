@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.engine.choose import choose_formulation
 from physworld.engine.thin.self_contact import COARSE, apart_m, refuse_thickness
 from physworld.engine.thin.triangles import Mesh
@@ -109,9 +110,9 @@ def build_twin(
 def _turning(
     scene: Scene,
     body: ReferenceBody,
-    first: np.ndarray,
-    groups: tuple[np.ndarray, ...],
-    held: list[np.ndarray],
+    first: Array,
+    groups: tuple[Array, ...],
+    held: list[Array],
 ) -> tuple[tuple[int, ...], tuple[str, ...]]:
     """Grips of a rope between which it carries twist, and a note on every other one; of one grip alone nothing."""
     if body.lattice.dim != 1 or sum(len(nodes) > 0 for nodes in held) < 2:

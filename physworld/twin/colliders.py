@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from physworld.arrays import Array
 from physworld.engine.lattice.lattice import Lattice
 from physworld.engine.terms.colliders import Collider
 from physworld.engine.terms.colliders_path import RigidPath
@@ -34,10 +35,10 @@ class TwinCollider:
 
     declared: DeclaredCollider
     shape: sdf.Shape
-    times: np.ndarray
-    poses: np.ndarray
+    times: Array
+    poses: Array
 
-    def on_its_way(self, start: np.ndarray, times: np.ndarray, controllers: np.ndarray) -> Collider:
+    def on_its_way(self, start: Array, times: Array, controllers: Array) -> Collider:
         """The collider under a control track.
 
         Args:
@@ -54,7 +55,7 @@ class TwinCollider:
         return Collider(self.declared.name, self.shape, path, float(self.declared.friction or 0.0))
 
     def contact(
-        self, collider: Collider, lattice: Lattice, nodes: np.ndarray, start_s: float, offset_m: float
+        self, collider: Collider, lattice: Lattice, nodes: Array, start_s: float, offset_m: float
     ) -> Any:
         """The term between this collider and a body that starts at ``nodes`` (n, 3) [m] at ``start_s``.
 
@@ -85,12 +86,12 @@ def twin_colliders(scene: Scene, margin_m: float, friction: float) -> tuple[Twin
     return tuple(_twin_collider(scene, declared, margin_m, friction) for declared in scene.colliders)
 
 
-def carried(scene: Scene) -> np.ndarray:
+def carried(scene: Scene) -> Array:
     """Controllers that carry colliders and so grip nothing, ascending."""
     return np.array(sorted({i for collider in scene.colliders for i in collider.controllers}), dtype=int)
 
 
-def to_parts(colliders: tuple[TwinCollider, ...]) -> tuple[list[dict[str, Any]], dict[str, np.ndarray]]:
+def to_parts(colliders: tuple[TwinCollider, ...]) -> tuple[list[dict[str, Any]], dict[str, Array]]:
     """Facts fit for JSON and arrays fit for an npz; :func:`from_parts` is the inverse."""
     facts, arrays = [], {}
     for number, collider in enumerate(colliders):
@@ -109,7 +110,7 @@ def to_parts(colliders: tuple[TwinCollider, ...]) -> tuple[list[dict[str, Any]],
 
 
 def from_parts(
-    facts: list[dict[str, Any]], arrays: dict[str, np.ndarray], margin_m: float
+    facts: list[dict[str, Any]], arrays: dict[str, Array], margin_m: float
 ) -> tuple[TwinCollider, ...]:
     """The colliders that :func:`to_parts` took apart."""
     colliders = []
@@ -171,5 +172,5 @@ def _shape(declared: DeclaredCollider, margin_m: float) -> sdf.Shape:
     raise SceneUnsupported(f"collider {declared.name!r} has the unknown shape {declared.shape!r}")
 
 
-def _rotations(quaternions_wxyz: np.ndarray) -> np.ndarray:
+def _rotations(quaternions_wxyz: Array) -> Array:
     return Rotation.from_quat(quaternions_wxyz, scalar_first=True).as_matrix()

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.engine.problem import HeldNodes
 from physworld.engine.terms.soft_grips import AS_HELD, gripped_points, holds_a_part, touched_nodes
 from physworld.engine.terms.term import Term
@@ -30,7 +31,7 @@ _FLAT = 1e-9  # component of a unit normal along which a sheet has no depth
 _LEVER_SIGMAS = 10.0  # of the tracking noise that control points must stand off the rope's axis
 
 
-def gripped_nodes(body: ReferenceBody, controllers: np.ndarray, grip: Grip | None) -> np.ndarray:
+def gripped_nodes(body: ReferenceBody, controllers: Array, grip: Grip | None) -> Array:
     """Every node that gripped material touches: all nodes of cells most of whose material is in the grip.
 
     In the grip is what lies in its declared box, or within its radius of any of its controllers; without either, what
@@ -69,7 +70,7 @@ def gripped_nodes(body: ReferenceBody, controllers: np.ndarray, grip: Grip | Non
     return np.unique(lattice.cell_nodes[cells])
 
 
-def _through(body: ReferenceBody, particles: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+def _through(body: ReferenceBody, particles: Array, low: Array, high: Array) -> Array:
     """Whether the body lies in the box from ``low`` to ``high`` (3,) at particles (P, 3), somewhere in its depth, (P,).
 
     A sheet reaches half its thickness to either side along its normal, and nowhere else: a box that ends on it holds
@@ -98,9 +99,7 @@ def _through(body: ReferenceBody, particles: np.ndarray, low: np.ndarray, high: 
     return (first <= last) & ~outside.any(axis=1)
 
 
-def _within(
-    body: ReferenceBody, particles: np.ndarray, controllers: np.ndarray, radius_m: float
-) -> np.ndarray:
+def _within(body: ReferenceBody, particles: Array, controllers: Array, radius_m: float) -> Array:
     """Which particles (P, 3) with material lie within a radius of any controller (k, 3), (P,) bool.
 
     Particles stand for an eighth of a cell, or a quarter or a half: one that is as near as its own size counts where no
@@ -118,7 +117,7 @@ def _within(
     return distance <= max(radius_m, nearest)
 
 
-def declared_region(grip: Grip | None, dim: int) -> np.ndarray | None:
+def declared_region(grip: Grip | None, dim: int) -> Array | None:
     """The box that a grip of a solid holds at the start, (2, 3) [m]; None where none with a depth is declared."""
     if dim != 3 or grip is None or grip.region_min_m is None:
         return None
@@ -139,14 +138,14 @@ def softly_held(twin: Twin) -> Twin:
     return replace(twin, grip_softness=AS_HELD)
 
 
-def soft_regions(twin: Twin) -> list[np.ndarray]:
+def soft_regions(twin: Twin) -> list[Array]:
     """Boxes (2, 3) [m] that soft grips hold; none where all gripped nodes are prescribed."""
     if twin.grip_softness <= 0 or twin.formulation != "total_lagrangian":
         return []
     return [region for region in twin.grip_regions if region is not None]
 
 
-def with_touched_nodes(twin: Twin, start: np.ndarray) -> Twin:
+def with_touched_nodes(twin: Twin, start: Array) -> Twin:
     """A twin whose declared grips hold every node that material in their boxes touches at ``start`` (n, 3)."""
     held = []
     taken = np.concatenate([np.empty(0, dtype=int), *twin.held_nodes])
@@ -159,7 +158,7 @@ def with_touched_nodes(twin: Twin, start: np.ndarray) -> Twin:
     return replace(twin, held_nodes=tuple(held))
 
 
-def held_paths(twin: Twin, times: np.ndarray, controls: np.ndarray) -> HeldNodes:
+def held_paths(twin: Twin, times: Array, controls: Array) -> HeldNodes:
     """Paths of the held nodes at ``times`` (T,) [s] under control points (T, K, 3) [m]: rigid with their group."""
     numbers, paths = [np.empty(0, dtype=int)], [np.empty((len(times), 0, 3))]
     for group, nodes in zip(twin.controller_groups, twin.held_nodes, strict=True):
@@ -171,9 +170,7 @@ def held_paths(twin: Twin, times: np.ndarray, controls: np.ndarray) -> HeldNodes
     return HeldNodes(np.concatenate(numbers), positions, velocities)
 
 
-def why_no_turn(
-    body: ReferenceBody, nodes: np.ndarray, points: np.ndarray, noise_sigma_m: float | None
-) -> str | None:
+def why_no_turn(body: ReferenceBody, nodes: Array, points: Array, noise_sigma_m: float | None) -> str | None:
     """Why a grip's control points (k, 3) at the start do not show how a rope's section turns; None if they do."""
     if len(points) < 3:
         return f"{len(points)} control points fix no turn about the axis, 3 are needed"
@@ -193,7 +190,7 @@ def why_no_turn(
     return None
 
 
-def twist_between_grips(twin: Twin, times: np.ndarray, controls: np.ndarray) -> tuple[Term, ...]:
+def twist_between_grips(twin: Twin, times: Array, controls: Array) -> tuple[Term, ...]:
     """Twist of a rope's spans between the grips that show a turn, at ``times`` (T,) under ``controls`` (T, K, 3)."""
     turning = [g for g in twin.turning if len(twin.held_nodes[g])]
     if len(turning) < 2 or not isinstance(twin.law, RodLaw) or twin.law.torsion_n_m2 == 0:
@@ -210,7 +207,7 @@ def twist_between_grips(twin: Twin, times: np.ndarray, controls: np.ndarray) -> 
     return (Twist(found),) if found else ()
 
 
-def _extent(body: ReferenceBody, nodes: np.ndarray) -> tuple[float, float]:
+def _extent(body: ReferenceBody, nodes: Array) -> tuple[float, float]:
     """Arc lengths [m] between which a rope's held ``nodes`` fix it: whole cells, else the middle of the nodes."""
     lattice = body.lattice
     whole = np.isin(lattice.cell_nodes, nodes).all(axis=1)
@@ -222,7 +219,7 @@ def _extent(body: ReferenceBody, nodes: np.ndarray) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _bonded_nodes(body: ReferenceBody, grip: Grip) -> np.ndarray:
+def _bonded_nodes(body: ReferenceBody, grip: Grip) -> Array:
     """The two layers of nodes whose splines fix an end face: of a grip without depth."""
     axis = int(np.argmin(grip.region_max_m - grip.region_min_m))
     lattice = body.lattice
@@ -230,5 +227,5 @@ def _bonded_nodes(body: ReferenceBody, grip: Grip) -> np.ndarray:
     return np.flatnonzero(distance < 1.0)
 
 
-def _nearest(particles: np.ndarray, targets: np.ndarray) -> np.ndarray:
+def _nearest(particles: Array, targets: Array) -> Array:
     return np.argmin(np.linalg.norm(targets[:, None] - particles[None], axis=2), axis=1)

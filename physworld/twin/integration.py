@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.engine.problem import HeldNodes, Problem
 
 _MERGE_S = 1e-6  # control and frame times closer than this are one
@@ -24,20 +25,18 @@ class Integration:
     """
 
     problem: Problem
-    velocity: np.ndarray
+    velocity: Array
     held: HeldNodes
-    knots: np.ndarray
-    frame_index: np.ndarray
+    knots: Array
+    frame_index: Array
 
-    def at_frames(self, start: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    def at_frames(self, start: Array, nodes: Array) -> Array:
         """Carriers (T, n, 3) at the frames from those at the knots; before the release they are at ``start`` (n, 3)."""
         held_back = np.repeat(start[None], int(np.sum(self.frame_index < 0)), axis=0)
         return np.concatenate([held_back, nodes[self.frame_index[self.frame_index >= 0]]])
 
 
-def solver_knots(
-    control_times: np.ndarray, frame_times: np.ndarray, release: float
-) -> tuple[np.ndarray, np.ndarray]:
+def solver_knots(control_times: Array, frame_times: Array, release: float) -> tuple[Array, Array]:
     """Times at which the solver stops, and each frame's place among them (-1 before the release)."""
     start = max(float(frame_times[0]), release)
     inner = control_times[(control_times > start) & (control_times < frame_times[-1])]

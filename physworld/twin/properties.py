@@ -9,10 +9,12 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from physworld.arrays import Array
+
 _NEIGHBOURS = 8
 
 
-def together(*fields: np.ndarray | None) -> np.ndarray | None:
+def together(*fields: Array | None) -> Array | None:
     """The sum of fields (P, 2) or (P, 3); a missing column is zero. None if there is none.
 
     Raises:
@@ -30,7 +32,7 @@ def together(*fields: np.ndarray | None) -> np.ndarray | None:
     return total
 
 
-def carried(field: np.ndarray | None, sources: np.ndarray, targets: np.ndarray) -> np.ndarray | None:
+def carried(field: Array | None, sources: Array, targets: Array) -> Array | None:
     """A field (P, k) of particles at ``sources`` (P, 3) at ``targets`` (Q, 3): the nearest ones by inverse distance."""
     if field is None:
         return None

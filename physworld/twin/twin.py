@@ -18,6 +18,7 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.sparse.linalg import splu
 
+from physworld.arrays import Array
 from physworld.effects.base import Effect
 from physworld.effects.registry import in_order
 from physworld.engine.choose import FormulationName
@@ -80,16 +81,16 @@ class Twin:
 
     body: ReferenceBody
     law: Law
-    gravity_m_s2: np.ndarray
+    gravity_m_s2: Array
     air_drag_per_s: float
     ground_height_m: float | None
     ground_friction: float
-    controller_groups: tuple[np.ndarray, ...]
-    held_nodes: tuple[np.ndarray, ...]
-    controllers_start: np.ndarray
+    controller_groups: tuple[Array, ...]
+    held_nodes: tuple[Array, ...]
+    controllers_start: Array
     release_s: float = 0.0
     grip_softness: float = 0.0
-    grip_regions: tuple[np.ndarray | None, ...] = ()
+    grip_regions: tuple[Array | None, ...] = ()
     turning: tuple[int, ...] = ()
     effects: tuple[Effect, ...] = ()
     colliders: tuple[TwinCollider, ...] = ()
@@ -97,7 +98,7 @@ class Twin:
     plasticity: Plasticity | None = None
     formulation: FormulationName = "total_lagrangian"
     transfer: str = Apic.name
-    properties: np.ndarray | None = None
+    properties: Array | None = None
     device: str = "cpu"
 
     @property
@@ -110,17 +111,17 @@ class Twin:
         return self.lattice.interpolation(self.lattice.particle_coordinates)
 
     @property
-    def particles_rest(self) -> np.ndarray:
+    def particles_rest(self) -> Array:
         """Particles of the body without stress [m], (P, 3)."""
         return self._particle_rows @ self.body.rest
 
     @property
-    def particles_start(self) -> np.ndarray:
+    def particles_start(self) -> Array:
         """Particles at the first frame [m], (P, 3)."""
         return self._particle_rows @ self.body.start
 
     @property
-    def particle_mass(self) -> np.ndarray:
+    def particle_mass(self) -> Array:
         """Mass of every particle [kg], (P,)."""
         return self.density * self.lattice.particle_measures
 
@@ -175,14 +176,14 @@ class Twin:
 
     def simulate(
         self,
-        control_times: np.ndarray,
-        control_points: np.ndarray,
-        frame_times: np.ndarray,
+        control_times: Array,
+        control_points: Array,
+        frame_times: Array,
         *,
-        properties: np.ndarray | None = None,
+        properties: Array | None = None,
         progress: Progress | None = None,
         from_rest: bool = False,
-    ) -> np.ndarray:
+    ) -> Array:
         """Particles (P, 3) [m] at every frame, (T, P, 3): see :meth:`simulate_nodes` for the arguments."""
         nodes = self.simulate_nodes(
             control_times,
@@ -196,14 +197,14 @@ class Twin:
 
     def simulate_nodes(
         self,
-        control_times: np.ndarray,
-        control_points: np.ndarray,
-        frame_times: np.ndarray,
+        control_times: Array,
+        control_points: Array,
+        frame_times: Array,
         *,
-        properties: np.ndarray | None = None,
+        properties: Array | None = None,
         progress: Progress | None = None,
         from_rest: bool = False,
-    ) -> np.ndarray:
+    ) -> Array:
         """Integrate under a control track and return the carriers at the frames.
 
         Args:
@@ -238,7 +239,7 @@ class Twin:
         transfer = TRANSFERS[self.transfer]()
         return UpdatedLagrangian(problem, time_step_s, transfer=transfer, plasticity=self.plasticity)
 
-    def with_empty_particles(self, numbers: np.ndarray, solid: np.ndarray) -> np.ndarray:
+    def with_empty_particles(self, numbers: Array, solid: Array) -> Array:
         """All particles (T, P, 3) from those with material, their ``numbers`` and paths (T, len(numbers), 3).
 
         Where there is no material they go along with what is near.
@@ -252,11 +253,11 @@ class Twin:
 
     def integration(
         self,
-        control_times: np.ndarray,
-        control_points: np.ndarray,
-        frame_times: np.ndarray,
+        control_times: Array,
+        control_points: Array,
+        frame_times: Array,
         *,
-        properties: np.ndarray | None = None,
+        properties: Array | None = None,
         from_rest: bool = False,
     ) -> Integration:
         """What :meth:`simulate_nodes` integrates, for whoever wants to integrate it otherwise: same arguments."""
@@ -303,13 +304,13 @@ class Twin:
         problem, held = soften(problem, held, self.grip_softness, regions)
         return Integration(problem, velocity, held, knots, frame_index)
 
-    def particles_at(self, nodes: np.ndarray) -> np.ndarray:
+    def particles_at(self, nodes: Array) -> Array:
         """Particles (T, P, 3) of the carriers' trajectories (T, n, 3)."""
         if self.formulation == "updated_lagrangian":
             return nodes
         return applied(self._particle_rows, nodes)
 
-    def track_nodes(self, nodes: np.ndarray) -> np.ndarray:
+    def track_nodes(self, nodes: Array) -> Array:
         """Tracked points (T, N, 3) of the carriers' trajectories (T, n, 3), from the first frame on."""
         body, lattice = self.body, self.lattice
         if self.formulation == "updated_lagrangian":
@@ -317,7 +318,7 @@ class Twin:
             return follow(lattice.interpolation(body.points) @ body.start, nodes[:, material])
         return material_tracks(body, nodes)
 
-    def observe(self, nodes: np.ndarray, times: np.ndarray) -> np.ndarray:
+    def observe(self, nodes: Array, times: Array) -> Array:
         """Tracked points (T, N, 3) as the camera reports them: :meth:`track_nodes` and the measurement's effects.
 
         Args:
@@ -332,7 +333,7 @@ class Twin:
             tracks = known.measured(times, tracks, self)
         return tracks
 
-    def track(self, particles: np.ndarray) -> np.ndarray:
+    def track(self, particles: Array) -> Array:
         """Tracked points (T, N, 3) of particle trajectories (T, P, 3), through the nodes that carry them.
 
         Where a body is one cell thick its particles do not fix the nodes: the smoothest of them are taken. In the
@@ -346,12 +347,12 @@ class Twin:
         nodes = factor.solve(rows.T @ flat).reshape(rows.shape[1], -1, 3).transpose(1, 0, 2)
         return self.track_nodes(nodes)
 
-    def to_arrays(self) -> dict[str, np.ndarray]:
+    def to_arrays(self) -> dict[str, Array]:
         """Everything as plain arrays, fit for an npz without pickle; :meth:`from_arrays` is the inverse."""
         return arrays_of(self)
 
     @classmethod
-    def from_arrays(cls, arrays: dict[str, np.ndarray], device: str = "cpu") -> Twin:
+    def from_arrays(cls, arrays: dict[str, Array], device: str = "cpu") -> Twin:
         """The twin that :meth:`to_arrays` took apart, to be simulated on ``device``."""
         return cls(**parts_of(arrays), device=device)
 
@@ -361,20 +362,20 @@ class Twin:
         if self.ground_height_m is None:
             return ()
         plane = ground(self.ground_height_m, self.ground_friction)
-        offsets: np.ndarray | float = 0.0
+        offsets: Array | float = 0.0
         if self.lattice.dim < 3:
             offsets = touching(
                 self.lattice, self.body.start, plane, self.release_s, self.body.half_thickness_m
             )
         return (GroundContact(self.ground_height_m, self.ground_friction, offsets),)
 
-    def _touching_itself(self, held: np.ndarray) -> tuple[Term, ...]:
+    def _touching_itself(self, held: Array) -> tuple[Term, ...]:
         """Contact of the body with itself, but for what the grips hold."""
         if self.self_friction is None:
             return ()
         return (SelfContact(2 * self.body.half_thickness_m, self.self_friction, held),)
 
-    def _friction_factor(self, properties: np.ndarray | None) -> np.ndarray | None:
+    def _friction_factor(self, properties: Array | None) -> Array | None:
         if properties is None or properties.shape[1] < 3:
             return None
         if self.ground_height_m is None or self.formulation == "updated_lagrangian":
@@ -384,7 +385,7 @@ class Twin:
             )
         return np.exp(properties[:, 2])
 
-    def _pushes(self, times: np.ndarray, points: np.ndarray) -> list[Term]:
+    def _pushes(self, times: Array, points: Array) -> list[Term]:
         """Contacts with the colliders under a control track."""
         terms = []
         for known in self.colliders:

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physworld.arrays import Array
+
 MOST_PIXELS = 4096 * 4096
 
 
@@ -29,7 +31,7 @@ class Camera:
     fy: float
     cx: float
     cy: float
-    world_to_camera: np.ndarray
+    world_to_camera: Array
 
     def __post_init__(self) -> None:
         if min(self.width, self.height) < 1 or self.width * self.height > MOST_PIXELS:
@@ -47,11 +49,11 @@ class Camera:
         object.__setattr__(self, "world_to_camera", pose)
 
     @property
-    def centre(self) -> np.ndarray:
+    def centre(self) -> Array:
         """Where it stands in the world [m], (3,)."""
         return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
 
-    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def project(self, points: Array) -> tuple[Array, Array]:
         """Pixels (P, 2) and depths (P,) [m] of points (P, 3); a depth at or below 0 is behind the camera."""
         seen = points @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
         depth = seen[:, 2]
@@ -62,8 +64,8 @@ class Camera:
 
 
 def look_at(
-    eye: np.ndarray,
-    target: np.ndarray,
+    eye: Array,
+    target: Array,
     width: int = 640,
     height: int = 480,
     field_of_view_deg: float = 45.0,
@@ -88,7 +90,7 @@ def look_at(
 
 
 def orbit_view(
-    points: np.ndarray,
+    points: Array,
     azimuth_deg: float = -60.0,
     elevation_deg: float = 20.0,
     width: int = 640,

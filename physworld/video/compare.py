@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
+from physworld.arrays import Array
+
 NOT_MEASURED = "not measured"
 _COVERED = 0.5
 _SSIM_WINDOW_PX = 11
@@ -32,15 +34,15 @@ class FrameScores:
     ssim: float
     iou: float | None
     lpips: float | str
-    per_frame: dict[str, np.ndarray]
+    per_frame: dict[str, Array]
 
 
 def compare_frames(
-    rendered: np.ndarray,
-    given: np.ndarray,
-    alpha: np.ndarray | None = None,
-    masks: np.ndarray | None = None,
-    lpips: Callable[[np.ndarray, np.ndarray], float] | None = None,
+    rendered: Array,
+    given: Array,
+    alpha: Array | None = None,
+    masks: Array | None = None,
+    lpips: Callable[[Array, Array], float] | None = None,
 ) -> FrameScores:
     """Compare frame by frame.
 
@@ -95,7 +97,7 @@ def compare_frames(
     )
 
 
-def _unit(frames: np.ndarray, name: str) -> np.ndarray:
+def _unit(frames: Array, name: str) -> Array:
     frames = np.asarray(frames)
     if frames.ndim != 4 or frames.shape[-1] != 3 or not frames.size:
         raise ValueError(f"{name} frames must be of shape (T, H, W, 3), got {frames.shape}")

@@ -9,8 +9,10 @@ from fractions import Fraction
 import av
 import numpy as np
 
+from physworld.arrays import Array
 
-def encode_mp4(frames: Iterable[np.ndarray], fps: float) -> bytes:
+
+def encode_mp4(frames: Iterable[Array], fps: float) -> bytes:
     """A film of frames (H, W, 3), in [0, 1] or 8 bit; an odd row or column at the edge is left out, as H.264 needs.
 
     Raises:
@@ -42,7 +44,7 @@ def encode_mp4(frames: Iterable[np.ndarray], fps: float) -> bytes:
     return buffer.getvalue()
 
 
-def frames_per_second(times: np.ndarray) -> float:
+def frames_per_second(times: Array) -> float:
     """The rate of frames at ``times`` (T,) [s]: one over their median distance.
 
     Raises:

@@ -14,6 +14,7 @@ import numpy as np
 from plyfile import PlyData, PlyElement, PlyHeaderParseError, PlyParseError
 from scipy.spatial import cKDTree
 
+from physworld.arrays import Array
 from physworld.errors import GaussiansUnreadable
 
 SH_DC = 0.5 / np.sqrt(np.pi)
@@ -40,17 +41,17 @@ class Gaussians:
         harmonics: (G, C, 3) with C = 1, 4, 9 or 16 coefficients a colour channel.
     """
 
-    means: np.ndarray
-    log_scales: np.ndarray
-    rotations: np.ndarray
-    opacity_logits: np.ndarray
-    harmonics: np.ndarray
+    means: Array
+    log_scales: Array
+    rotations: Array
+    opacity_logits: Array
+    harmonics: Array
 
     def __len__(self) -> int:
         return len(self.means)
 
     @property
-    def opacities(self) -> np.ndarray:
+    def opacities(self) -> Array:
         """(G,) in (0, 1)."""
         return 1.0 / (1.0 + np.exp(-self.opacity_logits))
 
@@ -96,7 +97,7 @@ def from_ply(content: bytes) -> Gaussians:
     if len(rest) + 3 not in _COEFFICIENTS or not set(rest) <= names:
         raise GaussiansUnreadable(f"{len(rest)} properties f_rest_*; there must be 0, 9, 24 or 45")
 
-    def columns(*keys: str) -> np.ndarray:
+    def columns(*keys: str) -> Array:
         return np.stack([np.asarray(vertex[key], dtype=np.float64) for key in keys], axis=1)
 
     values = columns(*wanted)
@@ -141,7 +142,7 @@ def to_ply(gaussians: Gaussians) -> bytes:
     return buffer.getvalue()
 
 
-def gaussians_at_points(points: np.ndarray, colours: np.ndarray | None = None) -> Gaussians:
+def gaussians_at_points(points: Array, colours: Array | None = None) -> Gaussians:
     """A plain splat where no photographs are: one sphere a point, as large as the distance to its neighbours.
 
     Args:

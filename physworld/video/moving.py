@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from physworld.arrays import Array
 from physworld.video.gaussians import Gaussians
 from physworld.worldmodel.model.skinning import (
     inverse_distance_weights,
@@ -34,7 +35,7 @@ class GaussianCarrier:
         ValueError: fewer than 2 vertices, or a splat so far from them that it cannot be theirs.
     """
 
-    def __init__(self, gaussians: Gaussians, rest: np.ndarray, neighbours: int = 8) -> None:
+    def __init__(self, gaussians: Gaussians, rest: Array, neighbours: int = 8) -> None:
         self.gaussians, self.rest = gaussians, np.asarray(rest, dtype=np.float64)
         if self.rest.ndim != 2 or self.rest.shape[1] != 3 or len(self.rest) < 2:
             raise ValueError(f"at least 2 vertices of shape (n, 3) carry a splat, got {self.rest.shape}")
@@ -48,7 +49,7 @@ class GaussianCarrier:
         self._around = neighbourhoods(self.rest, min(neighbours, len(self.rest) - 1))
         self.index, self.weight = index, inverse_distance_weights(distance)
 
-    def at(self, moved: np.ndarray) -> tuple[Gaussians, np.ndarray]:
+    def at(self, moved: Array) -> tuple[Gaussians, Array]:
         """The splat when the vertices are at ``moved`` (n, 3), and what each Gaussian was turned by, (G, 4).
 
         Raises:

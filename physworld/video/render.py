@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.video.camera import Camera
 from physworld.video.gaussians import SH_DC, Gaussians
 from physworld.video.render_kernels import TILE, blend
@@ -35,9 +36,9 @@ _C3 = (
 class Picture:
     """A frame: ``rgb`` (H, W, 3) in [0, 1], ``alpha`` (H, W) coverage, ``depth`` (H, W) [m], 0 where nothing is."""
 
-    rgb: np.ndarray
-    alpha: np.ndarray
-    depth: np.ndarray
+    rgb: Array
+    alpha: Array
+    depth: Array
 
 
 class Renderer:
@@ -55,7 +56,7 @@ class Renderer:
         self.camera, self.device = camera, device
         self.background = wp.vec3f(*background)
 
-    def render(self, gaussians: Gaussians, turn: np.ndarray | None = None) -> Picture:
+    def render(self, gaussians: Gaussians, turn: Array | None = None) -> Picture:
         """A frame.
 
         Args:
@@ -111,11 +112,11 @@ class Renderer:
             np.clip(rgb, 0, 1).reshape(*shape, 3), alpha.reshape(shape), (far / covered).reshape(shape)
         )
 
-    def _array(self, values: np.ndarray, kind: type) -> wp.array:
+    def _array(self, values: Array, kind: type) -> wp.array:
         plain = np.int32 if kind is wp.int32 else np.float32
         return wp.array(np.ascontiguousarray(values, dtype=plain), dtype=kind, device=self.device)
 
-    def _projected_covariance(self, gaussians: Gaussians, local: np.ndarray) -> np.ndarray:
+    def _projected_covariance(self, gaussians: Gaussians, local: Array) -> Array:
         """Σ' (G, 3) as (xx, xy, yy) [px²]."""
         camera = self.camera
         depth = np.maximum(local[:, 2], _NEAR_M)
@@ -129,9 +130,7 @@ class Renderer:
         flat = seen @ seen.transpose(0, 2, 1)
         return np.stack([flat[:, 0, 0] + _BLUR_PX2, flat[:, 0, 1], flat[:, 1, 1] + _BLUR_PX2], axis=1)
 
-    def _tiles(
-        self, centre: np.ndarray, radius: np.ndarray, depth: np.ndarray, good: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _tiles(self, centre: Array, radius: Array, depth: Array, good: Array) -> tuple[Array, Array]:
         """Gaussians of every tile, nearest first: ``order``, and where each tile's begin (tiles + 1,)."""
         across, down = -(-self.camera.width // TILE), -(-self.camera.height // TILE)
         number = np.flatnonzero(good)
@@ -156,7 +155,7 @@ class Renderer:
         starts = np.searchsorted(tile[sorted_pairs], np.arange(across * down + 1))
         return starts, number[which[sorted_pairs]]
 
-    def _colours(self, gaussians: Gaussians, turn: np.ndarray | None) -> np.ndarray:
+    def _colours(self, gaussians: Gaussians, turn: Array | None) -> Array:
         """Colour of every Gaussian as seen from the camera, (G, 3), not below 0."""
         harmonics = gaussians.harmonics
         colour = SH_DC * harmonics[:, 0]
@@ -173,7 +172,7 @@ class Renderer:
         return np.maximum(colour + 0.5, 0.0)
 
 
-def rotation_matrices(quaternions: np.ndarray) -> np.ndarray:
+def rotation_matrices(quaternions: Array) -> Array:
     """(G, 3, 3) of unit quaternions (G, 4), (w, x, y, z)."""
     w, x, y, z = quaternions.T
     rows = [
@@ -184,7 +183,7 @@ def rotation_matrices(quaternions: np.ndarray) -> np.ndarray:
     return np.array(rows).transpose(2, 0, 1)
 
 
-def _basis(direction: np.ndarray) -> np.ndarray:
+def _basis(direction: Array) -> Array:
     """Real spherical harmonics of degrees 1 to 3 in the order and signs of the PLY's coefficients, (G, 15)."""
     x, y, z = direction.T
     xx, yy, zz = x * x, y * y, z * z

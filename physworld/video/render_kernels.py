@@ -14,18 +14,18 @@ _LEAST_LEFT = 1e-4
 def blend(
     width: int,
     tiles_across: int,
-    starts: wp.array(dtype=wp.int32),
-    order: wp.array(dtype=wp.int32),
-    centres: wp.array(dtype=wp.vec2f),
-    conics: wp.array(dtype=wp.vec3f),
-    opacities: wp.array(dtype=wp.float32),
-    colours: wp.array(dtype=wp.vec3f),
-    depths: wp.array(dtype=wp.float32),
+    starts: wp.array[wp.int32],
+    order: wp.array[wp.int32],
+    centres: wp.array[wp.vec2f],
+    conics: wp.array[wp.vec3f],
+    opacities: wp.array[wp.float32],
+    colours: wp.array[wp.vec3f],
+    depths: wp.array[wp.float32],
     background: wp.vec3f,
-    picture: wp.array(dtype=wp.vec3f),
-    alpha: wp.array(dtype=wp.float32),
-    depth: wp.array(dtype=wp.float32),
-):
+    picture: wp.array[wp.vec3f],
+    alpha: wp.array[wp.float32],
+    depth: wp.array[wp.float32],
+) -> None:
     pixel = wp.tid()
     row = pixel // width
     column = pixel - row * width

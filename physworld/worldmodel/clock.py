@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from physworld.arrays import Array
+
 NOMINAL_RATE_HZ = 30.0
 
 
@@ -21,13 +23,13 @@ def model_dt(fps: float) -> float:
     return round(fps / NOMINAL_RATE_HZ) / fps
 
 
-def clock_times(duration_s: float, dt_s: float) -> np.ndarray:
+def clock_times(duration_s: float, dt_s: float) -> Array:
     """Ticks 0, dt, 2 dt … [s], shape (T,): the last one is the first at or after ``duration_s``."""
     steps = int(np.ceil(duration_s / dt_s - 1e-6))
     return np.arange(max(steps, 1) + 1) * dt_s
 
 
-def resample(values: np.ndarray, times: np.ndarray, at: np.ndarray) -> np.ndarray:
+def resample(values: Array, times: Array, at: Array) -> Array:
     """Linear interpolation of ``values`` (T, …) known at ``times`` (T,) to ``at`` (S,); the ends are held."""
     values = np.asarray(values, dtype=np.float64)
     times = np.asarray(times, dtype=np.float64)
@@ -44,7 +46,7 @@ def resample(values: np.ndarray, times: np.ndarray, at: np.ndarray) -> np.ndarra
     return (1.0 - weight) * values[left] + weight * values[left + 1]
 
 
-def resample_smooth(values: np.ndarray, times: np.ndarray, at: np.ndarray) -> np.ndarray:
+def resample_smooth(values: Array, times: Array, at: Array) -> Array:
     """Cubic Hermite interpolation of ``values`` (T, …) at ``times`` (T,) to ``at`` (S,); the ends are held.
 
     Slopes are second-order finite differences. An oscillation of 4 Hz sampled every 0.03 s loses 7 % of its

@@ -6,12 +6,13 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from physworld.arrays import Array
 from physworld.worldmodel.clock import clock_times, resample
 from physworld.worldmodel.errors import ControlsInvalid
 from physworld.worldmodel.model.graph import GraphSpec
 
 
-def grip_groups(spec: GraphSpec, controllers: np.ndarray) -> tuple[np.ndarray, ...]:
+def grip_groups(spec: GraphSpec, controllers: Array) -> tuple[Array, ...]:
     """Controllers (K, 3) that move as one grip, index arrays in the order of their first member.
 
     Control vertices of a grip hear each other in the graph; a controller that is no vertex goes with the nearest one.
@@ -30,7 +31,7 @@ def grip_groups(spec: GraphSpec, controllers: np.ndarray) -> tuple[np.ndarray, .
     return tuple(sorted(groups, key=lambda group: int(group[0])))
 
 
-def on_clock(controllers: np.ndarray, times: np.ndarray | None, dt_s: float, most_ticks: int) -> np.ndarray:
+def on_clock(controllers: Array, times: Array | None, dt_s: float, most_ticks: int) -> Array:
     """Control paths (B, T, K, 3) [m] known at ``times`` (T,) [s] from 0, linearly interpolated at ticks of ``dt_s``.
 
     Without ``times`` they are at ticks already. Raises ControlsInvalid, also where ``times`` go beyond ``most_ticks``.
@@ -54,7 +55,7 @@ def on_clock(controllers: np.ndarray, times: np.ndarray | None, dt_s: float, mos
     return np.moveaxis(resample(np.moveaxis(controllers, 1, 0), times, ticks), 0, 1)
 
 
-def peak_speed(controllers: np.ndarray, dt_s: float) -> float:
+def peak_speed(controllers: Array, dt_s: float) -> float:
     """Largest speed [m/s] of any controller of (…, T, K, 3)."""
     moves = np.linalg.norm(np.diff(controllers, axis=-3), axis=-1)
     return float(moves.max(initial=0.0)) / dt_s

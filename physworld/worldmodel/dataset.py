@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from physworld.arrays import Array
 from physworld.worldmodel.errors import DatasetUnusable
 from physworld.worldmodel.model.graph import EDGE_KINDS, NEAR, GraphSpec
 from physworld.worldmodel.model.model import Normalisation
@@ -43,7 +44,7 @@ class Batch:
     phi: Tensor
 
 
-def graph_origin(spec: GraphSpec, vertices: np.ndarray) -> np.ndarray:
+def graph_origin(spec: GraphSpec, vertices: Array) -> Array:
     """Where single precision counts from, (3,): the vertices' mean (…, n, 3), with z at the ground if there
     is one.
     """
@@ -54,7 +55,7 @@ def graph_origin(spec: GraphSpec, vertices: np.ndarray) -> np.ndarray:
 
 
 def read_track(
-    spec: GraphSpec, arrays: dict[str, np.ndarray], history: int, strengths: np.ndarray | None = None
+    spec: GraphSpec, arrays: dict[str, Array], history: int, strengths: Array | None = None
 ) -> Track:
     """The graph's vertices of an episode; ``strengths`` (m,) of effects are further columns of Φ after its properties.
 
@@ -88,7 +89,7 @@ def read_track(
     return Track(torch.as_tensor(vertices, dtype=torch.float32), torch.as_tensor(phi, dtype=torch.float32))
 
 
-def has_vertices(spec: GraphSpec, arrays: dict[str, np.ndarray]) -> bool:
+def has_vertices(spec: GraphSpec, arrays: dict[str, Array]) -> bool:
     """Whether an episode keeps the graph's vertices apart from its other particles (``VERTEX_ARRAYS``)."""
     kept = arrays.get("vertex_index")
     return kept is not None and np.array_equal(kept[: spec.object_count], spec.particle_index)

@@ -29,6 +29,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from physworld.arrays import Array
 from physworld.worldmodel.model.graph import EDGE_KINDS, NEAR, GraphSpec
 from physworld.worldmodel.model.model import WorldModel
 from physworld.worldmodel.model.nearest import cut_rest_length, cut_strain, near_ends
@@ -135,7 +136,7 @@ class StepProgram(nn.Module):
         )
 
 
-def edge_list(spec: GraphSpec, places: np.ndarray | None = None) -> dict[str, np.ndarray]:
+def edge_list(spec: GraphSpec, places: Array | None = None) -> dict[str, Array]:
     """The model's own edges as the program takes them.
 
     With ``places`` (V or n, 3) [m] also its NEAR edges there, if they are those of the current shape.
@@ -160,7 +161,7 @@ def edge_list(spec: GraphSpec, places: np.ndarray | None = None) -> dict[str, np
     return {name: np.concatenate([near[name], values], dtype=values.dtype) for name, values in edges.items()}
 
 
-def example_inputs(model: WorldModel) -> dict[str, np.ndarray]:
+def example_inputs(model: WorldModel) -> dict[str, Array]:
     """Inputs of the program at rest."""
     spec, frames = model.spec, model.config.history + 1
     rest = model._reference.numpy(force=True)

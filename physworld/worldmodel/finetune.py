@@ -23,6 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from physworld.arrays import Array
 from physworld.worldmodel.dataset import graph_origin
 from physworld.worldmodel.errors import TrainingCancelled
 from physworld.worldmodel.model.config import FineTuneConfig
@@ -46,19 +47,19 @@ class Recording:
         visible: (F, N) bool.
     """
 
-    history: np.ndarray
-    controllers: np.ndarray
-    ticks: np.ndarray
-    points: np.ndarray
-    visible: np.ndarray
+    history: Array
+    controllers: Array
+    ticks: Array
+    points: Array
+    visible: Array
 
 
 @dataclass(frozen=True)
 class FineTuneResult:
     """``phi`` (n, 2), ``strengths`` (m,); the inner validation error [m] before and after; whether they were kept."""
 
-    phi: np.ndarray
-    strengths: np.ndarray
+    phi: Array
+    strengths: Array
     error_before_m: float
     error_after_m: float
     kept: bool
@@ -67,12 +68,12 @@ class FineTuneResult:
 
 def fine_tune(
     model: WorldModel,
-    phi: np.ndarray,
+    phi: Array,
     recording: Recording,
     skin: Skin,
     config: FineTuneConfig,
     *,
-    bounds: np.ndarray | None = None,
+    bounds: Array | None = None,
     progress: Callable[[int, int, float], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> FineTuneResult:
@@ -100,8 +101,8 @@ def fine_tune(
 
 def _optimise(
     task: _Task,
-    phi: np.ndarray,
-    limits: np.ndarray,
+    phi: Array,
+    limits: Array,
     progress: Callable[[int, int, float], None] | None,
     cancelled: Callable[[], bool] | None,
 ) -> FineTuneResult:
@@ -234,7 +235,7 @@ class _Task:
             loss = loss + self.config.chamfer_weight * chamfer
         return loss
 
-    def _at_frames(self, ticks: Tensor, frames: np.ndarray, first: int) -> Tensor:
+    def _at_frames(self, ticks: Tensor, frames: Array, first: int) -> Tensor:
         """Tracked points (F, N, 3) at measured frames, linear between ticks."""
         left = torch.as_tensor(self.left[frames] - first)
         part = self.part[frames][:, None, None]

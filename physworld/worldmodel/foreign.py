@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.errors import SceneUnsupported
 from physworld.geometry.rigid import rigid_motion
 from physworld.scene import Scene
@@ -36,8 +37,8 @@ class ForeignPrediction:
         start_mismatch_m: root mean squared distance of the twin's points from the measured ones at the start.
     """
 
-    tracks: np.ndarray
-    twin_tracks: np.ndarray
+    tracks: Array
+    twin_tracks: Array
     first_frame: int
     start_mismatch_m: float
 
@@ -142,7 +143,7 @@ def predict(model: PublishedModel, recording: Scene, twin: Twin) -> ForeignPredi
     )
 
 
-def _lift(model: PublishedModel, twin: Twin) -> np.ndarray:
+def _lift(model: PublishedModel, twin: Twin) -> Array:
     """How far the recording's ground lies above the model's, which counts heights from its own, (3,) [m]."""
     own, theirs = model.spec.ground_height_m, twin.ground_height_m
     return np.array([0.0, 0.0, 0.0 if own is None or theirs is None else theirs - own])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.worldmodel.dataset import graph_origin
 from physworld.worldmodel.errors import GraphInvalid
 from physworld.worldmodel.published import PublishedModel
@@ -20,9 +21,9 @@ class LiveRollout:
         self,
         published: PublishedModel,
         *,
-        phi: np.ndarray | None = None,
-        history: np.ndarray | None = None,
-        controllers: np.ndarray | None = None,
+        phi: Array | None = None,
+        history: Array | None = None,
+        controllers: Array | None = None,
     ) -> None:
         """From the recording's start, or from ``history`` (h+1, n, 3) and ``controllers`` (h+1, K, 3) [m]."""
         self._published, spec = published, published.spec
@@ -45,11 +46,11 @@ class LiveRollout:
         self._window = np.concatenate([self._first - self._origin, driven], axis=1).astype(np.float32)
 
     @property
-    def vertices(self) -> np.ndarray:
+    def vertices(self) -> Array:
         """Object vertices now [m], (n, 3)."""
         return self._window[-1, : self._published.spec.object_count].astype(np.float64) + self._origin
 
-    def step(self, controllers: np.ndarray) -> np.ndarray:
+    def step(self, controllers: Array) -> Array:
         """Move all controllers to (K, 3) [m] within one tick; the object vertices then, (n, 3) [m].
 
         Raises GraphInvalid for another shape or values that are not finite; nothing has moved then.

@@ -6,10 +6,10 @@ meant to be used: it is several times slower. Equations and names: ``physworld.w
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
+from physworld.arrays import Array
 from physworld.worldmodel.export import edge_list
 from physworld.worldmodel.model.graph import EDGE_KINDS, NEAR
 from physworld.worldmodel.model.model import WorldModel
@@ -24,7 +24,7 @@ class NaiveWorldModel(nn.Module):
         self.model = model
         self._set_edges(edge_list(model.spec))
 
-    def _set_edges(self, edges: dict[str, np.ndarray]) -> None:
+    def _set_edges(self, edges: dict[str, Array]) -> None:
         for name, key in (("receiver", "receivers"), ("sender", "senders"), ("kind", "kinds")):
             self.register_buffer(name, torch.as_tensor(edges[key]), persistent=False)
         self.register_buffer("rest", torch.as_tensor(edges["rest_relative"]), persistent=False)

@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from physworld.arrays import Array
 from physworld.worldmodel.errors import VersionUnreadable, WorldModelError
 from physworld.worldmodel.model.config import WorldModelConfig
 from physworld.worldmodel.model.graph import EDGE_KINDS, GraphSpec
@@ -47,10 +48,10 @@ class PublishedModel:
     """See the module's text for the arrays."""
 
     model: WorldModel
-    phi: np.ndarray
-    phi_calibrated: np.ndarray
-    start_history: np.ndarray
-    start_controllers: np.ndarray
+    phi: Array
+    phi_calibrated: Array
+    start_history: Array
+    start_controllers: Array
     start_time_s: float
     skin: Skin
 
@@ -59,9 +60,7 @@ class PublishedModel:
         """The graph."""
         return self.model.spec
 
-    def rollout(
-        self, controllers: np.ndarray, *, history: np.ndarray | None = None, phi: np.ndarray | None = None
-    ) -> np.ndarray:
+    def rollout(self, controllers: Array, *, history: Array | None = None, phi: Array | None = None) -> Array:
         """Object vertices (T, n, 3) [m] for controllers (T, K, 3) at ticks from the start's first one."""
         return rollout(
             self.model,
@@ -78,12 +77,12 @@ class PublishedModel:
 
     def rollout_batch(
         self,
-        controllers: np.ndarray,
+        controllers: Array,
         *,
-        history: np.ndarray | None = None,
-        phi: np.ndarray | None = None,
+        history: Array | None = None,
+        phi: Array | None = None,
         threads: int = 1,
-    ) -> np.ndarray:
+    ) -> Array:
         """Object vertices (B, T, n, 3) [m] for candidates (B, T, K, 3) that share their first h+1 ticks."""
         return rollout_batch(
             self.engine,
@@ -94,7 +93,7 @@ class PublishedModel:
             threads=threads,
         )
 
-    def to_tensors(self) -> dict[str, np.ndarray]:
+    def to_tensors(self) -> dict[str, Array]:
         """Every array by its published name."""
         spec = self.spec
         single = {
@@ -137,7 +136,7 @@ class PublishedModel:
         }
 
     @classmethod
-    def from_tensors(cls, tensors: dict[str, np.ndarray], facts: dict[str, Any]) -> PublishedModel:
+    def from_tensors(cls, tensors: dict[str, Array], facts: dict[str, Any]) -> PublishedModel:
         """The inverse of :meth:`to_tensors` and :meth:`facts`. Raises VersionUnreadable for any other layout."""
         try:
             return cls._read(tensors, _FACTS_BEFORE | facts)
@@ -147,7 +146,7 @@ class PublishedModel:
             raise VersionUnreadable(f"its parts do not fit together: {error}") from error
 
     @classmethod
-    def from_card(cls, tensors: dict[str, np.ndarray], card: dict[str, Any]) -> PublishedModel:
+    def from_card(cls, tensors: dict[str, Array], card: dict[str, Any]) -> PublishedModel:
         """The model of a version's tensors and its card.
 
         Raises:
@@ -165,7 +164,7 @@ class PublishedModel:
             ) from error
 
     @classmethod
-    def _read(cls, tensors: dict[str, np.ndarray], facts: dict[str, Any]) -> PublishedModel:
+    def _read(cls, tensors: dict[str, Array], facts: dict[str, Any]) -> PublishedModel:
         names = WorldModelConfig.__dataclass_fields__
         config = WorldModelConfig(**{name: facts[name] for name in names})
         current = int(tensors["graph.current_neighbours"][0]) if config.near_edges == "current" else 0
@@ -207,7 +206,7 @@ def _table_name(current_neighbours: int) -> str:
     return "graph.kept_neighbours" if current_neighbours else "graph.neighbours"
 
 
-def _prior_of(tensors: dict[str, np.ndarray]) -> ModalPrior | ChainPrior | InertialPrior:
+def _prior_of(tensors: dict[str, Array]) -> ModalPrior | ChainPrior | InertialPrior:
     """The prior whose tensors there are."""
     if "prior.lags" in tensors:
         return InertialPrior(len(tensors["rest.vertices"]))
@@ -218,7 +217,7 @@ def _prior_of(tensors: dict[str, np.ndarray]) -> ModalPrior | ChainPrior | Inert
 
 
 def _refuse_other_sizes(
-    tensors: dict[str, np.ndarray],
+    tensors: dict[str, Array],
     prior: ModalPrior | ChainPrior | InertialPrior,
     config: WorldModelConfig,
     spec: GraphSpec,

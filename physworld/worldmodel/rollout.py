@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from physworld.arrays import Array
 from physworld.worldmodel.dataset import Track, graph_origin
 from physworld.worldmodel.errors import GraphInvalid
 from physworld.worldmodel.model.graph import GraphSpec
@@ -28,10 +29,10 @@ Step = Callable[[Tensor, Tensor, Tensor], Tensor]
 def rollout(
     model: WorldModel,
     spec: GraphSpec,
-    initial_history: np.ndarray,
-    controllers: np.ndarray,
-    phi: np.ndarray,
-) -> np.ndarray:
+    initial_history: Array,
+    controllers: Array,
+    phi: Array,
+) -> Array:
     """Object vertices over time [m], (T, n, 3) float64.
 
     Args:
@@ -46,12 +47,12 @@ def rollout(
 def rollout_batch(
     engine: RolloutEngine,
     spec: GraphSpec,
-    initial_history: np.ndarray,
-    controllers: np.ndarray,
-    phi: np.ndarray,
+    initial_history: Array,
+    controllers: Array,
+    phi: Array,
     *,
     threads: int = 1,
-) -> np.ndarray:
+) -> Array:
     """Object vertices of every candidate [m], (B, T, n, 3) float64.
 
     Args:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.scene import Scene
 from physworld.twin.twin import Twin
 from physworld.worldmodel.clock import clock_times, model_dt, resample, resample_smooth
@@ -48,10 +49,10 @@ class SceneView:
 
     scene: Scene
     spec: GraphSpec
-    times: np.ndarray
-    controllers: np.ndarray
-    vertices: np.ndarray
-    twin_tracks: np.ndarray
+    times: Array
+    controllers: Array
+    vertices: Array
+    twin_tracks: Array
     skin: Skin
     first: int
     history: int
@@ -59,11 +60,11 @@ class SceneView:
     skin_error_m: float
 
     @property
-    def start_history(self) -> np.ndarray:
+    def start_history(self) -> Array:
         """(h+1, n, 3) [m]."""
         return self.vertices[self.first : self.first + self.history + 1]
 
-    def tracks_of(self, rolled: np.ndarray) -> np.ndarray:
+    def tracks_of(self, rolled: Array) -> Array:
         """Tracked points at the measured times (F, N, 3) of a rollout (T - first, n, 3) from tick ``first``."""
         held = np.repeat(self.vertices[:1], self.first, axis=0)
         ticks = self.skin.apply(np.concatenate([held, rolled]))
@@ -83,7 +84,7 @@ class SceneView:
             visible=self.scene.visible[taken],
         )
 
-    def published(self, model: WorldModel, phi: np.ndarray, phi_calibrated: np.ndarray) -> PublishedModel:
+    def published(self, model: WorldModel, phi: Array, phi_calibrated: Array) -> PublishedModel:
         """The model with this scene's start and skin."""
         window = slice(self.first, self.first + self.history + 1)
         return PublishedModel(

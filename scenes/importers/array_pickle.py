@@ -18,6 +18,8 @@ from typing import Any
 
 import numpy as np
 
+from physworld.arrays import Array
+
 NUMBER_CODE = re.compile(r"^([<>|=]?)([biuf])(1|2|4|8)$")
 """Type codes of numpy that are plain numbers."""
 
@@ -83,7 +85,7 @@ class _Array:
     """Stands for ``numpy.ndarray``."""
 
     def __init__(self, *_empty: object) -> None:
-        self.value: np.ndarray | None = None
+        self.value: Array | None = None
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
         _version, shape, dtype, fortran, content = state
@@ -103,7 +105,7 @@ class _Callable:
         raise PickleRefused("tries to change a function")
 
 
-def _build(shape: Any, dtype: Any, order: str, content: Any) -> np.ndarray:
+def _build(shape: Any, dtype: Any, order: str, content: Any) -> Array:
     if not isinstance(dtype, _Dtype) or not isinstance(content, bytes | bytearray):
         raise PickleRefused("holds an array of Python objects; only numbers are read")
     if not isinstance(shape, tuple) or not all(isinstance(n, int) and n >= 0 for n in shape):

@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.scene import Scene
 from physworld_scenes.archives import ArchiveRefused, read_arrays
 from physworld_scenes.bundle import checked, scene_from_parts
@@ -65,8 +66,8 @@ GAP_WARNING = 0.1
 class Recording:
     """What the file holds: marker positions (T, N, 3) in ``unit``, validity (T, N), labels, rate [Hz]."""
 
-    positions: np.ndarray
-    valid: np.ndarray
+    positions: Array
+    valid: Array
     labels: list[str]
     unit: str
     rate_hz: float
@@ -171,14 +172,14 @@ def parse(data: bytes) -> Recording:
     return Recording(positions, valid, header["labels"], header["unit"], float(header["rate_hz"]))
 
 
-def _parsed_here(source: Path) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
+def _parsed_here(source: Path) -> tuple[Array, Array, dict[str, Any]]:
     try:
         return content_of(str(source))
     except (MemoryError, KeyError, IndexError, TypeError, ValueError, OSError, RuntimeError) as error:
         raise _invalid([f"cannot be read: {str(error)[:200] or type(error).__name__}"]) from error
 
 
-def _parsed_in_child(source: Path) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
+def _parsed_in_child(source: Path) -> tuple[Array, Array, dict[str, Any]]:
     target = source.with_suffix(".npz")
     command = [sys.executable, "-m", "physworld_scenes.importers.c3d_child", str(source), str(target)]
     try:
@@ -198,7 +199,7 @@ def _parsed_in_child(source: Path) -> tuple[np.ndarray, np.ndarray, dict[str, An
     return arrays["positions"], arrays["residuals"], json.loads(child.stdout)
 
 
-def fill_gaps(positions: np.ndarray, valid: np.ndarray) -> np.ndarray:
+def fill_gaps(positions: Array, valid: Array) -> Array:
     """Positions (T, N, 3) with every gap interpolated in time, held at the ends; zero if never seen."""
     filled = np.zeros_like(positions)
     frames = np.arange(len(positions))
@@ -236,7 +237,7 @@ def _scale(recording: Recording) -> float:
     return METRES_PER_UNIT[unit]
 
 
-def _rotation(up: str) -> np.ndarray:
+def _rotation(up: str) -> Array:
     if up not in ROTATION_FROM_UP:
         raise _invalid([f"up is {up!r}; known are {', '.join(ROTATION_FROM_UP)}"])
     return ROTATION_FROM_UP[up]

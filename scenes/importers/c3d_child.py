@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from physworld.arrays import Array
+
 MEMORY_BYTES = 4 << 30
 
 
@@ -26,7 +28,7 @@ def main(source: str, target: str) -> None:
     print(json.dumps(header))
 
 
-def content_of(source: str) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
+def content_of(source: str) -> tuple[Array, Array, dict[str, Any]]:
     """Positions (T, N, 3), residuals (T, N), and labels, unit and rate [Hz] of a C3D file, in this process."""
     import ezc3d
 

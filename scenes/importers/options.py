@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld_scenes.declaration import Kind
 
 TRAIN_FRACTION = 0.7
@@ -48,7 +49,7 @@ def split_of(frames: int) -> dict[str, list[int]]:
     return {"train": [0, last], "test": [last, frames]}
 
 
-def estimate_noise(points: np.ndarray, visible: np.ndarray) -> float | None:
+def estimate_noise(points: Array, visible: Array) -> float | None:
     """White noise per axis [m] from third differences; None if no point is seen in four frames running.
 
     Motion adds to it, so it is an upper estimate; the median keeps jumps out.

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.scene import Scene
 from physworld_scenes.bundle import checked, scene_from_parts
 from physworld_scenes.importers.array_pickle import PickleRefused, load_arrays
@@ -102,7 +103,7 @@ def read_bytes(data: bytes, name: str, options: ImportOptions | None = None) -> 
     return checked(scene_from_parts(declared, stored))
 
 
-def structure_points(*clouds: np.ndarray) -> np.ndarray:
+def structure_points(*clouds: Array) -> Array:
     """The points of all clouds (each (n, 3) [m]) in their order, the first of every 5 mm cell, (M, 3)."""
     points = np.concatenate(clouds)
     cells = np.floor(points / STRUCTURE_CELL_M).astype(np.int64)
@@ -147,7 +148,7 @@ def _load(data: bytes) -> dict[Any, Any]:
     return content
 
 
-def _turn(points: np.ndarray) -> np.ndarray:
+def _turn(points: Array) -> Array:
     """z-down to z-up; adding zero keeps the invisible points' zeros from becoming -0."""
     return np.asarray(points, dtype=np.float64) * Z_DOWN_TO_Z_UP + 0.0
 

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from physworld.arrays import Array
+
 if TYPE_CHECKING:
     from physworld.scene import Scene
 
@@ -40,7 +42,7 @@ class Layer:
     name: str
     label: str
     role: str
-    points: np.ndarray
+    points: Array
     shown: bool = True
     opacity: float = 1.0
     pairs: str | None = None
@@ -68,7 +70,7 @@ class Cloud:
         box: corners of the undeformed body [m], where it is declared to be a box.
     """
 
-    times: np.ndarray
+    times: Array
     layers: Sequence[Layer]
     split: int | None = None
     floor: float | None = None
@@ -125,7 +127,7 @@ def scene_cloud(scene: Scene, layers: Sequence[Layer]) -> Cloud:
     return Cloud(scene.times, layers, split, floor, box)
 
 
-def resampled(points: np.ndarray, times: np.ndarray, onto: np.ndarray) -> np.ndarray:
+def resampled(points: Array, times: Array, onto: Array) -> Array:
     """``points`` (T, n, 3) at ``times`` (T,) [s] on another time line: nearest frames, NaN outside."""
     if times.shape == onto.shape and np.allclose(times, onto, rtol=0.0, atol=1e-9):
         return points

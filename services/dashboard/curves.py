@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld_schemas.model import ModelComparison
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ PREDICTORS = ("after", "twin_homogeneous", "twin", "world_model", "world_model_f
 TIMES_KEY = "times_s"
 
 
-def frame_errors(scene: Scene, tracks: np.ndarray) -> np.ndarray:
+def frame_errors(scene: Scene, tracks: Array) -> Array:
     """Mean distance of predicted ``tracks`` (T, N, 3) [m] to the visible measured points, (T,) [m].
 
     NaN in a frame where nothing was visible.
@@ -42,7 +43,7 @@ def frame_errors(scene: Scene, tracks: np.ndarray) -> np.ndarray:
 
 
 def chart(
-    times: np.ndarray, errors: Mapping[str, np.ndarray], *, split: float | None, x_label: str = "time [s]"
+    times: Array, errors: Mapping[str, Array], *, split: float | None, x_label: str = "time [s]"
 ) -> dict[str, object]:
     """The JSON that ``frontend/src/curve.js`` draws: error curves [m] in millimetres over ``times`` [s]."""
     stride = max(1, -(-len(times) // MOST_TIMES))
@@ -66,7 +67,7 @@ def chart(
 def comparison_chart(found: ModelComparison) -> dict[str, object]:
     """Curves of two versions over the times of the first; what only the scene decides (baselines) is drawn once."""
     times = np.array(found.curves_a.times_s, dtype=float)
-    errors: dict[str, np.ndarray] = {}
+    errors: dict[str, Array] = {}
     drawn = chart(times, errors, split=None)
     series = []
     for number, curves, roles in (
@@ -84,7 +85,7 @@ def comparison_chart(found: ModelComparison) -> dict[str, object]:
     return {**drawn, "series": series}
 
 
-def given_curves(metrics: Mapping[str, Any]) -> tuple[np.ndarray, dict[str, np.ndarray]] | None:
+def given_curves(metrics: Mapping[str, Any]) -> tuple[Array, dict[str, Array]] | None:
     """The curves of the track error that a result stored: times (T,) [s], errors (T,) [m] by predictor.
 
     They are looked for in ``held_out.per_frame`` (what the library's ``held_out_table`` makes), ``per_frame``
@@ -107,10 +108,10 @@ def given_curves(metrics: Mapping[str, Any]) -> tuple[np.ndarray, dict[str, np.n
     return None
 
 
-def onto(times: np.ndarray, values: np.ndarray, target: np.ndarray) -> np.ndarray:
+def onto(times: Array, values: Array, target: Array) -> Array:
     """``values`` given at ``times`` on the ``target`` times, NaN outside of them."""
     return np.interp(target, times, values, left=math.nan, right=math.nan)
 
 
-def _rounded(values: np.ndarray) -> list[float | None]:
+def _rounded(values: Array) -> list[float | None]:
     return [float(f"{value:.5g}") if math.isfinite(value) else None for value in values]

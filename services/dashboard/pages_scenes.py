@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
 
+from physworld.arrays import Array
 from physworld_schemas.fit import Fit
 from physworld_schemas.scene import Scene as SceneRecord
 from physworld_services.dashboard.clouds import (
@@ -86,7 +86,7 @@ def router(site: Site) -> APIRouter:
     def curve(scene_id: str, fit: FitId = None) -> Response:
         record, shown = _load(site, scene_id, fit)
         recording = recording_of(site, record)
-        errors: dict[str, np.ndarray] = {}
+        errors: dict[str, Array] = {}
         given = given_curves(shown.metrics) if shown else None
         if given is not None:
             errors.update(

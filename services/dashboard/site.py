@@ -14,6 +14,7 @@ from fastapi import Request
 from fastapi.responses import HTMLResponse
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from physworld.arrays import Array
 from physworld_scenes.bundle import bundle_from_bytes
 from physworld_schemas.base import Artifact
 from physworld_schemas.job import Job
@@ -63,7 +64,7 @@ class Site:
             return None
         return self._parsed.get(("scene", archive.sha256), lambda: self._read_scene(archive.sha256))
 
-    def arrays(self, artifacts: list[Artifact], name: str) -> Mapping[str, np.ndarray] | None:
+    def arrays(self, artifacts: list[Artifact], name: str) -> Mapping[str, Array] | None:
         """The arrays of the artifact called ``name`` (an npz without pickles); None without one."""
         found = next((item for item in artifacts if item.name == name), None)
         if found is None:
@@ -74,7 +75,7 @@ class Site:
         scene, _warnings = bundle_from_bytes(self.artifacts.read_bytes(sha256))
         return scene
 
-    def _read_arrays(self, sha256: str) -> Mapping[str, np.ndarray]:
+    def _read_arrays(self, sha256: str) -> Mapping[str, Array]:
         with np.load(io.BytesIO(self.artifacts.read_bytes(sha256)), allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
 

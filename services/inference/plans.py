@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.planning.goals import Goal, GoalPoints, GoalShape
 from physworld.planning.mppi import Found, MppiConfig, search
 from physworld.planning.task import PlanningTask
@@ -30,7 +31,7 @@ from physworld_workers.tasks.inputs import scene_of, twin_of
 
 def make(
     context: TaskContext, stores: Stores, request: PlanCreate, model: PublishedModel
-) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+) -> tuple[dict[str, Any], dict[str, Array]]:
     """Search, execute, measure. Raises Cancelled, ValueError for limits that leave the start out."""
     payload = context.lease.payload
     scene = scene_of(stores, payload["scene_id"])
@@ -72,7 +73,7 @@ def make(
     return _figures(task, goal, config, found, executed, motionless) | {"goal": request.goal.kind}, arrays
 
 
-def goal_of(request: PlanCreate) -> tuple[Goal, dict[str, np.ndarray]]:
+def goal_of(request: PlanCreate) -> tuple[Goal, dict[str, Array]]:
     """The library's goal, and its arrays by name."""
     if isinstance(request.goal, PointGoal):
         index, places = np.array(request.goal.index), np.array(request.goal.places)
@@ -82,7 +83,7 @@ def goal_of(request: PlanCreate) -> tuple[Goal, dict[str, np.ndarray]]:
 
 
 def _limited(task: PlanningTask, limits: PlanLimits) -> PlanningTask:
-    def corner(place: tuple[float, float, float] | None) -> np.ndarray | None:
+    def corner(place: tuple[float, float, float] | None) -> Array | None:
         return None if place is None else np.array(place)
 
     return task.with_limits(
@@ -98,8 +99,8 @@ def _figures(
     goal: Goal,
     config: MppiConfig,
     found: Found,
-    executed: np.ndarray,
-    motionless: np.ndarray,
+    executed: Array,
+    motionless: Array,
 ) -> dict[str, Any]:
     ending = slice(-config.settling, None)
     gap = np.linalg.norm(found.points - executed, axis=-1)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.worldmodel.controls import on_clock, peak_speed
 from physworld.worldmodel.errors import ControlsInvalid, WorldModelError
 from physworld.worldmodel.published import PublishedModel
@@ -44,11 +45,11 @@ class Prepared:
         times: of those, from the first tick that was asked for [s].
     """
 
-    controllers: np.ndarray
-    history: np.ndarray
-    phi: np.ndarray
-    shown: np.ndarray
-    times: np.ndarray
+    controllers: Array
+    history: Array
+    phi: Array
+    shown: Array
+    times: Array
 
     @property
     def steps(self) -> int:
@@ -111,14 +112,14 @@ def run(
     *,
     threads: int = 1,
     progress: Callable[[int, int], None] | None = None,
-) -> tuple[dict[str, np.ndarray], float]:
+) -> tuple[dict[str, Array], float]:
     """``points`` (B, S, N, 3) and ``vertices`` (B, S, n, 3) float32 as asked for, and the seconds it took.
 
     ``progress(steps done, steps in all)`` may raise to stop. Raises RolloutDiverged.
     """
     started = time.perf_counter()
     driven = prepared.controllers
-    found: dict[str, list[np.ndarray]] = {part: [] for part in request.returns}
+    found: dict[str, list[Array]] = {part: [] for part in request.returns}
     per_candidate = driven.shape[1] - len(prepared.history)
     chunk = max(threads, CHUNK_STEPS // per_candidate)
     for first in range(0, len(driven), chunk):
@@ -148,7 +149,7 @@ def facts(request: RolloutCreate, model: PublishedModel, prepared: Prepared) -> 
     }
 
 
-def _read(value: ArrayInput, field: str, dimensions: tuple[int, ...], most: float) -> np.ndarray:
+def _read(value: ArrayInput, field: str, dimensions: tuple[int, ...], most: float) -> Array:
     try:
         return array_of(value, field, dimensions, most)
     except ValueError as error:
@@ -160,7 +161,7 @@ def _places(request: RolloutCreate, model: PublishedModel) -> int:
     return sum(counts[part] for part in set(request.returns))
 
 
-def _phi(request: RolloutCreate, model: PublishedModel, candidates: int) -> np.ndarray:
+def _phi(request: RolloutCreate, model: PublishedModel, candidates: int) -> Array:
     """(n, 2) or (B, n, 2), the factors added in the logarithm."""
     phi, n = model.phi, model.spec.object_count
     if request.phi is not None:
@@ -170,7 +171,7 @@ def _phi(request: RolloutCreate, model: PublishedModel, candidates: int) -> np.n
     return phi + np.log([request.stiffness_factor, request.density_factor])
 
 
-def _check(vertices: np.ndarray, first: int, lead: int, dt_s: float) -> None:
+def _check(vertices: Array, first: int, lead: int, dt_s: float) -> None:
     """Raises RolloutDiverged; ``lead`` ticks were put before the first that was asked for."""
     broken = ~(np.abs(vertices) < 10 * FARTHEST_M).all(axis=(2, 3))
     if broken.any():

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.worldmodel.controls import grip_groups
 from physworld.worldmodel.live import LiveRollout
 from physworld.worldmodel.published import PublishedModel
@@ -32,7 +33,7 @@ class Control:
     """``number`` of the message and velocities of all controllers [m/s], (K, 3)."""
 
     number: int
-    velocity: np.ndarray
+    velocity: Array
 
 
 class LiveSession:
@@ -87,7 +88,7 @@ class LiveSession:
         self._rollout.reset()
         self._before = self._now = self._places()
 
-    def tick(self, velocity: np.ndarray) -> None:
+    def tick(self, velocity: Array) -> None:
         """One step of the model under velocities (K, 3) [m/s]; a prediction that left the numbers is set back."""
         wanted = self._rollout.controllers + self.dt_s * velocity
         offset = wanted - self._start
@@ -113,7 +114,7 @@ class LiveSession:
         """The client has this frame, and knows what its flags say; frames that were left out told nobody."""
         self._flags &= ~HEAD.unpack_from(frame)[3]
 
-    def _places(self) -> np.ndarray:
+    def _places(self) -> Array:
         """Points and then controllers now [m], (N + K, 3)."""
         vertices = self._rollout.vertices
         points = vertices if self._skin is None else self._skin.apply(vertices)

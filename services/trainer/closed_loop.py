@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.evaluate.blocks import mean_with_interval, paired_gain
 from physworld.evaluate.metrics import track_error_per_frame
 from physworld.scene import Scene
@@ -87,7 +88,7 @@ def statement(trace: Trace) -> str:
     return f"Nothing was added to the twin, the verdict is {trace.verdict}: {trace.reason}"
 
 
-def before_and_after(before: np.ndarray | None, after: np.ndarray | None) -> dict[str, Any]:
+def before_and_after(before: Array | None, after: Array | None) -> dict[str, Any]:
     """Means of two error curves over the same frames (F,) [m], and the gain with its interval by paired blocks."""
     found: dict[str, Any] = {"before_m": None, "after_m": None, "gain_m": None, "gain_ci95_m": None}
     for name, curve in (("before_m", before), ("after_m", after)):
@@ -100,7 +101,7 @@ def before_and_after(before: np.ndarray | None, after: np.ndarray | None) -> dic
     return found
 
 
-def _curve(metrics: Mapping[str, Any], name: str) -> np.ndarray | None:
+def _curve(metrics: Mapping[str, Any], name: str) -> Array | None:
     """The error per held-out frame of a table, None where the table has none."""
     curves = metrics.get("held_out", {}).get("per_frame", {}).get(METRIC, {})
     if name not in curves:
@@ -117,7 +118,7 @@ def _declared_twin(stores: Stores, trace: Trace) -> Twin | None:
     return Twin.from_arrays(npz_arrays(stores.artifacts.read_bytes(found.sha256)), stores.settings.device)
 
 
-def _twin_errors(scene: Scene, twin: Twin, architecture: WorldModelConfig) -> np.ndarray:
+def _twin_errors(scene: Scene, twin: Twin, architecture: WorldModelConfig) -> Array:
     """Error of a twin per held-out frame [m], by the same way as the table of a version."""
     view = view_scene(scene, twin, architecture)
     tracks = resample_smooth(view.twin_tracks, view.times, scene.times - scene.times[0])

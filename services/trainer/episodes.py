@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.demonstrate.config import StrengthRange
 from physworld.demonstrate.perturbation import BOUND_SIGMAS
 from physworld.worldmodel.dataset import VERTEX_ARRAYS, Track, has_vertices, read_track
@@ -92,7 +93,7 @@ class Episodes:
             own.insert(0, float(np.log(drawn_friction / self.friction)))
         return read_track(self._spec, arrays, self._history, np.array(own))
 
-    def bounds(self) -> np.ndarray:
+    def bounds(self) -> Array:
         """Ends of what fine-tuning may choose: of log(μ/μ_fit), if the episodes differ in it, and of the strengths'
         intervals as distances from the estimates in half-widths, (m, 2)."""
         ends = [[(end - one.value) / half(one) for end in (one.low, one.high)] for one in self.strengths]
@@ -100,7 +101,7 @@ class Episodes:
             ends.insert(0, [-self._most_friction, self._most_friction])
         return np.array(ends).reshape(-1, 2)
 
-    def tuned(self, found: np.ndarray) -> dict[str, Any]:
+    def tuned(self, found: Array) -> dict[str, Any]:
         """What fine-tuning chose (m,) of :meth:`bounds`, in physical units beside what the calibration said."""
         values, said = list(found), {}
         if self.friction is not None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.evaluate.blocks import mean_with_interval
 from physworld.evaluate.table import held_out_table
 from physworld.worldmodel.clock import resample_smooth
@@ -22,10 +23,10 @@ SPEED_REPEATS = 3
 class Measured:
     """Predictions of tracked points at the measured times (T, N, 3) [m], their table, steps per second."""
 
-    tracks: np.ndarray
-    tracks_calibrated: np.ndarray
-    twin_tracks: np.ndarray
-    vertices: np.ndarray
+    tracks: Array
+    tracks_calibrated: Array
+    twin_tracks: Array
+    vertices: Array
     table: dict[str, Any]
     steps_per_second: dict[str, float]
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Ground, Scene
 
 if TYPE_CHECKING:
@@ -86,7 +87,7 @@ def everyday_scenes() -> dict[str, Scene]:
 
 
 def _still(
-    kind: str, points: Any, controllers: np.ndarray, body: Body, grips: tuple[Grip, ...] = ()
+    kind: str, points: Any, controllers: Array, body: Body, grips: tuple[Grip, ...] = ()
 ) -> Scene:  # fmt: skip
     points = np.repeat(np.asarray(points, dtype=float)[None], 3, axis=0)
     return Scene(

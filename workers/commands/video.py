@@ -24,6 +24,8 @@ from typing import Any
 
 import numpy as np
 
+from physworld.arrays import Array
+
 _MOTIONS = ("vertices", "particles", "tracks", "points", "after")
 _SHOWN = 3000  # points of a motion that are drawn where there is no splat
 
@@ -100,7 +102,7 @@ def _film(given: argparse.Namespace) -> None:
         given.json.write_text(json.dumps({"frames": len(pictures), "scores": scores}, indent=2) + "\n")
 
 
-def _motion(path: Path, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _motion(path: Path, number: int) -> tuple[Array, Array, Array]:
     """Moved points (T, n, 3), the same at rest (n, 3), and times (T,). Raises ValueError with what is wrong."""
     arrays = _arrays(path)
     name = next((key for key in _MOTIONS if key in arrays), None)
@@ -130,7 +132,7 @@ def _motion(path: Path, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray
     return moved, rest, times
 
 
-def _camera(given: argparse.Namespace, moved: np.ndarray) -> Any:
+def _camera(given: argparse.Namespace, moved: Array) -> Any:
     from physworld.video import Camera, orbit_view
 
     if given.camera is not None:
@@ -149,7 +151,7 @@ def _camera(given: argparse.Namespace, moved: np.ndarray) -> Any:
     return orbit_view(moved.reshape(-1, 3), given.azimuth, given.elevation, int(width), int(height))
 
 
-def _scores(given: argparse.Namespace, pictures: np.ndarray, coverage: np.ndarray) -> dict[str, Any] | None:
+def _scores(given: argparse.Namespace, pictures: Array, coverage: Array) -> dict[str, Any] | None:
     from PIL import Image
 
     from physworld.video import compare_frames
@@ -180,13 +182,13 @@ def _scores(given: argparse.Namespace, pictures: np.ndarray, coverage: np.ndarra
     return {"psnr_db": psnr, "ssim": found.ssim, "iou": found.iou, "lpips": found.lpips}
 
 
-def _lpips(path: Path) -> Callable[[np.ndarray, np.ndarray], float]:
+def _lpips(path: Path) -> Callable[[Array, Array], float]:
     """A torch.export program of two pictures (1, 3, H, W) in [-1, 1]."""
     import torch
 
     network = torch.export.load(path).module()
 
-    def distance(one: np.ndarray, other: np.ndarray) -> float:
+    def distance(one: Array, other: Array) -> float:
         pair = [torch.from_numpy(2.0 * x - 1.0).float().permute(2, 0, 1)[None] for x in (one, other)]
         with torch.no_grad():
             return float(network(*pair))
@@ -194,7 +196,7 @@ def _lpips(path: Path) -> Callable[[np.ndarray, np.ndarray], float]:
     return distance
 
 
-def _arrays(path: Path) -> dict[str, np.ndarray]:
+def _arrays(path: Path) -> dict[str, Array]:
     try:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}

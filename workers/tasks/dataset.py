@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.demonstrate import (
     DemonstrationConfig,
     StrengthRange,
@@ -157,7 +158,7 @@ def _made(
     demonstration: DemonstrationConfig,
     index: int,
     progress: Callable[[int, int], None],
-) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+) -> tuple[dict[str, Array], dict[str, Any]]:
     """Arrays and attributes of episode ``index``, alone or as one of its block."""
     seed = config.seed % 2**63
     width = WIDTHS[twin.device.partition(":")[0]]
@@ -176,7 +177,7 @@ def _made(
     return arrays, dict(attributes)
 
 
-def _vertices(stores: Stores, dataset_id: str, twin: Twin, particles: np.ndarray) -> dict[str, np.ndarray]:
+def _vertices(stores: Stores, dataset_id: str, twin: Twin, particles: Array) -> dict[str, Array]:
     """The particles that world models take for their vertices, kept apart: the same in every episode of a dataset."""
     chosen = stores.cached(("vertices", dataset_id), lambda: kept_vertices(twin.particles_rest))
     return {"vertices": particles[:, chosen], "vertex_index": chosen.astype(np.int32)}

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.calibrate import Estimate, FitResult
 from physworld.calibrate.law_choice import LawChoice
 from physworld.calibrate.local_search import FIELDS
@@ -97,7 +98,7 @@ def json_safe(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _predictors(fitted: FitResult) -> dict[str, np.ndarray]:
+def _predictors(fitted: FitResult) -> dict[str, Array]:
     """Tracks whose errors are reported: the twin's, and where it carries a field also those without it."""
     found = {"twin": fitted.tracks}
     return found if fitted.homogeneous is None else {"twin_homogeneous": fitted.homogeneous, **found}

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.scene import Scene
 from physworld_scenes.bundle import bundle_from_bytes
 from physworld_schemas.base import Artifact, Reference
@@ -68,7 +69,7 @@ def npz_bytes(arrays: Mapping[str, Any]) -> bytes:
     return buffer.getvalue()
 
 
-def npz_arrays(data: bytes) -> dict[str, np.ndarray]:
+def npz_arrays(data: bytes) -> dict[str, Array]:
     """The arrays of an npz; one that would need a pickle is refused with ValueError."""
     with np.load(io.BytesIO(data), allow_pickle=False) as archive:
         return {name: archive[name] for name in archive.files}

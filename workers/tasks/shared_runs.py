@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.calibrate import Journal
 from physworld.estimation.simulations import Drive, Job, engine, tracks_of
 from physworld.trace import Memory, TimeUp
@@ -66,7 +67,7 @@ class SharedMemory(Memory):
         super().__init__()
         self._stores, self._job_id = stores, job_id
 
-    def get(self, key: str) -> tuple[bool, np.ndarray | None]:
+    def get(self, key: str) -> tuple[bool, Array | None]:
         """Whether the run is known, and its tracks."""
         data = self._stores.scratch.get(self._job_id, f"{key}.npy")
         if data is None:
@@ -74,7 +75,7 @@ class SharedMemory(Memory):
         tracks = np.load(io.BytesIO(data), allow_pickle=False)
         return True, tracks if tracks.size else None
 
-    def put(self, key: str, tracks: np.ndarray | None) -> None:
+    def put(self, key: str, tracks: Array | None) -> None:
         """Remember a run, unless it is known."""
         if self._stores.scratch.has(self._job_id, f"{key}.npy"):
             return
@@ -98,9 +99,7 @@ class SharedRunner:
         self._runtime = Runtime(stores.settings, stores.database, stores, process_owner())
         self._count = 0
 
-    def __call__(
-        self, jobs: Sequence[Job], drive: Drive, poll: Callable[[], None]
-    ) -> Iterator[np.ndarray | None]:
+    def __call__(self, jobs: Sequence[Job], drive: Drive, poll: Callable[[], None]) -> Iterator[Array | None]:
         """Tracks of the jobs in their order; None for a run that cannot be trusted."""
         while jobs and (len(jobs) == 1 or not self._worth_sharing):
             yield self._here(jobs[0], drive, poll)
@@ -126,7 +125,7 @@ class SharedRunner:
     def _worth_sharing(self) -> bool:
         return self._worth_s == 0.0 or (self._timed >= _TIMED and self._fastest_s >= self._worth_s)
 
-    def _here(self, job: Job, drive: Drive, poll: Callable[[], None]) -> np.ndarray | None:
+    def _here(self, job: Job, drive: Drive, poll: Callable[[], None]) -> Array | None:
         begun = time.monotonic()
         tracks = tracks_of(job, drive, lambda done, total: poll())
         if tracks is not None:  # one that blew up ended early
@@ -171,7 +170,7 @@ def _read_drive(stores: Stores, job_id: str, name: str) -> Drive:
     return Drive(**_read(stores, job_id, name))
 
 
-def _read(stores: Stores, job_id: str, name: str) -> dict[str, np.ndarray]:
+def _read(stores: Stores, job_id: str, name: str) -> dict[str, Array]:
     data = stores.scratch.get(job_id, name)
     if data is None:
         raise NotFound("scratch file", f"{name} of {job_id}")

@@ -8,9 +8,10 @@ import zipfile
 import numpy as np
 
 from physworld_client.errors import PhysWorldError
+from physworld_client.types import Array
 
 
-def arrays_of(data: bytes) -> dict[str, np.ndarray]:
+def arrays_of(data: bytes) -> dict[str, Array]:
     """The arrays of an npz by name.
 
     Raises:

@@ -7,13 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from physworld_client import calls
 from physworld_client.arrays import arrays_of
 from physworld_client.async_resources import AsyncResource
 from physworld_client.pages import AsyncListPage
 from physworld_client.resources import LATEST
+from physworld_client.types import Array
 from physworld_schemas.assessment import Assessment
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.job import Job
@@ -59,7 +58,7 @@ class AsyncTraces(AsyncResource):
             lambda at: calls.trace_list(limit=limit, cursor=at, scene_id=scene_id, verdict=verdict), cursor
         )
 
-    async def tracks(self, trace_id: str) -> dict[str, np.ndarray]:
+    async def tracks(self, trace_id: str) -> dict[str, Array]:
         """``times`` (T,) [s], ``before`` and ``after`` (T, N, 3) [m]: open-loop tracks without and with the effects."""
         return arrays_of(await self._client.send(calls.trace_tracks(trace_id)))
 

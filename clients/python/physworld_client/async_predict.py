@@ -7,13 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from physworld_client import predictions
 from physworld_client.async_resources import AsyncResource
 from physworld_client.pages import AsyncListPage
 from physworld_client.predictions import Planned, Predicted
 from physworld_client.resources import LATEST
+from physworld_client.types import Array
 from physworld_schemas.job import Job
 from physworld_schemas.plan import Plan, PlanConfig, PlanLimits
 from physworld_schemas.rollout import Part, Rollout, Start
@@ -25,13 +24,13 @@ class AsyncRollouts(AsyncResource):
     async def create(
         self,
         model: str,
-        controllers: np.ndarray,
+        controllers: Array,
         version: int | str = LATEST,
         *,
-        times: np.ndarray | None = None,
+        times: Array | None = None,
         dt_s: float | None = None,
         start: Start = "recording",
-        phi: np.ndarray | None = None,
+        phi: Array | None = None,
         stiffness_factor: float = 1.0,
         density_factor: float = 1.0,
         returns: Sequence[Part] = ("points",),
@@ -105,7 +104,7 @@ class AsyncPlans(AsyncResource):
         version: int | str = LATEST,
         *,
         points: dict[int, Sequence[float]] | None = None,
-        shape: np.ndarray | None = None,
+        shape: Array | None = None,
         limits: PlanLimits | None = None,
         config: PlanConfig | None = None,
     ) -> Job:

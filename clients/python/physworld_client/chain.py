@@ -12,6 +12,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from physworld_client.types import Array
+
 CALMINGS = 8
 LEAN_FLOOR = 1e-6
 LENGTH_FLOOR_M2 = 1e-24
@@ -20,7 +22,7 @@ LENGTH_FLOOR_M2 = 1e-24
 class Chain:
     """Point masses along the centre line, moved through one tick both ways in time."""
 
-    def __init__(self, tensors: Mapping[str, np.ndarray]) -> None:
+    def __init__(self, tensors: Mapping[str, Array]) -> None:
         held = {
             name[6:]: value.astype(np.float64) for name, value in tensors.items() if name.startswith("prior.")
         }
@@ -29,7 +31,7 @@ class Chain:
         self._free = (held["member"].sum(axis=1) == 0).astype(np.float64)[:, None]
         self._lightness = self._free / held["mass"][:, None]
 
-    def ahead(self, window: np.ndarray, control_next: np.ndarray, phi: np.ndarray) -> np.ndarray:
+    def ahead(self, window: Array, control_next: Array, phi: Array) -> Array:
         """x̂^{t+1} of the object vertices [m], (n, 3), from (h+1, V, 3), (C, 3) and (n, 2)."""
         held, n = self._held, len(phi)
         ahead, here, behind = (self._driven(c) for c in (control_next, window[-1, n:], window[-2, n:]))
@@ -50,15 +52,15 @@ class Chain:
 
     def _flow(
         self,
-        place: np.ndarray,
-        velocity: np.ndarray,
-        here: np.ndarray,
-        slope: np.ndarray,
-        turn: np.ndarray,
-        pull: np.ndarray,
-        bend: np.ndarray,
-        ease: np.ndarray,
-    ) -> np.ndarray:
+        place: Array,
+        velocity: Array,
+        here: Array,
+        slope: Array,
+        turn: Array,
+        pull: Array,
+        bend: Array,
+        ease: Array,
+    ) -> Array:
         """Nodes (K, 3) after a tick; the driven ones are at here + s slope + s²/2 turn."""
         held, step = self._held, 1.0 / self._substeps
         dash, before = held["dash"][:, None] * self._substeps, None
@@ -79,10 +81,10 @@ class Chain:
             place = self._free * (place + step * velocity) + here + now * (slope + 0.5 * now * turn)
         return place
 
-    def _nodes(self, vertices: np.ndarray, driven: np.ndarray) -> np.ndarray:
+    def _nodes(self, vertices: Array, driven: Array) -> Array:
         return np.asarray(self._held["read"] @ vertices + self._held["hold"] @ driven)
 
-    def _moduli(self, phi: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _moduli(self, phi: Array) -> tuple[Array, Array, Array]:
         """Pull (K-1, 1), bend (K-2, 1) and ease (K, 1) of Φ."""
         held = self._held
         stiff, heavy = (held["share"] @ phi.astype(np.float64)).T
@@ -92,7 +94,7 @@ class Chain:
         bend = held["bend"] * np.exp(stiff[1:-1])
         return pull[:, None], bend[:, None], self._lightness * np.exp(-heavy)[:, None]
 
-    def _driven(self, controls: np.ndarray) -> np.ndarray:
+    def _driven(self, controls: Array) -> Array:
         """Places of the driven nodes (K, 3) from control vertices (C, 3)."""
         held, places = self._held, np.zeros((len(self._free), 3))
         for grip, markers in enumerate(held["markers"]):
@@ -110,7 +112,7 @@ class Chain:
             places += held["member"][:, grip, None] * (held["anchor"][grip] @ controls + offset)
         return places
 
-    def _rigid(self, place: np.ndarray, change: np.ndarray) -> np.ndarray:
+    def _rigid(self, place: Array, change: Array) -> Array:
         """``change`` of ``place`` without what lengthens segments."""
         along = _unit(np.diff(place, axis=0))
         stretch = (along * np.diff(change, axis=0)).sum(axis=1)
@@ -118,5 +120,5 @@ class Chain:
         return np.asarray(change + self._lightness * np.diff(push, axis=0))
 
 
-def _unit(vector: np.ndarray) -> np.ndarray:
+def _unit(vector: Array) -> Array:
     return np.asarray(vector / np.linalg.norm(vector, axis=-1, keepdims=True))

@@ -14,6 +14,7 @@ from websockets.exceptions import ConnectionClosed
 
 from physworld_client.calls import Call
 from physworld_client.errors import LiveSessionEnded, PhysWorldError
+from physworld_client.types import Array
 from physworld_schemas.live import LiveTicket, LiveTicketCreate
 from physworld_schemas.rollout import Part
 
@@ -39,8 +40,8 @@ class LiveStart:
     """
 
     dt_s: float
-    points: np.ndarray
-    controllers: np.ndarray
+    points: Array
+    controllers: Array
     grips: tuple[tuple[int, ...], ...]
     speed_m_s: float
     reach_m: float
@@ -62,8 +63,8 @@ class LiveFrame:
     control: int
     time_s: float
     set_back: bool
-    points: np.ndarray
-    controllers: np.ndarray
+    points: Array
+    controllers: Array
 
 
 def ticket_create(model: str, version: int | str) -> Call[LiveTicket]:

@@ -7,12 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from physworld_client import calls
 from physworld_client.arrays import arrays_of
 from physworld_client.pages import ListPage
 from physworld_client.resources import LATEST, Resource
+from physworld_client.types import Array
 from physworld_schemas.assessment import Assessment
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.job import Job
@@ -58,7 +57,7 @@ class Traces(Resource):
             lambda at: calls.trace_list(limit=limit, cursor=at, scene_id=scene_id, verdict=verdict), cursor
         )
 
-    def tracks(self, trace_id: str) -> dict[str, np.ndarray]:
+    def tracks(self, trace_id: str) -> dict[str, Array]:
         """``times`` (T,) [s], ``before`` and ``after`` (T, N, 3) [m]: open-loop tracks without and with the effects."""
         return arrays_of(self._client.send(calls.trace_tracks(trace_id)))
 

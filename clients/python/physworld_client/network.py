@@ -19,6 +19,7 @@ import numpy as np
 
 from physworld_client.chain import Chain
 from physworld_client.errors import ModelUnreadable
+from physworld_client.types import Array
 
 EDGE_KINDS = 3  # near, coarse, grip
 PROPERTY_COUNT = 2
@@ -37,16 +38,16 @@ class Edges:
         share: one over their number, (S, 1).
     """
 
-    receivers: np.ndarray
-    senders: np.ndarray
-    kinds: np.ndarray
-    rest: np.ndarray
-    segments: np.ndarray
-    first: np.ndarray
-    share: np.ndarray
+    receivers: Array
+    senders: Array
+    kinds: Array
+    rest: Array
+    segments: Array
+    first: Array
+    share: Array
 
     @classmethod
-    def sorted(cls, receivers: np.ndarray, senders: np.ndarray, kinds: np.ndarray, rest: np.ndarray) -> Edges:
+    def sorted(cls, receivers: Array, senders: Array, kinds: Array, rest: Array) -> Edges:
         """From edges in any order."""
         segments = receivers * EDGE_KINDS + kinds
         order = np.argsort(segments, kind="stable")
@@ -54,7 +55,7 @@ class Edges:
         share = (1.0 / counts[:, None]).astype(np.float32)
         return cls(receivers[order], senders[order], kinds[order], rest[order], ends, first, share)
 
-    def of_kind(self, kind: int) -> np.ndarray:
+    def of_kind(self, kind: int) -> Array:
         """Rows of that kind."""
         return np.nonzero(self.kinds == kind)[0]
 
@@ -69,7 +70,7 @@ class Network:
         has_ground: whether the vertices see their height above the ground.
     """
 
-    def __init__(self, tensors: Mapping[str, np.ndarray], object_count: int) -> None:
+    def __init__(self, tensors: Mapping[str, Array], object_count: int) -> None:
         self._tensors = tensors
         self.layers = sum(name.startswith("receive.") and name.endswith(".weight") for name in tensors)
         self._nearest = int(tensors.get("graph.current_neighbours", np.zeros(1))[0])
@@ -93,7 +94,7 @@ class Network:
         layers = [self._tensor(f"edge.{layer}.weight") for layer in range(self.layers)]
         self._edge_weights = np.concatenate(layers, axis=1).transpose(0, 2, 1).copy()
 
-    def step(self, window: np.ndarray, control_next: np.ndarray, phi: np.ndarray) -> np.ndarray:
+    def step(self, window: Array, control_next: Array, phi: Array) -> Array:
         """Positions of all vertices one clock tick later [m], (V, 3).
 
         Args:
@@ -117,7 +118,7 @@ class Network:
         ahead[:n] += self._scale("change") * correction.astype(np.float64)
         return ahead
 
-    def _prior(self, window: np.ndarray, control_next: np.ndarray, phi: np.ndarray) -> np.ndarray:
+    def _prior(self, window: Array, control_next: Array, phi: Array) -> Array:
         """x̂^{t+1} of the object vertices [m], (n, 3)."""
         if self._chain is not None:
             return self._chain.ahead(window, control_next, phi)
@@ -128,7 +129,7 @@ class Network:
             )
         return self._modal_prior(window, control_next, phi)
 
-    def _modal_prior(self, window: np.ndarray, control_next: np.ndarray, phi: np.ndarray) -> np.ndarray:
+    def _modal_prior(self, window: Array, control_next: Array, phi: Array) -> Array:
         """x̂^{t+1} of the object vertices [m], (n, 3)."""
         n = self.object_count
         basis = self._tensor("prior.basis").astype(np.float64)
@@ -157,7 +158,7 @@ class Network:
         rest = self._tensor("graph.rest_relative").astype(np.float64)[receivers, slots]
         return Edges.sorted(receivers, neighbours[receivers, slots], kinds, rest)
 
-    def _edges_at(self, places: np.ndarray) -> Edges:
+    def _edges_at(self, places: Array) -> Edges:
         """The kept edges and the NEAR ones of the places (V, 3): the nearest within the edge radius."""
         n, radius = self.object_count, np.float32(self._scale("length"))
         now, rest = places[:n].astype(np.float32), self._tensor("rest.vertices").astype(np.float64)
@@ -173,14 +174,14 @@ class Network:
             np.concatenate([rest[senders] - rest[receivers], kept.rest]),
         )
 
-    def _means(self, edges: Edges, messages: np.ndarray) -> np.ndarray:
+    def _means(self, edges: Edges, messages: Array) -> Array:
         """Means of the messages (E, H) by receiver and kind, (V, 3H); 0 where there is no such edge."""
         vertex_count, width = self.object_count + self.control_count, messages.shape[1]
         means = np.zeros((vertex_count * EDGE_KINDS, width), dtype=messages.dtype)
         means[edges.segments] = np.add.reduceat(messages, edges.first, axis=0) * edges.share
         return means.reshape(vertex_count, EDGE_KINDS * width)
 
-    def _vertex_features(self, window: np.ndarray, ahead: np.ndarray, phi: np.ndarray) -> np.ndarray:
+    def _vertex_features(self, window: Array, ahead: Array, phi: Array) -> Array:
         """f_i, (V, 3h+7 or 3h+8): own velocities newest first, what lies ahead, properties, kind, height."""
         n, control = self.object_count, self.control_count
         moves = (window[1:] - window[:-1])[::-1] / self._scale("velocity")
@@ -194,7 +195,7 @@ class Network:
             parts.append(np.clip(window[-1, :, 2:] / self._scale("length"), 0.0, 1.0))
         return np.concatenate(parts, axis=1).astype(np.float32)
 
-    def _edge_terms(self, edges: Edges, window: np.ndarray) -> np.ndarray:
+    def _edge_terms(self, edges: Edges, window: Array) -> Array:
         """edge.l.weight[κ] e_ij of every edge and layer, (E, L, H)."""
         relative = window[:, edges.senders] - window[:, edges.receivers]
         length = np.linalg.norm(relative[-1], axis=1, keepdims=True)
@@ -220,20 +221,20 @@ class Network:
             terms[rows] = features[rows] @ self._edge_weights[kind]
         return terms.reshape(len(features), self.layers, -1)
 
-    def _mlp(self, name: str, values: np.ndarray) -> np.ndarray:
+    def _mlp(self, name: str, values: Array) -> Array:
         return self._linear(f"{name}.out", np.maximum(self._linear(f"{name}.in", values), 0.0))
 
-    def _linear(self, name: str, values: np.ndarray) -> np.ndarray:
+    def _linear(self, name: str, values: Array) -> Array:
         return values @ self._tensor(f"{name}.weight").T + self._tensor(f"{name}.bias")
 
     def _scale(self, name: str) -> float:
         return float(self._tensor(f"norm.{name}")[0])
 
-    def _scale_by_kind(self, name: str, edges: Edges) -> np.ndarray:
+    def _scale_by_kind(self, name: str, edges: Edges) -> Array:
         """σ_name[κ] of every edge, (E, 1)."""
         return self._tensor(f"norm.{name}").astype(np.float64)[edges.kinds][:, None]
 
-    def _tensor(self, name: str) -> np.ndarray:
+    def _tensor(self, name: str) -> Array:
         try:
             return self._tensors[name]
         except KeyError:

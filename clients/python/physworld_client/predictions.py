@@ -13,6 +13,7 @@ from pydantic import TypeAdapter
 from physworld_client.arrays import arrays_of
 from physworld_client.calls import BYTES, Call, _given, _part, artifact_path
 from physworld_client.errors import DigestMismatch, ModelUnreadable
+from physworld_client.types import Array
 from physworld_schemas.arrays import EncodedArray
 from physworld_schemas.base import Artifact, Page
 from physworld_schemas.job import Job
@@ -41,9 +42,9 @@ class Predicted:
     """
 
     rollout: Rollout
-    times: np.ndarray
-    points: np.ndarray | None = None
-    vertices: np.ndarray | None = None
+    times: Array
+    points: Array | None = None
+    vertices: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -56,22 +57,22 @@ class Planned:
     """
 
     plan: Plan
-    arrays: dict[str, np.ndarray] = field(default_factory=dict)
+    arrays: dict[str, Array] = field(default_factory=dict)
 
     @property
-    def controllers(self) -> np.ndarray:
+    def controllers(self) -> Array:
         """All control points [m], the history's ticks first."""
         return self.arrays["controllers"]
 
 
 def rollout_create(
     model: str,
-    controllers: np.ndarray,
+    controllers: Array,
     version: int | str,
-    times: np.ndarray | None,
+    times: Array | None,
     dt_s: float | None,
     start: Start,
-    phi: np.ndarray | None,
+    phi: Array | None,
     stiffness_factor: float,
     density_factor: float,
     returns: Sequence[Part],
@@ -114,7 +115,7 @@ def plan_create(
     model: str,
     version: int | str,
     points: dict[int, Sequence[float]] | None,
-    shape: np.ndarray | None,
+    shape: Array | None,
     limits: PlanLimits | None,
     config: PlanConfig | None,
 ) -> Call[Job]:
@@ -155,7 +156,7 @@ def file_of(artifacts: list[Artifact], name: str, owner: str) -> tuple[Artifact,
     return found, Call("GET", artifact_path(found.sha256), BYTES)
 
 
-def checked_arrays(artifact: Artifact, data: bytes) -> dict[str, np.ndarray]:
+def checked_arrays(artifact: Artifact, data: bytes) -> dict[str, Array]:
     """The arrays of an artifact. Raises DigestMismatch."""
     digest = hashlib.sha256(data).hexdigest()
     if digest != artifact.sha256:
@@ -163,7 +164,7 @@ def checked_arrays(artifact: Artifact, data: bytes) -> dict[str, np.ndarray]:
     return arrays_of(data)
 
 
-def predicted(rollout: Rollout, arrays: dict[str, np.ndarray] | None = None) -> Predicted:
+def predicted(rollout: Rollout, arrays: dict[str, Array] | None = None) -> Predicted:
     """The arrays of an answer, or of the job's file."""
     if arrays is not None:
         return Predicted(rollout, arrays["times"], arrays.get("points"), arrays.get("vertices"))

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import httpx
-import numpy as np
 
 from physworld_client import calls, transport
 from physworld_client.arrays import arrays_of
@@ -24,6 +23,7 @@ from physworld_client.manifest import artifacts_of, verify_folder
 from physworld_client.pages import ListPage
 from physworld_client.signatures import given_key
 from physworld_client.stream import HEARTBEAT_S, IDLE_LIMIT_S, EventDecoder, ends_job
+from physworld_client.types import Array
 from physworld_client.waiting import Patience, job_id_of, require_success
 from physworld_schemas.dataset import Dataset, DatasetConfig, Episode
 from physworld_schemas.fit import Fit, FitConfig
@@ -111,7 +111,7 @@ class Datasets(Resource):
         """The committed episodes of a dataset."""
         return self._page(lambda at: calls.dataset_episodes(dataset_id, limit=limit, cursor=at), cursor)
 
-    def episode(self, dataset_id: str, index: int) -> dict[str, np.ndarray]:
+    def episode(self, dataset_id: str, index: int) -> dict[str, Array]:
         """The arrays of one committed episode.
 
         ``times`` (T,) [s], ``particles`` (T, P, 3) [m], ``controllers`` (T, K, 3) [m], ``properties`` (P, 2): log

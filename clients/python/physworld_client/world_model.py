@@ -24,6 +24,7 @@ from physworld_client.errors import ModelUnreadable
 from physworld_client.known_keys import trusted_keys
 from physworld_client.manifest import CARD_NAME, WEIGHTS_NAME, verify_folder
 from physworld_client.network import PROPERTY_COUNT, Network
+from physworld_client.types import Array
 from physworld_schemas.arrays import FARTHEST_M
 
 CARD_SCHEMA = 1
@@ -51,16 +52,16 @@ class WorldModel:
     version: int
     card: dict[str, Any]
     dt_s: float
-    start_history: np.ndarray
-    start_controllers: np.ndarray
+    start_history: Array
+    start_controllers: Array
     start_time_s: float
-    rest_vertices: np.ndarray
-    control_index: np.ndarray
-    phi: np.ndarray
-    phi_calibrated: np.ndarray
+    rest_vertices: Array
+    control_index: Array
+    phi: Array
+    phi_calibrated: Array
     ground_height_m: float | None
     _network: Network
-    _skin: tuple[np.ndarray, np.ndarray] | None
+    _skin: tuple[Array, Array] | None
 
     @classmethod
     def load(
@@ -114,11 +115,11 @@ class WorldModel:
         card: dict[str, Any],
         dt_s: float,
         ground_height_m: float | None,
-        tensors: Mapping[str, np.ndarray],
+        tensors: Mapping[str, Array],
     ) -> WorldModel:
         """The model of verified tensors."""
 
-        def tensor(key: str) -> np.ndarray:
+        def tensor(key: str) -> Array:
             if key not in tensors:
                 raise ModelUnreadable(f"{name} version {version} lacks the tensor {key!r}")
             return tensors[key]
@@ -159,9 +160,7 @@ class WorldModel:
         """K, the controllers of the scene."""
         return int(self.start_controllers.shape[1])
 
-    def rollout(
-        self, controllers: np.ndarray, phi: np.ndarray | None = None, *, history: np.ndarray | None = None
-    ) -> np.ndarray:
+    def rollout(self, controllers: Array, phi: Array | None = None, *, history: Array | None = None) -> Array:
         """Object vertices over time [m], (T, n, 3); the first h+1 frames are the history itself.
 
         Args:
@@ -204,13 +203,13 @@ class WorldModel:
             path[tick] = self._network.step(path[tick - frames : tick], controls[tick], properties)
         return path[:, :n] + origin
 
-    def track(self, vertices: np.ndarray) -> np.ndarray:
+    def track(self, vertices: Array) -> Array:
         """The scene's measured points that vertices (T, n, 3) carry [m], (T, N, 3)."""
         if self._skin is None:
             raise ModelUnreadable(f"{self.name} version {self.version} carries no measured points")
         index, weight = self._skin
         places = np.asarray(vertices)
-        points: np.ndarray = weight[:, :1] * places[..., index[:, 0], :]
+        points: Array = weight[:, :1] * places[..., index[:, 0], :]
         for k in range(1, index.shape[1]):  # one neighbour at a time: all at once take K times the memory
             points += weight[:, k, None] * places[..., index[:, k], :]
         return points

@@ -22,6 +22,7 @@ from dataclasses import replace
 import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.engine.gradients.adjoint_kernels import keep_row
 from physworld.engine.gradients.adjoint_pairs import ForcePair
 from physworld.engine.gradients.adjoint_reverse import Gradient, ReversePass
@@ -62,10 +63,10 @@ class Adjoint:
 
     def run(
         self,
-        x: np.ndarray,
-        v: np.ndarray,
+        x: Array,
+        v: Array,
         held: HeldNodes,
-        times: np.ndarray,
+        times: Array,
         progress: Callable[[int, int], None] | None = None,
     ) -> RecordedRun:
         """Integrate and keep what a gradient needs: arguments and errors of :meth:`TotalLagrangian.run`."""
@@ -91,10 +92,10 @@ class RecordedRun:
     def __init__(
         self,
         adjoint: Adjoint,
-        x: np.ndarray,
-        v: np.ndarray,
+        x: Array,
+        v: Array,
         held: HeldNodes,
-        times: np.ndarray,
+        times: Array,
         progress: Callable[[int, int], None] | None,
     ) -> None:
         self.problem, self.solver = adjoint.problem, adjoint.solver
@@ -143,7 +144,7 @@ class RecordedRun:
         """The problem's terms on the device."""
         return self.solver.terms[:-1]
 
-    def gradient(self, seed: np.ndarray, pairs: Sequence[ForcePair] = ()) -> Gradient:
+    def gradient(self, seed: Array, pairs: Sequence[ForcePair] = ()) -> Gradient:
         """Derivatives of L from those by the positions at the frames, ``seed`` (T, n, 3).
 
         Args:
@@ -178,7 +179,7 @@ class _Recorder:
     def bind(self, problem: Problem) -> _Recorder:
         return self
 
-    def begin(self, times: np.ndarray) -> None:
+    def begin(self, times: Array) -> None:
         return None
 
     def pace(self, time_step_s: float) -> None:

@@ -26,12 +26,12 @@ from physworld.engine.total.node_kernels import hermite
 @wp.kernel(enable_backward=False)
 def keep_row(
     # in
-    offset: wp.array(dtype=wp.int32),
-    counter: wp.array(dtype=wp.int32),
-    values: wp.array(dtype=wp.float64),
+    offset: wp.array[wp.int32],
+    counter: wp.array[wp.int32],
+    values: wp.array[wp.float64],
     # out
-    history: wp.array2d(dtype=Any),
-):
+    history: wp.array2d[Any],
+) -> None:
     """Write one component into the row of this substep."""
     k = wp.tid()
     history[offset[counter[0]] + counter[1], k] = history.dtype(values[k])
@@ -40,12 +40,12 @@ def keep_row(
 @wp.kernel(enable_backward=False)
 def keep_rows(
     # in
-    offset: wp.array(dtype=wp.int32),
-    counter: wp.array(dtype=wp.int32),
-    memory: wp.array(dtype=Any),
+    offset: wp.array[wp.int32],
+    counter: wp.array[wp.int32],
+    memory: wp.array[Any],
     # out
-    rows: wp.array2d(dtype=wp.float64),
-):
+    rows: wp.array2d[wp.float64],
+) -> None:
     """Write a memory as it is after this substep into the row of the next."""
     k = wp.tid()
     rows[offset[counter[0]] + counter[1] + 1, k] = wp.float64(memory[k])
@@ -54,12 +54,12 @@ def keep_rows(
 @wp.kernel(enable_backward=False)
 def load_row(
     # in
-    offset: wp.array(dtype=wp.int32),
-    counter: wp.array(dtype=wp.int32),
-    rows: wp.array2d(dtype=wp.float64),
+    offset: wp.array[wp.int32],
+    counter: wp.array[wp.int32],
+    rows: wp.array2d[wp.float64],
     # out
-    memory: wp.array(dtype=Any),
-):
+    memory: wp.array[Any],
+) -> None:
     """Set a memory to what it was before this substep."""
     k = wp.tid()
     memory[k] = memory.dtype(rows[offset[counter[0]] + counter[1], k])
@@ -68,10 +68,10 @@ def load_row(
 @wp.kernel(enable_backward=False)
 def take_away(
     # in
-    total: wp.array(dtype=wp.float64),
+    total: wp.array[wp.float64],
     # in, out
-    part: wp.array(dtype=wp.float64),
-):
+    part: wp.array[wp.float64],
+) -> None:
     """part becomes total - part."""
     k = wp.tid()
     part[k] = total[k] - part[k]
@@ -80,14 +80,14 @@ def take_away(
 @wp.kernel(enable_backward=False)
 def last_positions(
     # in
-    x_start: wp.array(dtype=wp.float64),
-    history: wp.array2d(dtype=Any),
+    x_start: wp.array[wp.float64],
+    history: wp.array2d[Any],
     first_row: int,
     substeps: int,
     dt: wp.float64,
     # out
-    x: wp.array(dtype=wp.float64),
-):
+    x: wp.array[wp.float64],
+) -> None:
     """Positions before the last substep of a frame that starts at ``x_start``."""
     k = wp.tid()
     moved = wp.float64(0.0)
@@ -99,31 +99,31 @@ def last_positions(
 @wp.kernel(enable_backward=False)
 def take_nodes_back(
     # model
-    mass: wp.array(dtype=wp.float64),
-    slot: wp.array(dtype=wp.int32),
+    mass: wp.array[wp.float64],
+    slot: wp.array[wp.int32],
     gravity: wp.vec3d,
     drag: wp.float64,
-    offset: wp.array(dtype=wp.int32),
-    history: wp.array2d(dtype=Any),
-    clock: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
-    earlier_dt: wp.array(dtype=wp.float64),
+    offset: wp.array[wp.int32],
+    history: wp.array2d[Any],
+    clock: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
+    earlier_dt: wp.array[wp.float64],
     # in
-    x: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
     # in, out
-    x_bar: wp.array(dtype=wp.float64),
-    v_bar: wp.array(dtype=wp.float64),
-    mass_bar: wp.array(dtype=wp.float64),
-    gravity_bar: wp.array(dtype=wp.float64),
-    drag_bar: wp.array(dtype=wp.float64),
-    path_x_bar: wp.array2d(dtype=wp.float64),
-    path_v_bar: wp.array2d(dtype=wp.float64),
+    x_bar: wp.array[wp.float64],
+    v_bar: wp.array[wp.float64],
+    mass_bar: wp.array[wp.float64],
+    gravity_bar: wp.array[wp.float64],
+    drag_bar: wp.array[wp.float64],
+    path_x_bar: wp.array2d[wp.float64],
+    path_v_bar: wp.array2d[wp.float64],
     # out
-    v: wp.array(dtype=wp.float64),
-    x_previous: wp.array(dtype=wp.float64),
-    pull: wp.array(dtype=wp.float64),
-    force_bar: wp.array(dtype=wp.float64),
-):
+    v: wp.array[wp.float64],
+    x_previous: wp.array[wp.float64],
+    pull: wp.array[wp.float64],
+    force_bar: wp.array[wp.float64],
+) -> None:
     """One node: from the derivatives after a substep to those of its forces, and to what is known before them."""
     node = wp.tid()
     dt = clock[2]
@@ -169,14 +169,14 @@ def take_nodes_back(
 @wp.kernel(enable_backward=False)
 def step_back(
     # in
-    x_previous: wp.array(dtype=wp.float64),
+    x_previous: wp.array[wp.float64],
     # in, out
-    previous_bar: wp.array(dtype=wp.float64),
-    pending: wp.array(dtype=wp.float64),
+    previous_bar: wp.array[wp.float64],
+    pending: wp.array[wp.float64],
     # out
-    x: wp.array(dtype=wp.float64),
-    x_bar: wp.array(dtype=wp.float64),
-):
+    x: wp.array[wp.float64],
+    x_bar: wp.array[wp.float64],
+) -> None:
     """One component to the substep before; what friction asked of the positions before waits one substep."""
     k = wp.tid()
     x_bar[k] += pending[k]
@@ -186,7 +186,7 @@ def step_back(
 
 
 @wp.kernel(enable_backward=False)
-def count_back(counter: wp.array(dtype=wp.int32)):
+def count_back(counter: wp.array[wp.int32]) -> None:
     """The substep before."""
     counter[1] = counter[1] - 1
 
@@ -194,22 +194,22 @@ def count_back(counter: wp.array(dtype=wp.int32)):
 @wp.kernel(enable_backward=False)
 def take_start_back(
     # model
-    mass: wp.array(dtype=wp.float64),
+    mass: wp.array[wp.float64],
     gravity: wp.vec3d,
     drag: wp.float64,
     dt: wp.float64,
     # in
-    v: wp.array(dtype=wp.float64),
-    v_half: wp.array(dtype=wp.float64),
+    v: wp.array[wp.float64],
+    v_half: wp.array[wp.float64],
     # in, out
-    v_bar: wp.array(dtype=wp.float64),
-    mass_bar: wp.array(dtype=wp.float64),
-    gravity_bar: wp.array(dtype=wp.float64),
-    drag_bar: wp.array(dtype=wp.float64),
+    v_bar: wp.array[wp.float64],
+    mass_bar: wp.array[wp.float64],
+    gravity_bar: wp.array[wp.float64],
+    drag_bar: wp.array[wp.float64],
     # out
-    pull: wp.array(dtype=wp.float64),
-    force_bar: wp.array(dtype=wp.float64),
-):
+    pull: wp.array[wp.float64],
+    force_bar: wp.array[wp.float64],
+) -> None:
     """The first half step, v_half = v - dt/2 (f / m + g - c v), taken back at one node."""
     node = wp.tid()
     half = wp.float64(0.5) * dt
@@ -227,12 +227,12 @@ def take_start_back(
 @wp.kernel(enable_backward=False)
 def add_work(
     # in
-    force_bar: wp.array(dtype=wp.float64),
+    force_bar: wp.array[wp.float64],
     # in, out
-    high: wp.array(dtype=wp.float64),
-    low: wp.array(dtype=wp.float64),
-    total: wp.array(dtype=wp.float64),
-):
+    high: wp.array[wp.float64],
+    low: wp.array[wp.float64],
+    total: wp.array[wp.float64],
+) -> None:
     """Add force_bar . (high - low) of one node; both are cleared."""
     node = wp.tid()
     work = wp.float64(0.0)
@@ -247,12 +247,12 @@ def add_work(
 @wp.kernel(enable_backward=False)
 def add_memory_work(
     # in
-    bar: wp.array(dtype=wp.float64),
-    high: wp.array(dtype=Any),
-    low: wp.array(dtype=Any),
+    bar: wp.array[wp.float64],
+    high: wp.array[Any],
+    low: wp.array[Any],
     # out
-    total: wp.array(dtype=wp.float64),
-):
+    total: wp.array[wp.float64],
+) -> None:
     """Add bar (high - low) of one number of a memory."""
     k = wp.tid()
     wp.atomic_add(total, 0, bar[k] * (wp.float64(high[k]) - wp.float64(low[k])))

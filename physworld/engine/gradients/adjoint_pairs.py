@@ -10,9 +10,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.engine.gradients.adjoint_kernels import add_memory_work, add_work, load_row
 from physworld.engine.gradients.adjoint_terms import Memory, Reverse, flat
 from physworld.engine.gradients.soft_grips_derivatives import SoftGripsChange
@@ -45,9 +45,7 @@ class ForcePair:
     def __init__(self, high: ForceSide, low: ForceSide, springs: SoftGripsChange | None = None) -> None:
         self._sides, self._springs = (high, low), springs
 
-    def prepare(
-        self, now: Reverse, x_previous: wp.array, times: np.ndarray, memories: list[list[Memory]]
-    ) -> None:
+    def prepare(self, now: Reverse, x_previous: wp.array, times: Array, memories: list[list[Memory]]) -> None:
         """Take the arrays of a reverse pass."""
         self._now, self._x_previous, self._memories = now, x_previous, memories
         self._forces = [wp.zeros_like(now.x) for _ in self._sides]

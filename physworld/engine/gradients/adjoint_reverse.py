@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.engine.gradients.adjoint_kernels import (
     count_back,
     last_positions,
@@ -69,28 +70,28 @@ class Gradient:
         works: of the force pairs that were given.
     """
 
-    log_stiffness: np.ndarray
-    log_density: np.ndarray
-    twist: np.ndarray
-    log_friction: np.ndarray | None
-    law: np.ndarray
+    log_stiffness: Array
+    log_density: Array
+    twist: Array
+    log_friction: Array | None
+    law: Array
     columns: tuple[str, ...]
-    mass: np.ndarray
-    gravity: np.ndarray
+    mass: Array
+    gravity: Array
     drag: float
-    x: np.ndarray
-    v: np.ndarray
-    held_positions: np.ndarray
-    held_velocities: np.ndarray
+    x: Array
+    v: Array
+    held_positions: Array
+    held_velocities: Array
     soft_grips: SoftGripsGradient | None
-    stresses: tuple[tuple[np.ndarray, np.ndarray] | None, ...]
+    stresses: tuple[tuple[Array, Array] | None, ...]
     works: tuple[float, ...]
 
 
 class ReversePass:
     """One reverse pass over a recorded run."""
 
-    def __init__(self, run: RecordedRun, seed: np.ndarray, pairs: Sequence[ForcePair]) -> None:
+    def __init__(self, run: RecordedRun, seed: Array, pairs: Sequence[ForcePair]) -> None:
         self._run, self._seed, self._pairs = run, seed, pairs
         self._problem, self._solver = run.problem, run.solver
         problem, solver, device = self._problem, self._solver, self._problem.device
@@ -315,7 +316,7 @@ class ReversePass:
             works=tuple(pair.work for pair in self._pairs),
         )
 
-    def _by_log_friction(self) -> np.ndarray | None:
+    def _by_log_friction(self) -> Array | None:
         found = None
         for bound, term in zip(self._solver.terms, self._terms, strict=False):
             if isinstance(bound, BoundGround) and isinstance(term, RecordedAdjoint):
@@ -324,7 +325,7 @@ class ReversePass:
         return found
 
 
-def _by_log_density(problem: Problem, mass_bar: np.ndarray) -> np.ndarray:
+def _by_log_density(problem: Problem, mass_bar: Array) -> Array:
     """Derivatives by the log densities of the particles, (P,), from those by the nodal masses (n,)."""
     lattice = problem.lattice
     name = {3: "density_kg_m3", 2: "density_kg_m2", 1: "density_kg_m"}[lattice.dim]

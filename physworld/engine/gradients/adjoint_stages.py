@@ -14,6 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.engine.gradients.adjoint_pairs import ForcePair
 from physworld.engine.gradients.adjoint_stages_kernels import (
     close_stage_back,
@@ -111,7 +112,7 @@ class StagesBack:
             outputs=[now.x_bar, *self._path_bars, now.v_bar], device=now.x.device,
         )  # fmt: skip
 
-    def _run_again(self, table: np.ndarray) -> None:
+    def _run_again(self, table: Array) -> None:
         """The velocities before every stage, and the friction at them."""
         now, y, q = self._now, self._velocities, self._pushes
         for stage in range(len(table)):

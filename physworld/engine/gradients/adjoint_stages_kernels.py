@@ -23,7 +23,7 @@ import warp as wp
 
 
 @wp.func
-def stage_step(clock: wp.array(dtype=wp.float64), counter: wp.array(dtype=wp.int32)):
+def stage_step(clock: wp.array[wp.float64], counter: wp.array[wp.int32]):
     """Time that the stages take [s]: a run's first are half a step."""
     if counter[0] == 0 and counter[1] == 0:
         return wp.float64(0.5) * clock[2]
@@ -33,33 +33,33 @@ def stage_step(clock: wp.array(dtype=wp.float64), counter: wp.array(dtype=wp.int
 @wp.kernel(enable_backward=False)
 def enter_stages_back(
     # model
-    mass: wp.array(dtype=wp.float64),
-    slot: wp.array(dtype=wp.int32),
+    mass: wp.array[wp.float64],
+    slot: wp.array[wp.int32],
     gravity: wp.vec3d,
-    offset: wp.array(dtype=wp.int32),
-    history: wp.array2d(dtype=Any),
-    forces: wp.array2d(dtype=Any),
-    clock: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
-    earlier_dt: wp.array(dtype=wp.float64),
+    offset: wp.array[wp.int32],
+    history: wp.array2d[Any],
+    forces: wp.array2d[Any],
+    clock: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
+    earlier_dt: wp.array[wp.float64],
     # in
-    x: wp.array(dtype=wp.float64),
-    v_bar: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
+    v_bar: wp.array[wp.float64],
     # in, out
-    x_bar: wp.array(dtype=wp.float64),
+    x_bar: wp.array[wp.float64],
     # out
-    v: wp.array(dtype=wp.float64),
-    x_previous: wp.array(dtype=wp.float64),
-    pull: wp.array(dtype=wp.float64),
-    source: wp.array(dtype=wp.float64),
-    y0: wp.array(dtype=wp.float64),
-    cur: wp.array(dtype=wp.float64),
-    before: wp.array(dtype=wp.float64),
-    y0_bar: wp.array(dtype=wp.float64),
-    rate0_bar: wp.array(dtype=wp.float64),
-    goal_bar: wp.array(dtype=wp.float64),
-    force_bar: wp.array(dtype=wp.float64),
-):
+    v: wp.array[wp.float64],
+    x_previous: wp.array[wp.float64],
+    pull: wp.array[wp.float64],
+    source: wp.array[wp.float64],
+    y0: wp.array[wp.float64],
+    cur: wp.array[wp.float64],
+    before: wp.array[wp.float64],
+    y0_bar: wp.array[wp.float64],
+    rate0_bar: wp.array[wp.float64],
+    goal_bar: wp.array[wp.float64],
+    force_bar: wp.array[wp.float64],
+) -> None:
     """One node: what its stages start from, and the derivatives by the velocities of the last."""
     node = wp.tid()
     row = offset[counter[0]] + counter[1]
@@ -93,24 +93,24 @@ def enter_stages_back(
 @wp.kernel(enable_backward=False)
 def take_stage_again(
     # model
-    inverse_mass: wp.array(dtype=wp.float64),
+    inverse_mass: wp.array[wp.float64],
     drag: wp.float64,
-    clock: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
+    clock: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
     a: wp.float64,
     b: wp.float64,
     own: wp.float64,
     first: wp.float64,
     # in
-    source: wp.array(dtype=wp.float64),
-    y0: wp.array(dtype=wp.float64),
-    q0: wp.array(dtype=wp.float64),
-    y_before: wp.array(dtype=wp.float64),
-    y: wp.array(dtype=wp.float64),
-    q: wp.array(dtype=wp.float64),
+    source: wp.array[wp.float64],
+    y0: wp.array[wp.float64],
+    q0: wp.array[wp.float64],
+    y_before: wp.array[wp.float64],
+    y: wp.array[wp.float64],
+    q: wp.array[wp.float64],
     # out
-    y_next: wp.array(dtype=wp.float64),
-):
+    y_next: wp.array[wp.float64],
+) -> None:
     """One component of the velocities after a stage; ``inverse_mass`` is 0 where nodes are prescribed."""
     k = wp.tid()
     share = inverse_mass[k]
@@ -127,26 +127,26 @@ def take_stage_again(
 @wp.kernel(enable_backward=False)
 def open_stage_back(
     # model
-    inverse_mass: wp.array(dtype=wp.float64),
-    clock: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
-    lag_clock: wp.array(dtype=wp.float64),
+    inverse_mass: wp.array[wp.float64],
+    clock: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
+    lag_clock: wp.array[wp.float64],
     is_first: int,
     stay: wp.float64,
     own: wp.float64,
     first: wp.float64,
     # in
-    cur: wp.array(dtype=wp.float64),
-    x: wp.array(dtype=wp.float64),
-    y: wp.array(dtype=wp.float64),
+    cur: wp.array[wp.float64],
+    x: wp.array[wp.float64],
+    y: wp.array[wp.float64],
     # in, out
-    rate0_bar: wp.array(dtype=wp.float64),
-    y0_bar: wp.array(dtype=wp.float64),
+    rate0_bar: wp.array[wp.float64],
+    y0_bar: wp.array[wp.float64],
     # out
-    u: wp.array(dtype=wp.float64),
-    pushed: wp.array(dtype=wp.float64),
-    x_lagged: wp.array(dtype=wp.float64),
-):
+    u: wp.array[wp.float64],
+    pushed: wp.array[wp.float64],
+    x_lagged: wp.array[wp.float64],
+) -> None:
     """One component of u, and of the positions a lag before ``x`` at the velocities ``y`` of the stage's rate."""
     k = wp.tid()
     dt = stage_step(clock, counter)
@@ -163,24 +163,24 @@ def open_stage_back(
 @wp.kernel(enable_backward=False)
 def close_stage_back(
     # model
-    mass: wp.array(dtype=wp.float64),
+    mass: wp.array[wp.float64],
     drag: wp.float64,
     a: wp.float64,
     b: wp.float64,
     # in
-    y: wp.array(dtype=wp.float64),
-    q: wp.array(dtype=wp.float64),
-    pull: wp.array(dtype=wp.float64),
-    u: wp.array(dtype=wp.float64),
-    pushed: wp.array(dtype=wp.float64),
+    y: wp.array[wp.float64],
+    q: wp.array[wp.float64],
+    pull: wp.array[wp.float64],
+    u: wp.array[wp.float64],
+    pushed: wp.array[wp.float64],
     # in, out
-    cur: wp.array(dtype=wp.float64),
-    before: wp.array(dtype=wp.float64),
-    force_bar: wp.array(dtype=wp.float64),
-    mass_bar: wp.array(dtype=wp.float64),
-    gravity_bar: wp.array(dtype=wp.float64),
-    drag_bar: wp.array(dtype=wp.float64),
-):
+    cur: wp.array[wp.float64],
+    before: wp.array[wp.float64],
+    force_bar: wp.array[wp.float64],
+    mass_bar: wp.array[wp.float64],
+    gravity_bar: wp.array[wp.float64],
+    drag_bar: wp.array[wp.float64],
+) -> None:
     """One node to the stage before; ``pushed`` is -C u [N], u is 0 at prescribed nodes."""
     node = wp.tid()
     for i in range(3):
@@ -198,20 +198,20 @@ def close_stage_back(
 @wp.kernel(enable_backward=False)
 def leave_stages_back(
     # model
-    slot: wp.array(dtype=wp.int32),
-    clock: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
+    slot: wp.array[wp.int32],
+    clock: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
     # in
-    cur: wp.array(dtype=wp.float64),
-    y0_bar: wp.array(dtype=wp.float64),
-    goal_bar: wp.array(dtype=wp.float64),
+    cur: wp.array[wp.float64],
+    y0_bar: wp.array[wp.float64],
+    goal_bar: wp.array[wp.float64],
     # in, out
-    x_bar: wp.array(dtype=wp.float64),
-    path_x_bar: wp.array2d(dtype=wp.float64),
-    path_v_bar: wp.array2d(dtype=wp.float64),
+    x_bar: wp.array[wp.float64],
+    path_x_bar: wp.array2d[wp.float64],
+    path_v_bar: wp.array2d[wp.float64],
     # out
-    v_bar: wp.array(dtype=wp.float64),
-):
+    v_bar: wp.array[wp.float64],
+) -> None:
     """One node: the derivatives by the velocity its stages started from; a prescribed one's go to its path."""
     node = wp.tid()
     held = slot[node]

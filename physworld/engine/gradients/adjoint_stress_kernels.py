@@ -215,53 +215,53 @@ def stress_adjoint(model: StressModel) -> Any:
         cell: int,
         # model
         cells: int,
-        cell_nodes: wp.array(dtype=wp.int32),
-        table: wp.array(dtype=wp.float64),
-        x_rest: wp.array(dtype=wp.float64),
+        cell_nodes: wp.array[wp.int32],
+        table: wp.array[wp.float64],
+        x_rest: wp.array[wp.float64],
         inv_dx0: wp.float64,
         inv_dx1: wp.float64,
         inv_dx2: wp.float64,
-        parameters: wp.array(dtype=wp.float64),
-        fields: wp.array(dtype=wp.float64),
+        parameters: wp.array[wp.float64],
+        fields: wp.array[wp.float64],
         first: int,
         row: int,
         dt: wp.float64,
         # in
-        x: wp.array(dtype=wp.float64),
-        state: wp.array2d(dtype=wp.float64),
-        w: wp.array(dtype=wp.float64),
+        x: wp.array[wp.float64],
+        state: wp.array2d[wp.float64],
+        w: wp.array[wp.float64],
         # in, out
-        state_bar: wp.array(dtype=wp.float64),
+        state_bar: wp.array[wp.float64],
         # out
-        x_bar: wp.array(dtype=wp.float64),
-        parameters_bar: wp.array(dtype=wp.float64),
-        fields_bar: wp.array(dtype=wp.float64),
+        x_bar: wp.array[wp.float64],
+        parameters_bar: wp.array[wp.float64],
+        fields_bar: wp.array[wp.float64],
     ): ...
 
     @wp.kernel(module="unique", enable_backward=False)
     def adjoint(
         # model
         cells: int,
-        cell_nodes: wp.array(dtype=wp.int32),
-        table: wp.array(dtype=wp.float64),
-        x_rest: wp.array(dtype=wp.float64),
+        cell_nodes: wp.array[wp.int32],
+        table: wp.array[wp.float64],
+        x_rest: wp.array[wp.float64],
         inv_dx: wp.vec3d,
-        parameters: wp.array(dtype=wp.float64),
-        fields: wp.array(dtype=wp.float64),
-        clock: wp.array(dtype=wp.float64),
-        counter: wp.array(dtype=wp.int32),
-        offset: wp.array(dtype=wp.int32),
+        parameters: wp.array[wp.float64],
+        fields: wp.array[wp.float64],
+        clock: wp.array[wp.float64],
+        counter: wp.array[wp.int32],
+        offset: wp.array[wp.int32],
         # in
-        x: wp.array(dtype=wp.float64),
-        state: wp.array2d(dtype=wp.float64),
-        w: wp.array(dtype=wp.float64),
+        x: wp.array[wp.float64],
+        state: wp.array2d[wp.float64],
+        w: wp.array[wp.float64],
         # in, out
-        state_bar: wp.array(dtype=wp.float64),
+        state_bar: wp.array[wp.float64],
         # out
-        x_bar: wp.array(dtype=wp.float64),
-        parameters_bar: wp.array(dtype=wp.float64),
-        fields_bar: wp.array(dtype=wp.float64),
-    ):
+        x_bar: wp.array[wp.float64],
+        parameters_bar: wp.array[wp.float64],
+        fields_bar: wp.array[wp.float64],
+    ) -> None:
         first = 1 - wp.min(counter[0] + counter[1], 1)
         cell_adjoint(
             wp.tid(), cells, cell_nodes, table, x_rest, inv_dx[0], inv_dx[1], inv_dx[2], parameters, fields, first,

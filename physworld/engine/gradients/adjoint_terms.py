@@ -20,6 +20,7 @@ from typing import Any, Protocol
 import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.engine.gradients.adjoint_kernels import keep_rows, load_row, take_away
 from physworld.engine.gradients.adjoint_stress_kernels import MOST_NUMBERS, stress_adjoint
 from physworld.engine.problem import Problem
@@ -113,7 +114,7 @@ class RecordedAdjoint:
         differentiated_bar: derivatives by the term's array of that name, as flat numbers; None where it has none.
     """
 
-    def __init__(self, term: BoundTerm, mass: np.ndarray, now: Reverse, memories: list[Memory]) -> None:
+    def __init__(self, term: BoundTerm, mass: Array, now: Reverse, memories: list[Memory]) -> None:
         self._term, self._memories = term, memories
         self._scratch = wp.zeros_like(now.force_bar)
         self._launches = launches_of(term, now, self._scratch)
@@ -158,7 +159,7 @@ class RecordedAdjoint:
 
     @staticmethod
     def _bar_of(
-        value: Any, known: dict[int, wp.array], memories: dict[int, wp.array], mass: np.ndarray, now: Reverse
+        value: Any, known: dict[int, wp.array], memories: dict[int, wp.array], mass: Array, now: Reverse
     ) -> Any:
         """Where the derivative by an argument goes; None where nobody asks, a zero for a number."""
         if not isinstance(value, wp.array):

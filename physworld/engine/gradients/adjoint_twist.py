@@ -8,9 +8,9 @@ other term is (:mod:`physworld.engine.gradients.gradient`).
 
 from __future__ import annotations
 
-import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.engine.gradients.adjoint_terms import Memory, Reverse
 from physworld.engine.thin.twist import BoundTwist
 from physworld.engine.thin.twist_kernels import push_twisted_along, turn_spans_along
@@ -27,7 +27,7 @@ class TwistAdjoint:
         self._by_log_stiffness = wp.zeros(term.spans, dtype=wp.float64, device=device)
 
     @property
-    def log_stiffness(self) -> np.ndarray:
+    def log_stiffness(self) -> Array:
         """Derivatives by the logarithms of the particles' stiffness, (P,): their sum is that by GJ's logarithm."""
         return self._by_log_stiffness.numpy() @ self._term.shares
 

@@ -18,6 +18,7 @@ from typing import Any, Protocol
 import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.engine.gradients.adjoint import RecordedRun
 from physworld.engine.gradients.adjoint_pairs import ForcePair, ForceSide
 from physworld.engine.gradients.adjoint_reverse import Gradient
@@ -36,7 +37,7 @@ class Setting(Protocol):
     """What is integrated: :class:`physworld.twin.twin.Integration` is one."""
 
     problem: Problem
-    velocity: np.ndarray
+    velocity: Array
     held: HeldNodes
 
 
@@ -50,7 +51,7 @@ class Direction:
 
 
 def gradients(
-    run: RecordedRun, seed: np.ndarray, directions: Mapping[str, Direction]
+    run: RecordedRun, seed: Array, directions: Mapping[str, Direction]
 ) -> tuple[Gradient, dict[str, float]]:
     """Derivatives of a scalar L of a run by everything, and by each of the scalars.
 
@@ -91,7 +92,7 @@ class _Comparison:
             )
         self._soft = same_soft_grips((base, high, low))[1:]
         self._by_columns = _moduli_alone_differ(base, high, low)
-        self._stresses: list[tuple[int, np.ndarray, np.ndarray]] = []
+        self._stresses: list[tuple[int, Array, Array]] = []
         sides = self._matched(terms, high, low)
         grows = any(_multiplies(term) for side in sides for _, term in side)
         launched = grows or not (self._by_columns or same_internal_forces(high, low))
@@ -272,6 +273,6 @@ def same_internal_forces(high: Problem, low: Problem) -> bool:
     )
 
 
-def _factor(problem: Problem) -> np.ndarray:
+def _factor(problem: Problem) -> Array:
     known = problem.stiffness_factor
     return np.ones(problem.lattice.fill.size) if known is None else known

@@ -24,6 +24,7 @@ from dataclasses import replace
 import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.engine.gradients.gradient import Direction, Setting, internal_forces, same_internal_forces
 from physworld.engine.gradients.gradient_forward_kernels import add_slope, advance_tangent, set_sides
 from physworld.engine.gradients.soft_grips_derivatives import SoftGripsTangent, same_soft_grips
@@ -38,11 +39,11 @@ from physworld.materials.laws import friction_law
 
 def sensitivities(
     setting: Setting,
-    x: np.ndarray,
-    times: np.ndarray,
+    x: Array,
+    times: Array,
     directions: Mapping[str, Direction],
     time_step_s: float | None = None,
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+) -> tuple[Array, dict[str, Array]]:
     """A run, and its derivatives by scalars.
 
     Args:
@@ -71,7 +72,7 @@ class _Tangent:
     frequency_rad_s = 0.0
     friction_per_s = 0.0
 
-    def __init__(self, setting: Setting, direction: Direction, times: np.ndarray) -> None:
+    def __init__(self, setting: Setting, direction: Direction, times: Array) -> None:
         high, low = direction.high, direction.low
         if not np.array_equal(high.held.nodes, low.held.nodes):
             raise NotDifferentiable(
@@ -89,7 +90,7 @@ class _Tangent:
         setting, high, low, width = self._setting, self._d.high, self._d.low, self._d.width
         own, device, n = setting.problem, problem.device, len(problem.rest)
 
-        def array(values: np.ndarray) -> wp.array:
+        def array(values: Array) -> wp.array:
             return wp.array(np.ascontiguousarray(values, dtype=float), dtype=wp.float64, device=device)
 
         def zeros() -> wp.array:
@@ -138,7 +139,7 @@ class _Tangent:
             for term in side:
                 term.pace(time_step_s)
 
-    def begin(self, times: np.ndarray) -> None:
+    def begin(self, times: Array) -> None:
         """A run starts."""
         for side in self._terms:
             for term in side:

@@ -19,12 +19,12 @@ from physworld.engine.total.node_kernels import on_path
 def set_sides(
     # in
     half_width: wp.float64,
-    centre: wp.array(dtype=wp.float64),
-    tangent: wp.array(dtype=wp.float64),
+    centre: wp.array[wp.float64],
+    tangent: wp.array[wp.float64],
     # out
-    high: wp.array(dtype=wp.float64),
-    low: wp.array(dtype=wp.float64),
-):
+    high: wp.array[wp.float64],
+    low: wp.array[wp.float64],
+) -> None:
     """One component of centre +- half_width tangent."""
     k = wp.tid()
     step = half_width * tangent[k]
@@ -37,10 +37,10 @@ def add_slope(
     # in
     width: wp.float64,
     # in, out
-    high: wp.array(dtype=wp.float64),
-    low: wp.array(dtype=wp.float64),
-    slope: wp.array(dtype=wp.float64),
-):
+    high: wp.array[wp.float64],
+    low: wp.array[wp.float64],
+    slope: wp.array[wp.float64],
+) -> None:
     """Add (high - low) / width; both are cleared."""
     k = wp.tid()
     slope[k] += (high[k] - low[k]) / width
@@ -51,26 +51,26 @@ def add_slope(
 @wp.kernel(enable_backward=False)
 def advance_tangent(
     # model
-    mass: wp.array(dtype=wp.float64),
-    mass_slope: wp.array(dtype=wp.float64),
-    slot: wp.array(dtype=wp.int32),
-    path_x_slope: wp.array2d(dtype=wp.float64),
-    path_v_slope: wp.array2d(dtype=wp.float64),
+    mass: wp.array[wp.float64],
+    mass_slope: wp.array[wp.float64],
+    slot: wp.array[wp.int32],
+    path_x_slope: wp.array2d[wp.float64],
+    path_v_slope: wp.array2d[wp.float64],
     gravity_slope: wp.vec3d,
     drag: wp.float64,
     drag_slope: wp.float64,
     starting: int,
-    clock: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
+    clock: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
     # in
-    force: wp.array(dtype=wp.float64),
-    v: wp.array(dtype=wp.float64),
+    force: wp.array[wp.float64],
+    v: wp.array[wp.float64],
     # in, out
-    force_slope: wp.array(dtype=wp.float64),
-    dx: wp.array(dtype=wp.float64),
-    dv: wp.array(dtype=wp.float64),
-    dx_previous: wp.array(dtype=wp.float64),
-):
+    force_slope: wp.array[wp.float64],
+    dx: wp.array[wp.float64],
+    dv: wp.array[wp.float64],
+    dx_previous: wp.array[wp.float64],
+) -> None:
     """One node; ``starting``: the half step back at the start, velocities only."""
     node = wp.tid()
     dt = clock[2]

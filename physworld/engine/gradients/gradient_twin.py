@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.engine.gradients.adjoint import MEMORY_MB, Adjoint
 from physworld.engine.gradients.adjoint_reverse import Gradient
 from physworld.engine.gradients.gradient import Direction, gradients
@@ -75,11 +76,11 @@ class TwinRun:
     def __init__(
         self,
         twin: Twin,
-        control_times: np.ndarray,
-        control_points: np.ndarray,
-        frame_times: np.ndarray,
+        control_times: Array,
+        control_points: Array,
+        frame_times: Array,
         *,
-        properties: np.ndarray | None = None,
+        properties: Array | None = None,
         time_step_s: float | None = None,
         memory_mb: float = MEMORY_MB,
         progress: Callable[[int, int], None] | None = None,
@@ -115,7 +116,7 @@ class TwinRun:
         self.tracks = twin.observe(self.nodes, frame_times)
 
     def gradient(
-        self, tracks_bar: np.ndarray, scalars: Mapping[str, Neighbours] | None = None
+        self, tracks_bar: Array, scalars: Mapping[str, Neighbours] | None = None
     ) -> tuple[Gradient, dict[str, float]]:
         """Derivatives of L from those by the tracked points, (T, N, 3): fields, and one for each scalar.
 
@@ -140,7 +141,7 @@ class TwinRun:
         return fields, found
 
 
-def nodes_bar(twin: Twin, nodes: np.ndarray, tracks_bar: np.ndarray) -> np.ndarray:
+def nodes_bar(twin: Twin, nodes: Array, tracks_bar: Array) -> Array:
     """Derivatives by the nodes (T, n, 3) from those by the tracked points (T, N, 3), at ``nodes``."""
     body, lattice = twin.body, twin.lattice
     found = _transposed(lattice.interpolation(body.points), tracks_bar)
@@ -151,7 +152,7 @@ def nodes_bar(twin: Twin, nodes: np.ndarray, tracks_bar: np.ndarray) -> np.ndarr
     slopes = [_apply(row, nodes) for row in rows]
     start = rows[0] @ body.start
 
-    def shifted() -> np.ndarray:
+    def shifted() -> Array:
         if lattice.dim == 2:
             normal = np.cross(*slopes)
             return body.offsets * normal / np.linalg.norm(normal, axis=-1, keepdims=True)
@@ -169,9 +170,9 @@ def nodes_bar(twin: Twin, nodes: np.ndarray, tracks_bar: np.ndarray) -> np.ndarr
     return found
 
 
-def _apply(row: object, nodes: np.ndarray) -> np.ndarray:
+def _apply(row: object, nodes: Array) -> Array:
     return np.stack([row @ frame for frame in nodes])  # type: ignore[operator]
 
 
-def _transposed(row: object, values: np.ndarray) -> np.ndarray:
+def _transposed(row: object, values: Array) -> Array:
     return np.stack([row.T @ frame for frame in values])  # type: ignore[attr-defined]

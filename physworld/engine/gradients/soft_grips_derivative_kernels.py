@@ -24,13 +24,13 @@ from physworld.engine.total.node_kernels import hermite, on_path
 @wp.kernel(enable_backward=False)
 def gather_nodes(
     # model
-    nodes: wp.array(dtype=wp.int32),
+    nodes: wp.array[wp.int32],
     width: int,
     # in
-    values: wp.array(dtype=wp.float64),
+    values: wp.array[wp.float64],
     # out
-    gap: wp.array(dtype=wp.float64),
-):
+    gap: wp.array[wp.float64],
+) -> None:
     """Lay the vectors of the held nodes out as gaps are."""
     held = wp.tid()
     for i in range(3):
@@ -40,25 +40,25 @@ def gather_nodes(
 @wp.kernel(enable_backward=False)
 def take_grips_back(
     # model
-    nodes: wp.array(dtype=wp.int32),
-    mass: wp.array(dtype=wp.float64),
+    nodes: wp.array[wp.int32],
+    mass: wp.array[wp.float64],
     drag: wp.float64,
-    clock: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
+    clock: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
     # in
-    v: wp.array(dtype=wp.float64),
-    pull: wp.array(dtype=wp.float64),
+    v: wp.array[wp.float64],
+    pull: wp.array[wp.float64],
     # in, out
-    minus_q: wp.array(dtype=wp.float64),
-    force_bar: wp.array(dtype=wp.float64),
-    x_bar: wp.array(dtype=wp.float64),
-    v_bar: wp.array(dtype=wp.float64),
-    mass_bar: wp.array(dtype=wp.float64),
-    gravity_bar: wp.array(dtype=wp.float64),
-    drag_bar: wp.array(dtype=wp.float64),
-    path_x_bar: wp.array2d(dtype=wp.float64),
-    path_v_bar: wp.array2d(dtype=wp.float64),
-):
+    minus_q: wp.array[wp.float64],
+    force_bar: wp.array[wp.float64],
+    x_bar: wp.array[wp.float64],
+    v_bar: wp.array[wp.float64],
+    mass_bar: wp.array[wp.float64],
+    gravity_bar: wp.array[wp.float64],
+    drag_bar: wp.array[wp.float64],
+    path_x_bar: wp.array2d[wp.float64],
+    path_v_bar: wp.array2d[wp.float64],
+) -> None:
     """One held node; ``pull`` is f' / m [m/s^2], ``minus_q`` (3k,) is read and cleared."""
     held = wp.tid()
     node = nodes[held]
@@ -87,26 +87,26 @@ def take_grips_back(
 @wp.kernel(enable_backward=False)
 def distance_slope(
     # model
-    nodes: wp.array(dtype=wp.int32),
-    mass: wp.array(dtype=wp.float64),
+    nodes: wp.array[wp.int32],
+    mass: wp.array[wp.float64],
     drag: wp.float64,
     width: int,
-    mass_slope: wp.array(dtype=wp.float64),
-    path_x_slope: wp.array2d(dtype=wp.float64),
-    path_v_slope: wp.array2d(dtype=wp.float64),
+    mass_slope: wp.array[wp.float64],
+    path_x_slope: wp.array2d[wp.float64],
+    path_v_slope: wp.array2d[wp.float64],
     gravity_slope: wp.vec3d,
     drag_slope: wp.float64,
-    clock: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
+    clock: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
     # in
-    v: wp.array(dtype=wp.float64),
-    dx: wp.array(dtype=wp.float64),
-    dv: wp.array(dtype=wp.float64),
-    force: wp.array(dtype=wp.float64),
-    force_slope: wp.array(dtype=wp.float64),
+    v: wp.array[wp.float64],
+    dx: wp.array[wp.float64],
+    dv: wp.array[wp.float64],
+    force: wp.array[wp.float64],
+    force_slope: wp.array[wp.float64],
     # out
-    gap: wp.array(dtype=wp.float64),
-):
+    gap: wp.array[wp.float64],
+) -> None:
     """h of one held node; ``force_slope`` is df - dK r."""
     held = wp.tid()
     node = nodes[held]

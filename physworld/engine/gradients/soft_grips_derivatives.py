@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.engine.gradients.adjoint_terms import Reverse
 from physworld.engine.gradients.soft_grips_derivative_kernels import (
     distance_slope,
@@ -29,8 +30,8 @@ from physworld.errors import NotDifferentiable
 class SoftGripsGradient:
     """Derivatives of a scalar L of a run by the paths of the nodes that soft grips hold, (T, k, 3)."""
 
-    positions: np.ndarray
-    velocities: np.ndarray
+    positions: Array
+    velocities: Array
 
     def along(self, high: HeldNodes, low: HeldNodes) -> float:
         """Change of L from one neighbour's paths to another's."""
@@ -78,7 +79,7 @@ class SoftGripsChange:
         change: of the stiffness, (k, k) [N/m].
     """
 
-    def __init__(self, term: BoundSoftGrips, change: np.ndarray) -> None:
+    def __init__(self, term: BoundSoftGrips, change: Array) -> None:
         self._term = term
         self._change = wp.array(_padded(change, term), dtype=wp.float64, device=term.device)
         nodes, mass, *rest = term.model
@@ -112,7 +113,7 @@ class SoftGripsTangent:
         self._term = own.bind(problem)
         device, frames = problem.device, len(own.held.positions)
 
-        def upload(values: np.ndarray) -> wp.array:
+        def upload(values: Array) -> wp.array:
             return wp.array(np.ascontiguousarray(values), dtype=wp.float64, device=device)
 
         stiffness = (sides[0].stiffness - sides[1].stiffness) / width
@@ -166,7 +167,7 @@ def same_soft_grips(problems: Sequence[Problem]) -> list[SoftGrips]:
     return found
 
 
-def _padded(matrix: np.ndarray, term: BoundSoftGrips) -> np.ndarray:
+def _padded(matrix: Array, term: BoundSoftGrips) -> Array:
     rows = np.zeros(term.pull.shape)
     rows[:, : len(matrix)] = matrix
     return rows

@@ -149,12 +149,12 @@ def solid_tangent(stress: Stress, moduli: int) -> wp.Kernel:
     def solid_cell(
         cell: int,
         # model
-        cell_nodes: wp.array(dtype=wp.int32),
-        gradients: wp.array(dtype=wp.float32),
-        x_rest: wp.array(dtype=wp.float64),
-        moduli_volume: wp.array(dtype=wp.float32),
-        eta_volume: wp.array(dtype=wp.float32),
-        numbers: wp.array(dtype=wp.float32),
+        cell_nodes: wp.array[wp.int32],
+        gradients: wp.array[wp.float32],
+        x_rest: wp.array[wp.float64],
+        moduli_volume: wp.array[wp.float32],
+        eta_volume: wp.array[wp.float32],
+        numbers: wp.array[wp.float32],
         inv_dx0: float,
         inv_dx1: float,
         inv_dx2: float,
@@ -162,37 +162,37 @@ def solid_tangent(stress: Stress, moduli: int) -> wp.Kernel:
         wanted: int,
         inv_dt: float,
         # in
-        x: wp.array(dtype=wp.float64),
-        x_previous: wp.array(dtype=wp.float64),
-        w: wp.array(dtype=wp.float64),
+        x: wp.array[wp.float64],
+        x_previous: wp.array[wp.float64],
+        w: wp.array[wp.float64],
         # out
-        out: wp.array(dtype=wp.float64),
-        out_previous: wp.array(dtype=wp.float64),
-        parameter_out: wp.array(dtype=wp.float64),
+        out: wp.array[wp.float64],
+        out_previous: wp.array[wp.float64],
+        parameter_out: wp.array[wp.float64],
     ): ...
 
     @wp.kernel(module=f"physworld_solid_tangent_{stress.name}", enable_backward=False)
     def tangent(
         # model
-        cell_nodes: wp.array(dtype=wp.int32),
-        gradients: wp.array(dtype=wp.float32),
-        x_rest: wp.array(dtype=wp.float64),
-        moduli_volume: wp.array(dtype=wp.float32),
-        eta_volume: wp.array(dtype=wp.float32),
-        numbers: wp.array(dtype=wp.float32),
+        cell_nodes: wp.array[wp.int32],
+        gradients: wp.array[wp.float32],
+        x_rest: wp.array[wp.float64],
+        moduli_volume: wp.array[wp.float32],
+        eta_volume: wp.array[wp.float32],
+        numbers: wp.array[wp.float32],
         inv_dx: wp.vec3f,
         viscous: int,
         wanted: int,
-        clock: wp.array(dtype=wp.float64),
+        clock: wp.array[wp.float64],
         # in
-        x: wp.array(dtype=wp.float64),
-        x_previous: wp.array(dtype=wp.float64),
-        w: wp.array(dtype=wp.float64),
+        x: wp.array[wp.float64],
+        x_previous: wp.array[wp.float64],
+        w: wp.array[wp.float64],
         # out
-        out: wp.array(dtype=wp.float64),
-        out_previous: wp.array(dtype=wp.float64),
-        parameter_out: wp.array(dtype=wp.float64),
-    ):
+        out: wp.array[wp.float64],
+        out_previous: wp.array[wp.float64],
+        parameter_out: wp.array[wp.float64],
+    ) -> None:
         solid_cell(
             wp.tid(),
             cell_nodes,

@@ -10,9 +10,9 @@ from positions: nothing is remembered between calls.
 
 from __future__ import annotations
 
-import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.engine.gradients.solid_tangent_kernels import solid_tangent
 from physworld.engine.gradients.thin_tangent_kernels import rod_tangent, sheet_tangent
 from physworld.engine.lattice.lattice import Lattice
@@ -32,9 +32,7 @@ class InternalTangent:
         particles: rows of ``parameter_out``.
     """
 
-    def __init__(
-        self, lattice: Lattice, law: Law, stiffness_factor: np.ndarray, rest: np.ndarray, device: str
-    ) -> None:
+    def __init__(self, lattice: Lattice, law: Law, stiffness_factor: Array, rest: Array, device: str) -> None:
         self.device = device
         self.particles = lattice.fill.size
         self._cells = len(lattice.cells)

@@ -171,47 +171,47 @@ _ROD = (
 def sheet_cell(
     cell: int,
     # model
-    cell_nodes: wp.array(dtype=wp.int32),
-    derivatives: wp.array(dtype=wp.float64),
-    membrane: wp.array(dtype=wp.float64),
-    bending: wp.array(dtype=wp.float64),
-    shape: wp.array(dtype=wp.float64),
+    cell_nodes: wp.array[wp.int32],
+    derivatives: wp.array[wp.float64],
+    membrane: wp.array[wp.float64],
+    bending: wp.array[wp.float64],
+    shape: wp.array[wp.float64],
     tau: wp.float64,
     viscous: int,
     wanted: int,
     inv_dt: wp.float64,
     # in
-    x: wp.array(dtype=wp.float64),
-    x_previous: wp.array(dtype=wp.float64),
-    w: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
+    x_previous: wp.array[wp.float64],
+    w: wp.array[wp.float64],
     # out
-    out: wp.array(dtype=wp.float64),
-    out_previous: wp.array(dtype=wp.float64),
-    parameter_out: wp.array(dtype=wp.float64),
+    out: wp.array[wp.float64],
+    out_previous: wp.array[wp.float64],
+    parameter_out: wp.array[wp.float64],
 ): ...
 
 
 @wp.kernel(enable_backward=False)
 def sheet_tangent(
     # model
-    cell_nodes: wp.array(dtype=wp.int32),
-    derivatives: wp.array(dtype=wp.float64),
-    membrane: wp.array(dtype=wp.float64),
-    bending: wp.array(dtype=wp.float64),
-    shape: wp.array(dtype=wp.float64),
+    cell_nodes: wp.array[wp.int32],
+    derivatives: wp.array[wp.float64],
+    membrane: wp.array[wp.float64],
+    bending: wp.array[wp.float64],
+    shape: wp.array[wp.float64],
     tau: wp.float64,
     viscous: int,
     wanted: int,
-    clock: wp.array(dtype=wp.float64),
+    clock: wp.array[wp.float64],
     # in
-    x: wp.array(dtype=wp.float64),
-    x_previous: wp.array(dtype=wp.float64),
-    w: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
+    x_previous: wp.array[wp.float64],
+    w: wp.array[wp.float64],
     # out
-    out: wp.array(dtype=wp.float64),
-    out_previous: wp.array(dtype=wp.float64),
-    parameter_out: wp.array(dtype=wp.float64),
-):
+    out: wp.array[wp.float64],
+    out_previous: wp.array[wp.float64],
+    parameter_out: wp.array[wp.float64],
+) -> None:
     """The products of one cell of a sheet; ``clock[1]`` is 1/dt [1/s]."""
     sheet_cell(
         wp.tid(), cell_nodes, derivatives, membrane, bending, shape, tau, viscous, wanted, clock[1],
@@ -223,45 +223,45 @@ def sheet_tangent(
 def rod_cell(
     cell: int,
     # model
-    cell_nodes: wp.array(dtype=wp.int32),
-    derivatives: wp.array(dtype=wp.float64),
-    stretching: wp.array(dtype=wp.float64),
-    bending: wp.array(dtype=wp.float64),
+    cell_nodes: wp.array[wp.int32],
+    derivatives: wp.array[wp.float64],
+    stretching: wp.array[wp.float64],
+    bending: wp.array[wp.float64],
     tau: wp.float64,
     viscous: int,
     wanted: int,
     inv_dt: wp.float64,
     # in
-    x: wp.array(dtype=wp.float64),
-    x_previous: wp.array(dtype=wp.float64),
-    w: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
+    x_previous: wp.array[wp.float64],
+    w: wp.array[wp.float64],
     # out
-    out: wp.array(dtype=wp.float64),
-    out_previous: wp.array(dtype=wp.float64),
-    parameter_out: wp.array(dtype=wp.float64),
+    out: wp.array[wp.float64],
+    out_previous: wp.array[wp.float64],
+    parameter_out: wp.array[wp.float64],
 ): ...
 
 
 @wp.kernel(enable_backward=False)
 def rod_tangent(
     # model
-    cell_nodes: wp.array(dtype=wp.int32),
-    derivatives: wp.array(dtype=wp.float64),
-    stretching: wp.array(dtype=wp.float64),
-    bending: wp.array(dtype=wp.float64),
+    cell_nodes: wp.array[wp.int32],
+    derivatives: wp.array[wp.float64],
+    stretching: wp.array[wp.float64],
+    bending: wp.array[wp.float64],
     tau: wp.float64,
     viscous: int,
     wanted: int,
-    clock: wp.array(dtype=wp.float64),
+    clock: wp.array[wp.float64],
     # in
-    x: wp.array(dtype=wp.float64),
-    x_previous: wp.array(dtype=wp.float64),
-    w: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
+    x_previous: wp.array[wp.float64],
+    w: wp.array[wp.float64],
     # out
-    out: wp.array(dtype=wp.float64),
-    out_previous: wp.array(dtype=wp.float64),
-    parameter_out: wp.array(dtype=wp.float64),
-):
+    out: wp.array[wp.float64],
+    out_previous: wp.array[wp.float64],
+    parameter_out: wp.array[wp.float64],
+) -> None:
     """The products of one cell of a rod; ``clock[1]`` is 1/dt [1/s]."""
     rod_cell(
         wp.tid(), cell_nodes, derivatives, stretching, bending, tau, viscous, wanted, clock[1],

@@ -14,20 +14,22 @@ from itertools import product
 
 import numpy as np
 
+from physworld.arrays import Array
+
 GAUSS_POINTS = (0.5 - 0.5 / np.sqrt(3.0), 0.5 + 0.5 / np.sqrt(3.0))
 
 
-def axis_values(xi: np.ndarray) -> np.ndarray:
+def axis_values(xi: Array) -> Array:
     """Values of the 3 functions of a cell at local coordinates ``xi`` (M,): shape (M, 3)."""
     return np.stack([0.5 * (1 - xi) ** 2, 0.5 + xi - xi**2, 0.5 * xi**2], axis=-1)
 
 
-def axis_slopes(xi: np.ndarray) -> np.ndarray:
+def axis_slopes(xi: Array) -> Array:
     """First derivatives with respect to ``xi`` (M,): shape (M, 3)."""
     return np.stack([xi - 1, 1 - 2 * xi, xi], axis=-1)
 
 
-def axis_curvatures(xi: np.ndarray) -> np.ndarray:
+def axis_curvatures(xi: Array) -> Array:
     """Second derivatives with respect to ``xi`` (M,): shape (M, 3)."""
     return np.broadcast_to(np.array([1.0, -2.0, 1.0]), (*xi.shape, 3)).copy()
 
@@ -35,7 +37,7 @@ def axis_curvatures(xi: np.ndarray) -> np.ndarray:
 _AXIS = (axis_values, axis_slopes, axis_curvatures)
 
 
-def tensor_weights(xi: np.ndarray, orders: tuple[int, ...]) -> np.ndarray:
+def tensor_weights(xi: Array, orders: tuple[int, ...]) -> Array:
     """Tensor-product weights at local coordinates, differentiated ``orders[a]`` times along axis a.
 
     Args:
@@ -52,11 +54,11 @@ def tensor_weights(xi: np.ndarray, orders: tuple[int, ...]) -> np.ndarray:
     return weights
 
 
-def gauss_points(dim: int) -> np.ndarray:
+def gauss_points(dim: int) -> Array:
     """Local coordinates of a cell's 2**dim particles, (2**dim, dim)."""
     return np.array(list(product(GAUSS_POINTS, repeat=dim)))
 
 
-def local_offsets(dim: int) -> np.ndarray:
+def local_offsets(dim: int) -> Array:
     """Node offsets (-1, 0, 1 an axis) of a cell, (3**dim, dim), in the order of :func:`tensor_weights`."""
     return np.array(list(product((-1, 0, 1), repeat=dim)))

@@ -14,12 +14,14 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from physworld.arrays import Array
+
 _NEIGHBOURS = 12  # a cell and a half of a full lattice: enough for an affine map on a surface
 _PARTED = 0.25  # misfit of the affine map, in mean distances of the particles, that attaches a point anew
 _THIN = 1e-4  # share of the largest spread below which the particles lie on a plane or line
 
 
-def follow(points: np.ndarray, particles: np.ndarray) -> np.ndarray:
+def follow(points: Array, particles: Array) -> Array:
     """Paths (T, N, 3) [m] of ``points`` (N, 3), given at the first frame, among ``particles`` (T, P, 3).
 
     Raises:
@@ -47,11 +49,11 @@ def follow(points: np.ndarray, particles: np.ndarray) -> np.ndarray:
     return paths
 
 
-def _attach(points: np.ndarray, particles: np.ndarray, count: int) -> np.ndarray:
+def _attach(points: Array, particles: Array, count: int) -> Array:
     return np.asarray(cKDTree(particles).query(points, k=count)[1]).reshape(len(points), count)
 
 
-def _carry(points: np.ndarray, before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _carry(points: Array, before: Array, after: Array) -> tuple[Array, Array]:
     """Places (N, 3) of ``points`` after their neighbours (N, K, 3) moved, and the misfit of the affine map (N,)."""
     middle, moved = before.mean(axis=1), after.mean(axis=1)
     X, Y = before - middle[:, None], after - moved[:, None]
@@ -70,7 +72,7 @@ def _carry(points: np.ndarray, before: np.ndarray, after: np.ndarray) -> tuple[n
     return moved + np.einsum("nij,nj->ni", A, points - middle), misfit / size
 
 
-def _rotation(A: np.ndarray) -> np.ndarray:
+def _rotation(A: Array) -> Array:
     """Nearest rotation to each matrix (N, 3, 3)."""
     U, _, Vt = np.linalg.svd(A)
     flip = np.ones((len(A), 3))

@@ -14,6 +14,7 @@ import numpy as np
 from scipy import sparse
 from scipy.spatial import cKDTree
 
+from physworld.arrays import Array
 from physworld.engine.lattice.bspline import gauss_points, local_offsets, tensor_weights
 
 
@@ -30,12 +31,12 @@ class Lattice:
         nodes: integer node coordinates, (n, d); node i sits at origin + (i + 1/2) spacing.
     """
 
-    origin: np.ndarray
-    spacing: np.ndarray
-    cells: np.ndarray
-    fill: np.ndarray
-    cell_nodes: np.ndarray
-    nodes: np.ndarray
+    origin: Array
+    spacing: Array
+    cells: Array
+    fill: Array
+    cell_nodes: Array
+    nodes: Array
     smooth: ClassVar[bool] = True
     """Whether its field has slopes without jumps, as splines do: what strains and curvatures of cells are made from."""
 
@@ -45,35 +46,33 @@ class Lattice:
         return self.cells.shape[1]
 
     @property
-    def node_coordinates(self) -> np.ndarray:
+    def node_coordinates(self) -> Array:
         """Reference coordinates of the nodes [m], (n, d)."""
         return self.origin + (self.nodes + 0.5) * self.spacing
 
     @property
-    def particle_coordinates(self) -> np.ndarray:
+    def particle_coordinates(self) -> Array:
         """Reference coordinates of the particles [m], (C * 2**d, d), a cell's particles side by side."""
         local = gauss_points(self.dim)
         return (self.origin + (self.cells[:, None, :] + local[None]) * self.spacing).reshape(-1, self.dim)
 
     @property
-    def particle_measures(self) -> np.ndarray:
+    def particle_measures(self) -> Array:
         """Length, area or volume that each particle stands for [m**d], (C * 2**d,)."""
         return (self.fill * (np.prod(self.spacing) / 2**self.dim)).reshape(-1)
 
-    def lumped(self, particle_mass: np.ndarray) -> np.ndarray:
+    def lumped(self, particle_mass: Array) -> Array:
         """Lumped nodal masses [kg], (n,), of particles (P,): rows of the mass matrix summed."""
         per_cell = particle_mass.reshape(len(self.cells), -1) @ self.table((0,) * self.dim).T
         mass = np.zeros(len(self.nodes))
         np.add.at(mass, self.cell_nodes, per_cell)
         return mass
 
-    def table(self, orders: tuple[int, ...]) -> np.ndarray:
+    def table(self, orders: tuple[int, ...]) -> Array:
         """Weights of a cell's nodes at its particles, differentiated in units of the cell, (3**d, 2**d)."""
         return np.ascontiguousarray(tensor_weights(gauss_points(self.dim), orders).T)
 
-    def interpolation(
-        self, coordinates: np.ndarray, orders: tuple[int, ...] | None = None
-    ) -> sparse.csr_matrix:
+    def interpolation(self, coordinates: Array, orders: tuple[int, ...] | None = None) -> sparse.csr_matrix:
         """Matrix (M, n) that takes nodal values to the values at material ``coordinates`` (M, d).
 
         Outside the material the field of the nearest cell is continued linearly: a marker on a stalk moves as if it
@@ -111,12 +110,12 @@ class Lattice:
         values = np.tile([1.0, -2.0, 1.0], len(triples))
         return sparse.csr_matrix((values, (rows, columns)), shape=(len(triples), len(self.nodes)))
 
-    def outside(self, coordinates: np.ndarray) -> np.ndarray:
+    def outside(self, coordinates: Array) -> Array:
         """Distance of material ``coordinates`` (M, d) from the nearest cell that holds material [m], (M,)."""
         _, local = self._locate(np.asarray(coordinates, dtype=float).reshape(-1, self.dim))
         return np.linalg.norm((local - np.clip(local, 0.0, 1.0)) * self.spacing, axis=1)
 
-    def _locate(self, coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _locate(self, coordinates: Array) -> tuple[Array, Array]:
         """Nearest cell (by distance to its box, among the nearest centres) and local coordinates there."""
         scaled = (coordinates - self.origin) / self.spacing
         neighbours = min(3**self.dim, len(self.cells))
@@ -129,9 +128,7 @@ class Lattice:
         return near[pick, best], local[pick, best]
 
 
-def lattice_from_cells(
-    origin: np.ndarray, spacing: np.ndarray, cells: np.ndarray, fill: np.ndarray
-) -> Lattice:
+def lattice_from_cells(origin: Array, spacing: Array, cells: Array, fill: Array) -> Lattice:
     """Number the nodes of the given cells.
 
     Raises:
@@ -157,7 +154,7 @@ def lattice_from_cells(
     )
 
 
-def box_lattice(origin: np.ndarray, size: np.ndarray, counts: tuple[int, ...]) -> Lattice:
+def box_lattice(origin: Array, size: Array, counts: tuple[int, ...]) -> Lattice:
     """A full box of ``counts`` cells: every face of the body lies on a cell face."""
     counts_array = np.asarray(counts)
     cells = np.stack(np.meshgrid(*[np.arange(c) for c in counts], indexing="ij"), axis=-1).reshape(

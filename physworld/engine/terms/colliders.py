@@ -18,6 +18,7 @@ import numpy as np
 import warp as wp
 from scipy import sparse
 
+from physworld.arrays import Array
 from physworld.engine.terms.colliders_kernels import move_collider, touch_collider, watch_nodes
 from physworld.engine.terms.colliders_path import RigidPath
 from physworld.engine.terms.term import BoundTerm
@@ -51,22 +52,22 @@ class Collider:
     path: RigidPath
     friction: float
 
-    def distance(self, points: np.ndarray, time_s: float) -> np.ndarray:
+    def distance(self, points: Array, time_s: float) -> Array:
         """Signed distances [m], (M,), at ``points`` (M, 3) in the world."""
         place, turn = self._pose(time_s)
         return self.shape.distance((points - place) @ turn)
 
-    def normal(self, points: np.ndarray, time_s: float) -> np.ndarray:
+    def normal(self, points: Array, time_s: float) -> Array:
         """Outward unit normals in the world, (M, 3)."""
         place, turn = self._pose(time_s)
         return self.shape.normal((points - place) @ turn) @ turn.T
 
-    def velocity(self, points: np.ndarray, time_s: float) -> np.ndarray:
+    def velocity(self, points: Array, time_s: float) -> Array:
         """Velocity [m/s] of the collider's material at ``points`` (M, 3) in the world."""
         place, _, velocity, spin = self.path.poses(np.array([time_s]))
         return velocity + np.cross(spin, points - place)
 
-    def _pose(self, time_s: float) -> tuple[np.ndarray, np.ndarray]:
+    def _pose(self, time_s: float) -> tuple[Array, Array]:
         place, turn, _, _ = self.path.poses(np.array([time_s]))
         return place[0], turn[0]
 
@@ -85,10 +86,10 @@ class ContactSurface:
         rate_per_s: c / dx; a speed over it is the depth to which a body comes in [1/s].
     """
 
-    points: np.ndarray
-    measures: np.ndarray
-    groups: np.ndarray
-    offsets: np.ndarray
+    points: Array
+    measures: Array
+    groups: Array
+    offsets: Array
     stiffness: float
     shear_stiffness: float
     damping: float
@@ -150,7 +151,7 @@ class BoundCollider(BoundTerm):
         return _SPEED_SHARE * self.collider.shape.inner_m * self._rate
 
     @property
-    def impulse_n_s(self) -> np.ndarray:
+    def impulse_n_s(self) -> Array:
         """What the collider gave to the body since the start of the last run [N s], (3,)."""
         return self._totals.numpy()[:3]
 
@@ -159,7 +160,7 @@ class BoundCollider(BoundTerm):
         """How deep the body came into the collider in the last run."""
         return float(self._totals.numpy()[3])
 
-    def begin(self, times: np.ndarray) -> None:
+    def begin(self, times: Array) -> None:
         """Keep the frame times.
 
         Raises:
@@ -215,7 +216,7 @@ class BoundCollider(BoundTerm):
         return self._travel
 
 
-def largest_share(matrix: sparse.csr_matrix, measures: np.ndarray, mass: np.ndarray) -> float:
+def largest_share(matrix: sparse.csr_matrix, measures: Array, mass: Array) -> float:
     """A bound from above on the largest eigenvalue of M^-1 W^T A W, per measure of stiffness [1/kg times A's unit].
 
     Args:
@@ -237,7 +238,7 @@ def largest_share(matrix: sparse.csr_matrix, measures: np.ndarray, mass: np.ndar
     return bound
 
 
-def reach_of_nodes(matrix: sparse.csr_matrix) -> np.ndarray:
+def reach_of_nodes(matrix: sparse.csr_matrix) -> Array:
     """Factors r of the nodes, (n,), with which no point goes farther than the greatest r_i |d_i| of their ways d.
 
     Args:

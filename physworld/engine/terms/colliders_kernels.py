@@ -42,20 +42,20 @@ def _spin(h: wp.vec3d, rate: wp.vec3d) -> wp.vec3d:
 @wp.kernel
 def move_collider(
     # model
-    frame_times: wp.array(dtype=wp.float64),
-    knots: wp.array(dtype=wp.float64),
-    positions: wp.array(dtype=wp.vec3d),
-    velocities: wp.array(dtype=wp.vec3d),
-    turns: wp.array(dtype=wp.vec3d),
-    first_rates: wp.array(dtype=wp.vec3d),
-    last_rates: wp.array(dtype=wp.vec3d),
-    rotations: wp.array(dtype=wp.mat33d),
-    clock: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
+    frame_times: wp.array[wp.float64],
+    knots: wp.array[wp.float64],
+    positions: wp.array[wp.vec3d],
+    velocities: wp.array[wp.vec3d],
+    turns: wp.array[wp.vec3d],
+    first_rates: wp.array[wp.vec3d],
+    last_rates: wp.array[wp.vec3d],
+    rotations: wp.array[wp.mat33d],
+    clock: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
     # out
-    pose: wp.array(dtype=wp.vec3d),
-    totals: wp.array(dtype=wp.float64),
-):
+    pose: wp.array[wp.vec3d],
+    totals: wp.array[wp.float64],
+) -> None:
     """Pose at the start of a substep; a run's first substep clears the totals."""
     if counter[0] == 0 and counter[1] == 0:
         for i in range(4):
@@ -97,13 +97,13 @@ def move_collider(
 
 @wp.kernel(enable_backward=False)
 def watch_nodes(
-    reach: wp.array(dtype=wp.float64),
-    x: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
+    reach: wp.array[wp.float64],
+    x: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
     # in, out
-    seen: wp.array(dtype=wp.float64),
-    travel: wp.array(dtype=wp.float64),
-):
+    seen: wp.array[wp.float64],
+    travel: wp.array[wp.float64],
+) -> None:
     """How far any contact point went at most since the last look [m], into the entry of this substep's parity.
 
     ``reach`` is what a node's way counts for (:func:`physworld.engine.terms.colliders.reach_of_nodes`). The entry of
@@ -123,10 +123,10 @@ def watch_nodes(
 def collider_distance(
     kind: int,
     size: wp.vec3d,
-    values: wp.array3d(dtype=wp.float32),
+    values: wp.array3d[wp.float32],
     low: wp.vec3d,
     inverse: wp.vec3d,
-    pose: wp.array(dtype=wp.vec3d),
+    pose: wp.array[wp.vec3d],
     x: wp.vec3d,
 ) -> wp.vec4d:
     """Gradient in the world (no unit) and distance [m] of a collider at ``x``."""
@@ -137,7 +137,7 @@ def collider_distance(
 
 
 @wp.func
-def collider_velocity(pose: wp.array(dtype=wp.vec3d), x: wp.vec3d) -> wp.vec3d:
+def collider_velocity(pose: wp.array[wp.vec3d], x: wp.vec3d) -> wp.vec3d:
     """Velocity of the collider's material at ``x`` [m/s]."""
     return pose[4] + wp.cross(pose[5], x - pose[0])
 
@@ -147,15 +147,15 @@ def touch_collider(
     # model: shape
     kind: int,
     size: wp.vec3d,
-    values: wp.array3d(dtype=wp.float32),
+    values: wp.array3d[wp.float32],
     low: wp.vec3d,
     inverse: wp.vec3d,
     # model: contact points
-    row_start: wp.array(dtype=wp.int32),
-    columns: wp.array(dtype=wp.int32),
-    weights: wp.array(dtype=wp.float64),
-    measure: wp.array(dtype=wp.float64),
-    offset: wp.array(dtype=wp.float64),
+    row_start: wp.array[wp.int32],
+    columns: wp.array[wp.int32],
+    weights: wp.array[wp.float64],
+    measure: wp.array[wp.float64],
+    offset: wp.array[wp.float64],
     # model: normal and tangential stiffness [N/m per measure], dampings [N s/m per measure], Coulomb's coefficient
     stiffness: wp.float64,
     shear_stiffness: wp.float64,
@@ -163,19 +163,19 @@ def touch_collider(
     shear_damping: wp.float64,
     friction: wp.float64,
     # in
-    pose: wp.array(dtype=wp.vec3d),
-    x: wp.array(dtype=wp.float64),
-    v: wp.array(dtype=wp.float64),
-    clock: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
-    travel: wp.array(dtype=wp.float64),
+    pose: wp.array[wp.vec3d],
+    x: wp.array[wp.float64],
+    v: wp.array[wp.float64],
+    clock: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
+    travel: wp.array[wp.float64],
     # in, out
-    clearance: wp.array(dtype=wp.float64),
-    stretch: wp.array(dtype=wp.vec3d),
+    clearance: wp.array[wp.float64],
+    stretch: wp.array[wp.vec3d],
     # out
-    force: wp.array(dtype=wp.float64),
-    totals: wp.array(dtype=wp.float64),
-):
+    force: wp.array[wp.float64],
+    totals: wp.array[wp.float64],
+) -> None:
     """Push one point of the body out of the collider, and hold it along the surface up to Coulomb's limit.
 
     ``stretch`` is the elastic slip of a point that sticks [m] (Cundall and Strack 1979). ``clearance`` is how far a

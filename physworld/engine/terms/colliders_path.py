@@ -15,6 +15,7 @@ import warp as wp
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
+from physworld.arrays import Array
 from physworld.errors import SceneUnsupported
 
 
@@ -28,9 +29,9 @@ class RigidPath:
         rotations: from the collider's frame to the world, (F, 3, 3).
     """
 
-    times: np.ndarray
-    positions: np.ndarray
-    rotations: np.ndarray
+    times: Array
+    positions: Array
+    rotations: Array
 
     def __post_init__(self) -> None:
         finite = all(np.isfinite(part).all() for part in (self.times, self.positions, self.rotations))
@@ -40,9 +41,7 @@ class RigidPath:
             )
 
     @classmethod
-    def still(
-        cls, position: np.ndarray | tuple[float, float, float], rotation: np.ndarray | None = None
-    ) -> RigidPath:
+    def still(cls, position: Array | tuple[float, float, float], rotation: Array | None = None) -> RigidPath:
         """A collider that never moves."""
         turn = np.eye(3) if rotation is None else np.asarray(rotation, dtype=float)
         return cls(np.zeros(1), np.asarray(position, dtype=float)[None], turn[None])
@@ -53,20 +52,20 @@ class RigidPath:
         return len(self.times) > 1
 
     @cached_property
-    def linear_velocities(self) -> np.ndarray:
+    def linear_velocities(self) -> Array:
         """At the knots, (F, 3) [m/s]."""
         if len(self.times) == 1:
             return np.zeros((1, 3))
         return PchipInterpolator(self.times, self.positions, axis=0).derivative()(self.times)
 
     @cached_property
-    def turns(self) -> np.ndarray:
+    def turns(self) -> Array:
         """Rotation vectors from knot to knot in the frame of the collider, (F - 1, 3) [rad]."""
         steps = np.einsum("tji,tjk->tik", self.rotations[:-1], self.rotations[1:])
         return Rotation.from_matrix(steps).as_rotvec() if len(steps) else np.zeros((0, 3))
 
     @cached_property
-    def angular_velocities(self) -> np.ndarray:
+    def angular_velocities(self) -> Array:
         """At the knots in the frame of the collider, (F, 3) [rad/s]: means of the two neighbouring turns' rates."""
         if len(self.times) == 1:
             return np.zeros((1, 3))
@@ -74,7 +73,7 @@ class RigidPath:
         ends = np.concatenate([rates[:1], rates, rates[-1:]])
         return 0.5 * (ends[:-1] + ends[1:])
 
-    def poses(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def poses(self, times: Array) -> tuple[Array, Array, Array, Array]:
         """Positions (T, 3) [m], rotations (T, 3, 3), velocities (T, 3) [m/s] and angular velocities in the world
         (T, 3) [rad/s] at ``times`` (T,): what the device computes, one launch a time.
         """
@@ -121,7 +120,7 @@ class RigidPath:
         return float(1.5 * (chords + reach_m * turning).max())
 
 
-def _right_jacobian_inverse(turns: np.ndarray) -> np.ndarray:
+def _right_jacobian_inverse(turns: Array) -> Array:
     """What takes an angular velocity in the turned frame to the rate of the rotation vector, (S, 3, 3)."""
     angle = np.linalg.norm(turns, axis=1)
     safe = np.maximum(angle, 1e-4)

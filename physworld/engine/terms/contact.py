@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.engine.lattice.bspline import GAUSS_POINTS
 from physworld.engine.lattice.lattice import Lattice
 from physworld.engine.terms.colliders import BoundCollider, Collider, ContactSurface
@@ -40,7 +41,7 @@ class GroundContact:
 
     height_m: float
     friction: float
-    offsets: np.ndarray | float = 0.0
+    offsets: Array | float = 0.0
 
     def bind(self, problem: Problem) -> BoundCollider:
         """Device arrays for one problem; its friction may be a field."""
@@ -67,7 +68,7 @@ class ColliderContact:
     """
 
     collider: Collider
-    offsets: np.ndarray | float = 0.0
+    offsets: Array | float = 0.0
 
     def bind(self, problem: Problem) -> BoundCollider:
         """Device arrays for one problem."""
@@ -75,7 +76,7 @@ class ColliderContact:
         return BoundCollider(self.collider, surface, problem)
 
 
-def contact_surface(lattice: Lattice, law: Law, offsets: np.ndarray | float = 0.0) -> ContactSurface:
+def contact_surface(lattice: Lattice, law: Law, offsets: Array | float = 0.0) -> ContactSurface:
     """Contact points of a body and their stiffness; see the module's text."""
     points, measures, groups = contact_points(lattice)
     dx = float(lattice.spacing.min())
@@ -99,9 +100,7 @@ def contact_surface(lattice: Lattice, law: Law, offsets: np.ndarray | float = 0.
     )
 
 
-def touching(
-    lattice: Lattice, nodes: np.ndarray, collider: Collider, time_s: float, thickness_m: float
-) -> np.ndarray:
+def touching(lattice: Lattice, nodes: Array, collider: Collider, time_s: float, thickness_m: float) -> Array:
     """Offsets (S,) [m] with which nothing is pressed at nodal positions ``nodes`` (n, 3).
 
     Points that start inside, by noise or by a thickness that is not quite right, touch there and further in: else the
@@ -112,7 +111,7 @@ def touching(
     return np.minimum(thickness_m, gap)
 
 
-def contact_points(lattice: Lattice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def contact_points(lattice: Lattice) -> tuple[Array, Array, Array]:
     """Reference coordinates (S, d) [m], measures (S,) [m**(d-1) of a solid, else m**d] and groups (S,) of the points
     that touch; those of one group may touch at the same time.
     """
@@ -133,7 +132,7 @@ def contact_points(lattice: Lattice) -> tuple[np.ndarray, np.ndarray, np.ndarray
     return np.concatenate(points), np.concatenate(areas), np.concatenate(groups)
 
 
-def _face_points(lattice: Lattice) -> list[tuple[int, np.ndarray]]:
+def _face_points(lattice: Lattice) -> list[tuple[int, Array]]:
     """Axis and points of the exposed faces that look along each of the six directions.
 
     Where a cell is filled in part, the surface lies as far behind its face as the two eighths of the cell there are
@@ -160,7 +159,7 @@ def _face_points(lattice: Lattice) -> list[tuple[int, np.ndarray]]:
     return sides
 
 
-def surface_points(lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
+def surface_points(lattice: Lattice) -> tuple[Array, Array]:
     """Reference coordinates (S, d) [m] and measures (S,) of the contact points."""
     points, measures, _ = contact_points(lattice)
     return points, measures

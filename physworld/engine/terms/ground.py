@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 from scipy.spatial import cKDTree
 
+from physworld.arrays import Array
 from physworld.engine.terms.colliders import BoundCollider, Collider, ContactSurface
 from physworld.engine.terms.colliders_kernels import move_collider
 from physworld.engine.terms.ground_kernels import touch_ground
@@ -56,7 +57,7 @@ class BoundGround(BoundCollider):
         self._height = wp.float64(height_m)
         self.differentiated = self._friction
 
-    def by_log_factor(self, bar: np.ndarray) -> np.ndarray:
+    def by_log_factor(self, bar: Array) -> Array:
         """Derivatives by the logarithms of the particles' factors, (P,), from those by ``differentiated``, (S,)."""
         found = np.zeros(self._count)
         np.add.at(found, self._particles, bar * self._friction.numpy())

@@ -17,32 +17,32 @@ from physworld.engine.total.node_kernels import weighted_sum
 @wp.kernel
 def touch_ground(
     # model: contact points
-    row_start: wp.array(dtype=wp.int32),
-    columns: wp.array(dtype=wp.int32),
-    weights: wp.array(dtype=wp.float64),
-    measure: wp.array(dtype=wp.float64),
-    offset: wp.array(dtype=wp.float64),
+    row_start: wp.array[wp.int32],
+    columns: wp.array[wp.int32],
+    weights: wp.array[wp.float64],
+    measure: wp.array[wp.float64],
+    offset: wp.array[wp.float64],
     # model: normal and tangential stiffness [N/m per measure], dampings [N s/m per measure]
     stiffness: wp.float64,
     shear_stiffness: wp.float64,
     damping: wp.float64,
     shear_damping: wp.float64,
     # model: Coulomb's coefficient of every point, height [m]
-    friction: wp.array(dtype=wp.float64),
+    friction: wp.array[wp.float64],
     height: wp.float64,
     # in
-    x: wp.array(dtype=wp.float64),
-    v: wp.array(dtype=wp.float64),
-    clock: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
-    travel: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
+    v: wp.array[wp.float64],
+    clock: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
+    travel: wp.array[wp.float64],
     # in, out
-    clearance: wp.array(dtype=wp.float64),
-    stretch: wp.array(dtype=wp.vec3d),
+    clearance: wp.array[wp.float64],
+    stretch: wp.array[wp.vec3d],
     # out
-    force: wp.array(dtype=wp.float64),
-    totals: wp.array(dtype=wp.float64),
-):
+    force: wp.array[wp.float64],
+    totals: wp.array[wp.float64],
+) -> None:
     """Push one point of the body off the ground, and hold it along the ground up to its own limit."""
     point = wp.tid()
     zero = wp.float64(0.0)

@@ -24,6 +24,7 @@ import numpy as np
 import warp as wp
 from scipy.linalg import eigh
 
+from physworld.arrays import Array
 from physworld.engine.lattice.bspline import gauss_points, tensor_weights
 from physworld.engine.lattice.lattice import Lattice
 from physworld.engine.problem import HeldNodes, Problem
@@ -38,7 +39,7 @@ _WHOLE = 0.9  # share of a section that a clamp across it holds at least, as far
 
 
 def soften(
-    problem: Problem, held: HeldNodes, softness: float, regions: Sequence[np.ndarray]
+    problem: Problem, held: HeldNodes, softness: float, regions: Sequence[Array]
 ) -> tuple[Problem, HeldNodes]:
     """The problem with grips that hold their material over ``softness`` cells, and the nodes that stay prescribed.
 
@@ -65,20 +66,20 @@ def soften(
     return replace(problem, terms=(*problem.terms, grips)), _part(held, ~loose)
 
 
-def gripped_points(lattice: Lattice, start: np.ndarray, region: np.ndarray) -> np.ndarray:
+def gripped_points(lattice: Lattice, start: Array, region: Array) -> Array:
     """Which of the cells' quadrature points lie in a box (2, 3) [m] when nodes are at ``start`` (n, 3), (C, Q) bool."""
     splines = tensor_weights(_places(lattice.dim), (0,) * lattice.dim)
     places = np.einsum("qa,cai->cqi", splines, start[lattice.cell_nodes])
     return np.all((places >= region[0] - _SLACK_M) & (places <= region[1] + _SLACK_M), axis=2)
 
 
-def touched_nodes(lattice: Lattice, shares: np.ndarray) -> np.ndarray:
+def touched_nodes(lattice: Lattice, shares: Array) -> Array:
     """Every node that gripped material touches, (k,)."""
     material = lattice.fill[:, _owners(lattice.dim)] > 0.0
     return np.unique(lattice.cell_nodes[np.any(shares & material, axis=1)])
 
 
-def holds_a_part(lattice: Lattice, start: np.ndarray, region: np.ndarray) -> bool:
+def holds_a_part(lattice: Lattice, start: Array, region: Array) -> bool:
     """Whether a box (2, 3) [m] holds a part of the body's section only, along whichever axis it is a clamp."""
     volumes = lattice.fill[:, _owners(lattice.dim)] * _weights(lattice.dim)
     gripped = float(volumes[gripped_points(lattice, start, region)].sum())
@@ -90,7 +91,7 @@ def holds_a_part(lattice: Lattice, start: np.ndarray, region: np.ndarray) -> boo
     return gripped > 0.0
 
 
-def gram_matrix(lattice: Lattice, regions: Sequence[np.ndarray], nodes: np.ndarray) -> np.ndarray:
+def gram_matrix(lattice: Lattice, regions: Sequence[Array], nodes: Array) -> Array:
     """Integrals of products of the splines of ``nodes`` (k,) over material in boxes (2, 3) [m], (k, k) [m^3].
 
     The parts of the cells' octants inside a box are integrated exactly: how hard a grip holds hangs on a tenth of a
@@ -118,23 +119,23 @@ def gram_matrix(lattice: Lattice, regions: Sequence[np.ndarray], nodes: np.ndarr
     return gram
 
 
-def _places(dim: int) -> np.ndarray:
+def _places(dim: int) -> Array:
     """Local coordinates of a cell's quadrature points, three to each half along an axis, (6**dim, dim)."""
     halves = 0.25 * (1.0 + _POINTS)
     return _grid(np.tile(np.concatenate([halves, 0.5 + halves])[:, None], dim))
 
 
-def _grid(lines: np.ndarray) -> np.ndarray:
+def _grid(lines: Array) -> Array:
     """All combinations of the entries of columns (k, dim), (k**dim, dim)."""
     return np.stack(np.meshgrid(*lines.T, indexing="ij"), axis=-1).reshape(-1, lines.shape[1])
 
 
-def _weights(dim: int) -> np.ndarray:
+def _weights(dim: int) -> Array:
     """Shares of a cell that its quadrature points stand for, (6**dim,)."""
     return np.prod(_grid(np.tile(np.tile(0.25 * _WEIGHTS, 2)[:, None], dim)), axis=1)
 
 
-def _owners(dim: int) -> np.ndarray:
+def _owners(dim: int) -> Array:
     """The particle whose part of the cell each quadrature point lies in, (6**dim,)."""
     corners = (gauss_points(dim) >= 0.5).astype(int)
     sides = (_places(dim) >= 0.5).astype(int)
@@ -146,7 +147,7 @@ class SoftGrips:
     """Term: nodes on springs to their paths, ``stiffness`` (k, k) [N/m] between them."""
 
     held: HeldNodes
-    stiffness: np.ndarray
+    stiffness: Array
 
     def bind(self, problem: Problem) -> BoundSoftGrips:
         """Device arrays."""
@@ -154,7 +155,7 @@ class SoftGrips:
         mass = problem.nodal_mass()[self.held.nodes]
         squares, modes = eigh(self.stiffness, np.diag(mass))
 
-        def upload(values: np.ndarray, dtype: type = wp.float64) -> wp.array:
+        def upload(values: Array, dtype: type = wp.float64) -> wp.array:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
 
         count = len(mass)
@@ -188,8 +189,8 @@ class BoundSoftGrips(BoundTerm):
     model: list
     pull: wp.array
     gap: wp.array
-    squares: np.ndarray
-    modes: np.ndarray
+    squares: Array
+    modes: Array
     device: str
     frequency_rad_s: float = 0.0
     friction_per_s: float = 0.0
@@ -218,22 +219,22 @@ class BoundSoftGrips(BoundTerm):
 @wp.kernel(enable_backward=False)
 def distance_from_path(
     # model
-    nodes: wp.array(dtype=wp.int32),
-    mass: wp.array(dtype=wp.float64),
-    path_x: wp.array2d(dtype=wp.float64),
-    path_v: wp.array2d(dtype=wp.float64),
+    nodes: wp.array[wp.int32],
+    mass: wp.array[wp.float64],
+    path_x: wp.array2d[wp.float64],
+    path_v: wp.array2d[wp.float64],
     gravity: wp.vec3d,
     drag: wp.float64,
     width: int,
-    clock: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
+    clock: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
     # in
-    x: wp.array(dtype=wp.float64),
-    v: wp.array(dtype=wp.float64),
-    force: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
+    v: wp.array[wp.float64],
+    force: wp.array[wp.float64],
     # out
-    gap: wp.array(dtype=wp.float64),
-):
+    gap: wp.array[wp.float64],
+) -> None:
     """Where a node would be after this substep, minus where its grip takes it [m].
 
     ``force`` is that of everything but the springs, or of all [N]; or an acceleration where ``mass`` is 1.
@@ -276,26 +277,26 @@ _LANES = 4  # rows are padded to whole vectors
 def pull_node(
     held: int,
     node: int,
-    pull: wp.array2d(dtype=wp.float64),
-    gap: wp.array(dtype=wp.float64),
-    force: wp.array(dtype=wp.float64),
+    pull: wp.array2d[wp.float64],
+    gap: wp.array[wp.float64],
+    force: wp.array[wp.float64],
 ): ...
 
 
 @wp.kernel(enable_backward=False)
 def pull_to_path(
     # model
-    nodes: wp.array(dtype=wp.int32),
-    pull: wp.array2d(dtype=wp.float64),
+    nodes: wp.array[wp.int32],
+    pull: wp.array2d[wp.float64],
     # in
-    gap: wp.array(dtype=wp.float64),
+    gap: wp.array[wp.float64],
     # out
-    force: wp.array(dtype=wp.float64),
-):
+    force: wp.array[wp.float64],
+) -> None:
     """Pull one node."""
     held = wp.tid()
     pull_node(held, nodes[held], pull, gap, force)
 
 
-def _part(held: HeldNodes, which: np.ndarray) -> HeldNodes:
+def _part(held: HeldNodes, which: Array) -> HeldNodes:
     return HeldNodes(held.nodes[which], held.positions[:, which], held.velocities[:, which])

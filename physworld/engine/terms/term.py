@@ -12,9 +12,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Protocol
 
-import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.errors import NotDifferentiable
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ class BoundTerm(Protocol):
     differentiable: bool = True
     multiplies: bool = False
 
-    def begin(self, times: np.ndarray) -> None:
+    def begin(self, times: Array) -> None:
         """A run over the frames ``times`` (T,) [s] starts: for terms that need the absolute time. May raise."""
         return None
 

@@ -132,39 +132,39 @@ _SNIPPET = (
 def rod_cell(
     cell: int,
     # model
-    cell_nodes: wp.array(dtype=wp.int32),
-    derivatives: wp.array(dtype=wp.float64),
-    stretching: wp.array(dtype=wp.float64),
-    bending: wp.array(dtype=wp.float64),
+    cell_nodes: wp.array[wp.int32],
+    derivatives: wp.array[wp.float64],
+    stretching: wp.array[wp.float64],
+    bending: wp.array[wp.float64],
     tau: wp.float64,
     viscous: int,
     inv_dt: wp.float64,
     # in
-    x: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
     # in, out
-    previous: wp.array(dtype=wp.float64),
+    previous: wp.array[wp.float64],
     # out
-    force: wp.array(dtype=wp.float64),
+    force: wp.array[wp.float64],
 ): ...
 
 
 @wp.kernel(enable_backward=False)
 def rod_forces(
     # model
-    cell_nodes: wp.array(dtype=wp.int32),
-    derivatives: wp.array(dtype=wp.float64),
-    stretching: wp.array(dtype=wp.float64),
-    bending: wp.array(dtype=wp.float64),
+    cell_nodes: wp.array[wp.int32],
+    derivatives: wp.array[wp.float64],
+    stretching: wp.array[wp.float64],
+    bending: wp.array[wp.float64],
     tau: wp.float64,
     viscous: int,
-    clock: wp.array(dtype=wp.float64),
+    clock: wp.array[wp.float64],
     # in
-    x: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
     # in, out
-    previous: wp.array(dtype=wp.float64),
+    previous: wp.array[wp.float64],
     # out
-    force: wp.array(dtype=wp.float64),
-):
+    force: wp.array[wp.float64],
+) -> None:
     """Add the internal forces [N] of one cell to its 3 nodes; ``clock[1]`` is 1/dt [1/s]."""
     rod_cell(
         wp.tid(), cell_nodes, derivatives, stretching, bending, tau, viscous, clock[1], x, previous, force

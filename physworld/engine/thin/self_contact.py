@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.engine.lattice.lattice import Lattice
 from physworld.engine.terms.contact import contact_surface
 from physworld.engine.terms.term import BoundTerm
@@ -67,7 +68,7 @@ class SelfContact:
 
     thickness_m: float
     friction: float
-    held: np.ndarray = field(default_factory=lambda: np.empty(0, dtype=int))
+    held: Array = field(default_factory=lambda: np.empty(0, dtype=int))
     damping: float = 1.0
 
     def bind(self, problem: Problem) -> BoundSelfContact:
@@ -130,7 +131,7 @@ class BoundSelfContact(BoundTerm):
         self.friction_per_s = 2 * damping * per_mass
         self._law = [wp.float64(0.5 * stiffness), wp.float64(0.5 * damping), wp.float64(contact.friction)]
 
-        def array(values: np.ndarray, dtype: type) -> wp.array:
+        def array(values: Array, dtype: type) -> wp.array:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
 
         most = _SLOTS[lattice.dim]
@@ -147,7 +148,7 @@ class BoundSelfContact(BoundTerm):
         low, high = _ends(lattice)
         begin = lattice.origin + corner * lattice.spacing
 
-        def in_cells(values: np.ndarray) -> np.ndarray:
+        def in_cells(values: Array) -> Array:
             found = np.full((len(values), 2), 0.5)
             found[:, : lattice.dim] = (values - begin) / lattice.spacing
             return found
@@ -250,7 +251,7 @@ class BoundSelfContact(BoundTerm):
             wp.launch(kernel, dim=lanes, inputs=[lanes, *inputs], device=self.device)
 
 
-def self_points(lattice: Lattice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def self_points(lattice: Lattice) -> tuple[Array, Array, Array]:
     """Reference coordinates (S, d) [m], cells (S,) ascending, and measures (S,) [m**d] of the contact points.
 
     The particles of a sheet; of a rope the middles of its half cells, which are evenly spaced.
@@ -265,7 +266,7 @@ def self_points(lattice: Lattice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return coordinates, cells, lattice.particle_measures[filled]
 
 
-def _ends(lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
+def _ends(lattice: Lattice) -> tuple[Array, Array]:
     """Where material begins and ends along every axis [m], (d,) each."""
     low, high = np.empty(lattice.dim), np.empty(lattice.dim)
     for axis in range(lattice.dim):

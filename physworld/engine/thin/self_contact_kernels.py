@@ -48,20 +48,20 @@ def touch_itself(
     stiffness: wp.float64,
     damping: wp.float64,
     friction: wp.float64,
-    held: wp.array(dtype=wp.float64),
+    held: wp.array[wp.float64],
     # in
-    x: wp.array(dtype=wp.float64),
-    v: wp.array(dtype=wp.float64),
-    clock: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
-    ways: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
+    v: wp.array[wp.float64],
+    clock: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
+    ways: wp.array[wp.float64],
     # in, out
-    moved: wp.array(dtype=wp.int32),
+    moved: wp.array[wp.int32],
     slots: Slots,
     # out
-    force: wp.array(dtype=wp.float64),
-    deepest: wp.array(dtype=wp.float64),
-):
+    force: wp.array[wp.float64],
+    deepest: wp.array[wp.float64],
+) -> None:
     """Push the two places of every pair apart, and hold them along each other up to Coulomb's limit."""
     lane = wp.tid()
     zero = wp.float64(0.0)

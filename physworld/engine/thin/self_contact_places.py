@@ -26,8 +26,8 @@ class Body:
     """The body's middle line or surface."""
 
     dim: int
-    cell_nodes: wp.array(dtype=wp.int32)
-    table: wp.array(dtype=wp.int32)  # cell at every place of the lattice's box, -1 for none
+    cell_nodes: wp.array[wp.int32]
+    table: wp.array[wp.int32]  # cell at every place of the lattice's box, -1 for none
     counts: wp.vec2i  # of that box
     low: wp.vec2d  # where material begins and ends [cells]
     high: wp.vec2d
@@ -68,12 +68,12 @@ def _slopes(u: wp.float64):
 
 
 @wp.func
-def node_at(values: wp.array(dtype=wp.float64), node: int):
+def node_at(values: wp.array[wp.float64], node: int):
     return wp.vec3d(values[3 * node], values[3 * node + 1], values[3 * node + 2])
 
 
 @wp.func
-def value_at(body: Body, values: wp.array(dtype=wp.float64), cell: int, u: wp.vec2d):
+def value_at(body: Body, values: wp.array[wp.float64], cell: int, u: wp.vec2d):
     """What nodal vectors ``values`` (3n,) are at a place."""
     a = _weights(u[0])
     found = wp.vec3d()
@@ -89,7 +89,7 @@ def value_at(body: Body, values: wp.array(dtype=wp.float64), cell: int, u: wp.ve
 
 
 @wp.func
-def add_at(body: Body, values: wp.array(dtype=wp.float64), cell: int, u: wp.vec2d, vector: wp.vec3d):
+def add_at(body: Body, values: wp.array[wp.float64], cell: int, u: wp.vec2d, vector: wp.vec3d):
     """Spread a vector at a place over its nodes."""
     a = _weights(u[0])
     b = _weights(u[1])
@@ -105,7 +105,7 @@ def add_at(body: Body, values: wp.array(dtype=wp.float64), cell: int, u: wp.vec2
 
 
 @wp.func
-def share_at(body: Body, mask: wp.array(dtype=wp.float64), cell: int, u: wp.vec2d):
+def share_at(body: Body, mask: wp.array[wp.float64], cell: int, u: wp.vec2d):
     """A nodal number at a place."""
     a = _weights(u[0])
     b = _weights(u[1])
@@ -121,7 +121,7 @@ def share_at(body: Body, mask: wp.array(dtype=wp.float64), cell: int, u: wp.vec2
 
 
 @wp.func
-def place_at(body: Body, x: wp.array(dtype=wp.float64), q: wp.vec2d):
+def place_at(body: Body, x: wp.array[wp.float64], q: wp.vec2d):
     """Position and its derivatives [m, m per cell] at a place."""
     here = Place()
     cell, u = cell_at(body, q)
@@ -177,7 +177,7 @@ def _in_window(body: Body, middle: wp.float64, q: wp.float64):
 
 
 @wp.func
-def _step_of_sheet(body: Body, x: wp.array(dtype=wp.float64), here: wp.vec3d, r: wp.vec2d):
+def _step_of_sheet(body: Body, x: wp.array[wp.float64], here: wp.vec3d, r: wp.vec2d):
     """One step towards the place nearest to ``here``."""
     zero = wp.float64(0.0)
     there = place_at(body, x, r)
@@ -201,7 +201,7 @@ def _step_of_sheet(body: Body, x: wp.array(dtype=wp.float64), here: wp.vec3d, r:
 
 
 @wp.func
-def _step_of_rope(body: Body, x: wp.array(dtype=wp.float64), middles: wp.vec2d, q: wp.float64, r: wp.float64):
+def _step_of_rope(body: Body, x: wp.array[wp.float64], middles: wp.vec2d, q: wp.float64, r: wp.float64):
     """One step towards the shortest way between the windows around two points of a rope."""
     zero = wp.float64(0.0)
     here = place_at(body, x, wp.vec2d(q, _HALF))
@@ -234,7 +234,7 @@ def _step_of_rope(body: Body, x: wp.array(dtype=wp.float64), middles: wp.vec2d, 
 @wp.func
 def refined(
     body: Body,
-    x: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
     middles: wp.vec2d,
     own: wp.vec2d,
     other: wp.vec2d,

@@ -35,9 +35,9 @@ _BESIDE = wp.constant(wp.float64(0.25))  # cells by which a minimum may lie outs
 class Points:
     """Its contact points."""
 
-    place: wp.array(dtype=wp.vec2d)
-    measure: wp.array(dtype=wp.float64)
-    first: wp.array(dtype=wp.int32)  # of every cell, (C + 1,)
+    place: wp.array[wp.vec2d]
+    measure: wp.array[wp.float64]
+    first: wp.array[wp.int32]  # of every cell, (C + 1,)
 
 
 @wp.struct
@@ -45,16 +45,16 @@ class Slots:
     """Pairs that are near; see the module's text."""
 
     most: int  # K
-    counts: wp.array(dtype=wp.int32)
-    own: wp.array(dtype=wp.vec2d)
-    other: wp.array(dtype=wp.vec2d)
-    slip: wp.array(dtype=wp.vec3d)
-    middles: wp.array(dtype=wp.vec2d)
-    side: wp.array(dtype=wp.vec3d)
-    reach: wp.array(dtype=wp.float64)
-    gap: wp.array(dtype=wp.float64)
-    active: wp.array(dtype=wp.int32)
-    actives: wp.array(dtype=wp.int32)
+    counts: wp.array[wp.int32]
+    own: wp.array[wp.vec2d]
+    other: wp.array[wp.vec2d]
+    slip: wp.array[wp.vec3d]
+    middles: wp.array[wp.vec2d]
+    side: wp.array[wp.vec3d]
+    reach: wp.array[wp.float64]
+    gap: wp.array[wp.float64]
+    active: wp.array[wp.int32]
+    actives: wp.array[wp.int32]
 
 
 @wp.func
@@ -72,13 +72,13 @@ def _bucket(p: wp.vec3d, width: wp.float64, i: int, j: int, k: int, mask: int):
 
 
 @wp.func
-def turn_of(counter: wp.array(dtype=wp.int32)):
+def turn_of(counter: wp.array[wp.int32]):
     """Where ``moved`` and ``ways`` have the numbers of this substep; the next one takes the other pair."""
     return 2 * (counter[1] % 2)
 
 
 @wp.func
-def searches(counter: wp.array(dtype=wp.int32), moved: wp.array(dtype=wp.int32)):
+def searches(counter: wp.array[wp.int32], moved: wp.array[wp.int32]):
     """Whether pairs are sought in this substep."""
     now = turn_of(counter)
     return moved[now] == 1 and moved[now + 1] == 1
@@ -90,13 +90,13 @@ def watch_nodes(
     # model
     middle: int,
     most: wp.float64,
-    x: wp.array(dtype=wp.float64),
-    built: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
+    x: wp.array[wp.float64],
+    built: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
     # in, out
-    moved: wp.array(dtype=wp.int32),
-    ways: wp.array(dtype=wp.float64),
-):
+    moved: wp.array[wp.int32],
+    ways: wp.array[wp.float64],
+) -> None:
     """How far nodes moved since the last search [m^2, squared], and whether it is farther than ``most``."""
     lane = wp.tid()
     now = turn_of(counter)
@@ -131,17 +131,17 @@ def place_cells(
     lanes: int,
     body: Body,
     width: wp.float64,
-    x: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
-    moved: wp.array(dtype=wp.int32),
+    x: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
+    moved: wp.array[wp.int32],
     # in, out
-    heads: wp.array(dtype=wp.int32),
+    heads: wp.array[wp.int32],
     # out
-    centres: wp.array(dtype=wp.vec3d),
-    nexts: wp.array(dtype=wp.int32),
+    centres: wp.array[wp.vec3d],
+    nexts: wp.array[wp.int32],
     slots: Slots,
-    deepest: wp.array(dtype=wp.float64),
-):
+    deepest: wp.array[wp.float64],
+) -> None:
     """Middles of the cells, and each in the list of its bucket of ``width`` [m], which are empty before.
 
     A run's first substep forgets all pairs.
@@ -164,7 +164,7 @@ def place_cells(
 
 
 @wp.func
-def _keep_slots(body: Body, slots: Slots, x: wp.array(dtype=wp.float64), point: int):
+def _keep_slots(body: Body, slots: Slots, x: wp.array[wp.float64], point: int):
     """Drop the pairs of a point that are no longer near, and all but the first of those that met."""
     kept = wp.int32(0)
     base = point * slots.most
@@ -211,7 +211,7 @@ def _has_middle(slots: Slots, base: int, count: int, middle: wp.float64):
 def _seek(
     body: Body,
     slots: Slots,
-    x: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
     point: int,
     own: wp.vec2d,
     other: wp.vec2d,
@@ -264,16 +264,16 @@ def seek_pairs(
     points: Points,
     width: wp.float64,
     around: wp.float64,
-    cells: wp.array(dtype=wp.vec2i),
-    x: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
-    moved: wp.array(dtype=wp.int32),
-    centres: wp.array(dtype=wp.vec3d),
-    heads: wp.array(dtype=wp.int32),
-    nexts: wp.array(dtype=wp.int32),
+    cells: wp.array[wp.vec2i],
+    x: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
+    moved: wp.array[wp.int32],
+    centres: wp.array[wp.vec3d],
+    heads: wp.array[wp.int32],
+    nexts: wp.array[wp.int32],
     # in, out
     slots: Slots,
-):
+) -> None:
     """Pairs of the points of every cell with what is near in space and far along the body.
 
     ``around``: how far from a cell's middle its material may be, or its windows reach [m].
@@ -319,13 +319,13 @@ def seek_pairs(
 @wp.kernel
 def end_search(
     lanes: int,
-    x: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
-    moved: wp.array(dtype=wp.int32),
+    x: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
+    moved: wp.array[wp.int32],
     # out
-    built: wp.array(dtype=wp.float64),
-    heads: wp.array(dtype=wp.int32),
-):
+    built: wp.array[wp.float64],
+    heads: wp.array[wp.int32],
+) -> None:
     """Keep the positions of a search, and empty the grid."""
     lane = wp.tid()
     if not searches(counter, moved):

@@ -121,41 +121,41 @@ _SNIPPET = (
 def sheet_cell(
     cell: int,
     # model
-    cell_nodes: wp.array(dtype=wp.int32),
-    derivatives: wp.array(dtype=wp.float64),
-    membrane: wp.array(dtype=wp.float64),
-    bending: wp.array(dtype=wp.float64),
-    shape: wp.array(dtype=wp.float64),
+    cell_nodes: wp.array[wp.int32],
+    derivatives: wp.array[wp.float64],
+    membrane: wp.array[wp.float64],
+    bending: wp.array[wp.float64],
+    shape: wp.array[wp.float64],
     tau: wp.float64,
     viscous: int,
     inv_dt: wp.float64,
     # in
-    x: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
     # in, out
-    previous: wp.array(dtype=wp.float64),
+    previous: wp.array[wp.float64],
     # out
-    force: wp.array(dtype=wp.float64),
+    force: wp.array[wp.float64],
 ): ...
 
 
 @wp.kernel(enable_backward=False)
 def sheet_forces(
     # model
-    cell_nodes: wp.array(dtype=wp.int32),
-    derivatives: wp.array(dtype=wp.float64),
-    membrane: wp.array(dtype=wp.float64),
-    bending: wp.array(dtype=wp.float64),
-    shape: wp.array(dtype=wp.float64),
+    cell_nodes: wp.array[wp.int32],
+    derivatives: wp.array[wp.float64],
+    membrane: wp.array[wp.float64],
+    bending: wp.array[wp.float64],
+    shape: wp.array[wp.float64],
     tau: wp.float64,
     viscous: int,
-    clock: wp.array(dtype=wp.float64),
+    clock: wp.array[wp.float64],
     # in
-    x: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
     # in, out
-    previous: wp.array(dtype=wp.float64),
+    previous: wp.array[wp.float64],
     # out
-    force: wp.array(dtype=wp.float64),
-):
+    force: wp.array[wp.float64],
+) -> None:
     """Add the internal forces [N] of one cell to its 9 nodes; ``clock[1]`` is 1/dt [1/s]."""
     sheet_cell(
         wp.tid(),

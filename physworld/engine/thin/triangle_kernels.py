@@ -85,16 +85,16 @@ _EDGE = (
 @wp.func_native(_TRIANGLE)
 def triangle(
     number: int,
-    corners: wp.array(dtype=wp.int32),
-    slopes: wp.array(dtype=wp.float64),
-    membrane: wp.array(dtype=wp.float64),
-    shape: wp.array(dtype=wp.float64),
+    corners: wp.array[wp.int32],
+    slopes: wp.array[wp.float64],
+    membrane: wp.array[wp.float64],
+    shape: wp.array[wp.float64],
     tau: wp.float64,
     viscous: int,
     inv_dt: wp.float64,
-    x: wp.array(dtype=wp.float64),
-    previous: wp.array(dtype=wp.float64),
-    force: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
+    previous: wp.array[wp.float64],
+    force: wp.array[wp.float64],
 ): ...
 
 
@@ -102,15 +102,15 @@ def triangle(
 def edge(
     number: int,
     triangles: int,
-    edges: wp.array(dtype=wp.int32),
-    weights: wp.array(dtype=wp.float64),
-    bending: wp.array(dtype=wp.float64),
+    edges: wp.array[wp.int32],
+    weights: wp.array[wp.float64],
+    bending: wp.array[wp.float64],
     tau: wp.float64,
     viscous: int,
     inv_dt: wp.float64,
-    x: wp.array(dtype=wp.float64),
-    previous: wp.array(dtype=wp.float64),
-    force: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
+    previous: wp.array[wp.float64],
+    force: wp.array[wp.float64],
 ): ...
 
 
@@ -118,23 +118,23 @@ def edge(
 def triangle_forces(
     # model
     triangles: int,
-    corners: wp.array(dtype=wp.int32),
-    slopes: wp.array(dtype=wp.float64),
-    membrane: wp.array(dtype=wp.float64),
-    shape: wp.array(dtype=wp.float64),
-    edges: wp.array(dtype=wp.int32),
-    weights: wp.array(dtype=wp.float64),
-    bending: wp.array(dtype=wp.float64),
+    corners: wp.array[wp.int32],
+    slopes: wp.array[wp.float64],
+    membrane: wp.array[wp.float64],
+    shape: wp.array[wp.float64],
+    edges: wp.array[wp.int32],
+    weights: wp.array[wp.float64],
+    bending: wp.array[wp.float64],
     tau: wp.float64,
     viscous: int,
-    clock: wp.array(dtype=wp.float64),
+    clock: wp.array[wp.float64],
     # in
-    x: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
     # in, out
-    previous: wp.array(dtype=wp.float64),
+    previous: wp.array[wp.float64],
     # out
-    force: wp.array(dtype=wp.float64),
-):
+    force: wp.array[wp.float64],
+) -> None:
     """Add the internal forces [N] of a triangle, or of an edge after the last triangle; ``clock[1]`` is 1/dt [1/s]."""
     number = wp.tid()
     if number < triangles:

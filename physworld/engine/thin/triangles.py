@@ -21,6 +21,7 @@ from typing import ClassVar
 import numpy as np
 from scipy import sparse
 
+from physworld.arrays import Array
 from physworld.engine.lattice.lattice import Lattice
 from physworld.errors import SceneUnsupported
 
@@ -69,11 +70,11 @@ class TriangleLattice(Lattice):
     smooth: ClassVar[bool] = False
 
     @property
-    def node_coordinates(self) -> np.ndarray:
+    def node_coordinates(self) -> Array:
         """Reference coordinates of the nodes [m], (n, 2)."""
         return self.origin + self.nodes * self.spacing
 
-    def table(self, orders: tuple[int, ...]) -> np.ndarray:
+    def table(self, orders: tuple[int, ...]) -> Array:
         """None: what a cell's corners weigh differs from cell to cell.
 
         Raises:
@@ -84,16 +85,14 @@ class TriangleLattice(Lattice):
             "this needs a sheet of splines"
         )
 
-    def lumped(self, particle_mass: np.ndarray) -> np.ndarray:
+    def lumped(self, particle_mass: Array) -> Array:
         """Lumped nodal masses [kg], (n,): a third of every triangle, which weighs half a cell."""
         share = particle_mass.reshape(len(self.cells), -1).sum(axis=1) / 6.0
         mass = np.zeros(len(self.nodes))
         np.add.at(mass, self.triangles, np.repeat(share, 2)[:, None])
         return mass
 
-    def interpolation(
-        self, coordinates: np.ndarray, orders: tuple[int, ...] | None = None
-    ) -> sparse.csr_matrix:
+    def interpolation(self, coordinates: Array, orders: tuple[int, ...] | None = None) -> sparse.csr_matrix:
         """As :meth:`Lattice.interpolation`, of the triangle at each place; of derivatives the first ones only."""
         coordinates = np.asarray(coordinates, dtype=float).reshape(-1, 2)
         cell, local = self._locate(coordinates)
@@ -116,11 +115,11 @@ class TriangleLattice(Lattice):
         across, up = (int(n) + 1 for n in self.cells.max(axis=0))
         return Mesh((across, up), self.odd)
 
-    def crossed(self, cell: np.ndarray) -> np.ndarray:
+    def crossed(self, cell: Array) -> Array:
         """Which of the cells (M,) are cut from (1, 0) to (0, 1), (M,) bool."""
         return (self.cells[cell].sum(axis=1) + int(self.odd)) % 2 == 1
 
-    def _weights(self, cell: np.ndarray, local: np.ndarray, within: np.ndarray | None = None) -> np.ndarray:
+    def _weights(self, cell: Array, local: Array, within: Array | None = None) -> Array:
         """Of the corners (M, 4) at ``local`` (M, 2), linear from the triangle that holds ``within`` on."""
         u, v = local.T
         a, b = (np.clip(local, 0.0, 1.0) if within is None else within).T
@@ -134,7 +133,7 @@ class TriangleLattice(Lattice):
         return np.where(self.crossed(cell)[:, None], across, straight)
 
     @cached_property
-    def triangles(self) -> np.ndarray:
+    def triangles(self) -> Array:
         """Nodes of the triangles, two a cell side by side, (2 C, 3) int32, counter-clockwise in the plane."""
         low, left, right, high = self.cell_nodes.T  # corners (0, 0), (0, 1), (1, 0), (1, 1)
         straight = np.stack([low, right, high, low, high, left], axis=1)
@@ -143,12 +142,12 @@ class TriangleLattice(Lattice):
         return np.where(crossed, across, straight).reshape(-1, 3).astype(np.int32)
 
     @cached_property
-    def areas(self) -> np.ndarray:
+    def areas(self) -> Array:
         """Of the triangles [m^2], (2 C,)."""
         return np.full(len(self.triangles), 0.5 * float(np.prod(self.spacing)))
 
     @cached_property
-    def slopes(self) -> np.ndarray:
+    def slopes(self) -> Array:
         """Derivatives of the corners' weights along both axes [1/m], (2 C, 3, 2)."""
         places = self.node_coordinates[self.triangles]
         return np.stack(
@@ -156,7 +155,7 @@ class TriangleLattice(Lattice):
         ) / (2.0 * self.areas[:, None, None])
 
     @cached_property
-    def hinges(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def hinges(self) -> tuple[Array, Array, Array]:
         """Ends of the inner edges and the corners opposite, (H, 4) int32; cotangent weights c, (H, 4); areas (H,)."""
         corners = np.array([(*ends, *(corner for corner, _ in sides)) for ends, sides in self._inner])
         corners = corners.reshape(-1, 4).astype(np.int32)
@@ -169,7 +168,7 @@ class TriangleLattice(Lattice):
         return corners, weights, np.full(len(corners), float(np.prod(self.spacing)))
 
     @property
-    def hinge_cells(self) -> np.ndarray:
+    def hinge_cells(self) -> Array:
         """The cells of the two triangles at every inner edge, (H, 2)."""
         return np.array([[cell for _, cell in sides] for _, sides in self._inner]).reshape(-1, 2)
 
@@ -189,7 +188,7 @@ def mesh_of(lattice: Lattice) -> Mesh | None:
     return lattice.mesh if isinstance(lattice, TriangleLattice) else None
 
 
-def triangle_lattice(size: np.ndarray, mesh: Mesh, origin: np.ndarray | None = None) -> TriangleLattice:
+def triangle_lattice(size: Array, mesh: Mesh, origin: Array | None = None) -> TriangleLattice:
     """The mesh of a sheet from ``origin`` (2,), by default (0, 0), over ``size`` (2,) [m].
 
     Raises:
@@ -212,12 +211,12 @@ def triangle_lattice(size: np.ndarray, mesh: Mesh, origin: np.ndarray | None = N
     )
 
 
-def _turned(edges: np.ndarray) -> np.ndarray:
+def _turned(edges: Array) -> Array:
     """Plane vectors (M, 2) turned to the left by a right angle."""
     return np.stack([-edges[:, 1], edges[:, 0]], axis=1)
 
 
-def _cotangent(at: np.ndarray, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+def _cotangent(at: Array, one: Array, other: Array) -> Array:
     """Of the angles at places (M, 2) between two others, (M,)."""
     u, v = one - at, other - at
     return np.sum(u * v, axis=1) / np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.engine.lattice.lattice import Lattice
 from physworld.engine.terms.term import BoundTerm
 from physworld.engine.thin.twist_kernels import push_twisted, sum_turning, turn_spans
@@ -46,13 +47,13 @@ class Span:
         rates: their rates [1/s], likewise.
     """
 
-    particles: np.ndarray
-    frames: np.ndarray
-    rates: np.ndarray
+    particles: Array
+    frames: Array
+    rates: Array
 
 
 def span_between(
-    lattice: Lattice, start: np.ndarray, ends_m: tuple[float, float], turns: np.ndarray, times: np.ndarray
+    lattice: Lattice, start: Array, ends_m: tuple[float, float], turns: Array, times: Array
 ) -> Span | None:
     """The span between two grips of a rope that is not twisted at ``start``.
 
@@ -84,7 +85,7 @@ def span_between(
     return Span(particles, frames, rates)
 
 
-def carried(director: np.ndarray, tangents: np.ndarray) -> np.ndarray:
+def carried(director: Array, tangents: Array) -> Array:
     """``director`` (3,) carried along unit ``tangents`` (M, 3) without twist: across the last of them."""
     for t, u in pairwise(tangents):
         axis = np.cross(t, u)
@@ -132,7 +133,7 @@ class BoundTwist(BoundTerm):
         self._turns = np.stack([prescribed_turns(span) for span in spans])
         self.frequency_rad_s = _fastest(problem.nodal_mass(), nodes, slopes, spans, compliance)
 
-        def array(values: np.ndarray, dtype: type = wp.float64) -> wp.array:
+        def array(values: Array, dtype: type = wp.float64) -> wp.array:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
 
         frames = [len(spans[0].frames), -1]
@@ -148,16 +149,16 @@ class BoundTwist(BoundTerm):
         self.memory = (self.angle,)
 
     @property
-    def angles_rad(self) -> np.ndarray:
+    def angles_rad(self) -> Array:
         """Twist of every span in the last substep [rad], (S,)."""
         return self.angle.numpy().copy()
 
     @property
-    def moments_n_m(self) -> np.ndarray:
+    def moments_n_m(self) -> Array:
         """Twisting moment of every span in the last substep [N m], (S,)."""
         return self.state.moment.numpy().copy()
 
-    def begin(self, times: np.ndarray) -> None:
+    def begin(self, times: Array) -> None:
         """A run starts.
 
         Raises:
@@ -232,7 +233,7 @@ class TwistMeter:
             outputs=self._out, device=twist.device,
         )  # fmt: skip
 
-    def read(self) -> tuple[np.ndarray, np.ndarray]:
+    def read(self) -> tuple[Array, Array]:
         """Work of the turning grips since the start and stored energy at the frames [J], (frames,) each."""
         work, energy = (array.numpy().sum(axis=1) for array in self._out)
         return work, energy
@@ -254,9 +255,7 @@ class _State:
         return [self.along, self.inverse, self.ends]
 
 
-def _fastest(
-    mass: np.ndarray, nodes: np.ndarray, slopes: np.ndarray, spans: tuple[Span, ...], compliance: np.ndarray
-) -> float:
+def _fastest(mass: Array, nodes: Array, slopes: Array, spans: tuple[Span, ...], compliance: Array) -> float:
     """Bound on the fastest frequency [rad/s] that twist adds.
 
     The Hessian of the energy by unit tangents is M d2Theta + dTheta dTheta' / C. Neighbours couple with half of M, so
@@ -275,7 +274,7 @@ def _fastest(
     return float(np.sqrt(per_mass * worst))
 
 
-def prescribed_turns(span: Span) -> np.ndarray:
+def prescribed_turns(span: Span) -> Array:
     """Angles by which the grips turned about their tangents since the first frame [rad], low end then high, (2, T)."""
     turned = np.zeros((2, len(span.frames)))
     for end in range(2):

@@ -21,7 +21,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def _slope(
-    values: wp.array(dtype=wp.float64), nodes: wp.array2d(dtype=wp.int32), slopes: wp.array2d(dtype=wp.float64),
+    values: wp.array[wp.float64], nodes: wp.array2d[wp.int32], slopes: wp.array2d[wp.float64],
     point: int,
 ) -> wp.vec3d:  # fmt: skip
     """Derivative of nodal ``values`` by the arc length at a particle."""
@@ -56,8 +56,8 @@ def _binormal_rate(t: wp.vec3d, u: wp.vec3d, dt: wp.vec3d, du: wp.vec3d) -> wp.v
 
 @wp.func
 def _prescribed(
-    path_x: wp.array2d(dtype=wp.float64), path_v: wp.array2d(dtype=wp.float64), clock: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32), first: int,
+    path_x: wp.array2d[wp.float64], path_v: wp.array2d[wp.float64], clock: wp.array[wp.float64],
+    counter: wp.array[wp.int32], first: int,
 ) -> wp.vec3d:  # fmt: skip
     """Three neighbouring columns of the paths now."""
     s = wp.float64(counter[1]) / wp.float64(counter[2])
@@ -74,25 +74,25 @@ def _prescribed(
 @wp.kernel
 def turn_spans(
     # model
-    begins: wp.array(dtype=wp.int32),
-    nodes: wp.array2d(dtype=wp.int32),
-    slopes: wp.array2d(dtype=wp.float64),
-    compliance: wp.array(dtype=wp.float64),
-    path_x: wp.array2d(dtype=wp.float64),
-    path_v: wp.array2d(dtype=wp.float64),
-    clock: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
+    begins: wp.array[wp.int32],
+    nodes: wp.array2d[wp.int32],
+    slopes: wp.array2d[wp.float64],
+    compliance: wp.array[wp.float64],
+    path_x: wp.array2d[wp.float64],
+    path_v: wp.array2d[wp.float64],
+    clock: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
     # in
-    x: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
     # in, out
-    angle: wp.array(dtype=wp.float64),
-    narrow: wp.array(dtype=wp.float64),
+    angle: wp.array[wp.float64],
+    narrow: wp.array[wp.float64],
     # out
-    along: wp.array(dtype=wp.vec3d),
-    inverse: wp.array(dtype=wp.float64),
-    ends: wp.array(dtype=wp.vec3d),
-    moment: wp.array(dtype=wp.float64),
-):
+    along: wp.array[wp.vec3d],
+    inverse: wp.array[wp.float64],
+    ends: wp.array[wp.vec3d],
+    moment: wp.array[wp.float64],
+) -> None:
     """Angle [rad] and moment [N m] of a span; the angle is followed from the last substep's, over any turns."""
     span = wp.tid()
     t = wp.normalize(_prescribed(path_x, path_v, clock, counter, 12 * span))
@@ -130,8 +130,8 @@ def turn_spans(
 
 @wp.func
 def _neighbours(
-    point: int, span: int, begins: wp.array(dtype=wp.int32), along: wp.array(dtype=wp.vec3d),
-    ends: wp.array(dtype=wp.vec3d),
+    point: int, span: int, begins: wp.array[wp.int32], along: wp.array[wp.vec3d],
+    ends: wp.array[wp.vec3d],
 ):  # fmt: skip
     """Unit tangents before and after a particle."""
     before = ends[4 * span]
@@ -146,18 +146,18 @@ def _neighbours(
 @wp.kernel
 def push_twisted(
     # model
-    begins: wp.array(dtype=wp.int32),
-    span_of: wp.array(dtype=wp.int32),
-    nodes: wp.array2d(dtype=wp.int32),
-    slopes: wp.array2d(dtype=wp.float64),
+    begins: wp.array[wp.int32],
+    span_of: wp.array[wp.int32],
+    nodes: wp.array2d[wp.int32],
+    slopes: wp.array2d[wp.float64],
     # in
-    along: wp.array(dtype=wp.vec3d),
-    inverse: wp.array(dtype=wp.float64),
-    ends: wp.array(dtype=wp.vec3d),
-    moment: wp.array(dtype=wp.float64),
+    along: wp.array[wp.vec3d],
+    inverse: wp.array[wp.float64],
+    ends: wp.array[wp.vec3d],
+    moment: wp.array[wp.float64],
     # out
-    force: wp.array(dtype=wp.float64),
-):
+    force: wp.array[wp.float64],
+) -> None:
     """Add - moment dTheta/dx [N] of one particle's tangent to its nodes."""
     point = wp.tid()
     span = span_of[point]
@@ -173,21 +173,21 @@ def push_twisted(
 @wp.kernel
 def turn_spans_along(
     # model
-    begins: wp.array(dtype=wp.int32),
-    nodes: wp.array2d(dtype=wp.int32),
-    slopes: wp.array2d(dtype=wp.float64),
-    compliance: wp.array(dtype=wp.float64),
+    begins: wp.array[wp.int32],
+    nodes: wp.array2d[wp.int32],
+    slopes: wp.array2d[wp.float64],
+    compliance: wp.array[wp.float64],
     # in
-    along: wp.array(dtype=wp.vec3d),
-    inverse: wp.array(dtype=wp.float64),
-    ends: wp.array(dtype=wp.vec3d),
-    moment: wp.array(dtype=wp.float64),
-    w: wp.array(dtype=wp.float64),
+    along: wp.array[wp.vec3d],
+    inverse: wp.array[wp.float64],
+    ends: wp.array[wp.vec3d],
+    moment: wp.array[wp.float64],
+    w: wp.array[wp.float64],
     # out
-    along_rate: wp.array(dtype=wp.vec3d),
-    moment_rate: wp.array(dtype=wp.float64),
-    by_log_stiffness: wp.array(dtype=wp.float64),
-):
+    along_rate: wp.array[wp.vec3d],
+    moment_rate: wp.array[wp.float64],
+    by_log_stiffness: wp.array[wp.float64],
+) -> None:
     """How unit tangents and moment change with the nodes along ``w``; adds w . f to ``by_log_stiffness``."""
     span = wp.tid()
     rate = wp.float64(0.0)
@@ -205,21 +205,21 @@ def turn_spans_along(
 @wp.kernel
 def push_twisted_along(
     # model
-    begins: wp.array(dtype=wp.int32),
-    span_of: wp.array(dtype=wp.int32),
-    nodes: wp.array2d(dtype=wp.int32),
-    slopes: wp.array2d(dtype=wp.float64),
+    begins: wp.array[wp.int32],
+    span_of: wp.array[wp.int32],
+    nodes: wp.array2d[wp.int32],
+    slopes: wp.array2d[wp.float64],
     # in
-    along: wp.array(dtype=wp.vec3d),
-    inverse: wp.array(dtype=wp.float64),
-    ends: wp.array(dtype=wp.vec3d),
-    moment: wp.array(dtype=wp.float64),
-    along_rate: wp.array(dtype=wp.vec3d),
-    moment_rate: wp.array(dtype=wp.float64),
-    w: wp.array(dtype=wp.float64),
+    along: wp.array[wp.vec3d],
+    inverse: wp.array[wp.float64],
+    ends: wp.array[wp.vec3d],
+    moment: wp.array[wp.float64],
+    along_rate: wp.array[wp.vec3d],
+    moment_rate: wp.array[wp.float64],
+    w: wp.array[wp.float64],
     # out
-    out: wp.array(dtype=wp.float64),
-):
+    out: wp.array[wp.float64],
+) -> None:
     """Add the change of :func:`push_twisted`'s forces with the nodes along ``w``."""
     point = wp.tid()
     span = span_of[point]
@@ -246,22 +246,22 @@ def push_twisted_along(
 @wp.kernel
 def sum_turning(
     # model
-    begins: wp.array(dtype=wp.int32),
-    counter: wp.array(dtype=wp.int32),
+    begins: wp.array[wp.int32],
+    counter: wp.array[wp.int32],
     # in
-    along: wp.array(dtype=wp.vec3d),
-    ends: wp.array(dtype=wp.vec3d),
-    angle: wp.array(dtype=wp.float64),
-    moment: wp.array(dtype=wp.float64),
+    along: wp.array[wp.vec3d],
+    ends: wp.array[wp.vec3d],
+    angle: wp.array[wp.float64],
+    moment: wp.array[wp.float64],
     # in, out: of the last substep
-    last_ends: wp.array(dtype=wp.vec3d),
-    last_bends: wp.array(dtype=wp.vec3d),
-    last_moment: wp.array(dtype=wp.float64),
-    work: wp.array(dtype=wp.float64),
+    last_ends: wp.array[wp.vec3d],
+    last_bends: wp.array[wp.vec3d],
+    last_moment: wp.array[wp.float64],
+    work: wp.array[wp.float64],
     # out
-    work_out: wp.array2d(dtype=wp.float64),
-    energy_out: wp.array2d(dtype=wp.float64),
-):
+    work_out: wp.array2d[wp.float64],
+    energy_out: wp.array2d[wp.float64],
+) -> None:
     """Work [J] that the grips of a span do by turning its ends, by the trapezoidal rule; written at a frame.
 
     What they turn about the axis counts in full; that they move the axis counts with the holonomy's variation.

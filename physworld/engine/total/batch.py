@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.engine.lattice.lattice import Lattice
 from physworld.engine.problem import HeldNodes, Problem
 from physworld.engine.terms.term import BoundTerm
@@ -79,12 +80,12 @@ class Batch:
 
     def run(
         self,
-        x: Sequence[np.ndarray],
-        v: Sequence[np.ndarray],
+        x: Sequence[Array],
+        v: Sequence[Array],
         held: Sequence[HeldNodes],
-        times: Sequence[np.ndarray],
+        times: Sequence[Array],
         progress: Callable[[int, int], None] | None = None,
-    ) -> list[np.ndarray | SimulationError]:
+    ) -> list[Array | SimulationError]:
         """Integrate from the common start and record the nodes at every time.
 
         Args:
@@ -125,7 +126,7 @@ class Batch:
         """Substeps that an interval between two frames takes."""
         return whole_chunks(interval, self.time_step_s)
 
-    def _fastest(self, factors: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    def _fastest(self, factors: list[Array]) -> tuple[Array, Array]:
         """Fastest frequencies [rad/s] and friction rates [1/s] of the bodies, (B,) each."""
         problems, cell = self.problems, float(self.lattice.spacing.min())
         rests = np.stack([problem.rest for problem in problems])
@@ -154,9 +155,7 @@ class _BatchRun(Run):
         awaited: for each body, whether the frame that is integrated is one of its own.
     """
 
-    def __init__(
-        self, batch: Batch, x: np.ndarray, v: np.ndarray, held: HeldNodes, times: np.ndarray
-    ) -> None:
+    def __init__(self, batch: Batch, x: Array, v: Array, held: HeldNodes, times: Array) -> None:
         self.errors: list[SimulationError | None] = [None] * len(batch.problems)
         self.awaited = [True] * len(batch.problems)
         self._gravity = np.array([problem.gravity_m_s2 for problem in batch.problems], dtype=float)
@@ -205,11 +204,11 @@ class _BatchRun(Run):
             device=batch.device,
         )
 
-    def _fall(self) -> tuple[np.ndarray, np.ndarray]:
+    def _fall(self) -> tuple[Array, Array]:
         nodes = len(self._solver.lattice.nodes)
         return np.repeat(self._gravity, nodes, axis=0), np.repeat(self._drag, nodes)[:, None]
 
-    def _check(self, now: np.ndarray, time: float) -> None:
+    def _check(self, now: Array, time: float) -> None:
         batch, dt = self._solver, float(self._clocks[0].numpy()[2])
         bodies = len(batch.problems)
         inverted = np.count_nonzero(batch.forces.inverted.numpy().reshape(bodies, -1), axis=1)
@@ -225,7 +224,7 @@ class _BatchRun(Run):
                 self.errors[body] = error
 
 
-def common_times(times: Sequence[np.ndarray]) -> np.ndarray:
+def common_times(times: Sequence[Array]) -> Array:
     """The longest of the bodies' times, of which all others must be the beginning.
 
     Raises:
@@ -250,7 +249,7 @@ def _same_lattice(one: Lattice, other: Lattice) -> bool:
     )
 
 
-def _joined(held: Sequence[HeldNodes], batch: Batch, times: np.ndarray) -> HeldNodes:
+def _joined(held: Sequence[HeldNodes], batch: Batch, times: Array) -> HeldNodes:
     """Grips of all bodies; where a body's times end before ``times``, its grips stand still from then on."""
     nodes, positions, velocities = [], [], []
     for body, own in enumerate(held):

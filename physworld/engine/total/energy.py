@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.engine.problem import HeldNodes, Problem
 from physworld.engine.thin.twist import Twist, TwistMeter
 from physworld.engine.total.energy_kernels import keep_forces, sum_friction, sum_works
@@ -45,22 +46,22 @@ class EnergyLedger:
         internal_friction: taken by the law's own friction.
     """
 
-    times: np.ndarray
-    kinetic: np.ndarray
-    gravitational: np.ndarray
-    elastic: np.ndarray
-    grip_work: np.ndarray
-    term_work: np.ndarray
-    drag: np.ndarray
-    internal_friction: np.ndarray
+    times: Array
+    kinetic: Array
+    gravitational: Array
+    elastic: Array
+    grip_work: Array
+    term_work: Array
+    drag: Array
+    internal_friction: Array
 
     @property
-    def mechanical(self) -> np.ndarray:
+    def mechanical(self) -> Array:
         """Kinetic, gravitational and elastic energy together."""
         return self.kinetic + self.gravitational + self.elastic
 
     @property
-    def lost(self) -> np.ndarray:
+    def lost(self) -> Array:
         """What the numerics lost (negative: gained) since the first frame."""
         accounted = self.grip_work + self.term_work - self.drag - self.internal_friction
         return accounted - (self.mechanical - self.mechanical[0])
@@ -77,14 +78,14 @@ class EnergyLedger:
 
 def run_with_ledger(
     problem: Problem,
-    x: np.ndarray,
-    v: np.ndarray,
+    x: Array,
+    v: Array,
     held: HeldNodes,
-    times: np.ndarray,
+    times: Array,
     *,
     time_step_s: float | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> tuple[np.ndarray, EnergyLedger]:
+) -> tuple[Array, EnergyLedger]:
     """Integrate a problem in the total Lagrangian form and account for its energy.
 
     Args:
@@ -140,7 +141,7 @@ def run_with_ledger(
     )
 
 
-def elastic_energy(problem: Problem, nodes: np.ndarray) -> np.ndarray:
+def elastic_energy(problem: Problem, nodes: Array) -> Array:
     """Energy stored by the law but for twist [J], (T,), at nodal positions (T, n, 3) [m]."""
     lattice, law = problem.lattice, problem.law
     measure = lattice.particle_measures
@@ -161,7 +162,7 @@ def elastic_energy(problem: Problem, nodes: np.ndarray) -> np.ndarray:
     return energies
 
 
-def _density(law: Law, derivatives: np.ndarray) -> np.ndarray:
+def _density(law: Law, derivatives: Array) -> Array:
     """Energy density (P,) of derivatives (P, k, 3): displacement gradients of a solid, or positions' of a thin body."""
     if isinstance(law, SolidLaw):
         return law.energy_density(np.eye(3) + derivatives.transpose(0, 2, 1))
@@ -184,7 +185,7 @@ class _Marker:
         self._kept = self._meter.allocate(problem)
         return self
 
-    def begin(self, times: np.ndarray) -> None:
+    def begin(self, times: Array) -> None:
         return None
 
     def pace(self, time_step_s: float) -> None:
@@ -245,7 +246,7 @@ class _Meter:
     def bind(self, problem: Problem) -> _Meter:
         return self
 
-    def begin(self, times: np.ndarray) -> None:
+    def begin(self, times: Array) -> None:
         return None
 
     def pace(self, time_step_s: float) -> None:
@@ -269,7 +270,7 @@ class _Meter:
             device=self._device,
         )
 
-    def read(self) -> tuple[np.ndarray, np.ndarray]:
+    def read(self) -> tuple[Array, Array]:
         """Works (T, 5, n) [J] and velocities (T, n, 3) [m/s] at the frames."""
         work, velocity = (array.numpy()[: self._frames] for array in self._outputs)
         return work.copy(), velocity.reshape(self._frames, -1, 3).copy()
@@ -285,13 +286,13 @@ class _Meter:
             device=self._device,
         )  # fmt: skip
 
-    def read_friction(self) -> np.ndarray:
+    def read_friction(self) -> Array:
         """Works of sub-cycled internal friction and drag at the frames [J], (T, 2, n); 0 where they are explicit."""
         if self._relaxed is None:
             return np.zeros((self._frames, 2, self._outputs[0].shape[2]))
         return self._friction[3].numpy()[: self._frames].copy()
 
-    def read_twist(self) -> tuple[np.ndarray, np.ndarray]:
+    def read_twist(self) -> tuple[Array, Array]:
         """Work of grips that turn a rope's ends and energy of its twist at the frames [J], (T,) each."""
         found = [turning.read() for _, turning in self._twists]
         work, energy = (sum((f[k] for f in found), np.zeros(self._frames + 1)) for k in range(2))

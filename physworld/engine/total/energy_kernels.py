@@ -14,10 +14,10 @@ import warp as wp
 @wp.kernel
 def keep_forces(
     # in
-    force: wp.array(dtype=wp.float64),
+    force: wp.array[wp.float64],
     # out
-    kept: wp.array(dtype=wp.float64),
-):
+    kept: wp.array[wp.float64],
+) -> None:
     """Copy the forces that have been added so far."""
     i = wp.tid()
     kept[i] = force[i]
@@ -26,28 +26,28 @@ def keep_forces(
 @wp.kernel
 def sum_works(
     # model
-    mass: wp.array(dtype=wp.float64),
+    mass: wp.array[wp.float64],
     gravity: wp.vec3d,
     drag: wp.float64,
     lag: wp.float64,
     # in
-    x: wp.array(dtype=wp.float64),
-    v: wp.array(dtype=wp.float64),
-    clock: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
-    internal: wp.array(dtype=wp.float64),
-    total: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
+    v: wp.array[wp.float64],
+    clock: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
+    internal: wp.array[wp.float64],
+    total: wp.array[wp.float64],
     # in, out
-    elastic: wp.array(dtype=wp.float64),
-    twist: wp.array(dtype=wp.float64),
-    last_x: wp.array(dtype=wp.float64),
-    last_force: wp.array2d(dtype=wp.float64),
-    last_dt: wp.array(dtype=wp.float64),
-    work: wp.array2d(dtype=wp.float64),
+    elastic: wp.array[wp.float64],
+    twist: wp.array[wp.float64],
+    last_x: wp.array[wp.float64],
+    last_force: wp.array2d[wp.float64],
+    last_dt: wp.array[wp.float64],
+    work: wp.array2d[wp.float64],
     # out
-    work_out: wp.array3d(dtype=wp.float64),
-    v_out: wp.array2d(dtype=wp.float64),
-):
+    work_out: wp.array3d[wp.float64],
+    v_out: wp.array2d[wp.float64],
+) -> None:
     """Add the works of the last substep at one node; at a frame, write them and the velocity at that very time.
 
     ``lag``: steps by which velocities are behind positions at the start of a run.
@@ -85,20 +85,20 @@ def sum_works(
 @wp.kernel
 def sum_friction(
     # model
-    mass: wp.array(dtype=wp.float64),
+    mass: wp.array[wp.float64],
     drag: wp.float64,
     # in
-    x: wp.array(dtype=wp.float64),
-    last_x: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
-    mean: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
+    last_x: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
+    mean: wp.array[wp.float64],
     # in, out
-    friction: wp.array(dtype=wp.float64),
-    last_moved: wp.array(dtype=wp.float64),
-    work: wp.array2d(dtype=wp.float64),
+    friction: wp.array[wp.float64],
+    last_moved: wp.array[wp.float64],
+    work: wp.array2d[wp.float64],
     # out
-    work_out: wp.array3d(dtype=wp.float64),
-):
+    work_out: wp.array3d[wp.float64],
+) -> None:
     """Add the works of sub-cycled friction and drag at one node: those of the last step, over the moves around it.
 
     At a frame the half of the last step's work is still to come, as its half of the kick is in the velocity.

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.engine.lattice.lattice import Lattice
 from physworld.engine.thin.rod_kernels import rod_forces
 from physworld.engine.thin.sheet_kernels import sheet_forces
@@ -43,9 +44,7 @@ class InternalForces:
         ValueError: the law is of another dimension.
     """
 
-    def __init__(
-        self, lattice: Lattice, law: Law, stiffness_factor: np.ndarray, rest: np.ndarray, device: str
-    ) -> None:
+    def __init__(self, lattice: Lattice, law: Law, stiffness_factor: Array, rest: Array, device: str) -> None:
         inputs = _triangle_inputs if isinstance(lattice, TriangleLattice) else model_inputs
         self._own(lattice, law, inputs(lattice, law, stiffness_factor, rest, device), 1, device)
 
@@ -96,8 +95,8 @@ class ForcesSideBySide(InternalForces):
         self,
         lattice: Lattice,
         laws: Sequence[Law],
-        stiffness_factors: Sequence[np.ndarray],
-        rests: Sequence[np.ndarray],
+        stiffness_factors: Sequence[Array],
+        rests: Sequence[Array],
         device: str,
     ) -> None:
         for law in laws:
@@ -132,15 +131,13 @@ def _joined(lattice: Lattice, law: Law, bodies: list[list[Any]], device: str) ->
     return [*joined, max(body[-1] for body in bodies)]
 
 
-def _numbers(value: Any) -> np.ndarray:
+def _numbers(value: Any) -> Array:
     if isinstance(value, wp.array):
         return value.numpy()
     return np.atleast_1d(np.array(getattr(value, "value", value), dtype=float))
 
 
-def model_inputs(
-    lattice: Lattice, law: Law, stiffness_factor: np.ndarray, rest: np.ndarray, device: str
-) -> list[Any]:
+def model_inputs(lattice: Lattice, law: Law, stiffness_factor: Array, rest: Array, device: str) -> list[Any]:
     """What the kernels of a dimension take as their model: arrays on the device, then whether there is friction.
 
     Raises:
@@ -179,7 +176,7 @@ def model_inputs(
 
 
 def _triangle_inputs(
-    lattice: TriangleLattice, law: Law, stiffness_factor: np.ndarray, rest: np.ndarray, device: str
+    lattice: TriangleLattice, law: Law, stiffness_factor: Array, rest: Array, device: str
 ) -> list[Any]:
     """The same of a mesh of triangles, of which two make a cell; they and the edges take the mean of its particles.
 

@@ -20,6 +20,7 @@ from typing import Any, Literal
 import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.engine.problem import HeldNodes, Problem
 from physworld.engine.total.forces import InternalForces
 from physworld.engine.total.friction import FrictionForces
@@ -109,12 +110,12 @@ class TotalLagrangian:
 
     def run(
         self,
-        x: np.ndarray,
-        v: np.ndarray,
+        x: Array,
+        v: Array,
         held: HeldNodes,
-        times: np.ndarray,
+        times: Array,
         progress: Callable[[int, int], None] | None = None,
-    ) -> np.ndarray:
+    ) -> Array:
         """Integrate from ``times[0]`` and record the nodes at every time.
 
         Args:
@@ -153,14 +154,12 @@ class Run:
         clock, counter: (frame interval [s], 1/dt [1/s], dt [s]) and (frame, substep, substeps).
     """
 
-    def __init__(
-        self, solver: TotalLagrangian, x: np.ndarray, v: np.ndarray, held: HeldNodes, times: np.ndarray
-    ) -> None:
+    def __init__(self, solver: TotalLagrangian, x: Array, v: Array, held: HeldNodes, times: Array) -> None:
         device, nodes, frames = solver.device, len(solver.mass), len(times)
         slot = np.full(nodes, -1, dtype=np.int32)
         slot[held.nodes] = np.arange(len(held.nodes), dtype=np.int32)
 
-        def upload(values: np.ndarray, dtype: type = wp.float64) -> wp.array:
+        def upload(values: Array, dtype: type = wp.float64) -> wp.array:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
 
         self._solver, self._start, self._times = solver, x, times
@@ -184,7 +183,7 @@ class Run:
         self.force.zero_()
         self._graphs: dict[int, Any] = {}
 
-    def advance(self, frame: int, stages: int | None = None) -> np.ndarray:
+    def advance(self, frame: int, stages: int | None = None) -> Array:
         """Integrate from ``times[frame]`` to the next; positions there, (n, 3) [m].
 
         Args:
@@ -270,7 +269,7 @@ class Run:
         for term in self._solver.terms:
             term.pace(time_step_s)
 
-    def _half_a_step_back(self, v: np.ndarray, interval: float) -> np.ndarray:
+    def _half_a_step_back(self, v: Array, interval: float) -> Array:
         """Velocities (n, 3) half a substep before the start, where a scheme of second order wants them.
 
         ``self.force`` holds the internal forces at the start; those of the terms are added.
@@ -284,7 +283,7 @@ class Run:
         gravity, drag = self._fall()
         return v - 0.5 * dt * (pull + gravity - drag * v)
 
-    def _fall(self) -> tuple[np.ndarray, np.ndarray | float]:
+    def _fall(self) -> tuple[Array, Array | float]:
         """Gravity [m/s^2] and drag rate [1/s]; they fit velocities (n, 3)."""
         return self._solver.problem.gravity_m_s2, self._solver.problem.drag_per_s
 
@@ -295,7 +294,7 @@ class Run:
         gravity, drag = self._fall()
         return Relaxation(self._nodes, solver.friction, gravity, float(drag), solver.mean_velocity)
 
-    def _check(self, now: np.ndarray, time: float) -> None:
+    def _check(self, now: Array, time: float) -> None:
         solver, dt = self._solver, float(self._clocks[0].numpy()[2])
         inverted = int(np.count_nonzero(solver.forces.inverted.numpy()))
         check_state(now, self._start, inverted, self._size, time, dt)
@@ -310,12 +309,12 @@ def whole_chunks(interval: float, time_step_s: float) -> int:
 
 def run_again_if_blown_up(
     solver: TotalLagrangian,
-    x: np.ndarray,
-    v: np.ndarray,
+    x: Array,
+    v: Array,
     held: HeldNodes,
-    times: np.ndarray,
+    times: Array,
     progress: Callable[[int, int], None] | None = None,
-) -> np.ndarray:
+) -> Array:
     """:meth:`TotalLagrangian.run`, and once more at half the time step where the body blew up.
 
     The stable time step is the undeformed body's; strain may stiffen a body beyond it. Raises what ``run`` raises.
@@ -326,9 +325,7 @@ def run_again_if_blown_up(
         return TotalLagrangian(solver.problem, 0.5 * solver.time_step_s).run(x, v, held, times, progress)
 
 
-def check_state(
-    now: np.ndarray, start: np.ndarray, inverted: int, size: float, time: float, dt: float
-) -> None:
+def check_state(now: Array, start: Array, inverted: int, size: float, time: float, dt: float) -> None:
     """Refuse nodal positions that cannot be trusted.
 
     Args:

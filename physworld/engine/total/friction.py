@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.engine.lattice.lattice import Lattice
 from physworld.engine.total.forces import model_inputs
 from physworld.engine.total.friction_kernels import (
@@ -26,9 +27,7 @@ class FrictionForces:
         ValueError: the law is of another dimension.
     """
 
-    def __init__(
-        self, lattice: Lattice, law: Law, stiffness_factor: np.ndarray, rest: np.ndarray, device: str
-    ) -> None:
+    def __init__(self, lattice: Lattice, law: Law, stiffness_factor: Array, rest: Array, device: str) -> None:
         model = model_inputs(lattice, law, stiffness_factor, rest, device)
         self.device, self._cells, self._dim = device, len(lattice.cells), lattice.dim
         self._at = wp.array(np.ascontiguousarray(rest).reshape(-1), dtype=wp.float64, device=device)

@@ -120,17 +120,17 @@ _ROD = (
 def prepare_cell(
     cell: int,
     # model
-    cell_nodes: wp.array(dtype=wp.int32),
-    gradients: wp.array(dtype=wp.float32),
-    x_rest: wp.array(dtype=wp.float64),
-    eta_volume: wp.array(dtype=wp.float32),
+    cell_nodes: wp.array[wp.int32],
+    gradients: wp.array[wp.float32],
+    x_rest: wp.array[wp.float64],
+    eta_volume: wp.array[wp.float32],
     inv_dx0: float,
     inv_dx1: float,
     inv_dx2: float,
     # in
-    x: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
     # out
-    turned: wp.array(dtype=wp.float32),
+    turned: wp.array[wp.float32],
 ): ...
 
 
@@ -138,16 +138,16 @@ def prepare_cell(
 def solid_cell(
     cell: int,
     # model
-    cell_nodes: wp.array(dtype=wp.int32),
-    gradients: wp.array(dtype=wp.float32),
+    cell_nodes: wp.array[wp.int32],
+    gradients: wp.array[wp.float32],
     inv_dx0: float,
     inv_dx1: float,
     inv_dx2: float,
-    turned: wp.array(dtype=wp.float32),
+    turned: wp.array[wp.float32],
     # in
-    v: wp.array(dtype=wp.float64),
+    v: wp.array[wp.float64],
     # out
-    force: wp.array(dtype=wp.float64),
+    force: wp.array[wp.float64],
 ): ...
 
 
@@ -155,17 +155,17 @@ def solid_cell(
 def sheet_cell(
     cell: int,
     # model
-    cell_nodes: wp.array(dtype=wp.int32),
-    derivatives: wp.array(dtype=wp.float64),
-    membrane: wp.array(dtype=wp.float64),
-    bending: wp.array(dtype=wp.float64),
-    shape: wp.array(dtype=wp.float64),
+    cell_nodes: wp.array[wp.int32],
+    derivatives: wp.array[wp.float64],
+    membrane: wp.array[wp.float64],
+    bending: wp.array[wp.float64],
+    shape: wp.array[wp.float64],
     tau: wp.float64,
     # in
-    x: wp.array(dtype=wp.float64),
-    v: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
+    v: wp.array[wp.float64],
     # out
-    force: wp.array(dtype=wp.float64),
+    force: wp.array[wp.float64],
 ): ...
 
 
@@ -173,31 +173,31 @@ def sheet_cell(
 def rod_cell(
     cell: int,
     # model
-    cell_nodes: wp.array(dtype=wp.int32),
-    derivatives: wp.array(dtype=wp.float64),
-    bending: wp.array(dtype=wp.float64),
+    cell_nodes: wp.array[wp.int32],
+    derivatives: wp.array[wp.float64],
+    bending: wp.array[wp.float64],
     tau: wp.float64,
     # in
-    x: wp.array(dtype=wp.float64),
-    v: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
+    v: wp.array[wp.float64],
     # out
-    force: wp.array(dtype=wp.float64),
+    force: wp.array[wp.float64],
 ): ...
 
 
 @wp.kernel(enable_backward=False)
 def prepare_solid_friction(
     # model
-    cell_nodes: wp.array(dtype=wp.int32),
-    gradients: wp.array(dtype=wp.float32),
-    x_rest: wp.array(dtype=wp.float64),
-    eta_volume: wp.array(dtype=wp.float32),
+    cell_nodes: wp.array[wp.int32],
+    gradients: wp.array[wp.float32],
+    x_rest: wp.array[wp.float64],
+    eta_volume: wp.array[wp.float32],
     inv_dx: wp.vec3f,
     # in
-    x: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
     # out
-    turned: wp.array(dtype=wp.float32),
-):
+    turned: wp.array[wp.float32],
+) -> None:
     """Keep B of the particles of one cell at nodal positions ``x``."""
     prepare_cell(
         wp.tid(), cell_nodes, gradients, x_rest, eta_volume, inv_dx[0], inv_dx[1], inv_dx[2], x, turned
@@ -207,15 +207,15 @@ def prepare_solid_friction(
 @wp.kernel(enable_backward=False)
 def solid_friction(
     # model
-    cell_nodes: wp.array(dtype=wp.int32),
-    gradients: wp.array(dtype=wp.float32),
+    cell_nodes: wp.array[wp.int32],
+    gradients: wp.array[wp.float32],
     inv_dx: wp.vec3f,
-    turned: wp.array(dtype=wp.float32),
+    turned: wp.array[wp.float32],
     # in
-    v: wp.array(dtype=wp.float64),
+    v: wp.array[wp.float64],
     # out
-    force: wp.array(dtype=wp.float64),
-):
+    force: wp.array[wp.float64],
+) -> None:
     """Add the friction [N] of one cell to its 27 nodes, where B was kept."""
     solid_cell(wp.tid(), cell_nodes, gradients, inv_dx[0], inv_dx[1], inv_dx[2], turned, v, force)
 
@@ -223,18 +223,18 @@ def solid_friction(
 @wp.kernel(enable_backward=False)
 def sheet_friction(
     # model
-    cell_nodes: wp.array(dtype=wp.int32),
-    derivatives: wp.array(dtype=wp.float64),
-    membrane: wp.array(dtype=wp.float64),
-    bending: wp.array(dtype=wp.float64),
-    shape: wp.array(dtype=wp.float64),
+    cell_nodes: wp.array[wp.int32],
+    derivatives: wp.array[wp.float64],
+    membrane: wp.array[wp.float64],
+    bending: wp.array[wp.float64],
+    shape: wp.array[wp.float64],
     tau: wp.float64,
     # in
-    x: wp.array(dtype=wp.float64),
-    v: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
+    v: wp.array[wp.float64],
     # out
-    force: wp.array(dtype=wp.float64),
-):
+    force: wp.array[wp.float64],
+) -> None:
     """Add the friction [N] of one cell to its 9 nodes."""
     sheet_cell(wp.tid(), cell_nodes, derivatives, membrane, bending, shape, tau, x, v, force)
 
@@ -242,15 +242,15 @@ def sheet_friction(
 @wp.kernel(enable_backward=False)
 def rod_friction(
     # model
-    cell_nodes: wp.array(dtype=wp.int32),
-    derivatives: wp.array(dtype=wp.float64),
-    bending: wp.array(dtype=wp.float64),
+    cell_nodes: wp.array[wp.int32],
+    derivatives: wp.array[wp.float64],
+    bending: wp.array[wp.float64],
     tau: wp.float64,
     # in
-    x: wp.array(dtype=wp.float64),
-    v: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
+    v: wp.array[wp.float64],
     # out
-    force: wp.array(dtype=wp.float64),
-):
+    force: wp.array[wp.float64],
+) -> None:
     """Add the friction [N] of one cell to its 3 nodes."""
     rod_cell(wp.tid(), cell_nodes, derivatives, bending, tau, x, v, force)

@@ -13,9 +13,9 @@ import warp as wp
 
 @wp.func
 def weighted_sum(
-    values: wp.array(dtype=wp.float64),
-    nodes: wp.array(dtype=wp.int32),
-    weights: wp.array(dtype=wp.float64),
+    values: wp.array[wp.float64],
+    nodes: wp.array[wp.int32],
+    weights: wp.array[wp.float64],
     first: int,
     last: int,
 ) -> wp.vec3d:
@@ -40,7 +40,7 @@ def hermite(s: wp.float64):
 
 @wp.func
 def on_path(
-    path_x: wp.array2d(dtype=wp.float64), path_v: wp.array2d(dtype=wp.float64), frame: int, k: int,
+    path_x: wp.array2d[wp.float64], path_v: wp.array2d[wp.float64], frame: int, k: int,
     s: wp.float64, span: wp.float64,
 ):  # fmt: skip
     """Cubic Hermite between two frames at the share ``s`` of their interval ``span`` [s]."""
@@ -53,17 +53,17 @@ def on_path(
 @wp.func
 def advance(
     node: int,
-    mass: wp.array(dtype=wp.float64),
-    slot: wp.array(dtype=wp.int32),
-    path_x: wp.array2d(dtype=wp.float64),
-    path_v: wp.array2d(dtype=wp.float64),
+    mass: wp.array[wp.float64],
+    slot: wp.array[wp.int32],
+    path_x: wp.array2d[wp.float64],
+    path_v: wp.array2d[wp.float64],
     gravity: wp.vec3d,
     drag: wp.float64,
-    clock: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
-    force: wp.array(dtype=wp.float64),
-    x: wp.array(dtype=wp.float64),
-    v: wp.array(dtype=wp.float64),
+    clock: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
+    force: wp.array[wp.float64],
+    x: wp.array[wp.float64],
+    v: wp.array[wp.float64],
 ):
     """One symplectic Euler step of a node; its force is read and cleared."""
     dt = clock[2]
@@ -87,19 +87,19 @@ def advance(
 @wp.kernel
 def advance_nodes(
     # model
-    mass: wp.array(dtype=wp.float64),
-    slot: wp.array(dtype=wp.int32),
-    path_x: wp.array2d(dtype=wp.float64),
-    path_v: wp.array2d(dtype=wp.float64),
+    mass: wp.array[wp.float64],
+    slot: wp.array[wp.int32],
+    path_x: wp.array2d[wp.float64],
+    path_v: wp.array2d[wp.float64],
     gravity: wp.vec3d,
     drag: wp.float64,
-    clock: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
+    clock: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
     # in, out
-    force: wp.array(dtype=wp.float64),
-    x: wp.array(dtype=wp.float64),
-    v: wp.array(dtype=wp.float64),
-):
+    force: wp.array[wp.float64],
+    x: wp.array[wp.float64],
+    v: wp.array[wp.float64],
+) -> None:
     """One step of a node of one body."""
     advance(wp.tid(), mass, slot, path_x, path_v, gravity, drag, clock, counter, force, x, v)
 
@@ -107,20 +107,20 @@ def advance_nodes(
 @wp.kernel
 def advance_nodes_side_by_side(
     # model
-    mass: wp.array(dtype=wp.float64),
-    slot: wp.array(dtype=wp.int32),
-    path_x: wp.array2d(dtype=wp.float64),
-    path_v: wp.array2d(dtype=wp.float64),
-    gravity: wp.array(dtype=wp.vec3d),
-    drag: wp.array(dtype=wp.float64),
-    clock: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
+    mass: wp.array[wp.float64],
+    slot: wp.array[wp.int32],
+    path_x: wp.array2d[wp.float64],
+    path_v: wp.array2d[wp.float64],
+    gravity: wp.array[wp.vec3d],
+    drag: wp.array[wp.float64],
+    clock: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
     nodes: int,
     # in, out
-    force: wp.array(dtype=wp.float64),
-    x: wp.array(dtype=wp.float64),
-    v: wp.array(dtype=wp.float64),
-):
+    force: wp.array[wp.float64],
+    x: wp.array[wp.float64],
+    v: wp.array[wp.float64],
+) -> None:
     """One step of a node of bodies with ``nodes`` nodes each, whose gravity and drag may differ."""
     node = wp.tid()
     body = node // nodes
@@ -128,6 +128,6 @@ def advance_nodes_side_by_side(
 
 
 @wp.kernel
-def advance_counter(counter: wp.array(dtype=wp.int32)):
+def advance_counter(counter: wp.array[wp.int32]) -> None:
     """Next substep."""
     counter[1] = counter[1] + 1

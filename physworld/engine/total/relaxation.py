@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.engine.total.friction import FrictionForces
 from physworld.engine.total.relaxation_kernels import begin_stages, end_stages, take_stage
 
@@ -43,7 +44,7 @@ def stages_for(stiffness: float) -> int:
     return stages
 
 
-def coefficients(stages: int) -> tuple[np.ndarray, np.ndarray]:
+def coefficients(stages: int) -> tuple[Array, Array]:
     """Of every stage (a, b, own, first), (s, 4), and its share of the mean velocity of the step, (s,)."""
     j = np.arange(stages + 1)
     b = np.full(stages + 1, 1.0 / 3.0)
@@ -80,7 +81,7 @@ class Relaxation:
         self,
         nodes: list[wp.array],
         friction: FrictionForces | None,
-        gravity: np.ndarray,
+        gravity: Array,
         drag: float,
         mean: wp.array,
     ) -> None:
@@ -97,7 +98,7 @@ class Relaxation:
         self._source, self._rate0, self._y0, self._y1, self._y2 = (
             wp.zeros(size, dtype=wp.float64, device=self._device) for _ in range(5)
         )
-        self._mode: np.ndarray | None = None
+        self._mode: Array | None = None
         self.stages = _LEAST
 
     def tune(self, x: wp.array, dt: float) -> int:

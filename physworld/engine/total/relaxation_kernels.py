@@ -18,24 +18,24 @@ from physworld.engine.total.node_kernels import on_path
 @wp.kernel(enable_backward=False)
 def begin_stages(
     # model
-    mass: wp.array(dtype=wp.float64),
-    slot: wp.array(dtype=wp.int32),
-    path_x: wp.array2d(dtype=wp.float64),
-    path_v: wp.array2d(dtype=wp.float64),
+    mass: wp.array[wp.float64],
+    slot: wp.array[wp.int32],
+    path_x: wp.array2d[wp.float64],
+    path_v: wp.array2d[wp.float64],
     gravity: wp.vec3d,
-    clock: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
+    clock: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
     # in
-    x: wp.array(dtype=wp.float64),
-    v: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
+    v: wp.array[wp.float64],
     # in, out
-    force: wp.array(dtype=wp.float64),
+    force: wp.array[wp.float64],
     # out
-    source: wp.array(dtype=wp.float64),
-    y0: wp.array(dtype=wp.float64),
-    y2: wp.array(dtype=wp.float64),
-    mean: wp.array(dtype=wp.float64),
-):
+    source: wp.array[wp.float64],
+    y0: wp.array[wp.float64],
+    y2: wp.array[wp.float64],
+    mean: wp.array[wp.float64],
+) -> None:
     """One node: its force is read and cleared, its velocity is where the stages start."""
     node = wp.tid()
     held = slot[node]
@@ -86,10 +86,10 @@ def stage_of_components(
     block: int,
     size: int,
     # model
-    inverse_mass: wp.array(dtype=wp.float64),
+    inverse_mass: wp.array[wp.float64],
     drag: wp.float64,
-    clock: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
+    clock: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
     starting: int,
     a: wp.float64,
     b: wp.float64,
@@ -97,14 +97,14 @@ def stage_of_components(
     first: wp.float64,
     share: wp.float64,
     # in
-    source: wp.array(dtype=wp.float64),
-    y0: wp.array(dtype=wp.float64),
-    y1: wp.array(dtype=wp.float64),
+    source: wp.array[wp.float64],
+    y0: wp.array[wp.float64],
+    y1: wp.array[wp.float64],
     # in, out
-    friction: wp.array(dtype=wp.float64),
-    rate0: wp.array(dtype=wp.float64),
-    mean: wp.array(dtype=wp.float64),
-    y2: wp.array(dtype=wp.float64),
+    friction: wp.array[wp.float64],
+    rate0: wp.array[wp.float64],
+    mean: wp.array[wp.float64],
+    y2: wp.array[wp.float64],
 ): ...
 
 
@@ -112,10 +112,10 @@ def stage_of_components(
 def take_stage(
     # model
     block: int,
-    inverse_mass: wp.array(dtype=wp.float64),
+    inverse_mass: wp.array[wp.float64],
     drag: wp.float64,
-    clock: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
+    clock: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
     starting: int,
     a: wp.float64,
     b: wp.float64,
@@ -123,15 +123,15 @@ def take_stage(
     first: wp.float64,
     share: wp.float64,
     # in
-    source: wp.array(dtype=wp.float64),
-    y0: wp.array(dtype=wp.float64),
-    y1: wp.array(dtype=wp.float64),
+    source: wp.array[wp.float64],
+    y0: wp.array[wp.float64],
+    y1: wp.array[wp.float64],
     # in, out
-    friction: wp.array(dtype=wp.float64),
-    rate0: wp.array(dtype=wp.float64),
-    mean: wp.array(dtype=wp.float64),
-    y2: wp.array(dtype=wp.float64),
-):
+    friction: wp.array[wp.float64],
+    rate0: wp.array[wp.float64],
+    mean: wp.array[wp.float64],
+    y2: wp.array[wp.float64],
+) -> None:
     """y2 becomes a y1 + b y2 + (1 - a - b) y0 + dt (own r(y1) + first r(y0)); the friction -C y1 is read and cleared.
 
     A thread takes ``block`` components; ``inverse_mass`` (3n,) is 0 where nodes are prescribed. ``share`` is the
@@ -147,17 +147,17 @@ def take_stage(
 @wp.kernel(enable_backward=False)
 def end_stages(
     # model
-    slot: wp.array(dtype=wp.int32),
-    path_x: wp.array2d(dtype=wp.float64),
-    path_v: wp.array2d(dtype=wp.float64),
-    clock: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
+    slot: wp.array[wp.int32],
+    path_x: wp.array2d[wp.float64],
+    path_v: wp.array2d[wp.float64],
+    clock: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
     # in
-    y: wp.array(dtype=wp.float64),
+    y: wp.array[wp.float64],
     # out
-    x: wp.array(dtype=wp.float64),
-    v: wp.array(dtype=wp.float64),
-):
+    x: wp.array[wp.float64],
+    v: wp.array[wp.float64],
+) -> None:
     """One node moves with the velocity of the last stage; a prescribed one to its place."""
     node = wp.tid()
     held = slot[node]

@@ -159,46 +159,46 @@ def solid_forces(stress: Stress, moduli: int) -> wp.Kernel:
     def solid_cell(
         cell: int,
         # model
-        cell_nodes: wp.array(dtype=wp.int32),
-        gradients: wp.array(dtype=wp.float32),
-        x_rest: wp.array(dtype=wp.float64),
-        moduli_volume: wp.array(dtype=wp.float32),
-        eta_volume: wp.array(dtype=wp.float32),
-        numbers: wp.array(dtype=wp.float32),
+        cell_nodes: wp.array[wp.int32],
+        gradients: wp.array[wp.float32],
+        x_rest: wp.array[wp.float64],
+        moduli_volume: wp.array[wp.float32],
+        eta_volume: wp.array[wp.float32],
+        numbers: wp.array[wp.float32],
         inv_dx0: float,
         inv_dx1: float,
         inv_dx2: float,
         viscous: int,
         inv_dt: float,
         # in
-        x: wp.array(dtype=wp.float64),
+        x: wp.array[wp.float64],
         # in, out
-        previous: wp.array(dtype=wp.float32),
+        previous: wp.array[wp.float32],
         # out
-        force: wp.array(dtype=wp.float64),
-        inverted: wp.array(dtype=wp.int32),
+        force: wp.array[wp.float64],
+        inverted: wp.array[wp.int32],
     ): ...
 
     @wp.kernel(module=f"physworld_solid_{stress.name}", enable_backward=False)
     def forces(
         # model
-        cell_nodes: wp.array(dtype=wp.int32),
-        gradients: wp.array(dtype=wp.float32),
-        x_rest: wp.array(dtype=wp.float64),
-        moduli_volume: wp.array(dtype=wp.float32),
-        eta_volume: wp.array(dtype=wp.float32),
-        numbers: wp.array(dtype=wp.float32),
+        cell_nodes: wp.array[wp.int32],
+        gradients: wp.array[wp.float32],
+        x_rest: wp.array[wp.float64],
+        moduli_volume: wp.array[wp.float32],
+        eta_volume: wp.array[wp.float32],
+        numbers: wp.array[wp.float32],
         inv_dx: wp.vec3f,
         viscous: int,
-        clock: wp.array(dtype=wp.float64),
+        clock: wp.array[wp.float64],
         # in
-        x: wp.array(dtype=wp.float64),
+        x: wp.array[wp.float64],
         # in, out
-        previous: wp.array(dtype=wp.float32),
+        previous: wp.array[wp.float32],
         # out
-        force: wp.array(dtype=wp.float64),
-        inverted: wp.array(dtype=wp.int32),
-    ):
+        force: wp.array[wp.float64],
+        inverted: wp.array[wp.int32],
+    ) -> None:
         solid_cell(
             wp.tid(),
             cell_nodes,

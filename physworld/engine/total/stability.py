@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.engine.total.forces import InternalForces
 
 SAFETY = 0.6  # share of the limit that is used: large strains stiffen a body
@@ -28,7 +29,7 @@ EXPLICIT_SHRINK = (
 DRAG_SHRINK = 1.05  # and drag this one: its sub-steps need no cells
 
 
-def fastest_frequency(forces: InternalForces, rest: np.ndarray, mass: np.ndarray, spacing: float) -> float:
+def fastest_frequency(forces: InternalForces, rest: Array, mass: Array, spacing: float) -> float:
     """Highest angular frequency [rad/s] about the rest state.
 
     Args:
@@ -40,9 +41,7 @@ def fastest_frequency(forces: InternalForces, rest: np.ndarray, mass: np.ndarray
     return float(fastest_frequencies(forces, rest[None], mass[None], spacing)[0])
 
 
-def fastest_frequencies(
-    forces: InternalForces, rest: np.ndarray, mass: np.ndarray, spacing: float
-) -> np.ndarray:
+def fastest_frequencies(forces: InternalForces, rest: Array, mass: Array, spacing: float) -> Array:
     """Highest angular frequencies [rad/s], (B,), of B bodies that ``forces`` holds side by side.
 
     Args:
@@ -108,7 +107,7 @@ class Steps:
         return shrink > EXPLICIT_SHRINK or internal / self.explicit_s() > DRAG_SHRINK
 
 
-def _forces_at(forces: InternalForces, x: np.ndarray, clock: wp.array) -> np.ndarray:
+def _forces_at(forces: InternalForces, x: Array, clock: wp.array) -> Array:
     force = wp.zeros(x.size, dtype=wp.float64, device=forces.device)
     forces.launch(wp.array(x.reshape(-1), dtype=wp.float64, device=forces.device), clock, force)
     return force.numpy().reshape(x.shape)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.engine.terms.term import BoundTerm
 from physworld.engine.total.stability import fastest_frequency
 from physworld.engine.total.stress_kernels import StressModel
@@ -36,7 +37,7 @@ class StressTerm:
 
     model: StressModel
     parameters: tuple[float, ...]
-    fields: np.ndarray | None = None
+    fields: Array | None = None
     frequency_rad_s: float | None = None
     name: str = "a stress beside the law's"
 
@@ -145,7 +146,7 @@ class BoundModel(BoundParticleStress):
         self,
         model: StressModel,
         parameters: tuple[float, ...],
-        fields: np.ndarray,
+        fields: Array,
         device: str,
         frequency_rad_s: float,
     ) -> None:

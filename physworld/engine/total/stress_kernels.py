@@ -280,22 +280,22 @@ def solid_model(model: str, rows: int = 0) -> StressModel:
         # model
         cells: int,
         rows: int,
-        cell_nodes: wp.array(dtype=wp.int32),
-        table: wp.array(dtype=wp.float32),
-        x_rest: wp.array(dtype=wp.float64),
+        cell_nodes: wp.array[wp.int32],
+        table: wp.array[wp.float32],
+        x_rest: wp.array[wp.float64],
         inv_dx0: float,
         inv_dx1: float,
         inv_dx2: float,
-        parameters: wp.array(dtype=wp.float32),
-        fields: wp.array(dtype=wp.float32),
+        parameters: wp.array[wp.float32],
+        fields: wp.array[wp.float32],
         first: int,
         dt: float,
         # in
-        x: wp.array(dtype=wp.float64),
+        x: wp.array[wp.float64],
         # in, out
-        state: wp.array(dtype=wp.float32),
+        state: wp.array[wp.float32],
         # out
-        force: wp.array(dtype=wp.float64),
+        force: wp.array[wp.float64],
     ): ...
 
     @wp.kernel(module="unique")
@@ -303,21 +303,21 @@ def solid_model(model: str, rows: int = 0) -> StressModel:
         # model
         cells: int,
         rows: int,
-        cell_nodes: wp.array(dtype=wp.int32),
-        table: wp.array(dtype=wp.float32),
-        x_rest: wp.array(dtype=wp.float64),
+        cell_nodes: wp.array[wp.int32],
+        table: wp.array[wp.float32],
+        x_rest: wp.array[wp.float64],
         inv_dx: wp.vec3f,
-        parameters: wp.array(dtype=wp.float32),
-        fields: wp.array(dtype=wp.float32),
-        clock: wp.array(dtype=wp.float64),
-        counter: wp.array(dtype=wp.int32),
+        parameters: wp.array[wp.float32],
+        fields: wp.array[wp.float32],
+        clock: wp.array[wp.float64],
+        counter: wp.array[wp.int32],
         # in
-        x: wp.array(dtype=wp.float64),
+        x: wp.array[wp.float64],
         # in, out
-        state: wp.array(dtype=wp.float32),
+        state: wp.array[wp.float32],
         # out
-        force: wp.array(dtype=wp.float64),
-    ):
+        force: wp.array[wp.float64],
+    ) -> None:
         first = wp.where(counter[0] + counter[1] == 0, 1, 0)
         cell_stress(
             wp.tid(), cells, rows, cell_nodes, table, x_rest, inv_dx[0], inv_dx[1], inv_dx[2], parameters,
@@ -344,18 +344,18 @@ def _thin_model(dim: int, frame: str, model: str, rows: int) -> StressModel:
         # model
         cells: int,
         rows: int,
-        cell_nodes: wp.array(dtype=wp.int32),
-        table: wp.array(dtype=wp.float64),
-        parameters: wp.array(dtype=wp.float64),
-        fields: wp.array(dtype=wp.float64),
+        cell_nodes: wp.array[wp.int32],
+        table: wp.array[wp.float64],
+        parameters: wp.array[wp.float64],
+        fields: wp.array[wp.float64],
         first: int,
         dt: wp.float64,
         # in
-        x: wp.array(dtype=wp.float64),
+        x: wp.array[wp.float64],
         # in, out
-        state: wp.array(dtype=wp.float64),
+        state: wp.array[wp.float64],
         # out
-        force: wp.array(dtype=wp.float64),
+        force: wp.array[wp.float64],
     ): ...
 
     @wp.kernel(module="unique")
@@ -363,19 +363,19 @@ def _thin_model(dim: int, frame: str, model: str, rows: int) -> StressModel:
         # model
         cells: int,
         rows: int,
-        cell_nodes: wp.array(dtype=wp.int32),
-        table: wp.array(dtype=wp.float64),
-        parameters: wp.array(dtype=wp.float64),
-        fields: wp.array(dtype=wp.float64),
-        clock: wp.array(dtype=wp.float64),
-        counter: wp.array(dtype=wp.int32),
+        cell_nodes: wp.array[wp.int32],
+        table: wp.array[wp.float64],
+        parameters: wp.array[wp.float64],
+        fields: wp.array[wp.float64],
+        clock: wp.array[wp.float64],
+        counter: wp.array[wp.int32],
         # in
-        x: wp.array(dtype=wp.float64),
+        x: wp.array[wp.float64],
         # in, out
-        state: wp.array(dtype=wp.float64),
+        state: wp.array[wp.float64],
         # out
-        force: wp.array(dtype=wp.float64),
-    ):
+        force: wp.array[wp.float64],
+    ) -> None:
         first = wp.where(counter[0] + counter[1] == 0, 1, 0)
         cell_stress(
             wp.tid(), cells, rows, cell_nodes, table, parameters, fields, first, clock[2], x, state, force

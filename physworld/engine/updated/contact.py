@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.engine.lattice.bspline import GAUSS_POINTS
 from physworld.engine.terms.colliders import Collider
 from physworld.engine.terms.colliders_kernels import move_collider
@@ -46,7 +47,7 @@ class GridContact:
         self,
         collider: Collider,
         lattice: GridLattice,
-        friction: np.ndarray,
+        friction: Array,
         modulus_pa: float,
         lenient: bool,
         device: str,
@@ -81,7 +82,7 @@ class GridContact:
         self._times = wp.zeros(1, dtype=wp.float64, device=device)
 
     @property
-    def impulse_n_s(self) -> np.ndarray:
+    def impulse_n_s(self) -> Array:
         """What the collider gave to the body since the start of the last run [N s], (3,)."""
         return self._totals.numpy()[:3]
 
@@ -100,7 +101,7 @@ class GridContact:
         """How far a particle and the collider may come together in a substep [m]: else it might pass through."""
         return min(_SIGHT * self._cell, 0.5 * self.collider.shape.inner_m)
 
-    def begin(self, times: np.ndarray, x: np.ndarray) -> None:
+    def begin(self, times: Array, x: Array) -> None:
         """A run over the frames ``times`` (T,) [s] starts with particles at ``x`` (P, 3) [m]."""
         self._times = wp.array(np.ascontiguousarray(times), dtype=wp.float64, device=self._device)
         self._impulse.zero_()

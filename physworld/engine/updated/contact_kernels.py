@@ -39,7 +39,7 @@ class Stencil:
 
 
 @wp.func
-def stencil_of(x: wp.vec3d, origin: wp.vec3d, inv_dx: wp.vec3d, box: wp.array(dtype=wp.int32)) -> Stencil:
+def stencil_of(x: wp.vec3d, origin: wp.vec3d, inv_dx: wp.vec3d, box: wp.array[wp.int32]) -> Stencil:
     """Nodes and weights of a particle at ``x``; the corner is negative or too high where it left the box."""
     s = Stencil()
     scaled = wp.cw_mul(x - origin, inv_dx)
@@ -56,7 +56,7 @@ def stencil_of(x: wp.vec3d, origin: wp.vec3d, inv_dx: wp.vec3d, box: wp.array(dt
 
 
 @wp.func
-def inside(s: Stencil, box: wp.array(dtype=wp.int32)) -> bool:
+def inside(s: Stencil, box: wp.array[wp.int32]) -> bool:
     """Whether all 27 nodes exist."""
     return s.i >= 0 and s.j >= 0 and s.k >= 0 and s.i + 2 < box[3] and s.j + 2 < box[4] and s.k + 2 < box[5]
 
@@ -65,10 +65,10 @@ def inside(s: Stencil, box: wp.array(dtype=wp.int32)) -> bool:
 def distance_from(
     kind: int,
     size: wp.vec3d,
-    values: wp.array3d(dtype=wp.float32),
+    values: wp.array3d[wp.float32],
     low: wp.vec3d,
     inverse: wp.vec3d,
-    pose: wp.array(dtype=wp.vec3d),
+    pose: wp.array[wp.vec3d],
     x: wp.vec3d,
 ) -> wp.vec4d:
     """Outward normal in the world and distance [m] of a collider at ``x``.
@@ -153,16 +153,16 @@ def carried(
     j: int,
     k: int,
     weights: wp.mat33f,
-    box: wp.array(dtype=wp.int32),
-    velocity: wp.array(dtype=wp.vec4f),
+    box: wp.array[wp.int32],
+    velocity: wp.array[wp.vec4f],
 ) -> wp.vec4f:
     """Grid velocity at a particle [m/s], and what an impulse of 1 N s there adds to it [1/kg]."""
 
 
 @wp.func_native(_PUSH)
 def push(
-    i: int, j: int, k: int, weights: wp.mat33f, box: wp.array(dtype=wp.int32), impulse: wp.vec3f,
-    velocity: wp.array(dtype=wp.vec4f),
+    i: int, j: int, k: int, weights: wp.mat33f, box: wp.array[wp.int32], impulse: wp.vec3f,
+    velocity: wp.array[wp.vec4f],
 ):  # fmt: skip
     """Give an impulse [N s] at a particle to its nodes."""
 
@@ -190,9 +190,9 @@ def _sift(
     count: int,
     plane: int,
     reach: wp.float64,
-    pose: wp.array(dtype=wp.vec3d),
-    x: wp.array(dtype=wp.float64),
-    candidates: wp.array(dtype=wp.int32),
+    pose: wp.array[wp.vec3d],
+    x: wp.array[wp.float64],
+    candidates: wp.array[wp.int32],
 ): ...
 
 
@@ -204,19 +204,17 @@ def sift(
     plane: int,
     reach: wp.float64,
     # in
-    pose: wp.array(dtype=wp.vec3d),
-    x: wp.array(dtype=wp.float64),
+    pose: wp.array[wp.vec3d],
+    x: wp.array[wp.float64],
     # out
-    candidates: wp.array(dtype=wp.int32),
-):
+    candidates: wp.array[wp.int32],
+) -> None:
     """List those of ``group`` particles that may be near: within ``reach`` [m] of the frame, or over a ``plane``."""
     _sift(wp.tid(), group, count, plane, reach, pose, x, candidates)
 
 
 @wp.kernel(enable_backward=False)
-def forget_near(
-    candidates: wp.array(dtype=wp.int32), near: wp.array(dtype=wp.int32), turn: wp.array(dtype=wp.int32)
-):
+def forget_near(candidates: wp.array[wp.int32], near: wp.array[wp.int32], turn: wp.array[wp.int32]) -> None:
     """No particle is near any more: a new turn."""
     candidates[0] = 0
     near[0] = 0
@@ -229,30 +227,30 @@ def find_near(
     # model: shape
     kind: int,
     size: wp.vec3d,
-    values: wp.array3d(dtype=wp.float32),
+    values: wp.array3d[wp.float32],
     low: wp.vec3d,
     inverse: wp.vec3d,
     # model: half a particle an axis, depths at the start
     half: wp.vec3d,
-    relief: wp.array(dtype=wp.float64),
+    relief: wp.array[wp.float64],
     sight: wp.float64,
     leaving: wp.float64,
     fastest: wp.float64,
-    clock: wp.array(dtype=wp.float64),
-    turn: wp.array(dtype=wp.int32),
+    clock: wp.array[wp.float64],
+    turn: wp.array[wp.int32],
     # in
-    pose: wp.array(dtype=wp.vec3d),
-    x: wp.array(dtype=wp.float64),
-    candidates: wp.array(dtype=wp.int32),
+    pose: wp.array[wp.vec3d],
+    x: wp.array[wp.float64],
+    candidates: wp.array[wp.int32],
     # in, out
-    last: wp.array(dtype=wp.int32),
+    last: wp.array[wp.int32],
     # out
-    near: wp.array(dtype=wp.int32),
-    contact: wp.array(dtype=wp.vec4f),
-    drive: wp.array(dtype=wp.vec3f),
-    impulse: wp.array(dtype=wp.vec3f),
-    totals: wp.array(dtype=wp.float64),
-):
+    near: wp.array[wp.int32],
+    contact: wp.array[wp.vec4f],
+    drive: wp.array[wp.vec3f],
+    impulse: wp.array[wp.vec3f],
+    totals: wp.array[wp.float64],
+) -> None:
     """List every ``stride``-th candidate whose face is within ``sight`` [m] of the collider, with what it asks for.
 
     What is inside leaves at ``leaving`` of its depth a substep, at most at ``fastest`` dx / dt [m]. ``last`` is the
@@ -282,22 +280,22 @@ def find_near(
 def correct(
     p: int,
     # model
-    friction: wp.array(dtype=wp.float32),
+    friction: wp.array[wp.float32],
     relaxation: float,
     again: int,
     origin: wp.vec3d,
     inv_dx: wp.vec3d,
-    box: wp.array(dtype=wp.int32),
+    box: wp.array[wp.int32],
     # in
-    x: wp.array(dtype=wp.float64),
-    contact: wp.array(dtype=wp.vec4f),
-    drive: wp.array(dtype=wp.vec3f),
-    seen: wp.array(dtype=wp.vec4f),
+    x: wp.array[wp.float64],
+    contact: wp.array[wp.vec4f],
+    drive: wp.array[wp.vec3f],
+    seen: wp.array[wp.vec4f],
     # in, out
-    impulse: wp.array(dtype=wp.vec3f),
-    velocity: wp.array(dtype=wp.vec4f),
-    totals: wp.array(dtype=wp.float64),
-    hardest: wp.array(dtype=wp.float32),
+    impulse: wp.array[wp.vec3f],
+    velocity: wp.array[wp.vec4f],
+    totals: wp.array[wp.float64],
+    hardest: wp.array[wp.float32],
 ):
     """Correct the impulse [N s] of one particle; see :func:`press`."""
     s = stencil_of(wp.vec3d(x[3 * p], x[3 * p + 1], x[3 * p + 2]), origin, inv_dx, box)
@@ -338,24 +336,24 @@ def correct(
 def press(
     stride: int,
     # model
-    friction: wp.array(dtype=wp.float32),
+    friction: wp.array[wp.float32],
     relaxation: float,
     again: int,
     origin: wp.vec3d,
     inv_dx: wp.vec3d,
-    box: wp.array(dtype=wp.int32),
+    box: wp.array[wp.int32],
     # in
-    x: wp.array(dtype=wp.float64),
-    near: wp.array(dtype=wp.int32),
-    contact: wp.array(dtype=wp.vec4f),
-    drive: wp.array(dtype=wp.vec3f),
-    seen: wp.array(dtype=wp.vec4f),
+    x: wp.array[wp.float64],
+    near: wp.array[wp.int32],
+    contact: wp.array[wp.vec4f],
+    drive: wp.array[wp.vec3f],
+    seen: wp.array[wp.vec4f],
     # in, out
-    impulse: wp.array(dtype=wp.vec3f),
-    velocity: wp.array(dtype=wp.vec4f),
-    totals: wp.array(dtype=wp.float64),
-    hardest: wp.array(dtype=wp.float32),
-):
+    impulse: wp.array[wp.vec3f],
+    velocity: wp.array[wp.vec4f],
+    totals: wp.array[wp.float64],
+    hardest: wp.array[wp.float32],
+) -> None:
     """Correct the impulses [N s] of every ``stride``-th near particle; with ``again`` give them the last substep's.
 
     ``seen`` is ``velocity`` itself where particles take their turns, a copy where they act at once; ``hardest`` becomes

@@ -94,36 +94,36 @@ def elastic_stress(stress: Stress, moduli: int) -> wp.Kernel:
     def particle_group(
         cell: int,
         # model
-        moduli_volume: wp.array(dtype=wp.float32),
-        eta_volume: wp.array(dtype=wp.float32),
-        numbers: wp.array(dtype=wp.float32),
-        clock: wp.array(dtype=wp.float64),
+        moduli_volume: wp.array[wp.float32],
+        eta_volume: wp.array[wp.float32],
+        numbers: wp.array[wp.float32],
+        clock: wp.array[wp.float64],
         # in
-        C: wp.array(dtype=wp.float32),
+        C: wp.array[wp.float32],
         # in, out
-        F_state: wp.array(dtype=wp.float64),
+        F_state: wp.array[wp.float64],
         # out
-        stress: wp.array(dtype=wp.float32),
-        ratio: wp.array(dtype=wp.float32),
-        flags: wp.array(dtype=wp.int32),
+        stress: wp.array[wp.float32],
+        ratio: wp.array[wp.float32],
+        flags: wp.array[wp.int32],
     ): ...
 
     @wp.kernel(module=f"physworld_particle_{stress.name}", enable_backward=False)
     def particle_stress(
         # model
-        moduli_volume: wp.array(dtype=wp.float32),
-        eta_volume: wp.array(dtype=wp.float32),
-        numbers: wp.array(dtype=wp.float32),
-        clock: wp.array(dtype=wp.float64),
+        moduli_volume: wp.array[wp.float32],
+        eta_volume: wp.array[wp.float32],
+        numbers: wp.array[wp.float32],
+        clock: wp.array[wp.float64],
         # in
-        C: wp.array(dtype=wp.float32),
+        C: wp.array[wp.float32],
         # in, out
-        F_state: wp.array(dtype=wp.float64),
+        F_state: wp.array[wp.float64],
         # out
-        stress: wp.array(dtype=wp.float32),
-        ratio: wp.array(dtype=wp.float32),
-        flags: wp.array(dtype=wp.int32),
-    ):
+        stress: wp.array[wp.float32],
+        ratio: wp.array[wp.float32],
+        flags: wp.array[wp.int32],
+    ) -> None:
         particle_group(wp.tid(), moduli_volume, eta_volume, numbers, clock, C, F_state, stress, ratio, flags)
 
     return particle_stress

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.engine.problem import HeldNodes
 from physworld.engine.updated.energy_kernels import sum_grid_works, sum_kinetic
 
@@ -50,24 +51,24 @@ class ParticleLedger:
         transfers: kinetic energy lost between particles and grid.
     """
 
-    times: np.ndarray
-    kinetic: np.ndarray
-    gravitational: np.ndarray
-    elastic: np.ndarray
-    grip_work: np.ndarray
-    contact_work: np.ndarray
-    term_work: np.ndarray
-    drag: np.ndarray
-    dissipated: np.ndarray
-    transfers: np.ndarray
+    times: Array
+    kinetic: Array
+    gravitational: Array
+    elastic: Array
+    grip_work: Array
+    contact_work: Array
+    term_work: Array
+    drag: Array
+    dissipated: Array
+    transfers: Array
 
     @property
-    def mechanical(self) -> np.ndarray:
+    def mechanical(self) -> Array:
         """Kinetic, gravitational and elastic energy together."""
         return self.kinetic + self.gravitational + self.elastic
 
     @property
-    def lost(self) -> np.ndarray:
+    def lost(self) -> Array:
         """The remainder: what the numerics lost (negative: gained) since the first frame."""
         done = self.grip_work + self.contact_work + self.term_work - self.drag - self.dissipated
         return done - (self.mechanical - self.mechanical[0])
@@ -84,12 +85,12 @@ class ParticleLedger:
 
 def run_particles_with_ledger(
     engine: UpdatedLagrangian,
-    x: np.ndarray,
-    v: np.ndarray,
+    x: Array,
+    v: Array,
     held: HeldNodes,
-    times: np.ndarray,
+    times: Array,
     progress: Callable[[int, int], None] | None = None,
-) -> tuple[np.ndarray, ParticleLedger]:
+) -> tuple[Array, ParticleLedger]:
     """:meth:`UpdatedLagrangian.run_particles` with an account of the energy: its arguments, its errors.
 
     Returns:
@@ -133,7 +134,7 @@ class ParticleMeter:
     def __init__(self, run: ParticleRun) -> None:
         self._run = run
         self._sums = wp.zeros(12, dtype=wp.float64, device=run.device)
-        self.rows: list[np.ndarray] = []
+        self.rows: list[Array] = []
         self.kinetic: list[float] = []
         self.elastic: list[float] = []
 
@@ -186,7 +187,7 @@ class ParticleMeter:
         )  # fmt: skip
 
 
-def stored_energy(engine: UpdatedLagrangian, F: np.ndarray) -> float:
+def stored_energy(engine: UpdatedLagrangian, F: Array) -> float:
     """Energy [J] that particles with elastic deformation gradients ``F`` (P, 3, 3) store.
 
     With a flow law it is that of Hencky's strains, whose stress the flow law returns.

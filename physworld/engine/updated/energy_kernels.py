@@ -18,15 +18,15 @@ def sum_grid_works(
     # model
     gravity: wp.vec3f,
     drag: float,
-    clock: wp.array(dtype=wp.float64),
-    box: wp.array(dtype=wp.int32),
+    clock: wp.array[wp.float64],
+    box: wp.array[wp.int32],
     # in
-    momentum: wp.array(dtype=wp.vec4f),
-    impulse: wp.array(dtype=wp.vec4f),
-    velocity: wp.array(dtype=wp.vec4f),
+    momentum: wp.array[wp.vec4f],
+    impulse: wp.array[wp.vec4f],
+    velocity: wp.array[wp.vec4f],
     # out
-    sums: wp.array(dtype=wp.float64),
-):
+    sums: wp.array[wp.float64],
+) -> None:
     """Add the works of one substep at one node; ``momentum`` and ``impulse`` are those before the grid advanced."""
     node = wp.tid()
     if node >= box[3] * box[4] * box[5]:
@@ -60,13 +60,13 @@ def sum_grid_works(
 @wp.kernel(enable_backward=False)
 def sum_kinetic(
     # model
-    mass: wp.array(dtype=wp.float32),
+    mass: wp.array[wp.float32],
     # in
-    v: wp.array(dtype=wp.float32),
+    v: wp.array[wp.float32],
     column: int,
     # out
-    sums: wp.array(dtype=wp.float64),
-):
+    sums: wp.array[wp.float64],
+) -> None:
     """Add one particle's kinetic energy [J] to a column."""
     p = wp.tid()
     u = wp.vec3d(wp.float64(v[3 * p]), wp.float64(v[3 * p + 1]), wp.float64(v[3 * p + 2]))

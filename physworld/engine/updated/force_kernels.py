@@ -9,7 +9,7 @@ import warp as wp
 
 
 @wp.kernel(enable_backward=False)
-def widen(v: wp.array(dtype=wp.float32), velocity: wp.array(dtype=wp.float64)):
+def widen(v: wp.array[wp.float32], velocity: wp.array[wp.float64]) -> None:
     """One component of the particles' velocities [m/s] in double precision, as forces read it."""
     k = wp.tid()
     velocity[k] = wp.float64(v[k])
@@ -18,13 +18,13 @@ def widen(v: wp.array(dtype=wp.float32), velocity: wp.array(dtype=wp.float64)):
 @wp.kernel(enable_backward=False)
 def kick(
     # model
-    mass: wp.array(dtype=wp.float64),
-    clock: wp.array(dtype=wp.float64),
+    mass: wp.array[wp.float64],
+    clock: wp.array[wp.float64],
     # in, cleared
-    force: wp.array(dtype=wp.float64),
+    force: wp.array[wp.float64],
     # in, out
-    v: wp.array(dtype=wp.float32),
-):
+    v: wp.array[wp.float32],
+) -> None:
     """One component of the velocity [m/s] after the force [N] of a substep."""
     k = wp.tid()
     v[k] = wp.float32(wp.float64(v[k]) + clock[2] * force[k] / mass[k // 3])

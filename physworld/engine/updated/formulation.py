@@ -21,6 +21,7 @@ import numpy as np
 import warp as wp
 from scipy.sparse.linalg import splu
 
+from physworld.arrays import Array
 from physworld.engine.problem import HeldNodes, Problem
 from physworld.engine.total.stability import stable_time_step
 from physworld.engine.updated.grid_box import GridLattice
@@ -102,12 +103,12 @@ class UpdatedLagrangian:
 
     def run(
         self,
-        x: np.ndarray,
-        v: np.ndarray,
+        x: Array,
+        v: Array,
         held: HeldNodes,
-        times: np.ndarray,
+        times: Array,
         progress: Callable[[int, int], None] | None = None,
-    ) -> np.ndarray:
+    ) -> Array:
         """Nodes of the reference lattice fitted to the particles at ``times``, (T, n, 3) [m].
 
         The smoothest least-squares fit; where material has flowed the lattice means little, and :meth:`run_particles`
@@ -117,12 +118,12 @@ class UpdatedLagrangian:
 
     def run_particles(
         self,
-        x: np.ndarray,
-        v: np.ndarray,
+        x: Array,
+        v: Array,
         held: HeldNodes,
-        times: np.ndarray,
+        times: Array,
         progress: Callable[[int, int], None] | None = None,
-    ) -> np.ndarray:
+    ) -> Array:
         """Integrate from ``times[0]`` and record the particles at every time.
 
         Args:
@@ -142,7 +143,7 @@ class UpdatedLagrangian:
         """
         return self.prepare(x, v, held).record(times, progress)
 
-    def prepare(self, x: np.ndarray, v: np.ndarray, held: HeldNodes) -> ParticleRun:
+    def prepare(self, x: Array, v: Array, held: HeldNodes) -> ParticleRun:
         """A run at its first time, from nodal positions and velocities (n, 3)."""
         start = x.copy()
         start[held.nodes] = held.positions[
@@ -154,7 +155,7 @@ class UpdatedLagrangian:
         """The particles that the held nodes grip."""
         return particle_grips(self.problem.lattice, self.solid, held.nodes, held.positions, held.velocities)
 
-    def fit_nodes(self, particles: np.ndarray) -> np.ndarray:
+    def fit_nodes(self, particles: Array) -> Array:
         """Nodes (T, n, 3) whose splines pass nearest to the particles (T, P, 3)."""
         lattice = self.problem.lattice
         rows = lattice.interpolation(lattice.particle_coordinates[self.solid])
@@ -169,7 +170,7 @@ class UpdatedLagrangian:
             self.problem.law, self.plasticity, self.volume, self._stiffness, self.problem.device
         )
 
-    def _hung(self) -> np.ndarray:
+    def _hung(self) -> Array:
         """Masses [kg], (P,), of the loads that hang from the lattice's nodes: each goes to the material around it."""
         added = self.problem.added_mass
         if added is None:
@@ -178,7 +179,7 @@ class UpdatedLagrangian:
         rows = lattice.interpolation(lattice.particle_coordinates[self.solid]).multiply(self.volume[:, None])
         return np.asarray(rows @ (added / np.maximum(np.asarray(rows.sum(axis=0)).ravel(), 1e-30)))
 
-    def _at_particles(self, nodal: np.ndarray, orders: tuple[int, int, int] = (0, 0, 0)) -> np.ndarray:
+    def _at_particles(self, nodal: Array, orders: tuple[int, int, int] = (0, 0, 0)) -> Array:
         """Values at the particles, (P, 3), of a nodal field (n, 3), differentiated ``orders`` times in cells."""
         lattice = self.problem.lattice
         table = lattice.table(orders)
@@ -186,16 +187,16 @@ class UpdatedLagrangian:
             self.solid
         ]
 
-    def _gradient(self, nodal: np.ndarray) -> np.ndarray:
+    def _gradient(self, nodal: Array) -> Array:
         """Gradients at the particles in the reference body, (P, 3, 3), of a nodal field (n, 3)."""
         slopes = [self._at_particles(nodal, axis) for axis in _AXES]
         return np.stack(slopes, axis=-1) / self.problem.lattice.spacing
 
     @cached_property
-    def _rest_inverse(self) -> np.ndarray:
+    def _rest_inverse(self) -> Array:
         return np.linalg.inv(self._gradient(self.problem.rest))
 
-    def _start(self, x: np.ndarray, v: np.ndarray) -> Particles:
+    def _start(self, x: Array, v: Array) -> Particles:
         device, shape = self.problem.device, self._gradient(x)
         C = self._gradient(v) @ np.linalg.inv(shape)
         F = shape @ self._rest_inverse
@@ -211,7 +212,7 @@ class UpdatedLagrangian:
         )
 
 
-def _field(factor: np.ndarray | None, solid: np.ndarray) -> np.ndarray:
+def _field(factor: Array | None, solid: Array) -> Array:
     return np.ones(len(solid)) if factor is None else np.asarray(factor, dtype=float)[solid]
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.errors import ParticlesLeftTheGrid, UnstableSimulation
 
 MAX_NODES = 4_000_000
@@ -21,8 +22,8 @@ _GROWTH = 1.5
 class GridLattice:
     """All places that a node may have: ``origin`` is a corner of a cell [m], (3,), ``spacing`` the cell [m], (3,)."""
 
-    origin: np.ndarray
-    spacing: np.ndarray
+    origin: Array
+    spacing: Array
 
 
 class GridBox:
@@ -40,7 +41,7 @@ class GridBox:
         self.nodes = 0
         self.counts = np.zeros(3, dtype=int)
 
-    def enclose(self, x: np.ndarray, rim: int, time: float) -> bool:
+    def enclose(self, x: Array, rim: int, time: float) -> bool:
         """Place the box around positions ``x`` (P, 3) [m] with ``rim`` cells to move into before the next look.
 
         Returns:

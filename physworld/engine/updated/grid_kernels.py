@@ -23,17 +23,17 @@ def advance_grid(
     gravity: wp.vec3f,
     drag: float,
     gripped: int,
-    clock: wp.array(dtype=wp.float64),
-    box: wp.array(dtype=wp.int32),
+    clock: wp.array[wp.float64],
+    box: wp.array[wp.int32],
     # in, cleared
-    momentum: wp.array(dtype=wp.vec4f),
-    impulse: wp.array(dtype=wp.vec4f),
-    grip: wp.array(dtype=wp.vec4f),
+    momentum: wp.array[wp.vec4f],
+    impulse: wp.array[wp.vec4f],
+    grip: wp.array[wp.vec4f],
     # out
-    velocity: wp.array(dtype=wp.vec4f),
-    velocity_old: wp.array(dtype=wp.vec4f),
+    velocity: wp.array[wp.vec4f],
+    velocity_old: wp.array[wp.vec4f],
     split: int,
-):
+) -> None:
     """Velocity [m/s] of one node at the end of the substep, before contacts, and its inverse mass [1/kg].
 
     ``velocity_old`` is the one without forces, where ``split``. A gripped node has the inverse mass 0.
@@ -69,23 +69,23 @@ def advance_grid(
 @wp.kernel(enable_backward=False)
 def scatter_grips(
     # model
-    particle: wp.array(dtype=wp.int32),
-    mass: wp.array(dtype=wp.float32),
-    path_x: wp.array2d(dtype=wp.vec3d),
-    path_v: wp.array2d(dtype=wp.vec3d),
-    path_gradient: wp.array2d(dtype=wp.mat33f),
+    particle: wp.array[wp.int32],
+    mass: wp.array[wp.float32],
+    path_x: wp.array2d[wp.vec3d],
+    path_v: wp.array2d[wp.vec3d],
+    path_gradient: wp.array2d[wp.mat33f],
     origin: wp.vec3d,
     inv_dx: wp.vec3d,
-    clock: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
-    box: wp.array(dtype=wp.int32),
+    clock: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
+    box: wp.array[wp.int32],
     # in
-    x: wp.array(dtype=wp.float64),
+    x: wp.array[wp.float64],
     # out
-    goal: wp.array(dtype=wp.vec3d),
-    grip: wp.array(dtype=wp.vec4f),
-    flags: wp.array(dtype=wp.int32),
-):
+    goal: wp.array[wp.vec3d],
+    grip: wp.array[wp.vec4f],
+    flags: wp.array[wp.int32],
+) -> None:
     """Place of one gripped particle after the substep, and its rigid velocity field on the 27 nodes, mass-weighted."""
     g = wp.tid()
     p = particle[g]
@@ -135,16 +135,16 @@ def scatter_grips(
 @wp.kernel(enable_backward=False)
 def place_grips(
     # model
-    particle: wp.array(dtype=wp.int32),
-    path_gradient: wp.array2d(dtype=wp.mat33f),
-    path_v: wp.array2d(dtype=wp.vec3d),
-    counter: wp.array(dtype=wp.int32),
-    goal: wp.array(dtype=wp.vec3d),
+    particle: wp.array[wp.int32],
+    path_gradient: wp.array2d[wp.mat33f],
+    path_v: wp.array2d[wp.vec3d],
+    counter: wp.array[wp.int32],
+    goal: wp.array[wp.vec3d],
     # out
-    x: wp.array(dtype=wp.float64),
-    v: wp.array(dtype=wp.float32),
-    C: wp.array(dtype=wp.float32),
-):
+    x: wp.array[wp.float64],
+    v: wp.array[wp.float32],
+    C: wp.array[wp.float32],
+) -> None:
     """Put one gripped particle where its grip carries it."""
     g = wp.tid()
     p = particle[g]

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.engine.lattice.lattice import Lattice
 from physworld.errors import SceneUnsupported
 
@@ -21,10 +22,10 @@ _AXES = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 class ParticleGrips:
     """Gripped particles: numbers (G,), and at the frames positions and velocities (T, G, 3), gradients (T, G, 3, 3)."""
 
-    particles: np.ndarray
-    positions: np.ndarray
-    velocities: np.ndarray
-    gradients: np.ndarray
+    particles: Array
+    positions: Array
+    velocities: Array
+    gradients: Array
 
     def upload(self, device: str) -> list[wp.array]:
         """(numbers, positions, velocities, gradients) on the device."""
@@ -37,7 +38,7 @@ class ParticleGrips:
 
 
 def particle_grips(
-    lattice: Lattice, solid: np.ndarray, nodes: np.ndarray, positions: np.ndarray, velocities: np.ndarray
+    lattice: Lattice, solid: Array, nodes: Array, positions: Array, velocities: Array
 ) -> ParticleGrips:
     """Gripped particles of held nodes.
 
@@ -65,7 +66,7 @@ def particle_grips(
     value = lattice.interpolation(coordinates)[:, nodes]
     slopes = [lattice.interpolation(coordinates, axis)[:, nodes] for axis in _AXES]
 
-    def carry(matrix: object, paths: np.ndarray) -> np.ndarray:
+    def carry(matrix: object, paths: Array) -> Array:
         flat = matrix @ paths.transpose(1, 0, 2).reshape(paths.shape[1], -1)  # type: ignore[operator]
         return np.asarray(flat).reshape(len(gripped), len(paths), 3).transpose(1, 0, 2)
 

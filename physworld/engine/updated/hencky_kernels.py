@@ -105,23 +105,23 @@ _STRETCH = r"""
 @wp.func_native(_STRETCH)
 def _stretch(
     group: int,
-    clock: wp.array(dtype=wp.float64),
-    C: wp.array(dtype=wp.float32),
-    F_state: wp.array(dtype=wp.float64),
-    eigen: wp.array(dtype=eigen_type),
+    clock: wp.array[wp.float64],
+    C: wp.array[wp.float32],
+    F_state: wp.array[wp.float64],
+    eigen: wp.array[eigen_type],
 ): ...
 
 
 @wp.kernel(enable_backward=False)
 def stretch(
-    clock: wp.array(dtype=wp.float64),
+    clock: wp.array[wp.float64],
     # in
-    C: wp.array(dtype=wp.float32),
+    C: wp.array[wp.float32],
     # in, out
-    F_state: wp.array(dtype=wp.float64),
+    F_state: wp.array[wp.float64],
     # out
-    eigen: wp.array(dtype=eigen_type),
-):
+    eigen: wp.array[eigen_type],
+) -> None:
     """Trial F of 8 particles, and of its B eigenvectors (rows 0 to 2) and eigenvalues (row 3).
 
     Jacobi's tan in a form without a pole, so that all lanes rotate alike.
@@ -150,22 +150,22 @@ def plastic_kernel(project: Any) -> Any:
     @wp.kernel(module="unique", enable_backward=False)
     def plastic_stress(
         # model
-        mu: wp.array(dtype=wp.float32),
-        lam: wp.array(dtype=wp.float32),
-        volume: wp.array(dtype=wp.float32),
-        eta: wp.array(dtype=wp.float32),
+        mu: wp.array[wp.float32],
+        lam: wp.array[wp.float32],
+        volume: wp.array[wp.float32],
+        eta: wp.array[wp.float32],
         parameters: wp.vec3d,
-        clock: wp.array(dtype=wp.float64),
-        C: wp.array(dtype=wp.float32),
-        eigen: wp.array(dtype=eigen_type),
+        clock: wp.array[wp.float64],
+        C: wp.array[wp.float32],
+        eigen: wp.array[eigen_type],
         # in, out
-        F: wp.array(dtype=wp.mat33d),
-        state: wp.array(dtype=wp.float64),
+        F: wp.array[wp.mat33d],
+        state: wp.array[wp.float64],
         # out
-        stress: wp.array(dtype=wp.float32),
-        ratio: wp.array(dtype=wp.float32),
-        flags: wp.array(dtype=wp.int32),
-    ):
+        stress: wp.array[wp.float32],
+        ratio: wp.array[wp.float32],
+        flags: wp.array[wp.int32],
+    ) -> None:
         p = wp.tid()
         c = 9 * p
         found = eigen[p]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.engine.problem import HeldNodes
 from physworld.engine.total.node_kernels import advance_counter
 from physworld.engine.updated.contact import press_all
@@ -73,7 +74,7 @@ class ParticleRun:
         instant = wp.array([_INSTANT, 1.0 / _INSTANT, _INSTANT], dtype=wp.float64, device=device)
         stress.launch(particles.F, particles.C, particles.stress, instant, self.flags)
 
-    def record(self, times: np.ndarray, progress: Callable[[int, int], None] | None) -> np.ndarray:
+    def record(self, times: Array, progress: Callable[[int, int], None] | None) -> Array:
         """Particles at ``times``, (T, P, 3); see :meth:`UpdatedLagrangian.run_particles`."""
         engine, frames = self.engine, len(times)
         recorded = np.empty((frames, len(engine.solid), 3))
@@ -104,7 +105,7 @@ class ParticleRun:
         """A run that goes on from here with other grips."""
         return ParticleRun(self.engine, self.particles, self.stress, self.engine.grips(held))
 
-    def _positions(self) -> np.ndarray:
+    def _positions(self) -> Array:
         return self.particles.x.numpy().reshape(-1, 3).copy()
 
     def _time_step(self, time: float, interval: float) -> float:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.engine.updated.elastic_stress_kernels import elastic_stress
 from physworld.engine.updated.hencky_kernels import eigen_type, plastic_kernel, stretch
 from physworld.materials.laws import SolidLaw
@@ -39,8 +40,8 @@ class ParticleStress:
         self,
         law: SolidLaw,
         plasticity: Plasticity | None,
-        volume: np.ndarray,
-        stiffness_factor: np.ndarray,
+        volume: Array,
+        stiffness_factor: Array,
         device: str,
     ) -> None:
         self._device = device

@@ -55,13 +55,13 @@ _ADD = r"""
 @wp.kernel(enable_backward=False)
 def grow_stress(
     # model
-    times: wp.array(dtype=wp.float64),
+    times: wp.array[wp.float64],
     rate: wp.float64,
-    clock: wp.array(dtype=wp.float64),
-    counter: wp.array(dtype=wp.int32),
+    clock: wp.array[wp.float64],
+    counter: wp.array[wp.int32],
     # in, out
-    stress: wp.array(dtype=wp.float32),
-):
+    stress: wp.array[wp.float32],
+) -> None:
     """Multiply one component of the stresses [J] by exp(rate t)."""
     k = wp.tid()
     time = times[counter[0]] + wp.float64(counter[1]) * clock[2]
@@ -80,15 +80,15 @@ def particle_model(model: str) -> Any:
         # model
         cells: int,
         rows: int,
-        parameters: wp.array(dtype=wp.float32),
-        fields: wp.array(dtype=wp.float32),
+        parameters: wp.array[wp.float32],
+        fields: wp.array[wp.float32],
         first: int,
         dt: float,
         # in
-        F_state: wp.array(dtype=wp.float64),
+        F_state: wp.array[wp.float64],
         # in, out
-        state: wp.array(dtype=wp.float32),
-        stress: wp.array(dtype=wp.float32),
+        state: wp.array[wp.float32],
+        stress: wp.array[wp.float32],
     ): ...
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -96,16 +96,16 @@ def particle_model(model: str) -> Any:
         # model
         cells: int,
         rows: int,
-        parameters: wp.array(dtype=wp.float32),
-        fields: wp.array(dtype=wp.float32),
-        clock: wp.array(dtype=wp.float64),
-        counter: wp.array(dtype=wp.int32),
+        parameters: wp.array[wp.float32],
+        fields: wp.array[wp.float32],
+        clock: wp.array[wp.float64],
+        counter: wp.array[wp.int32],
         # in
-        F_state: wp.array(dtype=wp.float64),
+        F_state: wp.array[wp.float64],
         # in, out
-        state: wp.array(dtype=wp.float32),
-        stress: wp.array(dtype=wp.float32),
-    ):
+        state: wp.array[wp.float32],
+        stress: wp.array[wp.float32],
+    ) -> None:
         first = wp.where(counter[0] + counter[1] == 0, 1, 0)
         group_stress(
             wp.tid(), cells, rows, parameters, fields, first, wp.float32(clock[2]), F_state, state, stress

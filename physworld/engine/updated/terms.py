@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from physworld.arrays import Array
 from physworld.engine.terms.contact import ColliderContact, GroundContact, ground
 from physworld.engine.terms.term import BoundTerm, Term
 from physworld.engine.updated.contact import GridContact
@@ -43,8 +44,8 @@ class ParticleBody:
     """
 
     problem: Problem
-    solid: np.ndarray
-    mass: np.ndarray
+    solid: Array
+    mass: Array
     padded: int
     flows: bool
 
@@ -55,7 +56,7 @@ class BoundParticleStress:
     frequency_rad_s: float = 0.0
     friction_per_s: float = 0.0
 
-    def begin(self, times: np.ndarray) -> None:
+    def begin(self, times: Array) -> None:
         """A run over the frames ``times`` (T,) [s] starts. May raise."""
         return None
 
@@ -113,7 +114,7 @@ class ParticleTerms:
             self._velocity = wp.zeros(3 * count, dtype=wp.float64, device=self._device)
             self._force = wp.zeros(3 * count, dtype=wp.float64, device=self._device)
 
-    def begin(self, times: np.ndarray, x: np.ndarray) -> None:
+    def begin(self, times: Array, x: Array) -> None:
         """A run over the frames ``times`` (T,) [s] starts with particles at ``x`` (P, 3) [m]. May raise."""
         for term in self._bound:
             term.begin(times)

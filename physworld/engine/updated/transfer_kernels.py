@@ -232,22 +232,22 @@ def _scatter(
     group: int,
     count: int,
     # model
-    mass: wp.array(dtype=wp.float32),
+    mass: wp.array[wp.float32],
     origin: wp.vec3d,
     inv_dx: wp.vec3f,
     dx: wp.vec3f,
     split: int,
-    clock: wp.array(dtype=wp.float64),
-    box: wp.array(dtype=wp.int32),
+    clock: wp.array[wp.float64],
+    box: wp.array[wp.int32],
     # in
-    x: wp.array(dtype=wp.float64),
-    v: wp.array(dtype=wp.float32),
-    C: wp.array(dtype=wp.float32),
-    stress: wp.array(dtype=wp.float32),
+    x: wp.array[wp.float64],
+    v: wp.array[wp.float32],
+    C: wp.array[wp.float32],
+    stress: wp.array[wp.float32],
     # out
-    momentum: wp.array(dtype=wp.vec4f),
-    impulse: wp.array(dtype=wp.vec4f),
-    flags: wp.array(dtype=wp.int32),
+    momentum: wp.array[wp.vec4f],
+    impulse: wp.array[wp.vec4f],
+    flags: wp.array[wp.int32],
 ): ...
 
 
@@ -264,19 +264,19 @@ def _gather(
     adjustment: float,
     separating: float,
     clear: wp.float64,
-    clock: wp.array(dtype=wp.float64),
-    box: wp.array(dtype=wp.int32),
+    clock: wp.array[wp.float64],
+    box: wp.array[wp.int32],
     # in
-    velocity: wp.array(dtype=wp.vec4f),
-    velocity_old: wp.array(dtype=wp.vec4f),
-    ratio: wp.array(dtype=wp.float32),
+    velocity: wp.array[wp.vec4f],
+    velocity_old: wp.array[wp.vec4f],
+    ratio: wp.array[wp.float32],
     # in, out
-    x: wp.array(dtype=wp.float64),
-    v: wp.array(dtype=wp.float32),
-    C: wp.array(dtype=wp.float32),
+    x: wp.array[wp.float64],
+    v: wp.array[wp.float32],
+    C: wp.array[wp.float32],
     # out
-    flags: wp.array(dtype=wp.int32),
-    extremes: wp.array(dtype=wp.float32),
+    flags: wp.array[wp.int32],
+    extremes: wp.array[wp.float32],
 ): ...
 
 
@@ -285,23 +285,23 @@ def particles_to_grid(
     group: int,
     count: int,
     # model
-    mass: wp.array(dtype=wp.float32),
+    mass: wp.array[wp.float32],
     origin: wp.vec3d,
     inv_dx: wp.vec3f,
     dx: wp.vec3f,
     split: int,
-    clock: wp.array(dtype=wp.float64),
-    box: wp.array(dtype=wp.int32),
+    clock: wp.array[wp.float64],
+    box: wp.array[wp.int32],
     # in
-    x: wp.array(dtype=wp.float64),
-    v: wp.array(dtype=wp.float32),
-    C: wp.array(dtype=wp.float32),
-    stress: wp.array(dtype=wp.float32),
+    x: wp.array[wp.float64],
+    v: wp.array[wp.float32],
+    C: wp.array[wp.float32],
+    stress: wp.array[wp.float32],
     # out
-    momentum: wp.array(dtype=wp.vec4f),
-    impulse: wp.array(dtype=wp.vec4f),
-    flags: wp.array(dtype=wp.int32),
-):
+    momentum: wp.array[wp.vec4f],
+    impulse: wp.array[wp.vec4f],
+    flags: wp.array[wp.int32],
+) -> None:
     """Add one particle's momentum [kg m/s] and mass [kg] to its 27 nodes.
 
     ``stress`` is volume times Kirchhoff stress [J], (6P,) in the order xx yy zz yz xz xy. With ``split`` what the
@@ -340,20 +340,20 @@ def grid_to_particles(
     adjustment: float,
     separating: float,
     clear: wp.float64,
-    clock: wp.array(dtype=wp.float64),
-    box: wp.array(dtype=wp.int32),
+    clock: wp.array[wp.float64],
+    box: wp.array[wp.int32],
     # in
-    velocity: wp.array(dtype=wp.vec4f),
-    velocity_old: wp.array(dtype=wp.vec4f),
-    ratio: wp.array(dtype=wp.float32),
+    velocity: wp.array[wp.vec4f],
+    velocity_old: wp.array[wp.vec4f],
+    ratio: wp.array[wp.float32],
     # in, out
-    x: wp.array(dtype=wp.float64),
-    v: wp.array(dtype=wp.float32),
-    C: wp.array(dtype=wp.float32),
+    x: wp.array[wp.float64],
+    v: wp.array[wp.float32],
+    C: wp.array[wp.float32],
     # out
-    flags: wp.array(dtype=wp.int32),
-    extremes: wp.array(dtype=wp.float32),
-):
+    flags: wp.array[wp.int32],
+    extremes: wp.array[wp.float32],
+) -> None:
     """Velocity, its gradient and position of one particle after the substep.
 
     With ``split``: v = sum w v_i + a (v - sum w v_i_old), and the same difference moves the particle where its elastic

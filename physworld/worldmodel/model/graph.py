@@ -26,6 +26,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.worldmodel.errors import GraphInvalid
 from physworld.worldmodel.model.config import WorldModelConfig
 
@@ -55,12 +56,12 @@ class GraphSpec:
     """
 
     dt_s: float
-    rest_vertices: np.ndarray
-    particle_index: np.ndarray
-    control_index: np.ndarray
-    neighbours: np.ndarray
-    edge_kind: np.ndarray
-    rest_relative: np.ndarray
+    rest_vertices: Array
+    particle_index: Array
+    control_index: Array
+    neighbours: Array
+    edge_kind: Array
+    rest_relative: Array
     vertex_spacing_m: float
     edge_radius_m: float
     ground_height_m: float | None = None
@@ -87,7 +88,7 @@ class GraphSpec:
         return int((self.neighbours < self.vertex_count).sum())
 
 
-def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
+def farthest_points(points: Array, count: int) -> Array:
     """Indices (≤ count,) of a farthest-point sampling of ``points`` (P, 3), from the point nearest the
     middle.
     """
@@ -103,7 +104,7 @@ def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
     return np.asarray(chosen, dtype=np.int64)
 
 
-def kept_vertices(particles_rest: np.ndarray) -> np.ndarray:
+def kept_vertices(particles_rest: Array) -> Array:
     """Particles (M,) that a store keeps beside all of them: the vertices of every graph with at most ``MOST_KEPT``.
 
     A farthest-point sampling of fewer points is the beginning of one of more.
@@ -111,9 +112,7 @@ def kept_vertices(particles_rest: np.ndarray) -> np.ndarray:
     return farthest_points(particles_rest, MOST_KEPT)
 
 
-def choose_control_vertices(
-    controllers: np.ndarray, groups: tuple[np.ndarray, ...], config: WorldModelConfig
-) -> np.ndarray:
+def choose_control_vertices(controllers: Array, groups: tuple[Array, ...], config: WorldModelConfig) -> Array:
     """Controllers that become vertices, (C,): all of a few, or a spread of each rigid group (K, 3)."""
     count = controllers.shape[0]
     if count <= config.control_vertices_all:
@@ -127,13 +126,13 @@ def choose_control_vertices(
 
 
 def build_graph(
-    particles_rest: np.ndarray,
-    particles_start: np.ndarray,
-    controllers_start: np.ndarray,
+    particles_rest: Array,
+    particles_start: Array,
+    controllers_start: Array,
     *,
     dt_s: float,
     config: WorldModelConfig,
-    control_groups: tuple[np.ndarray, ...] = (),
+    control_groups: tuple[Array, ...] = (),
     ground_height_m: float | None = None,
 ) -> GraphSpec:
     """The graph of a body.
@@ -194,7 +193,7 @@ def build_graph(
     )
 
 
-def _near_links(distances: np.ndarray, neighbours: int, radius: float) -> np.ndarray:
+def _near_links(distances: Array, neighbours: int, radius: float) -> Array:
     """Each vertex with its nearest within the radius, (n, n) bool."""
     nearest = np.argsort(distances, axis=1, kind="stable")[:, :neighbours]
     linked = np.zeros(distances.shape, dtype=bool)
@@ -202,7 +201,7 @@ def _near_links(distances: np.ndarray, neighbours: int, radius: float) -> np.nda
     return (linked | linked.T) & (distances <= radius)
 
 
-def _coarse_links(distances: np.ndarray, coarse: int, links: int) -> np.ndarray:
+def _coarse_links(distances: Array, coarse: int, links: int) -> Array:
     """The first ``coarse`` sampled vertices with each other, and every vertex with its nearest ones of them."""
     linked = np.zeros(distances.shape, dtype=bool)
     if coarse and links:
@@ -213,8 +212,8 @@ def _coarse_links(distances: np.ndarray, coarse: int, links: int) -> np.ndarray:
 
 
 def _control_links(
-    reach: np.ndarray, control: np.ndarray, groups: tuple[np.ndarray, ...], neighbours: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    reach: Array, control: Array, groups: tuple[Array, ...], neighbours: int
+) -> tuple[Array, Array, Array]:
     """Object with control vertices (n, C), the same turned round (C, n), control with control vertices (C,
     C).
 
@@ -234,7 +233,7 @@ def _control_links(
     return to_object, to_object.T, together
 
 
-def _slot_table(kind: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _slot_table(kind: Array) -> tuple[Array, Array]:
     """Senders by receiver (V, D), empty slots filled with V, and their kinds, from kinds (V, V) with -1 for
     none.
     """
@@ -248,7 +247,7 @@ def _slot_table(kind: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def _relative(neighbours: np.ndarray, undeformed: np.ndarray, reference: np.ndarray, n: int) -> np.ndarray:
+def _relative(neighbours: Array, undeformed: Array, reference: Array, n: int) -> Array:
     """Undeformed x_sender − x_receiver of each slot, (V, D, 3): at rest, or at the start beside a
     controller.
     """

@@ -95,6 +95,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from physworld.arrays import Array
 from physworld.worldmodel.model.config import WorldModelConfig
 from physworld.worldmodel.model.graph import EDGE_KINDS, NEAR, GraphSpec
 from physworld.worldmodel.model.inertia import InertialPrior
@@ -372,7 +373,7 @@ def _two_layers(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
     return layers
 
 
-def _reference_positions(spec: GraphSpec) -> np.ndarray:
+def _reference_positions(spec: GraphSpec) -> Array:
     """A place of every vertex from which displacements are counted, (V, 3): rest, and near it for
     controllers.
     """

@@ -22,13 +22,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from physworld.arrays import Array
 from physworld.worldmodel.model.graph import EDGE_KINDS
 from physworld.worldmodel.native.messages import EdgeList, mean_messages, warp_module
 
 REST_RADII = 2.0  # longest rest length that an edge tells, in edge radii
 
 
-def find_nearest(places: np.ndarray, most: int, radius_m: float) -> tuple[np.ndarray, np.ndarray]:
+def find_nearest(places: Array, most: int, radius_m: float) -> tuple[Array, Array]:
     """Senders (B, n, most) int32, ascending, and how many of them count (B, n) int32; the rest of a row is -1.
 
     Args:
@@ -47,7 +48,7 @@ def find_nearest(places: np.ndarray, most: int, radius_m: float) -> tuple[np.nda
     return senders, counts
 
 
-def near_ends(places: np.ndarray, most: int, radius_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def near_ends(places: Array, most: int, radius_m: float) -> tuple[Array, Array, Array]:
     """Batch element, receiver and sender of every NEAR edge of places (B, n, 3), (E,) each, in this order."""
     senders, _ = find_nearest(places, most, radius_m)
     element, receiver, slot = np.nonzero(senders >= 0)

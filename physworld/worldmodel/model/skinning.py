@@ -22,6 +22,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from physworld.arrays import Array
+
 RIDGE = 1e-4  # λ in units of the neighbourhood's mean square size: keeps weights near 1/distance where free
 DISTANCE_FLOOR = 1e-3  # of the neighbourhood's size: a point that is a vertex
 ON_A_LINE = 1e-6  # of the neighbourhood's spread along it: rounding across a line, not a shape
@@ -33,10 +35,10 @@ LEAST_TURN = 1e-8  # of the same: weight of turning as little as may be
 class Skin:
     """Vertices ``index`` (M, K) that carry each point, and their ``weight`` (M, K), rows summing to 1."""
 
-    index: np.ndarray
-    weight: np.ndarray
+    index: Array
+    weight: Array
 
-    def apply(self, vertices: np.ndarray) -> np.ndarray:
+    def apply(self, vertices: Array) -> Array:
         """Points (…, M, 3) of vertices (…, n, 3)."""
         vertices = np.asarray(vertices)
         points = self.weight[:, :1] * vertices[..., self.index[:, 0], :]
@@ -53,7 +55,7 @@ class Skin:
         return (weight[..., None] * moved).sum(dim=-2)
 
 
-def nearest_vertices(points: np.ndarray, vertices: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def nearest_vertices(points: Array, vertices: Array, count: int) -> tuple[Array, Array]:
     """Indices (M, K) of the nearest vertices and their distances [m], nearest first."""
     rows = max(1, GAPS_AT_ONCE // max(1, len(vertices)))
     parts = []
@@ -65,14 +67,14 @@ def nearest_vertices(points: np.ndarray, vertices: np.ndarray, count: int) -> tu
     return np.concatenate(indices), np.concatenate(distances)
 
 
-def inverse_distance_weights(distance: np.ndarray) -> np.ndarray:
+def inverse_distance_weights(distance: Array) -> Array:
     """w ∝ 1/distance, rows summing to 1, (M, K)."""
     floor = DISTANCE_FLOOR * distance[:, -1:] + np.finfo(np.float64).tiny
     weight = 1.0 / np.maximum(distance, floor)
     return weight / weight.sum(axis=1, keepdims=True)
 
 
-def affine_skin(points: np.ndarray, vertices: np.ndarray, neighbours: int = 8) -> Skin:
+def affine_skin(points: Array, vertices: Array, neighbours: int = 8) -> Skin:
     """Weights from one state, points (M, 3) and vertices (n, 3), or from several, (S, M, 3) and (S, n, 3).
 
     Neighbours are the nearest in the first state.
@@ -90,14 +92,12 @@ def affine_skin(points: np.ndarray, vertices: np.ndarray, neighbours: int = 8) -
     return Skin(index, weight / weight.sum(axis=1, keepdims=True))
 
 
-def neighbourhoods(rest: np.ndarray, neighbours: int = 8) -> np.ndarray:
+def neighbourhoods(rest: Array, neighbours: int = 8) -> Array:
     """Indices (n, K) of every vertex's nearest others in the state ``rest`` (n, 3)."""
     return nearest_vertices(rest, rest, neighbours + 1)[0][:, 1:]
 
 
-def local_rotations(
-    rest: np.ndarray, moved: np.ndarray, neighbours: int = 8, *, index: np.ndarray | None = None
-) -> np.ndarray:
+def local_rotations(rest: Array, moved: Array, neighbours: int = 8, *, index: Array | None = None) -> Array:
     """Rotation of every vertex's neighbourhood, (…, n, 3, 3): argmin_R Σ_j ‖R (rest_j − rest_i) − (moved_j
     − moved_i)‖².
 
@@ -119,13 +119,13 @@ def local_rotations(
 
 
 def linear_blend(
-    points: np.ndarray,
-    rest: np.ndarray,
-    moved: np.ndarray,
+    points: Array,
+    rest: Array,
+    moved: Array,
     *,
     neighbours: int = 8,
-    quaternions: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray | None]:
+    quaternions: Array | None = None,
+) -> tuple[Array, Array | None]:
     """Move points, and their orientations, with the vertices (paper, appendix 3D Gaussian Update Through
     LBS).
 
@@ -151,7 +151,7 @@ def linear_blend(
     return positions, quaternion_product(blended, quaternions)
 
 
-def quaternion_of(rotation: np.ndarray) -> np.ndarray:
+def quaternion_of(rotation: Array) -> Array:
     """Unit quaternions (…, 4) with w ≥ 0 of rotation matrices (…, 3, 3), stable at every angle."""
     r = rotation
     trace = np.trace(r, axis1=-2, axis2=-1)
@@ -175,7 +175,7 @@ def quaternion_of(rotation: np.ndarray) -> np.ndarray:
     return np.where(quaternion[..., :1] < 0.0, -quaternion, quaternion)
 
 
-def quaternion_product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+def quaternion_product(left: Array, right: Array) -> Array:
     """Hamilton product (…, 4): the turn ``right`` followed by ``left``."""
     w, v = left[..., :1], left[..., 1:]
     w2, v2 = right[..., :1], right[..., 1:]

@@ -90,12 +90,12 @@ def _roll(sizes: wp.uint64, arrays: wp.uint64): ...
 
 
 @wp.kernel
-def chain_flow(sizes: wp.uint64, arrays: wp.uint64):
+def chain_flow(sizes: wp.uint64, arrays: wp.uint64) -> None:
     """Launch with dim 1: the flow of ``count`` chains, or its adjoint where ``back``."""
     _flow(sizes, arrays)
 
 
 @wp.kernel
-def chain_roll(sizes: wp.uint64, arrays: wp.uint64):
+def chain_roll(sizes: wp.uint64, arrays: wp.uint64) -> None:
     """Launch with dim 1: fill in the object vertices of ``paths`` from frame ``first`` + 1 on."""
     _roll(sizes, arrays)

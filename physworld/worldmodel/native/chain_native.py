@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from physworld.arrays import Array
 from physworld.worldmodel.native.messages import warp_module
 from physworld.worldmodel.priors.chain import CALMINGS, ChainPrior
 
@@ -28,12 +29,12 @@ def chain_sizes(prior: ChainPrior, history: int) -> dict[str, int]:
     }
 
 
-def chain_arrays(prior: ChainPrior) -> dict[str, np.ndarray]:
+def chain_arrays(prior: ChainPrior) -> dict[str, Array]:
     """The kernel's arrays, float32, nodes padded to whole rows; ``chain_scratch`` is each caller's own."""
     count = len(prior.mass)
     width = -(-count // ROW) * ROW
 
-    def padded(values: np.ndarray) -> np.ndarray:
+    def padded(values: Array) -> Array:
         out = np.zeros((*values.shape[:-1], width), dtype=np.float32)
         out[..., : values.shape[-1]] = values
         return out
@@ -65,7 +66,7 @@ def chain_arrays(prior: ChainPrior) -> dict[str, np.ndarray]:
     return {f"chain_{name}": np.ascontiguousarray(value, dtype=np.float32) for name, value in arrays.items()}
 
 
-def chain_scratch(width: int) -> np.ndarray:
+def chain_scratch(width: int) -> Array:
     """Working memory of one call."""
     return np.zeros((_kernels().SCRATCH_ROWS, width + 2 * ROW), dtype=np.float32)
 
@@ -82,7 +83,7 @@ class ChainRoller:
         self._sizes, self._arrays = chain_sizes(prior, history), chain_arrays(prior)
         self._history = history
 
-    def run(self, start: np.ndarray, driven: np.ndarray, logs: np.ndarray) -> np.ndarray:
+    def run(self, start: Array, driven: Array, logs: Array) -> Array:
         """Vertices (B, T, V, 3) float32 of object frames (B, h+1, n, 3), control vertices (B, T, C, 3), Φ (B, n, 2)."""
         count, frames, controls = driven.shape[:3]
         n = start.shape[2]
@@ -119,7 +120,7 @@ class NativeFlow:
         """Places (K, M, 3) after a tick: place, velocity, here, slope, turn (K, M, 3); pull, bend, ease (K', M, 1)."""
         return _Flow.apply(self, *tensors)
 
-    def launch(self, count: int, given: dict[str, np.ndarray], back: bool) -> None:
+    def launch(self, count: int, given: dict[str, Array], back: bool) -> None:
         """One call of the kernel."""
         kernels = _kernels()
         sizes = [self.sizes[name] for name in kernels.CHAIN_SIZES] + [count, int(back)]
@@ -129,14 +130,14 @@ class NativeFlow:
             kernels.chain_flow, sizes, [arrays[name].ctypes.data if name in arrays else 0 for name in names]
         )
 
-    def rows(self, values: Tensor) -> np.ndarray:
+    def rows(self, values: Tensor) -> Array:
         """(K', M, 3 or 1) as padded rows (M, 3, W) or (M, W)."""
         count, many, axes = values.shape
         out = np.zeros((many, axes, self.sizes["chain_width"] + 2 * ROW), dtype=np.float32)
         out[:, :, ROW : ROW + count] = values.detach().permute(1, 2, 0).numpy()
         return out if axes == 3 else out[:, 0]
 
-    def tensor(self, rows: np.ndarray, like: Tensor) -> Tensor:
+    def tensor(self, rows: Array, like: Tensor) -> Tensor:
         """The inverse of :meth:`rows`."""
         whole = rows if rows.ndim == 3 else rows[:, None]
         return torch.from_numpy(whole[:, :, ROW : ROW + like.shape[0]]).permute(2, 0, 1)

@@ -15,6 +15,7 @@ from types import ModuleType
 import numpy as np
 import torch
 
+from physworld.arrays import Array
 from physworld.worldmodel.model.inertia import InertialStep
 from physworld.worldmodel.model.model import WorldModel
 from physworld.worldmodel.model.nearest import REST_RADII
@@ -80,13 +81,11 @@ class RolloutEngine:
         }
         self._sizes |= chain_sizes(chain, config.history) if chain is not None else {}
 
-    def run(self, start: np.ndarray, driven: np.ndarray, phi: np.ndarray) -> np.ndarray:
+    def run(self, start: Array, driven: Array, phi: Array) -> Array:
         """All vertices (T, V, 3) float32 from object frames (h+1, n, 3), control vertices (T, C, 3), Φ (n, 2)."""
         return self.run_batch(start, driven[None], phi)[0]
 
-    def run_batch(
-        self, start: np.ndarray, driven: np.ndarray, phi: np.ndarray, *, threads: int = 1
-    ) -> np.ndarray:
+    def run_batch(self, start: Array, driven: Array, phi: Array, *, threads: int = 1) -> Array:
         """All vertices of every candidate, (B, T, V, 3) float32.
 
         Args:
@@ -116,17 +115,17 @@ class RolloutEngine:
                 done.result()
         return path
 
-    def _softness(self, phi: np.ndarray) -> np.ndarray:
+    def _softness(self, phi: Array) -> Array:
         """ζ of the modal prior from Φ (B, n, 2), (B,); 0 where there is another one or none."""
         if self._placing is None:
             return np.zeros(len(phi))
         return np.clip(np.tensordot(phi, self._placing, axes=2), *self._span)
 
-    def _with_room(self, nearest: int) -> dict[str, np.ndarray]:
+    def _with_room(self, nearest: int) -> dict[str, Array]:
         """Edge arrays of one call with room for the NEAR edges of a step, and the search's working memory."""
         room = self.objects * nearest
 
-        def longer(kept: np.ndarray) -> np.ndarray:
+        def longer(kept: Array) -> Array:
             return np.concatenate([kept, np.zeros((room, *kept.shape[1:]), dtype=kept.dtype)])
 
         edges = {name: longer(self._fixed[name]) for name in ("edge_sender", "edge_rest", "edge_gap")}
@@ -136,7 +135,7 @@ class RolloutEngine:
             "search_room": np.zeros(nearest + 3 * self.objects, dtype=np.float32),
         }
 
-    def _launch(self, path: np.ndarray, phi: np.ndarray, soft: np.ndarray, logs: np.ndarray) -> None:
+    def _launch(self, path: Array, phi: Array, soft: Array, logs: Array) -> None:
         """Fill in ``path`` (B, T, V, 3) in place; the arrays are contiguous float32."""
         kernels, candidates, frames = _kernels(), path.shape[0], path.shape[1]
         sizes = self._sizes | {"candidates": candidates, "frames": frames}
@@ -172,7 +171,7 @@ def _kernels() -> ModuleType:
     return engine_kernels
 
 
-def _pack_weights(model: WorldModel, hidden: int) -> dict[str, np.ndarray]:
+def _pack_weights(model: WorldModel, hidden: int) -> dict[str, Array]:
     """Every weight as (…, in, out), widths padded to ``hidden``; layers stacked.
 
     What is constant of an edge's first product, (E, H) a layer, is too much to read every step. Its part that is linear
@@ -183,11 +182,11 @@ def _pack_weights(model: WorldModel, hidden: int) -> dict[str, np.ndarray]:
         constants = model.edge_constants()
     own, wide = model.config.hidden, hidden
 
-    def stack(layers: torch.nn.ModuleList, blocks: int = 1) -> np.ndarray:
+    def stack(layers: torch.nn.ModuleList, blocks: int = 1) -> Array:
         parts = [_padded(part.T, wide, wide) for layer in layers for part in layer.weight.split(own, dim=1)]
         return np.stack(parts).reshape(len(layers), blocks, wide, wide)
 
-    def biases(layers: torch.nn.ModuleList) -> np.ndarray:
+    def biases(layers: torch.nn.ModuleList) -> Array:
         return np.stack([_padded(layer.bias[None], 1, wide)[0] for layer in layers])
 
     encoder_in, encoder_out = getattr(model.encoder, "in"), model.encoder.out
@@ -236,16 +235,16 @@ def _pack_weights(model: WorldModel, hidden: int) -> dict[str, np.ndarray]:
     }
 
 
-def _padded(values: torch.Tensor, rows: int, columns: int) -> np.ndarray:
+def _padded(values: torch.Tensor, rows: int, columns: int) -> Array:
     """As float32 (rows, columns), filled up with zeros."""
     out = np.zeros((rows, columns), dtype=np.float32)
     out[: values.shape[0], : values.shape[1]] = values.numpy(force=True)
     return out
 
 
-def _floats(values: torch.Tensor) -> np.ndarray:
+def _floats(values: torch.Tensor) -> Array:
     return np.ascontiguousarray(values.numpy(force=True), dtype=np.float32)
 
 
-def _integers(values: torch.Tensor) -> np.ndarray:
+def _integers(values: torch.Tensor) -> Array:
     return np.ascontiguousarray(values.numpy(force=True), dtype=np.int32)

@@ -308,6 +308,6 @@ def rollout_rows(sizes: wp.uint64, scalars: wp.uint64, arrays: wp.uint64): ...
 
 
 @wp.kernel
-def rollout(sizes: wp.uint64, scalars: wp.uint64, arrays: wp.uint64):
+def rollout(sizes: wp.uint64, scalars: wp.uint64, arrays: wp.uint64) -> None:
     """Launch with dim 1: addresses of the int32 sizes, the float32 scalars and the table of array addresses."""
     rollout_rows(sizes, scalars, arrays)

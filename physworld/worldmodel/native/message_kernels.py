@@ -203,7 +203,7 @@ def message_mean(
     weight: wp.uint64,
     # out
     out: wp.uint64,
-):
+) -> None:
     """Launch with dim 1; addresses of contiguous float32 (graph: int32) memory."""
     message_mean_rows(
         vertices, batch, hidden, kinds, offsets, senders, heard, sent, bias, length, weight, out
@@ -233,7 +233,7 @@ def message_mean_adjoint(
     grad_bias: wp.uint64,
     grad_length: wp.uint64,
     grad_weight: wp.uint64,
-):
+) -> None:
     """Launch with dim 1; the outputs but ``grad_heard`` arrive zeroed."""
     message_mean_adjoint_rows(
         vertices,

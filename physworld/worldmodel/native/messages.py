@@ -18,6 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from physworld.arrays import Array
+
 
 @dataclass(frozen=True)
 class EdgeList:
@@ -32,10 +34,10 @@ class EdgeList:
     offsets: Tensor
     senders: Tensor
     receivers: Tensor
-    order: np.ndarray
+    order: Array
 
     @classmethod
-    def from_neighbours(cls, neighbours: np.ndarray, kind: np.ndarray, kinds: int) -> EdgeList:
+    def from_neighbours(cls, neighbours: Array, kind: Array, kinds: int) -> EdgeList:
         """From a slot table (V, D) in which V marks an empty slot, and the slots' kinds (V, D)."""
         vertex_count = neighbours.shape[0]
         receiver, slot = np.nonzero(neighbours < vertex_count)

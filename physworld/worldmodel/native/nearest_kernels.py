@@ -109,6 +109,6 @@ def nearest(
     senders: wp.uint64,
     found: wp.uint64,
     room: wp.uint64,
-):
+) -> None:
     """Launch with dim 1; addresses of contiguous float32 and int32 memory."""
     nearest_rows(batch, n, most, radius, places, senders, found, room)

@@ -37,6 +37,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import expm
 
+from physworld.arrays import Array
 from physworld.worldmodel.priors.chain_layout import ChainLayout
 
 CALMINGS = 8
@@ -67,7 +68,7 @@ class ChainPhysics:
     bending_m4_s2: float
     friction_s: float
     drag_per_s: float
-    gravity_m_s2: np.ndarray
+    gravity_m_s2: Array
 
 
 @dataclass(frozen=True)
@@ -86,29 +87,29 @@ class ChainPrior:
         substeps: S.
     """
 
-    spread: np.ndarray
-    read: np.ndarray
-    hold: np.ndarray
-    member: np.ndarray
-    offset: np.ndarray
-    anchor: np.ndarray
-    first: np.ndarray
-    second: np.ndarray
-    axis: np.ndarray
-    markers: np.ndarray
-    length: np.ndarray
-    pull: np.ndarray
-    mass: np.ndarray
-    curve: np.ndarray
-    bend: np.ndarray
-    dash: np.ndarray
-    keep: np.ndarray
-    calm: np.ndarray
-    smooth: np.ndarray
-    slack: np.ndarray
-    share: np.ndarray
-    reach: np.ndarray
-    gravity: np.ndarray
+    spread: Array
+    read: Array
+    hold: Array
+    member: Array
+    offset: Array
+    anchor: Array
+    first: Array
+    second: Array
+    axis: Array
+    markers: Array
+    length: Array
+    pull: Array
+    mass: Array
+    curve: Array
+    bend: Array
+    dash: Array
+    keep: Array
+    calm: Array
+    smooth: Array
+    slack: Array
+    share: Array
+    reach: Array
+    gravity: Array
     substeps: int
 
     def __post_init__(self) -> None:
@@ -145,7 +146,7 @@ class ChainPrior:
             raise ValueError(f"{self.substeps} substeps; there are {CALMINGS} or a multiple of them")
 
 
-def chain_of(layout: ChainLayout, physics: ChainPhysics, dt_s: float, reach: np.ndarray) -> ChainPrior:
+def chain_of(layout: ChainLayout, physics: ChainPhysics, dt_s: float, reach: Array) -> ChainPrior:
     """The prior of a layout and its physics; the wave speed is lowered to what ``MOST_SUBSTEPS`` can carry."""
     length = np.diff(layout.nodes)
     count, free = len(layout.nodes), layout.member.sum(axis=1) == 0
@@ -196,7 +197,7 @@ def chain_of(layout: ChainLayout, physics: ChainPhysics, dt_s: float, reach: np.
     return replace(prior, **{name: np.float32(v) for name, v in vars(prior).items() if name != "substeps"})
 
 
-def _short_waves(stiffness: np.ndarray, mass: np.ndarray, free: np.ndarray, dt_s: float) -> np.ndarray:
+def _short_waves(stiffness: Array, mass: Array, free: Array, dt_s: float) -> Array:
     """What a tick leaves of each wave, (K, K): all of the long ones, nothing of those that turn by π and more.
 
     They are told apart by the squared angular frequencies of bending and of a rope under its own weight.
@@ -215,15 +216,15 @@ def _short_waves(stiffness: np.ndarray, mass: np.ndarray, free: np.ndarray, dt_s
 
 
 def _substeps(
-    differ: np.ndarray,
-    length: np.ndarray,
-    mass: np.ndarray,
-    bending: np.ndarray,
-    free: np.ndarray,
+    differ: Array,
+    length: Array,
+    mass: Array,
+    bending: Array,
+    free: Array,
     wave: float,
     stiff: float,
     dt_s: float,
-    reach: np.ndarray,
+    reach: Array,
 ) -> int:
     """Substeps of a tick for which the fastest wave is stable at the stiffest and lightest that ``reach`` allows."""
     whole = wave**2 * (differ.T / length) @ differ + stiff * bending

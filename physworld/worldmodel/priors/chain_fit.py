@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
+from physworld.arrays import Array
 from physworld.worldmodel.model.graph import GraphSpec
 from physworld.worldmodel.native.chain_native import ChainRoller
 from physworld.worldmodel.priors.chain import ChainPhysics, ChainPrior, chain_of
@@ -35,13 +36,11 @@ MARGIN = 0.1  # of Φ beyond what the episodes show
 class _Seen:
     """Vertex tracks (B, T, V, 3) and Φ (B, n, 2) of episodes of one length."""
 
-    paths: np.ndarray
-    phis: np.ndarray
+    paths: Array
+    phis: Array
 
 
-def fit_chain(
-    episodes: list[np.ndarray], phis: list[np.ndarray], spec: GraphSpec, history: int
-) -> ChainPrior | None:
+def fit_chain(episodes: list[Array], phis: list[Array], spec: GraphSpec, history: int) -> ChainPrior | None:
     """The chain of vertex tracks (T, V, 3) and their log property ratios (n, 2 or more).
 
     None where the body is no straight line at rest or no grip holds it: that is no rope.
@@ -75,18 +74,18 @@ def fit_chain(
 
 
 def _fit(
-    layout: ChainLayout, build: Callable[[np.ndarray], ChainPrior], taught: _Seen, history: int
+    layout: ChainLayout, build: Callable[[Array], ChainPrior], taught: _Seen, history: int
 ) -> ChainPrior:
     """Least squares over windows that grow; the physics with the least error over whole episodes."""
     n, length = layout.spread.shape[0], float(np.ptp(layout.nodes))
 
-    def miss(parameters: np.ndarray, windows: _Seen) -> np.ndarray:
+    def miss(parameters: Array, windows: _Seen) -> Array:
         gap = (_rolled(build(parameters), windows, history) - windows.paths)[
             :, history + 1 :, :n:EVERY_VERTEX
         ]
         return np.nan_to_num(np.clip(gap, -length, length), nan=length).ravel().astype(float) / length
 
-    def fitted(start: np.ndarray, windows: _Seen, soft: bool) -> tuple[float, np.ndarray]:
+    def fitted(start: Array, windows: _Seen, soft: bool) -> tuple[float, Array]:
         answer = least_squares(
             miss,
             np.clip(start, LOW + 1e-3, HIGH - 1e-3),
@@ -117,11 +116,11 @@ def _fit(
     return best[1]
 
 
-def _physics(parameters: np.ndarray) -> ChainPhysics:
+def _physics(parameters: Array) -> ChainPhysics:
     return ChainPhysics(*(float(value) for value in np.exp(parameters[:4])), G * parameters[4:])
 
 
-def _rolled(prior: ChainPrior, seen: _Seen, history: int) -> np.ndarray:
+def _rolled(prior: ChainPrior, seen: _Seen, history: int) -> Array:
     """All vertices (B, T, V, 3), open loop from the first h + 1 frames."""
     n = seen.phis.shape[1]
     start = seen.paths[:, : history + 1, :n]
@@ -135,7 +134,7 @@ def _error(prior: ChainPrior, seen: _Seen, history: int) -> float:
     return mean if np.isfinite(mean) else np.inf
 
 
-def _of_one_length(episodes: list[np.ndarray], phis: list[np.ndarray], history: int) -> _Seen | None:
+def _of_one_length(episodes: list[Array], phis: list[Array], history: int) -> _Seen | None:
     """The first of the episodes that are no shorter than the median one, cut to that length."""
     frames = int(np.median([len(episode) for episode in episodes]))
     if frames < history + 3:

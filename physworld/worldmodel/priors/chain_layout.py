@@ -15,6 +15,7 @@ from scipy.interpolate import CubicSpline
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from physworld.arrays import Array
 from physworld.geometry.rigid import least_rotation
 from physworld.worldmodel.model.graph import GraphSpec
 
@@ -41,24 +42,24 @@ class GripFrames:
             direction, the normal of both, and what is left.
     """
 
-    anchor: np.ndarray
-    first: np.ndarray
-    second: np.ndarray
-    axis: np.ndarray
-    markers: np.ndarray
+    anchor: Array
+    first: Array
+    second: Array
+    axis: Array
+    markers: Array
 
 
 @dataclass(frozen=True)
 class ChainLayout:
     """``nodes`` (K,): arc lengths [m]; the other arrays are those of ``ChainPrior``."""
 
-    nodes: np.ndarray
-    spread: np.ndarray
-    read: np.ndarray
-    hold: np.ndarray
-    member: np.ndarray
-    offset: np.ndarray
-    share: np.ndarray
+    nodes: Array
+    spread: Array
+    read: Array
+    hold: Array
+    member: Array
+    offset: Array
+    share: Array
     grips: GripFrames
 
 
@@ -67,11 +68,11 @@ class Held:
     """The grip that holds each vertex, (n,), -1 for none, and where in its frame [m], (n, 3)."""
 
     grips: GripFrames
-    owner: np.ndarray
-    offset: np.ndarray
+    owner: Array
+    offset: Array
 
 
-def arc_lengths(spec: GraphSpec) -> np.ndarray | None:
+def arc_lengths(spec: GraphSpec) -> Array | None:
     """Places of the object vertices along the straight line that they lie on at rest [m], (n,); None if on none."""
     rest = spec.rest_vertices - spec.rest_vertices.mean(axis=0)
     _, _, axes = np.linalg.svd(rest, full_matrices=False)
@@ -111,7 +112,7 @@ def grip_frames(spec: GraphSpec) -> GripFrames:
     return GripFrames(anchor, first, second, axis, markers)
 
 
-def frame_rotations(grips: GripFrames, g: int, controls: np.ndarray) -> np.ndarray:
+def frame_rotations(grips: GripFrames, g: int, controls: Array) -> Array:
     """R_g of control vertices (T, C, 3), (T, 3, 3)."""
     if grips.markers[g] == 1:
         return np.repeat(np.eye(3)[None], len(controls), axis=0)
@@ -124,7 +125,7 @@ def frame_rotations(grips: GripFrames, g: int, controls: np.ndarray) -> np.ndarr
     return np.stack([along, np.cross(normal, along), normal], axis=-1)
 
 
-def held_vertices(spec: GraphSpec, paths: np.ndarray, length_m: float) -> Held:
+def held_vertices(spec: GraphSpec, paths: Array, length_m: float) -> Held:
     """Who is held, from vertex tracks (F, V, 3) of frames that show the grips turning."""
     n, grips = spec.object_count, grip_frames(spec)
     controls = paths[:, n:]
@@ -145,7 +146,7 @@ def held_vertices(spec: GraphSpec, paths: np.ndarray, length_m: float) -> Held:
     return Held(grips, owner, offset)
 
 
-def lay_out(along: np.ndarray, held: Held, segments: int) -> ChainLayout:
+def lay_out(along: Array, held: Held, segments: int) -> ChainLayout:
     """Nodes at every held vertex and evenly between them, about ``segments`` over the whole length."""
     spacing = np.ptp(along) / segments
     fixed = {float(along[i]): int(i) for i in np.flatnonzero(held.owner >= 0)}

@@ -6,10 +6,10 @@ that errs least, and the card says what each erred (``validation.priors_m``).
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor
 
+from physworld.arrays import Array
 from physworld.worldmodel.dataset import Track
 from physworld.worldmodel.model.config import WorldModelConfig
 from physworld.worldmodel.model.graph import GraphSpec
@@ -25,8 +25,8 @@ Prior = ModalPrior | ChainPrior | InertialPrior
 
 
 def fit_priors(
-    positions: list[np.ndarray],
-    phis: list[np.ndarray],
+    positions: list[Array],
+    phis: list[Array],
     spec: GraphSpec,
     config: WorldModelConfig,
     wanted: str = "auto",

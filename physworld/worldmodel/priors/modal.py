@@ -30,6 +30,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.worldmodel.errors import DatasetUnusable
 from physworld.worldmodel.priors.modal_places import find_places, mean_placing
 from physworld.worldmodel.priors.modal_poles import without_growth
@@ -58,13 +59,13 @@ class ModalPrior:
     (2, R, L + 1), ``placing`` (n, 2), ``span`` (2,): least and largest ζ of the episodes.
     """
 
-    mean: np.ndarray
-    basis: np.ndarray
-    shape: np.ndarray
-    weight: np.ndarray
-    response: np.ndarray
-    placing: np.ndarray
-    span: np.ndarray
+    mean: Array
+    basis: Array
+    shape: Array
+    weight: Array
+    response: Array
+    placing: Array
+    span: Array
 
     def __post_init__(self) -> None:
         """The rollout engine reads these arrays by their sizes. Raises ValueError for others."""
@@ -90,7 +91,7 @@ def regressor_count(modes: int, controls: int, history: int) -> int:
     return (history + 1) * modes + (history + 2) * 3 * controls + (history + 1) * 3 + 1
 
 
-def rigid_prior(vertices: np.ndarray, controls: np.ndarray, history: int) -> ModalPrior:
+def rigid_prior(vertices: Array, controls: Array, history: int) -> ModalPrior:
     """The prior without data: object vertices (n, 3) follow the control vertices (C, 3) as they lie."""
     anchor = controls.mean(axis=0)
     return ModalPrior(
@@ -104,9 +105,7 @@ def rigid_prior(vertices: np.ndarray, controls: np.ndarray, history: int) -> Mod
     )
 
 
-def fit_prior(
-    episodes: list[np.ndarray], phis: list[np.ndarray], n: int, history: int, most_modes: int
-) -> ModalPrior:
+def fit_prior(episodes: list[Array], phis: list[Array], n: int, history: int, most_modes: int) -> ModalPrior:
     """The prior of vertex tracks (T, V, 3), object vertices first, and their log property ratios (n, 2 or more)."""
     if episodes[0].shape[1] == n:
         raise DatasetUnusable("the graph has no control vertex: there is nothing to move the object by")
@@ -137,12 +136,12 @@ def fit_prior(
     return ModalPrior(mean.reshape(n, 3), kept, shape, weight, response, placing, np.array(span))
 
 
-def _control_shape(path: np.ndarray, n: int) -> np.ndarray:
+def _control_shape(path: Array, n: int) -> Array:
     """Control vertices around their mean, (T, C, 3)."""
     return path[:, n:] - path[:, n:].mean(axis=1, keepdims=True)
 
 
-def _drive(path: np.ndarray, n: int, shape: np.ndarray, history: int) -> np.ndarray:
+def _drive(path: Array, n: int, shape: Array, history: int) -> Array:
     """The regressors that the grips give for each step t → t+1, t = h … T-2, (T-1-h, ·)."""
     own, centre = _control_shape(path, n) - shape, path[:, n:].mean(axis=1)
     t = np.arange(history, len(path) - 1)
@@ -152,9 +151,7 @@ def _drive(path: np.ndarray, n: int, shape: np.ndarray, history: int) -> np.ndar
     return np.concatenate([*turns, *moves, np.ones((len(t), 1))], axis=1)
 
 
-def _choose(
-    seen: list[Seen], size: np.ndarray, grams: Grams, span: tuple[float, float], history: int
-) -> Choice:
+def _choose(seen: list[Seen], size: Array, grams: Grams, span: tuple[float, float], history: int) -> Choice:
     """The choice with the least open-loop error on episodes left out, each once (cross-validation).
 
     More modes are tried as long as they err less.

@@ -18,6 +18,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.worldmodel.priors.modal_poles import without_growth
 from physworld.worldmodel.priors.modal_regression import Choice, Seen, errors, grams_of, regress, scale_of
 
@@ -30,12 +31,12 @@ TRIALS, REACH = 25, 4.0  # values of ζ that are tried, over so many standard de
 RIDGES = 10.0 ** np.arange(-4.0, 3.5, 0.5)  # over the mean of the kernel's diagonal
 
 
-def mean_placing(n: int) -> np.ndarray:
+def mean_placing(n: int) -> Array:
     """The mean over the body of log stiffness less log density, (n, 2)."""
     return np.tile([1.0 / n, -1.0 / n], (n, 1))
 
 
-def find_places(seen: list[Seen], fields: np.ndarray, size: np.ndarray, history: int) -> np.ndarray:
+def find_places(seen: list[Seen], fields: Array, size: Array, history: int) -> Array:
     """``placing`` (n, 2) from episodes and their Φ (E, n, 2); ``size`` (R,) of the modes, above 0."""
     n = fields.shape[1]
     uniform = mean_placing(n)
@@ -69,8 +70,8 @@ def find_places(seen: list[Seen], fields: np.ndarray, size: np.ndarray, history:
 
 
 def _best_softness(
-    weight: np.ndarray, response: np.ndarray, seen: list[Seen], trials: np.ndarray, history: int
-) -> tuple[np.ndarray, np.ndarray]:
+    weight: Array, response: Array, seen: list[Seen], trials: Array, history: int
+) -> tuple[Array, Array]:
     """The ζ (E,) with the least error of every episode, and the curvature of the squared error there."""
     tried = [errors(weight, response, seen, np.full(len(seen), z), history) ** 2 for z in trials]
     square = np.minimum(tried, np.finfo(float).max / 16)
@@ -81,7 +82,7 @@ def _best_softness(
     return trials[middle] + step * np.clip(0.5 * (low - high) / bend, -1.0, 1.0), bend / step**2
 
 
-def _ridge(flat: np.ndarray, offset: np.ndarray, known: np.ndarray) -> np.ndarray | None:
+def _ridge(flat: Array, offset: Array, known: Array) -> Array | None:
     """Weights (2n,) with flat · weights ≈ offset (E,), rows weighted by ``known``; None where nothing is predicted."""
     rows = np.sqrt(known / known.mean())
     inputs, target = rows[:, None] * flat, rows * offset

@@ -19,6 +19,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from physworld.arrays import Array
+
 NODES = 7  # values of ζ over its span at which no motion may grow
 ROUNDS = 8
 MOST_GROWTH = 1.3  # beyond which eigenvalues are not moved one by one
@@ -26,14 +28,14 @@ MOST_CHANGE = 0.5  # of a weight, between modes of equal size; what would need m
 INSIDE = 1e-3  # distance from the circle that is aimed at
 
 
-def growth(weight: np.ndarray, response: np.ndarray, zeta: float, history: int) -> float:
+def growth(weight: Array, response: Array, zeta: float, history: int) -> float:
     """Largest factor by which a free motion of the modes grows in a step: the spectral radius of C(ζ)."""
     return float(np.abs(np.linalg.eigvals(_companion(weight, response, zeta, history))).max())
 
 
 def without_growth(
-    weight: np.ndarray, response: np.ndarray, size: np.ndarray, span: tuple[float, float], history: int
-) -> tuple[np.ndarray, np.ndarray]:
+    weight: Array, response: Array, size: Array, span: tuple[float, float], history: int
+) -> tuple[Array, Array]:
     """The map, weight (R, F) and response (2, R, L + 1), changed until no free motion grows for ζ within ``span``.
 
     ``size`` (R,): root mean square amplitudes of the modes, above 0.
@@ -65,11 +67,11 @@ def without_growth(
     return weight, response
 
 
-def _most_growth(weight: np.ndarray, response: np.ndarray, zetas: np.ndarray, history: int) -> float:
+def _most_growth(weight: Array, response: Array, zetas: Array, history: int) -> float:
     return max(growth(weight, response, float(zeta), history) for zeta in zetas)
 
 
-def _companion(weight: np.ndarray, response: np.ndarray, zeta: float, history: int) -> np.ndarray:
+def _companion(weight: Array, response: Array, zeta: float, history: int) -> Array:
     """C(ζ), (L, L)."""
     count = len(weight)
     lags = (history + 1) * count
@@ -80,7 +82,7 @@ def _companion(weight: np.ndarray, response: np.ndarray, zeta: float, history: i
     return companion
 
 
-def _to_the_circle(companion: np.ndarray, count: int) -> np.ndarray:
+def _to_the_circle(companion: Array, count: int) -> Array:
     """What to take from the first ``count`` rows (R, L) so that eigenvalues outside the circle lie on it."""
     values, vectors = np.linalg.eig(companion.T)
     outside = np.abs(values) > 1.0

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physworld.arrays import Array
+
 SCALE_FLOOR = 1e-3  # of the largest: what hardly moves must not get a large weight
 POWERS = 2  # of ζ
 
@@ -20,8 +22,8 @@ POWERS = 2  # of ζ
 class Seen:
     """An episode: amplitudes (T, R), what the grips do (T-1-h, D), ζ."""
 
-    amplitudes: np.ndarray
-    drive: np.ndarray
+    amplitudes: Array
+    drive: Array
     softness: float
 
 
@@ -38,8 +40,8 @@ class Choice:
 class Grams:
     """Normal equations, summed over episodes: ``inputs`` (G, G), ``targets`` (G, R), ``rows``: steps in them."""
 
-    inputs: np.ndarray
-    targets: np.ndarray
+    inputs: Array
+    targets: Array
     rows: int
 
     def without(self, other: Grams) -> Grams:
@@ -47,7 +49,7 @@ class Grams:
         return Grams(self.inputs - other.inputs, self.targets - other.targets, self.rows - other.rows)
 
 
-def grams_of(seen: list[Seen], scale: np.ndarray, history: int) -> Grams:
+def grams_of(seen: list[Seen], scale: Array, history: int) -> Grams:
     """The normal equations of episodes, regressors divided by ``scale`` (G,)."""
     inputs = np.zeros((len(scale), len(scale)))
     targets, rows = np.zeros((len(scale), seen[0].amplitudes.shape[1])), 0
@@ -62,7 +64,7 @@ def grams_of(seen: list[Seen], scale: np.ndarray, history: int) -> Grams:
     return Grams(inputs, targets, rows)
 
 
-def scale_of(seen: list[Seen], size: np.ndarray, history: int) -> np.ndarray:
+def scale_of(seen: list[Seen], size: Array, history: int) -> Array:
     """Sizes of the regressors (G,): their spread, not below a share of the largest; ``size`` (R,) of the modes."""
     spread = np.concatenate([s.drive for s in seen]).std(axis=0)
     lagged = np.tile(size, history + 1)
@@ -71,9 +73,7 @@ def scale_of(seen: list[Seen], size: np.ndarray, history: int) -> np.ndarray:
     return np.concatenate([lagged, drive, *[np.append(lagged, 1.0)] * POWERS])
 
 
-def regress(
-    grams: Grams, scale: np.ndarray, choice: Choice, modes: int, history: int
-) -> tuple[np.ndarray, np.ndarray]:
+def regress(grams: Grams, scale: Array, choice: Choice, modes: int, history: int) -> tuple[Array, Array]:
     """Ridge regression of the next amplitudes: weight (R, F) and response (2, R, L + 1) of ``choice``.
 
     ``modes``: how many the normal equations have.
@@ -96,9 +96,7 @@ def regress(
     return solution[:, :own], response
 
 
-def errors(
-    weight: np.ndarray, response: np.ndarray, judged: list[Seen], softness: np.ndarray, history: int
-) -> np.ndarray:
+def errors(weight: Array, response: Array, judged: list[Seen], softness: Array, history: int) -> Array:
     """Root mean square error of all amplitudes in open loop, by episode, (E,).
 
     Those beyond the R fitted are predicted as 0. ``softness`` (E,): the ζ at which each is predicted. Infinite where a
@@ -130,7 +128,7 @@ def errors(
     return np.where(np.isfinite(found), found, np.inf)
 
 
-def _past(amplitudes: np.ndarray, history: int) -> np.ndarray:
+def _past(amplitudes: Array, history: int) -> Array:
     """[a^t … a^{t-h}] for t = h … T-2."""
     t = np.arange(history, len(amplitudes) - 1)
     return np.concatenate([amplitudes[t - lag] for lag in range(history + 1)], axis=1)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
+from physworld.arrays import Array
 from physworld.worldmodel.model.inertia import InertialPrior, InertialStep, one_step_residual
 from physworld.worldmodel.priors.chain import ChainPrior
 from physworld.worldmodel.priors.chain_step import ChainStep
@@ -61,5 +61,5 @@ class PriorStep(nn.Module):
         return one_step_residual(self, positions, phi, self.mean.shape[0], self.history)
 
 
-def _single(values: np.ndarray) -> Tensor:
+def _single(values: Array) -> Tensor:
     return torch.as_tensor(values, dtype=torch.float32)

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import numpy as np
 from fastapi import APIRouter, Query, Response
 
+from physworld.arrays import Array
 from physworld_schemas.arrays import FARTHEST_M, ArrayInput, EncodedArray, array_of
 from physworld_schemas.base import FieldError, Page
 from physworld_schemas.job import Progress
@@ -112,7 +113,7 @@ def invalid(field: str, message: str) -> ApiProblem:
     return ApiProblem(422, "invalid_request", message, errors=[FieldError(loc=["body", field], msg=message)])
 
 
-def read_array(value: ArrayInput, field: str, dimensions: tuple[int, ...], most: float) -> np.ndarray:
+def read_array(value: ArrayInput, field: str, dimensions: tuple[int, ...], most: float) -> Array:
     """The values, finite and within ±``most``. Raises ApiProblem, 422, with the place and the numbers."""
     try:
         return array_of(value, field, dimensions, most)

@@ -16,6 +16,7 @@ from physworld_client.cli.options import Data, Json, Token, Url
 from physworld_client.cli.output import print_json, stderr, stdout
 from physworld_client.errors import PhysWorldError
 from physworld_client.resources import LATEST
+from physworld_client.types import Array
 from physworld_schemas.plan import Plan, PlanConfig, PlanLimits
 from physworld_schemas.rollout import Part
 
@@ -126,7 +127,7 @@ def _print_plan(plan: Plan, out: Path) -> None:
     )
 
 
-def _controllers(path: Path) -> dict[str, np.ndarray]:
+def _controllers(path: Path) -> dict[str, Array]:
     """From an npz, or from the ``suggested_experiment`` of a trace's report (JSON)."""
     if path.suffix == ".json":
         try:
@@ -146,7 +147,7 @@ def _controllers(path: Path) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _goal(path: Path) -> tuple[dict[int, Sequence[float]] | None, np.ndarray | None]:
+def _goal(path: Path) -> tuple[dict[int, Sequence[float]] | None, Array | None]:
     """Places (x, y, z) [m] by the number of their point, or a shape (M, 3) [m]. Raises PhysWorldError."""
     arrays = _npz(path)
     if not {"index", "places"} <= arrays.keys():
@@ -167,14 +168,14 @@ def _goal(path: Path) -> tuple[dict[int, Sequence[float]] | None, np.ndarray | N
     return points, None
 
 
-def _npz(path: Path) -> dict[str, np.ndarray]:
+def _npz(path: Path) -> dict[str, Array]:
     try:
         return arrays_of(path.read_bytes())
     except OSError as error:
         raise PhysWorldError(f"{path} cannot be read: {error}") from error
 
 
-def _write(path: Path, arrays: dict[str, np.ndarray]) -> None:
+def _write(path: Path, arrays: dict[str, Array]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays)

@@ -11,12 +11,11 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Literal, Protocol
 
-import numpy as np
-
 from physworld_client.errors import ExportRefused
 from physworld_client.export.lerobot import LeRobotWriter
 from physworld_client.export.npz import NpzWriter
 from physworld_client.export.ply import PlyWriter
+from physworld_client.types import Array
 from physworld_schemas.dataset import Dataset
 
 Format = Literal["npz", "ply", "lerobot"]
@@ -31,7 +30,7 @@ DATASET_FILE = "dataset.json"
 class Writer(Protocol):
     """What every format has."""
 
-    def add(self, index: int, arrays: Mapping[str, np.ndarray]) -> None:
+    def add(self, index: int, arrays: Mapping[str, Array]) -> None:
         """Write one episode; ``arrays`` are those of ``datasets.episode``."""
 
     def finish(self) -> None:

@@ -31,6 +31,7 @@ import numpy as np
 from physworld_client.errors import ExportRefused
 from physworld_client.export.properties import attributes_of, property_names, scalars_of
 from physworld_client.export.sampling import spread_points
+from physworld_client.types import Array
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -77,7 +78,7 @@ class LeRobotWriter:
         self._written_bytes = 0
         self._writer: Any = None
 
-    def add(self, index: int, arrays: Mapping[str, np.ndarray]) -> None:
+    def add(self, index: int, arrays: Mapping[str, Array]) -> None:
         """Write one episode's frames; ``index`` is kept in ``meta/physworld.json``, the format counts on its own."""
         attributes = attributes_of(arrays)
         self._check(index, arrays, attributes)
@@ -129,7 +130,7 @@ class LeRobotWriter:
         for name, content in (("info", self._info()), ("stats", stats), ("physworld", own)):
             (self._folder / f"meta/{name}.json").write_text(json.dumps(content, indent=4, ensure_ascii=False))
 
-    def _check(self, index: int, arrays: Mapping[str, np.ndarray], attributes: Mapping[str, Any]) -> None:
+    def _check(self, index: int, arrays: Mapping[str, Array], attributes: Mapping[str, Any]) -> None:
         """Take the first episode's size, clock and what it was made with, and refuse another one's that differ."""
         times, particles, controllers = arrays["times"], arrays["particles"], arrays["controllers"]
         step = float(times[-1] - times[0]) / max(len(times) - 1, 1)
@@ -151,8 +152,8 @@ class LeRobotWriter:
             )
 
     def _columns(
-        self, arrays: Mapping[str, np.ndarray], attributes: Mapping[str, Any], number: int, task: int
-    ) -> dict[str, np.ndarray]:
+        self, arrays: Mapping[str, Array], attributes: Mapping[str, Any], number: int, task: int
+    ) -> dict[str, Array]:
         """Features of one episode by name, each (T, …), (T,) where there is one number."""
         times, controllers = arrays["times"], arrays["controllers"]
         frames = len(times)
@@ -228,12 +229,12 @@ class _Totals:
     """Statistics of all episodes from those of each: exact, without the frames."""
 
     def __init__(self) -> None:
-        self._all: list[dict[str, dict[str, np.ndarray]]] = []
+        self._all: list[dict[str, dict[str, Array]]] = []
 
-    def add(self, statistics: dict[str, dict[str, np.ndarray]]) -> None:
+    def add(self, statistics: dict[str, dict[str, Array]]) -> None:
         self._all.append(statistics)
 
-    def merged(self) -> dict[str, dict[str, np.ndarray]]:
+    def merged(self) -> dict[str, dict[str, Array]]:
         found = {}
         for name in self._all[0]:
             parts = {key: np.stack([one[name][key] for one in self._all]) for key in self._all[0][name]}
@@ -250,7 +251,7 @@ class _Totals:
         return found
 
 
-def _statistics(values: np.ndarray) -> dict[str, np.ndarray]:
+def _statistics(values: Array) -> dict[str, Array]:
     """Over the frames of one episode's feature (T, …), each (n,)."""
     flat = values.reshape(len(values), -1).astype(np.float64)
     kind = np.int64 if values.dtype.kind == "i" else np.float64
@@ -263,7 +264,7 @@ def _statistics(values: np.ndarray) -> dict[str, np.ndarray]:
     }
 
 
-def _table(columns: Mapping[str, np.ndarray]) -> pa.Table:
+def _table(columns: Mapping[str, Array]) -> pa.Table:
     """Columns (T,) as plain values, (T, n) as lists of fixed length."""
     import pyarrow as pa
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from physworld_client.errors import ExportRefused
+from physworld_client.types import Array
 
 
 class NpzWriter:
@@ -17,7 +18,7 @@ class NpzWriter:
         self._folder = folder
         self._count = 0
 
-    def add(self, index: int, arrays: Mapping[str, np.ndarray]) -> None:
+    def add(self, index: int, arrays: Mapping[str, Array]) -> None:
         """Write one episode."""
         np.savez(self._folder / f"episode-{index:05d}.npz", allow_pickle=False, **arrays)
         self._count += 1

@@ -17,6 +17,7 @@ import numpy as np
 from physworld_client.errors import ExportRefused
 from physworld_client.export.properties import attributes_of, property_names
 from physworld_client.export.sampling import spread_points
+from physworld_client.types import Array
 
 PLACE = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("kind", "u1")]
 PLY_TYPES = {"<f4": "float", "|u1": "uchar"}
@@ -29,7 +30,7 @@ class PlyWriter:
         self._folder, self._points = folder, points
         self._count = 0
 
-    def add(self, index: int, arrays: Mapping[str, np.ndarray]) -> None:
+    def add(self, index: int, arrays: Mapping[str, Array]) -> None:
         """Write one episode's frames."""
         particles, controllers = arrays["particles"], arrays["controllers"]
         chosen = spread_points(particles[0], self._points)
@@ -57,7 +58,7 @@ class PlyWriter:
             raise ExportRefused("the dataset holds no episode")
 
 
-def ply_bytes(vertices: np.ndarray) -> bytes:
+def ply_bytes(vertices: Array) -> bytes:
     """A binary PLY of one element, ``vertex``, with the fields of a structured array (n,), ``PLACE`` and more."""
     names = vertices.dtype.names or ()
     lines = [f"property {PLY_TYPES[vertices.dtype[name].str]} {name}" for name in names]

@@ -6,17 +6,17 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
+from physworld_client.types import Array
 
 COLUMNS = ("log_modulus", "log_density", "log_friction")
 
 
-def property_names(arrays: Mapping[str, np.ndarray]) -> tuple[str, ...]:
+def property_names(arrays: Mapping[str, Array]) -> tuple[str, ...]:
     """Names of the columns of ``properties`` (P, 2), or (P, 3) where the ground's friction was perturbed as a field."""
     return COLUMNS[: arrays["properties"].shape[1]]
 
 
-def attributes_of(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+def attributes_of(arrays: Mapping[str, Array]) -> dict[str, Any]:
     """The episode's attributes; empty where it has none."""
     return json.loads(str(arrays["attributes"])) if "attributes" in arrays else {}
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from physworld_client.types import Array
 
-def spread_points(points: np.ndarray, count: int | None) -> np.ndarray:
+
+def spread_points(points: Array, count: int | None) -> Array:
     """Indices (n,) of at most ``count`` of the points (P, 3) [m], ascending: each the farthest from those before it.
 
     The first one is the nearest to the middle, so equal points give equal indices. None: all of them.
