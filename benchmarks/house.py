@@ -1,0 +1,238 @@
+"""``python -m benchmarks.house [--tree FOLDER] [--json FILE] [--page FILE]``: how the house is built, in numbers.
+
+Counts files and lines of every room, short files, long functions, public functions without an Args section, modules
+that no strict type checker reads, copies of the network's step, and the files that each kind of addition touches.
+``--tree`` names another checkout of the repository; ``--page`` writes the counts beside those of
+``benchmarks/records/house_before.json`` between the markers of a page. Nothing is imported from the tree that is
+counted, so that any commit can be: a room is a folder, and files are those that git tracks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import json
+import subprocess
+import tomllib
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from benchmarks.house_lists import ADDITIONS, STEPS
+
+ROOT = Path(__file__).resolve().parents[1]
+BEFORE = Path(__file__).parent / "records" / "house_before.json"
+PRODUCT = ("physworld", "scenes", "schemas", "storage", "workers", "services", "clients")
+BESIDE = ("benchmarks", "scripts", "tests")
+INNER = ("physworld", "storage", "services")
+"""Folders whose subfolders are rooms of their own."""
+SHORT_FILE, LONG_FUNCTION, MANY_PARAMETERS = 60, 80, 4
+CALLED_BY_FRAMEWORKS = ("wp", "router", "app", "pages", "command")
+"""Decorators of kernels, routes and commands: no Python caller reads an Args section of theirs."""
+
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+
+
+def tracked(tree: Path) -> list[Path]:
+    """The Python files of a checkout, relative to it."""
+    listed = subprocess.run(
+        ["git", "-C", str(tree), "ls-files", "*.py"], capture_output=True, text=True, check=True
+    )
+    return [Path(line) for line in listed.stdout.splitlines() if (tree / line).is_file()]
+
+
+def room_of(path: Path) -> str:
+    """The room of a file: its top-level folder, of large ones with the folder below."""
+    parts = path.parts
+    if parts[0] in INNER and len(parts) > 2 and parts[1] != "migrations":
+        return "/".join(parts[:2])
+    return parts[0]
+
+
+def functions(module: ast.Module) -> Iterator[tuple[Function, ast.ClassDef | None]]:
+    """Every function and method of a module that is not nested in another function, with its class."""
+    for node in module.body:
+        if isinstance(node, Function):
+            yield node, None
+        elif isinstance(node, ast.ClassDef):
+            for inner in node.body:
+                if isinstance(inner, Function):
+                    yield inner, node
+
+
+def all_functions(module: ast.Module) -> Iterator[Function]:
+    """Every function, nested ones among them."""
+    return (node for node in ast.walk(module) if isinstance(node, Function))
+
+
+def wants_args(function: Function, owner: ast.ClassDef | None) -> bool:
+    """Whether it is public, is called by people, has four parameters or more, and no Args section tells of them.
+
+    A constructor's arguments are told by its class; a method that overrides another is counted like any other.
+    """
+    name = function.name
+    public = name == "__init__" or not name.startswith("_")
+    if not public or (owner is not None and owner.name.startswith("_")):
+        return False
+    if any(_base_name(decorator) in CALLED_BY_FRAMEWORKS for decorator in function.decorator_list):
+        return False
+    given = function.args
+    count = len([*given.posonlyargs, *given.args, *given.kwonlyargs])
+    is_static = any(_base_name(decorator) == "staticmethod" for decorator in function.decorator_list)
+    count -= owner is not None and not is_static
+    texts = [ast.get_docstring(function) or ""]
+    if name == "__init__" and owner is not None:
+        texts.append(ast.get_docstring(owner) or "")
+    return count >= MANY_PARAMETERS and not any("Args:" in text for text in texts)
+
+
+def _base_name(node: ast.expr) -> str:
+    """The first name of a decorator: ``wp`` of ``@wp.kernel``."""
+    while not isinstance(node, ast.Name):
+        if isinstance(node, ast.Attribute):
+            node = node.value
+        elif isinstance(node, ast.Call):
+            node = node.func
+        else:
+            return ""
+    return node.id
+
+
+def unchecked(tree: Path, product: list[Path]) -> tuple[int, int]:
+    """How many modules no type checker reads, and how many it does not read strictly."""
+    settings = tomllib.loads((tree / "pyproject.toml").read_text())["tool"].get("mypy", {})
+    folders = {
+        "clients" if name == "physworld_client" else name.removeprefix("physworld_")
+        for name in settings.get("packages", [])
+    }
+    read = sum(path.parts[0] in folders for path in product)
+    return len(product) - read, len(product) - (read if settings.get("strict") else 0)
+
+
+def counts(tree: Path) -> dict[str, Any]:
+    """Everything that is counted of a checkout."""
+    files = tracked(tree)
+    product = [path for path in files if path.parts[0] in PRODUCT]
+    rooms: dict[str, Counter[str]] = {}
+    lengths: dict[Path, int] = {}
+    found: Counter[str] = Counter()
+    for path in files:
+        if path.parts[0] not in PRODUCT + BESIDE:
+            continue
+        text = (tree / path).read_text()
+        lengths[path] = len(text.splitlines())
+        room = rooms.setdefault(room_of(path), Counter())
+        room.update(files=1, lines=lengths[path])
+        if path.parts[0] not in PRODUCT:
+            continue
+        module = ast.parse(text)
+        short = lengths[path] < SHORT_FILE and path.name != "__init__.py"
+        long = sum((f.end_lineno or f.lineno) - f.lineno + 1 > LONG_FUNCTION for f in all_functions(module))
+        bare = sum(wants_args(function, owner) for function, owner in functions(module))
+        for counter in (room, found):
+            counter.update(short=short, long=long, bare=bare)
+    unread, loose = unchecked(tree, product)
+    whole = sorted(lengths[path] for path in product if path.name != "__init__.py")
+    return {
+        "commit": subprocess.run(
+            ["git", "-C", str(tree), "rev-parse", "--short=7", "HEAD"],
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout.strip(),
+        "product_files": len(product),
+        "product_lines": sum(lengths[path] for path in product),
+        "median_lines": whole[len(whole) // 2],
+        "largest_flat_folder": max(Counter(path.parent for path in product).values()),
+        "short_files": found["short"],
+        "long_functions": found["long"],
+        "functions_without_args": found["bare"],
+        "modules_without_types": unread,
+        "modules_without_strict_types": loose,
+        "steps": sorted(name for name, places in STEPS.items() if any(_defines(tree, *at) for at in places)),
+        "additions": {kind: _touched(tree, layouts) for kind, layouts in ADDITIONS.items()},
+        "rooms": {name: dict(rooms[name]) for name in sorted(rooms)},
+    }
+
+
+def _defines(tree: Path, path: str, text: str) -> bool:
+    return (tree / path).is_file() and text in (tree / path).read_text()
+
+
+def _touched(tree: Path, layouts: tuple[tuple[str, ...], ...]) -> list[str]:
+    """The files of the first layout all of which exist; names in capitals are the new files themselves."""
+    for layout in layouts:
+        if all(Path(path).stem.isupper() or (tree / path).is_file() for path in layout):
+            return list(layout)
+    missing = [path for path in layouts[0] if not (tree / path).is_file()]
+    raise SystemExit(f"benchmarks/house_lists.py names files that {tree} does not have: {', '.join(missing)}")
+
+
+SINGLE = {
+    "product_files": "files of the product",
+    "product_lines": "lines of the product",
+    "median_lines": "lines of its median file",
+    "largest_flat_folder": "files of its largest flat folder",
+    "short_files": f"files under {SHORT_FILE} lines",
+    "long_functions": f"functions over {LONG_FUNCTION} lines",
+    "functions_without_args": f"public functions with {MANY_PARAMETERS} parameters or more and no Args section",
+    "modules_without_types": "modules that no type checker reads",
+    "modules_without_strict_types": "modules that no strict type checker reads",
+}
+
+
+def markdown(before: dict[str, Any], now: dict[str, Any]) -> str:
+    """Two tables: what is counted once, and the rooms."""
+    lines = [f"| | before ({before['commit']}) | now |", "|---|---|---|"]
+    lines += [f"| {text} | {before[key]} | {now[key]} |" for key, text in SINGLE.items()]
+    lines.append(f"| distinct copies of the network's step | {len(before['steps'])} | {len(now['steps'])} |")
+    lines += [
+        f"| files to touch for {kind} | {len(before['additions'][kind])} | {len(now['additions'][kind])} |"
+        for kind in now["additions"]
+    ]
+    lines += ["", "| room | files before | lines before | files | lines | short | long | no Args |"]
+    lines.append("|---|---|---|---|---|---|---|---|")
+    for name in sorted({*before["rooms"], *now["rooms"]}):
+        old, new = before["rooms"].get(name, {}), now["rooms"].get(name, {})
+        cells = [old.get("files", ""), old.get("lines", ""), new.get("files", ""), new.get("lines", "")]
+        cells += [new.get(key, "") for key in ("short", "long", "bare")]
+        lines.append(f"| {name} | " + " | ".join(map(str, cells)) + " |")
+    lines += [
+        "",
+        "The steps: " + "; ".join(now["steps"]) + ". The files of an addition, beside its tests and docs:",
+        "",
+    ]
+    lines += [
+        f"- {kind}: " + ", ".join(f"`{path}`" for path in paths) for kind, paths in now["additions"].items()
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def write_page(page: Path, text: str) -> None:
+    """Replaces what lies between the markers of a page."""
+    begin, end = "<!-- house: begin -->\n", "<!-- house: end -->"
+    head, rest = page.read_text().split(begin, 1)
+    page.write_text(head + begin + text + end + rest.split(end, 1)[1])
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n\n")[0])
+    parser.add_argument("--tree", type=Path, default=ROOT, help="the checkout to count")
+    parser.add_argument("--json", type=Path, help="write the counts to this file")
+    parser.add_argument("--page", type=Path, help="write the tables between this page's markers")
+    given = parser.parse_args()
+    now = counts(given.tree)
+    if given.json:
+        given.json.write_text(json.dumps(now, indent=1) + "\n")
+    before = json.loads(BEFORE.read_text()) if BEFORE.is_file() else now
+    text = markdown(before, now)
+    if given.page:
+        write_page(given.page, text)
+    print(json.dumps(now, indent=1))
+    print(text)
+
+
+if __name__ == "__main__":
+    main()
