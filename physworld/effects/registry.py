@@ -1,4 +1,6 @@
-"""Every effect by name, in the order in which a twin applies them. A new one is a file beside this one and a line here.
+"""Every effect by name, in the order in which a twin applies them.
+
+A new one is a file beside this one and a line here; other packages add theirs after ours (:mod:`physworld.catalogue`).
 
 Shape and fields come first, then what changes gravity (buoyancy scales it, wind adds to it), then forces and stresses,
 contacts and grips; the growth of the law's stiffness puts itself before every other term. A camera scales, then
@@ -7,6 +9,7 @@ stamps, smooths and drifts.
 
 from __future__ import annotations
 
+from physworld.catalogue import with_plugins
 from physworld.effects.actuation_lag import ActuationLag
 from physworld.effects.adhesion import Adhesion
 from physworld.effects.air_drag_linear import AirDragLinear
@@ -35,36 +38,36 @@ from physworld.effects.viscosity_kelvin_voigt import ViscosityKelvinVoigt
 from physworld.effects.wind import Wind
 from physworld.errors import UnknownEffect
 
-EFFECTS: dict[str, type[Effect]] = {
-    kind.name: kind
-    for kind in (
-        RestShape,
-        StiffnessField,
-        MassField,
-        GravityTilt,
-        Buoyancy,
-        Wind,
-        AirDragLinear,
-        AirDragQuadratic,
-        ViscosityKelvinVoigt,
-        ViscoelasticMaxwell,
-        Anisotropy,
-        StrainStiffening,
-        Plasticity,
-        Tether,
-        RegionForce,
-        GroundFriction,
-        Adhesion,
-        ActuationLag,
-        ClampOffset,
-        GripSlip,
-        TimeVaryingStiffness,
-        MeasurementScale,
-        MeasurementClock,
-        MeasurementSmoothing,
-        MeasurementDrift,
-    )
-}
+_BUILT_IN: tuple[type[Effect], ...] = (
+    RestShape,
+    StiffnessField,
+    MassField,
+    GravityTilt,
+    Buoyancy,
+    Wind,
+    AirDragLinear,
+    AirDragQuadratic,
+    ViscosityKelvinVoigt,
+    ViscoelasticMaxwell,
+    Anisotropy,
+    StrainStiffening,
+    Plasticity,
+    Tether,
+    RegionForce,
+    GroundFriction,
+    Adhesion,
+    ActuationLag,
+    ClampOffset,
+    GripSlip,
+    TimeVaryingStiffness,
+    MeasurementScale,
+    MeasurementClock,
+    MeasurementSmoothing,
+    MeasurementDrift,
+)
+EFFECTS: dict[str, type[Effect]] = with_plugins(
+    "physworld.effects", Effect, {kind.name: kind for kind in _BUILT_IN}
+)
 
 
 def in_order(effects: tuple[Effect, ...]) -> list[Effect]:

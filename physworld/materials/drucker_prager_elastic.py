@@ -20,3 +20,5 @@ class DruckerPragerElastic(Hencky):
     """Quadratic Hencky law of granular matter, without yield: see the module's text."""
 
     name: ClassVar[str] = "drucker_prager_elastic"
+    title: ClassVar[str] = "Elastic part of Drucker-Prager plasticity"
+    use: ClassVar[str] = "sand and soil before they yield"

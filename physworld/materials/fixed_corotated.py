@@ -62,6 +62,9 @@ class FixedCorotated(SolidLaw):
     """Fixed corotated solid: see the module's text."""
 
     name: ClassVar[str] = "fixed_corotated"
+    title: ClassVar[str] = "Fixed corotated solid"
+    equation: ClassVar[str] = "W = mu |F - R|^2 + lambda/2 (J - 1)^2"
+    use: ClassVar[str] = "bodies that are squeezed flat or inside out and come back, which is not reported"
     stress: ClassVar[Stress] = STRESS
 
     def energy_density(self, F: Array) -> Array:

@@ -118,6 +118,11 @@ class Hencky(SolidLaw):
     """Hencky solid: see the module's text."""
 
     name: ClassVar[str] = "hencky"
+    title: ClassVar[str] = "Hencky solid"
+    equation: ClassVar[str] = "W = mu ln U:ln U + lambda/2 (ln J)^2"
+    use: ClassVar[str] = (
+        "stretches to about 1.3, the elastic part of plasticity; softens beyond a stretch of e"
+    )
     stress: ClassVar[Stress] = STRESS
 
     def energy_density(self, F: Array) -> Array:

@@ -1,9 +1,13 @@
-"""Every law by name: what a scene may declare, a calibration may choose and an archive may hold."""
+"""Every elastic law by name: what a calibration may choose and an archive may hold.
+
+A new one is a file beside this one and a line here; other packages add theirs (:mod:`physworld.catalogue`).
+"""
 
 from __future__ import annotations
 
 from dataclasses import fields
 
+from physworld.catalogue import with_plugins
 from physworld.materials.drucker_prager_elastic import DruckerPragerElastic
 from physworld.materials.fixed_corotated import FixedCorotated
 from physworld.materials.hencky import Hencky
@@ -14,15 +18,21 @@ from physworld.materials.solid import SolidLaw
 from physworld.materials.st_venant_kirchhoff import StVenantKirchhoff
 from physworld.materials.transversely_isotropic import TransverselyIsotropic
 
-SOLID_LAWS: dict[str, type[SolidLaw]] = {
-    law.name: law
-    for law in (
-        SolidLaw, FixedCorotated, StVenantKirchhoff, Hencky, DruckerPragerElastic, TransverselyIsotropic,
-    )
-}  # fmt: skip
-SHEET_LAWS: dict[str, type[SheetLaw]] = {law.name: law for law in (SheetLaw, OrthotropicSheetLaw)}
-ROD_LAWS: dict[str, type[RodLaw]] = {RodLaw.name: RodLaw}
-_OF_DIMENSION: dict[int, dict[str, type]] = {1: ROD_LAWS, 2: SHEET_LAWS, 3: SOLID_LAWS}
+_BUILT_IN: tuple[type[Law], ...] = (
+    SolidLaw,
+    FixedCorotated,
+    StVenantKirchhoff,
+    Hencky,
+    DruckerPragerElastic,
+    TransverselyIsotropic,
+    SheetLaw,
+    OrthotropicSheetLaw,
+    RodLaw,
+)
+ELASTIC_LAWS: dict[str, type[Law]] = with_plugins("physworld.laws", Law, {law.name: law for law in _BUILT_IN})
+SOLID_LAWS = {name: law for name, law in ELASTIC_LAWS.items() if issubclass(law, SolidLaw)}
+SHEET_LAWS = {name: law for name, law in ELASTIC_LAWS.items() if issubclass(law, SheetLaw)}
+ROD_LAWS = {name: law for name, law in ELASTIC_LAWS.items() if issubclass(law, RodLaw)}
 
 
 def law_class(name: str, dimension: int) -> type[Law]:
@@ -34,7 +44,7 @@ def law_class(name: str, dimension: int) -> type[Law]:
     Raises:
         ValueError: there is no such law; the message lists those of that dimension.
     """
-    laws = _OF_DIMENSION[dimension]
+    laws = {name: law for name, law in ELASTIC_LAWS.items() if law.dimension == dimension}
     name = {law.__name__: key for key, law in laws.items()}.get(name, name)
     if name not in laws:
         raise ValueError(f"no law {name!r} for a body of dimension {dimension}; there are {sorted(laws)}")
@@ -47,7 +57,6 @@ def with_law(law: Law, name: str) -> Law:
     Raises:
         ValueError: there is no such law for that shape.
     """
-    dimension = 3 if isinstance(law, SolidLaw) else 2 if isinstance(law, SheetLaw) else 1
-    target = law_class(name, dimension)
+    target = law_class(name, law.dimension)
     shared = {f.name for f in fields(target)} & {f.name for f in fields(law)}
     return target(**{key: getattr(law, key) for key in sorted(shared)})

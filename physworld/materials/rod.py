@@ -9,33 +9,36 @@ held at both (Bergou et al. 2008): there GJ = ``torsion_ratio`` EI counts, as :m
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from physworld.arrays import Array
+from physworld.catalogue import Quantity
 
 
 @dataclass(frozen=True)
 class RodLaw:
-    """Rope or rod, straight at rest.
+    """Rope or rod, straight at rest; the density is per length.
 
-    Attributes:
-        stretching_n: EA, force per strain [N].
-        bending_n_m2: B = EI, bending stiffness [N m^2].
-        relaxation_s: Kelvin-Voigt time tau of bending.
-        density_kg_m: mass per length.
-        torsion_ratio: GJ / EI, torsional over bending stiffness: 1 / (1 + nu) of a round section, the default that of
-            nu = 0.3. It counts where grips hold the section at two places; 0: no twist is carried.
+    The default of ``torsion_ratio``, 1 / (1 + nu), is that of a round section with nu = 0.3. It counts where grips
+    hold the section at two places; 0: no twist is carried.
     """
 
-    name: ClassVar[str] = "rod"
+    dimension: ClassVar[int] = 1
 
-    stretching_n: float
-    bending_n_m2: float
-    relaxation_s: float = 0.0
-    density_kg_m: float = 0.05
-    torsion_ratio: float = 1.0 / 1.3
+    name: ClassVar[str] = "rod"
+    title: ClassVar[str] = "Rope or rod, straight at rest"
+    equation: ClassVar[str] = "W = EA/2 (|x'| - 1)^2 + B/2 |k|^2 + GJ/2 (Theta/L)^2"
+    use: ClassVar[str] = "ropes, cables, rods"
+
+    stretching_n: Annotated[float, Quantity("N", "EA, force per strain", 0.0)]
+    bending_n_m2: Annotated[float, Quantity("N m^2", "B = EI, bending stiffness", 0.0)]
+    relaxation_s: Annotated[float, Quantity("s", "Kelvin-Voigt time tau of bending", 0.0)] = 0.0
+    density_kg_m: Annotated[float, Quantity("kg/m", "mass per length", 0.0)] = 0.05
+    torsion_ratio: Annotated[float, Quantity("1", "GJ / EI, torsional over bending stiffness", 0.0)] = (
+        1.0 / 1.3
+    )
 
     @property
     def torsion_n_m2(self) -> float:

@@ -12,38 +12,40 @@ isotropic sheet has all five at 1.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from physworld.arrays import Array
+from physworld.catalogue import Quantity
 
 
 @dataclass(frozen=True)
 class SheetLaw:
     """Thin sheet, the same along both axes; isotropic unless the shape of its bending energy says otherwise.
 
-    Attributes:
-        membrane_n_m: K = h E / (1 - nu^2), in-plane stiffness [N/m].
-        bending_n_m: D, bending stiffness [N m].
-        poissons_ratio: of the sheet.
-        relaxation_s: Kelvin-Voigt time tau of stretch and bending.
-        density_kg_m2: mass per area.
-        bending_twist_ratio: t, twisting stiffness over an isotropic sheet's. A homogeneous plate has 1; a mesh of
-            triangles whose edges bend like hinges has about 3.
-        bending_coupling: c, how much a curvature along one axis calls for the opposite one along the other, over an
-            isotropic sheet's; the energy is positive while abs(c nu) is below 1.
+    A homogeneous plate has ``bending_twist_ratio`` 1, a mesh of triangles whose edges bend like hinges about 3.
+    ``bending_coupling`` says how much a curvature along one axis calls for the opposite one along the other; the energy
+    is positive while abs(c nu) is below 1.
     """
 
-    name: ClassVar[str] = "isotropic_sheet"
+    dimension: ClassVar[int] = 2
 
-    membrane_n_m: float
-    bending_n_m: float
-    poissons_ratio: float = 0.3
-    relaxation_s: float = 0.0
-    density_kg_m2: float = 0.3
-    bending_twist_ratio: float = 1.0
-    bending_coupling: float = 1.0
+    name: ClassVar[str] = "isotropic_sheet"
+    title: ClassVar[str] = "Thin isotropic sheet, flat at rest"
+    equation: ClassVar[str] = (
+        "W = K/2 [e11^2 + e22^2 + 2 nu e11 e22 + 2 (1 - nu) e12^2]"
+        " + D/2 [k11^2 + k22^2 + 2 nu c k11 k22 + 2 (1 - nu) t k12^2]"
+    )
+    use: ClassVar[str] = "paper, film, rubber sheet, felt"
+
+    membrane_n_m: Annotated[float, Quantity("N/m", "K = h E / (1 - nu^2), in-plane stiffness", 0.0)]
+    bending_n_m: Annotated[float, Quantity("N m", "D, bending stiffness", 0.0)]
+    poissons_ratio: Annotated[float, Quantity("1", "nu, Poisson's ratio", -1.0, 0.5)] = 0.3
+    relaxation_s: Annotated[float, Quantity("s", "Kelvin-Voigt time tau of stretch and bending", 0.0)] = 0.0
+    density_kg_m2: Annotated[float, Quantity("kg/m^2", "mass per area", 0.0)] = 0.3
+    bending_twist_ratio: Annotated[float, Quantity("1", "t, twisting stiffness over a plate's", 0.0)] = 1.0
+    bending_coupling: Annotated[float, Quantity("1", "c, coupling of the curvatures over a plate's")] = 1.0
 
     @property
     def membrane_shape(self) -> tuple[float, float, float, float]:
@@ -71,19 +73,21 @@ class SheetLaw:
 
 @dataclass(frozen=True)
 class OrthotropicSheetLaw(SheetLaw):
-    """Woven cloth: warp along the sheet's first axis, weft along its second; see the module's text.
-
-    Attributes:
-        weft_ratio: r, in-plane stiffness along the weft over the warp's.
-        shear_ratio: s, shear stiffness over an isotropic sheet's; about 0.01 to 0.1 for woven cloth.
-        bending_weft_ratio: b, bending stiffness along the weft over the warp's.
-    """
+    """Woven cloth: warp along the sheet's first axis, weft along its second; see the module's text."""
 
     name: ClassVar[str] = "orthotropic_sheet"
+    title: ClassVar[str] = "Woven sheet, flat at rest"
+    equation: ClassVar[str] = (
+        "W = K/2 [e11^2 + r e22^2 + 2 nu sqrt(r) e11 e22 + 2 (1 - nu) s e12^2]"
+        " + D/2 [k11^2 + b k22^2 + 2 nu c sqrt(b) k11 k22 + 2 (1 - nu) t k12^2]"
+    )
+    use: ClassVar[str] = (
+        "woven cloth: warp and weft along the sheet's axes, shear far softer (s about 0.01 to 0.1)"
+    )
 
-    weft_ratio: float = 1.0
-    shear_ratio: float = 1.0
-    bending_weft_ratio: float = 1.0
+    weft_ratio: Annotated[float, Quantity("1", "r, in-plane stiffness, weft over warp", 0.0)] = 1.0
+    shear_ratio: Annotated[float, Quantity("1", "s, shear stiffness over an isotropic sheet's", 0.0)] = 1.0
+    bending_weft_ratio: Annotated[float, Quantity("1", "b, bending stiffness, weft over warp", 0.0)] = 1.0
 
     @property
     def membrane_shape(self) -> tuple[float, float, float, float]:

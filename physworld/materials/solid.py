@@ -7,11 +7,12 @@ its stress (native text) and its energy density (numpy, for ledgers and tests); 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from physworld.arrays import Array
+from physworld.catalogue import Quantity
 from physworld.materials import neo_hookean
 from physworld.materials.stress import Stress
 
@@ -20,20 +21,22 @@ from physworld.materials.stress import Stress
 class SolidLaw:
     """Compressible neo-Hookean solid: see :mod:`physworld.materials.neo_hookean`; the base of the other laws.
 
-    Attributes:
-        youngs_modulus_pa, poissons_ratio: linear elastic constants at small strain.
-        viscosity_pa_s: Kelvin-Voigt eta, Cauchy stress + 2 eta d.
-        density_kg_m3: mass per volume.
+    Every law says of itself its ``name``, a ``title``, its ``equation`` and its ``use``: what it is for.
     """
 
+    dimension: ClassVar[int] = 3
+
     name: ClassVar[str] = "neo_hookean"
+    title: ClassVar[str] = "Compressible neo-Hookean solid"
+    equation: ClassVar[str] = "W = mu/2 (tr C - 3 - 2 ln J) + lambda/2 (ln J)^2"
+    use: ClassVar[str] = "rubber, foam, soft toys; the default"
     stress: ClassVar[Stress] = neo_hookean.STRESS
     further_moduli: ClassVar[tuple[str, ...]] = ()  # names of the moduli after mu and lambda
 
-    youngs_modulus_pa: float
-    poissons_ratio: float = 0.35
-    viscosity_pa_s: float = 0.0
-    density_kg_m3: float = 1000.0
+    youngs_modulus_pa: Annotated[float, Quantity("Pa", "E, Young's modulus at small strain", 0.0)]
+    poissons_ratio: Annotated[float, Quantity("1", "nu, Poisson's ratio at small strain", -1.0, 0.5)] = 0.35
+    viscosity_pa_s: Annotated[float, Quantity("Pa s", "Kelvin-Voigt eta: Cauchy stress + 2 eta d", 0.0)] = 0.0
+    density_kg_m3: Annotated[float, Quantity("kg/m^3", "mass per volume", 0.0)] = 1000.0
 
     @property
     def lame(self) -> tuple[float, float]:

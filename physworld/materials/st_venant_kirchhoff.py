@@ -44,6 +44,11 @@ class StVenantKirchhoff(SolidLaw):
     """St. Venant-Kirchhoff solid on the Green strain: see the module's text."""
 
     name: ClassVar[str] = "st_venant_kirchhoff"
+    title: ClassVar[str] = "St. Venant-Kirchhoff solid"
+    equation: ClassVar[str] = "W = mu E:E + lambda/2 (tr E)^2, E = (C - I)/2"
+    use: ClassVar[str] = (
+        "stiff or thin bodies: large turns, small strains; gives way below a stretch of 1/sqrt(3)"
+    )
     stress: ClassVar[Stress] = STRESS
 
     def energy_density(self, F: Array) -> Array:

@@ -10,11 +10,12 @@ which is how fibres are added to another law.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from physworld.arrays import Array
+from physworld.catalogue import Quantity
 from physworld.materials import neo_hookean
 from physworld.materials.solid import SolidLaw
 from physworld.materials.stress import Stress
@@ -37,21 +38,18 @@ STRESS = Stress(
 
 @dataclass(frozen=True)
 class TransverselyIsotropic(SolidLaw):
-    """Neo-Hookean matrix with fibres: see the module's text.
-
-    Attributes:
-        fibre_modulus_pa: E_f.
-        fibre_azimuth_rad: direction of the fibres from x towards y, in the undeformed body.
-        fibre_elevation_rad: from the xy plane towards z.
-    """
+    """Neo-Hookean matrix with fibres: see the module's text."""
 
     name: ClassVar[str] = "transversely_isotropic"
+    title: ClassVar[str] = "Neo-Hookean solid with fibres"
+    equation: ClassVar[str] = "W = W of neo_hookean + E_f/8 (a.C a - 1)^2"
+    use: ClassVar[str] = "fibres along a: wood, muscle, a seam; they bear compression too"
     stress: ClassVar[Stress] = STRESS
     further_moduli: ClassVar[tuple[str, ...]] = ("fibre_modulus",)
 
-    fibre_modulus_pa: float = 0.0
-    fibre_azimuth_rad: float = 0.0
-    fibre_elevation_rad: float = 0.0
+    fibre_modulus_pa: Annotated[float, Quantity("Pa", "E_f, added along the fibres", 0.0)] = 0.0
+    fibre_azimuth_rad: Annotated[float, Quantity("rad", "fibres' direction at rest, from x towards y")] = 0.0
+    fibre_elevation_rad: Annotated[float, Quantity("rad", "the same, from the xy plane towards z")] = 0.0
 
     @property
     def moduli(self) -> tuple[float, ...]:

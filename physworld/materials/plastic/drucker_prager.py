@@ -13,10 +13,12 @@ volumetric strain lost there, and it is added to the trial strain until it is us
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import warp as wp
+
+from physworld.catalogue import Quantity
 
 
 @wp.func
@@ -52,18 +54,17 @@ def _project(
 class DruckerPrager:
     """See the module's text.
 
-    Attributes:
-        friction_angle_rad: phi, between 0 and pi/2.
-        cohesion_pa: c, shear strength without pressure.
-
     Raises:
         ValueError: a friction angle outside (0, pi/2) or a negative cohesion.
     """
 
-    friction_angle_rad: float
-    cohesion_pa: float = 0.0
+    friction_angle_rad: Annotated[float, Quantity("rad", "phi, angle of friction", 0.0, np.pi / 2)]
+    cohesion_pa: Annotated[float, Quantity("Pa", "c, shear strength without pressure", 0.0)] = 0.0
 
     name: ClassVar[str] = "drucker_prager"
+    title: ClassVar[str] = "Drucker-Prager plasticity of grains"
+    equation: ClassVar[str] = "|dev eps| + a (3 lambda + 2 mu) / (2 mu) (tr eps - t) <= 0"
+    use: ClassVar[str] = "sand, soil, snow"
     project: ClassVar[Any] = _project
     initial_memory: ClassVar[float] = 0.0
 

@@ -20,6 +20,9 @@ class Identity:
     """Purely elastic in Hencky strain."""
 
     name: ClassVar[str] = "identity"
+    title: ClassVar[str] = "No plastic flow"
+    equation: ClassVar[str] = "eps stays eps"
+    use: ClassVar[str] = "bodies that do not flow"
     project: ClassVar[Any] = _project
     initial_memory: ClassVar[float] = 0.0
 

@@ -11,9 +11,11 @@ yield stress the finite-strain elastic solid. The volume is kept.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import warp as wp
+
+from physworld.catalogue import Quantity
 
 
 @wp.func
@@ -41,18 +43,19 @@ def _project(
 class StVenantKirchhoff:
     """See the module's text.
 
-    Attributes:
-        yield_stress_pa: sigma_y, stress at which simple tension starts to flow; infinite for an elastic solid.
-        flow_viscosity_pa_s: eta.
-
     Raises:
         ValueError: a negative yield stress or viscosity.
     """
 
-    yield_stress_pa: float = float("inf")
-    flow_viscosity_pa_s: float = 0.0
+    yield_stress_pa: Annotated[float, Quantity("Pa", "sigma_y, at which simple tension flows", 0.0)] = float(
+        "inf"
+    )
+    flow_viscosity_pa_s: Annotated[float, Quantity("Pa s", "eta; 0: flows at once", 0.0)] = 0.0
 
     name: ClassVar[str] = "st_venant_kirchhoff"
+    title: ClassVar[str] = "St. Venant-Kirchhoff solid with viscous flow"
+    equation: ClassVar[str] = "d gamma/dt = <|s| - sqrt(2/3) sigma_y> / eta"
+    use: ClassVar[str] = "foam and paste that flow slowly"
     project: ClassVar[Any] = _project
     initial_memory: ClassVar[float] = 0.0
 

@@ -12,9 +12,11 @@ The trace of eps stays, so plastic flow keeps the volume. In simple tension it y
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import warp as wp
+
+from physworld.catalogue import Quantity
 
 
 @wp.func
@@ -43,18 +45,17 @@ def _project(
 class VonMises:
     """See the module's text.
 
-    Attributes:
-        yield_stress_pa: sigma_y, stress at which simple tension yields.
-        hardening_pa: h, growth of the yield stress per accumulated plastic strain.
-
     Raises:
         ValueError: a negative yield stress or hardening.
     """
 
-    yield_stress_pa: float
-    hardening_pa: float = 0.0
+    yield_stress_pa: Annotated[float, Quantity("Pa", "sigma_y, at which simple tension yields", 0.0)]
+    hardening_pa: Annotated[float, Quantity("Pa", "h, growth of sigma_y per plastic strain", 0.0)] = 0.0
 
     name: ClassVar[str] = "von_mises"
+    title: ClassVar[str] = "Von Mises plasticity with linear hardening"
+    equation: ClassVar[str] = "|s| - sqrt(2/3) (sigma_y + h a) <= 0"
+    use: ClassVar[str] = "metals, clay, dough"
     project: ClassVar[Any] = _project
     initial_memory: ClassVar[float] = 0.0
 
