@@ -178,12 +178,12 @@ def test_named_volumes_are_declared(text: str) -> None:
         (
             "api",
             "physworld_services.web physworld_services.api.migrate",
-            "torch warp celery kombu workers benchmarks",
+            "torch warp celery kombu physworld_workers benchmarks",
         ),
         (
             "worker",
             "physworld_workers.__main__ physworld_workers.dispatcher physworld_workers.app",
-            "torch warp services benchmarks",
+            "torch warp physworld_services benchmarks",
         ),
         (
             "trainer",
@@ -200,8 +200,8 @@ def test_named_volumes_are_declared(text: str) -> None:
 def test_an_image_holds_what_its_process_imports(
     repository: Path, tmp_path: Path, target: str, modules: str, absent: str
 ) -> None:
-    for word in _copied(repository, target):
-        destination = tmp_path / word
+    for word, place in _copied(repository, target).items():
+        destination = tmp_path / place
         destination.parent.mkdir(parents=True, exist_ok=True)
         if (repository / word).is_dir():
             shutil.copytree(repository / word, destination, ignore=shutil.ignore_patterns("node_modules"))
@@ -226,9 +226,15 @@ for name in {modules.split()!r}:
     assert result.returncode == 0, result.stderr
 
 
-def _copied(repository: Path, target: str) -> list[str]:
+def _copied(repository: Path, target: str) -> dict[str, str]:
+    """What a stage copies: place in the repository to place in the image."""
     stage = (repository / "Dockerfile").read_text().split(f" AS {target}\n")[1].split("\nFROM ")[0]
-    return [word.rstrip("/") for line in re.findall(r"(?m)^COPY (.+)$", stage) for word in line.split()[:-1]]
+    places = {}
+    for line in re.findall(r"(?m)^COPY (.+)$", stage):
+        *sources, goal = line.split()
+        for word in sources:
+            places[word.rstrip("/")] = goal.rstrip("/") if word.endswith("/") else goal + Path(word).name
+    return places
 
 
 def _interpolated(text: str) -> str:
@@ -256,7 +262,8 @@ def _config(command: list[str], folder: Path, secrets: dict[str, str]) -> subpro
 
 
 def _module_file(repository: Path, module: str) -> Path:
-    path = repository.joinpath(*module.split("."))
+    """The file of a module: a folder of the repository is imported as ``physworld_FOLDER``."""
+    path = repository.joinpath(*module.removeprefix("physworld_").split("."))
     return path / "__main__.py" if path.is_dir() else path.with_suffix(".py")
 
 
