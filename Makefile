@@ -3,6 +3,7 @@
 # make bench               the figures of docs/benchmarks.md
 # make up                  the embedded service in the foreground
 # make lock [UPGRADE=name] write requirements.lock anew; UPGRADE=all moves every package to its newest release
+# make sdk                the synchronous half of the SDK, made of the asynchronous one
 # make audit               the SBOM (build/sbom.cdx.json), and known vulnerabilities of the locked packages
 SHELL := /bin/bash
 SCENE ?= sample/soft_beam
@@ -11,7 +12,7 @@ JOBS ?= 2
 BIN := .venv/bin
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test bench lint up clean install dev lock audit
+.PHONY: demo test bench lint up clean install dev sdk lock audit
 
 install:
 	@scripts/bootstrap.sh
@@ -38,6 +39,9 @@ test: lint
 bench:
 	@scripts/bootstrap.sh --bench
 	$(BIN)/python -m benchmarks
+
+sdk: dev
+	$(BIN)/python scripts/make_sdk.py
 
 lock:
 	@test -x $(BIN)/python || python3 -m venv .venv

@@ -1,4 +1,5 @@
-"""The service's artifacts, synchronous: content-addressed files that are downloaded."""
+# Made of async_artifacts.py by `make sdk`: change that file.
+"""The service's artifacts: content-addressed files that are downloaded."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The service's artifacts, asynchronous: content-addressed files that are downloaded, awaited."""
+"""The service's artifacts: content-addressed files that are downloaded."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The asynchronous client: the same names as ``Client``, awaited."""
+"""The client: connection, retries, and the resources as attributes."""
 
 from __future__ import annotations
 
@@ -29,7 +29,21 @@ Answer = TypeVar("Answer")
 
 
 class AsyncClient:
-    """A connection to one PhysWorld service; arguments and attributes as in ``Client``."""
+    """A connection to one PhysWorld service; usable as a context manager.
+
+    Args:
+        base_url: address of the service, e.g. ``http://127.0.0.1:8000``.
+        token: API key.
+        timeout: seconds for one answer (a long poll adds its own wait).
+        max_retries: further attempts after the first, see ``physworld_client.transport``.
+        transport: a transport of httpx, for tests or a Unix socket.
+        known_keys: the file of keys that may sign models; by default that of this machine.
+        known_as: the service's name in that file; its address without it.
+
+    Attributes:
+        scenes, fits, traces, datasets, models, assessments, rollouts, plans, live, jobs, pipelines, artifacts:
+            the resources.
+    """
 
     def __init__(
         self,

@@ -1,15 +1,15 @@
-"""Live sessions with a published model, asynchronous.
+"""Live sessions with a published model: velocities out, frames in.
 
     async with client.live.open("beam") as session:
         async for frame in session:
-            await session.steer([0.0, 0.0, 0.1])
+            await session.steer([0.0, 0.0, 0.1])      # m/s; lasts 0.3 s
+            robot.show(frame.points)
 
-The classes of ``live`` with the same names and arguments; a test compares them.
+A session ends with its block, or where the service ends it.
 """
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 from typing import Literal
@@ -19,10 +19,9 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
 from physworld_client import live_frames
-from physworld_client.async_resources import AsyncResource
-from physworld_client.errors import ConnectionFailed, RequestTimedOut
+from physworld_client.async_resources import LATEST, AsyncResource
+from physworld_client.errors import ConnectionFailed
 from physworld_client.live_frames import LiveFrame, LiveStart
-from physworld_client.resources import LATEST
 from physworld_client.transport import is_loopback
 from physworld_schemas.rollout import Part
 
@@ -62,7 +61,9 @@ class AsyncLiveSession:
             LiveSessionEnded: the session is over.
             RequestTimedOut: none came within the client's timeout.
         """
-        return live_frames.read_frame(await _received(self._socket, self._timeout), self.start)
+        return live_frames.read_frame(
+            await live_frames.received_async(self._socket, self._timeout), self.start
+        )
 
     async def reset(self) -> None:
         """Puts the body back to its start; velocities that were set go on for their 0.3 s."""
@@ -113,15 +114,5 @@ class AsyncLive(AsyncResource):
                 raise ConnectionFailed(
                     f"no live session at {self._client.base_url}: {str(error) or type(error).__name__}"
                 ) from error
-            start = live_frames.read_start(await _received(socket, self._client.timeout))
+            start = live_frames.read_start(await live_frames.received_async(socket, self._client.timeout))
             yield AsyncLiveSession(socket, start, self._client.timeout)
-
-
-async def _received(socket: ClientConnection, timeout: float) -> bytes | str:
-    try:
-        async with asyncio.timeout(timeout):
-            return await socket.recv()
-    except ConnectionClosed as error:
-        raise live_frames.ended(error) from error
-    except TimeoutError as error:
-        raise RequestTimedOut(f"a live session sent nothing within {timeout:g} s") from error

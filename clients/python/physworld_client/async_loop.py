@@ -1,7 +1,4 @@
-"""Closing the loop, asynchronous: traces of what a twin leaves, and recordings held against published models.
-
-The classes of ``loop`` with the same names and arguments; a test compares them.
-"""
+"""Closing the loop: traces of what a twin leaves, and recordings held against published models."""
 
 from __future__ import annotations
 
@@ -9,9 +6,8 @@ from collections.abc import Sequence
 
 from physworld_client import calls
 from physworld_client.arrays import arrays_of
-from physworld_client.async_resources import AsyncResource
+from physworld_client.async_resources import LATEST, AsyncResource
 from physworld_client.pages import AsyncListPage
-from physworld_client.resources import LATEST
 from physworld_client.types import Array
 from physworld_schemas.assessment import Assessment
 from physworld_schemas.fit import FitConfig
@@ -64,7 +60,8 @@ class AsyncTraces(AsyncResource):
 
     async def cancel(self, trace_id: str) -> Job:
         """Asks for the end of the trace's job."""
-        return await self._client.send(calls.job_cancel((await self.get(trace_id)).job_id))
+        trace = await self.get(trace_id)
+        return await self._client.send(calls.job_cancel(trace.job_id))
 
 
 class AsyncAssessments(AsyncResource):

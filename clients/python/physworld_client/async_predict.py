@@ -1,17 +1,13 @@
-"""Using published models, asynchronous: rollouts and plans.
-
-The classes of ``predict`` with the same names and arguments; a test compares them.
-"""
+"""Using published models: rollouts and plans."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 from physworld_client import predictions
-from physworld_client.async_resources import AsyncResource
+from physworld_client.async_resources import LATEST, AsyncResource
 from physworld_client.pages import AsyncListPage
 from physworld_client.predictions import Planned, Predicted
-from physworld_client.resources import LATEST
 from physworld_client.types import Array
 from physworld_schemas.job import Job
 from physworld_schemas.plan import Plan, PlanConfig, PlanLimits

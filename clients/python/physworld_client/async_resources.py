@@ -1,4 +1,4 @@
-"""The service's resources, asynchronous: the classes of ``resources`` with the same names, awaited."""
+"""The service's resources. Every answer is a model of ``physworld_schemas``."""
 
 from __future__ import annotations
 
@@ -333,8 +333,10 @@ class AsyncJobs(AsyncResource):
                 broken = error
             if decoder.last_id != seen:
                 retry.attempt = 0
-            elif broken is None and (await self.get(job_id)).state in TERMINAL_STATES:
-                return
+            elif broken is None:
+                job = await self.get(job_id)
+                if job.state in TERMINAL_STATES:
+                    return
             if not retry.again():
                 raise transport.stream_ended(broken, self._client.http, retry) from broken
             decoder.reset()

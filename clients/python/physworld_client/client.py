@@ -1,4 +1,5 @@
-"""The synchronous client: connection, retries, and the resources as attributes."""
+# Made of async_client.py by `make sdk`: change that file.
+"""The client: connection, retries, and the resources as attributes."""
 
 from __future__ import annotations
 
@@ -16,7 +17,14 @@ from physworld_client.known_keys import KnownKeys
 from physworld_client.live import Live
 from physworld_client.loop import Assessments, Traces
 from physworld_client.predict import Plans, Rollouts
-from physworld_client.resources import Datasets, Fits, Jobs, Models, Pipelines, Scenes
+from physworld_client.resources import (
+    Datasets,
+    Fits,
+    Jobs,
+    Models,
+    Pipelines,
+    Scenes,
+)
 
 Answer = TypeVar("Answer")
 

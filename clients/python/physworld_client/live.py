@@ -1,11 +1,12 @@
-"""Live sessions with a published model, synchronous: velocities out, frames in.
+# Made of async_live.py by `make sdk`: change that file.
+"""Live sessions with a published model: velocities out, frames in.
 
     with client.live.open("beam") as session:
         for frame in session:
             session.steer([0.0, 0.0, 0.1])      # m/s; lasts 0.3 s
             robot.show(frame.points)
 
-``async_live`` holds the same classes with the same names and arguments, awaited; a test compares them.
+A session ends with its block, or where the service ends it.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.sync.client import ClientConnection, connect
 
 from physworld_client import live_frames
-from physworld_client.errors import ConnectionFailed, RequestTimedOut
+from physworld_client.errors import ConnectionFailed
 from physworld_client.live_frames import LiveFrame, LiveStart
 from physworld_client.resources import LATEST, Resource
 from physworld_client.transport import is_loopback
@@ -61,7 +62,7 @@ class LiveSession:
             LiveSessionEnded: the session is over.
             RequestTimedOut: none came within the client's timeout.
         """
-        return live_frames.read_frame(_received(self._socket, self._timeout), self.start)
+        return live_frames.read_frame(live_frames.received(self._socket, self._timeout), self.start)
 
     def reset(self) -> None:
         """Puts the body back to its start; velocities that were set go on for their 0.3 s."""
@@ -112,14 +113,5 @@ class Live(Resource):
                 raise ConnectionFailed(
                     f"no live session at {self._client.base_url}: {str(error) or type(error).__name__}"
                 ) from error
-            start = live_frames.read_start(_received(socket, self._client.timeout))
+            start = live_frames.read_start(live_frames.received(socket, self._client.timeout))
             yield LiveSession(socket, start, self._client.timeout)
-
-
-def _received(socket: ClientConnection, timeout: float) -> bytes | str:
-    try:
-        return socket.recv(timeout=timeout)
-    except ConnectionClosed as error:
-        raise live_frames.ended(error) from error
-    except TimeoutError as error:
-        raise RequestTimedOut(f"a live session sent nothing within {timeout:g} s") from error

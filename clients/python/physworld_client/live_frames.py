@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import struct
 from dataclasses import dataclass
@@ -10,10 +11,12 @@ from urllib.parse import urlencode
 import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import TypeAdapter
+from websockets.asyncio.client import ClientConnection as AsyncClientConnection
 from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import ClientConnection
 
 from physworld_client.calls import Call
-from physworld_client.errors import LiveSessionEnded, PhysWorldError
+from physworld_client.errors import LiveSessionEnded, PhysWorldError, RequestTimedOut
 from physworld_client.types import Array
 from physworld_schemas.live import LiveTicket, LiveTicketCreate
 from physworld_schemas.rollout import Part
@@ -132,3 +135,26 @@ def ended(error: ConnectionClosed) -> LiveSessionEnded:
     """Why the service, or the line, ended the session."""
     close = error.rcvd or error.sent
     return LiveSessionEnded(close.code if close else 1006, close.reason if close else "the line broke")
+
+
+def received(socket: ClientConnection, timeout: float) -> bytes | str:
+    """The next message of a session, within so many seconds."""
+    try:
+        return socket.recv(timeout=timeout)
+    except (ConnectionClosed, TimeoutError) as error:
+        raise _not_received(error, timeout) from error
+
+
+async def received_async(socket: AsyncClientConnection, timeout: float) -> bytes | str:
+    """The same, awaited: the one call that differs between the two kinds of sockets by more than a word."""
+    try:
+        async with asyncio.timeout(timeout):
+            return await socket.recv()
+    except (ConnectionClosed, TimeoutError) as error:
+        raise _not_received(error, timeout) from error
+
+
+def _not_received(error: ConnectionClosed | TimeoutError, timeout: float) -> PhysWorldError:
+    if isinstance(error, ConnectionClosed):
+        return ended(error)
+    return RequestTimedOut(f"a live session sent nothing within {timeout:g} s")

@@ -1,7 +1,5 @@
-"""Closing the loop, synchronous: traces of what a twin leaves, and recordings held against published models.
-
-``async_loop`` holds the same classes with the same names and arguments, awaited; a test compares them.
-"""
+# Made of async_loop.py by `make sdk`: change that file.
+"""Closing the loop: traces of what a twin leaves, and recordings held against published models."""
 
 from __future__ import annotations
 
@@ -63,7 +61,8 @@ class Traces(Resource):
 
     def cancel(self, trace_id: str) -> Job:
         """Asks for the end of the trace's job."""
-        return self._client.send(calls.job_cancel(self.get(trace_id).job_id))
+        trace = self.get(trace_id)
+        return self._client.send(calls.job_cancel(trace.job_id))
 
 
 class Assessments(Resource):

@@ -1,7 +1,5 @@
-"""Using published models, synchronous: rollouts and plans.
-
-``async_predict`` holds the same classes with the same names and arguments, awaited; a test compares them.
-"""
+# Made of async_predict.py by `make sdk`: change that file.
+"""Using published models: rollouts and plans."""
 
 from __future__ import annotations
 
@@ -70,7 +68,8 @@ class Rollouts(Resource):
         )
         if isinstance(answer, Rollout):
             return predictions.predicted(answer)
-        return self.result(self._client.jobs.wait(answer, timeout).outputs[0].id)
+        job = self._client.jobs.wait(answer, timeout)
+        return self.result(job.outputs[0].id)
 
     def get(self, rollout_id: str) -> Rollout:
         """A rollout that was a job."""

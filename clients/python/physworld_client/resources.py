@@ -1,7 +1,5 @@
-"""The service's resources, synchronous. Every answer is a model of ``schemas``.
-
-``async_resources`` holds the same classes with the same names and arguments, awaited; a test compares them.
-"""
+# Made of async_resources.py by `make sdk`: change that file.
+"""The service's resources. Every answer is a model of ``physworld_schemas``."""
 
 from __future__ import annotations
 
@@ -332,8 +330,10 @@ class Jobs(Resource):
                 broken = error
             if decoder.last_id != seen:
                 retry.attempt = 0
-            elif broken is None and self.get(job_id).state in TERMINAL_STATES:
-                return
+            elif broken is None:
+                job = self.get(job_id)
+                if job.state in TERMINAL_STATES:
+                    return
             if not retry.again():
                 raise transport.stream_ended(broken, self._client.http, retry) from broken
             decoder.reset()

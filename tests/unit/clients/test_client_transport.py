@@ -6,6 +6,8 @@ import inspect
 import json
 import random
 import re
+import subprocess
+import sys
 from datetime import UTC, datetime, timedelta
 from email.utils import format_datetime
 from pathlib import Path
@@ -201,3 +203,9 @@ def test_the_asynchronous_resources_have_the_same_names_and_arguments() -> None:
     assert public(predict) == public(async_predict)
     assert called(public(live)) == called(public(async_live))
     assert list(inspect.signature(Client).parameters) == list(inspect.signature(AsyncClient).parameters)
+
+
+def test_the_synchronous_half_is_made_of_the_asynchronous_one(repository: Path) -> None:
+    script = [sys.executable, str(repository / "scripts" / "make_sdk.py"), "--check"]
+    checked = subprocess.run(script, capture_output=True, text=True, check=False)
+    assert checked.returncode == 0, checked.stderr + checked.stdout
