@@ -27,8 +27,7 @@ class FitConfig(Request):
     ``formulation``: which form integrates the body; "auto" takes the one that its laws and its scene need.
     ``transfer``: how the updated Lagrangian form's particles and grid exchange velocities; "asflip" damps less.
     ``mesh``: of a sheet that another engine recorded as a mesh of triangles, its cells along both sides, such as
-    "16x15"; "16x15odd" has the diagonals the other way round. Four particles a cell, 200 000 at most. "auto" fits a
-    plate, asks the first frames for a mesh, and takes what follows the training frames better.
+    "16x15"; "16x15odd" has the diagonals the other way round. Four particles a cell, 200 000 at most. Null is a plate.
     ``stages``: "global+local" then fits a field of stiffness, and of the ground's friction where the data know it, over
     the body; it is kept only if training frames that its search did not see get better.
     ``numerics``: measure the engine's own damping on the scene, and the numbers with cells of no size.
@@ -41,14 +40,13 @@ class FitConfig(Request):
     plasticity: FlowLaw | None = None
     formulation: Literal["auto", "total_lagrangian", "updated_lagrangian"] = "auto"
     transfer: Literal["apic", "asflip"] = "apic"
-    mesh: str | None = Field(default=None, pattern=r"^(auto|[1-9]\d{0,2}x[1-9]\d{0,2}(odd)?)$")
+    mesh: str | None = Field(default=None, pattern=r"^[1-9]\d{0,2}x[1-9]\d{0,2}(odd)?$")
     stages: Literal["global", "global+local"] = "global"
     numerics: bool = True
 
     @model_validator(mode="after")
     def _small_enough(self) -> Self:
-        if self.mesh not in (None, "auto"):
-            assert self.mesh is not None
+        if self.mesh is not None:
             particles = 4 * prod(int(count) for count in self.mesh.removesuffix("odd").split("x"))
             if particles > MOST_PARTICLES:
                 raise ValueError(f"mesh {self.mesh} has {particles} particles; {MOST_PARTICLES} are the most")
@@ -72,9 +70,9 @@ class FitConfig(Request):
     def usual_physics(self) -> bool:
         """Whether the body is homogeneous, of its shape's usual law, in the form that the engine takes.
 
-        That is what a trace can work on.
+        That is what a trace can work on, on the mesh that it names if it names one.
         """
-        usual_form = self.plasticity is None and self.formulation == "auto" and self.mesh is None
+        usual_form = self.plasticity is None and self.formulation == "auto"
         return self.law is None and usual_form and self.stages == "global"
 
 
@@ -124,7 +122,7 @@ class Numerics(Resource):
 class SearchState(Resource):
     """Whether the search converged, which is so only where every search of the fit ended by itself.
 
-    ``open`` says why not, by parameter (``law``, ``mesh``: the choice of it). A search that spent ``max_simulations``
+    ``open`` says why not, by parameter (``law``: the choice of it). A search that spent ``max_simulations``
     leaves the best found so far, without intervals.
     """
 

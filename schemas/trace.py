@@ -41,17 +41,17 @@ TRACE_PARTICLES = 1000
 """Coarser than a fit's: a trace runs a thousand simulations, and asks finer cells in the end."""
 
 NO_OTHER_PHYSICS = (
-    "a trace calibrates the usual elastic law, the same all over the body, and finds by itself which mesh recorded a "
-    "sheet: fit.law, fit.plasticity, fit.formulation, fit.mesh and fit.stages must be left out"
+    "a trace calibrates the usual elastic law, the same all over the body: fit.law, fit.plasticity, fit.formulation "
+    "and fit.stages must be left out"
 )
 
 
 class TraceCreate(Request):
     """Body of POST /v1/traces.
 
-    A trace calibrates the declared physics itself, with ``fit``'s budgets and never with damping. ``fit_id`` names a
-    ready fit of the scene: its twin is taken instead where its physics is the declared one (no damping, the usual law,
-    a sheet that bends as a plate) and it has ``fit``'s number of particles.
+    A trace calibrates the declared physics itself, with ``fit``'s budgets and mesh and never with damping. ``fit_id``
+    names a ready fit of the scene: its twin is taken instead where its physics is the declared one (no damping, the
+    usual law, a sheet that bends as a plate) and it has ``fit``'s number of particles and mesh.
 
     ``scene_ids`` are further recordings of the same object, fitted together with ``scene_id``;
     ``held_out_scene_ids`` are recordings that only the report sees.
@@ -105,8 +105,7 @@ class Trace(Resource):
 
     ``held_out`` are errors on frames that nothing before the report has seen, of the recordings that are held out if
     there are any; ``recordings`` has those of each. ``twin.npz`` is among the artifacts where an effect is
-    added: one that is ``named``, or the best of an ``equivalent_set`` unless that is a fault of the measurement; and
-    where nothing has to be explained on the mesh of triangles that a sheet was recorded as: that mesh.
+    added: one that is ``named``, or the best of an ``equivalent_set`` unless that is a fault of the measurement.
     """
 
     model_config = ConfigDict(extra="allow")

@@ -83,11 +83,7 @@ def trace_row(session: Session, trace_id: str) -> TraceRow:
 
 
 def leaves_twin(trace: Trace | TraceRow) -> bool:
-    """Whether the trace left a better twin than the fit's.
-
-    One that carries an effect (named, or the best of an equivalent set), or, where nothing has to be explained on the
-    mesh of triangles that a sheet was recorded as, that mesh.
-    """
+    """Whether the trace left a twin with an effect: one that is named, or the best of an equivalent set."""
     names = [item["name"] if isinstance(item, dict) else item.name for item in trace.artifacts]
     return trace.state == "ready" and TWIN in names
 

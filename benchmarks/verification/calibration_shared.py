@@ -14,7 +14,7 @@ from typing import Any
 
 from benchmarks.harness import Report
 
-SCENES = {"d02": ("undeclared/d02", "plate"), "beam_free_a": ("real/beam_free_a", "plate")}
+SCENES = {"d02": "undeclared/d02", "beam_free_a": "real/beam_free_a"}
 PROCESSES = (1, 2)
 ROUNDS = 2
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
@@ -26,12 +26,12 @@ def shared(seed: int, recordings: Path, resume: Path | None = None) -> Report:
     del resume  # a step that is kept is not timed
     figures: dict[str, Any] = {}
     rows = []
-    for name, (place, mesh) in SCENES.items():
+    for name, place in SCENES.items():
         taken: dict[int, list[float]] = {processes: [] for processes in PROCESSES}
         answers = []
         for _ in range(ROUNDS):
             for processes in PROCESSES:
-                seconds, answer = timed_fit(recordings / place, mesh, processes)
+                seconds, answer = timed_fit(recordings / place, processes)
                 taken[processes].append(seconds)
                 answers.append(_untimed(answer))
         one, two = (statistics.median(taken[processes]) for processes in PROCESSES)
@@ -59,14 +59,14 @@ def shared(seed: int, recordings: Path, resume: Path | None = None) -> Report:
     )
 
 
-def timed_fit(scene: Path, mesh: str, processes: int) -> tuple[float, dict[str, Any]]:
+def timed_fit(scene: Path, processes: int) -> tuple[float, dict[str, Any]]:
     """Seconds of the command and its answer."""
     with tempfile.TemporaryDirectory() as folder:
         answer = Path(folder) / "fit.json"
         command = [sys.executable, "-m", "physworld_workers.commands.fit", str(scene), "--json", str(answer)]
         begun = time.perf_counter()
         subprocess.run(
-            [*command, "--mesh", mesh, "--processes", str(processes)],
+            [*command, "--processes", str(processes)],
             check=True,
             capture_output=True,
             env={**os.environ, **ONE_THREAD},

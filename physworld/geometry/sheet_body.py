@@ -20,10 +20,6 @@ _CELLS, _BUDGET = 24, 2000  # along the longer side at that budget, as its squar
 _FEWEST_CELLS = 12
 _FLAT = 0.08  # a sheet's points lie within this share of its width of their plane (root mean square)
 _TIGHTER = 0.97  # a sheet is turned in its plane if that shrinks its bounding rectangle below this share
-_FEWEST_MESH_CELLS, _MOST_CELLS = 6, 24  # of a mesh, along a side
-_LONG = 1.6  # a mesh's cells are at most so much longer than wide
-_ON_LINE = 0.02  # cells by which a grip's end may miss a line of a mesh
-_MOST_MESHES = 24  # that a trace asks: of more, those whose cells are the most square
 _AS_DECLARED = 0.05  # share by which extents of points may miss the declared size
 
 
@@ -85,42 +81,6 @@ def sheet_body(
         start, velocity = fit_nodes(scene, lattice, material)
         offsets = np.zeros((len(points), 1))
     return ReferenceBody(lattice, rest, start, velocity, material, offsets, thickness, tuple(notes))
-
-
-def possible_meshes(scene: Scene) -> list[Mesh]:
-    """Meshes that another engine may have recorded a sheet with: their lines lie where the declared grips end.
-
-    Cells are about as wide as high, and at most :data:`_MOST_CELLS` on a side; :data:`_MOST_MESHES` in all, those with
-    the squarest cells. Empty where no grip ends on the sheet.
-    """
-    points = first_points(scene)
-    if scene.kind not in SHEET_KINDS or scene.body.side_m is not None:
-        return []
-    origin, axes, size, off_plane = plane_of(scene, points)
-    if off_plane > _FLAT * size.min():
-        return []
-    flat_map = (origin, axes)
-    begin, sides = _declared_extent(scene, flat_map, size)
-    faces = _grip_faces(scene, flat_map) - begin
-    counts = [_counts_through(faces[:, a], float(sides[a])) for a in range(2)]
-    for a, b in ((0, 1), (1, 0)):
-        if not counts[a]:
-            counts[a] = sorted({max(round(n * sides[a] / sides[b]), 1) for n in counts[b]})
-    shapes = [(across, up) for across in counts[0] for up in counts[1]]
-    long = {shape: abs(float(np.log(sides[0] / shape[0] * shape[1] / sides[1]))) for shape in shapes}
-    squarest = sorted(
-        (shape for shape in shapes if long[shape] <= np.log(_LONG)), key=lambda shape: long[shape]
-    )
-    return [Mesh(shape, odd) for shape in sorted(squarest[: _MOST_MESHES // 2]) for odd in (False, True)]
-
-
-def _counts_through(faces: Array, side: float) -> list[int]:
-    """Numbers of cells along a side [m] whose lines all inner ``faces`` (F,) lie on; empty where there is none."""
-    inner = faces[(faces > _ON_LINE * side) & (faces < (1 - _ON_LINE) * side)]
-    if not len(inner):
-        return []
-    tried = range(_FEWEST_MESH_CELLS, _MOST_CELLS + 1)
-    return [n for n in tried if np.all(np.abs(inner * n / side - np.round(inner * n / side)) < _ON_LINE)]
 
 
 def _grip_faces(scene: Scene, flat_map: tuple[Array, Array] | None) -> Array:

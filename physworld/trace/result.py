@@ -11,7 +11,7 @@ from physworld.trace.experiment import Experiment
 from physworld.trace.held_out import HeldOut
 from physworld.trace.score import Scores
 from physworld.trace.split import Split
-from physworld.trace.verdict import DATA, NOTHING, Verdict
+from physworld.trace.verdict import Verdict
 from physworld.twin.twin import Twin
 
 
@@ -115,13 +115,5 @@ class TraceResult:
 
     @property
     def better(self) -> Twin | None:
-        """The twin to predict with where it is another than a fit of the declared physics gives, else None.
-
-        It carries the effects of the verdict; or it is the mesh of triangles that a sheet was recorded as, where that
-        leaves nothing to explain (but faulty sightings).
-        """
-        if self.verdict.added is not None:
-            return self.verdict.added.fitted.twin
-        declared = self.declared.fitted.twin
-        alone = self.verdict.name in (NOTHING, DATA) and not self.verdict.model.members
-        return declared if alone and not declared.lattice.smooth else None
+        """The twin with the effects of the verdict, where it adds any."""
+        return None if self.verdict.added is None else self.verdict.added.fitted.twin

@@ -33,7 +33,6 @@ from physworld.trace.experiment import Experiment, propose, rival_of
 from physworld.trace.faults import Faults, without_faults
 from physworld.trace.holds import held_otherwise
 from physworld.trace.intervals import calibrated, named, spread_of
-from physworld.trace.meshes import MESH_STARTS, MESH_STIFFNESS, recorded_as, taken_as
 from physworld.trace.mixtures import Mixtures
 from physworld.trace.noise import noise_sigma, remarks, taken_with
 from physworld.trace.outcomes import Outcomes
@@ -62,13 +61,11 @@ from physworld.trace.unknowns import (
     clamp_reach,
     grip_compliance,
     grip_softness,
-    near_its_start,
     of_parameter,
 )
 from physworld.trace.verdict import (
     DATA,
     NOTHING,
-    NUMERICAL,
     UNEXPLAINED,
     Verdict,
     claimable,
@@ -84,6 +81,8 @@ _TWIST_SPREAD = 0.7  # of the logarithm of a sheet's twisting stiffness over an 
 _BENDING_SPREAD = 0.5  # of the logarithm of a sheet's bending stiffness over what its thickness says
 _OTHER_STIFFNESSES = tuple(0.12 * k for k in (-6, -5, -4, -3, -2, -1, 1, 2, 3, 4, 5, 6))
 """Logarithms: a phase that has slipped by a period is a local minimum, so others are looked at before a descent."""
+_MESH_STIFFNESSES = tuple(0.01 * k for k in (-4, -3, -2, -1, 1, 2, 3, 4))
+"""Of a mesh of triangles also these: its wrinkles make basins that are a few percent of its stiffness wide."""
 _OTHER_TWIST = float(np.log(2.0))
 _NEAR = (-0.12, 0.12)  # on finer cells, where the coarser ones have looked farther
 _THOROUGH = 2  # times the iterations of other refits: everything is compared with the declared physics
@@ -142,18 +141,8 @@ def trace(
         looked = runs + simulations.count
         simulations, twin, runs = begin.calibrated(recordings, None, None)
         runs += looked
-    alone = len(recordings.fitted) == 1 and not recordings.held_out
-    bodies = [twin]
-    if alone:
-        bodies = recorded_as(recordings.scene, twin, simulations, recordings.split.train[1])
-    results, clock = [], Clock(begun, config.time_limit_s, begin.ledger, len(bodies))
-    for body in bodies:
-        results.append(_Trace(recordings, config, simulations, body, faults, clock).run())
-        if results[-1].verdict.name not in (UNEXPLAINED, NUMERICAL):
-            break
-    else:  # none explains it: what is said is said of the declared body
-        results.sort(key=lambda found: not found.declared.fitted.twin.lattice.smooth, reverse=True)
-    result = results[-1]
+    clock = Clock(begun, config.time_limit_s, begin.ledger)
+    result = _Trace(recordings, config, simulations, twin, faults, clock).run()
     stages = tuple(Stage(name, *cost) for name, cost in begin.ledger.spent.items())
     return replace(
         result,
@@ -202,7 +191,7 @@ class _Trace:
             block_of_row = self.split.block_of(white.frame_of_row)
             others = _OTHER_STIFFNESSES if level == 1.0 else _NEAR
             declared = self._declared(
-                white, block_of_row, others if self.twin.lattice.smooth else MESH_STARTS
+                white, block_of_row, others if self.twin.lattice.smooth else (*others, *_MESH_STIFFNESSES)
             )
             basis = orthonormal(declared.fitted.free_jacobian)
             shifts = [project(basis, white.change(direction)) for direction in directions.values()]
@@ -214,7 +203,7 @@ class _Trace:
             level *= config.refinement
             self.twin = refinement_of(declared.fitted.twin, finer)
         if isinstance(self.twin.lattice, TriangleLattice):
-            self.notes.append(taken_as(self.twin.lattice.mesh))
+            self.notes.append(f"taken as a mesh that another engine recorded, {self.twin.lattice.mesh}")
         self.notes += remarks(sigma, config.noise_m is not None, numerics)
         if level > 1.0:
             self.notes.append(f"cells {level:.3g} times smaller than asked for: coarser ones change too much")
@@ -341,8 +330,6 @@ class _Trace:
         # a reach within a cell is what softness is, and a mesh's lines lie on the faces of its grips
         reach = clamp_reach(twin) if softness is None and twin.lattice.smooth else None
         found = [of_parameter(p, twin, spread.get(p.name)) for p in known if p.name != BENDING_COUPLING]
-        if not twin.lattice.smooth:  # its first frames have said how stiff it is
-            found[0] = near_its_start(found[0], MESH_STIFFNESS)
         own = (reach, softness, grip_compliance(twin))
         return [*found, *(unknown for unknown in own if unknown is not None)]
 

@@ -2,8 +2,8 @@
 
 Calibration, noise and first-order scores are never cut short, for without them there is no answer. What is left of the
 limit then, and a quarter of it at least, goes to the selection, the second resolution and the proposed experiment in
-turn; what one of them does not need the next one has. Of a sheet that may be one of two bodies each has its part. A run
-that is remembered takes no time, so a trace that resumes goes on where its searches were left.
+turn; what one of them does not need the next one has. A run that is remembered takes no time,
+so a trace that resumes goes on where its searches were left.
 """
 
 from __future__ import annotations
@@ -30,21 +30,17 @@ class Clock:
         begun: when it began, by ``time.perf_counter``.
         limit_s: see ``TraceConfig.time_limit_s``.
         ledger: of its simulations, whose end this sets.
-        bodies: that may be traced in turn.
     """
 
-    def __init__(self, begun: float, limit_s: float | None, ledger: Ledger, bodies: int) -> None:
-        self.begun, self.limit_s, self.ledger, self._bodies = begun, limit_s, ledger, bodies
+    def __init__(self, begun: float, limit_s: float | None, ledger: Ledger) -> None:
+        self.begun, self.limit_s, self.ledger = begun, limit_s, ledger
         self._from = self._left = 0.0
 
     def start(self) -> None:
-        """The searches of a body begin."""
-        self.ledger.cut.clear()
+        """The searches begin."""
         if self.limit_s is not None:
             self._from = time.perf_counter()
-            left = max(self.limit_s - (self._from - self.begun), _AT_LEAST * self.limit_s)
-            self._left = left / max(self._bodies, 1)
-        self._bodies -= 1
+            self._left = max(self.limit_s - (self._from - self.begun), _AT_LEAST * self.limit_s)
 
     @contextmanager
     def until(self, share: float) -> Iterator[None]:

@@ -69,12 +69,6 @@ def of_parameter(parameter: Parameter, twin: Twin, spread: float | None) -> Unkn
     )
 
 
-def near_its_start(unknown: Unknown, reach: float) -> Unknown:
-    """The same with bounds at most ``reach`` from its start, in the scale of the search."""
-    low, high = max(unknown.low, unknown.start - reach), min(unknown.high, unknown.start + reach)
-    return replace(unknown, low=low, high=high)
-
-
 def _value(twin: Twin, parameter: Parameter) -> float:
     known = twin.parameters
     if parameter.name in known:

@@ -76,8 +76,6 @@ def closed_loop(
 
 def statement(trace: Trace) -> str:
     """One sentence for people."""
-    if traces.leaves_twin(trace) and not trace.effects:
-        return f"The twin is the mesh of triangles that the sheet was recorded as, without an effect: {trace.reason}"
     if traces.leaves_twin(trace):
         found = []
         for effect in trace.effects:

@@ -42,7 +42,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--mesh",
         default=None,
-        help="of a sheet: the mesh that recorded it, such as 16x15; plate; default: ask its first frames",
+        help="of a sheet: the mesh of triangles that recorded it, such as 16x15 or 16x15odd",
     )
     parser.add_argument(
         "--stages", default="global", help="global, or global+local: a field on top if it holds"
@@ -71,36 +71,33 @@ def _fit(given: argparse.Namespace) -> None:
     import warp as wp
 
     wp.config.quiet = True  # before the first import that starts it
-    from physworld.calibrate import CalibrationConfig
-    from physworld.calibrate.stages import GLOBAL
+    from physworld.calibrate import CalibrationConfig, calibrate_in_stages
+    from physworld.engine.thin.triangles import Mesh
     from physworld.estimation.simulations import Workers, in_turn
     from physworld_workers.commands.steps import journal_in
     from physworld_workers.commands.terminal import progress_bar, read_scene
     from physworld_workers.law_choice import AUTO, chosen_laws
-    from physworld_workers.mesh_choice import AUTO as AUTO_MESH
-    from physworld_workers.mesh_choice import PLATE, fitted_as_recorded, named_mesh
     from physworld_workers.tasks.fit_accuracy import fit_accuracy, not_measured
     from physworld_workers.tasks.fit_report import fit_files, fit_report
 
     _refuse_places(given)
     scene = read_scene(given.scene)
-    mesh = given.mesh or (AUTO_MESH if given.stages == GLOBAL else PLATE)  # no mesh has a field's gradients
     numbers = {"particle_budget": given.particles, "max_simulations": given.simulations}
     config = CalibrationConfig(
         **{name: value for name, value in numbers.items() if value is not None},
         formulation=given.formulation,
         transfer=given.transfer,
         plasticity=given.plasticity,
-        mesh=named_mesh(mesh),
+        mesh=None if given.mesh is None else Mesh.read(given.mesh),
     )
-    settings = f"{given.law} {mesh} {config}"
+    settings = f"{given.law} {config}"
     journal = None if given.resume is None else journal_in(given.resume, scene, settings)
     with Workers(given.processes) if given.processes > 1 else nullcontext(in_turn) as runner:
         with progress_bar(f"law {scene.name}") if given.law == AUTO else nullcontext() as shown:
             config, choice = chosen_laws(given.law, scene, config, shown, journal=journal, runner=runner)
         with progress_bar(f"fit {scene.name}") as shown:
-            fitted = fitted_as_recorded(
-                mesh, scene, config, given.stages, shown, journal=journal, runner=runner
+            fitted = calibrate_in_stages(
+                scene, config, given.stages, progress=shown, journal=journal, runner=runner
             )
         accuracy = not_measured("left out by --quick")
         if not given.quick:

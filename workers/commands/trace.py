@@ -57,6 +57,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--predictions", type=Path, default=None, help="npz with the tracks before and after")
     parser.add_argument("--html", type=Path, default=None, help="write the report as a page to this file")
     parser.add_argument("--particles", type=_count, default=None, help="particles of the twin, about")
+    parser.add_argument(
+        "--mesh",
+        default=None,
+        help="of a sheet: the mesh of triangles that recorded it, such as 16x15 or 16x15odd",
+    )
     parser.add_argument("--processes", type=_count, default=PROCESSES, help="processes that simulate")
     parser.add_argument(
         "--time-limit",
@@ -103,7 +108,7 @@ def _trace(given: argparse.Namespace) -> None:
     wp.config.quiet = True  # before the first import that starts it
     import numpy as np
 
-    from physworld.calibrate import CalibrationConfig
+    from physworld.engine.thin.triangles import Mesh
     from physworld.estimation.simulations import in_turn
     from physworld.report import render
     from physworld.trace import Memory, TraceConfig, Workers, document, trace
@@ -115,8 +120,9 @@ def _trace(given: argparse.Namespace) -> None:
     scene = scenes[0]
     config = TraceConfig(time_limit_s=60.0 * given.time_limit or None, noise_m=given.noise)
     if given.particles is not None:
-        budget = CalibrationConfig(particle_budget=given.particles, damping="none")
-        config = replace(config, calibration=budget)
+        config = replace(config, calibration=replace(config.calibration, particle_budget=given.particles))
+    if given.mesh is not None:
+        config = replace(config, calibration=replace(config.calibration, mesh=Mesh.read(given.mesh)))
     memory = journal = None
     if given.resume is not None:
         memory = Memory(given.resume / "simulations")

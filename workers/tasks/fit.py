@@ -8,13 +8,13 @@ Simulations that do not depend on each other are shared with whatever worker is 
 
 from __future__ import annotations
 
-from physworld.calibrate import CalibrationConfig
+from physworld.calibrate import CalibrationConfig, calibrate_in_stages
+from physworld.engine.thin.triangles import Mesh
 from physworld_schemas.fit import FitConfig
 from physworld_storage.jobs import helpers
 from physworld_workers.context import TaskContext
 from physworld_workers.law_choice import chosen_laws
 from physworld_workers.lineage import lineage_of
-from physworld_workers.mesh_choice import fitted_as_recorded, named_mesh
 from physworld_workers.registry import HandlerResult
 from physworld_workers.stores import Stores
 from physworld_workers.tasks.fit_accuracy import fit_accuracy, not_measured
@@ -44,15 +44,15 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
         plasticity=config.plasticity,
         formulation=config.formulation,
         transfer=config.transfer,
-        mesh=named_mesh(config.mesh),
+        mesh=None if config.mesh is None else Mesh.read(config.mesh),
     )
     journal = stored_journal(stores, context.lease.job_id, payload)
     runner = SharedRunner(context, stores, WORTH_SHARING_S)
     calibration, law = chosen_laws(
         config.law, scene, calibration, progress, context.cancelled, journal, runner
     )
-    fitted = fitted_as_recorded(
-        config.mesh, scene, calibration, config.stages, progress, context.cancelled, journal, runner
+    fitted = calibrate_in_stages(
+        scene, calibration, config.stages, None, progress, context.cancelled, journal, runner
     )
     accuracy = not_measured("left out by the request")
     if config.numerics:

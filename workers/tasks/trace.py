@@ -16,6 +16,7 @@ import numpy as np
 
 from physworld.calibrate import CalibrationConfig
 from physworld.calibrate.parameters import bending_ratio
+from physworld.engine.thin.triangles import Mesh
 from physworld.materials.laws import SheetLaw
 from physworld.trace import TraceConfig, trace
 from physworld.twin.twin import Twin
@@ -86,7 +87,7 @@ def _traced(context: TaskContext, stores: Stores, scene: Scene) -> Any:
         runner=SharedRunner(context, stores),
         memory=SharedMemory(stores, context.lease.job_id),
         journal=stored_journal(stores, context.lease.job_id, payload),
-        calibrated_twin=_undamped_twin(stores, payload["fit_id"], fit.particle_budget),
+        calibrated_twin=_undamped_twin(stores, payload["fit_id"], fit),
         progress=shown,
         cancelled=context.cancelled,
     )
@@ -100,6 +101,7 @@ def translate(fit: FitConfig, config: WireConfig, device: str) -> TraceConfig:
         max_simulations=fit.max_simulations,
         device=device,
         damping="none",
+        mesh=None if fit.mesh is None else Mesh.read(fit.mesh),
     )
     return replace(
         settings,
@@ -130,8 +132,8 @@ class _Progress:
         self._context.progress(round(100 * self._share, 1), 100, "percent", text)
 
 
-def _undamped_twin(stores: Stores, fit_id: str | None, budget: int) -> Twin | None:
-    """The fit's twin where its physics is the declared one and its cells are of this budget; else None.
+def _undamped_twin(stores: Stores, fit_id: str | None, asked: FitConfig) -> Twin | None:
+    """The fit's twin where its physics is the declared one and its cells are those asked for; else None.
 
     A sheet whose bending has a shape of its own is none: an effect such as fibres may have gone into it.
     """
@@ -139,7 +141,8 @@ def _undamped_twin(stores: Stores, fit_id: str | None, budget: int) -> Twin | No
         return None
     with stores.database.reading() as session:
         config = resources.get_fit(session, fit_id).config
-    if config.particle_budget != budget or not config.usual_physics:
+    cells = (config.particle_budget, config.mesh)
+    if cells != (asked.particle_budget, asked.mesh) or not config.usual_physics:
         return None
     twin = twin_of(stores, fit_id)
     if isinstance(twin.law, SheetLaw):

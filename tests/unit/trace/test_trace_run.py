@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 from made_scene import box_body, made_scene
 
-from benchmarks.peers.flex_sheet import FlexSheet, record
 from physworld.calibrate import CalibrationConfig
 from physworld.effects.registry import effect
-from physworld.engine.thin.triangles import Mesh
 from physworld.errors import Cancelled
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
 from physworld.trace import Memory, TraceConfig, TraceResult, document, trace
@@ -64,9 +62,6 @@ def test_where_nothing_acts_nothing_is_named() -> None:
     found = trace(recorded(beam(0.015), sigma=2 * SIGMA), CONFIG)
     assert found.verdict.name == "nothing_to_explain" and not found.effects
     assert found.better is None
-    mesh = build_twin(record(FlexSheet(frames=4)), mesh=Mesh((16, 15)))
-    fitted = replace(found.declared.fitted, twin=mesh)
-    assert replace(found, declared=replace(found.declared, fitted=fitted)).better is mesh
 
 
 def test_a_faulty_frame_and_a_marker_that_slips_are_left_out_and_told() -> None:

@@ -63,18 +63,16 @@ def test_jobs_that_have_not_begun_never_do_once_time_is_up() -> None:
 
 
 def test_the_parts_of_a_trace_end_in_turn_and_the_searches_have_a_quarter_at_least() -> None:
-    ledger = Ledger(cut=["of another body"])
-    clock = Clock(time.perf_counter() - 1000.0, 100.0, ledger, 2)
-    for left in (0.5, 1.0):
-        clock.start()
-        begun = time.perf_counter()
-        assert not ledger.cut
-        with clock.until(SELECTION):
-            assert ledger.ends_at == pytest.approx(begun + left * 25.0 * SELECTION, abs=1.0)
-        with clock.until(CONFIRMATION):
-            assert ledger.ends_at == pytest.approx(begun + left * 25.0 * CONFIRMATION, abs=1.0)
-        assert ledger.ends_at == float("inf")
-    free = Clock(0.0, None, Ledger(), 1)
+    ledger = Ledger()
+    clock = Clock(time.perf_counter() - 1000.0, 100.0, ledger)
+    clock.start()
+    begun = time.perf_counter()
+    with clock.until(SELECTION):
+        assert ledger.ends_at == pytest.approx(begun + 25.0 * SELECTION, abs=1.0)
+    with clock.until(CONFIRMATION):
+        assert ledger.ends_at == pytest.approx(begun + 25.0 * CONFIRMATION, abs=1.0)
+    assert ledger.ends_at == float("inf")
+    free = Clock(0.0, None, Ledger())
     free.start()
     with free.until(SELECTION):
         assert free.ledger.ends_at == float("inf")
@@ -83,7 +81,7 @@ def test_the_parts_of_a_trace_end_in_turn_and_the_searches_have_a_quarter_at_lea
 def test_nothing_is_named_that_finer_cells_were_not_asked_about() -> None:
     bar = Bar(effect("air_drag_linear", rate_per_s=3.0))
     declared, model = bar.declared(5e4), bar.model("air_drag_linear", 5e4, rate_per_s=3.0)
-    clock = Clock(0.0, 60.0, Ledger(), 1)
+    clock = Clock(0.0, 60.0, Ledger())
     named = Verdict(NAMED, model, (), "best supported")
     assert clock.told(named, declared, {}) is named
     clock.ledger.cut += ["second resolution", "refit of mixtures", "refit of mixtures"]

@@ -243,6 +243,7 @@ def test_a_service_traces_as_the_library_does_unless_it_is_told_otherwise() -> N
     [
         ({"law": "hencky"}, {}, False),
         ({"plasticity": "von_mises"}, {}, False),
+        ({"mesh": "4x4"}, {}, False),
         ({}, {}, True),
         ({}, {"membrane_n_m": 3e3, "bending_n_m": 3e3 * 4e-4**2 / 12, "bending_twist_ratio": 2.0}, True),
         ({}, {"bending_coupling": 0.5}, False),
@@ -266,4 +267,4 @@ def test_a_fit_whose_physics_is_not_the_declared_one_is_calibrated_anew(
         scene = replace(scene, grips=())
     twin = build_twin(scene, FIT.particle_budget).with_parameters(**law)
     monkeypatch.setattr(task, "twin_of", lambda stores, fit_id: twin)
-    assert (task._undamped_twin(stores, fit_id, FIT.particle_budget) is twin) is taken
+    assert (task._undamped_twin(stores, fit_id, FIT) is twin) is taken

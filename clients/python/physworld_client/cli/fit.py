@@ -39,7 +39,7 @@ def fit(
     ] = None,
     mesh: Annotated[
         str | None,
-        typer.Option(help="Of a sheet: the mesh that recorded it, such as 16x15; or plate; default: ask."),
+        typer.Option(help="Of a sheet: the mesh of triangles that recorded it, such as 16x15."),
     ] = None,
     stages: Annotated[
         str | None, typer.Option(help="global, or global+local: a field over the body on top, if it holds.")

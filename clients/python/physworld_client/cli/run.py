@@ -48,7 +48,7 @@ def run(
         str | None, typer.Option(help="Of the updated Lagrangian form: apic or asflip.")
     ] = None,
     mesh: Annotated[
-        str | None, typer.Option(help="Of a sheet: the mesh that recorded it, such as 16x15, or auto.")
+        str | None, typer.Option(help="Of a sheet: the mesh of triangles that recorded it, such as 16x15.")
     ] = None,
     stages: Annotated[
         str | None, typer.Option(help="Of the fit: global, or global+local with a field over the body.")

@@ -51,6 +51,10 @@ def trace(
     ] = None,
     html: Annotated[Path | None, typer.Option(help="Write the report as a page to this file.")] = None,
     particles: Annotated[int | None, typer.Option(min=50, help="Particles of the twin, about.")] = None,
+    mesh: Annotated[
+        str | None,
+        typer.Option(help="Of a sheet: the mesh of triangles that recorded it, such as 16x15."),
+    ] = None,
     processes: Annotated[int | None, typer.Option(min=1, help="Processes that simulate.")] = None,
     time_limit: Annotated[
         float | None,
@@ -77,6 +81,7 @@ def trace(
         "--predictions": predictions,
         "--html": html,
         "--particles": particles,
+        "--mesh": mesh,
         "--processes": processes,
         "--time-limit": time_limit,
         "--noise": noise,

@@ -22,7 +22,6 @@ from physworld_schemas.model import ModelVersion, TrainingConfig, TrainingCreate
 from physworld_schemas.trace import TraceCreate
 from physworld_services.trainer.app import HANDLERS
 from physworld_services.trainer.assessment import assess
-from physworld_services.trainer.closed_loop import statement
 from physworld_storage import registry, traces
 from physworld_storage.database import open_database
 from physworld_storage.jobs import jobs, leases
@@ -163,20 +162,6 @@ def test_the_card_says_why_nothing_was_added(
         "Nothing was added to the twin, the verdict is unexplained: it fits"
     )
     assert version.metrics["held_out"]["track_m"]["twin"] == plain.metrics["held_out"]["track_m"]["twin"]
-
-
-def test_a_twin_without_an_effect_that_a_trace_leaves_is_called_a_mesh(
-    runtime: Runtime, scene_id: str, fit_id: str
-) -> None:
-    trace_id = _trace(runtime, scene_id, fit_id, "named")
-    with runtime.database.session() as session:
-        row = session.get_one(TraceRow, trace_id)
-        row.verdict = "nothing_to_explain"
-        row.report = row.report | {"verdict": row.verdict, "effects": []}
-    with runtime.database.reading() as session:
-        found = traces.get_trace(session, trace_id)
-    assert traces.leaves_twin(found)
-    assert statement(found).startswith("The twin is the mesh of triangles that the sheet was recorded as")
 
 
 def test_the_best_of_an_equivalent_set_is_added_and_called_that(
