@@ -15,7 +15,7 @@ from physworld_client import calls, transport
 from physworld_client.arrays import arrays_of
 from physworld_client.bundle import open_bundle
 from physworld_client.errors import PhysWorldError, WaitTimedOut
-from physworld_client.export import Format, open_export
+from physworld_client.export import open_export
 from physworld_client.known_keys import is_fingerprint, trusted_keys
 from physworld_client.manifest import artifacts_of, verify_folder
 from physworld_client.pages import ListPage
@@ -126,7 +126,7 @@ class Datasets(Resource):
         dataset_id: str,
         folder: str | Path,
         *,
-        format: Format = "npz",
+        format: str = "npz",
         episodes: int | None = None,
         points: int | None = None,
         on_progress: Callable[[int, int], None] | None = None,

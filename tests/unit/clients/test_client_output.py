@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
+
 import pytest
+from physworld_client.cli.app import app
+from physworld_client.cli.lists import RESOURCES, Resource
 from physworld_client.cli.output import print_fields
+from physworld_client.client import Client
 from pydantic import BaseModel
+from typer.testing import CliRunner
 
 
 class Thing(BaseModel):
@@ -18,3 +24,23 @@ def test_long_curves_are_told_by_their_length(capsys: pytest.CaptureFixture[str]
     assert '"40 numbers"' in printed
     assert "[0, 63]" in printed
     assert "0.1" not in printed
+
+
+@pytest.mark.parametrize("resource", RESOURCES, ids=lambda resource: resource.name)
+def test_the_table_of_lists_names_what_the_client_has(resource: Resource) -> None:
+    with Client("http://127.0.0.1:1") as client:
+        held = getattr(client, resource.name)
+    for listing in resource.lists:
+        parameters = inspect.signature(getattr(held, listing.name)).parameters
+        wanted = {keyword for _, keyword, _ in listing.filters} | ({listing.of} - {None})
+        assert wanted <= parameters.keys(), listing
+        help_text = CliRunner().invoke(app, [resource.name, listing.name, "--help"]).output
+        for option in (
+            "limit",
+            "json",
+            "url",
+            "token",
+            "data",
+            *(option for option, _, _ in listing.filters),
+        ):
+            assert f"--{option}" in help_text

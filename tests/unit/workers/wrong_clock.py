@@ -27,7 +27,10 @@ def put_wrong(seconds: float) -> None:
             return right.now(tz) + datetime.timedelta(seconds=seconds)
 
     for name, module in list(sys.modules.items()):
-        if name.partition(".")[0] in {"physworld_storage", "physworld_workers"} and vars(module).get("datetime") is right:
+        if (
+            name.partition(".")[0] in {"physworld_storage", "physworld_workers"}
+            and vars(module).get("datetime") is right
+        ):
             vars(module)["datetime"] = Wrong
     assert abs((physworld_storage.tables.utc_now() - right.now(datetime.UTC)).total_seconds() - seconds) < 5.0
 

@@ -16,7 +16,11 @@ from typing import NoReturn
 import typer
 from pydantic import ValidationError
 
-from physworld_client.cli import effects, export, fit, lists, loop, predict, registry, run, trace, up, video
+import physworld_client.cli.actions
+import physworld_client.cli.loop
+import physworld_client.cli.registry  # noqa: F401  (adds commands to the groups)
+from physworld_client.cli import effects, fit, lists, predict, run, trace, up, video
+from physworld_client.cli.options import connected
 from physworld_client.cli.output import stderr
 from physworld_client.errors import PhysWorldError
 
@@ -32,17 +36,12 @@ app.command("up")(up.up)
 app.command("run")(run.run)
 app.command("fit")(fit.fit)
 app.command("trace", cls=trace.ManyHeldOut)(trace.trace)
-app.command("rollout")(predict.rollout)
-app.command("plan")(predict.plan)
+connected(app, "rollout")(predict.rollout)
+connected(app, "plan")(predict.plan)
 app.command("video")(video.video)
 app.add_typer(effects.effects, name="effects")
-app.add_typer(lists.scenes, name="scenes")
-app.add_typer(lists.fits, name="fits")
-app.add_typer(loop.traces, name="traces")
-lists.datasets.command("export")(export.export)
-app.add_typer(lists.datasets, name="datasets")
-app.add_typer(registry.models, name="models")
-app.add_typer(lists.jobs, name="jobs")
+for name, group in lists.GROUPS.items():
+    app.add_typer(group, name=name)
 
 
 @app.command("version")

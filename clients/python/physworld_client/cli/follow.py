@@ -13,8 +13,7 @@ from typing import Protocol
 
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
-from physworld_client.cli.lists import progress_text
-from physworld_client.cli.output import stdout
+from physworld_client.cli.output import progress_text, stdout
 from physworld_client.cli.report import STAGES, duration_s
 from physworld_client.client import Client
 from physworld_client.errors import ConnectionFailed

@@ -1,372 +1,272 @@
-"""``physworld scenes|fits|datasets|models|jobs``: look at what the service holds, cancel, download.
+"""What the command line lists, shows and downloads: one table of resources, and the commands that are made of it.
 
-Every command goes through the SDK; ``--json`` prints the wire models as they are.
+Every command goes through the SDK; ``--json`` prints the wire models as they are. What else can be done with a
+resource stands in ``actions``, ``registry`` and ``traces``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import inspect
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Any
 
-import numpy as np
 import typer
 from pydantic import BaseModel
 
-from physworld_client.cli import service
-from physworld_client.cli.export import export
-from physworld_client.cli.options import Data, Json, Limit, Token, Url
-from physworld_client.cli.output import ago, print_fields, print_json, print_table, stdout
+from physworld_client.cli.options import Json, Limit, Out, connected
+from physworld_client.cli.output import (
+    ago,
+    millimetres,
+    print_json,
+    print_table,
+    progress_text,
+    show,
+    stdout,
+)
 from physworld_client.client import Client
 from physworld_client.manifest import checked_name
-from physworld_client.resources import LATEST
+from physworld_client.pages import ListPage
 from physworld_schemas.base import Artifact
-from physworld_schemas.dataset import Dataset
+from physworld_schemas.dataset import Dataset, Episode
 from physworld_schemas.fit import Fit
 from physworld_schemas.job import Job
 from physworld_schemas.model import Model, ModelVersion
 from physworld_schemas.scene import Scene
+from physworld_schemas.trace import Trace
 
-Item = TypeVar("Item", bound=BaseModel)
 DEFAULT_LIMIT = 20
 PAGE = 100
 
-scenes = typer.Typer(help="Measured scenes.", no_args_is_help=True)
-fits = typer.Typer(help="Calibrated twins.", no_args_is_help=True)
-datasets = typer.Typer(help="Datasets of demonstration episodes.", no_args_is_help=True)
-datasets.command("export")(export)
-models = typer.Typer(help="Published world models.", no_args_is_help=True)
-jobs = typer.Typer(help="Jobs.", no_args_is_help=True)
-
-Out = Annotated[Path | None, typer.Option("--out", "-o", help="Folder for the files [./ID].")]
-VersionName = Annotated[str, typer.Option("--version", help="A number, an alias, or latest.")]
+Row = Callable[[Any], Sequence[object]]
 
 
-@scenes.command("list")
-def scenes_list(
-    limit: Limit = DEFAULT_LIMIT, json: Json = False, url: Url = None, token: Token = None, data: Data = None
-) -> None:
-    """Scenes, newest first."""
-    headings = ("id", "name", "kind", "frames", "points", "controllers", "age")
+@dataclass(frozen=True)
+class Listing:
+    """One list of a resource.
 
-    def row(scene: Scene) -> tuple[str, ...]:
-        counts = (str(scene.frames), str(scene.points), str(scene.controllers))
-        return (scene.id, scene.name, scene.kind, *counts, ago(scene.created_at))
+    Attributes:
+        name: of the command, and the method of the client's resource.
+        help: its line of help.
+        headings: of the columns.
+        row: the cells of an item.
+        of: the argument that names whose list it is; none: all of the service.
+        filters: options that narrow it: (option, the method's keyword, help).
+    """
 
-    with service.connect(url, token, data) as client:
-        show_list(client.scenes.list(limit=min(limit, PAGE)).auto_paging_iter(), limit, json, headings, row)
-
-
-@scenes.command("add")
-def scenes_add(
-    path: Annotated[Path, typer.Argument(help="Folder, archive, final_data.pkl or C3D file.")],
-    json: Json = False,
-    url: Url = None,
-    token: Token = None,
-    data: Data = None,
-) -> None:
-    """Upload a scene."""
-    with service.connect(url, token, data) as client:
-        show(client.scenes.create(path), json)
+    name: str
+    help: str
+    headings: tuple[str, ...]
+    row: Row
+    of: str | None = None
+    filters: tuple[tuple[str, str, str], ...] = ()
 
 
-@scenes.command("show")
-def scenesshow(
-    scene_id: str, json: Json = False, url: Url = None, token: Token = None, data: Data = None
-) -> None:
-    """One scene."""
-    with service.connect(url, token, data) as client:
-        show(client.scenes.get(scene_id), json)
+@dataclass(frozen=True)
+class Resource:
+    """One resource of the service as the command line knows it.
+
+    Attributes:
+        name: of the group of commands, and the client's attribute.
+        help: the group's line of help.
+        lists: its lists.
+        one: what ``show`` and ``download`` call one of them; their argument is its id.
+        shown: whether ``show`` prints it field by field; otherwise it has a command of its own.
+        files: what ``download`` fetches; None: it has a command of its own, or no files.
+    """
+
+    name: str
+    help: str
+    lists: tuple[Listing, ...]
+    one: str
+    shown: bool = True
+    files: str | None = None
 
 
-@scenes.command("download")
-def scenes_download(
-    scene_id: str, out: Out = None, url: Url = None, token: Token = None, data: Data = None
-) -> None:
-    """Download the files of a scene."""
-    with service.connect(url, token, data) as client:
-        download(client, client.scenes.get(scene_id).artifacts, out or Path(scene_id))
+def _scene(scene: Scene) -> Sequence[object]:
+    counts = (scene.frames, scene.points, scene.controllers)
+    return (scene.id, scene.name, scene.kind, *counts, ago(scene.created_at))
 
 
-@fits.command("list")
-def fits_list(
-    limit: Limit = DEFAULT_LIMIT, json: Json = False, url: Url = None, token: Token = None, data: Data = None
-) -> None:
-    """Fits, newest first."""
-    headings = ("id", "scene", "state", "parameters", "age")
-
-    def row(fit: Fit) -> tuple[str, ...]:
-        shown = ", ".join(f"{name} {value.value:.4g} {value.unit}" for name, value in fit.parameters.items())
-        return (fit.id, fit.scene_id, fit.state, shown, ago(fit.created_at))
-
-    with service.connect(url, token, data) as client:
-        show_list(client.fits.list(limit=min(limit, PAGE)).auto_paging_iter(), limit, json, headings, row)
+def _fit(fit: Fit) -> Sequence[object]:
+    parameters = (f"{name} {value.value:.4g} {value.unit}" for name, value in fit.parameters.items())
+    return (fit.id, fit.scene_id, fit.state, ", ".join(parameters), ago(fit.created_at))
 
 
-@fits.command("show")
-def fitsshow(
-    fit_id: str, json: Json = False, url: Url = None, token: Token = None, data: Data = None
-) -> None:
-    """One fit."""
-    with service.connect(url, token, data) as client:
-        show(client.fits.get(fit_id), json)
+def _trace(trace: Trace) -> Sequence[object]:
+    effects = ", ".join(effect.name for effect in trace.effects)
+    verdict = (trace.verdict or "", effects, held_out_errors(trace))
+    return (trace.id, trace.scene or trace.scene_id, trace.state, *verdict, ago(trace.created_at))
 
 
-@fits.command("download")
-def fits_download(
-    fit_id: str, out: Out = None, url: Url = None, token: Token = None, data: Data = None
-) -> None:
-    """Download the files of a fit: the twin and its report."""
-    with service.connect(url, token, data) as client:
-        download(client, client.fits.get(fit_id).artifacts, out or Path(fit_id))
+def _dataset(dataset: Dataset) -> Sequence[object]:
+    episodes = f"{dataset.episodes_done}/{dataset.config.episodes}"
+    return (dataset.id, dataset.fit_id, dataset.state, episodes, ago(dataset.created_at))
 
 
-@datasets.command("list")
-def datasets_list(
-    limit: Limit = DEFAULT_LIMIT, json: Json = False, url: Url = None, token: Token = None, data: Data = None
-) -> None:
-    """Datasets, newest first."""
-    headings = ("id", "fit", "state", "episodes", "age")
-
-    def row(dataset: Dataset) -> tuple[str, ...]:
-        episodes = f"{dataset.episodes_done}/{dataset.config.episodes}"
-        return (dataset.id, dataset.fit_id, dataset.state, episodes, ago(dataset.created_at))
-
-    with service.connect(url, token, data) as client:
-        show_list(client.datasets.list(limit=min(limit, PAGE)).auto_paging_iter(), limit, json, headings, row)
+def _episode(episode: Episode) -> Sequence[object]:
+    made = (episode.index, episode.motion, episode.seed, episode.frames)
+    return (*made, episode.particles, episode.attempt, episode.digest[:12])
 
 
-@datasets.command("show")
-def datasetsshow(
-    dataset_id: str, json: Json = False, url: Url = None, token: Token = None, data: Data = None
-) -> None:
-    """One dataset."""
-    with service.connect(url, token, data) as client:
-        show(client.datasets.get(dataset_id), json)
+def _model(model: Model) -> Sequence[object]:
+    aliases = ", ".join(f"{alias} → {number}" for alias, number in sorted(model.aliases.items()))
+    return (model.name, model.latest_version or "none", aliases, ago(model.created_at))
 
 
-@datasets.command("episodes")
-def datasets_episodes(
-    dataset_id: str,
-    limit: Limit = DEFAULT_LIMIT,
-    json: Json = False,
-    url: Url = None,
-    token: Token = None,
-    data: Data = None,
-) -> None:
-    """The committed episodes of a dataset."""
-    headings = ("index", "motion", "seed", "frames", "particles", "attempt", "digest")
-    with service.connect(url, token, data) as client:
-        show_list(
-            client.datasets.episodes(dataset_id, limit=min(limit, PAGE)).auto_paging_iter(),
-            limit,
-            json,
-            headings,
-            lambda episode: (
-                *(str(number) for number in (episode.index, episode.motion, episode.seed, episode.frames)),
-                *(str(number) for number in (episode.particles, episode.attempt)),
-                episode.digest[:12],
-            ),
-        )
+def _version(version: ModelVersion) -> Sequence[object]:
+    digest = (version.sha256 or "")[:12]
+    return (version.version, version.state, ", ".join(version.aliases), digest, ago(version.created_at))
 
 
-@datasets.command("download")
-def datasets_download(
-    dataset_id: str,
-    out: Out = None,
-    episodes: Annotated[bool, typer.Option("--episodes", help="Every episode too, as npz.")] = False,
-    url: Url = None,
-    token: Token = None,
-    data: Data = None,
-) -> None:
-    """Download the manifest of a dataset, and its episodes when asked."""
-    folder = out or Path(dataset_id)
-    with service.connect(url, token, data) as client:
-        download(client, client.datasets.get(dataset_id).artifacts, folder)
-        if not episodes:
-            return
-        folder.mkdir(parents=True, exist_ok=True)
-        count = 0
-        for episode in client.datasets.episodes(dataset_id, limit=PAGE).auto_paging_iter():
-            arrays = client.datasets.episode(dataset_id, episode.index)
-            np.savez(folder / f"episode-{episode.index:05d}.npz", allow_pickle=False, **arrays)
-            count += 1
-    stdout.print(f"{folder.absolute()}  {count} episodes", soft_wrap=True)
+def _job(job: Job) -> Sequence[object]:
+    return (job.id, job.kind, job.state, progress_text(job), ago(job.created_at))
 
 
-@models.command("list")
-def models_list(
-    limit: Limit = DEFAULT_LIMIT, json: Json = False, url: Url = None, token: Token = None, data: Data = None
-) -> None:
-    """Registered names."""
-
-    def row(model: Model) -> tuple[str, ...]:
-        aliases = ", ".join(f"{alias} → {number}" for alias, number in sorted(model.aliases.items()))
-        return (model.name, str(model.latest_version or "none"), aliases, ago(model.created_at))
-
-    with service.connect(url, token, data) as client:
-        pages = client.models.list(limit=min(limit, PAGE)).auto_paging_iter()
-        show_list(pages, limit, json, ("name", "latest", "aliases", "age"), row)
+def held_out_errors(trace: Trace) -> str:
+    """``2.31 → 1.7 (noise 1.6)`` [mm]; nothing before the trace has measured them."""
+    held_out = trace.held_out
+    if held_out is None:
+        return ""
+    text = f"{millimetres(held_out.get('before'))} → {millimetres(held_out.get('after'))}"
+    floor = held_out.get("noise_floor")
+    return text if floor is None else f"{text} (noise {millimetres(floor)})"
 
 
-@models.command("versions")
-def models_versions(
-    name: str,
-    limit: Limit = DEFAULT_LIMIT,
-    json: Json = False,
-    url: Url = None,
-    token: Token = None,
-    data: Data = None,
-) -> None:
-    """Versions of a name, newest first."""
-
-    def row(version: ModelVersion) -> tuple[str, ...]:
-        digest = (version.sha256 or "")[:12]
-        return (
-            str(version.version),
-            version.state,
-            ", ".join(version.aliases),
-            digest,
-            ago(version.created_at),
-        )
-
-    with service.connect(url, token, data) as client:
-        pages = client.models.versions(name, limit=min(limit, PAGE)).auto_paging_iter()
-        show_list(pages, limit, json, ("version", "state", "aliases", "sha256", "age"), row)
-
-
-@models.command("show")
-def modelsshow(
-    name: str,
-    version: VersionName = LATEST,
-    json: Json = False,
-    url: Url = None,
-    token: Token = None,
-    data: Data = None,
-) -> None:
-    """One version of a model."""
-    with service.connect(url, token, data) as client:
-        show(client.models.version(name, version), json)
-
-
-@models.command("alias")
-def models_alias(
-    name: str, alias: str, version: int, url: Url = None, token: Token = None, data: Data = None
-) -> None:
-    """Point an alias at a version."""
-    with service.connect(url, token, data) as client:
-        client.models.set_alias(name, alias, version)
-    stdout.print(f"{name}@{alias} is version {version}")
-
-
-@jobs.command("list")
-def jobs_list(
-    limit: Limit = DEFAULT_LIMIT,
-    state: Annotated[str | None, typer.Option(help="Only jobs in this state.")] = None,
-    kind: Annotated[str | None, typer.Option(help="Only jobs of this kind.")] = None,
-    json: Json = False,
-    url: Url = None,
-    token: Token = None,
-    data: Data = None,
-) -> None:
-    """Jobs, newest first."""
-
-    def row(job: Job) -> tuple[str, ...]:
-        return (job.id, job.kind, job.state, progress_text(job), ago(job.created_at))
-
-    with service.connect(url, token, data) as client:
-        pages = client.jobs.list(limit=min(limit, PAGE), state=state, kind=kind).auto_paging_iter()
-        show_list(pages, limit, json, ("id", "kind", "state", "progress", "age"), row)
+SCENES = Listing(
+    "list",
+    "Scenes, newest first.",
+    ("id", "name", "kind", "frames", "points", "controllers", "age"),
+    _scene,
+)
+FITS = Listing("list", "Fits, newest first.", ("id", "scene", "state", "parameters", "age"), _fit)
+TRACES = Listing(
+    "list",
+    "Traces, newest first.",
+    ("id", "scene", "state", "verdict", "effects", "before → after [mm]", "age"),
+    _trace,
+    filters=(
+        ("scene", "scene_id", "Only traces of this scene."),
+        ("verdict", "verdict", "Only traces with this verdict."),
+    ),
+)
+DATASETS = Listing("list", "Datasets, newest first.", ("id", "fit", "state", "episodes", "age"), _dataset)
+EPISODES = Listing(
+    "episodes",
+    "The committed episodes of a dataset.",
+    ("index", "motion", "seed", "frames", "particles", "attempt", "digest"),
+    _episode,
+    of="dataset_id",
+)
+MODELS = Listing("list", "Registered names.", ("name", "latest", "aliases", "age"), _model)
+VERSIONS = Listing(
+    "versions",
+    "Versions of a name, newest first.",
+    ("version", "state", "aliases", "sha256", "age"),
+    _version,
+    of="name",
+)
+JOBS = Listing(
+    "list",
+    "Jobs, newest first.",
+    ("id", "kind", "state", "progress", "age"),
+    _job,
+    filters=(
+        ("state", "state", "Only jobs in this state."),
+        ("kind", "kind", "Only jobs of this kind."),
+    ),
+)
+RESOURCES = (
+    Resource("scenes", "Measured scenes.", (SCENES,), "scene", files="the files of a scene"),
+    Resource(
+        "fits", "Calibrated twins.", (FITS,), "fit", files="the files of a fit: the twin and its report"
+    ),
+    Resource(
+        "traces",
+        "Residuals traced to effects.",
+        (TRACES,),
+        "trace",
+        shown=False,
+        files="the files of a trace: the report, the tracks before and after, the twin with the effects",
+    ),
+    Resource("datasets", "Datasets of demonstration episodes.", (DATASETS, EPISODES), "dataset"),
+    Resource("models", "Published world models.", (MODELS, VERSIONS), "model", shown=False),
+    Resource("jobs", "Jobs.", (JOBS,), "job"),
+)
 
 
-@jobs.command("show")
-def jobsshow(
-    job_id: str, json: Json = False, url: Url = None, token: Token = None, data: Data = None
-) -> None:
-    """One job."""
-    with service.connect(url, token, data) as client:
-        show(client.jobs.get(job_id), json)
+def group_of(resource: Resource) -> typer.Typer:
+    """The group of a resource's commands, with those that the table tells of."""
+    group = typer.Typer(help=resource.help, no_args_is_help=True)
+    for listing in resource.lists:
+        _add_list(group, resource, listing)
+    if resource.shown:
+        _add_show(group, resource)
+    if resource.files is not None:
+        _add_download(group, resource)
+    return group
 
 
-@jobs.command("wait")
-def jobs_wait(
-    job_id: str,
-    timeout: Annotated[float | None, typer.Option(min=0, help="Seconds; default for ever.")] = None,
-    json: Json = False,
-    url: Url = None,
-    token: Token = None,
-    data: Data = None,
-) -> None:
-    """Wait for a job's end; exit code 1 when it failed or was cancelled."""
+def _add_list(group: typer.Typer, resource: Resource, listing: Listing) -> None:
+    options: dict[str, tuple[Any, Any]] = {}
+    if listing.of is not None:
+        options[listing.of] = (str, inspect.Parameter.empty)
+    options["limit"] = (Limit, DEFAULT_LIMIT)
+    for option, _, text in listing.filters:
+        options[option] = (Annotated[str | None, typer.Option(help=text)], None)
+    options["json"] = (Json, False)
 
-    def tell(job: Job) -> None:
-        if not json:
-            stdout.print(f"{job.state}  {progress_text(job)}", soft_wrap=True)
+    def listed(client: Client, **given: Any) -> None:
+        method: Callable[..., ListPage[Any]] = getattr(getattr(client, resource.name), listing.name)
+        whose = () if listing.of is None else (given[listing.of],)
+        chosen = {keyword: given[option] for option, keyword, _ in listing.filters}
+        pages = method(*whose, limit=min(given["limit"], PAGE), **chosen).auto_paging_iter()
+        show_list(pages, given["limit"], given["json"], listing.headings, listing.row)
 
-    with service.connect(url, token, data) as client:
-        job = client.jobs.wait(job_id, timeout, tell)
-    if json:
-        print_json(job)
-
-
-@jobs.command("retry")
-def jobs_retry(
-    job_id: str, json: Json = False, url: Url = None, token: Token = None, data: Data = None
-) -> None:
-    """Take a failed job up again; what it stored is kept."""
-    with service.connect(url, token, data) as client:
-        _print_state(client.jobs.retry(job_id), json)
+    listed.__doc__ = listing.help
+    connected(group, listing.name, options)(listed)
 
 
-@jobs.command("cancel")
-def jobs_cancel(
-    job_id: str, json: Json = False, url: Url = None, token: Token = None, data: Data = None
-) -> None:
-    """Cancel a job and everything it started."""
-    with service.connect(url, token, data) as client:
-        _print_state(client.jobs.cancel(job_id), json)
+def _add_show(group: typer.Typer, resource: Resource) -> None:
+    name = f"{resource.one}_id"
+
+    def shown(client: Client, **given: Any) -> None:
+        show(getattr(client, resource.name).get(given[name]), given["json"])
+
+    shown.__doc__ = f"One {resource.one}."
+    connected(group, "show", {name: (str, inspect.Parameter.empty), "json": (Json, False)})(shown)
 
 
-def _print_state(job: Job, json: bool) -> None:
-    if json:
-        print_json(job)
-    else:
-        stdout.print(f"{job.id} is {job.state}")
+def _add_download(group: typer.Typer, resource: Resource) -> None:
+    name = f"{resource.one}_id"
 
+    def downloaded(client: Client, **given: Any) -> None:
+        found = getattr(client, resource.name).get(given[name])
+        download(client, found.artifacts, given["out"] or Path(given[name]))
 
-def progress_text(job: Job) -> str:
-    """``12 of 40 episodes, message``."""
-    progress = job.progress
-    parts = []
-    if progress.total:
-        parts.append(f"{progress.done:g} of {progress.total:g} {progress.unit}".strip())
-    if progress.message:
-        parts.append(progress.message)
-    return ", ".join(parts)
+    downloaded.__doc__ = f"Download {resource.files}."
+    connected(group, "download", {name: (str, inspect.Parameter.empty), "out": (Out, None)})(downloaded)
 
 
 def show_list(
-    items: Iterable[Item],
-    limit: int,
-    json: bool,
-    headings: tuple[str, ...],
-    row: Callable[[Item], tuple[str, ...]],
+    items: Iterable[BaseModel], limit: int, as_json: bool, headings: tuple[str, ...], row: Row
 ) -> None:
-    """The first ``limit`` items as a table, or as JSON."""
+    """Prints the first items of a list.
+
+    Args:
+        items: as they come from the service.
+        limit: at most so many.
+        as_json: the wire models instead of a table.
+        headings: of the columns.
+        row: the cells of an item.
+    """
     chosen = list(islice(items, limit))
-    if json:
+    if as_json:
         print_json(chosen)
     else:
-        print_table(headings, map(row, chosen))
-
-
-def show(value: BaseModel, json: bool) -> None:
-    """One object, field by field, or as JSON."""
-    if json:
-        print_json(value)
-    else:
-        print_fields(value)
+        print_table(headings, (tuple(map(str, row(item))) for item in chosen))
 
 
 def download(client: Client, artifacts: list[Artifact], folder: Path) -> None:
@@ -376,3 +276,7 @@ def download(client: Client, artifacts: list[Artifact], folder: Path) -> None:
         stdout.print(f"{path.absolute()}  {artifact.size} bytes", soft_wrap=True)
     if not artifacts:
         stdout.print("no files yet")
+
+
+GROUPS = {resource.name: group_of(resource) for resource in RESOURCES}
+"""The groups of commands, by their names; the other modules add what is no list."""

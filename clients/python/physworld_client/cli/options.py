@@ -1,11 +1,16 @@
-"""Options that several commands share."""
+"""Options that several commands share, and the commands that are given a connection to a service."""
 
 from __future__ import annotations
 
+import functools
+import inspect
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, get_type_hints
 
 import typer
+
+from physworld_client.cli import service
 
 Url = Annotated[str | None, typer.Option("--url", help="Address of a running service [PHYSWORLD_URL].")]
 Token = Annotated[str | None, typer.Option("--token", help="API key for --url [PHYSWORLD_TOKEN].")]
@@ -14,3 +19,50 @@ Data = Annotated[
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
 Limit = Annotated[int, typer.Option("--limit", "-n", min=1, help="At most so many, newest first.")]
+Out = Annotated[Path | None, typer.Option("--out", "-o", help="Folder for the files [./ID].")]
+VersionName = Annotated[str, typer.Option("--version", help="A number, an alias, or latest.")]
+
+CONNECTION = {"url": Url, "token": Token, "data": Data}
+"""The options that say which service a command talks to, by the parameters of ``service.connect``."""
+
+
+def connected(
+    group: typer.Typer, name: str, options: dict[str, tuple[Any, Any]] | None = None
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Makes a command of a function whose first parameter is the client.
+
+    On the command line the client's place is taken by ``--url``, ``--token`` and ``--data``, which stand last.
+
+    Args:
+        group: where the command is added.
+        name: of the command.
+        options: parameters that the function takes as keywords: name, (type for typer, default). Without a
+            default (``inspect.Parameter.empty``) it is an argument.
+    """
+
+    def added(function: Callable[..., None]) -> Callable[..., None]:
+        hints = get_type_hints(function, include_extras=True)
+        own = [
+            parameter.replace(annotation=hints[parameter.name])
+            for parameter in list(inspect.signature(function).parameters.values())[1:]
+            if parameter.kind is not inspect.Parameter.VAR_KEYWORD
+        ]
+        more = {**(options or {}), **{option: (hint, None) for option, hint in CONNECTION.items()}}
+        own += [
+            inspect.Parameter(option, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+            for option, (annotation, default) in more.items()
+        ]
+
+        @functools.wraps(function)
+        def command(**given: Any) -> None:
+            where = {option: given.pop(option) for option in CONNECTION}
+            with service.connect(**where) as client:
+                function(client, **given)
+
+        parameters = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in own]
+        command.__dict__["__signature__"] = inspect.Signature(parameters)
+        command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+        group.command(name)(command)
+        return function
+
+    return added

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
@@ -11,6 +12,8 @@ from typing import Any
 from pydantic import BaseModel
 from rich.console import Console
 from rich.table import Table
+
+from physworld_schemas.job import Job
 
 NARROWEST = 110
 LONGEST_LIST = 8
@@ -50,6 +53,38 @@ def print_fields(value: BaseModel) -> None:
             continue
         text = content if isinstance(content, str) else json.dumps(_shortened(content), ensure_ascii=False)
         stdout.print(f"{name:<{width}}  {text}", markup=False, soft_wrap=True)
+
+
+def show(value: BaseModel, as_json: bool) -> None:
+    """One object, field by field, or as JSON."""
+    if as_json:
+        print_json(value)
+    else:
+        print_fields(value)
+
+
+def print_state(job: Job, as_json: bool) -> None:
+    """What has become of a job, in a line or as JSON."""
+    if as_json:
+        print_json(job)
+    else:
+        stdout.print(f"{job.id} is {job.state}")
+
+
+def progress_text(job: Job) -> str:
+    """``12 of 40 episodes, message``."""
+    progress = job.progress
+    parts = []
+    if progress.total:
+        parts.append(f"{progress.done:g} of {progress.total:g} {progress.unit}".strip())
+    if progress.message:
+        parts.append(progress.message)
+    return ", ".join(parts)
+
+
+def millimetres(metres: Any) -> str:
+    """A length in mm with three digits, ``?`` where there is none."""
+    return f"{1e3 * metres:.3g}" if isinstance(metres, int | float) and math.isfinite(metres) else "?"
 
 
 def _shortened(content: Any) -> Any:

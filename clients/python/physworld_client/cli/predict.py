@@ -11,9 +11,9 @@ import numpy as np
 import typer
 
 from physworld_client.arrays import arrays_of
-from physworld_client.cli import service
-from physworld_client.cli.options import Data, Json, Token, Url
+from physworld_client.cli.options import Json
 from physworld_client.cli.output import print_json, stderr, stdout
+from physworld_client.client import Client
 from physworld_client.errors import PhysWorldError
 from physworld_client.resources import LATEST
 from physworld_client.types import Array
@@ -24,6 +24,7 @@ Version = Annotated[str, typer.Option(help="Number, alias or latest.")]
 
 
 def rollout(
+    client: Client,
     model: Annotated[str, typer.Argument(help="Name of a published model.")],
     controllers: Annotated[
         Path,
@@ -37,25 +38,21 @@ def rollout(
     stiffness: Annotated[float, typer.Option(help="Factor on the stiffness.")] = 1.0,
     timeout: Annotated[float | None, typer.Option(min=0, help="Seconds to wait for a job.")] = None,
     json: Json = False,
-    url: Url = None,
-    token: Token = None,
-    data: Data = None,
 ) -> None:
     """Predict what the object does under given motions of its control points."""
     arrays = _controllers(controllers)
     returns: list[Part] = ["points", "vertices"] if vertices else ["points"]
-    with service.connect(url, token, data) as client:
-        found = client.rollouts.create(
-            model,
-            arrays["controllers"],
-            _version(version),
-            times=arrays.get("times"),
-            start="rest" if rest else "recording",
-            stiffness_factor=stiffness,
-            returns=returns,
-            every=every,
-            timeout=timeout,
-        )
+    found = client.rollouts.create(
+        model,
+        arrays["controllers"],
+        _version(version),
+        times=arrays.get("times"),
+        start="rest" if rest else "recording",
+        stiffness_factor=stiffness,
+        returns=returns,
+        every=every,
+        timeout=timeout,
+    )
     parts = {"points": found.points, "vertices": found.vertices}
     _write(out, {"times": found.times, **{name: part for name, part in parts.items() if part is not None}})
     if json:
@@ -71,6 +68,7 @@ def rollout(
 
 
 def plan(
+    client: Client,
     model: Annotated[str, typer.Argument(help="Name of a published model.")],
     goal: Annotated[
         Path,
@@ -87,25 +85,21 @@ def plan(
     seed: Annotated[int, typer.Option(min=0)] = 0,
     timeout: Annotated[float | None, typer.Option(min=0, help="Seconds to wait; default for ever.")] = None,
     json: Json = False,
-    url: Url = None,
-    token: Token = None,
-    data: Data = None,
 ) -> None:
     """Find a motion of the grips that brings the object to a goal, and check it in the twin."""
     points, shape = _goal(goal)
     config = PlanConfig(horizon=horizon, samples=samples, iterations=iterations, seed=seed)
-    with service.connect(url, token, data) as client:
-        job = client.plans.create(
-            model,
-            _version(version),
-            points=points,
-            shape=shape,
-            limits=PlanLimits(speed_m_s=speed),
-            config=config,
-        )
-        stderr.print(f"job {job.id}", markup=False)
-        client.jobs.wait(job, timeout)
-        found = client.plans.result(job.outputs[0].id)
+    job = client.plans.create(
+        model,
+        _version(version),
+        points=points,
+        shape=shape,
+        limits=PlanLimits(speed_m_s=speed),
+        config=config,
+    )
+    stderr.print(f"job {job.id}", markup=False)
+    client.jobs.wait(job, timeout)
+    found = client.plans.result(job.outputs[0].id)
     _write(out, found.arrays)
     if json:
         print_json(found.plan)

@@ -1,4 +1,4 @@
-"""``physworld models compare|describe|unalias|download|verify|keys|trust|distrust``: the registry beyond looking."""
+"""``physworld models …``: versions, aliases, comparison, signatures; their lists are made in ``lists``."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from typing import Annotated
 import typer
 
 from physworld_client.cli import service
-from physworld_client.cli.lists import Out, VersionName, models, show, show_list
-from physworld_client.cli.options import Data, Json, Token, Url
-from physworld_client.cli.output import print_json, print_table, stdout
+from physworld_client.cli.lists import GROUPS, show_list
+from physworld_client.cli.options import Data, Json, Out, Token, Url, VersionName, connected
+from physworld_client.cli.output import print_json, print_table, show, stdout
+from physworld_client.client import Client
 from physworld_client.known_keys import trusted_keys
 from physworld_client.manifest import verify_folder
 from physworld_client.resources import LATEST
@@ -18,57 +19,64 @@ from physworld_client.signatures import fingerprint_of
 from physworld_schemas.model import MeasuredError, ModelComparison
 from physworld_schemas.signing import SigningKey
 
+MODELS = GROUPS["models"]
 PublicKey = Annotated[
     str | None, typer.Option("--public-key", help="The only key that may have signed: base64, or a file.")
 ]
 Key = Annotated[str, typer.Argument(help="A fingerprint (`models keys`), a key in base64, or a file.")]
 
 
-@models.command("compare")
+@connected(MODELS, "compare")
 def models_compare(
+    client: Client,
     name: str,
     a: Annotated[str, typer.Argument(help="A number, an alias, or latest.")],
     b: Annotated[str, typer.Argument(help="A number, an alias, or latest.")] = LATEST,
     json: Json = False,
-    url: Url = None,
-    token: Token = None,
-    data: Data = None,
 ) -> None:
     """Two versions side by side: errors with intervals, gains, and what differs in how they were made."""
-    with service.connect(url, token, data) as client:
-        found = client.models.compare(name, a, b)
+    found = client.models.compare(name, a, b)
     if json:
         print_json(found)
     else:
         _print_comparison(found)
 
 
-@models.command("describe")
+@connected(MODELS, "show")
+def models_show(client: Client, name: str, version: VersionName = LATEST, json: Json = False) -> None:
+    """One version of a model."""
+    show(client.models.version(name, version), json)
+
+
+@connected(MODELS, "alias")
+def models_alias(client: Client, name: str, alias: str, version: int) -> None:
+    """Point an alias at a version."""
+    client.models.set_alias(name, alias, version)
+    stdout.print(f"{name}@{alias} is version {version}")
+
+
+@connected(MODELS, "describe")
 def models_describe(
+    client: Client,
     name: str,
     version: VersionName = LATEST,
     description: Annotated[str | None, typer.Option(help="New description.")] = None,
     tag: Annotated[list[str] | None, typer.Option(help="Tags from now on; repeatable.")] = None,
     json: Json = False,
-    url: Url = None,
-    token: Token = None,
-    data: Data = None,
 ) -> None:
     """Change description and tags of a version; its files never change."""
-    with service.connect(url, token, data) as client:
-        tags = None if tag is None else tuple(tag)
-        show(client.models.update(name, version, description=description, tags=tags), json)
+    tags = None if tag is None else tuple(tag)
+    show(client.models.update(name, version, description=description, tags=tags), json)
 
 
-@models.command("unalias")
-def models_unalias(name: str, alias: str, url: Url = None, token: Token = None, data: Data = None) -> None:
+@connected(MODELS, "unalias")
+def models_unalias(client: Client, name: str, alias: str) -> None:
     """Remove an alias; the version stays."""
-    with service.connect(url, token, data) as client:
-        client.models.delete_alias(name, alias)
+    client.models.delete_alias(name, alias)
     stdout.print(f"{name}@{alias} is no more")
 
 
-@models.command("download")
+@MODELS.command("download")
 def models_download(
     name: str,
     version: VersionName = LATEST,
@@ -95,7 +103,7 @@ def models_download(
     )
 
 
-@models.command("verify")
+@MODELS.command("verify")
 def models_verify(
     folder: Annotated[Path, typer.Argument(help="A folder that `models download` wrote.")],
     public_key: PublicKey = None,
@@ -108,12 +116,11 @@ def models_verify(
     )
 
 
-@models.command("keys")
-def models_keys(json: Json = False, url: Url = None, token: Token = None, data: Data = None) -> None:
+@connected(MODELS, "keys")
+def models_keys(client: Client, json: Json = False) -> None:
     """The public keys that sign, or once signed, this service's models, and whether they are trusted here."""
-    with service.connect(url, token, data) as client:
-        keys = client.models.signing_keys()
-        pinned = client.known_keys.of(client.known_as) or {}
+    keys = client.models.signing_keys()
+    pinned = client.known_keys.of(client.known_as) or {}
 
     def row(key: SigningKey) -> tuple[str, ...]:
         mark = fingerprint_of(key.public_key)
@@ -122,25 +129,21 @@ def models_keys(json: Json = False, url: Url = None, token: Token = None, data: 
     show_list(keys, len(keys), json, ("fingerprint", "algorithm", "since", "trusted here"), row)
 
 
-@models.command("trust")
-def models_trust(key: Key, url: Url = None, token: Token = None, data: Data = None) -> None:
+@connected(MODELS, "trust")
+def models_trust(client: Client, key: Key) -> None:
     """Trust a key to sign this service's models, beside those that are."""
-    with service.connect(url, token, data) as client:
-        mark = client.models.trust(_key(key))
-        stdout.print(f"{mark} is trusted for {client.known_as}", soft_wrap=True)
+    mark = client.models.trust(_key(key))
+    stdout.print(f"{mark} is trusted for {client.known_as}", soft_wrap=True)
 
 
-@models.command("distrust")
+@connected(MODELS, "distrust")
 def models_distrust(
+    client: Client,
     fingerprint: Annotated[str, typer.Argument(help="Of a key that is trusted (`models keys`).")],
-    url: Url = None,
-    token: Token = None,
-    data: Data = None,
 ) -> None:
     """Trust a key no more to sign this service's models."""
-    with service.connect(url, token, data) as client:
-        client.models.distrust(fingerprint)
-        stdout.print(f"{fingerprint} is trusted no more for {client.known_as}", soft_wrap=True)
+    client.models.distrust(fingerprint)
+    stdout.print(f"{fingerprint} is trusted no more for {client.known_as}", soft_wrap=True)
 
 
 def _key(given: str) -> str | Path:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Protocol
 
 from physworld_client.errors import ExportRefused
 from physworld_client.export.lerobot import LeRobotWriter
@@ -18,7 +18,6 @@ from physworld_client.export.ply import PlyWriter
 from physworld_client.types import Array
 from physworld_schemas.dataset import Dataset
 
-Format = Literal["npz", "ply", "lerobot"]
 FORMATS: dict[str, Callable[[Path, int | None], Writer]] = {
     "npz": lambda folder, points: NpzWriter(folder),
     "ply": PlyWriter,

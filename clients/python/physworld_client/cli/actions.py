@@ -1,0 +1,116 @@
+"""What the command line does with scenes, datasets and jobs beside listing them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.progress import Progress
+
+from physworld_client.cli.lists import GROUPS, PAGE, download
+from physworld_client.cli.options import Json, Out, connected
+from physworld_client.cli.output import print_json, print_state, progress_text, show, stderr, stdout
+from physworld_client.client import Client
+from physworld_client.export import FORMATS
+from physworld_schemas.job import Job
+
+
+def _known(format: str) -> str:
+    if format not in FORMATS:
+        raise typer.BadParameter(f"{format!r} is none of {', '.join(FORMATS)}")
+    return format
+
+
+@connected(GROUPS["scenes"], "add")
+def scenes_add(
+    client: Client,
+    path: Annotated[Path, typer.Argument(help="Folder, archive, final_data.pkl or C3D file.")],
+    json: Json = False,
+) -> None:
+    """Upload a scene."""
+    show(client.scenes.create(path), json)
+
+
+@connected(GROUPS["datasets"], "download")
+def datasets_download(
+    client: Client,
+    dataset_id: str,
+    out: Out = None,
+    episodes: Annotated[bool, typer.Option("--episodes", help="Every episode too, as npz.")] = False,
+) -> None:
+    """Download the manifest of a dataset, and its episodes when asked."""
+    folder = out or Path(dataset_id)
+    download(client, client.datasets.get(dataset_id).artifacts, folder)
+    if not episodes:
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    count = 0
+    for episode in client.datasets.episodes(dataset_id, limit=PAGE).auto_paging_iter():
+        arrays = client.datasets.episode(dataset_id, episode.index)
+        np.savez(folder / f"episode-{episode.index:05d}.npz", allow_pickle=False, **arrays)
+        count += 1
+    stdout.print(f"{folder.absolute()}  {count} episodes", soft_wrap=True)
+
+
+@connected(GROUPS["datasets"], "export")
+def datasets_export(
+    client: Client,
+    dataset_id: str,
+    format: Annotated[
+        str,
+        typer.Option(
+            "--format", "-f", metavar="|".join(FORMATS), callback=_known, help="In which form to write them."
+        ),
+    ] = "npz",
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="New or empty folder [./ID-FORMAT].")
+    ] = None,
+    episodes: Annotated[int | None, typer.Option(min=1, help="Only the first so many.")] = None,
+    points: Annotated[
+        int | None, typer.Option(min=1, help="At most so many particles a frame [ply: all, lerobot: 256].")
+    ] = None,
+) -> None:
+    """Write the episodes of a sealed dataset as npz, PLY or LeRobot v3."""
+    folder = out or Path(f"{dataset_id}-{format}")
+    with Progress(console=stderr, transient=True) as shown:
+        task = shown.add_task("episodes", total=None)
+
+        def tell(done: int, total: int) -> None:
+            shown.update(task, completed=done, total=total)
+
+        client.datasets.export(
+            dataset_id, folder, format=format, episodes=episodes, points=points, on_progress=tell
+        )
+    stdout.print(f"{folder.absolute()}", soft_wrap=True)
+
+
+@connected(GROUPS["jobs"], "wait")
+def jobs_wait(
+    client: Client,
+    job_id: str,
+    timeout: Annotated[float | None, typer.Option(min=0, help="Seconds; default for ever.")] = None,
+    json: Json = False,
+) -> None:
+    """Wait for a job's end; exit code 1 when it failed or was cancelled."""
+
+    def tell(job: Job) -> None:
+        if not json:
+            stdout.print(f"{job.state}  {progress_text(job)}", soft_wrap=True)
+
+    job = client.jobs.wait(job_id, timeout, tell)
+    if json:
+        print_json(job)
+
+
+@connected(GROUPS["jobs"], "retry")
+def jobs_retry(client: Client, job_id: str, json: Json = False) -> None:
+    """Take a failed job up again; what it stored is kept."""
+    print_state(client.jobs.retry(job_id), json)
+
+
+@connected(GROUPS["jobs"], "cancel")
+def jobs_cancel(client: Client, job_id: str, json: Json = False) -> None:
+    """Cancel a job and everything it started."""
+    print_state(client.jobs.cancel(job_id), json)
