@@ -152,7 +152,7 @@ class Supervisor:
         for number in range(1, self._options.workers + 1):
             name = f"worker-{number}"
             serve = ("--queue", SIMULATION, "--name", name)
-            programs.append(self._consumer(name, "workers", serve, environment))
+            programs.append(self._consumer(name, "physworld_workers", serve, environment))
         if self._options.trainer:
             train = ("--name", "trainer")
             programs.append(self._consumer("trainer", "physworld_services.trainer", train, environment))
