@@ -15,10 +15,6 @@ from physworld.materials.plastic import Identity, Plasticity
 
 FormulationName = Literal["total_lagrangian", "updated_lagrangian"]
 FORMULATIONS: tuple[FormulationName, ...] = ("total_lagrangian", "updated_lagrangian")
-FLOWING_KINDS = {
-    "sand": "grains flow", "soil": "grains flow", "granular": "grains flow", "dough": "dough flows",
-    "clay": "clay flows", "plasticine": "plasticine flows", "paste": "paste flows", "snow": "snow flows and parts",
-}  # fmt: skip
 _DECLARED = {"self_contact": "the body touches itself", "topology_change": "the body parts or merges"}
 
 
@@ -32,7 +28,6 @@ class Choice:
 
 def choose_formulation(
     dimension: int,
-    kind: str,
     declared: dict[str, Any],
     plasticity: Plasticity | None = None,
     asked: str = "auto",
@@ -41,7 +36,6 @@ def choose_formulation(
 
     Args:
         dimension: 3 for a solid, 2 for a sheet, 1 for a rod.
-        kind: the scene's word for the body.
         declared: the scene's declaration; ``body.self_contact`` and ``body.topology_change`` are read.
         plasticity: the body's flow law.
         asked: "auto", or the name of a formulation, which is then taken.
@@ -74,6 +68,4 @@ def choose_formulation(
     for key, reason in _DECLARED.items():
         if body.get(key):
             return Choice("updated_lagrangian", f"the scene declares {key}: {reason}")
-    if kind in FLOWING_KINDS:
-        return Choice("updated_lagrangian", f"the scene's kind is {kind}: {FLOWING_KINDS[kind]}")
     return Choice("total_lagrangian", "an elastic solid: no transfers, so none of their damping")

@@ -60,7 +60,7 @@ def build_twin(
     if transfer not in TRANSFERS:
         raise ValueError(f"no transfer is called {transfer!r}; there are {sorted(TRANSFERS)}")
     body = reference_body(scene, particle_budget, refinement, mesh)
-    choice = choose_formulation(body.lattice.dim, scene.kind, scene.declared, plasticity, formulation)
+    choice = choose_formulation(body.lattice.dim, scene.declared, plasticity, formulation)
     taken_form = f"{choice.formulation.replace('_', ' ')} form: {choice.reason}"
     if choice.formulation == "updated_lagrangian":
         taken_form += f"; transfers by {transfer}"

@@ -1,10 +1,9 @@
-"""Device side of soft grips differentiated: one substep's springs taken back, or carried along with a tangent.
+"""Device side of soft grips differentiated: one substep's springs taken back.
 
 The springs are implicit. With f the forces of everything else, K their stiffness, P the pull of
 :class:`physworld.engine.terms.soft_grips.BoundSoftGrips`, and y the path after the substep,
 
     f' = f - P gap = f - K r        r = x + dt v + dt^2 (f' / m + g - c v) - y
-    df' = df - dK r - P h           h = dr at f' + (df - dK r) in the place of f', at fixed K
 
 Backwards, with w the derivatives by f', q = P w and w' = w - dt^2 q / m those by f:
 
@@ -18,7 +17,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from physworld.engine.total.node_kernels import hermite, on_path
+from physworld.engine.total.node_kernels import hermite
 
 
 @wp.kernel(enable_backward=False)
@@ -82,39 +81,3 @@ def take_grips_back(
         path_x_bar[frame + 1, p] += h[0] * q
         path_v_bar[frame, p] += clock[0] * h[1] * q
         path_v_bar[frame + 1, p] += clock[0] * h[2] * q
-
-
-@wp.kernel(enable_backward=False)
-def distance_slope(
-    # model
-    nodes: wp.array[wp.int32],
-    mass: wp.array[wp.float64],
-    drag: wp.float64,
-    width: int,
-    mass_slope: wp.array[wp.float64],
-    path_x_slope: wp.array2d[wp.float64],
-    path_v_slope: wp.array2d[wp.float64],
-    gravity_slope: wp.vec3d,
-    drag_slope: wp.float64,
-    clock: wp.array[wp.float64],
-    counter: wp.array[wp.int32],
-    # in
-    v: wp.array[wp.float64],
-    dx: wp.array[wp.float64],
-    dv: wp.array[wp.float64],
-    force: wp.array[wp.float64],
-    force_slope: wp.array[wp.float64],
-    # out
-    gap: wp.array[wp.float64],
-) -> None:
-    """h of one held node; ``force_slope`` is df - dK r."""
-    held = wp.tid()
-    node = nodes[held]
-    dt = clock[2]
-    s = wp.float64(counter[1] + 1) / wp.float64(counter[2])
-    for i in range(3):
-        k = 3 * node + i
-        goal = on_path(path_x_slope, path_v_slope, counter[0], 3 * held + i, s, clock[0])
-        change = (force_slope[k] - force[k] * mass_slope[node] / mass[held]) / mass[held]
-        change += gravity_slope[i] - drag_slope * v[k] - drag * dv[k]
-        gap[i * width + held] = dx[k] + dt * (dv[k] + dt * change) - goal

@@ -1,15 +1,14 @@
-"""Soft grips differentiated, both ways; the formulas are in
+"""The reverse pass of soft grips; the formulas are in
 :mod:`physworld.engine.gradients.soft_grips_derivative_kernels`.
 
 The springs see the forces of everything else, for they are implicit. So a reverse pass takes them back before anything
-else of a substep, and a tangent takes them after everything else.
+else of a substep.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -17,7 +16,6 @@ import warp as wp
 from physworld.arrays import Array
 from physworld.engine.gradients.adjoint_terms import Reverse
 from physworld.engine.gradients.soft_grips_derivative_kernels import (
-    distance_slope,
     gather_nodes,
     take_grips_back,
 )
@@ -92,61 +90,6 @@ class SoftGripsChange:
         wp.launch(distance_from_path, dim=count, inputs=inputs, outputs=[term.gap], device=term.device)
         inputs = [term.model[0], self._change, term.gap]
         wp.launch(pull_to_path, dim=count, inputs=inputs, outputs=[force], device=term.device)
-
-
-class SoftGripsTangent:
-    """The tangent of soft grips along a scalar that is ``width`` between two neighbours.
-
-    Args:
-        problem: the run's, whose last term they are.
-        high, low: the neighbours' problems.
-        slopes: arrays of the tangent: of the nodal masses (n,), of gravity, and of the drag rate.
-
-    Raises:
-        NotDifferentiable: the neighbours hold other nodes.
-    """
-
-    def __init__(
-        self, problem: Problem, high: Problem, low: Problem, width: float, slopes: tuple[wp.array, Any, Any]
-    ) -> None:
-        own, *sides = same_soft_grips((problem, high, low))
-        self._term = own.bind(problem)
-        device, frames = problem.device, len(own.held.positions)
-
-        def upload(values: Array) -> wp.array:
-            return wp.array(np.ascontiguousarray(values), dtype=wp.float64, device=device)
-
-        stiffness = (sides[0].stiffness - sides[1].stiffness) / width
-        self._stiffens = bool(np.any(stiffness))
-        self._stiffness_slope = upload(_padded(stiffness, self._term))
-        paths = (
-            (getattr(sides[0].held, name) - getattr(sides[1].held, name)).reshape(frames, -1) / width
-            for name in ("positions", "velocities")
-        )
-        mass_slope, gravity_slope, drag_slope = slopes
-        nodes, mass, _, _, _, drag, padded = self._term.model
-        self._slopes = [nodes, mass, drag, padded, mass_slope, *map(upload, paths), gravity_slope, drag_slope]
-
-    def pace(self, time_step_s: float) -> None:
-        """The springs' implicit step of this length."""
-        self._term.pace(time_step_s)
-
-    def add(
-        self, x: wp.array, v: wp.array, dx: wp.array, dv: wp.array, clock: wp.array, counter: wp.array,
-        force: wp.array, slope: wp.array,
-    ) -> None:  # fmt: skip
-        """Add the springs' share to ``slope`` (3n,), the slope of all other forces; ``force`` is that of all."""
-        term = self._term
-        nodes, count = term.model[0], term.pull.shape[0]
-        if self._stiffens:
-            inputs = [*term.model, clock, counter, x, v, force]
-            wp.launch(distance_from_path, dim=count, inputs=inputs, outputs=[term.gap], device=term.device)
-            inputs = [nodes, self._stiffness_slope, term.gap]
-            wp.launch(pull_to_path, dim=count, inputs=inputs, outputs=[slope], device=term.device)
-        inputs = [*self._slopes, clock, counter, v, dx, dv, force, slope]
-        wp.launch(distance_slope, dim=count, inputs=inputs, outputs=[term.gap], device=term.device)
-        inputs = [nodes, term.pull, term.gap]
-        wp.launch(pull_to_path, dim=count, inputs=inputs, outputs=[slope], device=term.device)
 
 
 def same_soft_grips(problems: Sequence[Problem]) -> list[SoftGrips]:

@@ -47,11 +47,6 @@ class Mesh:
             raise ValueError(f'a mesh is written as 16x15, or 16x15odd; this is "{text}"')
         return cls((int(found[1]), int(found[2])), found[3] is not None)
 
-    @property
-    def spelled(self) -> str:
-        """As :meth:`read` takes it."""
-        return f"{self.counts[0]}x{self.counts[1]}{'odd' if self.odd else ''}"
-
     def __str__(self) -> str:
         cut = ", the first cut the other way" if self.odd else ""
         return f"{self.counts[0]} x {self.counts[1]} cells of two triangles{cut}"

@@ -1,4 +1,4 @@
-"""Gradients through grips that hold softly: fields, scalars and paths against central differences, and both directions.
+"""Gradients through grips that hold softly: fields, scalars and paths against central differences.
 
 A block held by a quarter of its section is shaken for 400 substeps. Solids strain in single precision, which limits the
 differences; directions are those of the gradient itself or one-signed, so nothing cancels.
@@ -14,8 +14,6 @@ import pytest
 from made_scene import box_body, made_scene
 
 from physworld.effects.registry import effect
-from physworld.engine.gradients.gradient import Direction
-from physworld.engine.gradients.gradient_forward import sensitivities
 from physworld.engine.gradients.gradient_twin import Neighbours, TwinRun, parameter, strength
 from physworld.engine.gradients.soft_grips_derivatives import same_soft_grips
 from physworld.engine.problem import HeldNodes
@@ -174,36 +172,6 @@ def test_running_every_frame_twice_takes_soft_grips_back_the_same() -> None:
     assert two.soft_grips is not None and one.soft_grips is not None
     assert np.allclose(two.soft_grips.positions, one.soft_grips.positions, rtol=1e-9, atol=1e-15)
     assert np.allclose(two.log_stiffness, one.log_stiffness, rtol=1e-9, atol=1e-15)
-
-
-def test_forward_sensitivities_through_soft_grips() -> None:
-    twin, times, controls = with_effects(STRENGTHS[0])
-    pairs = {name: parameter(twin, name) for name in SCALARS[:-1]}
-    ends = [
-        twin.with_parameters(viscosity_pa_s=eta) for eta in (4.0, 2.0)
-    ]  # far apart: forces are linear in it
-    pairs["viscosity_pa_s"] = Neighbours(*ends, 2.0)
-    pairs["lag"] = strength(twin, *STRENGTHS[0][:2])
-    pairs["softness"] = Neighbours(
-        replace(twin, grip_softness=0.162), replace(twin, grip_softness=0.158), 0.004
-    )
-    base, *sides = (
-        t.integration(times, controls, times)
-        for t in (twin, *(side for pair in pairs.values() for side in (pair.high, pair.low)))
-    )
-    directions = {
-        name: Direction(sides[2 * k], sides[2 * k + 1], pair.width)
-        for k, (name, pair) in enumerate(pairs.items())
-    }
-    nodes, forward = sensitivities(base, twin.body.start, base.knots, directions, step())
-    run = run_of(STRENGTHS[0])
-    assert np.array_equal(base.at_frames(twin.body.start, nodes), run.nodes)
-    tracks_bar = weights_of(run)
-    _, reverse = run.gradient(tracks_bar, pairs)
-    points = twin.lattice.interpolation(twin.body.points)
-    for name, change in forward.items():
-        seen = np.stack([points @ frame for frame in base.at_frames(0 * twin.body.start, change)])
-        assert np.sum(tracks_bar * seen) == pytest.approx(reverse[name], rel=3e-3), name
 
 
 def test_grips_that_hold_other_material_on_either_side_are_refused() -> None:

@@ -13,8 +13,6 @@ from scipy.spatial.transform import Rotation
 
 from physworld.calibrate.parameters import parameters_of
 from physworld.effects.registry import effect
-from physworld.engine.gradients.gradient import Direction
-from physworld.engine.gradients.gradient_forward import sensitivities
 from physworld.engine.gradients.gradient_twin import TwinRun, parameter
 from physworld.engine.thin.twist import BoundTwist, Twist
 from physworld.engine.total.formulation import TotalLagrangian
@@ -152,23 +150,6 @@ def test_twisted_ropes_side_by_side_are_those_alone() -> None:
         alone = TwinRun(twin, times, controls, scenes[0].times, time_step_s=step)
         assert np.array_equal(outcome.trusted(), alone.nodes)
     assert np.abs(outcomes[0].trusted() - outcomes[1].trusted()).max() > 1e-4
-
-
-def test_forward_sensitivities_know_twist() -> None:
-    scene = rope(turns=1.9)
-    twin, track = buckling(scene), scene.control_track()
-    value, h = twin.law.torsion_ratio, 1e-4
-    near = [twin.with_parameters(torsion_ratio=value + sign * h) for sign in (1, -1)]
-    here, high, low = (t.integration(*track, scene.times) for t in (twin, *near))
-    step = 0.5 * TwinRun(twin, *track, scene.times).time_step_s
-    _, found = sensitivities(here, twin.body.start, here.knots, {"t": Direction(high, low, 2 * h)}, step)
-    ends = [
-        TotalLagrangian(side.problem, step).run(twin.body.start, side.velocity, side.held, side.knots)
-        for side in (high, low)
-    ]
-    expected = (ends[0] - ends[1]) / (2 * h)
-    assert np.abs(expected).max() > 1e-6
-    assert np.abs(found["t"] - expected).max() < 1e-3 * np.abs(expected).max()
 
 
 def test_a_grip_that_gives_still_twists() -> None:
