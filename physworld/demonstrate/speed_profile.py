@@ -48,11 +48,6 @@ class SpeedProfile:
         """V·(D - ta/2 - td/2)."""
         return self.cruise_m_s * (self.duration_s - 0.5 * (self.accelerate_s + self.decelerate_s))
 
-    @property
-    def peak_acceleration_m_s2(self) -> float:
-        """1.5·V over the shorter ramp."""
-        return PEAK_SLOPE * self.cruise_m_s / min(self.accelerate_s, self.decelerate_s)
-
     def speed(self, t: Array) -> Array:
         """v(t) [m/s]; zero outside [0, D]."""
         rise, fall = self._phases(t)

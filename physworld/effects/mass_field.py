@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from physworld.effects.base import Effect, Strength
-from physworld.effects.stiffness_field import field_strengths, log_field
+from physworld.effects.base import Strength
+from physworld.effects.stiffness_field import LowRankField, field_strengths, log_field
 from physworld.engine.problem import Problem
 
 if TYPE_CHECKING:
@@ -22,23 +22,11 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class MassField(Effect):
-    """``slope_x`` …: s; ``bump``: b, at ``bump_x`` … (xi_0) with ``bump_width`` (w)."""
+class MassField(LowRankField):
+    """A :class:`LowRankField` of the density."""
 
     name = "mass_field"
     title = "density that varies over the body"
-    equation = "log factor = s . xi + b exp(-|xi - xi_0|^2 / 2 w^2)"
-    kind = "field"
-    gates = ("slope_x", "slope_y", "slope_z", "bump")
-
-    slope_x: float = 0.0
-    slope_y: float = 0.0
-    slope_z: float = 0.0
-    bump: float = 0.0
-    bump_x: float = 0.0
-    bump_y: float = 0.0
-    bump_z: float = 0.0
-    bump_width: float = 0.3
 
     @classmethod
     def strengths(cls, twin: Twin) -> tuple[Strength, ...]:

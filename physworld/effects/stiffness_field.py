@@ -26,11 +26,9 @@ _AXES = ("x", "y", "z")
 
 
 @dataclass(frozen=True)
-class StiffnessField(Effect):
+class LowRankField(Effect):
     """``slope_x`` …: s; ``bump``: b, at ``bump_x`` … (xi_0) with ``bump_width`` (w)."""
 
-    name = "stiffness_field"
-    title = "stiffness that varies over the body"
     equation = "log factor = s . xi + b exp(-|xi - xi_0|^2 / 2 w^2)"
     kind = "field"
     gates = ("slope_x", "slope_y", "slope_z", "bump")
@@ -43,6 +41,14 @@ class StiffnessField(Effect):
     bump_y: float = 0.0
     bump_z: float = 0.0
     bump_width: float = 0.3
+
+
+@dataclass(frozen=True)
+class StiffnessField(LowRankField):
+    """A :class:`LowRankField` of every stiffness and of the law's friction."""
+
+    name = "stiffness_field"
+    title = "stiffness that varies over the body"
 
     @classmethod
     def strengths(cls, twin: Twin) -> tuple[Strength, ...]:
@@ -67,7 +73,7 @@ def field_strengths(dim: int) -> tuple[Strength, ...]:
     )
 
 
-def log_field(lattice: Lattice, effect: Effect) -> Array:
+def log_field(lattice: Lattice, effect: LowRankField) -> Array:
     """Log factor of every particle, (P,), of an effect with slopes and a bump."""
     xi = unit_coordinates(lattice)
     axes = _AXES[: lattice.dim]

@@ -103,20 +103,6 @@ def noise_floor(noise_sigma_m: float) -> float:
     return noise_sigma_m * MEAN_DISTANCE_PER_SIGMA
 
 
-def nearest_at_start(surface: Array, points: Array) -> Array:
-    """Index of the predicted vertex that stands for each measured point: the nearest at frame 0.
-
-    Args:
-        surface: predicted points of frame 0 [m], (M, 3).
-        points: measured points of frame 0 [m], (N, 3).
-
-    Returns:
-        Indices into ``surface``, (N,) int64.
-    """
-    _, index = cKDTree(surface).query(points)
-    return np.asarray(index, dtype=np.int64)
-
-
 def _mean_nearest(points: Array, targets: Array, norm: int) -> float:
     """Mean distance of ``points`` to their nearest of ``targets`` in the given Minkowski norm."""
     distance, _ = cKDTree(targets).query(points, p=norm)

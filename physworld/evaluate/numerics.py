@@ -71,11 +71,6 @@ class Numerics:
     simulations: int
     seconds: float
 
-    @property
-    def worst_m(self) -> float:
-        """The larger of the two changes of the prediction [m]: no residual below it means anything."""
-        return max(self.half_step_m, self.finer_cells_m)
-
 
 def measure_numerics(
     scene: Scene,

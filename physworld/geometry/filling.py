@@ -97,11 +97,6 @@ def filled_body(points: Array) -> FilledBody:
     return _grown(shape, points, spacing, (len(points) * float(share[deep].mean()), len(points) * error))
 
 
-def inside_volume_points(points: Array, query: Array) -> Array:
-    """Which of ``query`` (Q, 3) lie inside the body that ``points`` (M, 3) fill; (Q,) bool."""
-    return filled_body(points).contains(np.asarray(query, dtype=float))
-
-
 def inside_surface_points(points: Array, query: Array, cell: float) -> Array:
     """Which of ``query`` (Q, 3) lie inside the surface sampled by ``points`` (M, 3), at voxel size ``cell`` [m].
 

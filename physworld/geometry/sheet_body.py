@@ -6,18 +6,23 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from physworld.arrays import Array
-from physworld.engine.lattice.lattice import Lattice
+from physworld.engine.lattice.lattice import Lattice, lattice_from_cells
 from physworld.engine.thin.triangles import Mesh, triangle_lattice
 from physworld.errors import SceneUnsupported
+from physworld.geometry.alignment import cells_along, faces_along
 from physworld.geometry.body import ReferenceBody, first_points
 from physworld.geometry.curves import fit_nodes
-from physworld.geometry.sheet_cells import grips_in_plane, sheet_lattice
-from physworld.scene import Scene
+from physworld.geometry.declared import grips_of
+from physworld.scene import Grip, Scene
 
 SHEET_KINDS = ("sheet", "cloth")
 THIN = 1e-4  # points whose extent falls below this share of their largest one span a dimension less
 _CELLS, _BUDGET = 24, 2000  # along the longer side at that budget, as its square root
 _FEWEST_CELLS = 12
+_LEAST_CELLS = 3  # along an edge of a lattice
+_ALONG_AXES = 0.999  # cosine above which a sheet's edge lies along an axis of the world
+_LEAST_FILL = 0.05  # cells of a sheet that hold less are left out
+_DIGITS = 9  # of a fill: a full cell is full
 _FLAT = 0.08  # a sheet's points lie within this share of its width of their plane (root mean square)
 _TIGHTER = 0.97  # a sheet is turned in its plane if that shrinks its bounding rectangle below this share
 _AS_DECLARED = 0.05  # share by which extents of points may miss the declared size
@@ -145,3 +150,37 @@ def _tightest_turn(plane: Array) -> Array:
     turns = np.stack([np.cos(angle), np.sin(angle), -np.sin(angle), np.cos(angle)], axis=1).reshape(-1, 2, 2)
     areas = np.prod(np.ptp(np.einsum("kij,mj->kmi", turns, corners), axis=1), axis=1)
     return turns[np.argmin(areas)] if areas.min() < _TIGHTER * areas[0] else np.eye(2)
+
+
+def grips_in_plane(scene: Scene, flat_map: tuple[Array, Array] | None) -> tuple[Grip, ...]:
+    """The grips' boxes in the sheet's own two coordinates; none where its edges do not lie along the world's axes.
+
+    Args:
+        flat_map: corner (3,) and axes (3, 3) of the plane in which the sheet lies at the start; None: it is not flat.
+    """
+    if flat_map is None or np.abs(flat_map[1][:2]).max(axis=1).min() < _ALONG_AXES:
+        return ()
+    found = []
+    for grip in grips_of(scene):
+        if grip.region_min_m is not None and grip.region_max_m is not None:
+            ends = (np.stack([grip.region_min_m, grip.region_max_m]) - flat_map[0]) @ flat_map[1][:2].T
+            found.append(Grip(grip.controllers, ends.min(axis=0), ends.max(axis=0)))
+    return tuple(found)
+
+
+def sheet_lattice(size: Array, cell: float, grips: tuple[Grip, ...]) -> Lattice:
+    """Cells of about ``cell`` [m] over a sheet from (0, 0) to ``size`` (2,) [m], at its edges filled in part.
+
+    A thin sheet's clamp fixes its slope, as held splines do, so cell faces lie on the grips' own.
+    """
+    low, asked = np.zeros(2), np.minimum(cell, size / _LEAST_CELLS)
+    along = [cells_along(0.0, size[a], asked[a], faces_along(a, low, size, grips), 0.0) for a in range(2)]
+    origin, spacing = np.array(along).T
+    counts = np.ceil((size - origin) / spacing - 1e-6).astype(int)
+    cells = np.stack(np.meshgrid(*[np.arange(c) for c in counts], indexing="ij"), axis=-1).reshape(-1, 2)
+    corner = np.stack(np.meshgrid([0, 0.5], [0, 0.5], indexing="ij"), axis=-1).reshape(4, 2)
+    begin = origin + (cells[:, None, :] + corner[None]) * spacing
+    inside = np.minimum(begin + 0.5 * spacing, size) - np.maximum(begin, 0.0)
+    fill = np.prod(np.clip(inside / (0.5 * spacing), 0.0, 1.0), axis=2).round(_DIGITS)
+    present = fill.max(axis=1) > _LEAST_FILL
+    return lattice_from_cells(origin, spacing, cells[present], fill[present])

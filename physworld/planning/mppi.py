@@ -24,8 +24,7 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.errors import Cancelled, UnstableSimulation
-from physworld.planning.goals import Goal
-from physworld.planning.limits import GripLimits
+from physworld.planning.goals import Goal, GripLimits
 
 Predict = Callable[[Array], Array]
 """Predicted points (B, T, N, 3) [m] for displacements (B, T, G, 3) [m] of the grips at ticks 1 … T."""

@@ -14,7 +14,7 @@ import numpy as np
 from physworld.arrays import Array
 from physworld.demonstrate.limits import limits_of
 from physworld.errors import SceneUnsupported
-from physworld.planning.limits import GripLimits
+from physworld.planning.goals import GripLimits
 from physworld.scene import Scene
 from physworld.twin.twin import Twin
 from physworld.worldmodel.clock import resample

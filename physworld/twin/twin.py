@@ -33,8 +33,7 @@ from physworld.engine.total.formulation import TotalLagrangian, run_again_if_blo
 from physworld.engine.updated.formulation import UpdatedLagrangian
 from physworld.engine.updated.transfer import TRANSFERS, Apic
 from physworld.errors import EffectRefused, SceneUnsupported
-from physworld.geometry.body import ReferenceBody
-from physworld.geometry.tracks import applied, material_tracks
+from physworld.geometry.body import ReferenceBody, applied, material_tracks
 from physworld.materials.laws import Law
 from physworld.materials.plastic import Plasticity
 from physworld.twin.arrays import arrays_of, parts_of

@@ -118,39 +118,6 @@ def local_rotations(rest: Array, moved: Array, neighbours: int = 8, *, index: Ar
     return (left * flip[..., None, :]) @ right
 
 
-def linear_blend(
-    points: Array,
-    rest: Array,
-    moved: Array,
-    *,
-    neighbours: int = 8,
-    quaternions: Array | None = None,
-) -> tuple[Array, Array | None]:
-    """Move points, and their orientations, with the vertices (paper, appendix 3D Gaussian Update Through
-    LBS).
-
-    Args:
-        points: (M, 3) in the rest state.
-        rest, moved: vertices at rest (n, 3) and moved (n, 3).
-        quaternions: orientations at rest (M, 4), or None.
-
-    Returns:
-        Moved points (M, 3) and orientations (M, 4), or None.
-    """
-    index, distance = nearest_vertices(points, rest, neighbours)
-    weight = inverse_distance_weights(distance)
-    rotation = local_rotations(rest, moved, neighbours)
-    carried = np.einsum("mkxy,mky->mkx", rotation[index], points[:, None] - rest[index]) + moved[index]
-    positions = np.einsum("mk,mkx->mx", weight, carried)
-    if quaternions is None:
-        return positions, None
-    turns = quaternion_of(rotation)[index]
-    agree = np.sign(np.einsum("mkq,mq->mk", turns, turns[:, 0]))
-    blended = np.einsum("mk,mkq->mq", weight * np.where(agree == 0.0, 1.0, agree), turns)
-    blended /= np.linalg.norm(blended, axis=1, keepdims=True)
-    return positions, quaternion_product(blended, quaternions)
-
-
 def quaternion_of(rotation: Array) -> Array:
     """Unit quaternions (…, 4) with w ≥ 0 of rotation matrices (…, 3, 3), stable at every angle."""
     r = rotation

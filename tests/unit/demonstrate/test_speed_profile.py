@@ -12,6 +12,11 @@ from physworld.demonstrate.speed_profile import SpeedProfile, profile_for
 PROFILE = SpeedProfile(duration_s=2.0, accelerate_s=0.4, decelerate_s=0.7, cruise_m_s=0.5)
 
 
+def peak_acceleration(profile: SpeedProfile) -> float:
+    """1.5 times the cruise speed over the shorter ramp [m/s²]."""
+    return 1.5 * profile.cruise_m_s / min(profile.accelerate_s, profile.decelerate_s)
+
+
 def test_speed_rises_cruises_and_falls():
     assert PROFILE.speed(np.array(0.0)) == 0.0
     assert PROFILE.speed(np.array(2.0)) == 0.0
@@ -40,7 +45,7 @@ def test_acceleration_is_the_derivative_of_speed_and_has_no_jump_at_the_joints()
         assert np.ptp(around) < 1e-6
         assert abs(around[1]) < 1e-12
     assert np.abs(PROFILE.acceleration(np.linspace(0, 2, 5001))).max() == pytest.approx(
-        PROFILE.peak_acceleration_m_s2, rel=1e-4
+        peak_acceleration(PROFILE), rel=1e-4
     )
 
 
@@ -63,7 +68,7 @@ def test_a_profile_covers_its_distance_within_its_limits(distance, peak, rise, f
     slack = 1.0 + 1e-9
     assert profile.total_distance_m == pytest.approx(distance, rel=1e-9)
     assert profile.cruise_m_s <= peak * slack
-    assert profile.peak_acceleration_m_s2 <= acceleration * slack
+    assert peak_acceleration(profile) <= acceleration * slack
     assert min(profile.accelerate_s, profile.decelerate_s) * slack >= 0.05
 
 

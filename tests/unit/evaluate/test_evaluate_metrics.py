@@ -96,11 +96,6 @@ def test_noise_floor_is_the_mean_length_of_the_noise() -> None:
     assert error == pytest.approx(metrics.noise_floor(sigma), abs=sampling)
 
 
-def test_nearest_at_start_picks_the_closest_vertex() -> None:
-    surface = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    assert metrics.nearest_at_start(surface, np.array([[0.9, 0.2, 0.0], [0.1, 0.6, 0.0]])).tolist() == [1, 2]
-
-
 def test_shapes_that_disagree_are_refused_with_their_numbers() -> None:
     with pytest.raises(ValueError, match=r"\(2, 4, 3\).*\(2, 3, 3\)"):
         metrics.track_error(np.zeros((2, 4, 3)), np.zeros((2, 3, 3)), np.ones((2, 3), bool))

@@ -8,7 +8,6 @@ import pytest
 from physworld.geometry.filling import (
     filled_body,
     inside_surface_points,
-    inside_volume_points,
     median_spacing,
 )
 
@@ -38,7 +37,7 @@ def test_points_that_fill_an_l_leave_its_notch_empty() -> None:
     cloud = cloud + rng.normal(scale=0.005, size=cloud.shape)
     query = rng.uniform([0, 0, 0], [2, 1, 2], size=(3000, 3))
     truly = (query[:, 0] < 1) | (query[:, 2] < 1)
-    found = inside_volume_points(cloud, query)
+    found = filled_body(cloud).contains(query)
     deep_in_notch = (query[:, 0] > 1 + 3 * STEP) & (query[:, 2] > 1 + 3 * STEP)
     assert found[truly].mean() > 0.99
     assert not found[deep_in_notch].any()
@@ -47,7 +46,7 @@ def test_points_that_fill_an_l_leave_its_notch_empty() -> None:
 def test_the_skin_of_filling_points_is_half_a_spacing_thick() -> None:
     cloud = grid([0, 0, 0], [1, 1, 1])
     above = np.array([[0.5, 0.5, 1 + 0.4 * STEP], [0.5, 0.5, 1 + 0.6 * STEP], [0.5, 0.5, 3.0]])
-    assert inside_volume_points(cloud, above).tolist() == [True, False, False]
+    assert filled_body(cloud).contains(above).tolist() == [True, False, False]
 
 
 def test_a_closed_surface_is_filled_and_what_lies_beyond_is_not() -> None:

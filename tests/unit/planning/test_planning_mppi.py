@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from physworld.errors import Cancelled, UnstableSimulation
-from physworld.planning.goals import GoalPoints, GoalShape
-from physworld.planning.limits import GripLimits
+from physworld.planning.goals import GoalPoints, GoalShape, GripLimits
 from physworld.planning.mppi import MppiConfig, coloured_noise, search
 
 DT = 1 / 30
