@@ -6,7 +6,7 @@ One graph of 150 vertices and about 1950 directed edges, 7 message passing steps
 
 * ``pyg``: the usual interaction network (edge and vertex MLPs of two layers on concatenated states) as a PyTorch
   Geometric ``MessagePassing``, eager, on the same graph and features;
-* ``pytorch_naive``: our own function written the plain way (``physworld.worldmodel.naive``), eager torch.
+* ``pytorch_naive``: our own function written the plain way (``benchmarks.peers.plain_network``), eager torch.
 
 All roll the same sequence out, features included, with the material graph kept; ``ours_rebuilt`` is ours with its NEAR
 edges found anew at every step (``near_edges = "current"``). Training is one sample (one sub-sequence and one step,
@@ -34,13 +34,14 @@ from torch import Tensor, nn
 from torch_geometric.nn import MessagePassing
 
 from benchmarks.harness import Report, Timing, interleave, run_alone
+from benchmarks.peers.plain_network import PlainNetwork
 from benchmarks.peers.spring_mass import SUBSTEPS, SpringMass
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Scene
 from physworld.twin.build import build_twin
 from physworld.worldmodel.model.config import WorldModelConfig
+from physworld.worldmodel.model.features import Normalisation
 from physworld.worldmodel.model.graph import GraphSpec, build_graph
-from physworld.worldmodel.model.model import Normalisation, WorldModel
-from physworld.worldmodel.naive import NaiveWorldModel
+from physworld.worldmodel.model.model import WorldModel
 from physworld.worldmodel.native.engine import RolloutEngine
 from physworld.worldmodel.rollout import unroll
 
@@ -92,7 +93,7 @@ class _Interaction(MessagePassing):
 class _PygNetwork(nn.Module):
     """Encoder, interactions, decoder over the features that ours sees."""
 
-    def __init__(self, naive: NaiveWorldModel) -> None:
+    def __init__(self, naive: PlainNetwork) -> None:
         super().__init__()
         model = naive.model
         hidden, h = model.config.hidden, model.config.history
@@ -107,8 +108,7 @@ class _PygNetwork(nn.Module):
     def forward(self, window: Tensor, ahead: Tensor, phi: Tensor) -> Tensor:
         """Outputs (n, 1, 3) for a batch of one."""
         model = self.naive.model
-        moves = (window[1:] - window[:-1]).flip(0)
-        state = self.encoder(model._vertex_features(window, moves, ahead, phi)[:, 0])
+        state = self.encoder(self.naive.vertex_features(window, ahead, phi)[:, 0])
         edges = self.naive.edge_features(window)[:, 0]
         for layer in self.layers:
             state = layer(state, self.edge_index, edges)
@@ -173,7 +173,7 @@ def cases_of(hidden: int, seed: int) -> tuple[dict[str, Callable[[], float]], Gr
     """What is measured of the model at one width, by name, each of ``LABELS``; the graph."""
     model, spec = _model(hidden, seed)
     rebuilt, _ = _model(hidden, seed, "current")
-    naive = NaiveWorldModel(model)
+    naive = PlainNetwork(model)
     start, driven, phi = _sequence(spec, seed)
     cases = {
         "ours": _engine_case(model, start, driven, phi),

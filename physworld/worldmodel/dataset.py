@@ -18,9 +18,9 @@ from torch import Tensor
 
 from physworld.arrays import Array
 from physworld.worldmodel.errors import DatasetUnusable
+from physworld.worldmodel.model.features import Normalisation, cut_rest_length, cut_strain
 from physworld.worldmodel.model.graph import EDGE_KINDS, NEAR, GraphSpec
-from physworld.worldmodel.model.model import Normalisation
-from physworld.worldmodel.model.nearest import cut_rest_length, cut_strain, near_ends
+from physworld.worldmodel.model.nearest import near_ends
 
 SCALE_FLOOR_M = 1e-7
 PROPERTY_FLOOR = 0.05

@@ -30,9 +30,10 @@ import torch
 from torch import Tensor, nn
 
 from physworld.arrays import Array
+from physworld.worldmodel.model.features import edge_features, vertex_features
 from physworld.worldmodel.model.graph import EDGE_KINDS, NEAR, GraphSpec
 from physworld.worldmodel.model.model import WorldModel
-from physworld.worldmodel.model.nearest import cut_rest_length, cut_strain, near_ends
+from physworld.worldmodel.model.nearest import near_ends
 from physworld.worldmodel.priors.chain_step import ChainStep
 
 INPUTS = ("window", "control_next", "phi", "senders", "receivers", "kinds", "rest_relative")
@@ -69,9 +70,11 @@ class StepProgram(nn.Module):
         n, count = self.objects, self.vertices
         prior = self.prior(window[:, :, None], control_next[:, None], phi[:, None])[:, 0]
         ahead = torch.cat([prior, control_next])
-        features = self._vertex_features(window, ahead, phi)
+        moves = (window[1:] - window[:-1]).flip(0)
+        features = vertex_features(window, moves, ahead, phi, self.norm, grounded=self.grounded)
         of_kind = nn.functional.one_hot(kinds, EDGE_KINDS).to(window.dtype)
-        edges = self._edge_features(window, senders, receivers, kinds, rest_relative)
+        relative = window.index_select(1, senders) - window.index_select(1, receivers)
+        edges = edge_features(relative, rest_relative, kinds, self.norm, self.radius)
         by_kind = (of_kind[:, :, None] * edges[:, None, :]).flatten(1)
         ends = kinds * count + receivers
         degree = window.new_zeros(EDGE_KINDS * count).scatter_add(0, ends, torch.ones_like(edges[:, 0]))
@@ -89,51 +92,6 @@ class StepProgram(nn.Module):
             state = state + self.update_out[layer](torch.relu(inner))
         correction = self.decoder(state[:n]) + self.skip(features[:n])
         return torch.cat([prior + self.norm.change * correction, control_next])
-
-    def _vertex_features(self, window: Tensor, ahead: Tensor, phi: Tensor) -> Tensor:
-        """f_i, (V, 3h + 7 or 3h + 8)."""
-        controls = self.vertices - self.objects
-        moves = (window[1:] - window[:-1]).flip(0) / self.norm.velocity
-        of_object = torch.cat([window.new_ones(self.objects, 1), window.new_zeros(controls, 1)])
-        properties = torch.cat([phi / self.norm.properties, phi.new_zeros(controls, phi.shape[1])])
-        parts = [
-            *moves.unbind(0),
-            (ahead - window[-1]) / self.norm.velocity,
-            properties,
-            of_object,
-            1.0 - of_object,
-        ]
-        if self.grounded:
-            parts.append(torch.clamp(window[-1, :, 2:] / self.norm.length, 0.0, 1.0))
-        return torch.cat(parts, dim=-1)
-
-    def _edge_features(
-        self, window: Tensor, senders: Tensor, receivers: Tensor, kinds: Tensor, rest: Tensor
-    ) -> Tensor:
-        """e_ij, (E, 3h + 8)."""
-        norm = self.norm
-        relative = window.index_select(1, senders) - window.index_select(1, receivers)
-        strain, drift, stretch = (
-            scale.index_select(0, kinds)[:, None] for scale in (norm.strain, norm.relative, norm.stretch)
-        )
-        moves = (relative[1:] - relative[:-1]).flip(0) / drift
-        length = torch.linalg.vector_norm(relative[-1], dim=-1, keepdim=True)
-        rest_length = torch.linalg.vector_norm(rest, dim=-1, keepdim=True)
-        strained = relative[-1] - rest
-        if self.radius is not None:
-            near = (kinds == NEAR)[:, None]
-            strained = torch.where(near, cut_strain(strained, self.radius), strained)
-            rest_length = torch.where(near, cut_rest_length(rest_length, self.radius), rest_length)
-        return torch.cat(
-            [
-                relative[-1] / norm.length,
-                strained / strain,
-                *moves.unbind(0),
-                rest_length / norm.length,
-                (length - rest_length) / stretch,
-            ],
-            dim=-1,
-        )
 
 
 def edge_list(spec: GraphSpec, places: Array | None = None) -> dict[str, Array]:

@@ -41,8 +41,9 @@ from physworld.worldmodel.errors import (
     TrainingDiverged,
 )
 from physworld.worldmodel.model.config import TrainingConfig, WorldModelConfig
+from physworld.worldmodel.model.features import Normalisation
 from physworld.worldmodel.model.graph import GraphSpec
-from physworld.worldmodel.model.model import Normalisation, WorldModel
+from physworld.worldmodel.model.model import WorldModel
 from physworld.worldmodel.priors.choose import Prior, fit_priors, prior_error
 from physworld.worldmodel.priors.prior_step import prior_step
 from physworld.worldmodel.rollout import mean_error, rollout_tracks

@@ -81,8 +81,8 @@ What a published version adds for its scene is told in ``physworld.worldmodel.pu
 **Split.** The first edge product of [h_i, h_j, e_ij] is taken apart: h_i and h_j are multiplied once per
 vertex and gathered on edges, and so is what of e_ij is linear in positions (r^t = x_j - x_i is a difference
 of vertex quantities). Per edge and step there remain a constant of the graph, computed once per sequence,
-and |r^t|. The product of the messages with update_in follows the sum. The function is that of
-``naive.NaiveWorldModel`` up to rounding.
+and |r^t|. The product of the messages with update_in follows the sum. The function is that of the
+exported step (``physworld.worldmodel.export``) up to rounding.
 """
 
 from __future__ import annotations
@@ -97,6 +97,7 @@ from torch import Tensor, nn
 
 from physworld.arrays import Array
 from physworld.worldmodel.model.config import WorldModelConfig
+from physworld.worldmodel.model.features import Normalisation, Scales, vertex_features
 from physworld.worldmodel.model.graph import EDGE_KINDS, NEAR, GraphSpec
 from physworld.worldmodel.model.inertia import InertialPrior
 from physworld.worldmodel.model.nearest import CurrentEdges, KeptEdges
@@ -109,27 +110,6 @@ PROPERTY_COUNT = 2
 
 Means = Callable[[int, Tensor, Tensor], Tensor]
 """Mean messages (K, V, B, H) of a layer from what is heard and sent (K, V, B, H)."""
-
-
-@dataclass(frozen=True)
-class Normalisation:
-    """Root-mean-square scales of the training data, in metres (``properties``: of the logarithms).
-
-    Attributes:
-        velocity: of vertex displacements per step.
-        change: of what the prior leaves, x^{t+1} - x̂^{t+1}.
-        relative: of relative displacements per step along edges, by edge kind.
-        strain: of r - r_rest along edges, by edge kind.
-        stretch: of |r| - |r_rest| along edges, by edge kind.
-        properties: of Φ, (2,), or (2 + m,) with m strengths of effects.
-    """
-
-    velocity: float = 1.0
-    change: float = 1.0
-    relative: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    strain: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    stretch: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    properties: tuple[float, ...] = (1.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -172,7 +152,7 @@ class WorldModel(nn.Module):
         for start in (self.skip.weight, self.decoder.out.weight, self.decoder.out.bias):
             nn.init.zeros_(start)  # an untrained network leaves the prior as it is
         self._set_graph(spec)
-        self.norm = _Scales(normalisation, spec)
+        self.norm = Scales(normalisation, spec)
         reference = _reference_positions(spec)
         n = spec.object_count
         self.prior = prior_step(prior or rigid_prior(reference[:n], reference[n:], h), h)
@@ -213,7 +193,8 @@ class WorldModel(nn.Module):
         constants = constants or self.edge_constants()
         n = self.spec.object_count
         moves = (window[1:] - window[:-1]).flip(0)
-        features = self._vertex_features(window, moves, ahead, phi)
+        grounded = self.spec.ground_height_m is not None
+        features = vertex_features(window, moves, ahead, phi, self.norm, grounded=grounded)
         shifted = window[-1] - self._reference[:, None]
         places = torch.cat([shifted, *moves.unbind(0)], dim=-1).flatten(0, 1).expand(EDGE_KINDS, -1, -1)
         means = self._material_means if not self.spec.current_neighbours else self._current_means
@@ -312,21 +293,6 @@ class WorldModel(nn.Module):
         bias = torch.cat([part @ table[kind] for kind, part in enumerate(parts)])
         return bias, torch.cat([near + strain, moves], dim=1), stretch, table[NEAR]
 
-    def _vertex_features(self, window: Tensor, moves: Tensor, ahead: Tensor, phi: Tensor) -> Tensor:
-        """f_i, (V, B, F)."""
-        n, control, batch = self.spec.object_count, self.spec.control_count, window.shape[2]
-        new = window.new_zeros
-        own = moves.permute(1, 2, 0, 3).flatten(2) / self.norm.velocity
-        act = (ahead - window[-1]) / self.norm.velocity
-        properties = torch.cat([phi / self.norm.properties, new(control, batch, phi.shape[-1])])
-        kind = new(n + control, batch, 2)
-        kind[:n, :, 0] = 1.0
-        kind[n:, :, 1] = 1.0
-        parts = [own, act, properties, kind]
-        if self.spec.ground_height_m is not None:
-            parts.append(torch.clamp(window[-1, :, :, 2:] / self.norm.length, 0.0, 1.0))
-        return torch.cat(parts, dim=-1)
-
 
 class _EdgeWeights(nn.Module):
     """``weight`` (3, H, F): one linear map of the edge features for each kind of edge."""
@@ -335,20 +301,6 @@ class _EdgeWeights(nn.Module):
         super().__init__()
         bound = features**-0.5
         self.weight = nn.Parameter(torch.empty(EDGE_KINDS, hidden, features).uniform_(-bound, bound))
-
-
-class _Scales(nn.Module):
-    """The scales ``norm.*`` as float32 buffers: (1,), by edge kind (3,), by property (2,)."""
-
-    def __init__(self, normalisation: Normalisation, spec: GraphSpec) -> None:
-        super().__init__()
-        values = {name: (getattr(normalisation, name),) for name in ("velocity", "change")}
-        values |= {
-            name: getattr(normalisation, name) for name in ("relative", "strain", "stretch", "properties")
-        }
-        values["length"] = (spec.edge_radius_m,)
-        for name, value in values.items():
-            self.register_buffer(name, torch.tensor(value, dtype=torch.float32))
 
 
 def _at_inputs(layer: nn.Linear, first: int, values: Tensor) -> nn.Linear:

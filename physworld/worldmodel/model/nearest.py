@@ -23,10 +23,9 @@ import torch
 from torch import Tensor
 
 from physworld.arrays import Array
+from physworld.worldmodel.model.features import cut_rest_length, cut_strain
 from physworld.worldmodel.model.graph import EDGE_KINDS
 from physworld.worldmodel.native.messages import EdgeList, mean_messages, warp_module
-
-REST_RADII = 2.0  # longest rest length that an edge tells, in edge radii
 
 
 def find_nearest(places: Array, most: int, radius_m: float) -> tuple[Array, Array]:
@@ -53,17 +52,6 @@ def near_ends(places: Array, most: int, radius_m: float) -> tuple[Array, Array, 
     senders, _ = find_nearest(places, most, radius_m)
     element, receiver, slot = np.nonzero(senders >= 0)
     return element, receiver, senders[element, receiver, slot].astype(np.int64)
-
-
-def cut_strain(strain: Tensor, radius: float | Tensor) -> Tensor:
-    """s̄ of s (…, 3)."""
-    size = torch.linalg.vector_norm(strain, dim=-1, keepdim=True)
-    return strain * (radius / size.clamp(min=radius))
-
-
-def cut_rest_length(rest_length: Tensor, radius: float | Tensor) -> Tensor:
-    """|r̄_rest| of |r_rest|."""
-    return rest_length.clamp(max=REST_RADII * radius)
 
 
 class KeptEdges:

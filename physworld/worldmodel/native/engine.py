@@ -16,9 +16,9 @@ import numpy as np
 import torch
 
 from physworld.arrays import Array
+from physworld.worldmodel.model.features import REST_RADII
 from physworld.worldmodel.model.inertia import InertialStep
 from physworld.worldmodel.model.model import WorldModel
-from physworld.worldmodel.model.nearest import REST_RADII
 from physworld.worldmodel.native.chain_native import chain_arrays, chain_scratch, chain_sizes
 from physworld.worldmodel.native.messages import warp_module
 from physworld.worldmodel.priors.chain_step import ChainStep

@@ -19,9 +19,9 @@ from physworld_client.world_model import WorldModel
 from safetensors.numpy import load_file, save_file
 
 from physworld.worldmodel import PublishedModel, WorldModelConfig, affine_skin, build_graph
+from physworld.worldmodel.model.features import Normalisation
 from physworld.worldmodel.model.graph import GraphSpec
 from physworld.worldmodel.model.inertia import InertialPrior
-from physworld.worldmodel.model.model import Normalisation
 from physworld.worldmodel.model.model import WorldModel as Network
 from physworld.worldmodel.priors.modal import ModalPrior, regressor_count, rigid_prior
 from physworld_storage import signing

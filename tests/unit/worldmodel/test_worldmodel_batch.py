@@ -11,7 +11,8 @@ from held_bar import SMALL, graph
 
 from physworld.worldmodel.errors import GraphInvalid
 from physworld.worldmodel.live import LiveRollout
-from physworld.worldmodel.model.model import Normalisation, WorldModel
+from physworld.worldmodel.model.features import Normalisation
+from physworld.worldmodel.model.model import WorldModel
 from physworld.worldmodel.model.skinning import affine_skin
 from physworld.worldmodel.published import PublishedModel
 from physworld.worldmodel.rollout import rollout, unroll

@@ -19,7 +19,8 @@ from physworld.worldmodel.dataset import Track, read_track
 from physworld.worldmodel.errors import VersionUnreadable
 from physworld.worldmodel.export import edge_list, onnx_program, torch_program
 from physworld.worldmodel.model.config import TrainingConfig
-from physworld.worldmodel.model.model import Normalisation, WorldModel
+from physworld.worldmodel.model.features import Normalisation
+from physworld.worldmodel.model.model import WorldModel
 from physworld.worldmodel.native.chain_native import ChainRoller
 from physworld.worldmodel.native.engine import RolloutEngine
 from physworld.worldmodel.priors.chain import ChainPhysics, ChainPrior, chain_of

@@ -18,7 +18,8 @@ from safetensors.numpy import save_file
 from physworld.worldmodel import PublishedModel, affine_skin
 from physworld.worldmodel.dataset import Track
 from physworld.worldmodel.export import INPUTS, edge_list, onnx_program, torch_program
-from physworld.worldmodel.model.model import Normalisation, WorldModel
+from physworld.worldmodel.model.features import Normalisation
+from physworld.worldmodel.model.model import WorldModel
 from physworld.worldmodel.native.engine import RolloutEngine
 from physworld.worldmodel.priors.modal import fit_prior
 

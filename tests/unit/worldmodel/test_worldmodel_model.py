@@ -9,9 +9,10 @@ import pytest
 import torch
 from held_bar import SMALL, graph
 
+from benchmarks.peers.plain_network import PlainNetwork
+from physworld.worldmodel.model.features import Normalisation
 from physworld.worldmodel.model.graph import EDGE_KINDS, GraphSpec
-from physworld.worldmodel.model.model import Normalisation, WorldModel
-from physworld.worldmodel.naive import NaiveWorldModel
+from physworld.worldmodel.model.model import WorldModel
 from physworld.worldmodel.native.engine import RolloutEngine
 from physworld.worldmodel.native.messages import EdgeList, mean_messages, mean_messages_torch
 from physworld.worldmodel.priors.modal import rigid_prior
@@ -60,7 +61,7 @@ def test_the_split_form_is_the_same_function_as_the_plain_one(ground: float | No
     model = _model(spec)
     window, control_next, phi = _state(spec)
     ahead = torch.cat([model.prior(window, control_next, phi), control_next])
-    plain = NaiveWorldModel(model)(window, ahead, phi)
+    plain = PlainNetwork(model)(window, ahead, phi)
     assert torch.allclose(
         model(window, ahead, phi), plain, atol=SAME_FUNCTION * float(plain.detach().abs().max())
     )
@@ -73,7 +74,7 @@ def test_both_forms_have_the_same_gradients() -> None:
     ahead = torch.cat([model.prior(window, control_next, phi), control_next])
     weights = list(model.parameters())
     split = torch.autograd.grad(model(window, ahead, phi).square().sum(), weights)
-    plain = torch.autograd.grad(NaiveWorldModel(model)(window, ahead, phi).square().sum(), weights)
+    plain = torch.autograd.grad(PlainNetwork(model)(window, ahead, phi).square().sum(), weights)
     for a, b in zip(split, plain, strict=True):
         assert torch.allclose(a, b, rtol=1e-3, atol=1e-3 * float(b.abs().max()))
 

@@ -11,13 +11,14 @@ import torch
 from held_bar import SMALL, graph
 from scipy.spatial import cKDTree
 
+from benchmarks.peers.plain_network import PlainNetwork
 from physworld.worldmodel.dataset import Track, measure_scales, read_track
 from physworld.worldmodel.export import INPUTS, StepProgram, edge_list, onnx_program
 from physworld.worldmodel.model.config import TrainingConfig, WorldModelConfig
+from physworld.worldmodel.model.features import Normalisation
 from physworld.worldmodel.model.graph import NEAR, GraphSpec
-from physworld.worldmodel.model.model import Normalisation, WorldModel
+from physworld.worldmodel.model.model import WorldModel
 from physworld.worldmodel.model.nearest import find_nearest
-from physworld.worldmodel.naive import NaiveWorldModel
 from physworld.worldmodel.native.engine import RolloutEngine
 from physworld.worldmodel.rollout import unroll
 from physworld.worldmodel.training import train
@@ -88,7 +89,7 @@ def test_the_split_form_is_the_same_function_as_the_plain_one() -> None:
     model = model_of(spec)
     window, control_next, phi = folded(spec)
     ahead = torch.cat([model.prior(window, control_next, phi), control_next])
-    plain = NaiveWorldModel(model)(window, ahead, phi)
+    plain = PlainNetwork(model)(window, ahead, phi)
     found = edge_list(spec, window[-1, :, 0].numpy())
     near = found["kinds"] == NEAR
     assert np.linalg.norm(found["rest_relative"][near], axis=1).max() > 2.0 * spec.edge_radius_m  # what meets
@@ -98,7 +99,7 @@ def test_the_split_form_is_the_same_function_as_the_plain_one() -> None:
     )
     weights = list(model.parameters())
     split = torch.autograd.grad(model(window, ahead, phi).square().sum(), weights)
-    other = torch.autograd.grad(NaiveWorldModel(model)(window, ahead, phi).square().sum(), weights)
+    other = torch.autograd.grad(PlainNetwork(model)(window, ahead, phi).square().sum(), weights)
     for a, b in zip(split, other, strict=True):
         assert torch.allclose(a, b, rtol=1e-3, atol=1e-3 * float(b.abs().max()))
 

@@ -12,8 +12,9 @@ from physworld.worldmodel.dataset import Track, read_track
 from physworld.worldmodel.export import INPUTS, StepProgram, edge_list
 from physworld.worldmodel.finetune import Recording, fine_tune
 from physworld.worldmodel.model.config import FineTuneConfig, TrainingConfig
+from physworld.worldmodel.model.features import Normalisation
 from physworld.worldmodel.model.inertia import InertialPrior, InertialStep
-from physworld.worldmodel.model.model import Normalisation, WorldModel
+from physworld.worldmodel.model.model import WorldModel
 from physworld.worldmodel.native.engine import RolloutEngine
 from physworld.worldmodel.rollout import unroll
 from physworld.worldmodel.training import TrainingResult, open_loop_error, train

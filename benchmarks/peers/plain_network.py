@@ -1,7 +1,8 @@
-"""The same network written the usual way: edge features concatenated with both ends' states, edge by edge.
+"""The network's function written the usual way: edge features concatenated with both ends' states, edge by edge.
 
-It shares a ``WorldModel``'s weights. It is the oracle of the tests and the yardstick of the benchmark, not
-meant to be used: it is several times slower. Equations and names: ``physworld.worldmodel.model.model``.
+It shares a ``WorldModel``'s weights and features, several times slower: the peer of ``benchmarks.speed.world_model``
+and, with its gradients and its batches, the oracle of the tests of the split form. Equations and names:
+``physworld.worldmodel.model.model``.
 """
 
 from __future__ import annotations
@@ -11,13 +12,18 @@ from torch import Tensor, nn
 
 from physworld.arrays import Array
 from physworld.worldmodel.export import edge_list
-from physworld.worldmodel.model.graph import EDGE_KINDS, NEAR
+from physworld.worldmodel.model.features import edge_features, vertex_features
+from physworld.worldmodel.model.graph import EDGE_KINDS
 from physworld.worldmodel.model.model import WorldModel
-from physworld.worldmodel.model.nearest import cut_rest_length, cut_strain
 
 
-class NaiveWorldModel(nn.Module):
+class PlainNetwork(nn.Module):
     """Message passing over an edge list, with nothing taken apart."""
+
+    receiver: Tensor
+    sender: Tensor
+    kind: Tensor
+    rest: Tensor
 
     def __init__(self, model: WorldModel) -> None:
         super().__init__()
@@ -29,33 +35,19 @@ class NaiveWorldModel(nn.Module):
             self.register_buffer(name, torch.as_tensor(edges[key]), persistent=False)
         self.register_buffer("rest", torch.as_tensor(edges["rest_relative"]), persistent=False)
 
+    def vertex_features(self, window: Tensor, ahead: Tensor, phi: Tensor) -> Tensor:
+        """f_i of every vertex, (V, B, F)."""
+        moves = (window[1:] - window[:-1]).flip(0)
+        grounded = self.model.spec.ground_height_m is not None
+        return vertex_features(window, moves, ahead, phi, self.model.norm, grounded=grounded)
+
     def edge_features(self, window: Tensor) -> Tensor:
         """e_ij of every edge, (E, B, 3h + 8)."""
-        norm = self.model.norm
-        batch = window.shape[2]
+        spec = self.model.spec
         relative = window[:, self.sender] - window[:, self.receiver]
-        rest = self.rest[:, None].expand(-1, batch, -1)
-        rest_length = torch.linalg.vector_norm(rest, dim=-1, keepdim=True)
-        strained = relative[-1] - rest
-        if self.model.spec.current_neighbours:
-            near, radius = (self.kind == NEAR)[:, None, None], self.model.spec.edge_radius_m
-            strained = torch.where(near, cut_strain(strained, radius), strained)
-            rest_length = torch.where(near, cut_rest_length(rest_length, radius), rest_length)
-        length = torch.linalg.vector_norm(relative[-1], dim=-1, keepdim=True)
-        strain, drift, stretch = (
-            scale[self.kind][:, None, None] for scale in (norm.strain, norm.relative, norm.stretch)
-        )
-        moves = (relative[1:] - relative[:-1]).flip(0) / drift
-        return torch.cat(
-            [
-                relative[-1] / norm.length,
-                strained / strain,
-                *moves.unbind(0),
-                rest_length / norm.length,
-                (length - rest_length) / stretch,
-            ],
-            dim=-1,
-        )
+        rest = self.rest[:, None].expand(-1, window.shape[2], -1)
+        radius = spec.edge_radius_m if spec.current_neighbours else None
+        return edge_features(relative, rest, self.kind, self.model.norm, radius)
 
     def forward(self, window: Tensor, ahead: Tensor, phi: Tensor) -> Tensor:
         """y (n, B, 3); arguments as ``WorldModel.forward``."""
@@ -65,8 +57,7 @@ class NaiveWorldModel(nn.Module):
         model = self.model
         if model.spec.current_neighbours:
             self._set_edges(edge_list(model.spec, window[-1, :, 0].detach().numpy()))
-        moves = (window[1:] - window[:-1]).flip(0)
-        features = model._vertex_features(window, moves, ahead, phi)
+        features = self.vertex_features(window, ahead, phi)
         state = model.encoder(features)
         edges = self.edge_features(window)
         kinds = [torch.nonzero(self.kind == k)[:, 0] for k in range(EDGE_KINDS)]
