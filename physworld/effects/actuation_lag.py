@@ -27,6 +27,7 @@ class ActuationLag(Effect):
     equation = "grip(t) = record(t - lag)"
     kind = "boundary"
     gates = ("lag_s",)
+    instead = "put a marker on the grip itself and compare it with the commanded track"
 
     lag_s: float = 0.0
 

@@ -15,13 +15,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.effects.base import Effect, Strength
+from physworld.effects.base import BasinScan, Effect, Strength, Variant
 from physworld.engine.problem import Problem
 from physworld.engine.total.stress import StressTerm
 from physworld.engine.total.stress_kernels import sheet_model, solid_model
 
 if TYPE_CHECKING:
     from physworld.twin.twin import Twin
+
+_DIAGONAL = 0.25 * np.pi
 
 _MODELS = {
     3: solid_model(r"""
@@ -51,6 +53,9 @@ class Anisotropy(Effect):
     kind = "stress"
     gates = ("ratio",)
     strains = True
+    basins = BasinScan(
+        (-0.4, -0.2, 0.0), (0.025, 0.1, 0.4)
+    )  # fibres so stiff that nothing about them is small
 
     ratio: float = 0.0
     azimuth_rad: float = 0.0
@@ -71,6 +76,26 @@ class Anisotropy(Effect):
         if twin.lattice.dim == 3:
             angles.append(Strength("elevation_rad", "rad", -half_turn, half_turn, 0.05, gate=False))
         return (Strength("ratio", "1", -0.5, 20.0, 0.05), *angles)
+
+    @classmethod
+    def variants(cls, twin: Twin) -> list[Variant]:
+        """Directions over the half circle, for a solid over the half sphere: axes and the diagonals between them."""
+        angles: list[tuple[float, float | None]]
+        if twin.lattice.dim < 3:
+            angles = [(azimuth, None) for azimuth in (0.0, _DIAGONAL, -_DIAGONAL, 2 * _DIAGONAL)]
+        else:
+            angles = [(a, 0.0) for a in (0.0, _DIAGONAL, -_DIAGONAL, 2 * _DIAGONAL)]
+            angles += [(0.0, 2 * _DIAGONAL), (0.0, _DIAGONAL), (0.0, -_DIAGONAL)]
+            angles += [(2 * _DIAGONAL, _DIAGONAL), (2 * _DIAGONAL, -_DIAGONAL)]
+        variants = []
+        for azimuth, elevation in angles:
+            fixed = {"azimuth_rad": azimuth}
+            label = f"{np.degrees(azimuth):.0f}°"
+            if elevation is not None:
+                fixed["elevation_rad"] = elevation
+                label += f", {np.degrees(elevation):.0f}°"
+            variants.append(Variant(("ratio",), label, fixed, tuple(fixed)))
+        return variants
 
     @classmethod
     def refuses(cls, twin: Twin) -> str | None:

@@ -12,7 +12,8 @@ effects take their turn in the order of the registry. A hook leaves what it does
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from physworld.arrays import Array
@@ -22,6 +23,9 @@ if TYPE_CHECKING:
     from physworld.twin.twin import Twin
 
 Kind = Literal["force", "stress", "boundary", "field", "measurement"]
+Shape = dict[str, float]
+"""Numbers that only shape an effect (a direction, a place, a time), by name."""
+Mirror = Callable[[Shape], Shape]
 
 
 @dataclass(frozen=True)
@@ -35,6 +39,7 @@ class Strength:
         probe: a step for sensitivities, large enough to show in a simulation and small enough to stay linear.
         gate: zero switches the effect off; False for a number that only shapes it.
         start: where a search starts: 0 of a gate, else the field's default or the place that ``None`` chooses.
+        prior_deviation: standard deviation about 0 of what is known before any recording, in ``unit``; None: nothing.
     """
 
     name: str
@@ -44,6 +49,41 @@ class Strength:
     probe: float
     gate: bool = True
     start: float = 0.0
+    prior_deviation: float | None = None
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One form in which a trace tries an effect: a linear score is taken of its gates, with its shape fixed.
+
+    Attributes:
+        gates: names of the strengths that are free from the start.
+        label: what tells it from the effect's other variants.
+        fixed: values of the strengths that only shape the effect.
+        shapes: names of those of them that a refit of the best variant frees.
+    """
+
+    gates: tuple[str, ...]
+    label: str = ""
+    fixed: Shape = field(default_factory=dict)
+    shapes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class BasinScan:
+    """Where a trace looks for other basins of an effect with one gate, by simulation.
+
+    Attributes:
+        stiffness_shifts: natural logarithms of the stiffness over that of the declared physics' optimum.
+        shares: strengths of the gate over its upper bound.
+    """
+
+    stiffness_shifts: tuple[float, ...]
+    shares: tuple[float, ...]
+
+
+DISSIPATIVE = BasinScan((-0.9, -0.6, -0.4, -0.2, 0.0, 0.25, 0.5), (0.01, 0.1, 0.5))
+"""Of effects that take energy: without them a body that rings down is fitted by one so stiff that it hardly rings."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +97,10 @@ class Effect:
         kind: where it enters.
         gates: fields whose zero switches the effect off.
         strains: acts on the strains of a body's cells, which a mesh of triangles does not have.
+        basins: where a trace looks for other basins of the effect; None: nowhere.
+        parts: effects whose sum this one is, each with the gates that make it up; a recording of one place tells the
+            sum from its parts hardly, so a trace asks both.
+        instead: a measurement that settles whether the effect is there without a motion of the grips, for people.
     """
 
     name: ClassVar[str]
@@ -65,6 +109,9 @@ class Effect:
     kind: ClassVar[Kind]
     gates: ClassVar[tuple[str, ...]]
     strains: ClassVar[bool] = False
+    basins: ClassVar[BasinScan | None] = None
+    parts: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    instead: ClassVar[str | None] = None
 
     @property
     def active(self) -> bool:
@@ -84,6 +131,24 @@ class Effect:
     def strengths(cls, twin: Twin) -> tuple[Strength, ...]:
         """What a trace may estimate on this twin; bounds and probes follow its scales."""
         raise NotImplementedError(f"{cls.__name__} names no strengths")
+
+    @classmethod
+    def variants(cls, twin: Twin) -> list[Variant]:
+        """The forms in which a trace tries the effect on this twin: by default one, with every gate free."""
+        return [Variant(tuple(s.name for s in cls.strengths(twin) if s.gate))]
+
+    @classmethod
+    def mirror(cls, twin: Twin) -> Mirror | None:
+        """From a shape to another one that to first order does the same; None where there is none."""
+        return None
+
+    def implausible(self) -> str | None:
+        """Why nobody would believe these strengths, whatever a recording says; None where one may."""
+        return None
+
+    def in_parts(self, twin: Twin) -> list[float]:
+        """Strengths of the gates of ``parts``, in their order, that do to first order what this effect does."""
+        raise NotImplementedError(f"{type(self).__name__} is no sum of other effects")
 
     @classmethod
     def refuses(cls, twin: Twin) -> str | None:
@@ -124,3 +189,10 @@ class Effect:
     def measured(self, times: Array, tracks: Array, twin: Twin) -> Array:
         """What the camera reports at ``times`` (T,) [s] of true ``tracks`` (T, N, 3) [m]."""
         return tracks
+
+
+def one_by_one(strengths: tuple[Strength, ...], *groups: tuple[str, ...]) -> list[Variant]:
+    """One variant a group of gates, of those that a twin has; a group's label is its first gate's name."""
+    known = {s.name for s in strengths}
+    present = [tuple(gate for gate in group if gate in known) for group in groups]
+    return [Variant(group, group[0]) for group in present if group]

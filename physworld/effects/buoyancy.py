@@ -30,6 +30,7 @@ class Buoyancy(Effect):
     equation = "(1 + a) m dv/dt = f + (1 - b) m g"
     kind = "force"
     gates = ("density_ratio", "added_mass_ratio")
+    instead = "weigh the body in the same surroundings"
 
     density_ratio: float = 0.0
     added_mass_ratio: float = 0.0

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from physworld.arrays import Array
-from physworld.effects.base import Effect, Strength
+from physworld.effects.base import Effect, Strength, Variant
 from physworld.effects.places import body_size, held_count
 from physworld.engine.problem import Problem
 
@@ -38,6 +38,7 @@ class ClampOffset(Effect):
     equation = "free length L - r; held material turned"
     kind = "boundary"
     gates = ("reach_m", "angle_x_rad", "angle_y_rad", "angle_z_rad")
+    instead = "measure where the clamp's face is"
 
     reach_m: float = 0.0
     angle_x_rad: float = 0.0
@@ -53,6 +54,13 @@ class ClampOffset(Effect):
             Strength("reach_m", "m", -most, most, 0.25 * min(cell, most)),
             *(Strength(f"angle_{axis}_rad", "rad", -0.2, 0.2, 0.005) for axis in "xyz"),
         )
+
+    @classmethod
+    def variants(cls, twin: Twin) -> list[Variant]:
+        """Angles; the reach only where grips prescribe nodes: a reach within a cell is what softness is."""
+        angles = Variant(("angle_x_rad", "angle_y_rad", "angle_z_rad"), "angle_x_rad")
+        reach = [Variant(("reach_m",), "reach_m")] if twin.grip_softness == 0 else []
+        return [*reach, angles]
 
     @classmethod
     def refuses(cls, twin: Twin) -> str | None:

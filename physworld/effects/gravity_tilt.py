@@ -15,11 +15,21 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from physworld.arrays import Array
-from physworld.effects.base import Effect, Strength
+from physworld.effects.base import Effect, Strength, Variant, one_by_one
 from physworld.engine.problem import Problem
 
 if TYPE_CHECKING:
     from physworld.twin.twin import Twin
+
+
+_LARGEST_TILT_RAD = 0.2
+_LARGEST_MAGNITUDE = 0.01  # over the Earth gravity's strength differs by half as much
+_TILT_DEVIATION_RAD = 0.1
+"""Who sets up a camera sees a frame that is far off the vertical before any recording.
+
+A strong recording overrules that, and where it says a tilt that nobody believes that stays so. A weak one that hardly
+tells a tilt of 3 degrees from one of 13 says the one that is believed.
+"""
 
 
 @dataclass(frozen=True)
@@ -31,6 +41,7 @@ class GravityTilt(Effect):
     equation = "g' = (1 + s) R(a e1 + b e2) g"
     kind = "force"
     gates = ("tilt_x_rad", "tilt_y_rad", "magnitude")
+    instead = "hang a plumb line into the picture, or level the frame"
 
     tilt_x_rad: float = 0.0
     tilt_y_rad: float = 0.0
@@ -44,10 +55,27 @@ class GravityTilt(Effect):
     def strengths(cls, twin: Twin) -> tuple[Strength, ...]:
         """Up to half a radian either way, half as much or half more."""
         return (
-            Strength("tilt_x_rad", "rad", -0.5, 0.5, 0.01),
-            Strength("tilt_y_rad", "rad", -0.5, 0.5, 0.01),
+            Strength("tilt_x_rad", "rad", -0.5, 0.5, 0.01, prior_deviation=_TILT_DEVIATION_RAD),
+            Strength("tilt_y_rad", "rad", -0.5, 0.5, 0.01, prior_deviation=_TILT_DEVIATION_RAD),
             Strength("magnitude", "1", -0.5, 0.5, 0.01),
         )
+
+    @classmethod
+    def variants(cls, twin: Twin) -> list[Variant]:
+        """Direction and strength apart."""
+        return one_by_one(cls.strengths(twin), ("tilt_x_rad", "tilt_y_rad"), ("magnitude",))
+
+    def implausible(self) -> str | None:
+        """A plumb line shows a frame that is far off the vertical before a recording does.
+
+        Gravity's strength is known everywhere; a body that weighs less is carried by a fluid.
+        """
+        tilt = float(np.hypot(self.tilt_x_rad, self.tilt_y_rad))
+        if tilt > _LARGEST_TILT_RAD:
+            return f"gravity tilted by {np.degrees(tilt):.0f}° is not believed"
+        if abs(self.magnitude) > _LARGEST_MAGNITUDE:
+            return f"gravity that differs by {self.magnitude:+.0%} is not believed"
+        return None
 
     @classmethod
     def refuses(cls, twin: Twin) -> str | None:

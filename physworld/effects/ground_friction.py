@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from physworld.effects.base import Effect, Strength
+from physworld.effects.base import Effect, Strength, Variant, one_by_one
 from physworld.effects.places import body_size
 from physworld.engine.problem import Problem
 from physworld.engine.terms.contact import GroundContact
@@ -40,6 +40,11 @@ class GroundFriction(Effect):
             Strength("change", "1", -twin.ground_friction, 1.5, 0.05),
             Strength("height_m", "m", -reach, reach, 0.01 * reach),
         )
+
+    @classmethod
+    def variants(cls, twin: Twin) -> list[Variant]:
+        """Friction and height apart."""
+        return one_by_one(cls.strengths(twin), ("change",), ("height_m",))
 
     @classmethod
     def refuses(cls, twin: Twin) -> str | None:

@@ -27,6 +27,7 @@ class MassField(LowRankField):
 
     name = "mass_field"
     title = "density that varies over the body"
+    instead = "weigh the body's halves"
 
     @classmethod
     def strengths(cls, twin: Twin) -> tuple[Strength, ...]:

@@ -30,6 +30,7 @@ class MeasurementClock(Effect):
     equation = "measured(t) = true(t - offset)"
     kind = "measurement"
     gates = ("offset_s",)
+    instead = "record one event that both clocks see (a flash, a tap on the grip)"
 
     offset_s: float = 0.0
 

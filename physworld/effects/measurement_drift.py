@@ -26,6 +26,7 @@ class MeasurementDrift(Effect):
     equation = "measured = true + u (t - t0)"
     kind = "measurement"
     gates = ("x_m_s", "y_m_s", "z_m_s")
+    instead = "keep a fixed target in the picture"
 
     x_m_s: float = 0.0
     y_m_s: float = 0.0

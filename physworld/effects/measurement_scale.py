@@ -30,6 +30,7 @@ class MeasurementScale(Effect):
     equation = "measured = c + (1 + s) (true - c)"
     kind = "measurement"
     gates = ("scale",)
+    instead = "film a rod of known length in the same place"
 
     scale: float = 0.0
 

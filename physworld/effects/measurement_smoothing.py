@@ -29,6 +29,7 @@ class MeasurementSmoothing(Effect):
     equation = "tau dy/dt = true - y"
     kind = "measurement"
     gates = ("time_constant_s",)
+    instead = "look at the tracker's raw detections, or film a falling ball with it"
 
     time_constant_s: float = 0.0
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from physworld.effects.base import Effect, Strength
+from physworld.effects.base import Effect, Strength, Variant, one_by_one
 from physworld.effects.places import body_size
 from physworld.engine.problem import Problem
 from physworld.engine.total.stress import StressTerm
@@ -59,6 +59,7 @@ class RestShape(Effect):
     kind = "field"
     gates = ("strain_x", "strain_y", "strain_z", "curvature_1_per_m", "curvature_2_per_m")
     strains = True
+    instead = "scan the body without load"
 
     strain_x: float = 0.0
     strain_y: float = 0.0
@@ -75,6 +76,12 @@ class RestShape(Effect):
             Strength("curvature_1_per_m", "1/m", -most, most, 0.02 * most),
             Strength("curvature_2_per_m", "1/m", -most, most, 0.02 * most),
         )
+
+    @classmethod
+    def variants(cls, twin: Twin) -> list[Variant]:
+        """Strains and curvatures apart."""
+        strains, bends = ("strain_x", "strain_y", "strain_z"), ("curvature_1_per_m", "curvature_2_per_m")
+        return one_by_one(cls.strengths(twin), strains, bends)
 
     def problem(self, problem: Problem, twin: Twin) -> Problem:
         """Scales the lattice, and adds the stress of a bend."""

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.effects.base import Effect, Strength
+from physworld.effects.base import Effect, Strength, Variant
 from physworld.effects.places import unit_coordinates
 from physworld.engine.lattice.lattice import Lattice
 from physworld.engine.problem import Problem
@@ -41,6 +41,18 @@ class LowRankField(Effect):
     bump_y: float = 0.0
     bump_z: float = 0.0
     bump_width: float = 0.3
+
+    @classmethod
+    def variants(cls, twin: Twin) -> list[Variant]:
+        """A slope along the body's axes, and bumps along its longest."""
+        axes = _AXES[: twin.lattice.dim]
+        span = np.ptp(twin.lattice.particle_coordinates, axis=0)
+        along = axes[int(np.argmax(span))]
+        variants = [Variant(tuple(f"slope_{a}" for a in axes), "slope")]
+        for place in (-0.5, 0.0, 0.5):
+            fixed = {f"bump_{a}": 0.0 for a in axes} | {f"bump_{along}": place}
+            variants.append(Variant(("bump",), f"bump at {place:+g}", fixed, (f"bump_{along}",)))
+        return variants
 
 
 @dataclass(frozen=True)

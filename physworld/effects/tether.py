@@ -16,7 +16,7 @@ import numpy as np
 import warp as wp
 
 from physworld.arrays import Array
-from physworld.effects.base import Effect, Strength
+from physworld.effects.base import Effect, Mirror, Shape, Strength, Variant
 from physworld.effects.places import (
     body_size,
     gravity_size,
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from physworld.twin.twin import Twin
 
 _RADIUS = 0.1  # of the body's size
+_SHORTEST = 0.05  # length of a tether on its other side over the one at rest
 
 
 @wp.kernel
@@ -111,6 +112,7 @@ class Tether(Effect):
     equation = "F = -k (1 - l / |d|) d"
     kind = "force"
     gates = ("stiffness_n_m",)
+    instead = "look for a cable or a contact near the place it points to"
 
     stiffness_n_m: float = 0.0
     anchor_x_m: float | None = None
@@ -135,6 +137,44 @@ class Tether(Effect):
             ),
             Strength("rest_length_m", "m", 0.0, 3 * size, 0.02 * size, gate=False),
         )
+
+    @classmethod
+    def variants(cls, twin: Twin) -> list[Variant]:
+        """Relaxed springs from the middle of the free end in every direction: axes, and the diagonals between them.
+
+        The anchor stands in the room; which material is tied is left to each recording's twin.
+        """
+        end, reach = middle_of_free_end(twin), body_size(twin)
+        axes = np.eye(3)
+        ways = [*axes]
+        for i, j in ((0, 1), (0, 2), (1, 2)):
+            ways += [axes[i] + axes[j], axes[i] - axes[j]]
+        variants = []
+        for way in ways:
+            unit = way / np.linalg.norm(way)
+            anchor = end + reach * unit
+            fixed = {f"anchor_{a}_m": float(p) for a, p in zip("xyz", anchor, strict=True)}
+            fixed["rest_length_m"] = reach
+            label = "towards " + " ".join(f"{p:+.0f}" for p in np.sign(np.round(way, 6)))
+            shapes = tuple(f"anchor_{a}_m" for a in "xyz")
+            variants.append(Variant(("stiffness_n_m",), label, fixed, shapes))
+        return variants
+
+    @classmethod
+    def mirror(cls, twin: Twin) -> Mirror:
+        """To the tether that pushes from the other side with the force of one that pulls, or the other way round.
+
+        What tells the two apart is how a spring's force turns with it, which is of second order.
+        """
+        end = middle_of_free_end(twin)
+
+        def other_side(shape: Shape) -> Shape:
+            way, rest = np.array([shape[f"anchor_{a}_m"] for a in "xyz"]) - end, shape["rest_length_m"]
+            length = max(float(np.linalg.norm(way)), 1e-9)
+            other = end - way / length * max(2.0 * rest - length, _SHORTEST * rest)
+            return shape | {f"anchor_{a}_m": float(p) for a, p in zip("xyz", other, strict=True)}
+
+        return other_side
 
     def places(self, twin: Twin) -> tuple[Array, Array]:
         """Anchor and centre of the material at the start [m], (3,) each."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from physworld.effects.base import Effect, Strength
+from physworld.effects.base import DISSIPATIVE, Effect, Strength, Variant
 from physworld.effects.places import body_size, gravity_size
 from physworld.engine.problem import Problem
 from physworld.engine.total.stress import StressTerm
@@ -20,6 +20,8 @@ from physworld.engine.total.stress_kernels import rod_model, sheet_model, solid_
 
 if TYPE_CHECKING:
     from physworld.twin.twin import Twin
+
+_RELAXATIONS_S = (0.02, 0.1, 0.5)
 
 _MODELS = {
     3: solid_model(
@@ -80,6 +82,7 @@ class ViscoelasticMaxwell(Effect):
     kind = "stress"
     gates = ("shear_modulus_pa", "share")
     strains = True
+    basins = DISSIPATIVE
 
     shear_modulus_pa: float = 0.0
     share: float = 0.0
@@ -93,6 +96,15 @@ class ViscoelasticMaxwell(Effect):
             return (Strength("share", "1", 0.0, 5.0, 0.02), time)
         scale = twin.density * gravity_size(twin) * body_size(twin)
         return (Strength("shear_modulus_pa", "Pa", 0.0, 1e4 * scale, 0.02 * twin.law.lame[0]), time)
+
+    @classmethod
+    def variants(cls, twin: Twin) -> list[Variant]:
+        """Three relaxation times."""
+        gates = tuple(s.name for s in cls.strengths(twin) if s.gate)
+        return [
+            Variant(gates, f"{time:g} s", {"relaxation_s": time}, ("relaxation_s",))
+            for time in _RELAXATIONS_S
+        ]
 
     def problem(self, problem: Problem, twin: Twin) -> Problem:
         """Adds the branch."""

@@ -10,16 +10,20 @@ alone is the same as other gravity (``gravity_tilt``); the drag alone is ``air_d
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from physworld.effects.base import Effect, Strength
+from physworld.effects.gravity_tilt import horizontal_axes
 from physworld.effects.places import gravity_size
 from physworld.engine.problem import Problem
 
 if TYPE_CHECKING:
     from physworld.twin.twin import Twin
+
+
+_FASTEST_M_S = 20.0
 
 
 @dataclass(frozen=True)
@@ -31,6 +35,8 @@ class Wind(Effect):
     equation = "a = c (w - v) = p - c v"
     kind = "force"
     gates = ("push_x_m_s2", "push_y_m_s2", "push_z_m_s2", "rate_per_s")
+    parts: ClassVar = {"air_drag_linear": ("rate_per_s",), "gravity_tilt": ("tilt_x_rad", "tilt_y_rad")}
+    instead = "repeat the recording in a closed box"
 
     push_x_m_s2: float = 0.0
     push_y_m_s2: float = 0.0
@@ -52,6 +58,25 @@ class Wind(Effect):
             Strength(f"push_{axis}_m_s2", "m/s^2", -weight, weight, 0.01 * weight) for axis in ("x", "y", "z")
         )
         return (*pushes, Strength("rate_per_s", "1/s", 0.0, 30.0, 0.1))
+
+    def implausible(self) -> str | None:
+        """A wind is a push with the drag that it comes with: a push over a drag that is a gale is no wind in a room.
+
+        Without the drag the push is other gravity, which has its own name.
+        """
+        push = float(np.linalg.norm([self.push_x_m_s2, self.push_y_m_s2, self.push_z_m_s2]))
+        speed = push / max(self.rate_per_s, 1e-9)
+        return f"a wind of {speed:.3g} m/s is not believed" if speed > _FASTEST_M_S else None
+
+    def in_parts(self, twin: Twin) -> list[float]:
+        """The drag in still air, and the tilt of gravity that pushes as much across it."""
+        gravity = np.asarray(twin.gravity_m_s2, dtype=float)
+        push = np.array([self.push_x_m_s2, self.push_y_m_s2, self.push_z_m_s2])
+        angles = [
+            float(push @ np.cross(axis, gravity)) / float(gravity @ gravity)
+            for axis in horizontal_axes(gravity)
+        ]
+        return [self.rate_per_s, *angles]
 
     def problem(self, problem: Problem, twin: Twin) -> Problem:
         """Adds to gravity and to the drag rate: no kernel."""

@@ -1,60 +1,64 @@
-"""One effect that is the sum of two others: a wind is a drag in still air and a push, and a tilt of gravity pushes too.
+"""An effect that is the sum of others: a wind is a drag in still air and a push, and a tilt of gravity pushes too.
 
     a = p - c v        p across gravity: a wind p / c, or a drag c where gravity is tilted by about |p| / g
 
-No recording of one place tells the two apart, so where a wind does, the pair is asked as well. Where the push is not
-across gravity the pair fits worse, for gravity's strength is known.
+No recording of one place tells the two apart, so where the sum does, its parts are asked as well. Where the push is not
+across gravity the pair fits worse, for gravity's strength is known. Which effect is a sum of which says the effect
+itself (:attr:`physworld.effects.base.Effect.parts`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
-from physworld.effects.gravity_tilt import horizontal_axes
+from physworld.effects.registry import EFFECTS, effect
 from physworld.trace.candidates import Candidate
 from physworld.trace.confirm import Confirmation, Model
 
-WHOLE = "wind"
-PARTS = ("air_drag_linear", "gravity_tilt")
+
+def whole_of(model: Model) -> str | None:
+    """The effect whose parts a model's effects are; None where they are of none."""
+    own = set(model.names)
+    return next((name for name, kind in EFFECTS.items() if kind.parts and set(kind.parts) == own), None)
 
 
-def is_in_parts(model: Model) -> bool:
-    """Whether a model's effects are the parts of one."""
-    return set(model.names) == set(PARTS)
+def has_parts(model: Model) -> bool:
+    """Whether a model is one effect that is the sum of others."""
+    return len(model.names) == 1 and model.names[0] in EFFECTS and bool(EFFECTS[model.names[0]].parts)
 
 
 def count_of_effects(model: Model) -> int:
     """Effects in a model; the parts of one count as that one."""
-    return 1 if is_in_parts(model) else len(model.members)
+    return 1 if whole_of(model) is not None else len(model.members)
 
 
 def other_names(model: Model, other: Model) -> bool:
     """Whether one is the sum and the other its parts."""
-    return sorted([sorted(model.names), sorted(other.names)]) == sorted([[WHOLE], sorted(PARTS)])
+    return model.names == (whole_of(other),) or other.names == (whole_of(model),)
 
 
 def in_parts(
     confirmation: Confirmation, base: Model, whole: Model, candidates: Sequence[Candidate]
 ) -> Model | None:
-    """The parts of a wind, refitted from its numbers; None where one is no candidate, or no run was usable."""
-    tilts = ("tilt_x_rad", "tilt_y_rad")
-    gates = {PARTS[0]: ("rate_per_s",), PARTS[1]: tilts}
+    """The parts of a sum, refitted from its numbers; None where one is no candidate, or no run was usable.
+
+    Args:
+        confirmation: refits of the trace.
+        base: the declared physics.
+        whole: the model of one effect that is a sum (:func:`has_parts`).
+        candidates: variants that may be parts.
+    """
+    name = whole.names[0]
+    kind = EFFECTS[name]
     members = tuple(
         next(
-            (c for c in candidates if c.effect == part and tuple(g.name for g in c.gates) == gates[part]),
+            (c for c in candidates if c.effect == part and tuple(g.name for g in c.gates) == gates),
             None,
         )
-        for part in PARTS
+        for part, gates in kind.parts.items()
     )
     known = [member for member in members if member is not None]
-    if base.members or len(known) < len(PARTS):
+    if base.members or len(known) < len(kind.parts):
         return None
-    gravity = np.asarray(base.fitted.twin.gravity_m_s2, dtype=float)
-    push = np.array([whole.fitted.value(f"{WHOLE}.push_{axis}_m_s2") for axis in "xyz"])
-    angles = [
-        float(push @ np.cross(axis, gravity)) / float(gravity @ gravity) for axis in horizontal_axes(gravity)
-    ]
-    strengths = [whole.fitted.value(f"{WHOLE}.rate_per_s"), *angles]
-    return confirmation.together(base, tuple(known), strengths, whole)
+    found = effect(name, **{gate: whole.fitted.value(f"{name}.{gate}") for gate in kind.gates})
+    return confirmation.together(base, tuple(known), found.in_parts(base.fitted.twin), whole)

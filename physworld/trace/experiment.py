@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from physworld.arrays import Array
+from physworld.effects.registry import EFFECTS
 from physworld.estimation.simulations import Drive
 from physworld.scene import Scene
 from physworld.trace.experiment_search import ExperimentConfig, Search, Tried
@@ -33,21 +34,6 @@ from physworld.twin.twin import Twin
 
 __all__ = ["Experiment", "ExperimentConfig", "Rival", "propose", "rival_of"]
 
-_INSTEAD = {
-    "measurement_clock": "record one event that both clocks see (a flash, a tap on the grip)",
-    "actuation_lag": "put a marker on the grip itself and compare it with the commanded track",
-    "measurement_scale": "film a rod of known length in the same place",
-    "measurement_drift": "keep a fixed target in the picture",
-    "measurement_smoothing": "look at the tracker's raw detections, or film a falling ball with it",
-    "gravity_tilt": "hang a plumb line into the picture, or level the frame",
-    "wind": "repeat the recording in a closed box",
-    "clamp_offset": "measure where the clamp's face is",
-    "rest_shape": "scan the body without load",
-    "mass_field": "weigh the body's halves",
-    "buoyancy": "weigh the body in the same surroundings",
-    "tether": "look for a cable or a contact near the place it points to",
-}
-"""What settles an effect without a motion of the grips."""
 _LEAST_SHARE = 0.25  # of the noise in a coordinate: nobody knows a body, a grip and a camera better than that
 
 
@@ -135,7 +121,8 @@ def propose(
     config = config or ExperimentConfig()
     simulations = simulations or Simulations(Drive(*scene.control_track(), scene.times))
     labels = tuple(rival.label for rival in rivals)
-    instead = tuple(dict.fromkeys(_INSTEAD[n] for r in rivals for n in r.names if n in _INSTEAD))
+    known = [EFFECTS[name] for rival in rivals for name in rival.names if name in EFFECTS]
+    instead = tuple(dict.fromkeys(effect.instead for effect in known if effect.instead is not None))
     first = rivals[0].twin
     if not first.controller_groups or not any(len(nodes) for nodes in first.held_nodes):
         reason = "Nothing holds this body, so no motion of a grip can be proposed."

@@ -9,7 +9,7 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.trace.comparison import alikeness, cross_validated
-from physworld.trace.compound import WHOLE, in_parts, is_in_parts
+from physworld.trace.compound import has_parts, in_parts, whole_of
 from physworld.trace.config import TraceConfig
 from physworld.trace.confirm import Confirmation, Model, best_variants, explained_direction
 from physworld.trace.plates import as_a_plate
@@ -189,13 +189,11 @@ class Selection:
     def _in_parts(
         self, confirmation: Confirmation, base: Model, tried: list[Model], usable: list[Response]
     ) -> list[Model]:
-        """The two effects that a wind may be as well, where it leaves little."""
+        """The effects that one which is their sum may be as well, where it leaves little."""
         found = [
             in_parts(confirmation, base, m, [response.candidate for response in usable])
             for m in tried
-            if m.names == (WHOLE,)
-            and m.fitted.misfit <= self.config.acceptable
-            and helps(m, base, self.config)
+            if has_parts(m) and m.fitted.misfit <= self.config.acceptable and helps(m, base, self.config)
         ]
         return [model for model in found if model is not None]
 
@@ -323,6 +321,7 @@ def _strengths(model: Model) -> Array:
 
 def by_chance(model: Model, scores: Scores) -> bool:
     """Whether random signs reach the score of every effect of a model, in its best variant; the whole's for parts."""
-    names = (*model.names, WHOLE) if is_in_parts(model) else model.names
+    whole = whole_of(model)
+    names = model.names if whole is None else (*model.names, whole)
     own = [s.share for s in scores.ranked if s.candidate.effect in names]
     return max(own, default=0.0) < scores.threshold

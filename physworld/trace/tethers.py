@@ -20,7 +20,8 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.effects.places import middle_of_free_end
-from physworld.effects.registry import EFFECTS
+from physworld.effects.region_force import RegionForce
+from physworld.effects.tether import Tether
 from physworld.trace.candidates import Candidate
 from physworld.trace.comparison import cross_validated
 from physworld.trace.confirm import Confirmation, Model, beats
@@ -29,7 +30,7 @@ from physworld.trace.score import Score, Scores, orthonormal, project
 from physworld.trace.sensitivity import Response
 from physworld.trace.unknowns import of_strength
 
-TETHER, FORCE = "tether", "region_force"
+TETHER, FORCE = Tether.name, RegionForce.name
 _DIRECTIONS = 600
 _DISTANCES = (
     0.3,
@@ -152,7 +153,7 @@ def _any_length(confirmation: Confirmation, model: Model) -> Model:
     """The tether with its rest length freed, where that predicts left-out blocks better beyond chance; else itself."""
     fitted = model.fitted
     values = next(known.values for known in fitted.twin.effects if known.name == TETHER)
-    rest = next(s for s in EFFECTS[TETHER].strengths(fitted.twin) if s.name == _REST)
+    rest = next(s for s in Tether.strengths(fitted.twin) if s.name == _REST)
     free = of_strength(TETHER, rest, _REST_STEP * (rest.high - rest.low), float(values[_REST] or 0.0))
     other = refit(
         confirmation.simulations, confirmation.whitener, fitted.twin, [*fitted.unknowns, free], confirmation.frames,

@@ -10,15 +10,17 @@ import numpy as np
 from physworld.arrays import Array
 from physworld.calibrate.parameters import BENDING_RATIO, Parameter, bending_ratio
 from physworld.effects.base import Strength
+from physworld.effects.clamp_offset import ClampOffset
+from physworld.effects.grip_slip import GripSlip
 from physworld.effects.places import gravity_size
 from physworld.effects.registry import EFFECTS
 from physworld.engine.terms.soft_grips import AS_HELD
 from physworld.twin.twin import Twin
 
-CLAMP = "clamp_offset"
+CLAMP = ClampOffset.name
 SOFTNESS = "grip_softness"
 REACH = f"{CLAMP}.reach_m"
-SLIP = "grip_slip"
+SLIP = GripSlip.name
 _SLIP_STEP = 0.25  # of a sheared rope's compliance
 _SOFTNESS_SHARES = (0.1, 1.5)  # of ``AS_HELD``: finite elements as large as the grip hold so much harder
 _SOFTNESS_STEP = 0.1

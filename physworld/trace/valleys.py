@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from physworld.arrays import Array
+from physworld.effects.registry import EFFECTS
 from physworld.estimation.simulations import Job
 from physworld.trace.candidates import Candidate
 from physworld.trace.confirm import Confirmation, Model
@@ -26,12 +27,6 @@ from physworld.trace.simulations import Simulations
 from physworld.trace.unknowns import at
 from physworld.trace.whitening import Whitener
 
-DISSIPATIVE = (
-    "air_drag_linear", "air_drag_quadratic", "viscosity_kelvin_voigt", "viscoelastic_maxwell"
-)  # fmt: skip
-_SHIFTS = (-0.9, -0.6, -0.4, -0.2, 0.0, 0.25, 0.5)  # of the stiffness, logarithms
-_SHARES = (0.01, 0.1, 0.5)  # of a strength's upper bound
-_FIBRES, _FIBRE_SHIFTS, _FIBRE_SHARES = "anisotropy", (-0.4, -0.2, 0.0), (0.025, 0.1, 0.4)
 _BETTER = 0.7  # share of the squared residual that a valley may leave
 _EARLY = 0.5  # share of the training frames that is looked at
 
@@ -99,7 +94,7 @@ def valleys(
     """
     if fitted.misfit <= complete:
         return []
-    known = [c for c in chosen if c.effect in (*DISSIPATIVE, _FIBRES) and len(c.gates) == 1]
+    known = [c for c in chosen if EFFECTS[c.effect].basins is not None and len(c.gates) == 1]
     low, high = (np.array([getattr(u, end) for u in fitted.unknowns]) for end in ("low", "high"))
     first = np.eye(len(low))[0]
     looked = whitener.first + max(int(np.ceil(_EARLY * (frames - whitener.first))), 1)
@@ -107,11 +102,12 @@ def valleys(
     tries, jobs = [], []
     for candidate in known:
         prepared, gate = candidate.prepared(fitted.twin), candidate.unknowns()[0]
-        fibres = candidate.effect == _FIBRES
-        for shift in _FIBRE_SHIFTS if fibres else _SHIFTS:
+        scan = EFFECTS[candidate.effect].basins
+        assert scan is not None  # chosen by it
+        for shift in scan.stiffness_shifts:
             place = np.clip(fitted.theta + shift * first, low, high)
             there = at(prepared, fitted.unknowns, place)
-            for share in _FIBRE_SHARES if fibres else _SHARES:
+            for share in scan.shares:
                 strength = share * gate.high
                 tries.append((candidate, place, strength))
                 jobs.append(Job(gate.apply(there, strength), looked))

@@ -15,19 +15,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-
 from physworld.arrays import Array
 from physworld.trace.comparison import alikeness, better_beyond_chance, difference, seen_through
-from physworld.trace.compound import count_of_effects, is_in_parts, other_names
+from physworld.trace.compound import count_of_effects, other_names, whole_of
 from physworld.trace.config import TraceConfig
 from physworld.trace.confirm import Model, beats, explained_direction
 
 NAMED, EQUIVALENT, DATA, NUMERICAL = "named", "equivalent_set", "data_issue", "numerical_issue"
 UNEXPLAINED, NOTHING = "unexplained", "nothing_to_explain"
-FASTEST_WIND_M_S = 20.0
-LARGEST_TILT_RAD = 0.2
-LARGEST_MAGNITUDE = 0.01  # over the Earth gravity's strength differs by half as much
 _DISCREPANCY = 0.05
 _BELOW_NOISE = 0.9
 _NOISE_KNOWN = 0.05  # share to which the variance of the noise is known
@@ -180,26 +175,9 @@ def survives(model: Model, declared: Model, solver: Array, block_of_row: Array, 
 
 
 def implausible(model: Model) -> str | None:
-    """Why nobody would believe a model's numbers; None where one may.
-
-    A wind is a push with the drag that it comes with: without the drag the push is other gravity, which has its own
-    name, and a push over a drag that is a gale is no wind in a room. A plumb line shows a frame that is far off the
-    vertical before a recording does. Its strength is known everywhere; a body that weighs less is carried by a fluid.
-    """
-    for known in model.fitted.twin.effects:
-        if known.name == "gravity_tilt" and "gravity_tilt" in model.names:
-            tilt = float(np.hypot(known.values["tilt_x_rad"], known.values["tilt_y_rad"]))
-            if tilt > LARGEST_TILT_RAD:
-                return f"gravity tilted by {np.degrees(tilt):.0f}° is not believed"
-            if abs(known.values["magnitude"] or 0.0) > LARGEST_MAGNITUDE:
-                return f"gravity that differs by {known.values['magnitude']:+.0%} is not believed"
-        if known.name == "wind" and "wind" in model.names:
-            values = known.values
-            push = float(np.linalg.norm([values[f"push_{axis}_m_s2"] for axis in "xyz"]))
-            speed = push / max(float(values["rate_per_s"] or 0.0), 1e-9)
-            if speed > FASTEST_WIND_M_S:
-                return f"a wind of {speed:.3g} m/s is not believed"
-    return None
+    """Why nobody would believe a model's strengths; None where one may."""
+    own = (known.implausible() for known in model.fitted.twin.effects if known.name in model.names)
+    return next((reason for reason in own if reason is not None), None)
 
 
 def _better_unbelieved(best: Model, models: list[Model], declared: Model) -> Model | None:
@@ -290,7 +268,7 @@ def indistinguishable(model: Model, best: Model, basis: Array, declared: Model, 
     unless it predicts better beyond chance.
     """
     if other_names(model, best):
-        return is_in_parts(best) or as_good(model, best, declared) or not beats(best, model)
+        return whole_of(best) is not None or as_good(model, best, declared) or not beats(best, model)
     if len(model.members) != len(best.members) or len(model.fitted.unknowns) > len(best.fitted.unknowns):
         return False
     same = alikeness(explained_direction(model, declared, basis), explained_direction(best, declared, basis))

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import ast
 import io
 from dataclasses import fields
 from functools import cache
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
 import warp as wp
 from effect_twins import SCENES, TWINS, simulated
 
+from physworld import trace
 from physworld.effects.base import Effect
 from physworld.effects.registry import EFFECTS, effect
 from physworld.errors import EffectRefused, UnknownEffect
@@ -139,3 +142,27 @@ def test_unknown_names_are_refused_with_the_known_ones() -> None:
         effect("air_drag")
     with pytest.raises(UnknownEffect, match="rate_per_s"):
         effect("air_drag_linear", rate=1.0)
+
+
+def _strings(file: Path) -> set[str]:
+    """The string constants of a Python file."""
+    tree = ast.parse(file.read_text())
+    return {
+        node.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    }
+
+
+@pytest.mark.parametrize("file", sorted(Path(trace.__file__).parent.glob("*.py")), ids=lambda file: file.stem)
+def test_the_trace_names_no_effect(file: Path) -> None:
+    """What a trace knows of an effect stands in the effect's own file."""
+    assert _strings(file).isdisjoint(EFFECTS)
+
+
+def test_the_parts_of_an_effect_are_effects_with_those_gates() -> None:
+    summed = [kind for kind in EFFECTS.values() if kind.parts]
+    assert summed
+    for kind in summed:
+        for part, gates in kind.parts.items():
+            assert set(gates) <= set(EFFECTS[part].gates)
