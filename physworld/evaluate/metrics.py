@@ -10,15 +10,23 @@ Two Chamfer distances with two names, never mixed (PhysTwin's evaluation, and th
 A frame in which nothing was seen has no error: it is NaN per frame and left out of every mean. PhysTwin's
 published code counts such a frame as 0; ``track_error_phystwin`` is that variant, to be reported beside.
 
+:func:`metrics` lists them all: tables, comparisons, dashboard and command line show what it has. A new one is a function
+and an entry in this file, or an entry point of another package (:mod:`physworld.catalogue`).
+
 Legend: T frames, N measured points, M predicted points (M = N for tracks).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+
 import numpy as np
 from scipy.spatial import cKDTree
 
 from physworld.arrays import Array
+from physworld.catalogue import with_plugins
 
 L1 = 1
 L2 = 2
@@ -48,7 +56,7 @@ def track_error(predicted: Array, measured: Array, visible: Array) -> float:
 
 def track_error_phystwin(predicted: Array, measured: Array, visible: Array) -> float:
     """PhysTwin's variant: a frame in which nothing was seen counts as error 0 [m]."""
-    return float(np.nan_to_num(track_error_per_frame(predicted, measured, visible), nan=0.0).mean())
+    return mean_with_hidden_as_zero(track_error_per_frame(predicted, measured, visible))
 
 
 def chamfer_phystwin_per_frame(predicted: Array, measured: Array, visible: Array) -> Array:
@@ -98,9 +106,81 @@ def mean_over_frames(per_frame: Array) -> float:
     return float(known.mean()) if known.size else float("nan")
 
 
+def mean_with_hidden_as_zero(per_frame: Array) -> float:
+    """Mean over all frames, those without a value counted as 0."""
+    return float(np.nan_to_num(per_frame, nan=0.0).mean())
+
+
 def noise_floor(noise_sigma_m: float) -> float:
     """Track error of a perfect prediction under Gaussian tracking noise [m]: sigma sqrt(8/pi)."""
     return noise_sigma_m * MEAN_DISTANCE_PER_SIGMA
+
+
+@dataclass(frozen=True)
+class Metric:
+    """How a prediction of measured points is scored.
+
+    Attributes:
+        name: key in tables of results; ends with the unit.
+        title: a few words for people.
+        unit: SI unit, "1" for none.
+        help: what is measured.
+        per_frame: predicted (T, M, 3) [m], measured (T, N, 3) [m] and visible (T, N) points to a value a frame (T,),
+            NaN where there is none. ``held_out_table`` gives predictions of the measured points, so M = N.
+        mean: a curve (T,) to one value.
+        lower_is_better: whether a smaller value is the better one.
+        listed: shown in comparisons, reports and pages, and kept as a curve; others stand in the table of means only.
+    """
+
+    name: str
+    title: str
+    unit: str
+    help: str
+    per_frame: Callable[[Array, Array, Array], Array]
+    mean: Callable[[Array], float] = mean_over_frames
+    lower_is_better: bool = True
+    listed: bool = True
+
+
+_BUILT_IN = (
+    Metric(
+        "track_m",
+        "Track",
+        "m",
+        "mean Euclidean distance of predicted to measured points where these are visible; mean over frames",
+        track_error_per_frame,
+    ),
+    Metric(
+        "chamfer_phystwin_m",
+        "Chamfer (PhysTwin)",
+        "m",
+        "measured visible points to their nearest predicted point, one way, L1 norm; mean over points, then frames",
+        chamfer_phystwin_per_frame,
+    ),
+    Metric(
+        "chamfer_l2_m",
+        "Chamfer (L2)",
+        "m",
+        "both ways, Euclidean, the two means added; mean over frames. Every predicted point counts in the way back, "
+        "so occlusion alone gives a floor",
+        chamfer_l2_per_frame,
+    ),
+    Metric(
+        "track_phystwin_m",
+        "Track (PhysTwin)",
+        "m",
+        "as track_m, but a frame in which nothing was seen counts as 0 (PhysTwin's published code)",
+        track_error_per_frame,
+        mean_with_hidden_as_zero,
+        listed=False,
+    ),
+)
+
+
+@cache
+def metrics() -> dict[str, Metric]:
+    """Every metric by name, our own first."""
+    return with_plugins("physworld.metrics", Metric, {metric.name: metric for metric in _BUILT_IN})
 
 
 def _mean_nearest(points: Array, targets: Array, norm: int) -> float:

@@ -11,6 +11,7 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.evaluate.blocks import mean_with_interval
+from physworld.evaluate.metrics import metrics
 from physworld.evaluate.table import held_out_table
 from physworld.worldmodel.clock import resample_smooth
 from physworld.worldmodel.published import PublishedModel
@@ -71,14 +72,14 @@ def json_safe(value: Any) -> Any:
 
 
 def _with_intervals(table: dict[str, Any]) -> dict[str, Any]:
-    """The table with ``ci95``: metric to name to the 95 % interval of the mean [m], by blocks of frames."""
+    """The table with ``ci95``: metric to name to the 95 % interval of the mean, by blocks of frames."""
     table["ci95"] = {
         metric: {
             name: list(mean_with_interval(np.array(curve, dtype=float)).ci95)
             for name, curve in table["per_frame"][metric].items()
             if any(value is not None for value in curve)
         }
-        for metric in ("track_m", "chamfer_phystwin_m", "chamfer_l2_m")
+        for metric in (metric.name for metric in metrics().values() if metric.listed)
     }
     return table
 
@@ -86,6 +87,6 @@ def _with_intervals(table: dict[str, Any]) -> dict[str, Any]:
 def _with_absent(table: dict[str, Any], absent: list[str]) -> dict[str, Any]:
     """The table with None for predictions that left the numbers: they have no error, and the rest is published."""
     for name in absent:
-        for metric in ("track_m", "track_phystwin_m", "chamfer_phystwin_m", "chamfer_l2_m"):
+        for metric in metrics():
             table[metric][name] = None
     return table

@@ -1,71 +1,45 @@
-"""Read-only libraries: the constitutive laws and the effects that this version of the engine knows."""
+"""The catalogue's lists: laws, effects, metrics, importers and export formats that this version knows."""
 
 from __future__ import annotations
 
-from functools import cache
-from pathlib import Path
+from typing import Annotated, get_args, get_origin
 
 from fastapi import APIRouter
-from pydantic import TypeAdapter
+from pydantic import BaseModel
 
-from physworld_schemas.base import Page
-from physworld_schemas.library import Effect, Material
-from physworld_services.api.errors import documented
+from physworld_schemas.base import FieldError, Page
+from physworld_schemas.library import Effect, ExportFormat, Importer, Material, Metric, NamesOf, catalogue
+from physworld_services.api.errors import ApiProblem, documented
 
 router = APIRouter(tags=["library"], responses=documented(401, 403))
-
-_MATERIALS = [
-    Material(
-        name="neo_hookean",
-        title="Compressible neo-Hookean solid",
-        energy="W(F) = mu/2 (tr F^T F - 3 - 2 ln J) + lambda/2 (ln J)^2",
-        parameters={
-            "youngs_modulus_pa": "Pa",
-            "poissons_ratio": "1",
-            "viscosity_pa_s": "Pa s",
-            "density_kg_m3": "kg/m^3",
-        },
-    ),
-    Material(
-        name="elastic_sheet",
-        title="Thin isotropic sheet, flat at rest",
-        energy="W(e, k) = C/2 (nu (tr e)^2 + (1 - nu) e:e) + D/2 (nu (tr k)^2 + (1 - nu) k:k)",
-        parameters={
-            "membrane_n_m": "N/m",
-            "bending_n_m": "N m",
-            "poissons_ratio": "1",
-            "relaxation_s": "s",
-            "density_kg_m2": "kg/m^2",
-        },
-    ),
-    Material(
-        name="elastic_rod",
-        title="Rope or rod, straight at rest",
-        energy="W(x', k, Theta) = EA/2 (|x'| - 1)^2 + B/2 |k|^2 + GJ/2 (Theta/L)^2",
-        parameters={
-            "stretching_n": "N",
-            "bending_n_m2": "N m^2",
-            "relaxation_s": "s",
-            "density_kg_m": "kg/m",
-            "torsion_ratio": "1",
-        },
-    ),
-]
+ADDRESSES = {"elastic": "materials", "flow": "materials", "effects": "effects"}
 
 
 @router.get("/materials")
 def list_materials() -> Page[Material]:
-    """Constitutive laws that a fit chooses from by the body's shape: solid, sheet, rod."""
-    return Page(data=_MATERIALS)
+    """Constitutive laws of solids, sheets and rods, and flow laws of solids: `law` and `plasticity` of a fit."""
+    return Page(data=catalogue().materials)
 
 
 @router.get("/effects")
 def list_effects() -> Page[Effect]:
-    """Effects that a residual can be traced to, with their strengths' units."""
-    return Page(data=known_effects())
+    """Effects that a residual can be traced to, with their strengths' units and bounds."""
+    return Page(data=catalogue().effects)
 
 
-@cache
-def known_effects() -> list[Effect]:
-    """The registry, as the file beside this package has it (``physworld_workers.commands.effects_wire`` writes it)."""
-    return TypeAdapter(list[Effect]).validate_json((Path(__file__).parents[1] / "effects.json").read_bytes())
+@router.get("/metrics")
+def list_metrics() -> Page[Metric]:
+    """Metrics of predictions on held-out frames, with units; comparisons show those that are `listed`."""
+    return Page(data=catalogue().metrics)
+
+
+@router.get("/importers")
+def list_importers() -> Page[Importer]:
+    """Forms of recordings that an upload may have."""
+    return Page(data=catalogue().importers)
+
+
+@router.get("/exports")
+def list_exports() -> Page[ExportFormat]:
+    """Forms in which the SDK and the command line write the episodes of a dataset."""
+    return Page(data=catalogue().exports)
