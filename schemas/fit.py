@@ -4,17 +4,13 @@ from __future__ import annotations
 
 from datetime import datetime
 from math import prod
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
 from physworld_schemas.base import Artifact, Lineage, Request, Resource
+from physworld_schemas.library import NamesOf
 
-ElasticLaw = Literal[
-    "auto", "neo_hookean", "fixed_corotated", "st_venant_kirchhoff", "hencky", "drucker_prager_elastic",
-    "transversely_isotropic", "isotropic_sheet", "orthotropic_sheet", "rod",
-]  # fmt: skip
-FlowLaw = Literal["identity", "von_mises", "drucker_prager", "st_venant_kirchhoff"]
 MOST_PARTICLES = 200_000
 
 
@@ -36,8 +32,8 @@ class FitConfig(Request):
     particle_budget: int = Field(default=2000, ge=50, le=MOST_PARTICLES)
     max_simulations: int = Field(default=400, ge=1, le=5000)
     damping: Literal["auto", "none"] = "auto"
-    law: ElasticLaw | None = None
-    plasticity: FlowLaw | None = None
+    law: Annotated[str, NamesOf("law")] | None = None
+    plasticity: Annotated[str, NamesOf("flow law")] | None = None
     formulation: Literal["auto", "total_lagrangian", "updated_lagrangian"] = "auto"
     transfer: Literal["apic", "asflip"] = "apic"
     mesh: str | None = Field(default=None, pattern=r"^[1-9]\d{0,2}x[1-9]\d{0,2}(odd)?$")

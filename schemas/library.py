@@ -1,8 +1,8 @@
 """The catalogue: what this version knows by name, with units, bounds and defaults.
 
 Laws, effects, metrics, importers and export formats are declared in the rooms that implement them. What they say of
-themselves is written into ``catalogue.json`` (``python -m scripts.catalogue``), because neither the web process nor the
-SDK loads Warp. Another package that adds to the registries (:mod:`physworld.catalogue`) carries such a file too, written
+themselves is written into ``catalogue.json`` (``python -m scripts.catalogue``), because neither web process nor SDK
+loads Warp. Another package that adds to the registries (:mod:`physworld.catalogue`) carries such a file too, written
 by ``python -m physworld_workers.commands.catalogue PACKAGE``, and names its top-level package as an entry point::
 
     [project.entry-points."physworld.catalogue"]
@@ -11,6 +11,7 @@ by ``python -m physworld_workers.commands.catalogue PACKAGE``, and names its top
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
 from importlib.util import find_spec
@@ -23,6 +24,7 @@ from pydantic.json_schema import JsonSchemaValue
 from physworld_schemas.base import Resource
 
 BodyShape = Literal["solid", "sheet", "rod"]
+NameKind = Literal["law", "flow law", "effect"]
 FILE = "catalogue.json"
 
 
@@ -101,13 +103,14 @@ class Catalogue(Resource):
     importers: list[Importer] = Field(default_factory=list)
     exports: list[ExportFormat] = Field(default_factory=list)
 
-    def laws(self, kind: Literal["elastic", "flow"]) -> list[str]:
-        """Names of the laws of one kind."""
-        return [material.name for material in self.materials if material.kind == kind]
-
     def listed_metrics(self) -> list[Metric]:
         """The metrics that comparisons, reports and pages show, in their order."""
         return [metric for metric in self.metrics if metric.listed]
+
+    def metric(self, name: str) -> Metric:
+        """The metric of that name; of one that is not installed here only the name is known."""
+        known = {metric.name: metric for metric in self.metrics}
+        return known.get(name, Metric(name=name, title=name, unit="1"))
 
 
 @cache
@@ -125,25 +128,30 @@ def file_of(package: str) -> Path:
     """Where a top-level package keeps its catalogue; nothing of the package is run to find out."""
     spec = find_spec(package)
     if spec is None or spec.origin is None:
-        raise ModuleNotFoundError(f"{package} adds to the catalogue but is no installed package with an __init__.py")
+        raise ModuleNotFoundError(
+            f"{package} adds to the catalogue but is no installed package with an __init__.py"
+        )
     return Path(spec.origin).parent / FILE
 
 
-class NamesOf:
-    """Marks a field whose values are names of the catalogue: OpenAPI lists them, and the API refuses others.
+def known_names(kind: NameKind) -> list[str]:
+    """What a request may call a law, a flow law or an effect."""
+    if kind == "effect":
+        return [effect.name for effect in catalogue().effects]
+    if kind == "flow law":
+        return [law.name for law in catalogue().materials if law.kind == "flow"]
+    return ["auto", *(law.name for law in catalogue().materials if law.kind == "elastic")]
 
-    A model does not refuse them itself, so that a client reads what a service with more packages has made.
+
+@dataclass(frozen=True)
+class NamesOf:
+    """Marks a field of names: OpenAPI lists them, and the API refuses others.
+
+    The models themselves take any name, so that a client reads what a service with more packages has made.
     """
 
-    def __init__(self, kind: Literal["elastic", "flow", "effects"]) -> None:
-        self.kind: Literal["elastic", "flow", "effects"] = kind
-
-    def names(self) -> list[str]:
-        """Every name that may stand there."""
-        if self.kind == "effects":
-            return [effect.name for effect in catalogue().effects]
-        return [*(["auto"] if self.kind == "elastic" else []), *catalogue().laws(self.kind)]
+    kind: NameKind
 
     def __get_pydantic_json_schema__(self, core: Any, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         """The names as an enumeration."""
-        return {**handler(core), "enum": self.names()}
+        return {**handler(core), "enum": known_names(self.kind)}

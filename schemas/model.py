@@ -97,7 +97,7 @@ class VersionPatch(Request):
 
 
 class MeasuredError(Resource):
-    """A mean error [m] and its 95 % interval by blocks of frames; None where it is not known."""
+    """A mean error, in its metric's unit, and its 95 % interval by blocks of frames; None where it is not known."""
 
     value: float
     ci95: tuple[float, float] | None = None
@@ -106,7 +106,8 @@ class MeasuredError(Resource):
 class ComparedError(Resource):
     """One predictor's error on the held-out frames in two versions.
 
-    ``gain``: mean of a − b over the frames that both versions score, paired; above zero: b is better. None where the
+    ``gain``: mean of a − b over the frames that both versions score, paired, of b − a where a higher value is better;
+    above zero: b is better. None where the
     versions were not scored on the same frames of the same recording.
     """
 

@@ -48,7 +48,7 @@ class ModelReference(Resource):
 class RunReport(Resource):
     """The figures of one main job, under stable keys (``physworld run --json``).
 
-    ``held_out`` maps a metric (``track_m``, ``chamfer_phystwin_m``, ``chamfer_l2_m``, all in metres) to the
+    ``held_out`` maps a listed metric of ``GET /v1/metrics`` to the
     figures of ``static``, ``rigid_follow``, ``constant_velocity``, ``twin``, ``world_model`` and
     ``world_model_finetuned``. ``closed_loop`` is the card's: the verdict, the effects that were added, and the
     errors before and after; null where no trace was asked for.

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import ConfigDict, Field, model_validator
 
 from physworld_schemas.base import Artifact, Lineage, Request, Resource, Seed
 from physworld_schemas.fit import FitConfig
+from physworld_schemas.library import NamesOf
 
 Verdict = Literal[
     "named", "equivalent_set", "data_issue", "numerical_issue", "unexplained", "nothing_to_explain"
@@ -26,7 +27,7 @@ class TraceConfig(Request):
     that sees more finely than the experiment repeats; none: what scenes declare.
     """
 
-    candidates: list[str] = Field(default_factory=list, max_length=64)
+    candidates: list[Annotated[str, NamesOf("effect")]] = Field(default_factory=list, max_length=64)
     effects_at_most: int = Field(default=2, ge=1, le=4)
     confirmed: int = Field(default=8, ge=1, le=32)
     iterations: int = Field(default=5, ge=1, le=50)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from physworld.arrays import Array
+from physworld_schemas.library import catalogue
 from physworld_schemas.model import (
     ComparedError,
     Difference,
@@ -22,7 +23,6 @@ from physworld_schemas.model import (
 )
 from physworld_storage.errors import Conflict
 
-METRICS = ("track_m", "chamfer_phystwin_m", "chamfer_l2_m")
 FIGURES = (
     "steps_per_second.world_model",
     "steps_per_second.twin",
@@ -63,7 +63,8 @@ def compare_versions(a: ModelVersion, b: ModelVersion) -> ModelComparison:
 
 def _errors(a: ModelVersion, b: ModelVersion, same: bool) -> Iterator[ComparedError]:
     tables = [_table(version) for version in (a, b)]
-    for metric in METRICS:
+    for listed in catalogue().listed_metrics():
+        metric = listed.name
         predictors = dict.fromkeys(name for table in tables for name in table.get(metric, {}))
         for predictor in predictors:
             curves = [_curve(table, metric, predictor) for table in tables]
@@ -75,7 +76,7 @@ def _errors(a: ModelVersion, b: ModelVersion, same: bool) -> Iterator[ComparedEr
                 predictor=predictor,
                 a=means[0],
                 b=means[1],
-                gain=_gain(curves[0], curves[1]) if same else None,
+                gain=_gain(*(curves if listed.lower_is_better else reversed(curves))) if same else None,
             )
 
 

@@ -10,8 +10,8 @@ Two Chamfer distances with two names, never mixed (PhysTwin's evaluation, and th
 A frame in which nothing was seen has no error: it is NaN per frame and left out of every mean. PhysTwin's
 published code counts such a frame as 0; ``track_error_phystwin`` is that variant, to be reported beside.
 
-:func:`metrics` lists them all: tables, comparisons, dashboard and command line show what it has. A new one is a function
-and an entry in this file, or an entry point of another package (:mod:`physworld.catalogue`).
+:func:`metrics` lists them all: tables, comparisons, dashboard and command line show what it has. A new one is a
+function and an entry in this file, or an entry point of another package (:mod:`physworld.catalogue`).
 
 Legend: T frames, N measured points, M predicted points (M = N for tracks).
 """

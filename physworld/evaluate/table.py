@@ -1,7 +1,7 @@
 """The results table on a scene's held-out frames: every prediction beside every baseline.
 
-All figures in SI units, those of our own metrics in metres, over the frames ``scene.test`` (frame 0 is never scored: every prediction starts from
-it). The table is plain JSON: a value that does not exist (nothing was seen) is None, never NaN.
+All figures in SI units, over the frames ``scene.test`` (frame 0 is never scored: every prediction starts from it). The
+table is plain JSON: a value that does not exist (nothing was seen) is None, never NaN.
 """
 
 from __future__ import annotations

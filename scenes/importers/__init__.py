@@ -1,4 +1,7 @@
-"""Imports of scenes: our bundle, PhysTwin's pickle, C3D motion capture, told apart by their content."""
+"""Imports of scenes: our bundle, PhysTwin's pickle, C3D motion capture, told apart by their content.
+
+A new one is a file beside this one and a line here.
+"""
 
 from __future__ import annotations
 
@@ -8,14 +11,21 @@ from physworld.scene import Scene
 from physworld_scenes.archives import is_tar, is_zip
 from physworld_scenes.bundle import bundle_from_bytes
 from physworld_scenes.importers import c3d, phystwin
-from physworld_scenes.importers.options import ImportOptions
+from physworld_scenes.importers.options import Importer, ImportOptions
 from physworld_schemas.base import FieldError
 from physworld_storage.errors import SceneInvalid
 
-__all__ = ["ImportOptions", "import_any"]
+__all__ = ["IMPORTERS", "ImportOptions", "Importer", "import_any"]
 
-PICKLE_PROTOCOL = b"\x80"
-PICKLE_SUFFIXES = (".pkl", ".pickle")
+BUNDLE = Importer(
+    "bundle",
+    "archive of scene.json and scene.npz",
+    (".zip", ".tar", ".tar.gz", ".tgz"),
+    "the scene as it is declared, and meshes of its colliders; the SDK and the command line pack folders",
+    lambda data, filename: is_zip(data) or is_tar(data),
+    lambda data, name, options: bundle_from_bytes(data),
+)
+IMPORTERS = (BUNDLE, c3d.IMPORTER, phystwin.IMPORTER)
 
 
 def import_any(
@@ -32,16 +42,10 @@ def import_any(
         SceneInvalid: with every fault.
     """
     path = PurePosixPath(filename.replace("\\", "/"))
-    name = path.stem or "scene"
-    if is_zip(data) or is_tar(data):
-        return bundle_from_bytes(data)
-    if c3d.is_c3d(data):
-        return c3d.read_bytes(data, name, options)
-    if data[:1] == PICKLE_PROTOCOL or path.suffix.lower() in PICKLE_SUFFIXES:
-        return phystwin.read_bytes(data, name, options)
+    for importer in IMPORTERS:
+        if importer.recognises(data, path.name):
+            return importer.read(data, path.stem or "scene", options)
     start = data[:8].hex(" ") or "nothing"
-    message = (
-        f"is neither an archive with scene.json and scene.npz, nor PhysTwin's final_data.pkl, nor C3D:"
-        f" {len(data)} bytes that begin with {start}"
-    )
+    forms = ", nor ".join(importer.title for importer in IMPORTERS)
+    message = f"is neither {forms}: {len(data)} bytes that begin with {start}"
     raise SceneInvalid([FieldError(loc=[path.name or "file"], msg=message)])

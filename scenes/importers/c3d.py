@@ -28,7 +28,7 @@ from physworld.scene import Scene
 from physworld_scenes.archives import ArchiveRefused, read_arrays
 from physworld_scenes.bundle import checked, scene_from_parts
 from physworld_scenes.importers.c3d_child import content_of
-from physworld_scenes.importers.options import ImportOptions, estimate_noise, split_of
+from physworld_scenes.importers.options import Importer, ImportOptions, estimate_noise, split_of
 from physworld_schemas.base import FieldError
 from physworld_storage.errors import SceneInvalid
 
@@ -263,3 +263,13 @@ def _controllers(labels: list[str], named: tuple[str, ...] | None) -> list[int]:
 
 def _invalid(messages: list[str]) -> SceneInvalid:
     return SceneInvalid([FieldError(loc=["c3d"], msg=message) for message in messages])
+
+
+IMPORTER = Importer(
+    "c3d",
+    "C3D motion capture",
+    (".c3d",),
+    "markers, in metres by POINT:UNITS; gaps are filled and invisible; controllers by their labels or options",
+    lambda data, filename: is_c3d(data),
+    read_bytes,
+)

@@ -1,13 +1,15 @@
-"""What a person knows of a foreign recording and its file does not say."""
+"""What an importer is, and what a person knows of a foreign recording that its file does not say."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from physworld.arrays import Array
+from physworld.scene import Scene
 from physworld_scenes.declaration import Kind
 
 TRAIN_FRACTION = 0.7
@@ -41,6 +43,27 @@ class ImportOptions:
     body: dict[str, Any] = field(default_factory=dict)
     controllers: tuple[str, ...] | None = None
     up: str = "z"
+
+
+@dataclass(frozen=True)
+class Importer:
+    """A form of recording.
+
+    Attributes:
+        name, title: in the catalogue; a few words for people.
+        suffixes: file names usually end with one of them.
+        help: what of the file is read.
+        recognises: whether the bytes of a file of that name are of this form; the first importer that says so reads it.
+        read: bytes, the scene's name where the file has none, and options, to the scene and its warnings. Raises
+            SceneInvalid, with every fault.
+    """
+
+    name: str
+    title: str
+    suffixes: tuple[str, ...]
+    help: str
+    recognises: Callable[[bytes, str], bool]
+    read: Callable[[bytes, str, ImportOptions | None], tuple[Scene, list[str]]]
 
 
 def split_of(frames: int) -> dict[str, list[int]]:

@@ -21,13 +21,14 @@ from physworld.arrays import Array
 from physworld.scene import Scene
 from physworld_scenes.bundle import checked, scene_from_parts
 from physworld_scenes.importers.array_pickle import PickleRefused, load_arrays
-from physworld_scenes.importers.options import ImportOptions, estimate_noise, split_of
+from physworld_scenes.importers.options import Importer, ImportOptions, estimate_noise, split_of
 from physworld_schemas.base import FieldError
 from physworld_storage.errors import SceneInvalid
 
 FPS = 30.0
 DEFAULT_KIND = "toy"
 STRUCTURE_CELL_M = 5e-3
+PICKLE_PROTOCOL = b"\x80"
 MAX_PICKLE_BYTES = 1 << 30
 
 Z_DOWN_TO_Z_UP = np.array([1.0, -1.0, -1.0])
@@ -155,3 +156,13 @@ def _turn(points: Array) -> Array:
 
 def _invalid(messages: list[str]) -> SceneInvalid:
     return SceneInvalid([FieldError(loc=["final_data.pkl"], msg=message) for message in messages])
+
+
+IMPORTER = Importer(
+    "phystwin",
+    "PhysTwin's final_data.pkl",
+    (".pkl", ".pickle"),
+    "tracked points with visibility, controllers, structure points; z-down becomes z-up",
+    lambda data, filename: data[:1] == PICKLE_PROTOCOL or filename.lower().endswith((".pkl", ".pickle")),
+    read_bytes,
+)

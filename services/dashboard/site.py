@@ -20,6 +20,7 @@ from physworld_schemas.base import Artifact
 from physworld_schemas.job import Job
 from physworld_services.dashboard import text
 from physworld_services.dashboard.byte_cache import ByteCache
+from physworld_schemas.library import catalogue
 from physworld_services.dashboard.tables import held_out_columns, held_out_of, held_out_rows, noise_floor_of
 from physworld_services.stores import Stores
 from physworld_storage.access.api_keys import ApiKey
@@ -103,6 +104,7 @@ def _environment() -> Environment:
         share=share,
         lasted=text.lasted,
         held_out_of=held_out_of,
+        metric_called=catalogue().metric,
         noise_floor_of=noise_floor_of,
         held_out_columns=held_out_columns,
         held_out_rows=held_out_rows,

@@ -6,15 +6,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from physworld_schemas.library import Metric, catalogue
 from physworld_services.dashboard.curves import LABELS, PREDICTORS
 
-METRICS = ("track_m", "chamfer_phystwin_m", "chamfer_l2_m")
 HeldOut = Mapping[str, Mapping[str, float | None]]
 
 
 @dataclass(frozen=True)
 class Cell:
-    """An error [m], and whether no other predictor has a smaller one."""
+    """An error, in its metric's unit, and whether no other predictor has a better one."""
 
     value: float | None
     best: bool
@@ -45,30 +45,31 @@ def noise_floor_of(metrics: Mapping[str, Any]) -> float | None:
     return float(found) if isinstance(found, int | float) else None
 
 
-def held_out_columns(table: Mapping[str, Any]) -> list[str]:
+def held_out_columns(table: Mapping[str, Any]) -> list[Metric]:
     """Metrics of the table that are shown, in their order."""
-    return [metric for metric in METRICS if isinstance(table.get(metric), Mapping)]
+    return [metric for metric in catalogue().listed_metrics() if isinstance(table.get(metric.name), Mapping)]
 
 
 def held_out_rows(table: HeldOut) -> list[Row]:
     """One row for each predictor that any metric has, baselines first."""
     columns = held_out_columns(table)
-    present = {name for metric in columns for name in table[metric]}
+    present = {name for metric in columns for name in table[metric.name]}
     names = [name for name in LABELS if name in present] + sorted(present - set(LABELS))
-    best = {metric: _smallest(table[metric]) for metric in columns}
+    best = {metric.name: _best(metric, table[metric.name]) for metric in columns}
     return [
         Row(
             LABELS.get(name, (name.replace("_", " "), ""))[0],
             name not in PREDICTORS,
             [
-                Cell(value, value is not None and value == best[metric])
+                Cell(value, value is not None and value == best[metric.name])
                 for metric in columns
-                for value in [table[metric].get(name)]
+                for value in [table[metric.name].get(name)]
             ],
         )
         for name in names
     ]
 
 
-def _smallest(values: Mapping[str, float | None]) -> float | None:
-    return min((value for value in values.values() if value is not None), default=None)
+def _best(metric: Metric, values: Mapping[str, float | None]) -> float | None:
+    better = min if metric.lower_is_better else max
+    return better((value for value in values.values() if value is not None), default=None)

@@ -91,6 +91,16 @@ def millimetres(metres: float | None) -> str:
     return _fixed(float(metres) * 1000, 3)
 
 
+def shown_unit(unit: str) -> str:
+    """The unit in which :func:`measured` shows a value, with a comma before it; nothing where there is none."""
+    return "" if unit == "1" else f", {'mm' if unit == 'm' else unit}"
+
+
+def measured(value: float | None, unit: str) -> str:
+    """A value of a metric without its unit: lengths as millimetres, others as they are."""
+    return millimetres(value) if unit == "m" else figure(value, 3)
+
+
 def _fixed(value: float, digits: int) -> str:
     """Decimal notation with ``digits`` significant digits, zeros at the end kept."""
     places = digits - 1 - math.floor(math.log10(abs(value))) if value else digits - 1
@@ -137,7 +147,9 @@ FILTERS = {
     "moment": moment,
     "duration": duration,
     "figure": figure,
+    "measured": measured,
     "millimetres": millimetres,
+    "shown_unit": shown_unit,
     "size": size,
     "words": words,
     "identifier": identifier,

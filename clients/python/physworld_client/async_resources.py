@@ -136,7 +136,7 @@ class AsyncDatasets(AsyncResource):
 
         Args:
             folder: a new or empty folder.
-            format: ``npz``, ``ply`` or ``lerobot`` (v3, needs the extra ``export``).
+            format: one of ``physworld_client.export.FORMATS``; ``lerobot`` needs the extra ``export``.
             episodes: only the first so many.
             points: at most so many particles a frame; None: all, of ``lerobot`` 256.
             on_progress: called with (episodes written, episodes in all).

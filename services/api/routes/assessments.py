@@ -10,8 +10,8 @@ from physworld_schemas.job import Job
 from physworld_services.api.dependencies import DatabaseDep, ModelName, ObjectId, PageDep
 from physworld_services.api.errors import documented
 from physworld_services.api.idempotency import IdempotencyDep, accepted
+from physworld_services.api.routes.library import require_known
 from physworld_services.api.routes.models import Version
-from physworld_services.api.routes.traces import require_known
 from physworld_storage import registry, traces
 from physworld_storage.jobs import jobs
 
@@ -31,7 +31,7 @@ def create_assessment(
 
     Where the error is above noise and above what the version's card lets expect, a trace of the recording is opened.
     """
-    require_known(body.trace, ("body", "trace", "candidates"))
+    require_known(trace=body.trace)
     return idempotency.run(
         body,
         lambda session: accepted(

@@ -12,6 +12,7 @@ from physworld_schemas.job import Job
 from physworld_services.api.dependencies import ID_PATTERN, DatabaseDep, ObjectId, PageDep
 from physworld_services.api.errors import documented
 from physworld_services.api.idempotency import IdempotencyDep, accepted
+from physworld_services.api.routes.library import require_known
 from physworld_storage import resources
 from physworld_storage.jobs import jobs
 
@@ -21,6 +22,7 @@ router = APIRouter(prefix="/fits", tags=["fits"])
 @router.post("", status_code=202, response_model=Job, responses=documented(401, 403, 404, 409, 413, 422))
 def create_fit(body: FitCreate, idempotency: IdempotencyDep) -> Response:
     """Start a calibration; the fit's id is in the job's `outputs`."""
+    require_known(config=body.config)
     return idempotency.run(
         body, lambda session: accepted(jobs.create_fit(session, body.scene_id, body.config))
     )

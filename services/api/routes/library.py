@@ -2,17 +2,30 @@
 
 from __future__ import annotations
 
-from typing import Annotated, get_args, get_origin
-
 from fastapi import APIRouter
-from pydantic import BaseModel
 
 from physworld_schemas.base import FieldError, Page
-from physworld_schemas.library import Effect, ExportFormat, Importer, Material, Metric, NamesOf, catalogue
+from physworld_schemas.fit import FitConfig
+from physworld_schemas.library import (
+    Effect,
+    ExportFormat,
+    Importer,
+    Material,
+    Metric,
+    NameKind,
+    catalogue,
+    known_names,
+)
+from physworld_schemas.trace import TraceConfig
 from physworld_services.api.errors import ApiProblem, documented
 
 router = APIRouter(tags=["library"], responses=documented(401, 403))
-ADDRESSES = {"elastic": "materials", "flow": "materials", "effects": "effects"}
+Named = tuple[tuple[str | int, ...], NameKind, str | None]
+LISTS: dict[NameKind, str] = {
+    "law": "GET /v1/materials",
+    "flow law": "GET /v1/materials",
+    "effect": "GET /v1/effects",
+}
 
 
 @router.get("/materials")
@@ -43,3 +56,28 @@ def list_importers() -> Page[Importer]:
 def list_exports() -> Page[ExportFormat]:
     """Forms in which the SDK and the command line write the episodes of a dataset."""
     return Page(data=catalogue().exports)
+
+
+def require_known(**configs: FitConfig | TraceConfig) -> None:
+    """Refuse names that the catalogue does not have. Raises ApiProblem, 422, that names each.
+
+    Args:
+        configs: parts of a request's body by their key in it.
+    """
+    unknown = [
+        FieldError(loc=["body", key, *place], msg=f"no {kind} {name!r}; {LISTS[kind]} lists them")
+        for key, config in configs.items()
+        for place, kind, name in _named(config)
+        if name is not None and name not in known_names(kind)
+    ]
+    if unknown:
+        raise ApiProblem(
+            422, "invalid_request", "; ".join(fault.msg for fault in unknown[:3]), errors=unknown
+        )
+
+
+def _named(config: FitConfig | TraceConfig) -> list[Named]:
+    """Names in a configuration with their places."""
+    if isinstance(config, FitConfig):
+        return [(("law",), "law", config.law), (("plasticity",), "flow law", config.plasticity)]
+    return [(("candidates", index), "effect", name) for index, name in enumerate(config.candidates)]

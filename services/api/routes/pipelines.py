@@ -8,7 +8,7 @@ from physworld_schemas.job import Job
 from physworld_schemas.pipeline import PipelineCreate
 from physworld_services.api.errors import documented
 from physworld_services.api.idempotency import IdempotencyDep, accepted
-from physworld_services.api.routes.traces import require_known
+from physworld_services.api.routes.library import require_known
 from physworld_storage.jobs import jobs
 
 router = APIRouter(prefix="/pipelines", tags=["pipelines"])
@@ -20,5 +20,5 @@ def create_pipeline(body: PipelineCreate, idempotency: IdempotencyDep) -> Respon
 
     With `close_the_loop` what the twin leaves is traced first, and the twin with the named effect demonstrates.
     """
-    require_known(body.trace, ("body", "trace", "candidates"))
+    require_known(fit=body.fit, trace=body.trace)
     return idempotency.run(body, lambda session: accepted(jobs.create_pipeline(session, body)))

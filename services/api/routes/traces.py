@@ -7,14 +7,14 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Response
 from fastapi.responses import StreamingResponse
 
-from physworld_schemas.base import FieldError, Page
+from physworld_schemas.base import Page
 from physworld_schemas.job import Job
-from physworld_schemas.trace import Trace, TraceConfig, TraceCreate, TraceState, Verdict
+from physworld_schemas.trace import Trace, TraceCreate, TraceState, Verdict
 from physworld_services.api.dependencies import ID_PATTERN, DatabaseDep, ObjectId, PageDep, StoresDep
-from physworld_services.api.errors import ApiProblem, documented
+from physworld_services.api.errors import documented
 from physworld_services.api.idempotency import IdempotencyDep, accepted
 from physworld_services.api.ranges import etag
-from physworld_services.api.routes.library import known_effects
+from physworld_services.api.routes.library import require_known
 from physworld_storage import traces
 from physworld_storage.errors import Conflict
 from physworld_storage.jobs import jobs
@@ -27,22 +27,8 @@ NPZ = "application/vnd.numpy.npz"
 @router.post("", status_code=202, response_model=Job, responses=documented(401, 403, 404, 409, 413, 422))
 def create_trace(body: TraceCreate, idempotency: IdempotencyDep) -> Response:
     """Trace a scene's residual to a named effect; the trace's id is in the job's `outputs`."""
-    require_known(body.config, ("body", "config", "candidates"))
+    require_known(config=body.config)
     return idempotency.run(body, lambda session: accepted(jobs.create_trace(session, body)))
-
-
-def require_known(config: TraceConfig, place: tuple[str, ...]) -> None:
-    """Refuse candidates that the registry does not have. Raises ApiProblem, 422, that names each."""
-    known = {effect.name for effect in known_effects()}
-    unknown = [
-        FieldError(loc=[*place, index], msg=f"no effect {name!r}; GET /v1/effects lists them")
-        for index, name in enumerate(config.candidates)
-        if name not in known
-    ]
-    if unknown:
-        raise ApiProblem(
-            422, "invalid_request", "; ".join(fault.msg for fault in unknown[:3]), errors=unknown
-        )
 
 
 @router.get("", responses=documented(401, 403, 422))

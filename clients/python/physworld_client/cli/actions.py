@@ -15,6 +15,10 @@ from physworld_client.cli.output import print_json, print_state, progress_text, 
 from physworld_client.client import Client
 from physworld_client.export import FORMATS
 from physworld_schemas.job import Job
+from physworld_schemas.library import catalogue
+
+FORMS = "; ".join(f"{name}: {form.title}" for name, form in FORMATS.items()) + "."
+RECORDING = f"A folder with scene.json, or a file: {', '.join(one.title for one in catalogue().importers)}."
 
 
 def _known(format: str) -> str:
@@ -26,7 +30,7 @@ def _known(format: str) -> str:
 @connected(GROUPS["scenes"], "add")
 def scenes_add(
     client: Client,
-    path: Annotated[Path, typer.Argument(help="Folder, archive, final_data.pkl or C3D file.")],
+    path: Annotated[Path, typer.Argument(help=RECORDING)],
     json: Json = False,
 ) -> None:
     """Upload a scene."""
@@ -61,7 +65,7 @@ def datasets_export(
     format: Annotated[
         str,
         typer.Option(
-            "--format", "-f", metavar="|".join(FORMATS), callback=_known, help="In which form to write them."
+            "--format", "-f", metavar="|".join(FORMATS), callback=_known, help=FORMS
         ),
     ] = "npz",
     out: Annotated[

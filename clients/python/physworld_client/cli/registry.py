@@ -12,10 +12,12 @@ from physworld_client.cli.lists import GROUPS, show_list
 from physworld_client.cli.options import Data, Json, Out, Token, Url, VersionName, connected
 from physworld_client.cli.output import print_json, print_table, show, stdout
 from physworld_client.client import Client
+from physworld_client.cli.report import shown_unit
 from physworld_client.known_keys import trusted_keys
 from physworld_client.manifest import verify_folder
 from physworld_client.resources import LATEST
 from physworld_client.signatures import fingerprint_of
+from physworld_schemas.library import Metric, catalogue
 from physworld_schemas.model import MeasuredError, ModelComparison
 from physworld_schemas.signing import SigningKey
 
@@ -157,21 +159,24 @@ def _print_comparison(found: ModelComparison) -> None:
     if not found.same_recording:
         stdout.print("The versions were scored on different frames: no gains.")
     rows = [
-        (item.metric, item.predictor, _millimetres(item.a), _millimetres(item.b), _millimetres(item.gain))
+        (f"{metric.title}{shown_unit(metric)}", item.predictor, *(_error(one, metric) for one in three))
         for item in found.errors
+        for metric in [catalogue().metric(item.metric)]
+        for three in [(item.a, item.b, item.gain)]
     ]
-    print_table(("error [mm]", "predictor", first, second, "gain of b"), rows)
+    print_table(("metric", "predictor", first, second, "gain of b"), rows)
     for heading, items in (("figure", found.figures), ("made with", found.differences)):
         stdout.print()
         print_table((heading, first, second), [(item.field, _text(item.a), _text(item.b)) for item in items])
 
 
-def _millimetres(error: MeasuredError | None) -> str:
-    """``1.76 (1.42 to 2.1)``."""
+def _error(error: MeasuredError | None, metric: Metric) -> str:
+    """``1.76 (1.42 to 2.1)``, lengths in millimetres."""
     if error is None:
         return "–"
-    interval = "" if error.ci95 is None else f" ({1e3 * error.ci95[0]:.3g} to {1e3 * error.ci95[1]:.3g})"
-    return f"{1e3 * error.value:.3g}{interval}"
+    scale = 1e3 if metric.unit == "m" else 1.0
+    interval = "" if error.ci95 is None else f" ({scale * error.ci95[0]:.3g} to {scale * error.ci95[1]:.3g})"
+    return f"{scale * error.value:.3g}{interval}"
 
 
 def _text(value: object) -> str:

@@ -14,14 +14,11 @@ from physworld_client.cli.output import stdout
 from physworld_client.errors import PhysWorldError
 from physworld_schemas.fit import Fit
 from physworld_schemas.job import Job
+from physworld_schemas.library import Metric, catalogue
 from physworld_schemas.model import ModelVersion
 from physworld_schemas.pipeline import ModelReference, RunReport
 
-METRICS = {
-    "track_m": "track",
-    "chamfer_phystwin_m": "chamfer (phystwin)",
-    "chamfer_l2_m": "chamfer (l2)",
-}
+MAIN_METRIC = "track_m"
 ROWS = {
     "static": "static",
     "rigid_follow": "rigid-follow",
@@ -51,7 +48,8 @@ def build_report(
     """
     metrics = version.metrics
     held_out = _table(metrics, "held_out", version)
-    for metric in METRICS:
+    metrics_held = [one.name for one in catalogue().listed_metrics() if one.name in held_out]
+    for metric in dict.fromkeys([MAIN_METRIC, *metrics_held]):
         missing = [row for row in ROWS if row not in OPTIONAL_ROWS and row not in held_out.get(metric, {})]
         if missing:
             raise PhysWorldError(f"{_label(version)} has no held_out.{metric} of {', '.join(missing)}")
@@ -63,7 +61,7 @@ def build_report(
     noise_floor = metrics.get("noise_floor_m", held_out.get("noise_floor_m"))
     return RunReport(
         scene=scene_name,
-        held_out={metric: {row: held_out[metric].get(row) for row in held_out[metric]} for metric in METRICS},
+        held_out={metric: dict(held_out[metric]) for metric in metrics_held},
         noise_floor_m=noise_floor,
         steps_per_second={name: float(speeds[name]) for name in SPEEDS if name in speeds},
         model=ModelReference(name=version.name, version=version.version, sha256=version.sha256),
@@ -77,14 +75,15 @@ def build_report(
 
 def print_report(report: RunReport) -> None:
     """The results table, the speeds and the model."""
-    table = Table(title=Text(f"Held-out error of {report.scene}, in mm"), title_justify="left")
+    table = Table(title=Text(f"Held-out error of {report.scene}"), title_justify="left")
     table.add_column("prediction")
-    for heading in METRICS.values():
-        table.add_column(heading, justify="right")
-    first = report.held_out["track_m"]
+    columns = [catalogue().metric(name) for name in report.held_out]
+    for metric in columns:
+        table.add_column(f"{metric.title}{shown_unit(metric)}", justify="right")
+    first = report.held_out[MAIN_METRIC]
     for row, heading in ROWS.items():
         if row in first:
-            cells = [_millimetres(report.held_out[metric].get(row)) for metric in METRICS]
+            cells = [_measured(metric, report.held_out[metric.name].get(row)) for metric in columns]
             table.add_row(heading, *cells, end_section=row == _last_baseline(first))
     stdout.print()
     stdout.print(table)
@@ -160,6 +159,17 @@ def _label(version: ModelVersion) -> str:
 
 def _last_baseline(rows: Mapping[str, object]) -> str:
     return "persistence" if "persistence" in rows else "constant_velocity"
+
+
+def shown_unit(metric: Metric) -> str:
+    """The unit that a column's values have, with a comma before it: lengths are shown in millimetres."""
+    return "" if metric.unit == "1" else f", {'mm' if metric.unit == 'm' else metric.unit}"
+
+
+def _measured(metric: Metric, value: float | None) -> str:
+    if metric.unit == "m" or value is None:
+        return _millimetres(value)
+    return f"{value:.3g}"
 
 
 def _millimetres(metres: float | None) -> str:

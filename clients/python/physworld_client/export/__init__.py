@@ -2,14 +2,15 @@
 
 A writer takes the episodes one by one, in the order of their index, so that only one of them is in memory:
 ``for index, arrays in …: writer.add(index, arrays)`` and at the end ``writer.finish()``.
+A new format is a file beside this one and an entry of ``FORMATS``.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 from physworld_client.errors import ExportRefused
 from physworld_client.export.lerobot import LeRobotWriter
@@ -18,22 +19,25 @@ from physworld_client.export.ply import PlyWriter
 from physworld_client.types import Array
 from physworld_schemas.dataset import Dataset
 
-FORMATS: dict[str, Callable[[Path, int | None], Writer]] = {
-    "npz": lambda folder, points: NpzWriter(folder),
-    "ply": PlyWriter,
-    "lerobot": LeRobotWriter,
-}
 DATASET_FILE = "dataset.json"
 
 
 class Writer(Protocol):
-    """What every format has."""
+    """What every format has: a title and help for the catalogue, and how it takes a folder and a number of points."""
+
+    title: ClassVar[str]
+    help: ClassVar[str]
+
+    def __init__(self, folder: Path, points: int | None = None) -> None: ...
 
     def add(self, index: int, arrays: Mapping[str, Array]) -> None:
         """Write one episode; ``arrays`` are those of ``datasets.episode``."""
 
     def finish(self) -> None:
         """Write what belongs to all episodes. Raises ExportRefused where none was added."""
+
+
+FORMATS: dict[str, type[Writer]] = {"npz": NpzWriter, "ply": PlyWriter, "lerobot": LeRobotWriter}
 
 
 def open_export(format: str, folder: str | Path, dataset: Dataset, points: int | None = None) -> Writer:

@@ -24,7 +24,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -59,6 +59,9 @@ class LeRobotWriter:
     Raises:
         ExportRefused: pyarrow is missing (the extra ``export`` brings it), or an episode is of another size or clock.
     """
+
+    title: ClassVar[str] = "LeRobot v3.0"
+    help: ClassVar[str] = "data/, meta/info.json, stats.json, tasks.parquet, episodes/"
 
     def __init__(self, folder: Path, points: int | None = None) -> None:
         _parquet()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
@@ -14,7 +15,10 @@ from physworld_client.types import Array
 class NpzWriter:
     """``episode-00000.npz`` and so on: ``times``, ``particles``, ``controllers``, ``properties``, ``attributes``."""
 
-    def __init__(self, folder: Path) -> None:
+    title: ClassVar[str] = "one npz an episode"
+    help: ClassVar[str] = "episode-00000.npz and so on: the arrays as the service gives them"
+
+    def __init__(self, folder: Path, points: int | None = None) -> None:
         self._folder = folder
         self._count = 0
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
@@ -25,6 +26,12 @@ PLY_TYPES = {"<f4": "float", "|u1": "uchar"}
 
 class PlyWriter:
     """A folder an episode, a file a frame."""
+
+    title: ClassVar[str] = "one PLY a frame"
+    help: ClassVar[str] = (
+        "episode-00000/frame-00000.ply: binary; x, y, z, kind (0 particle, 1 control point), log_modulus, log_density, "
+        "and log_friction where the episode has it; times.txt; attributes.json"
+    )
 
     def __init__(self, folder: Path, points: int | None = None) -> None:
         self._folder, self._points = folder, points
