@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from importlib import import_module
+from pkgutil import iter_modules
 
 import anyio
 from fastapi import APIRouter, FastAPI
 from fastapi_offline import FastAPIOffline
 
-from physworld_services.api import errors
+from physworld_services.api import errors, routes
 from physworld_services.api.access import Access
 from physworld_services.api.attempts import Attempts
 from physworld_services.api.closing import Closing
@@ -20,25 +22,7 @@ from physworld_services.api.metrics import Metrics
 from physworld_services.api.openapi import describe
 from physworld_services.api.parsing import Parsers
 from physworld_services.api.probes import Probe
-from physworld_services.api.routes import (
-    artifacts,
-    assessments,
-    audit,
-    datasets,
-    fits,
-    health,
-    jobs,
-    keys,
-    library,
-    live,
-    models,
-    pipelines,
-    plans,
-    rollouts,
-    scenes,
-    signing_keys,
-    traces,
-)
+from physworld_services.api.routes import health, live
 from physworld_services.api.security import Authentication, Gate, bearer
 from physworld_services.stores import Stores
 from physworld_storage.database import Database
@@ -83,25 +67,10 @@ def create_api(settings: Settings, database: Database, stores: Stores) -> FastAP
     app.state.upload_slots = anyio.CapacityLimiter(PARALLEL_UPLOADS)
     app.state.parsers = parsers
     versioned = APIRouter(prefix=PREFIX, dependencies=[bearer])
-    for module in (
-        scenes,
-        fits,
-        traces,
-        datasets,
-        models,
-        assessments,
-        rollouts,
-        plans,
-        live,
-        pipelines,
-        jobs,
-        artifacts,
-        library,
-        signing_keys,
-        keys,
-        audit,
-    ):
-        versioned.include_router(module.router)
+    for name in sorted(part.name for part in iter_modules(routes.__path__)):
+        module = import_module(f"{routes.__name__}.{name}")
+        if module is not health:
+            versioned.include_router(module.router)
     app.include_router(versioned)
     app.include_router(live.sockets, prefix=PREFIX)
     app.include_router(health.router)

@@ -18,9 +18,9 @@ from physworld.arrays import Array
 from physworld_scenes.bundle import bundle_from_bytes
 from physworld_schemas.base import Artifact
 from physworld_schemas.job import Job
+from physworld_schemas.library import catalogue
 from physworld_services.dashboard import text
 from physworld_services.dashboard.byte_cache import ByteCache
-from physworld_schemas.library import catalogue
 from physworld_services.dashboard.tables import held_out_columns, held_out_of, held_out_rows, noise_floor_of
 from physworld_services.stores import Stores
 from physworld_storage.access.api_keys import ApiKey

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from physworld.twin.twin import Twin
 
 OWN = "physworld"
-SHAPES: dict[int, BodyShape] = {1: "rod", 2: "sheet", 3: "solid"}
+SHAPES: dict[int, BodyShape] = {3: "solid", 2: "sheet", 1: "rod"}
 _DIGITS = 3  # of bounds that follow a body of everyday size
 _PARTICLES = 300  # bounds do not depend on the resolution, except for a grip's and a clamp's, by the cell
 
@@ -69,7 +69,8 @@ def registered(package: str = OWN) -> Catalogue:
     def own(thing: Any) -> bool:
         return bool(thing.__module__.split(".")[0] == package)
 
-    twins = {shape: build_twin(scene, _PARTICLES) for shape, scene in everyday_scenes().items()}
+    everyday = everyday_scenes()
+    twins = {shape: build_twin(everyday[shape], _PARTICLES) for shape in SHAPES.values()}
     laws = [_material(law, "elastic", SHAPES[law.dimension]) for law in ELASTIC_LAWS.values() if own(law)]
     flows = [_material(law, "flow", "solid") for law in PLASTICITIES.values() if own(law)]
     return Catalogue(

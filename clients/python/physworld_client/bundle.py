@@ -1,8 +1,8 @@
 """Packing a local scene for the upload.
 
 A folder with ``scene.json`` and ``scene.npz`` becomes a zip of these two files and the meshes beside them, with fixed
-time stamps, so that the same scene always gives the same bytes. A file (archive, PhysTwin ``final_data.pkl``, C3D)
-is sent as it is; the service tells by its content what it is and checks it. Nothing is unpickled here.
+time stamps, so that the same scene always gives the same bytes. A file of any form that
+the importers know is sent as it is; the service tells by its content what it is and checks it. Nothing is unpickled here.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def _pack_folder(folder: Path) -> Upload:
         shown = ", ".join(present[:8]) + (f" and {len(present) - 8} more" if len(present) > 8 else "")
         raise BundleUnreadable(
             f"{folder} lacks {' and '.join(missing)} (it holds {shown or 'nothing'}); "
-            "a .pkl or .c3d recording is given by its file"
+            "a recording of another program is given by its file"
         )
     stream = tempfile.SpooledTemporaryFile(max_size=SPOOL_LIMIT_BYTES)  # noqa: SIM115 (the upload closes it)
     try:

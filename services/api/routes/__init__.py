@@ -1,1 +1,1 @@
-"""One file of routes per resource."""
+"""One file of routes per resource: the application includes the ``router`` of each of them under ``/v1``."""

@@ -12,8 +12,11 @@ import httpx
 import numpy as np
 import pytest
 from api_service import EPISODE, Service, assert_problem, scene_id, sha256
+from physworld_client.export import FORMATS
 from serving import log_in
 
+from physworld.materials.library import ELASTIC_LAWS
+from physworld.materials.plastic import PLASTICITIES
 from physworld_storage import resources
 
 CONTENT = bytes(range(256)) * 40
@@ -94,10 +97,35 @@ def test_aliases_need_a_ready_version_and_a_sound_name(client: httpx.Client, cha
 
 
 def test_libraries_name_the_laws_that_a_fit_chooses_from(client: httpx.Client) -> None:
-    names = [material["name"] for material in client.get("/v1/materials").json()["data"]]
-    assert names == ["neo_hookean", "elastic_sheet", "elastic_rod"]
+    laws = {(law["kind"], law["name"]): law for law in client.get("/v1/materials").json()["data"]}
+    assert [name for kind, name in laws if kind == "elastic"] == list(ELASTIC_LAWS)
+    assert [name for kind, name in laws if kind == "flow"] == list(PLASTICITIES)
+    assert laws["elastic", "rod"]["parameters"]["stretching_n"]["unit"] == "N"
     effects = {effect["name"]: effect for effect in client.get("/v1/effects").json()["data"]}
-    assert effects["air_drag_linear"]["parameters"] == {"rate_per_s": "1/s"}
+    rate = effects["air_drag_linear"]["parameters"]["rate_per_s"]
+    assert (rate["unit"], rate["default"], rate["gate"]) == ("1/s", 0.0, True)
+    assert rate["bounds"] == {shape: [0.0, 30.0] for shape in ("solid", "sheet", "rod")}
+    metrics = {metric["name"]: metric for metric in client.get("/v1/metrics").json()["data"]}
+    assert metrics["track_m"]["listed"] and not metrics["track_phystwin_m"]["listed"]
+    assert [one["name"] for one in client.get("/v1/importers").json()["data"]] == [
+        "bundle",
+        "c3d",
+        "phystwin",
+    ]
+    assert [one["name"] for one in client.get("/v1/exports").json()["data"]] == list(FORMATS)
+
+
+def test_a_law_that_the_catalogue_does_not_have_is_refused(client: httpx.Client) -> None:
+    scene = scene_id(client)
+    body = {"scene_id": scene, "config": {"law": "elastic_sheet", "plasticity": "butter"}}
+    problem = assert_problem(client.post("/v1/fits", json=body), 422, "invalid_request")
+    assert [fault["loc"] for fault in problem["errors"]] == [
+        ["body", "config", "law"],
+        ["body", "config", "plasticity"],
+    ]
+    assert "no law 'elastic_sheet'; GET /v1/materials lists them" in problem["detail"]
+    pipeline = {"scene_id": scene, "fit": {"law": "elastic_rod"}}
+    assert_problem(client.post("/v1/pipelines", json=pipeline), 422, "invalid_request")
 
 
 def test_file_is_streamed_with_its_digest(client: httpx.Client, digest: str) -> None:

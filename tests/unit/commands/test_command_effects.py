@@ -10,7 +10,6 @@ import pytest
 
 from physworld.effects.registry import EFFECTS
 from physworld_workers.commands.effects import main
-from physworld_workers.commands.effects_wire import FILE, wire_effects
 
 ROOT = Path(__file__).resolve().parents[3]
 PAGE = (ROOT / "docs" / "effects.md").read_text()
@@ -59,9 +58,3 @@ def test_the_page_has_every_effect_with_its_strengths() -> None:
     for name, kind in EFFECTS.items():
         missing = {field for field in kind().values if f"`{field}`" not in sections[name]}
         assert missing == set(), name
-
-
-def test_the_api_serves_this_registry() -> None:
-    assert json.loads(FILE.read_text(encoding="utf-8")) == wire_effects(), (
-        "run physworld_workers.commands.effects_wire"
-    )

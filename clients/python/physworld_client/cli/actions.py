@@ -64,9 +64,7 @@ def datasets_export(
     dataset_id: str,
     format: Annotated[
         str,
-        typer.Option(
-            "--format", "-f", metavar="|".join(FORMATS), callback=_known, help=FORMS
-        ),
+        typer.Option("--format", "-f", metavar="|".join(FORMATS), callback=_known, help=FORMS),
     ] = "npz",
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="New or empty folder [./ID-FORMAT].")

@@ -11,8 +11,8 @@ from physworld_client.cli import service
 from physworld_client.cli.lists import GROUPS, show_list
 from physworld_client.cli.options import Data, Json, Out, Token, Url, VersionName, connected
 from physworld_client.cli.output import print_json, print_table, show, stdout
-from physworld_client.client import Client
 from physworld_client.cli.report import shown_unit
+from physworld_client.client import Client
 from physworld_client.known_keys import trusted_keys
 from physworld_client.manifest import verify_folder
 from physworld_client.resources import LATEST
