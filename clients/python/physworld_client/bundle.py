@@ -1,8 +1,8 @@
 """Packing a local scene for the upload.
 
 A folder with ``scene.json`` and ``scene.npz`` becomes a zip of these two files and the meshes beside them, with fixed
-time stamps, so that the same scene always gives the same bytes. A file of any form that
-the importers know is sent as it is; the service tells by its content what it is and checks it. Nothing is unpickled here.
+time stamps, so that the same scene always gives the same bytes. A file of any form that the importers know is sent as
+it is; the service tells by its content what it is and checks it. Nothing is unpickled here.
 """
 
 from __future__ import annotations

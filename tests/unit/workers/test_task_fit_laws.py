@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import get_args
-
 import pytest
 from pydantic import ValidationError
 from test_tasks import _drain, _make_dataset
 
 from physworld.calibrate import Journal
-from physworld.materials.library import ROD_LAWS, SHEET_LAWS, SOLID_LAWS
-from physworld.materials.plastic import PLASTICITIES
 from physworld_schemas.fit import Fit, FitConfig
 from physworld_schemas.pipeline import PipelineCreate
 from physworld_schemas.trace import TraceCreate
