@@ -6,16 +6,3 @@ SIMULATION = "sim"
 TRAINING = "train"
 INFERENCE = "infer"
 TASK_NAME = "physworld.run_shard"
-
-QUEUE_OF_SHARD = {
-    "fit": SIMULATION,
-    "trace": SIMULATION,
-    "simulation": SIMULATION,
-    "dataset_plan": SIMULATION,
-    "episode": SIMULATION,
-    "dataset_seal": SIMULATION,
-    "training": TRAINING,
-    "assessment": TRAINING,
-    "rollout": INFERENCE,
-    "plan": INFERENCE,
-}

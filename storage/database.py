@@ -2,7 +2,7 @@
 
 SQLite (one host, WAL) begins every writing transaction with ``BEGIN IMMEDIATE``: writers queue up at the
 start instead of failing in the middle, so a read followed by a write in one transaction is a law, not a race.
-Postgres locks rows instead (``physworld_storage.jobs.locks.lock_job``). A killed process loses no committed
+Postgres locks rows instead (``physworld_storage.jobs.shards.lock_job``). A killed process loses no committed
 transaction; with SQLite's ``synchronous=NORMAL`` a power cut may lose the last moments but never the consistency.
 """
 

@@ -13,6 +13,7 @@ from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from physworld_schemas.base import Page
 from physworld_schemas.job import TERMINAL_STATES, Event, Job
+from physworld_storage.jobs.kinds import KINDS
 from physworld_storage.pages import page_of
 from physworld_storage.tables import (
     DatasetRow,
@@ -60,7 +61,7 @@ def list_top_jobs(
 
 def children_of(session: Session, jobs: Iterable[Job]) -> dict[str, list[Job]]:
     """The children of these jobs by parent, each list in the order of the stages."""
-    parents = [job.id for job in jobs if job.kind == "pipeline"]
+    parents = [job.id for job in jobs if KINDS[job.kind].has_children]
     order = (JobRow.created_at, JobRow.id)
     children: dict[str, list[Job]] = {parent: [] for parent in parents}
     if not parents:
@@ -81,8 +82,8 @@ def subjects_of(session: Session, jobs: Sequence[Job]) -> dict[str, str]:
             names.update((row[0], row[1]) for row in session.execute(statement.where(table.id.in_(wanted))))
     subjects = {job_id: names[item.id] for job_id, item in inputs.items() if item.id in names}
     subjects.update({job_id: item.id for job_id, item in inputs.items() if item.kind == "model"})
-    subjects.update({job.id: str(job.config["name"]) for job in jobs if job.kind == "training"})
-    return subjects
+    own = ((job.id, KINDS[job.kind].subject(job)) for job in jobs)
+    return subjects | {job_id: subject for job_id, subject in own if subject is not None}
 
 
 def scene_names(session: Session, scene_ids: Iterable[str]) -> dict[str, str]:

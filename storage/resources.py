@@ -1,6 +1,6 @@
 """Scenes, fits, datasets and episodes: rows in, wire models out.
 
-A fit, a dataset and a model version are born pending with their job (``physworld_storage.jobs.opening``) and filled in
+A fit, a dataset and a model version are born pending with their job (``physworld_storage.jobs.kinds``) and filled in
 by the commit of its last shard (``physworld_storage.jobs.flow``); what is ready or sealed never changes again.
 """
 

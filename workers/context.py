@@ -1,5 +1,8 @@
 """What a handler holds while it works: the lease, kept alive by a thread, and the way to report and to stop.
 
+A handler is ``run(context: TaskContext, stores: Stores) -> HandlerResult``, named by its kind of shard
+(``physworld_storage.jobs.kind.ShardKind``).
+
 The thread renews the lease about every two seconds (sooner when there is new progress) and reads from the
 same transaction whether the job was cancelled or the lease lost. A handler calls ``progress`` and ``check``
 as often as it likes: both only touch memory. A database that does not answer costs the lease once
@@ -12,7 +15,10 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from types import TracebackType
+from typing import TYPE_CHECKING, Any
 
 from physworld_schemas.job import Progress
 from physworld_storage.database import Database
@@ -21,12 +27,26 @@ from physworld_storage.jobs import leases
 from physworld_storage.settings import Settings
 from physworld_workers.errors import Cancelled, LeaseLost
 
+if TYPE_CHECKING:
+    from physworld_workers.stores import Stores
+
 logger = logging.getLogger(__name__)
 
 RENEW_INTERVAL_S = 2.0
 PROGRESS_INTERVAL_S = 0.5
 JOIN_S = 5.0
 """That the end of a task waits for a renewal under way, which may wait for a silent database."""
+
+
+@dataclass(frozen=True)
+class HandlerResult:
+    """What a shard came to: a JSON-able result, and the digest of what it wrote (None: nothing)."""
+
+    result: dict[str, Any] = field(default_factory=dict)
+    digest: str | None = None
+
+
+Handler = Callable[["TaskContext", "Stores"], HandlerResult]
 
 
 class TaskContext:

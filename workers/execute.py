@@ -9,6 +9,7 @@ attempt whose result could not be committed is gone on with.
 from __future__ import annotations
 
 import functools
+import importlib
 import logging
 import re
 import time
@@ -26,19 +27,18 @@ from physworld_schemas.job import TERMINAL_STATES
 from physworld_storage.database import Database, open_database
 from physworld_storage.errors import DatabaseUnavailable, StorageError, StoreReadFailed, StoreWriteFailed
 from physworld_storage.jobs import leases
+from physworld_storage.jobs.kinds import SHARDS
 from physworld_storage.settings import Settings, get_settings
 from physworld_storage.tables import JobRow
-from physworld_workers.context import TaskContext
+from physworld_workers.context import Handler, HandlerResult, TaskContext
 from physworld_workers.errors import Cancelled, LeaseLost, NotEnoughDisk, UnknownShardKind, WorkerError
 from physworld_workers.owner import process_owner
-from physworld_workers.registry import Handler, HandlerResult, handler_of
 from physworld_workers.stores import Stores
 
 logger = logging.getLogger(__name__)
 
 Outcome = Literal["done", "failed", "retried", "cancelled", "not committed", "not claimed"]
 COMMIT_PAUSE_S = 1.0
-KEEPS_SCRATCH = frozenset({"fit", "trace", "simulation", "training"})
 WORTH_A_RETRY = (
     OSError,
     MemoryError,
@@ -56,6 +56,18 @@ SAID_BY_THE_WORK = (
     ValueError,
     SoftTimeLimitExceeded,
 )
+
+
+def handler_of(kind: str) -> Handler:
+    """The handler of a kind of shard, its module imported now. Raises UnknownShardKind.
+
+    Handlers are import strings, so that starting a worker imports neither ``torch`` nor ``warp``.
+    """
+    if kind not in SHARDS:
+        raise UnknownShardKind(f"no handler for shard kind {kind!r}; this worker knows {sorted(SHARDS)}")
+    module, _, function = SHARDS[kind].handler.partition(":")
+    handler: Handler = getattr(importlib.import_module(module), function)
+    return handler
 
 
 @dataclass(frozen=True)
@@ -87,7 +99,7 @@ def run_shard(runtime: Runtime, shard_id: str) -> Outcome:
     logger.info("shard %s: %s %d, attempt %d", shard_id, lease.kind, lease.index, lease.attempt)
     started = time.monotonic()
     outcome = _run_claimed(runtime, lease)
-    if lease.kind in KEEPS_SCRATCH:
+    if SHARDS[lease.kind].keeps_scratch:
         _tidy(runtime, lease.job_id)
     logger.info("shard %s: %s after %.2f s", shard_id, outcome, time.monotonic() - started)
     return outcome

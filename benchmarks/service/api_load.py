@@ -22,7 +22,7 @@ from benchmarks.harness import Report, run_alone
 from benchmarks.service.hostile_files.corpus import sound_bundle
 from benchmarks.service.web_process import WebProcess, serving
 from physworld_storage.database import Database, open_database
-from physworld_storage.jobs import events, opening
+from physworld_storage.jobs import events, shards
 from physworld_storage.settings import Settings
 from physworld_storage.tables import JobRow
 
@@ -78,7 +78,7 @@ def _job(web: WebProcess, database: Database, queued: int) -> str:
     with database.session() as session:
         job = session.get_one(JobRow, job_id)
         job.stage += 1
-        opening.add_shards(session, job, "episode", {"dataset_id": "none"}, total=queued or None)
+        shards.put_up(session, job, shards.Stage("episode", {"dataset_id": "none"}, queued or None))
     return job_id
 
 

@@ -20,6 +20,7 @@ from physworld_services.api.dependencies import DatabaseDep, PrincipalDep
 from physworld_storage import idempotency
 from physworld_storage.database import Database
 from physworld_storage.idempotency import Answer
+from physworld_storage.jobs.kinds import MAKERS
 
 RETRY_AFTER_S = "1"
 JSON = "application/json"
@@ -96,11 +97,7 @@ def job_links(job: Job) -> Job:
     own = f"/v1/jobs/{job.id}"
     links = {"self": own, "events": f"{own}/events", "cancel": f"{own}/cancel"}
     for output in job.outputs:
-        if output.kind == "model":
-            name, _, version = output.id.rpartition(":")
-            links["model"] = f"/v1/models/{name}/versions/{version}"
-        elif output.kind in {"fit", "trace", "dataset", "assessment", "rollout", "plan"}:
-            links[output.kind] = f"/v1/{output.kind}s/{output.id}"
+        links[output.kind] = f"/v1/{MAKERS[output.kind].path(output.id)}"
     return job.model_copy(update={"links": links})
 
 

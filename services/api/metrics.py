@@ -15,11 +15,11 @@ from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
-from physworld_schemas.queues import QUEUE_OF_SHARD
 from physworld_services.api.probes import Probe
 from physworld_storage.database import Database
 from physworld_storage.errors import StorageError
-from physworld_storage.jobs.counts import count_jobs, count_shards
+from physworld_storage.jobs.kinds import SHARDS
+from physworld_storage.jobs.shards import count_jobs, count_shards
 
 WAITING = "QUEUED"
 COUNT_S = 2.0
@@ -83,10 +83,10 @@ class _DatabaseFigures(Collector):
         by_job, by_shard, depth = _jobs(), _shards(), _depth()
         for (kind, state), count in sorted(jobs.items()):
             by_job.add_metric([kind, state], count)
-        waiting = Tally(dict.fromkeys(QUEUE_OF_SHARD.values(), 0))
+        waiting = Tally(dict.fromkeys((shard.queue for shard in SHARDS.values()), 0))
         for (kind, state), count in sorted(shards.items()):
-            by_shard.add_metric([QUEUE_OF_SHARD[kind], kind, state.lower()], count)
-            waiting[QUEUE_OF_SHARD[kind]] += count if state == WAITING else 0
+            by_shard.add_metric([SHARDS[kind].queue, kind, state.lower()], count)
+            waiting[SHARDS[kind].queue] += count if state == WAITING else 0
         for queue, count in sorted(waiting.items()):
             depth.add_metric([queue], count)
         yield from (by_job, by_shard, depth)

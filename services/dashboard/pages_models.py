@@ -22,7 +22,7 @@ from physworld_storage.access import tickets
 from physworld_storage.access.api_keys import ApiKey
 from physworld_storage.comparison import compare_versions
 from physworld_storage.errors import NotFound
-from physworld_storage.jobs.opening_runs import ready_version
+from physworld_storage.jobs.kinds.rollout import ready_version
 
 PAGE_SIZE = 50
 

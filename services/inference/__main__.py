@@ -36,11 +36,8 @@ def main(arguments: list[str] | None = None) -> int:
 def _work(settings: Settings, name: str) -> int:
     from physworld_schemas.queues import INFERENCE
     from physworld_workers.app import run_worker
-    from physworld_workers.registry import register
 
     settings.check()
-    register("rollout", "physworld_services.inference.jobs:rollout")
-    register("plan", "physworld_services.inference.jobs:plan")
     return run_worker(settings, INFERENCE, name)
 
 

@@ -15,9 +15,8 @@ from physworld_services.inference import rollouts
 from physworld_services.inference.models import Models
 from physworld_storage import registry
 from physworld_storage.runs import RESULT
-from physworld_workers.context import TaskContext
+from physworld_workers.context import HandlerResult, TaskContext
 from physworld_workers.lineage import lineage_of
-from physworld_workers.registry import HandlerResult
 from physworld_workers.stores import Stores
 from physworld_workers.tasks.inputs import made_from, npz_bytes
 

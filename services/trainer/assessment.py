@@ -3,7 +3,7 @@
 The model is rolled out over the recording, open loop from its start. Its mean track error is compared with what noise
 alone shows and with the held-out error on the model's card, both with intervals by blocks of frames
 (:mod:`physworld.evaluate.blocks`). What follows from a model that has become worse is the database's business: the
-commit opens a trace (``physworld_storage.jobs.flow``).
+commit opens a trace (``physworld_storage.jobs.kinds.assessment``).
 """
 
 from __future__ import annotations
@@ -27,9 +27,8 @@ from physworld_schemas.model import ModelVersion
 from physworld_services.trainer.closed_loop import METRIC, WORLD_MODEL
 from physworld_services.trainer.measuring import json_safe
 from physworld_storage import registry, resources
-from physworld_workers.context import TaskContext
+from physworld_workers.context import HandlerResult, TaskContext
 from physworld_workers.lineage import lineage_of
-from physworld_workers.registry import HandlerResult
 from physworld_workers.stores import Stores
 from physworld_workers.tasks.inputs import named, scene_of, scene_reference, twin_of
 

@@ -37,9 +37,8 @@ from physworld_services.trainer.measuring import Measured, json_safe, measure
 from physworld_services.trainer.publishing import MANIFEST_NAME, card_of, store_version
 from physworld_services.trainer.settings import translate
 from physworld_storage import traces
-from physworld_workers.context import TaskContext
+from physworld_workers.context import HandlerResult, TaskContext
 from physworld_workers.lineage import lineage_of
-from physworld_workers.registry import HandlerResult
 from physworld_workers.stores import Stores
 from physworld_workers.tasks.dataset import strength_ranges
 from physworld_workers.tasks.inputs import made_from, scene_of, twin_of

@@ -1,7 +1,7 @@
 """The event log: every change of a job, appended in the same transaction as the change.
 
-Writers of one job hold its lock (``physworld_storage.jobs.locks.lock_job``), so within a job ``seq`` grows in the order
-in which the changes became visible, and a reader that remembers the last ``seq`` misses nothing.
+Writers of one job hold its lock (``physworld_storage.jobs.shards.lock_job``), so within a job ``seq`` grows in the
+order in which the changes became visible, and a reader that remembers the last ``seq`` misses nothing.
 """
 
 from __future__ import annotations

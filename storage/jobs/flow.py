@@ -1,21 +1,10 @@
-"""What follows what: stages of a job, children of a pipeline, failure and cancellation in both directions.
+"""What follows what, for every kind alike: stages of a job, children of a parent, failure and cancellation both ways.
 
-::
-
-    fit        stage 0  one `fit` shard, which may put up `simulation` helpers (``physworld_storage.jobs.helpers``)
-    trace      stage 0  one `trace` shard, which puts them up too
-    dataset    stage 0  one `dataset_plan` shard, whose result says how many episodes follow
-               stage 1  one `episode` shard each, made as the work goes on (``physworld_storage.jobs.opening.add_more``)
-               stage 2  one `dataset_seal` shard
-    training   stage 0  one `training` shard
-    assessment stage 0  one `assessment` shard, whose result may open a trace
-    rollout    stage 0  one `rollout` shard
-    plan       stage 0  one `plan` shard
-    pipeline   child jobs, each opened by the success of the one before (``physworld_storage.jobs.pipeline``)
+What a kind does at each of these points is its own business (``physworld_storage.jobs.kinds``).
 
 Everything here runs in the transaction that changes the shard, under the lock of the job and, before it, of
-the job's parent (``physworld_storage.jobs.locks``). Rows below a job are touched only under that lock, so two workers
-that finish the last two episodes at the same moment start the next stage once.
+the job's parent (``physworld_storage.jobs.shards.lock_job``). Rows below a job are touched only under that lock, so two
+workers that finish the last two episodes at the same moment start the next stage once.
 """
 
 from __future__ import annotations
@@ -26,45 +15,25 @@ from typing import Any
 from sqlalchemy import exists, select, update
 from sqlalchemy.orm import Session
 
-from physworld_schemas.assessment import AssessmentCreate
 from physworld_schemas.base import Problem, Reference
-from physworld_schemas.dataset import Episode
-from physworld_schemas.fit import FitConfig
 from physworld_schemas.job import TERMINAL_STATES, Progress
-from physworld_schemas.trace import TRACE_PARTICLES
-from physworld_storage import registry, resources, runs, traces
 from physworld_storage.errors import Conflict
-from physworld_storage.jobs import helpers
 from physworld_storage.jobs.events import append_event
-from physworld_storage.jobs.opening import (
-    CANCELLED,
-    QUEUED,
-    RUNNING,
-    add_more,
-    add_shards,
-    open_trace,
-)
-from physworld_storage.jobs.pipeline import dataset_planned, open_next, share_done
-from physworld_storage.jobs.results import (
-    AssessmentResult,
-    EpisodeResult,
-    FitResult,
-    PlanResult,
-    RunResult,
-    SealResult,
-    ShardResult,
-    SimulationResult,
-    TraceResult,
-    TrainingResult,
-)
-from physworld_storage.tables import FitRow, JobRow, ShardRow
-
-# Alone in their stage: their own progress is the job's.
-LONG_SHARDS = frozenset({"fit", "trace", "training", "assessment", "rollout", "plan"})
+from physworld_storage.jobs.kind import ShardResult, Tells
+from physworld_storage.jobs.kinds import SHARDS, kind_of
+from physworld_storage.jobs.shards import CANCELLED, QUEUED, RUNNING, put_up, put_up_more
+from physworld_storage.tables import JobRow, ShardRow
 
 
 def shard_started(session: Session, job: JobRow, attempt: int, now: datetime) -> None:
-    """A worker took a shard: the job and its parent run."""
+    """A worker took a shard: the job and its parent run.
+
+    Args:
+        session: the transaction of the claim.
+        job: locked.
+        attempt: of the shard, from 1.
+        now: by the database's clock.
+    """
     job.attempt = max(job.attempt, attempt)
     for row in (_parent(session, job), job):
         if row is None:
@@ -78,21 +47,31 @@ def shard_started(session: Session, job: JobRow, attempt: int, now: datetime) ->
 def shard_succeeded(
     session: Session, job: JobRow, shard: ShardRow, result: ShardResult, now: datetime
 ) -> None:
-    """Apply a shard's result; when it was the stage's last, start the next stage or finish the job."""
+    """Apply a shard's result; when it was the stage's last, start the next stage or finish the job.
+
+    Args:
+        session: the transaction that commits the shard.
+        job: locked.
+        shard: of the job.
+        result: of the shard's kind.
+        now: by the database's clock.
+    """
     job.heartbeat_at = now
-    if isinstance(result, SimulationResult):
+    kind = SHARDS[shard.kind]
+    if kind.is_helper:
         return
     job.stage_done += 1
     result.lineage.job_id = job.id
     if not result.lineage.inputs:
         result.lineage.inputs = [Reference.model_validate(item) for item in job.inputs]
-    _apply(session, job, shard, result)
-    if job.kind == "dataset" and isinstance(result, EpisodeResult):
-        done = Progress(done=job.stage_done, total=job.stage_total, unit="episodes")
-        report_progress(session, job, done)
+    kind.apply(session, job, shard, result)
+    if kind.progress is Tells.SHARDS_DONE:
+        _report_shards_done(session, job)
     if job.stage_done < job.stage_total:
-        add_more(session, job, shard)
-    elif not _start_next_stage(session, job, shard, result):
+        put_up_more(session, job, shard)
+    elif kind.next is not None:
+        _start_stage(session, job, shard, result)
+    else:
         job.finished_at = now
         _set_state(session, job, "succeeded")
         _child_succeeded(session, job, now)
@@ -103,14 +82,21 @@ def report_progress(session: Session, job: JobRow, progress: Progress) -> None:
     _set_progress(session, job, progress)
     parent = _parent(session, job)
     if parent is not None and parent.state not in TERMINAL_STATES:
-        _set_progress(session, parent, _pipeline_progress(session, parent, job))
+        _set_progress(session, parent, _parent_progress(session, parent, job))
 
 
 def fail_job(session: Session, job: JobRow, problem: Problem, now: datetime) -> None:
-    """Fail the job with its resource and its parent; its other shards are called off."""
+    """Fail the job with its resource and its parent; its other shards are called off.
+
+    Args:
+        session: the transaction that it belongs to.
+        job: locked.
+        problem: why it failed.
+        now: by the database's clock.
+    """
     _stop_shards(session, job, (QUEUED, RUNNING), now)
     job.error = problem.model_dump(mode="json")
-    _fail_output(session, job, problem.detail or problem.title)
+    kind_of(job).fail(session, job, problem.detail or problem.title)
     job.finished_at = now
     _set_state(session, job, "failed")
     parent = _parent(session, job)
@@ -147,7 +133,7 @@ def settle_cancel(session: Session, job: JobRow, now: datetime) -> None:
         return
     if any(child.state not in TERMINAL_STATES for child in _children(session, job)):
         return
-    _fail_output(session, job, "cancelled")
+    kind_of(job).fail(session, job, "cancelled")
     job.finished_at = now
     _set_state(session, job, "cancelled")
     parent = _parent(session, job)
@@ -155,100 +141,27 @@ def settle_cancel(session: Session, job: JobRow, now: datetime) -> None:
         settle_cancel(session, parent, now)
 
 
-def _apply(session: Session, job: JobRow, shard: ShardRow, result: ShardResult) -> None:
-    payload = shard.payload
-    if isinstance(result, FitResult):
-        helpers.call_off(session, job.id)
-        fit_id = payload["fit_id"]
-        resources.mark_fit_ready(
-            session, fit_id, result.parameters, result.metrics, result.artifacts, result.lineage
-        )
-        fit = session.get_one(FitRow, fit_id)
-        _set_output(job, Reference(kind="fit", id=fit_id, digest=traces.fit_digest(fit)))
-    elif isinstance(result, TraceResult):
-        helpers.call_off(session, job.id)
-        trace_id = payload["trace_id"]
-        traces.mark_trace_ready(
-            session, trace_id, result.verdict, result.report, result.artifacts, result.lineage
-        )
-        digest = traces.trace_digest(traces.trace_row(session, trace_id))
-        _set_output(job, Reference(kind="trace", id=trace_id, digest=digest))
-    elif isinstance(result, AssessmentResult):
-        _apply_assessment(session, job, payload["assessment_id"], result)
-    elif isinstance(result, RunResult):
-        _apply_run(session, job, payload["run_id"], result)
-    elif isinstance(result, PlanResult):
-        resources.start_writing(session, payload["dataset_id"])
-    elif isinstance(result, EpisodeResult):
-        episode = Episode(**result.model_dump(include=set(Episode.model_fields)), attempt=shard.attempt)
-        resources.add_episode(session, payload["dataset_id"], shard.id, episode, result.seconds)
-    elif isinstance(result, SealResult):
-        resources.seal_dataset(
-            session,
-            payload["dataset_id"],
-            digest=result.digest,
-            statistics=result.statistics,
-            artifacts=result.artifacts,
-            lineage=result.lineage,
-        )
-        _set_output(job, Reference(kind="dataset", id=payload["dataset_id"], digest=result.digest))
-    elif isinstance(result, TrainingResult):
-        name, version = payload["name"], payload["version"]
-        registry.publish(
-            session,
-            name,
-            version,
-            artifacts=result.artifacts,
-            sha256=result.sha256,
-            metrics=result.metrics,
-            lineage=result.lineage,
-        )
-        output = Reference(kind="model", id=registry.reference_id(name, version), digest=result.sha256)
-        _set_output(job, output)
+def _start_stage(session: Session, job: JobRow, shard: ShardRow, result: ShardResult) -> None:
+    """Put up what follows the stage that ended with this shard."""
+    follows = SHARDS[shard.kind].next
+    assert follows is not None
+    stage = follows(shard, result)
+    job.stage += 1
+    put_up(session, job, stage)
+    if SHARDS[stage.shard].progress is Tells.SHARDS_DONE:
+        _report_shards_done(session, job)
+    parent = _parent(session, job)
+    if parent is not None:
+        kind_of(parent).stage_opened(session, parent, job)
 
 
-def _apply_assessment(session: Session, job: JobRow, assessment_id: str, result: AssessmentResult) -> None:
-    """Keep the figures; a recording that the model predicts worse than expected is traced, if that was asked for."""
-    figures = result.model_dump(mode="json", exclude={"lineage"})
-    row = traces.mark_assessment_ready(session, assessment_id, figures, result.lineage)
-    request = AssessmentCreate.model_validate(job.config)
-    if result.outcome != "worse_than_expected" or not request.open_trace:
-        return
-    declared = FitConfig(damping="none", particle_budget=TRACE_PARTICLES)
-    opened = open_trace(session, row.scene_id, declared, request.trace)
-    row.trace_id = opened.outputs[0]["id"]
-    job.outputs = [*job.outputs, *opened.outputs]
-    append_event(session, job.id, "log", {"message": "trace queued", "child": opened.id, "kind": "trace"})
-
-
-def _apply_run(session: Session, job: JobRow, run_id: str, result: RunResult) -> None:
-    """Keep the figures and files of a rollout or a plan."""
-    kind: runs.RunKind = "plan" if job.kind == "plan" else "rollout"
-    runs.mark_run_ready(session, kind, run_id, result.figures, result.artifacts, result.lineage)
-    _set_output(job, Reference(kind=kind, id=run_id, digest=runs.run_digest(result.artifacts, kind)))
-
-
-def _start_next_stage(session: Session, job: JobRow, shard: ShardRow, result: ShardResult) -> bool:
-    """Open what follows the stage that ended with this shard; False when nothing does."""
-    if isinstance(result, PlanResult):
-        job.stage += 1
-        plan = {"frames": result.frames, "particles": result.particles}
-        add_shards(session, job, "episode", {**shard.payload, "plan": plan}, result.episodes)
-        report_progress(session, job, Progress(done=0, total=result.episodes, unit="episodes"))
-        parent = _parent(session, job)
-        if parent is not None:
-            dataset_planned(session, parent, shard.payload["dataset_id"])
-        return True
-    if isinstance(result, EpisodeResult):
-        job.stage += 1
-        base = {key: value for key, value in shard.payload.items() if key not in {"index", "plan"}}
-        add_shards(session, job, "dataset_seal", base)
-        return True
-    return False
+def _report_shards_done(session: Session, job: JobRow) -> None:
+    done = Progress(done=job.stage_done, total=job.stage_total, unit=kind_of(job).unit)
+    report_progress(session, job, done)
 
 
 def _child_succeeded(session: Session, child: JobRow, now: datetime) -> None:
-    """Open the pipeline's next child, or finish the pipeline."""
+    """Open the parent's next child, or finish the parent."""
     parent = _parent(session, child)
     if parent is None or parent.state in TERMINAL_STATES:  # what ran beside this child has failed
         return
@@ -256,15 +169,15 @@ def _child_succeeded(session: Session, child: JobRow, now: datetime) -> None:
     parent.outputs = [*parent.outputs, *child.outputs]
     message = f"{child.kind} done"
     append_event(session, parent.id, "log", {"message": message, "child": child.id, "kind": child.kind})
-    progress = _pipeline_progress(session, parent, child)
+    progress = _parent_progress(session, parent, child)
     _set_progress(session, parent, progress.model_copy(update={"message": message}))
-    if not open_next(session, parent, _children(session, parent)):
+    if not kind_of(parent).open_next(session, parent, _children(session, parent)):
         parent.finished_at = now
         _set_state(session, parent, "succeeded")
 
 
-def _pipeline_progress(session: Session, parent: JobRow, active: JobRow) -> Progress:
-    share = share_done(parent, _children(session, parent))
+def _parent_progress(session: Session, parent: JobRow, active: JobRow) -> Progress:
+    share = kind_of(parent).share_done(parent, _children(session, parent))
     own = Progress.model_validate(active.progress)
     message = f"{active.kind}: {own.done:g} of {own.total:g} {own.unit}"
     return Progress(done=round(100 * share, 2), total=100, unit="percent", message=message)
@@ -284,29 +197,6 @@ def _set_state(session: Session, job: JobRow, state: str) -> None:
     session.flush()
 
 
-def _set_output(job: JobRow, output: Reference) -> None:
-    job.outputs = [output.model_dump(mode="json")]
-
-
-def _fail_output(session: Session, job: JobRow, message: str) -> None:
-    if job.kind == "pipeline":
-        return
-    output = job.outputs[0]["id"]
-    if job.kind == "fit":
-        resources.fail_fit(session, output)
-    elif job.kind == "trace":
-        traces.fail_trace(session, output)
-    elif job.kind == "assessment":
-        traces.fail_assessment(session, output)
-    elif job.kind == "rollout" or job.kind == "plan":
-        runs.fail_run(session, "plan" if job.kind == "plan" else "rollout", output)
-    elif job.kind == "dataset":
-        resources.fail_dataset(session, output)
-    else:
-        name, _, version = output.rpartition(":")
-        registry.fail_version(session, name, int(version), message)
-
-
 def _stop_shards(session: Session, job: JobRow, states: tuple[str, ...], now: datetime) -> None:
     session.execute(
         update(ShardRow)
@@ -321,12 +211,12 @@ def _has_running(session: Session, job: JobRow) -> bool:
 
 
 def _parent(session: Session, job: JobRow) -> JobRow | None:
-    """The parent, which ``physworld_storage.jobs.locks.lock_job`` has locked and loaded."""
+    """The parent, which ``physworld_storage.jobs.shards.lock_job`` has locked and loaded."""
     return None if job.parent_id is None else session.get_one(JobRow, job.parent_id)
 
 
 def _children(session: Session, job: JobRow) -> list[JobRow]:
-    if job.kind != "pipeline":
+    if not kind_of(job).has_children:
         return []
     order = (JobRow.created_at, JobRow.id)
     statement = select(JobRow).where(JobRow.parent_id == job.id).order_by(*order)

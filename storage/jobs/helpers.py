@@ -17,17 +17,40 @@ from typing import TYPE_CHECKING, Any
 from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
+from physworld_schemas import queues
 from physworld_schemas.ids import new_id
 from physworld_storage.changes import announce
 from physworld_storage.database import DEFAULT_MAX_ATTEMPTS, MAX_ATTEMPTS
-from physworld_storage.jobs.locks import lock_job
-from physworld_storage.jobs.opening import CANCELLED, QUEUED, RUNNING
-from physworld_storage.tables import ShardRow, utc_now
+from physworld_storage.jobs.kind import ShardKind, ShardResult, Tells
+from physworld_storage.jobs.shards import CANCELLED, QUEUED, RUNNING, lock_job
+from physworld_storage.tables import JobRow, ShardRow, utc_now
 
 if TYPE_CHECKING:
     from physworld_storage.jobs.leases import Lease
 
 SIMULATION = "simulation"
+
+
+class SimulationResult(ShardResult):
+    """Of a ``simulation`` shard: whether the run can be trusted; its tracks are in the scratch."""
+
+    trusted: bool
+
+
+def _apply(session: Session, job: JobRow, shard: ShardRow, result: SimulationResult) -> None:
+    """Nothing: the driver, which waits for the shard, reads its tracks."""
+
+
+KIND = ShardKind(
+    SIMULATION,
+    queues.SIMULATION,
+    "physworld_workers.tasks.shared_runs:simulate",
+    SimulationResult,
+    _apply,
+    progress=Tells.NOTHING,
+    keeps_scratch=True,
+    is_helper=True,
+)
 
 
 def put_up(
@@ -36,7 +59,13 @@ def put_up(
     """Add one simulation to the driver's job for each payload; the shards' ids.
 
     None when the lease is lost or the job no longer runs (nobody would call off what a cancelled job is given).
-    The driver's epoch is the stage, so two attempts never share one; ``first_index`` counts on within an attempt.
+    The driver's epoch is the stage, so two attempts never share one.
+
+    Args:
+        session: the transaction that they belong to.
+        driver: the lease of the shard that waits for them.
+        first_index: of the first; it counts on within an attempt.
+        payloads: one for each simulation.
     """
     if lock_job(session, driver.job_id).state != "running":
         return []

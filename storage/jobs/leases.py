@@ -26,22 +26,20 @@ from sqlalchemy.orm import Session
 
 from physworld_schemas.base import Problem
 from physworld_schemas.job import TERMINAL_STATES, Progress
-from physworld_schemas.queues import QUEUE_OF_SHARD
 from physworld_storage.changes import announce
 from physworld_storage.clock import database_now
 from physworld_storage.errors import NotFound
 from physworld_storage.jobs import losses
 from physworld_storage.jobs.flow import (
-    LONG_SHARDS,
     fail_job,
     report_progress,
     settle_cancel,
     shard_started,
     shard_succeeded,
 )
-from physworld_storage.jobs.locks import lock_job
-from physworld_storage.jobs.opening import CANCELLED, DONE, FAILED, QUEUED, RUNNING
-from physworld_storage.jobs.results import parse_result
+from physworld_storage.jobs.kind import Tells
+from physworld_storage.jobs.kinds import SHARDS, parse_result
+from physworld_storage.jobs.shards import CANCELLED, DONE, FAILED, QUEUED, RUNNING, lock_job
 from physworld_storage.tables import JobRow, ShardRow
 
 BACKOFF_SECONDS = 1.0  # before the second attempt; doubles with each further one
@@ -138,7 +136,7 @@ def renew(
     job.heartbeat_at = now
     if job.state == "cancelling":
         return "cancel"
-    if progress is not None and lease.kind in LONG_SHARDS:
+    if progress is not None and SHARDS[lease.kind].progress is Tells.ITS_OWN:
         report_progress(session, job, progress)
     return "held"
 
@@ -238,15 +236,15 @@ def publishable(
         .group_by(ShardRow.kind)
     )
     for kind, count, told in session.execute(counts):
-        if kind in QUEUE_OF_SHARD:
-            queued[QUEUE_OF_SHARD[kind]] += count
-            announced[QUEUE_OF_SHARD[kind]] += int(told)
+        if kind in SHARDS:
+            queued[SHARDS[kind].queue] += count
+            announced[SHARDS[kind].queue] += int(told)
     found: list[Publication] = []
     for queue in sorted(queued):
         room = min(limit, window - announced[queue])
         if room <= 0 or queued[queue] == announced[queue]:
             continue
-        kinds = [kind for kind, name in QUEUE_OF_SHARD.items() if name == queue]
+        kinds = [kind.name for kind in SHARDS.values() if kind.queue == queue]
         rows = session.execute(
             select(ShardRow.id, ShardRow.kind, ShardRow.epoch)
             .join(JobRow, JobRow.id == ShardRow.job_id)

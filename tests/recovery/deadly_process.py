@@ -9,10 +9,9 @@ from pathlib import Path
 
 from physworld_storage.database import open_database
 from physworld_storage.settings import Settings
-from physworld_workers.context import TaskContext
+from physworld_workers.context import HandlerResult, TaskContext
 from physworld_workers.execute import Runtime, run_shard
 from physworld_workers.owner import process_owner
-from physworld_workers.registry import HandlerResult
 from physworld_workers.stores import Stores
 
 

@@ -14,7 +14,6 @@ from physworld_storage.jobs import leases
 from physworld_storage.settings import Settings
 from physworld_workers.execute import Runtime, run_shard
 from physworld_workers.owner import process_owner
-from physworld_workers.registry import register
 from physworld_workers.stores import Stores
 
 PATIENCE_S = 20.0
@@ -24,7 +23,6 @@ def main(data_dir: Path) -> int:
     """0 when every training is done; 1 when one failed or waits for too long."""
     settings = Settings(data_dir=data_dir, lease_seconds=20.0)
     database = open_database(settings)
-    register("training", "physworld_services.trainer.training:run")
     runtime = Runtime(settings, database, Stores(settings, database), process_owner())
     for take_back in (leases.recover, leases.reap):
         with database.session() as session:

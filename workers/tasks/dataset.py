@@ -39,10 +39,9 @@ from physworld.worldmodel.model.graph import MOST_KEPT, kept_vertices
 from physworld_schemas.dataset import DatasetConfig, Episode
 from physworld_schemas.trace import FoundEffect
 from physworld_storage import resources, traces
-from physworld_workers.context import TaskContext
+from physworld_workers.context import HandlerResult, TaskContext
 from physworld_workers.errors import DatasetIncomplete, NotEnoughDisk
 from physworld_workers.lineage import lineage_of
-from physworld_workers.registry import HandlerResult
 from physworld_workers.stores import Stores
 from physworld_workers.tasks.dataset_card import store_card
 from physworld_workers.tasks.inputs import made_from, scene_of, twin_of

@@ -12,10 +12,9 @@ from physworld.calibrate import CalibrationConfig, calibrate_in_stages
 from physworld.engine.thin.triangles import Mesh
 from physworld_schemas.fit import FitConfig
 from physworld_storage.jobs import helpers
-from physworld_workers.context import TaskContext
+from physworld_workers.context import HandlerResult, TaskContext
 from physworld_workers.law_choice import chosen_laws
 from physworld_workers.lineage import lineage_of
-from physworld_workers.registry import HandlerResult
 from physworld_workers.stores import Stores
 from physworld_workers.tasks.fit_accuracy import fit_accuracy, not_measured
 from physworld_workers.tasks.fit_report import MEDIA_TYPES, fit_files, fit_report

@@ -23,12 +23,11 @@ from physworld.trace import Memory, TimeUp
 from physworld.twin.twin import Twin
 from physworld_storage.errors import NotFound
 from physworld_storage.jobs import helpers
-from physworld_storage.jobs.opening import DONE, QUEUED
-from physworld_workers.context import TaskContext
+from physworld_storage.jobs.shards import DONE, QUEUED
+from physworld_workers.context import HandlerResult, TaskContext
 from physworld_workers.errors import Cancelled
 from physworld_workers.execute import Runtime, run_shard
 from physworld_workers.owner import process_owner
-from physworld_workers.registry import HandlerResult
 from physworld_workers.stores import Stores
 from physworld_workers.tasks.inputs import npz_arrays, npz_bytes
 

@@ -25,9 +25,8 @@ from physworld_schemas.fit import FitConfig
 from physworld_schemas.trace import TraceConfig as WireConfig
 from physworld_storage import resources
 from physworld_storage.jobs import helpers
-from physworld_workers.context import TaskContext
+from physworld_workers.context import HandlerResult, TaskContext
 from physworld_workers.lineage import lineage_of
-from physworld_workers.registry import HandlerResult
 from physworld_workers.stores import Stores
 from physworld_workers.tasks.inputs import fit_reference, scene_of, scene_reference, twin_of
 from physworld_workers.tasks.shared_runs import SharedMemory, SharedRunner, stored_journal

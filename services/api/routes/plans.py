@@ -8,7 +8,7 @@ from fastapi import APIRouter, Query, Response
 
 from physworld_schemas.arrays import FARTHEST_M, EncodedArray
 from physworld_schemas.base import Page
-from physworld_schemas.job import Job, Progress
+from physworld_schemas.job import Job
 from physworld_schemas.plan import Plan, PlanCreate, ShapeGoal
 from physworld_services.api.bodies import LongBodyRoute
 from physworld_services.api.dependencies import DatabaseDep, ObjectId, PageDep, StoresDep
@@ -34,11 +34,12 @@ def create_plan(
     asked = _checked(body, points).model_copy(update={"version": version.version})
     request = stores.artifacts.put_bytes(asked.model_dump_json().encode(), runs.REQUEST, "application/json")
     config = asked.model_dump(mode="json", exclude={"goal"}) | {"goal": body.goal.kind}
-    progress = Progress(total=body.config.iterations, unit="iterations")
     return idempotency.run(
         body,
         lambda session: accepted(
-            jobs.create_run(session, "plan", body.model, version.version, config, request, progress)
+            jobs.create_run(
+                session, "plan", body.model, version.version, config, request, body.config.iterations
+            )
         ),
     )
 

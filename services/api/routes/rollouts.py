@@ -10,7 +10,6 @@ from fastapi import APIRouter, Query, Response
 from physworld.arrays import Array
 from physworld_schemas.arrays import FARTHEST_M, ArrayInput, EncodedArray, array_of
 from physworld_schemas.base import FieldError, Page
-from physworld_schemas.job import Progress
 from physworld_schemas.model import ModelVersion
 from physworld_schemas.rollout import (
     MAX_CANDIDATES,
@@ -72,11 +71,11 @@ def create_rollout(
         return idempotency.run(body, lambda session: answer_of(200, found))
     request = stores.artifacts.put_bytes(asked.model_dump_json().encode(), runs.REQUEST, "application/json")
     config = asked.model_dump(mode="json", exclude={"controllers", "phi", "times"}) | {"shape": list(shape)}
-    progress = Progress(total=shape[0] * ticks, unit="steps")
+    total = shape[0] * ticks
     return idempotency.run(
         body,
         lambda session: accepted(
-            jobs.create_run(session, "rollout", body.model, version.version, config, request, progress)
+            jobs.create_run(session, "rollout", body.model, version.version, config, request, total)
         ),
     )
 

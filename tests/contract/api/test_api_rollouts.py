@@ -18,7 +18,6 @@ from physworld_services.inference import rollouts
 from physworld_services.inference.models import Models
 from physworld_storage.jobs import leases
 from physworld_workers.execute import Runtime, run_shard
-from physworld_workers.registry import register
 
 SINGLE_PRECISION_M = 2e-6
 
@@ -54,7 +53,6 @@ def absurd(controllers: np.ndarray) -> np.ndarray:
 
 
 def _work(served: Served, ends: str = "done") -> None:
-    register("rollout", "physworld_services.inference.jobs:rollout")
     runtime = Runtime(served.settings, served.database, served.stores, "test")
     while True:
         with served.database.session() as session:

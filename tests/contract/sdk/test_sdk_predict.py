@@ -24,7 +24,6 @@ from physworld_schemas.plan import PlanConfig, PlanLimits
 from physworld_schemas.rollout import SYNC_STEPS
 from physworld_storage.jobs import leases
 from physworld_workers.execute import Runtime, run_shard
-from physworld_workers.registry import register
 
 SINGLE_PRECISION_M = 2e-6
 SMALL = PlanConfig(horizon=12, samples=24, iterations=3)
@@ -34,8 +33,6 @@ SMALL = PlanConfig(horizon=12, samples=24, iterations=3)
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     """The service, and a worker for its inference queue in a thread."""
     with serve_inference(tmp_path_factory.mktemp("data")) as served:
-        register("rollout", "physworld_services.inference.jobs:rollout")
-        register("plan", "physworld_services.inference.jobs:plan")
         runtime = Runtime(served.settings, served.database, served.stores, "test")
         over = threading.Event()
 

@@ -12,9 +12,10 @@ from physworld_schemas.model import TrainingCreate
 from physworld_schemas.pipeline import PipelineCreate
 from physworld_storage import registry, resources
 from physworld_storage.errors import Conflict, NotFound, ResultInvalid
-from physworld_storage.jobs import jobs, leases, opening
-from physworld_storage.jobs.counts import count_shards
-from physworld_storage.jobs.opening import STAGE_WINDOW, model_name_of
+from physworld_storage.jobs import events as log
+from physworld_storage.jobs import jobs, leases, shards
+from physworld_storage.jobs.kinds.pipeline import model_name_of
+from physworld_storage.jobs.shards import STAGE_WINDOW, count_shards
 
 if TYPE_CHECKING:
     from conftest import Work
@@ -70,7 +71,7 @@ def test_progress_of_a_pipeline_never_falls(work: Work) -> None:
     pipeline = work.pipeline(episodes=5)
     work.finish(pipeline)
     with work.database.reading() as session:
-        events = jobs.events_after(session, pipeline.id, 0)
+        events = log.events_after(session, pipeline.id, 0)
     done = [event.data["done"] for event in events if event.type == "progress"]
     assert done == sorted(done)
     assert done[-1] == 100
@@ -79,9 +80,9 @@ def test_progress_of_a_pipeline_never_falls(work: Work) -> None:
 def test_events_tell_the_states_in_order_and_can_be_resumed(work: Work) -> None:
     job = work.finish(work.fit())
     with work.database.reading() as session:
-        everything = jobs.events_after(session, job.id, 0)
-        resumed = jobs.events_after(session, job.id, everything[0].seq)
-        limited = jobs.events_after(session, job.id, 0, limit=1)
+        everything = log.events_after(session, job.id, 0)
+        resumed = log.events_after(session, job.id, everything[0].seq)
+        limited = log.events_after(session, job.id, 0, limit=1)
     assert [event.data["state"] for event in everything if event.type == "state"] == [
         "queued",
         "running",
@@ -174,7 +175,7 @@ def test_a_cancelling_pipeline_waits_for_its_running_child(work: Work) -> None:
         leases.mark_cancelled(session, lease)
     assert work.job(pipeline).state == "cancelled"
     with work.database.reading() as session:
-        states = [event.data for event in jobs.events_after(session, pipeline.id, 0) if event.type == "state"]
+        states = [event.data for event in log.events_after(session, pipeline.id, 0) if event.type == "state"]
     assert [state["state"] for state in states] == ["queued", "running", "cancelling", "cancelled"]
 
 
@@ -278,7 +279,7 @@ def test_a_stage_of_twenty_thousand_shards_is_opened_by_one_short_transaction(wo
 def test_the_shards_of_a_stage_are_made_as_it_goes_on_and_none_is_left_out(
     work: Work, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(opening, "STAGE_WINDOW", 4)
+    monkeypatch.setattr(shards, "STAGE_WINDOW", 4)
     dataset = work.dataset(episodes=11)
     work.complete(work.claim())
     taken, most = [], 0
@@ -295,7 +296,7 @@ def test_the_shards_of_a_stage_are_made_as_it_goes_on_and_none_is_left_out(
 def test_a_stage_goes_on_when_its_shards_end_in_another_order(
     work: Work, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(opening, "STAGE_WINDOW", 4)
+    monkeypatch.setattr(shards, "STAGE_WINDOW", 4)
     dataset = work.dataset(episodes=10)
     work.complete(work.claim())
     while work.job(dataset).progress.done < 10:
@@ -307,7 +308,7 @@ def test_a_stage_goes_on_when_its_shards_end_in_another_order(
 
 
 def test_a_cancelled_stage_makes_no_more_shards(work: Work, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(opening, "STAGE_WINDOW", 4)
+    monkeypatch.setattr(shards, "STAGE_WINDOW", 4)
     dataset = work.dataset(episodes=10)
     work.complete(work.claim())
     lease = work.claim()

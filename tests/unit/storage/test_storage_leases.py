@@ -18,7 +18,7 @@ from physworld_storage import resources
 from physworld_storage.clock import CLOCK
 from physworld_storage.database import Database
 from physworld_storage.errors import ResultInvalid
-from physworld_storage.jobs import jobs, leases
+from physworld_storage.jobs import events, jobs, leases
 from physworld_storage.tables import ShardRow, utc_now
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ def test_progress_of_a_long_shard_is_the_jobs(work: Work) -> None:
         leases.renew(session, lease, LEASE_SECONDS, progress)
     assert work.job(job).progress == progress
     with work.database.reading() as session:
-        last = jobs.events_after(session, job.id, 0)[-1]
+        last = events.events_after(session, job.id, 0)[-1]
     assert (last.type, last.data["done"]) == ("progress", 12)
 
 

@@ -15,7 +15,7 @@ from physworld_schemas.model import TrainingConfig
 from physworld_schemas.scene import Scene
 from physworld_storage import registry, resources
 from physworld_storage.errors import Conflict, InvalidCursor, NotFound, ResultInvalid
-from physworld_storage.jobs.results import parse_result
+from physworld_storage.jobs.kinds import parse_result
 
 if TYPE_CHECKING:
     from conftest import Work

@@ -15,9 +15,9 @@ from physworld_services.embedded.child import Child, Program
 from physworld_services.embedded.folder import DataFolder
 from physworld_storage.database import open_database
 from physworld_storage.settings import Settings
+from physworld_workers.context import Handler
 from physworld_workers.execute import Runtime
 from physworld_workers.owner import process_owner
-from physworld_workers.registry import Handler
 from physworld_workers.stores import Stores
 
 BROKER_WITHIN_S = 20.0

@@ -9,6 +9,7 @@ import pytest
 
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.job import Job
+from physworld_storage.jobs import events as log
 from physworld_storage.jobs import jobs, leases
 from physworld_storage.settings import Settings
 from physworld_storage.tables import ShardRow
@@ -65,7 +66,7 @@ def test_progress_reaches_the_job(stores: Stores, lease: leases.Lease, settings:
             context.progress(done, 1000, "simulations", "1.2 mm")
         _until(lambda: progress() == 999)
     with stores.database.reading() as session:
-        events = [event for event in jobs.events_after(session, job.id, 0, 500) if event.type == "progress"]
+        events = [event for event in log.events_after(session, job.id, 0, 500) if event.type == "progress"]
     assert len(events) < 20
 
 

@@ -16,10 +16,9 @@ from physworld_storage.errors import DatabaseUnavailable, StoreReadFailed, Store
 from physworld_storage.jobs import jobs, leases
 from physworld_storage.tables import ShardRow
 from physworld_workers import execute
-from physworld_workers.context import TaskContext
+from physworld_workers.context import HandlerResult, TaskContext
 from physworld_workers.errors import Cancelled
 from physworld_workers.execute import Runtime, problem_of, run_shard
-from physworld_workers.registry import HandlerResult
 from physworld_workers.stores import Stores
 
 FIT_RESULT = {"parameters": {}, "metrics": {}, "artifacts": []}

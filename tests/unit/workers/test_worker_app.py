@@ -9,10 +9,11 @@ import pytest
 from pydantic import SecretStr
 
 from physworld_schemas.queues import INFERENCE, SIMULATION, TASK_NAME, TRAINING
+from physworld_storage.jobs.kinds import SHARDS
 from physworld_storage.settings import Settings
-from physworld_workers import registry
 from physworld_workers.app import HARD_LIMIT_S, create_app
 from physworld_workers.errors import UnknownShardKind
+from physworld_workers.execute import handler_of
 
 
 @pytest.fixture
@@ -53,7 +54,8 @@ def test_an_application_needs_a_broker(tmp_path) -> None:
 
 
 @pytest.mark.parametrize(
-    "module", ["physworld_workers.__main__", "physworld_workers.dispatcher", "physworld_services.trainer.app"]
+    "module",
+    ["physworld_workers.__main__", "physworld_workers.dispatcher", "physworld_services.trainer.__main__"],
 )
 def test_neither_torch_nor_warp_is_loaded_when_a_worker_starts(module: str) -> None:
     code = (
@@ -67,11 +69,11 @@ def test_neither_torch_nor_warp_is_loaded_when_a_worker_starts(module: str) -> N
     assert done.returncode == 0, done.stderr
 
 
-def test_a_kind_that_nobody_registered_is_named() -> None:
+def test_a_kind_that_there_is_not_is_named() -> None:
     with pytest.raises(UnknownShardKind, match="'rendering'"):
-        registry.handler_of("rendering")
+        handler_of("rendering")
 
 
-def test_every_handler_of_the_workers_can_be_imported() -> None:
-    for kind in ("fit", "dataset_plan", "episode", "dataset_seal"):
-        assert callable(registry.handler_of(kind))
+def test_every_handler_can_be_imported() -> None:
+    for kind in SHARDS:
+        assert callable(handler_of(kind))

@@ -20,7 +20,6 @@ from physworld_schemas.fit import FitConfig
 from physworld_schemas.job import Job
 from physworld_schemas.model import ModelVersion, TrainingConfig, TrainingCreate
 from physworld_schemas.trace import TraceCreate
-from physworld_services.trainer.app import HANDLERS
 from physworld_services.trainer.assessment import assess
 from physworld_storage import registry, traces
 from physworld_storage.database import open_database
@@ -29,7 +28,6 @@ from physworld_storage.settings import Settings
 from physworld_storage.tables import TraceRow
 from physworld_workers.execute import Runtime, run_shard
 from physworld_workers.owner import process_owner
-from physworld_workers.registry import register as register_handler
 from physworld_workers.stores import Stores
 from physworld_workers.tasks.inputs import named, npz_bytes, twin_of
 
@@ -48,8 +46,6 @@ def runtime(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Runtime]:
     settings = Settings(data_dir=tmp_path_factory.mktemp("data"), lease_seconds=20.0)
     database = open_database(settings)
     database.upgrade()
-    for kind, handler in HANDLERS.items():
-        register_handler(kind, handler)
     yield Runtime(settings, database, Stores(settings, database), process_owner())
     database.dispose()
 

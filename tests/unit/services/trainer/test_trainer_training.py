@@ -40,7 +40,6 @@ from physworld_storage.settings import Settings
 from physworld_storage.tables import ShardRow
 from physworld_workers.execute import Runtime, run_shard
 from physworld_workers.owner import process_owner
-from physworld_workers.registry import register as register_handler
 from physworld_workers.stores import Stores
 from physworld_workers.tasks.inputs import scene_of, twin_of
 
@@ -72,7 +71,6 @@ def runtime(tmp_path: Path) -> Iterator[Runtime]:
     )
     database = open_database(settings)
     database.upgrade()
-    register_handler("training", "physworld_services.trainer.training:run")
     yield Runtime(settings, database, Stores(settings, database), process_owner())
     database.dispose()
 

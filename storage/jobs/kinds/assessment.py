@@ -1,0 +1,115 @@
+"""Assessments: one shard compares a recording with a model version; a trace follows where it is worse than expected."""
+
+from __future__ import annotations
+
+from pydantic import Field
+from sqlalchemy.orm import Session
+
+from physworld_schemas import queues
+from physworld_schemas.assessment import AssessmentCreate, ErrorFigure, Outcome
+from physworld_schemas.base import Reference
+from physworld_schemas.fit import FitConfig
+from physworld_schemas.ids import new_id
+from physworld_schemas.trace import TRACE_PARTICLES
+from physworld_storage import traces
+from physworld_storage.errors import Conflict
+from physworld_storage.jobs.events import append_event
+from physworld_storage.jobs.kind import JobKind, ShardKind, ShardResult, output_of, scene_row
+from physworld_storage.jobs.kinds import trace
+from physworld_storage.registry import reference_id, version_row
+from physworld_storage.tables import AssessmentRow, JobRow, ShardRow
+
+
+class AssessmentResult(ShardResult):
+    """Of an ``assessment`` shard."""
+
+    outcome: Outcome
+    reason: str
+    measured: ErrorFigure
+    expected: ErrorFigure
+    excess_m: float
+    excess_ci95_m: tuple[float, float]
+    baselines_m: dict[str, float | None] = Field(default_factory=dict)
+    twin_m: float | None = None
+    start_mismatch_m: float
+
+
+def _apply(session: Session, job: JobRow, shard: ShardRow, result: AssessmentResult) -> None:
+    """Keep the figures; a recording that the model predicts worse than expected is traced, if that was asked for."""
+    figures = result.model_dump(mode="json", exclude={"lineage"})
+    row = traces.mark_assessment_ready(session, shard.payload["assessment_id"], figures, result.lineage)
+    request = AssessmentCreate.model_validate(job.config)
+    if result.outcome != "worse_than_expected" or not request.open_trace:
+        return
+    declared = FitConfig(damping="none", particle_budget=TRACE_PARTICLES)
+    opened = trace.KIND.open(session, row.scene_id, declared, request.trace)
+    row.trace_id = output_of(opened)
+    job.outputs = [*job.outputs, *opened.outputs]
+    append_event(session, job.id, "log", {"message": "trace queued", "child": opened.id, "kind": "trace"})
+
+
+class AssessmentJobs(JobKind):
+    """Jobs that assess."""
+
+    name = "assessment"
+    unit = "rollouts"
+    shards = (
+        ShardKind(
+            "assessment",
+            queues.TRAINING,
+            "physworld_services.trainer.assessment:run",
+            AssessmentResult,
+            _apply,
+        ),
+    )
+
+    def open(self, session: Session, name: str, version: int, request: AssessmentCreate) -> JobRow:
+        """A recording held against a model version. Raises NotFound, or Conflict when the version is not ready.
+
+        Args:
+            session: the transaction that it belongs to.
+            name: of the model.
+            version: its number.
+            request: the recording, and whether a trace may follow.
+        """
+        model = version_row(session, name, version)
+        if model.state != "ready" or model.fit_id is None or model.scene_id is None:
+            raise Conflict(
+                f"version {version} of {name} is {model.state}; an assessment needs a ready version"
+            )
+        scene = scene_row(session, request.scene_id)
+        assessment_id = new_id("assessment")
+        job = self.queued(
+            session,
+            total=1,
+            inputs=[
+                Reference(kind="model", id=reference_id(name, version), digest=model.sha256),
+                Reference(kind="scene", id=scene.id, digest=scene.digest),
+            ],
+            output_id=assessment_id,
+            config=request.model_dump(mode="json"),
+        )
+        row = AssessmentRow(
+            id=assessment_id, name=name, version=version, scene_id=scene.id, config=job.config, figures={}
+        )
+        payload = {
+            "assessment_id": assessment_id,
+            "name": name,
+            "version": version,
+            "scene_id": scene.id,
+            "model_scene_id": model.scene_id,
+            "fit_id": model.fit_id,
+            "trace_id": model.trace_id,
+        }
+        return self.begin(session, job, row, payload)
+
+    def fail(self, session: Session, job: JobRow, message: str) -> None:
+        """The assessment has failed."""
+        traces.fail_assessment(session, output_of(job))
+
+    def reopen(self, session: Session, job: JobRow) -> None:
+        """The assessment is pending again."""
+        traces.assessment_row(session, output_of(job)).state = "pending"
+
+
+KIND = AssessmentJobs()

@@ -1,0 +1,94 @@
+"""Fits: one shard calibrates a twin of a scene; other workers help with its simulations."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy.orm import Session
+
+from physworld_schemas import queues
+from physworld_schemas.base import Artifact, Reference
+from physworld_schemas.fit import FitConfig, Parameter
+from physworld_schemas.ids import new_id
+from physworld_storage import resources
+from physworld_storage.errors import Conflict, NotFound
+from physworld_storage.jobs import helpers
+from physworld_storage.jobs.kind import JobKind, ShardKind, ShardResult, output_of, scene_row
+from physworld_storage.tables import FitRow, JobRow, ShardRow
+from physworld_storage.traces import fit_digest
+
+
+class FitResult(ShardResult):
+    """Of a ``fit`` shard."""
+
+    parameters: dict[str, Parameter]
+    metrics: dict[str, Any]
+    artifacts: list[Artifact]
+    seconds: float | None = None
+
+
+def _apply(session: Session, job: JobRow, shard: ShardRow, result: FitResult) -> None:
+    helpers.call_off(session, job.id)
+    fit_id = shard.payload["fit_id"]
+    resources.mark_fit_ready(
+        session, fit_id, result.parameters, result.metrics, result.artifacts, result.lineage
+    )
+    KIND.fulfil(job, fit_id, fit_digest(session.get_one(FitRow, fit_id)))
+
+
+class FitJobs(JobKind):
+    """Jobs that fit."""
+
+    name = "fit"
+    unit = "simulations"
+    shards = (
+        ShardKind(
+            "fit", queues.SIMULATION, "physworld_workers.tasks.fit:run", FitResult, _apply, keeps_scratch=True
+        ),
+        helpers.KIND,
+    )
+
+    def open(
+        self, session: Session, scene_id: str, config: FitConfig, parent: JobRow | None = None
+    ) -> JobRow:
+        """A fit of a scene. Raises NotFound.
+
+        Args:
+            session: the transaction that it belongs to.
+            scene_id: of a stored scene.
+            config: its settings.
+            parent: the pipeline that it belongs to.
+        """
+        scene = scene_row(session, scene_id)
+        fit_id = new_id("fit")
+        job = self.queued(
+            session,
+            total=config.max_simulations,
+            inputs=[Reference(kind="scene", id=scene_id, digest=scene.digest)],
+            output_id=fit_id,
+            config=config.model_dump(mode="json"),
+            parent=parent,
+        )
+        row = FitRow(id=fit_id, scene_id=scene_id, config=job.config, parameters={}, metrics={}, artifacts=[])
+        return self.begin(session, job, row, {"fit_id": fit_id, "scene_id": scene_id, "config": job.config})
+
+    def fail(self, session: Session, job: JobRow, message: str) -> None:
+        """The fit has failed."""
+        resources.fail_fit(session, output_of(job))
+
+    def reopen(self, session: Session, job: JobRow) -> None:
+        """The fit is pending again."""
+        session.get_one(FitRow, output_of(job)).state = "pending"
+
+
+KIND = FitJobs()
+
+
+def ready_fit(session: Session, fit_id: str, for_what: str) -> FitRow:
+    """The row of a ready fit. Raises NotFound, or Conflict when it is not ready."""
+    fit = session.get(FitRow, fit_id)
+    if fit is None:
+        raise NotFound("fit", fit_id)
+    if fit.state != "ready":
+        raise Conflict(f"fit {fit_id} is {fit.state}; {for_what} needs a ready fit")
+    return fit

@@ -1,0 +1,153 @@
+"""Pipelines: jobs that consist of other jobs.
+
+::
+
+    fit -> dataset -> training                                           without a trace
+    fit -> trace -> dataset -> training                                  ``close_the_loop``, nothing added
+    fit -> trace -> dataset -> training -> dataset -> training           ... an effect added: first on the fit's own
+                                                                         twin, for comparison, then with the effect
+
+A training whose ``start_share`` is below 1 is opened as soon as its dataset is planned, and runs beside it.
+
+The comparison is left out when it was not asked for (``compare``) or when a ready version of the same name on an equal
+twin with the same settings is there already.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+from sqlalchemy.orm import Session
+
+from physworld_schemas.base import Reference
+from physworld_schemas.job import TERMINAL_STATES, Progress
+from physworld_schemas.model import TrainingCreate
+from physworld_schemas.pipeline import PipelineCreate
+from physworld_schemas.trace import TRACE_PARTICLES
+from physworld_storage.jobs.kind import JobKind, output_of, scene_row
+from physworld_storage.jobs.kinds import dataset, fit, trace, training
+from physworld_storage.registry import find_baseline
+from physworld_storage.tables import JobRow, TraceRow
+from physworld_storage.traces import leaves_twin, trace_row
+
+FIT, TRACE, DATASET, TRAINING = (part.KIND.name for part in (fit, trace, dataset, training))
+SHARES = {FIT: 0.35, TRACE: 0.6, DATASET: 0.35, TRAINING: 0.30}  # of a pipeline's time, about
+NAME_LENGTH = 64
+
+
+class PipelineJobs(JobKind):
+    """Jobs that run the whole chain from a scene to a published model."""
+
+    name = "pipeline"
+    unit = "percent"
+    has_children = True
+
+    def open(self, session: Session, request: PipelineCreate) -> JobRow:
+        """The whole chain; its first child, the fit, is opened with it. Raises NotFound."""
+        scene = scene_row(session, request.scene_id)
+        name = request.model_name or model_name_of(scene.name)
+        job = self.queued(
+            session,
+            total=100,
+            inputs=[Reference(kind="scene", id=scene.id, digest=scene.digest)],
+            output_id=None,
+            config=request.model_copy(update={"model_name": name}).model_dump(mode="json"),
+        )
+        fit.KIND.open(session, scene.id, request.fit, parent=job)
+        return job
+
+    def fail(self, session: Session, job: JobRow, message: str) -> None:
+        """Nothing of its own: what it makes is its children's."""
+
+    def open_next(self, session: Session, parent: JobRow, children: Sequence[JobRow]) -> bool:
+        """Open what follows the last child, when all have succeeded; False when nothing does."""
+        if any(job.state not in TERMINAL_STATES for job in children):
+            return True  # a training runs beside its dataset; the end of the later one decides
+        request = PipelineCreate.model_validate(parent.config)
+        outputs = {job.kind: output_of(job) for job in children}
+        last = children[-1].kind
+        if last == DATASET and _has_training(children, outputs[DATASET]):
+            last = TRAINING  # it ran beside its dataset: the two were made at once, by clocks that may differ
+        if last == FIT and request.close_the_loop:
+            particles = min(request.fit.particle_budget, TRACE_PARTICLES)
+            declared = request.fit.model_copy(update={"damping": "none", "particle_budget": particles})
+            trace.KIND.open(session, request.scene_id, declared, request.trace, outputs[FIT], parent=parent)
+        elif last == DATASET:
+            _open_training(session, parent, request, outputs[DATASET])
+        elif last == TRAINING and not _is_comparison(session, children):
+            return False
+        else:
+            traced = trace_row(session, outputs[TRACE]) if TRACE in outputs else None
+            own = (
+                last == TRACE and traced is not None and _wants_comparison(session, request, traced, outputs)
+            )
+            trace_id = None if traced is None or own else traced.id
+            dataset.KIND.open(session, outputs[FIT], request.dataset, trace_id, parent=parent)
+        return True
+
+    def stage_opened(self, session: Session, parent: JobRow, child: JobRow) -> None:
+        """Open the training beside a dataset whose episodes are about to be made, where it need not wait for them."""
+        if child.kind != DATASET or child.stage != dataset.WRITING:
+            return
+        request = PipelineCreate.model_validate(parent.config)
+        if request.training.start_share < 1.0:
+            _open_training(session, parent, request, output_of(child))
+
+    def share_done(self, parent: JobRow, children: Sequence[JobRow]) -> float:
+        """How much of the pipeline is done, 0 to 1; a comparison counts until it is known to be left out."""
+        request = PipelineCreate.model_validate(parent.config)
+        kinds = [FIT, DATASET, TRAINING]
+        if request.close_the_loop:
+            kinds.append(TRACE)
+            if request.compare:
+                kinds += [DATASET, TRAINING]
+        done = sum(SHARES[child.kind] * _fraction(child) for child in children)
+        return float(min(1.0, done / sum(SHARES[kind] for kind in kinds)))
+
+
+KIND = PipelineJobs()
+
+
+def model_name_of(scene_name: str) -> str:
+    """A valid model name from a scene's: lower case, other characters become dashes."""
+    plain = re.sub(r"[^a-z0-9._-]+", "-", scene_name.lower()).strip("._-")
+    return plain[:NAME_LENGTH] or "model"
+
+
+def _open_training(session: Session, parent: JobRow, request: PipelineCreate, dataset_id: str) -> None:
+    name = request.model_name or ""
+    asked = TrainingCreate(name=name, dataset_id=dataset_id, config=request.training)
+    training.KIND.open(session, asked, parent=parent)
+
+
+def _wants_comparison(
+    session: Session, request: PipelineCreate, traced: TraceRow, outputs: dict[str, str]
+) -> bool:
+    if not request.compare or not leaves_twin(traced):
+        return False
+    settings = request.dataset.model_dump(mode="json")
+    name = request.model_name or ""
+    return find_baseline(session, name, outputs[FIT], settings, request.training) is None
+
+
+def _has_training(children: Sequence[JobRow], dataset_id: str) -> bool:
+    """Whether one of the jobs is a training on this dataset."""
+    return any(job.kind == TRAINING and job.inputs[0]["id"] == dataset_id for job in children)
+
+
+def _is_comparison(session: Session, children: Sequence[JobRow]) -> bool:
+    """Whether the training that has just ended was the one without the effects that the trace added."""
+    kinds = [job.kind for job in children]
+    if TRACE not in kinds or kinds.count(TRAINING) > 1:
+        return False
+    traced = trace_row(session, output_of(children[kinds.index(TRACE)]))
+    last_dataset = next(job for job in reversed(children) if job.kind == DATASET)
+    return leaves_twin(traced) and all(item["kind"] != "trace" for item in last_dataset.inputs)
+
+
+def _fraction(job: JobRow) -> float:
+    if job.state == "succeeded":
+        return 1.0
+    progress = Progress.model_validate(job.progress)
+    return min(1.0, max(0.0, progress.done / progress.total)) if progress.total > 0 else 0.0

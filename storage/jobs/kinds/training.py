@@ -1,0 +1,139 @@
+"""Trainings: one shard learns a world model from a dataset and publishes it as the next version of a model."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import Field
+from sqlalchemy.orm import Session
+
+from physworld_schemas import queues
+from physworld_schemas.base import Artifact, Reference
+from physworld_schemas.job import Job
+from physworld_schemas.model import TrainingCreate
+from physworld_storage import registry
+from physworld_storage.errors import Conflict, NotFound
+from physworld_storage.jobs.kind import JobKind, ShardKind, ShardResult, output_of, pending_lineage
+from physworld_storage.tables import DatasetRow, JobRow, ShardRow
+
+
+class TrainingResult(ShardResult):
+    """Of a ``training`` shard: ``sha256`` is the digest of the version's manifest."""
+
+    artifacts: list[Artifact]
+    sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
+    metrics: dict[str, Any] = Field(default_factory=dict)
+
+
+def _apply(session: Session, job: JobRow, shard: ShardRow, result: TrainingResult) -> None:
+    name, version = shard.payload["name"], shard.payload["version"]
+    registry.publish(
+        session,
+        name,
+        version,
+        artifacts=result.artifacts,
+        sha256=result.sha256,
+        metrics=result.metrics,
+        lineage=result.lineage,
+    )
+    KIND.fulfil(job, registry.reference_id(name, version), result.sha256)
+
+
+class TrainingJobs(JobKind):
+    """Jobs that train; what they make is a model's version."""
+
+    name = "training"
+    unit = "steps"
+    makes = "model"
+    shards = (
+        ShardKind(
+            "training",
+            queues.TRAINING,
+            "physworld_services.trainer.training:run",
+            TrainingResult,
+            _apply,
+            keeps_scratch=True,
+        ),
+    )
+
+    def open(self, session: Session, request: TrainingCreate, parent: JobRow | None = None) -> JobRow:
+        """The next version of a model. Raises NotFound, or Conflict when the dataset is not sealed.
+
+        With a ``start_share`` below 1 it may still be in the making: the training waits for what it needs.
+        """
+        dataset = _usable(session, request)
+        job = self.queued(
+            session,
+            total=request.config.steps,
+            inputs=[Reference(kind="dataset", id=dataset.id, digest=dataset.digest)],
+            output_id=None,
+            config=request.model_dump(mode="json"),
+            parent=parent,
+        )
+        baseline = registry.baseline_of(session, request.name, dataset, request.config)
+        version = registry.allot_version(
+            session,
+            request.name,
+            config=request.config,
+            job_id=job.id,
+            scene_id=dataset.scene_id,
+            fit_id=dataset.fit_id,
+            trace_id=dataset.trace_id,
+            dataset_id=dataset.id,
+            description=request.description,
+            tags=request.tags,
+        )
+        version.lineage = pending_lineage(job)
+        self.fulfil(job, registry.reference_id(version.name, version.version), None)
+        payload = {
+            "name": version.name,
+            "version": version.version,
+            "dataset_id": dataset.id,
+            "fit_id": dataset.fit_id,
+            "trace_id": dataset.trace_id,
+            "baseline": None if baseline is None else baseline.version,
+            "scene_id": dataset.scene_id,
+            "config": version.config,
+        }
+        return self.begin(session, job, None, payload)
+
+    def fail(self, session: Session, job: JobRow, message: str) -> None:
+        """The version has failed, and says why."""
+        registry.fail_version(session, *_version_of(job), message)
+
+    def reopen(self, session: Session, job: JobRow) -> None:
+        """The version is pending again."""
+        row = registry.version_row(session, *_version_of(job))
+        row.state, row.message = "pending", ""
+
+    def subject(self, job: Job) -> str | None:
+        """The model that it trains."""
+        return str(job.config["name"])
+
+    def path(self, output_id: str) -> str:
+        """Where the API serves the version."""
+        name, _, version = output_id.rpartition(":")
+        return f"models/{name}/versions/{version}"
+
+
+KIND = TrainingJobs()
+
+
+def _version_of(job: JobRow) -> tuple[str, int]:
+    name, _, version = output_of(job).rpartition(":")
+    return name, int(version)
+
+
+def _usable(session: Session, request: TrainingCreate) -> DatasetRow:
+    dataset = session.get(DatasetRow, request.dataset_id)
+    if dataset is None:
+        raise NotFound("dataset", request.dataset_id)
+    streams = request.config.start_share < 1.0
+    if dataset.state != "sealed" and not (streams and dataset.state in {"pending", "writing"}):
+        needed = (
+            "one that is sealed or in the making"
+            if streams
+            else "a sealed dataset (or a start_share below 1)"
+        )
+        raise Conflict(f"dataset {dataset.id} is {dataset.state}; training needs {needed}")
+    return dataset
