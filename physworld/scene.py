@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.geometry.surface_mesh import SurfaceMesh
+from physworld.shapes.surface_mesh import SurfaceMesh
 
 UNDEFORMED_AT_REST = "undeformed"
 AS_MEASURED = "as measured"

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.geometry.surface_mesh import SurfaceMesh
 from physworld.scene import AS_MEASURED, UNDEFORMED_AT_REST, Body, Grip, Ground, Scene
+from physworld.shapes.surface_mesh import SurfaceMesh
 from physworld_scenes.archives import (
     DEFAULT_LIMITS,
     ArchiveLimits,
@@ -39,10 +39,10 @@ from physworld_scenes.colliders import (
     meshes_of,
 )
 from physworld_scenes.declaration import SCHEMA_VERSION, UNDEFORMED_TEXT, parse_json
+from physworld_scenes.errors import SceneInvalid
 from physworld_scenes.meshes import MAX_MESH_BYTES
 from physworld_scenes.validation import check_scene
 from physworld_schemas.base import FieldError
-from physworld_storage.errors import SceneInvalid
 
 JSON_NAME = "scene.json"
 ARRAYS_NAME = "scene.npz"

@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.geometry.surface_mesh import SurfaceMesh
+from physworld.shapes.surface_mesh import SurfaceMesh
 from physworld_scenes.checks_measured import Findings, Measured
 from physworld_scenes.declaration import ColliderForm, Declaration
 from physworld_scenes.meshes import mesh_path_fault

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from physworld.geometry.surface_mesh import SurfaceMesh
 from physworld.scene import DeclaredCollider, Scene
+from physworld.shapes.surface_mesh import SurfaceMesh
 from physworld_scenes.meshes import MeshRefused, mesh_path_fault, read_mesh, write_mesh
 from physworld_schemas.base import FieldError
 

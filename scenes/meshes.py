@@ -9,7 +9,7 @@ import io
 
 import numpy as np
 
-from physworld.geometry.surface_mesh import SurfaceMesh, merged
+from physworld.shapes.surface_mesh import SurfaceMesh, merged
 
 MESH_SUFFIXES = ("stl", "obj", "ply", "off")
 MAX_MESH_BYTES = 32 << 20

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.geometry.surface_mesh import SurfaceMesh
+from physworld.shapes.surface_mesh import SurfaceMesh
 from physworld_scenes.checks_colliders import check_colliders
 from physworld_scenes.checks_declared import (
     check_body,

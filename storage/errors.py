@@ -9,7 +9,6 @@
     │   ├── IdempotencyMismatch   the same Idempotency-Key came with another body
     │   └── KeyEnded              a token whose key was revoked, has expired or was given another token
     ├── InvalidCursor             a ``cursor`` that no list ever gave out
-    ├── SceneInvalid              a scene bundle with faults; ``faults`` are FieldErrors
     ├── ResultInvalid             a shard's result that its kind does not allow
     ├── DatabaseUnavailable       locked, full, unreachable or not migrated; the transaction did not happen
     └── StoreError                the object store
@@ -23,8 +22,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-
-from physworld_schemas.base import FieldError
 
 
 class StorageError(Exception):
@@ -79,16 +76,6 @@ class InvalidCursor(StorageError):
     """A page cursor that cannot be decoded."""
 
     code = "invalid_cursor"
-
-
-class SceneInvalid(StorageError):
-    """A scene bundle with faults: ``faults`` says where and what, each with its numbers."""
-
-    code = "scene_invalid"
-
-    def __init__(self, faults: Sequence[FieldError]) -> None:
-        super().__init__("; ".join(f"{'.'.join(map(str, fault.loc))}: {fault.msg}" for fault in faults))
-        self.faults = list(faults)
 
 
 class ResultInvalid(StorageError):

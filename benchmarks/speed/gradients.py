@@ -18,13 +18,13 @@ import warp as wp
 from benchmarks.harness import Report, run_alone
 from physworld.effects.registry import EFFECTS, effect
 from physworld.engine.gradients.adjoint import Adjoint
-from physworld.engine.gradients.gradient_twin import TwinRun, strength
 from physworld.engine.lattice.lattice import box_lattice
 from physworld.engine.problem import HeldNodes, Problem
 from physworld.engine.total.formulation import TotalLagrangian
 from physworld.materials.laws import SolidLaw
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Ground, Scene
 from physworld.twin.build import build_twin
+from physworld.twin.gradient import TwinRun, strength
 from physworld.twin.grips import softly_held
 from physworld.twin.twin import Twin
 

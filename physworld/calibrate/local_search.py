@@ -16,12 +16,12 @@ import numpy as np
 from scipy.optimize import OptimizeResult, minimize
 
 from physworld.arrays import Array
-from physworld.engine.gradients.gradient_twin import TwinRun
 from physworld.errors import CalibrationError, Cancelled, SimulationError
 from physworld.estimation.journal import Journal
 from physworld.estimation.simulations import Drive, Job, Runner, in_turn
 from physworld.geometry.features import carry_features, part_features
 from physworld.scene import Scene
+from physworld.twin.gradient import TwinRun
 from physworld.twin.properties import together
 from physworld.twin.twin import Twin
 

@@ -8,7 +8,7 @@ is minimised over the training frames is
 
     mean squared error / that of the homogeneous fit + strength * |z|^2
 
-by BFGS with the reverse-mode gradient (:mod:`physworld.engine.gradients.gradient_twin`). The modulus itself outweighs
+by BFGS with the reverse-mode gradient (:mod:`physworld.twin.gradient`). The modulus itself outweighs
 every mode a hundredfold, so the first Hessian is that of Gauss and Newton, from one run a coefficient.
 
 A field of the friction under a body is searched only if the data know it: what they say of its best coefficient, the

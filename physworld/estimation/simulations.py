@@ -24,7 +24,14 @@ from physworld.engine.total.formulation import TotalLagrangian, run_again_if_blo
 from physworld.errors import CFLViolation, SimulationError, WorkerLost
 from physworld.twin.twin import Twin
 
-_ENGINE = ("effects", "engine", "geometry", "materials", "twin")  # and the modules of ``physworld`` itself
+_ENGINE = (
+    "effects",
+    "engine",
+    "geometry",
+    "materials",
+    "shapes",
+    "twin",
+)  # and the modules of ``physworld`` itself
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,10 @@ from physworld.engine.terms.colliders import Collider
 from physworld.engine.terms.colliders_path import RigidPath
 from physworld.engine.terms.contact import ColliderContact, touching
 from physworld.errors import SceneUnsupported
-from physworld.geometry import sdf
 from physworld.geometry.rigid import rigid_motion
-from physworld.geometry.surface_mesh import SurfaceMesh
 from physworld.scene import DeclaredCollider, Scene
+from physworld.shapes import sdf
+from physworld.shapes.surface_mesh import SurfaceMesh
 
 _OVERLAP_SHARE = 0.5  # of a collider's own depth: material that starts deeper is on no side of it
 

@@ -10,10 +10,10 @@ from pathlib import PurePosixPath
 from physworld.scene import Scene
 from physworld_scenes.archives import is_tar, is_zip
 from physworld_scenes.bundle import bundle_from_bytes
+from physworld_scenes.errors import SceneInvalid
 from physworld_scenes.importers import c3d, phystwin
 from physworld_scenes.importers.options import Importer, ImportOptions
 from physworld_schemas.base import FieldError
-from physworld_storage.errors import SceneInvalid
 
 __all__ = ["IMPORTERS", "ImportOptions", "Importer", "import_any"]
 

@@ -27,10 +27,10 @@ from physworld.arrays import Array
 from physworld.scene import Scene
 from physworld_scenes.archives import ArchiveRefused, read_arrays
 from physworld_scenes.bundle import checked, scene_from_parts
+from physworld_scenes.errors import SceneInvalid
 from physworld_scenes.importers.c3d_child import content_of
 from physworld_scenes.importers.options import Importer, ImportOptions, estimate_noise, split_of
 from physworld_schemas.base import FieldError
-from physworld_storage.errors import SceneInvalid
 
 DEFAULT_KIND = "blob"
 CONTROLLER_LABEL = re.compile(r"^(.*:)?(base|clamp|ctrl|control|grip|robot)", re.IGNORECASE)

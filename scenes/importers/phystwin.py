@@ -20,10 +20,10 @@ import numpy as np
 from physworld.arrays import Array
 from physworld.scene import Scene
 from physworld_scenes.bundle import checked, scene_from_parts
+from physworld_scenes.errors import SceneInvalid
 from physworld_scenes.importers.array_pickle import PickleRefused, load_arrays
 from physworld_scenes.importers.options import Importer, ImportOptions, estimate_noise, split_of
 from physworld_schemas.base import FieldError
-from physworld_storage.errors import SceneInvalid
 
 FPS = 30.0
 DEFAULT_KIND = "toy"

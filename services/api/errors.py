@@ -18,6 +18,7 @@ from fastapi.responses import JSONResponse
 from sqlalchemy.exc import DataError
 from starlette.exceptions import HTTPException
 
+from physworld_scenes.errors import SceneInvalid
 from physworld_schemas.base import FieldError, Problem
 from physworld_storage.errors import (
     ArtifactCorrupt,
@@ -27,7 +28,6 @@ from physworld_storage.errors import (
     IdempotencyMismatch,
     InvalidCursor,
     NotFound,
-    SceneInvalid,
     StorageError,
     StoreError,
     StoreFull,
@@ -59,7 +59,6 @@ _STORAGE_STATUS: tuple[tuple[type[StorageError], int], ...] = (
     (IdempotencyMismatch, 422),
     (Conflict, 409),
     (InvalidCursor, 422),
-    (SceneInvalid, 422),
     (DatabaseUnavailable, 503),
     (ArtifactCorrupt, 500),
     (EpisodeCorrupt, 500),
@@ -164,6 +163,7 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_exception_handler(DataError, _unstorable)
     app.add_exception_handler(StorageError, _storage)
+    app.add_exception_handler(SceneInvalid, _scene)
     app.add_exception_handler(Exception, _unexpected)
 
 
@@ -216,8 +216,14 @@ async def _storage(request: Request, error: Exception) -> JSONResponse:
         "idempotency_key_reused" if isinstance(error, IdempotencyMismatch) else error.code,
         error.told,
         request_id=request_id_of(request.scope),
-        errors=error.faults if isinstance(error, SceneInvalid) else (),
         headers={"Retry-After": "2"} if status == 503 else None,
+    )
+
+
+async def _scene(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, SceneInvalid)
+    return problem_response(
+        422, error.code, str(error), request_id=request_id_of(request.scope), errors=error.faults
     )
 
 

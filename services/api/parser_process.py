@@ -27,10 +27,10 @@ import scipy.spatial  # noqa: F401  so that a child need not
 import trimesh  # noqa: F401
 
 from physworld_scenes.bundle import canonical_archive, checked
+from physworld_scenes.errors import SceneInvalid
 from physworld_scenes.importers import ImportOptions, import_any
 from physworld_scenes.importers.c3d import limit_here
 from physworld_schemas.base import FieldError
-from physworld_storage.errors import SceneInvalid
 
 UPLOAD, ARCHIVE, FOUND = "upload", "scene.zip", "found.json"
 MEBIBYTE = 1 << 20

@@ -20,9 +20,9 @@ from typing import Any
 
 import structlog
 
+from physworld_scenes.errors import SceneInvalid
 from physworld_schemas.base import FieldError
 from physworld_services.api.errors import ApiProblem
-from physworld_storage.errors import SceneInvalid
 
 ROOT = Path(__file__).parents[2]
 PASSED_ON = ("PATH", "HOME", "TMPDIR", "LANG", "LC_ALL", "PYTHONPATH", "VIRTUAL_ENV", "LD_LIBRARY_PATH")

@@ -23,7 +23,7 @@ from physworld.engine.terms.colliders_kernels import move_collider, touch_collid
 from physworld.engine.terms.colliders_path import RigidPath
 from physworld.engine.terms.term import BoundTerm
 from physworld.errors import ContactFailed
-from physworld.geometry.sdf import Shape
+from physworld.shapes.sdf import Shape
 
 if TYPE_CHECKING:
     from physworld.engine.problem import Problem

@@ -10,7 +10,7 @@ from __future__ import annotations
 import warp as wp
 
 from physworld.engine.total.node_kernels import weighted_sum
-from physworld.geometry.sdf_kernels import signed_distance
+from physworld.shapes.sdf_kernels import signed_distance
 
 ROUND_OFF_M = 1e-9  # a point that is nearer than this is looked at
 

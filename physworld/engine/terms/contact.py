@@ -25,8 +25,8 @@ from physworld.engine.lattice.lattice import Lattice
 from physworld.engine.terms.colliders import BoundCollider, Collider, ContactSurface
 from physworld.engine.terms.colliders_path import RigidPath
 from physworld.engine.terms.ground import BoundGround
-from physworld.geometry.sdf import half_space
 from physworld.materials.laws import Law, SolidLaw
+from physworld.shapes.sdf import half_space
 
 if TYPE_CHECKING:
     from physworld.engine.problem import Problem

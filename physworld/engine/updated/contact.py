@@ -17,7 +17,7 @@ from physworld.engine.terms.colliders_kernels import move_collider
 from physworld.engine.updated.contact_kernels import find_near, forget_near, press, sift
 from physworld.engine.updated.grid_box import GridLattice
 from physworld.errors import ContactFailed
-from physworld.geometry.sdf_kernels import HALF_SPACE
+from physworld.shapes.sdf_kernels import HALF_SPACE
 
 _SIGHT = 0.5  # cells: particles cross less than that in a substep
 _LEAVING = 0.1  # of its depth that material inside a collider leaves in a substep

@@ -22,7 +22,7 @@ from __future__ import annotations
 import warp as wp
 
 from physworld.engine.terms.colliders_kernels import collider_velocity
-from physworld.geometry.sdf_kernels import SAMPLED, signed_distance
+from physworld.shapes.sdf_kernels import SAMPLED, signed_distance
 
 _SAMPLED = wp.constant(SAMPLED)
 _INSIDE = wp.constant(wp.float64(1.0e-6))  # of a sample's spacing

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from physworld.engine.terms.colliders import Collider
 from physworld.engine.terms.colliders_path import RigidPath
 from physworld.errors import SceneUnsupported
-from physworld.geometry import sdf
+from physworld.shapes import sdf
 
 RNG = np.random.default_rng(3)
 KNOTS = np.array([0.0, 0.1, 0.25, 0.3, 0.5])

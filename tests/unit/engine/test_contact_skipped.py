@@ -14,7 +14,7 @@ from physworld.engine.terms.colliders import Collider, largest_share, reach_of_n
 from physworld.engine.terms.colliders_path import RigidPath
 from physworld.engine.terms.contact import ColliderContact, contact_points
 from physworld.engine.total.formulation import TotalLagrangian
-from physworld.geometry import sdf
+from physworld.shapes import sdf
 
 LAW = SolidLaw(2e5, 0.3, 20.0, 1000.0)
 BLOCK = box_lattice(np.array([-0.05, -0.05, 0.05]), np.array([0.1, 0.1, 0.05]), (4, 4, 2))

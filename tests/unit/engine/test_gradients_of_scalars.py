@@ -14,10 +14,10 @@ from effect_twins import SCENES, TWINS
 
 from physworld.calibrate.parameters import flow_law
 from physworld.effects.registry import EFFECTS, effect
-from physworld.engine.gradients.gradient_twin import TwinRun, parameter, strength
 from physworld.engine.total.formulation import TotalLagrangian
 from physworld.errors import NotDifferentiable
 from physworld.twin.build import build_twin
+from physworld.twin.gradient import TwinRun, parameter, strength
 from physworld.twin.twin import Twin
 
 FRAMES = 3

@@ -14,13 +14,13 @@ import pytest
 from made_scene import box_body, made_scene
 
 from physworld.effects.registry import effect
-from physworld.engine.gradients.gradient_twin import Neighbours, TwinRun, parameter, strength
 from physworld.engine.gradients.soft_grips_derivatives import same_soft_grips
 from physworld.engine.problem import HeldNodes
 from physworld.engine.total.formulation import TotalLagrangian
 from physworld.errors import NotDifferentiable
 from physworld.scene import Grip
 from physworld.twin.build import build_twin
+from physworld.twin.gradient import Neighbours, TwinRun, parameter, strength
 from physworld.twin.twin import Twin
 
 SUBSTEPS, FRAMES = 400, 6

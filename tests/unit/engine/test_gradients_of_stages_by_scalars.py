@@ -18,8 +18,8 @@ sys.path.append(str(Path(__file__).parents[1] / "effects"))
 from effect_twins import SCENES, TWINS
 
 from physworld.effects.registry import effect
-from physworld.engine.gradients.gradient_twin import Neighbours, TwinRun, parameter, strength
 from physworld.engine.total.formulation import TotalLagrangian
+from physworld.twin.gradient import Neighbours, TwinRun, parameter, strength
 from physworld.twin.twin import Twin
 
 FRAMES = 4

@@ -68,10 +68,7 @@ def test_the_updated_form_reports_its_own_damping() -> None:
     assert apic.equivalent_drag_per_s > 0.1 and apic.equivalent_drag_per_s > 2 * asflip.equivalent_drag_per_s
     assert apic.damping_ratio is not None and apic.damping_ratio > 2e-3
     assert apic.lost_share > 10 * SINGLE
-    assert (
-        0 < apic.half_step_m < apic.finer_cells_m
-        and apic.finer_particles > 1.3 * apic.particles
-    )
+    assert 0 < apic.half_step_m < apic.finer_cells_m and apic.finer_particles > 1.3 * apic.particles
 
 
 def test_a_finer_twin_keeps_parameters_and_material_points() -> None:

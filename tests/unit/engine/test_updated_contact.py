@@ -17,8 +17,8 @@ from physworld.engine.terms.contact import ColliderContact, GroundContact
 from physworld.engine.total.formulation import TotalLagrangian
 from physworld.engine.updated.formulation import UpdatedLagrangian
 from physworld.errors import ContactFailed
-from physworld.geometry import sdf
 from physworld.materials.plastic import DruckerPrager, Plasticity, VonMises
+from physworld.shapes import sdf
 
 LAW = SolidLaw(2e5, 0.3, 20.0, 1000.0)
 BLOCK = box_lattice(np.array([-0.05, -0.05, 0.0]), np.array([0.1, 0.1, 0.05]), (4, 4, 2))

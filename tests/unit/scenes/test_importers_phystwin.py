@@ -14,9 +14,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from physworld_scenes.errors import SceneInvalid
 from physworld_scenes.importers import ImportOptions, import_any, phystwin
 from physworld_scenes.importers.array_pickle import PickleRefused, load_arrays
-from physworld_storage.errors import SceneInvalid
 
 FRAMES, POINTS, CONTROLLERS = 20, 40, 30
 
@@ -233,7 +233,7 @@ def test_reading_runs_no_foreign_code_in_a_fresh_interpreter(tmp_path: Any) -> N
     forged.write_bytes(pickle.dumps(Caller(os.system, f"touch {flag}")))
     code = (
         "import sys; from physworld_scenes.importers import phystwin\n"
-        "from physworld_storage.errors import SceneInvalid\n"
+        "from physworld_scenes.errors import SceneInvalid\n"
         "try: phystwin.read(sys.argv[1])\n"
         "except SceneInvalid as error: print(error)"
     )

@@ -27,7 +27,7 @@ from physworld_scenes.archives import (
     write_zip,
 )
 from physworld_scenes.bundle import bundle_from_bytes, read_bundle
-from physworld_storage.errors import SceneInvalid
+from physworld_scenes.errors import SceneInvalid
 
 WANTED = frozenset({"scene.json", "scene.npz"})
 SMALL = ArchiveLimits(total_bytes=50_000, members=5, ratio=20.0, ratio_free_bytes=1_000)

@@ -29,7 +29,7 @@ from physworld_scenes.bundle import (
     validate,
     write_bundle,
 )
-from physworld_storage.errors import SceneInvalid
+from physworld_scenes.errors import SceneInvalid
 
 
 def sound_scene() -> Scene:

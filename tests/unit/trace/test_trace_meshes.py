@@ -14,7 +14,6 @@ from physworld.calibrate import CalibrationConfig
 from physworld.calibrate.parameters import parameters_of
 from physworld.effects.anisotropy import Anisotropy
 from physworld.effects.registry import effect
-from physworld.engine.gradients.gradient_twin import TwinRun
 from physworld.engine.thin.triangles import Mesh, TriangleLattice, mesh_of
 from physworld.errors import BatchRefused, EffectRefused, NotDifferentiable, SceneUnsupported
 from physworld.estimation.simulations import Job
@@ -25,6 +24,7 @@ from physworld.trace.candidates import candidates
 from physworld.trace.recordings import JointSimulations, Recordings
 from physworld.twin.batch import Episode, simulate_batch
 from physworld.twin.build import build_twin
+from physworld.twin.gradient import TwinRun
 from physworld.twin.twin import Twin
 
 SHEET = FlexSheet(frames=16, noise_sigma_m=5e-4, seed=1)

@@ -10,8 +10,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from physworld.errors import SceneUnsupported
-from physworld.geometry.surface_mesh import SurfaceMesh
 from physworld.scene import UNDEFORMED_AT_REST, Body, DeclaredCollider, Ground, Scene
+from physworld.shapes.surface_mesh import SurfaceMesh
 from physworld.twin.build import build_twin
 from physworld.twin.twin import Twin
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from tiny_scene import tiny_scene
 
-from physworld.geometry.sdf import sphere
 from physworld.materials.plastic import DruckerPrager, VonMises
 from physworld.scene import Body, DeclaredCollider, Ground
+from physworld.shapes.sdf import sphere
 from physworld.twin.build import build_twin
 from physworld.twin.colliders import TwinCollider
 from physworld.twin.twin import Twin

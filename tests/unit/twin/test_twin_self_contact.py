@@ -10,7 +10,6 @@ import pytest
 from made_scene import GRAVITY, box_body, made_scene, recorded_by
 
 from physworld.calibrate import CalibrationConfig, calibrate
-from physworld.engine.gradients.gradient_twin import TwinRun
 from physworld.engine.thin.self_contact import SelfContact
 from physworld.engine.total.formulation import TotalLagrangian
 from physworld.errors import NotDifferentiable, SceneUnsupported
@@ -18,6 +17,7 @@ from physworld.evaluate.numerics import free_swing
 from physworld.scene import Body, Ground, Scene
 from physworld.twin.batch import Episode, simulate_batch
 from physworld.twin.build import PRIOR_FRICTION, build_twin
+from physworld.twin.gradient import TwinRun
 from physworld.twin.twin import Twin
 
 LENGTH, RADIUS, FRAMES = 0.6, 0.006, 13

@@ -13,13 +13,13 @@ from scipy.spatial.transform import Rotation
 
 from physworld.calibrate.parameters import parameters_of
 from physworld.effects.registry import effect
-from physworld.engine.gradients.gradient_twin import TwinRun, parameter
 from physworld.engine.thin.twist import BoundTwist, Twist
 from physworld.engine.total.formulation import TotalLagrangian
 from physworld.errors import SceneUnsupported
 from physworld.scene import UNDEFORMED_AT_REST, Body, Scene
 from physworld.twin.batch import Episode, simulate_batch
 from physworld.twin.build import build_twin
+from physworld.twin.gradient import TwinRun, parameter
 from physworld.twin.twin import Twin
 
 LENGTH, ARM = 0.4, 0.02

@@ -2,7 +2,7 @@
 
 Primitives have closed forms; a closed mesh is sampled once on a grid of equal spacing and interpolated trilinearly.
 Its distances are those of the mesh within half the square of the spacing over the radius of curvature, and its edges
-are rounded by about half a spacing. The same functions run on the device (:mod:`physworld.geometry.sdf_kernels`).
+are rounded by about half a spacing. The same functions run on the device (:mod:`physworld.shapes.sdf_kernels`).
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import warp as wp
 
 from physworld.arrays import Array
 from physworld.errors import SceneUnsupported
-from physworld.geometry import sdf_kernels as kernels
-from physworld.geometry.surface_mesh import SurfaceMesh, require_closed
+from physworld.shapes import sdf_kernels as kernels
+from physworld.shapes.surface_mesh import SurfaceMesh, require_closed
 
 _MESH_CELLS = 64  # grid cells along the longest side of a mesh
 _MARGIN_CELLS = 3  # beyond the mesh, plus what the body's thickness asks
@@ -27,7 +27,7 @@ class Shape:
     """A rigid shape.
 
     Attributes:
-        kind: a constant of :mod:`physworld.geometry.sdf_kernels`.
+        kind: a constant of :mod:`physworld.shapes.sdf_kernels`.
         size: its numbers there, (3,).
         inner_m: depth of its deepest inside point [m]; a body that came deeper has come through.
         reach_m: distance of its farthest point from the origin of its frame [m].
@@ -58,7 +58,7 @@ class Shape:
         return gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-30)
 
     def on_device(self, device: str) -> list[Any]:
-        """Leading arguments of :func:`physworld.geometry.sdf_kernels.signed_distance`."""
+        """Leading arguments of :func:`physworld.shapes.sdf_kernels.signed_distance`."""
         return [
             self.kind,
             wp.vec3d(*self.size),

@@ -7,8 +7,8 @@ import pytest
 import trimesh
 
 from physworld.errors import SceneUnsupported
-from physworld.geometry import sdf
-from physworld.geometry.surface_mesh import SurfaceMesh, merged
+from physworld.shapes import sdf
+from physworld.shapes.surface_mesh import SurfaceMesh, merged
 
 CLOUD = np.random.default_rng(0).uniform(-0.3, 0.3, size=(2000, 3))
 SHAPES = {
