@@ -3,6 +3,7 @@
 # make bench               the figures of docs/benchmarks.md
 # make up                  the embedded service in the foreground
 # make lock [UPGRADE=name] write requirements.lock anew; UPGRADE=all moves every package to its newest release
+# make catalogue          schemas/catalogue.json and the tables of it in docs/
 # make sdk                the synchronous half of the SDK, made of the asynchronous one
 # make audit               the SBOM (build/sbom.cdx.json), and known vulnerabilities of the locked packages
 SHELL := /bin/bash
@@ -12,7 +13,7 @@ JOBS ?= 2
 BIN := .venv/bin
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test bench lint up clean install dev sdk lock audit
+.PHONY: demo test bench lint up clean install dev catalogue sdk lock audit
 
 install:
 	@scripts/bootstrap.sh
@@ -39,6 +40,9 @@ test: lint
 bench:
 	@scripts/bootstrap.sh --bench
 	$(BIN)/python -m benchmarks
+
+catalogue: dev
+	$(BIN)/python -m scripts.catalogue
 
 sdk: dev
 	$(BIN)/python scripts/make_sdk.py

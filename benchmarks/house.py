@@ -163,9 +163,9 @@ def _defines(tree: Path, path: str, text: str) -> bool:
 def _touched(tree: Path, layouts: tuple[tuple[str, ...], ...]) -> list[str]:
     """The files of the first layout all of which exist; names in capitals are the new files themselves."""
     for layout in layouts:
-        if all(Path(path).stem.isupper() or (tree / path).is_file() for path in layout):
-            return list(layout)
-    missing = [path for path in layouts[0] if not (tree / path).is_file()]
+        if all(Path(path).stem.isupper() or (tree / path.removeprefix("?")).is_file() for path in layout):
+            return [path for path in layout if not path.startswith("?")]
+    missing = [path for path in layouts[0] if not (tree / path.removeprefix("?")).is_file()]
     raise SystemExit(f"benchmarks/house_lists.py names files that {tree} does not have: {', '.join(missing)}")
 
 

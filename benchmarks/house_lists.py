@@ -46,6 +46,7 @@ def _moved(*paths: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 ADDITIONS = {
     "an effect": (
+        ("?schemas/catalogue.json", "physworld/effects/NEW.py", "physworld/effects/registry.py"),
         *_moved(
             "physworld/effects/NEW.py",
             "physworld/effects/registry.py",
@@ -59,6 +60,7 @@ ADDITIONS = {
         ),
     ),
     "a law of solids": (
+        ("?schemas/catalogue.json", "physworld/materials/NEW.py", "physworld/materials/library.py"),
         *_moved(
             "physworld/materials/NEW.py",
             "physworld/materials/library.py",
@@ -69,6 +71,7 @@ ADDITIONS = {
         ),
     ),
     "an importer": (
+        ("?schemas/catalogue.json", "scenes/importers/NEW.py", "scenes/importers/__init__.py"),
         *_moved(
             "scenes/importers/NEW.py",
             "scenes/importers/__init__.py",
@@ -76,6 +79,7 @@ ADDITIONS = {
         ),
     ),
     "a metric": (
+        ("?schemas/catalogue.json", "physworld/evaluate/metrics.py"),
         *_moved(
             "physworld/evaluate/metrics.py",
             "physworld/evaluate/table.py",
@@ -88,13 +92,21 @@ ADDITIONS = {
         ),
     ),
     "an export format": (
+        (
+            "?schemas/catalogue.json",
+            "clients/python/physworld_client/export/NEW.py",
+            "clients/python/physworld_client/export/__init__.py",
+        ),
         *_moved(
             "clients/python/physworld_client/export/NEW.py",
             "clients/python/physworld_client/export/__init__.py",
             "clients/python/physworld_client/cli/export.py",
         ),
     ),
-    "a read-only route": (*_moved("schemas/NEW.py", "services/api/routes/NEW.py", "services/api/app.py"),),
+    "a read-only route": (
+        ("?schemas/catalogue.json", "schemas/NEW.py", "services/api/routes/NEW.py"),
+        *_moved("schemas/NEW.py", "services/api/routes/NEW.py", "services/api/app.py"),
+    ),
     "a job kind": (
         *_moved(
             "schemas/NEW.py",
@@ -110,6 +122,9 @@ ADDITIONS = {
     ),
 }
 """Files that each kind of addition touches, layouts of the tree from the newest to the oldest.
+
+A file behind a question mark only tells the layout: ``schemas/catalogue.json`` is written by ``make catalogue``, with
+the tables in the docs.
 
 The lists of the old layouts are the files that named a member of the kind (``git grep`` for one effect, one law and so
 on), less what only uses it.
