@@ -1,10 +1,11 @@
 # make demo [SCENE=path]   the main job on a scene, from a fresh machine to the results table
 # make test [JOBS=n]       everything the tests need, then linters and tests in n processes (2)
+# make test-fast           the tests that neither are slow nor need a service, in JOBS processes; no linters
 # make bench               the figures of docs/benchmarks.md
 # make up                  the embedded service in the foreground
 # make lock [UPGRADE=name] write requirements.lock anew; UPGRADE=all moves every package to its newest release
-# make catalogue          schemas/catalogue.json and the tables of it in docs/
-# make sdk                the synchronous half of the SDK, made of the asynchronous one
+# make catalogue           schemas/catalogue.json and the tables of it in docs/
+# make sdk                 the synchronous half of the SDK, made of the asynchronous one
 # make audit               the SBOM (build/sbom.cdx.json), and known vulnerabilities of the locked packages
 SHELL := /bin/bash
 SCENE ?= sample/soft_beam
@@ -13,7 +14,7 @@ JOBS ?= 2
 BIN := .venv/bin
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test bench lint up clean install dev catalogue sdk lock audit
+.PHONY: demo test test-fast bench lint up clean install dev catalogue sdk lock audit
 
 install:
 	@scripts/bootstrap.sh
@@ -32,10 +33,13 @@ lint: dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/bandit --quiet --recursive --configfile pyproject.toml physworld schemas storage workers services clients/python
+	$(BIN)/bandit --quiet --recursive --configfile pyproject.toml physworld scenes schemas storage workers services clients/python
 
 test: lint
 	$(BIN)/python -m pytest --numprocesses=$(JOBS) --dist=loadfile
+
+test-fast: dev
+	$(BIN)/python -m pytest --numprocesses=$(JOBS) --dist=loadfile --durations=10 -m "not slow and not service and not browser"
 
 bench:
 	@scripts/bootstrap.sh --bench

@@ -14,6 +14,18 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+SERVICE_FOLDERS = ("contract/api", "contract/sdk", "recovery", "system")
+"""Of the tests that start a service, or its processes."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what needs a service by the folder in which it lies."""
+    folders = [REPOSITORY / "tests" / name for name in SERVICE_FOLDERS]
+    for item in items:
+        if any(item.path.is_relative_to(folder) for folder in folders):
+            item.add_marker("service")
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _own_configuration(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Signing keys that a test comes to know are forgotten with it, also by the processes that it starts."""

@@ -8,8 +8,9 @@ from typing import Annotated, cast
 from fastapi import Depends, Path, Query, Request
 
 from physworld_services.api.feed import Feed
-from physworld_services.api.security import Principal, address_of
+from physworld_services.api.security import address_of
 from physworld_services.stores import Stores
+from physworld_storage.access.api_keys import ApiKey as Principal
 from physworld_storage.access.audit import Actor
 from physworld_storage.database import Database
 from physworld_storage.settings import Settings

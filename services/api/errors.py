@@ -143,7 +143,8 @@ def answer(problem: ApiProblem, scope: Mapping[str, Any]) -> JSONResponse:
 
 def request_id_of(scope: Mapping[str, Any]) -> str | None:
     """The id that the access log gave this request (``physworld_services.api.access``)."""
-    return scope.get("state", {}).get("request_id")
+    found: str | None = scope.get("state", {}).get("request_id")
+    return found
 
 
 def documented(*statuses: int) -> dict[int | str, dict[str, Any]]:

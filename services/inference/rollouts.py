@@ -54,7 +54,7 @@ class Prepared:
     @property
     def steps(self) -> int:
         """Steps of the model, over all candidates."""
-        return self.controllers.shape[0] * (self.controllers.shape[1] - len(self.history))
+        return int(self.controllers.shape[0]) * (int(self.controllers.shape[1]) - len(self.history))
 
 
 def prepare(request: RolloutCreate, model: PublishedModel) -> Prepared:

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -157,7 +158,7 @@ def _train(
         return _stopping(context, lambda: attempt(None))
 
 
-def _stopping(context: TaskContext, work: Any) -> Any:
+def _stopping(context: TaskContext, work: Callable[[], TrainingResult]) -> TrainingResult:
     """``work()``; a cancellation that it noticed ends the shard as the worker's own does."""
     try:
         return work()

@@ -12,6 +12,8 @@ from physworld.engine.gradients.solid_tangent_kernels import solid_tangent
 from physworld.engine.total.solid_kernels import solid_forces
 from physworld.materials.library import SOLID_LAWS
 
+pytestmark = pytest.mark.slow  # CUDA's compiler, over a hundred kernels
+
 
 def compiles(module: object, folder: Path) -> bool:
     wp.init()

@@ -24,6 +24,8 @@ from physworld.engine.total.stress_kernels import StressModel
 from physworld.materials.plastic import PLASTICITIES
 from physworld.worldmodel.native.messages import EdgeList, mean_messages, mean_messages_torch
 
+pytestmark = pytest.mark.slow  # CUDA's compiler, over a hundred kernels
+
 ARCHITECTURE = 80
 CPU_ONLY = {  # rows of SIMD registers; on other devices torch does the same (``messages``, ``chain_step``)
     "physworld.worldmodel.native.chain_kernels",

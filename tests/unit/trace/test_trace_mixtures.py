@@ -51,6 +51,7 @@ def traced(**strengths: float) -> TraceResult:
     return trace(replace(scene, points=tracks + noise, noise_sigma_m=SIGMA), CONFIG)
 
 
+@pytest.mark.slow
 def test_a_viscosity_that_hides_behind_a_drag_is_found() -> None:
     found = traced(rate_per_s=RATE_PER_S, viscosity_pa_s=VISCOSITY_PA_S)
     assert found.verdict.name == "named"
