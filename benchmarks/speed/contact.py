@@ -21,11 +21,11 @@ from physworld.engine.terms.colliders_path import RigidPath
 from physworld.engine.terms.contact import ColliderContact, GroundContact, contact_surface
 from physworld.engine.total.formulation import TotalLagrangian
 from physworld.engine.total.stability import stable_time_step
-from physworld.materials.laws import SolidLaw
+from physworld.materials.neo_hookean import NeoHookean
 from physworld.shapes import sdf
 
 SIZE_M, CELLS = np.array([0.14, 0.1, 0.07]), (10, 7, 5)
-LAW = SolidLaw(2e4, 0.35, density_kg_m3=400.0)
+LAW = NeoHookean(2e4, 0.35, density_kg_m3=400.0)
 FRICTION, SPEED_M_S = 0.5, 0.5
 TIMES = np.linspace(0.0, 0.5, 16)
 LATTICE = box_lattice(np.zeros(3), SIZE_M, CELLS)

@@ -19,14 +19,17 @@ from benchmarks.verification.cases import GRAVITY, clamped_lattice, gripped, hol
 from physworld.engine.lattice.lattice import Lattice
 from physworld.engine.problem import Problem
 from physworld.engine.total.formulation import Run, TotalLagrangian
-from physworld.materials.laws import Law, RodLaw, SheetLaw, SolidLaw
+from physworld.materials.laws import Law
+from physworld.materials.neo_hookean import NeoHookean
+from physworld.materials.rod import RodLaw
+from physworld.materials.sheet import SheetLaw
 
 SHRINK = (10.0, 30.0, 100.0)
 SECONDS, FRAMES = 0.06, 4
 BODIES: dict[str, tuple[Lattice, Law, str]] = {
     "solid": (
         clamped_lattice(0.3, (0.06, 0.06), (19, 4, 4)),
-        SolidLaw(2e5, 0.3, density_kg_m3=600.0),
+        NeoHookean(2e5, 0.3, density_kg_m3=600.0),
         "viscosity_pa_s",
     ),
     "sheet": (

@@ -21,7 +21,7 @@ from physworld.engine.gradients.adjoint import Adjoint
 from physworld.engine.lattice.lattice import box_lattice
 from physworld.engine.problem import HeldNodes, Problem
 from physworld.engine.total.formulation import TotalLagrangian
-from physworld.materials.laws import SolidLaw
+from physworld.materials.neo_hookean import NeoHookean
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Ground, Scene
 from physworld.twin.build import build_twin
 from physworld.twin.gradient import TwinRun, strength
@@ -300,7 +300,7 @@ def _seconds(work: Callable[[], object]) -> float:
 
 def _bar() -> tuple[Problem, HeldNodes, np.ndarray]:
     lattice = box_lattice(np.zeros(3), np.array([0.25, 0.125, 0.125]), (10, 5, 5))
-    law = SolidLaw(1e5, 0.35, density_kg_m3=1000.0)
+    law = NeoHookean(1e5, 0.35, density_kg_m3=1000.0)
     times = np.arange(FRAMES + 1) / FPS
     rest = lattice.node_coordinates
     nodes = np.unique(lattice.cell_nodes[lattice.cells[:, 0] < 1])

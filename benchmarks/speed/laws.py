@@ -20,9 +20,10 @@ from physworld.engine.gradients.tangent import InternalTangent
 from physworld.engine.lattice.lattice import Lattice, box_lattice
 from physworld.engine.problem import HeldNodes, Problem
 from physworld.engine.total.formulation import TotalLagrangian
-from physworld.materials.laws import Law, RodLaw, SheetLaw
+from physworld.materials.laws import Law
 from physworld.materials.library import SOLID_LAWS
-from physworld.materials.sheet import OrthotropicSheetLaw
+from physworld.materials.rod import RodLaw
+from physworld.materials.sheet import OrthotropicSheetLaw, SheetLaw
 
 SUBSTEPS, PRODUCTS = 80, 8
 DT_SHARE = 0.5  # of the engine's own time step: the cost does not depend on it

@@ -21,7 +21,7 @@ from physworld.engine.problem import Problem
 from physworld.engine.terms.contact import GroundContact
 from physworld.engine.thin.self_contact import BoundSelfContact, SelfContact
 from physworld.engine.total.formulation import TotalLagrangian
-from physworld.materials.laws import RodLaw
+from physworld.materials.rod import RodLaw
 
 ROPE = RodLaw(stretching_n=200.0, bending_n_m2=1e-4, relaxation_s=2e-3, density_kg_m=0.05)
 _WAVE_M_S, _WAVE_LENGTHS = 0.2, 4

@@ -14,7 +14,8 @@ from physworld.engine.terms.contact import GroundContact
 from physworld.engine.thin.self_contact import SelfContact
 from physworld.engine.total.energy import run_with_ledger
 from physworld.engine.total.formulation import Run, TotalLagrangian
-from physworld.materials.laws import RodLaw, SheetLaw
+from physworld.materials.rod import RodLaw
+from physworld.materials.sheet import SheetLaw
 
 G = -float(GRAVITY[2])
 DIAMETER = 0.008

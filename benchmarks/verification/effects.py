@@ -18,7 +18,8 @@ from benchmarks.verification.cases import (
 from physworld.effects.registry import effect
 from physworld.engine.problem import Problem
 from physworld.engine.total.formulation import TotalLagrangian
-from physworld.materials.laws import RodLaw, SolidLaw
+from physworld.materials.neo_hookean import NeoHookean
+from physworld.materials.rod import RodLaw
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Scene
 from physworld.twin.build import build_twin
 from physworld.twin.twin import Twin
@@ -102,7 +103,7 @@ def lag(frames: float) -> float:
 def viscosity(cells: float) -> float:
     """Relative error of the decay of axial vibration under Kelvin-Voigt friction, rate eta omega^2 / E at nu = 0."""
     modulus, eta, length, depth = 2e5, 30.0, 0.3, 0.03
-    law = SolidLaw(modulus, 0.0, viscosity_pa_s=eta, density_kg_m3=600.0)
+    law = NeoHookean(modulus, 0.0, viscosity_pa_s=eta, density_kg_m3=600.0)
     lattice = clamped_lattice(length, (depth, depth), (int(cells), 2, 2), CLAMP_REACH)
     rest = rest_nodes(lattice)
     frequency = 0.5 * np.pi * np.sqrt(modulus / 600.0) / length
@@ -127,7 +128,7 @@ def creeping_viscosity(cells: float) -> float:
 def _pushed_bar(cells: float, eta: float) -> float:
     """Kelvin-Voigt bar at nu = 0: every mode is an oscillator of damping ratio eta omega / E, the first is pushed."""
     modulus, length, depth = 2e5, 0.3, 0.03
-    law = SolidLaw(modulus, 0.0, viscosity_pa_s=eta, density_kg_m3=600.0)
+    law = NeoHookean(modulus, 0.0, viscosity_pa_s=eta, density_kg_m3=600.0)
     lattice = clamped_lattice(length, (depth, depth), (int(cells), 2, 2), CLAMP_REACH)
     rest = rest_nodes(lattice)
     frequency = 0.5 * np.pi * np.sqrt(modulus / 600.0) / length

@@ -25,10 +25,11 @@ from benchmarks.verification.cases import (
     run,
 )
 from benchmarks.verification.solids import SILICONE, SILICONE_SIZE, bending_mode
-from physworld.materials.laws import SolidLaw
+from physworld.materials.neo_hookean import NeoHookean
+from physworld.materials.solid import SolidLaw
 
 SAG_SIZE = (0.2, 0.04, 0.04)
-SAG_LAW = SolidLaw(1.2e5, 0.35, density_kg_m3=1000.0)
+SAG_LAW = NeoHookean(1.2e5, 0.35, density_kg_m3=1000.0)
 _STEPS = 4  # load steps of the peer's Newton iteration
 _TOLERANCE = 1e-9  # of the peer's last Newton step, over the length
 

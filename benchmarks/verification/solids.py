@@ -26,13 +26,14 @@ from physworld.engine.terms.contact import GroundContact
 from physworld.engine.total.energy import run_with_ledger
 from physworld.engine.total.forces import InternalForces
 from physworld.engine.total.formulation import TotalLagrangian
-from physworld.materials.laws import SolidLaw
+from physworld.materials.neo_hookean import NeoHookean
+from physworld.materials.solid import SolidLaw
 
 LENGTH, DEPTH = 0.3, 0.03
-STIFF = SolidLaw(2e6, 0.0, density_kg_m3=600.0)
+STIFF = NeoHookean(2e6, 0.0, density_kg_m3=600.0)
 CLAMPED_FREE = 1.8751040687  # first root of cos x cosh x = -1
 SQUARE_TORSION = 0.1405770  # J / a^4 of a square section (Saint-Venant)
-SILICONE = SolidLaw(
+SILICONE = NeoHookean(
     2.64e5, 0.45, density_kg_m3=1070.0
 )  # the beam of shared/data/real/beam_free_a, as its source fits it
 SILICONE_SIZE = (0.1, 0.03, 0.03)
@@ -41,7 +42,7 @@ SILICONE_SIZE = (0.1, 0.03, 0.03)
 def free_fall(step: float) -> float:
     """Worst distance from the parabola after 0.5 s over the fall, with ``step`` times the default time step."""
     lattice = box_lattice(np.zeros(3), np.full(3, 0.06), (2, 2, 2))
-    law = SolidLaw(1e5, 0.3)
+    law = NeoHookean(1e5, 0.3)
     rest = rest_nodes(lattice)
     velocity = np.tile([0.4, 0.0, 1.0], (len(rest), 1))
     times = np.linspace(0.0, 0.5, 6)
@@ -206,7 +207,7 @@ def rotation_patch(cells: float) -> float:
     rest = rest_nodes(lattice)
     stretch = np.array([[1.2, 0.1, 0.0], [0.1, 0.9, -0.05], [0.0, -0.05, 1.1]])
     deformed = Rotation.from_rotvec([1.1, -2.0, 0.7]).apply(rest @ stretch) + np.array([3.0, -1.0, 2.0])
-    force = internal_forces(lattice, SolidLaw(1e5, 0.35), deformed)
+    force = internal_forces(lattice, NeoHookean(1e5, 0.35), deformed)
     inner = np.bincount(lattice.cell_nodes.ravel(), minlength=len(rest)) == 27
     return float(np.abs(force[inner]).max() / np.abs(force[~inner]).max())
 
@@ -229,7 +230,7 @@ def twist_patch(cells: float) -> float:
         share = sign * angle * rest[:, 0] / length
         turned[:, 1] -= share * arm[:, 2]
         turned[:, 2] += share * arm[:, 1]
-        force += sign * internal_forces(lattice, SolidLaw(1e5, 0.35), turned)
+        force += sign * internal_forces(lattice, NeoHookean(1e5, 0.35), turned)
     inner = np.bincount(lattice.cell_nodes.ravel(), minlength=len(rest)) == 27
     return float(np.abs(force[inner]).max() / np.abs(force[~inner]).max())
 
@@ -244,7 +245,7 @@ def internal_forces(lattice: Lattice, law: SolidLaw, x: np.ndarray) -> np.ndarra
 
 def spin(step: float) -> float:
     """Change of a free body's angular momentum over three turns, over its size, at ``step`` default time steps."""
-    law = SolidLaw(2e5, 0.3)
+    law = NeoHookean(2e5, 0.3)
     lattice = box_lattice(np.full(3, -0.03), np.array([0.12, 0.06, 0.06]), (4, 2, 2))
     rest = rest_nodes(lattice)
     mass = nodal_mass(lattice, law, None)
@@ -264,7 +265,7 @@ def spin(step: float) -> float:
 def sliding_block(cells: float) -> float:
     """Relative error of the way that a sliding block takes to stop, v^2 / 2 mu g."""
     count = int(cells)
-    law = SolidLaw(2e5, 0.3, viscosity_pa_s=20.0, density_kg_m3=500.0)
+    law = NeoHookean(2e5, 0.3, viscosity_pa_s=20.0, density_kg_m3=500.0)
     lattice = box_lattice(
         np.zeros(3), np.array([0.12, 0.12, 0.03]), (2 * count, 2 * count, max(1, count // 2))
     )

@@ -19,7 +19,8 @@ from benchmarks.verification.cases import (
 )
 from benchmarks.verification.solids import CLAMPED_FREE, bending_mode
 from physworld.engine.lattice.lattice import Lattice, box_lattice, lattice_from_cells
-from physworld.materials.laws import RodLaw, SheetLaw
+from physworld.materials.rod import RodLaw
+from physworld.materials.sheet import SheetLaw
 
 LENGTH = 0.3
 ROD = RodLaw(stretching_n=200.0, bending_n_m2=2e-2, density_kg_m=0.05)

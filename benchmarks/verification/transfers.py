@@ -15,11 +15,12 @@ import warp as wp
 
 from benchmarks.harness import Report, run_alone
 from physworld.engine.lattice.lattice import Lattice, box_lattice
-from physworld.engine.problem import Formulation, HeldNodes, Problem
+from physworld.engine.problem import HeldNodes, Problem, Solver
 from physworld.engine.total.formulation import TotalLagrangian
 from physworld.engine.updated.formulation import UpdatedLagrangian
 from physworld.engine.updated.transfer import Apic, Asflip
-from physworld.materials.laws import SolidLaw
+from physworld.materials.neo_hookean import NeoHookean
+from physworld.materials.solid import SolidLaw
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 FRAME_S = 0.005
@@ -47,8 +48,8 @@ class Beam:
         )
 
 
-SILICONE = SolidLaw(264e3, 0.35, density_kg_m3=1070.0)
-FOAM = SolidLaw(9e5, 0.3, density_kg_m3=600.0)
+SILICONE = NeoHookean(264e3, 0.35, density_kg_m3=1070.0)
+FOAM = NeoHookean(9e5, 0.3, density_kg_m3=600.0)
 BEAMS = {
     "silicone, 0.1 m, 10 mm": Beam(0.1, 0.03, (10, 3), SILICONE, 2.0),
     "silicone, 0.1 m, 5 mm": Beam(0.1, 0.03, (20, 6), SILICONE, 1.2),
@@ -112,7 +113,7 @@ def ringing(beam: Beam, make: object) -> dict[str, float]:
     rest, times = lattice.node_coordinates, np.arange(0.0, beam.seconds, FRAME_S)
     gripped = np.unique(lattice.cell_nodes[lattice.cells[:, 0] == 0])
     paths = np.repeat(rest[gripped][None], len(times), axis=0)
-    engine: Formulation = make(Problem(lattice, beam.law, rest, GRAVITY))  # type: ignore[operator]
+    engine: Solver = make(Problem(lattice, beam.law, rest, GRAVITY))  # type: ignore[operator]
     nodes = engine.run(rest, np.zeros_like(rest), HeldNodes(gripped, paths, np.zeros_like(paths)), times)
     row = lattice.interpolation(np.array([[beam.length_m, beam.side_m / 2, beam.side_m / 2]]))
     tip = np.array([(row @ frame)[0, 2] for frame in nodes]) - beam.side_m / 2

@@ -17,7 +17,7 @@ from physworld.engine.lattice.lattice import Lattice, box_lattice
 from physworld.engine.problem import Problem
 from physworld.engine.thin.twist import BoundTwist, Twist, span_between
 from physworld.engine.total.forces import InternalForces
-from physworld.materials.laws import RodLaw
+from physworld.materials.rod import RodLaw
 
 LENGTH = 0.4
 ROD = RodLaw(stretching_n=2e4, bending_n_m2=2e-2, density_kg_m=0.05)

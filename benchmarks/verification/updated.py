@@ -23,7 +23,7 @@ from physworld.engine.terms.contact import GroundContact
 from physworld.engine.updated.energy import run_particles_with_ledger
 from physworld.engine.updated.formulation import UpdatedLagrangian
 from physworld.engine.updated.transfer import Apic, Asflip, Transfer
-from physworld.materials.laws import SolidLaw
+from physworld.materials.neo_hookean import NeoHookean
 
 _RING_S = 0.6
 
@@ -32,7 +32,7 @@ def free_fall(step: float) -> float:
     """Worst distance from the parabola after 0.5 s over the fall, with ``step`` times the default time step."""
     lattice = box_lattice(np.zeros(3), np.full(3, 0.06), (4, 4, 4))
     rest = rest_nodes(lattice)
-    problem = Problem(lattice, SolidLaw(1e5, 0.3), rest, GRAVITY)
+    problem = Problem(lattice, NeoHookean(1e5, 0.3), rest, GRAVITY)
     velocity = np.tile([0.4, 0.0, 1.0], (len(rest), 1))
     times = np.linspace(0.0, 0.5, 6)
     engine = UpdatedLagrangian(problem, step * UpdatedLagrangian(problem).time_step_s)
@@ -45,7 +45,7 @@ def free_fall(step: float) -> float:
 def axial_frequency(cells: float) -> float:
     """Relative error of the first axial frequency of a clamped bar, c / 4 L, nu = 0."""
     count, length, depth = int(cells), 0.3, 0.03
-    law = SolidLaw(2e6, 0.0, density_kg_m3=600.0)
+    law = NeoHookean(2e6, 0.0, density_kg_m3=600.0)
     across = max(2, count // 10)
     lattice = clamped_lattice(length, (depth, depth), (count, across, across), CLAMP_REACH)
     rest = rest_nodes(lattice)
@@ -62,7 +62,7 @@ def axial_frequency(cells: float) -> float:
 def sliding_block(cells: float) -> float:
     """Relative error of the way that a sliding block takes to stop, v^2 / 2 mu g."""
     count = int(cells)
-    law = SolidLaw(2e5, 0.3, viscosity_pa_s=20.0, density_kg_m3=500.0)
+    law = NeoHookean(2e5, 0.3, viscosity_pa_s=20.0, density_kg_m3=500.0)
     lattice = box_lattice(np.zeros(3), np.array([0.12, 0.12, 0.03]), (2 * count, 2 * count, count // 2))
     friction, speed = 0.4, 0.8
     rest = rest_nodes(lattice)
@@ -79,7 +79,7 @@ def momentum(transfer: Transfer, step: float) -> float:
     """Change of a free, ringing bar's momentum over its largest speed times its mass."""
     lattice = box_lattice(np.zeros(3), np.array([0.12, 0.06, 0.06]), (8, 4, 4))
     rest = rest_nodes(lattice)
-    problem = Problem(lattice, SolidLaw(2e5, 0.3), rest, np.zeros(3))
+    problem = Problem(lattice, NeoHookean(2e5, 0.3), rest, np.zeros(3))
     velocity = np.array([0.2, -0.1, 0.3]) + 0.2 * np.sin(60 * rest)
     times = np.array([0.0, 1e-4, 0.3, 0.3001])
     engine = UpdatedLagrangian(problem, step * UpdatedLagrangian(problem).time_step_s, transfer=transfer)

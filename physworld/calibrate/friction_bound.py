@@ -28,7 +28,7 @@ def affordable(scene: Scene, twin: Twin, parameter: Parameter) -> Parameter:
 
     Parameters other than internal friction, and twins of the updated Lagrangian form, keep theirs.
     """
-    if parameter.name not in _NAMES or twin.formulation != "total_lagrangian":
+    if parameter.name not in _NAMES or twin.form.on_particles:
         return parameter
     controls = scene.control_track()
 

@@ -75,7 +75,7 @@ class CalibrationConfig:
         damping: "auto" adds drag and internal friction where the data ask; "none" keeps the declared physics only.
         bending: "auto" frees how a sheet bends where the data ask; "declared" keeps what its thickness says.
         law: name of the elastic law (:mod:`physworld.materials.library`); None for the shape's usual one.
-        formulation: "auto", "total_lagrangian" or "updated_lagrangian": see :mod:`physworld.engine.choose`.
+        formulation: "auto", "total_lagrangian" or "updated_lagrangian": see :mod:`physworld.engine.formulations`.
         transfer: of the updated Lagrangian form, "apic" or "asflip".
         plasticity: name of the flow law (:mod:`physworld.materials.plastic`), whose yield is searched too; None for an
             elastic body.

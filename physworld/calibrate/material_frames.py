@@ -20,7 +20,7 @@ def material_frames(twin: Twin, carriers: Array) -> Array:
     lattice, points = twin.lattice, twin.body.points
     columns = []
     for axis in range(lattice.dim):
-        if twin.formulation == "updated_lagrangian":
+        if twin.form.on_particles:
             step = np.zeros(lattice.dim)
             step[axis] = _BESIDE * lattice.spacing[axis]
             ends = [

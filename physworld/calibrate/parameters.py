@@ -21,7 +21,6 @@ from typing import Literal
 
 import numpy as np
 
-from physworld.materials.laws import RodLaw, SheetLaw, SolidLaw
 from physworld.materials.plastic import (
     PLASTICITIES,
     DruckerPrager,
@@ -30,7 +29,9 @@ from physworld.materials.plastic import (
     StVenantKirchhoff,
     VonMises,
 )
-from physworld.materials.sheet import OrthotropicSheetLaw
+from physworld.materials.rod import RodLaw
+from physworld.materials.sheet import OrthotropicSheetLaw, SheetLaw
+from physworld.materials.solid import SolidLaw
 from physworld.materials.transversely_isotropic import TransverselyIsotropic
 from physworld.twin.twin import Twin
 

@@ -59,15 +59,15 @@ def calibrate_in_stages(
         raise ValueError(f"no stages {stages!r}; there are {get_args(Stages)}")
     if stages != GLOBAL:
         prior = prior_twin(scene, config)
-        form = prior.formulation
+        form = prior.form
         if not prior.lattice.smooth:
             raise SceneUnsupported(
                 f"the local stage needs gradients, which a mesh of {len(prior.lattice.cells)} cells of triangles lacks"
             )
-        if form != "total_lagrangian":
+        if not form.supports("gradients"):
             raise SceneUnsupported(
                 f"the local stage needs the total Lagrangian form, whose runs have a gradient; this body is of the "
-                f"{form.replace('_', ' ')} one"
+                f"{form.title} one"
             )
     fitted = calibrate(scene, config, progress, cancelled, journal, runner)
     if stages == GLOBAL:

@@ -93,7 +93,7 @@ def draw_properties(
     """
     law = None
     rubs = config.sigma_of("friction") > 0.0 and twin.ground_height_m is not None
-    as_field = rubs and twin.formulation == "total_lagrangian"
+    as_field = rubs and twin.form.supports("friction_field")
     named = ("stiffness", "density", "friction") if as_field else ("stiffness", "density")
     if config.perturbation == "p3" and any(config.sigma_of(name) for name in named):
         law = property_field(scene, twin, config)

@@ -23,7 +23,6 @@ from physworld.engine.total.stability import fastest_frequency
 from physworld.engine.updated.stress_kernels import grow_stress
 from physworld.engine.updated.terms import BoundParticleStress, ParticleBody
 from physworld.errors import CFLViolation
-from physworld.materials.laws import friction_law
 
 if TYPE_CHECKING:
     from physworld.twin.twin import Twin
@@ -121,7 +120,7 @@ def _faster(problem: Problem, rate_per_s: float) -> tuple[float, float, float]:
     lattice, mass, cell = problem.lattice, problem.nodal_mass(), float(problem.lattice.spacing.min())
     stiffness = np.ones(lattice.fill.size) if problem.stiffness_factor is None else problem.stiffness_factor
     squares = [0.0, 0.0]  # of the fastest modes of the law and of its friction alone
-    for k, law in enumerate((problem.law, friction_law(problem.law))):
+    for k, law in enumerate((problem.law, problem.law.friction_law)):
         if law is not None:
             forces = InternalForces(lattice, law, stiffness, problem.rest, problem.device)
             squares[k] = fastest_frequency(forces, problem.rest, mass, cell) ** 2

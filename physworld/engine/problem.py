@@ -1,4 +1,4 @@
-"""What a formulation integrates, and what it promises: the interface that both formulations stand behind."""
+"""What a formulation integrates, and what it promises: what both formulations make of it."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ class Problem:
         return mass if self.added_mass is None else mass + self.added_mass
 
 
-class Formulation(Protocol):
-    """One way to integrate a :class:`Problem`; the engine chooses by the scene."""
+class Solver(Protocol):
+    """A :class:`Problem` with a time step: what a formulation makes of it."""
 
     time_step_s: float
 
@@ -75,8 +75,7 @@ class Formulation(Protocol):
 
 def nodal_mass(lattice: Lattice, law: Law, density_factor: Array | None) -> Array:
     """Lumped nodal masses [kg], (n,): rows of the mass matrix summed."""
-    density = {3: "density_kg_m3", 2: "density_kg_m2", 1: "density_kg_m"}[lattice.dim]
-    particle_mass = getattr(law, density) * lattice.particle_measures
+    particle_mass = law.density * lattice.particle_measures
     if density_factor is not None:
         particle_mass = particle_mass * density_factor
     return lattice.lumped(particle_mass)

@@ -20,7 +20,7 @@ from typing import Protocol
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.engine.total.formulation import TotalLagrangian, run_again_if_blown_up
+from physworld.engine.total.formulation import TotalLagrangian
 from physworld.errors import CFLViolation, SimulationError, WorkerLost
 from physworld.twin.twin import Twin
 
@@ -97,23 +97,15 @@ def nodes_of(job: Job, drive: Drive, poll: Callable[[int, int], None] | None = N
     """Carriers (frames, n, 3) [m] of a job. Raises SimulationError."""
     twin = job.twin
     run = twin.integration(drive.control_times, drive.control_points, drive.times[: job.frames])
-    start = twin.body.start
-    if twin.formulation != "total_lagrangian":
-        form = twin.flowing_form(run.problem)
-        if job.step_share != 1.0:
-            form = twin.flowing_form(run.problem, job.step_share * form.time_step_s)
-        solid = form.run_particles(start, run.velocity, run.held, run.knots, poll)
-        return run.at_frames(twin.particles_start, twin.with_empty_particles(form.solid, solid))
-    solver = TotalLagrangian(run.problem)
-    if solver.stage_s < job.least_step_s:
+    solver = twin.solver(run.problem)
+    if not twin.form.on_particles and solver.stage_s < job.least_step_s:
         raise CFLViolation(
             f"{solver.stage_s:.3g} s for an evaluation of the forces is below {job.least_step_s:.3g} s, which a "
             "trace waits for"
         )
     if job.step_share != 1.0:
-        solver = TotalLagrangian(run.problem, job.step_share * solver.time_step_s)
-    nodes = run_again_if_blown_up(solver, start, run.velocity, run.held, run.knots, poll)
-    return run.at_frames(start, nodes)
+        solver = twin.solver(run.problem, job.step_share * solver.time_step_s)
+    return twin.carriers(solver, run, poll)
 
 
 def stage_s(twin: Twin, drive: Drive) -> float:

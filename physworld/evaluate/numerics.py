@@ -21,12 +21,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.engine.total.energy import EnergyLedger, run_with_ledger
-from physworld.engine.total.formulation import TotalLagrangian
-from physworld.engine.updated.energy import ParticleLedger, run_particles_with_ledger
+from physworld.engine.total.energy import EnergyLedger
+from physworld.engine.updated.energy import ParticleLedger
 from physworld.errors import SceneUnsupported, SimulationError
 from physworld.estimation.simulations import Drive, Job, Runner, in_turn
-from physworld.materials.laws import without_friction
 from physworld.scene import Scene
 from physworld.twin.build import build_twin
 from physworld.twin.integration import Integration
@@ -239,7 +237,7 @@ def free_swing(
     """
     silent = replace(
         twin,
-        law=without_friction(twin.law),
+        law=twin.law.without_friction(),
         air_drag_per_s=0.0,
         ground_friction=0.0,
         self_friction=None if twin.self_friction is None else 0.0,
@@ -301,17 +299,9 @@ def _run_with_ledger(
     poll: Poll | None = None,
 ) -> tuple[Array, EnergyLedger | ParticleLedger, float]:
     """Carriers at the frames (T, n, 3), the ledger at the knots, and the largest time step [s]."""
-    start = twin.body.start
-    if twin.formulation == "total_lagrangian":
-        step = time_step_s or TotalLagrangian(run.problem).time_step_s
-        nodes, ledger = run_with_ledger(
-            run.problem, start, velocity, run.held, run.knots, time_step_s=time_step_s, progress=poll
-        )
-        return run.at_frames(start, nodes), ledger, step
-    form = twin.flowing_form(run.problem, time_step_s)
-    solid, account = run_particles_with_ledger(form, start, velocity, run.held, run.knots, poll)
-    carriers = run.at_frames(twin.particles_start, twin.with_empty_particles(form.solid, solid))
-    return carriers, account, form.time_step_s
+    solver, start = twin.solver(run.problem, time_step_s), twin.start_of(velocity)
+    carriers, ledger = twin.form.run_with_ledger(solver, start, run.held, run.knots, poll)
+    return run.at_frames(twin.carriers_start, carriers), ledger, solver.time_step_s
 
 
 def _across(start: Array, gravity: Array) -> Array:

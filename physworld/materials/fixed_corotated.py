@@ -73,4 +73,5 @@ class FixedCorotated(SolidLaw):
         J = np.linalg.det(F)
         stretches = np.linalg.svd(F, compute_uv=False)
         stretches[..., 2] *= np.where(J < 0, -1.0, 1.0)
-        return mu * np.sum((stretches - 1) ** 2, axis=-1) + 0.5 * lam * (J - 1) ** 2
+        energy: Array = mu * np.sum((stretches - 1) ** 2, axis=-1) + 0.5 * lam * (J - 1) ** 2
+        return energy

@@ -12,6 +12,7 @@ from physworld.materials.drucker_prager_elastic import DruckerPragerElastic
 from physworld.materials.fixed_corotated import FixedCorotated
 from physworld.materials.hencky import Hencky
 from physworld.materials.laws import Law
+from physworld.materials.neo_hookean import NeoHookean
 from physworld.materials.rod import RodLaw
 from physworld.materials.sheet import OrthotropicSheetLaw, SheetLaw
 from physworld.materials.solid import SolidLaw
@@ -19,7 +20,7 @@ from physworld.materials.st_venant_kirchhoff import StVenantKirchhoff
 from physworld.materials.transversely_isotropic import TransverselyIsotropic
 
 _BUILT_IN: tuple[type[Law], ...] = (
-    SolidLaw,
+    NeoHookean,
     FixedCorotated,
     StVenantKirchhoff,
     Hencky,
@@ -30,6 +31,7 @@ _BUILT_IN: tuple[type[Law], ...] = (
     RodLaw,
 )
 ELASTIC_LAWS: dict[str, type[Law]] = with_plugins("physworld.laws", Law, {law.name: law for law in _BUILT_IN})
+_OLD_NEO_HOOKEAN = "SolidLaw"  # in archives of version 0.1
 SOLID_LAWS = {name: law for name, law in ELASTIC_LAWS.items() if issubclass(law, SolidLaw)}
 SHEET_LAWS = {name: law for name, law in ELASTIC_LAWS.items() if issubclass(law, SheetLaw)}
 ROD_LAWS = {name: law for name, law in ELASTIC_LAWS.items() if issubclass(law, RodLaw)}
@@ -45,7 +47,9 @@ def law_class(name: str, dimension: int) -> type[Law]:
         ValueError: there is no such law; the message lists those of that dimension.
     """
     laws = {name: law for name, law in ELASTIC_LAWS.items() if law.dimension == dimension}
-    name = {law.__name__: key for key, law in laws.items()}.get(name, name)
+    name = {_OLD_NEO_HOOKEAN: NeoHookean.name, **{law.__name__: key for key, law in laws.items()}}.get(
+        name, name
+    )
     if name not in laws:
         raise ValueError(f"no law {name!r} for a body of dimension {dimension}; there are {sorted(laws)}")
     return laws[name]

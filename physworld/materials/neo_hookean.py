@@ -8,9 +8,13 @@ The default for rubber, foam and soft toys: the energy is infinite at J = 0, so 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import ClassVar
+
 import numpy as np
 
 from physworld.arrays import Array
+from physworld.materials.solid import SolidLaw
 from physworld.materials.stress import Stress
 
 STRESS = Stress(
@@ -30,3 +34,18 @@ def energy_density(F: Array, mu: float, lam: float) -> Array:
     log_j = np.log(np.where(J > 0, J, 1.0))
     W = 0.5 * mu * (np.sum(F**2, axis=(-2, -1)) - 3 - 2 * log_j) + 0.5 * lam * log_j**2
     return np.where(J > 0, W, np.inf)
+
+
+@dataclass(frozen=True)
+class NeoHookean(SolidLaw):
+    """Compressible neo-Hookean solid: see the module's text."""
+
+    name: ClassVar[str] = "neo_hookean"
+    title: ClassVar[str] = "Compressible neo-Hookean solid"
+    equation: ClassVar[str] = "W = mu/2 (tr C - 3 - 2 ln J) + lambda/2 (ln J)^2"
+    use: ClassVar[str] = "rubber, foam, soft toys; the default"
+    stress: ClassVar[Stress] = STRESS
+
+    def energy_density(self, F: Array) -> Array:
+        """Stored energy [J/m^3] of deformation gradients (..., 3, 3), without the stiffness field's factor."""
+        return energy_density(F, *self.lame)

@@ -8,17 +8,18 @@ held at both (Bergou et al. 2008): there GJ = ``torsion_ratio`` EI counts, as :m
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
 import numpy as np
 
 from physworld.arrays import Array
 from physworld.catalogue import Quantity
+from physworld.materials.laws import Law
 
 
 @dataclass(frozen=True)
-class RodLaw:
+class RodLaw(Law):
     """Rope or rod, straight at rest; the density is per length.
 
     The default of ``torsion_ratio``, 1 / (1 + nu), is that of a round section with nu = 0.3. It counts where grips
@@ -26,6 +27,8 @@ class RodLaw:
     """
 
     dimension: ClassVar[int] = 1
+    friction_name: ClassVar[str] = "relaxation_s"
+    strain_orders: ClassVar[tuple[tuple[int, ...], ...]] = ((1,), (2,))
 
     name: ClassVar[str] = "rod"
     title: ClassVar[str] = "Rope or rod, straight at rest"
@@ -41,6 +44,11 @@ class RodLaw:
     )
 
     @property
+    def density(self) -> float:
+        """Mass per length [kg/m]."""
+        return self.density_kg_m
+
+    @property
     def torsion_n_m2(self) -> float:
         """GJ, torsional stiffness [N m^2]."""
         return self.torsion_ratio * self.bending_n_m2
@@ -50,9 +58,49 @@ class RodLaw:
         """Speed of stretch waves [m/s]."""
         return float(np.sqrt(self.stretching_n / self.density_kg_m))
 
+    @property
+    def columns(self) -> dict[str, float]:
+        """EA [N], B [N m^2] and the relaxation time [s]."""
+        return {
+            "stretching": self.stretching_n,
+            "bending": self.bending_n_m2,
+            "relaxation": self.relaxation_s,
+        }
+
+    @property
+    def stiffness_columns(self) -> tuple[int, ...]:
+        """EA and B: the friction is in theirs."""
+        return 0, 1
+
+    @property
+    def shape(self) -> tuple[tuple[float, ...], ...]:
+        """Nothing beside the columns."""
+        return ()
+
+    @property
+    def friction_law(self) -> Law | None:
+        """The friction of bending; a rod's stretch has none."""
+        if self.relaxation_s == 0:
+            return None
+        return replace(
+            self, stretching_n=0.0, bending_n_m2=self.relaxation_s * self.bending_n_m2, relaxation_s=0.0
+        )
+
+    def contact_stiffness(self, cell_m: float) -> tuple[float, float]:
+        """Of the body's fastest waves over a cell of ``cell_m``, in all directions."""
+        rate = self.wave_speed_m_s / cell_m
+        return self.density * rate**2, self.density * rate**2
+
+    def energy_of(self, derivatives: Array) -> Array:
+        """Stored energy [J/m] of first and second derivatives of the centre line, (..., 2, 3)."""
+        return self.energy_density(*rod_strains(derivatives))
+
     def energy_density(self, strain: Array, curvature: Array) -> Array:
         """Stored energy [J/m] of strains |x'| - 1, (...), and curvature vectors [1/m], (..., 3)."""
-        return 0.5 * self.stretching_n * strain**2 + 0.5 * self.bending_n_m2 * np.sum(curvature**2, axis=-1)
+        energy: Array = 0.5 * self.stretching_n * strain**2 + 0.5 * self.bending_n_m2 * np.sum(
+            curvature**2, axis=-1
+        )
+        return energy
 
 
 def rod_strains(derivatives: Array) -> tuple[Array, Array]:

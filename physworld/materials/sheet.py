@@ -11,17 +11,18 @@ isotropic sheet has all five at 1.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
 import numpy as np
 
 from physworld.arrays import Array
 from physworld.catalogue import Quantity
+from physworld.materials.laws import Law
 
 
 @dataclass(frozen=True)
-class SheetLaw:
+class SheetLaw(Law):
     """Thin sheet, the same along both axes; isotropic unless the shape of its bending energy says otherwise.
 
     A homogeneous plate has ``bending_twist_ratio`` 1, a mesh of triangles whose edges bend like hinges about 3.
@@ -30,6 +31,8 @@ class SheetLaw:
     """
 
     dimension: ClassVar[int] = 2
+    friction_name: ClassVar[str] = "relaxation_s"
+    strain_orders: ClassVar[tuple[tuple[int, ...], ...]] = ((1, 0), (0, 1), (2, 0), (0, 2), (1, 1))
 
     name: ClassVar[str] = "isotropic_sheet"
     title: ClassVar[str] = "Thin isotropic sheet, flat at rest"
@@ -59,10 +62,49 @@ class SheetLaw:
         return 1.0, 1.0, nu * self.bending_coupling, (1.0 - nu) * self.bending_twist_ratio
 
     @property
+    def density(self) -> float:
+        """Mass per area [kg/m^2]."""
+        return self.density_kg_m2
+
+    @property
     def wave_speed_m_s(self) -> float:
         """Speed of the fastest in-plane waves [m/s]."""
         stiffest = max(self.membrane_shape[:2])
         return float(np.sqrt(self.membrane_n_m * stiffest / self.density_kg_m2))
+
+    @property
+    def columns(self) -> dict[str, float]:
+        """K [N/m], D [N m] and the relaxation time [s]."""
+        return {"membrane": self.membrane_n_m, "bending": self.bending_n_m, "relaxation": self.relaxation_s}
+
+    @property
+    def stiffness_columns(self) -> tuple[int, ...]:
+        """K and D: the friction is in theirs."""
+        return 0, 1
+
+    @property
+    def shape(self) -> tuple[tuple[float, ...], ...]:
+        """The shapes of the membrane's and of the bending energy."""
+        return self.membrane_shape, self.bending_shape
+
+    @property
+    def friction_law(self) -> Law | None:
+        """The friction of stretch and bending."""
+        tau = self.relaxation_s
+        if tau == 0:
+            return None
+        return replace(
+            self, membrane_n_m=tau * self.membrane_n_m, bending_n_m=tau * self.bending_n_m, relaxation_s=0.0
+        )
+
+    def contact_stiffness(self, cell_m: float) -> tuple[float, float]:
+        """Of the body's fastest waves over a cell of ``cell_m``, in all directions."""
+        rate = self.wave_speed_m_s / cell_m
+        return self.density * rate**2, self.density * rate**2
+
+    def energy_of(self, derivatives: Array) -> Array:
+        """Stored energy [J/m^2] of derivatives of the surface by :attr:`strain_orders`, (..., 5, 3)."""
+        return self.energy_density(*sheet_strains(derivatives))
 
     def energy_density(self, strain: Array, curvature: Array) -> Array:
         """Stored energy [J/m^2] of strains (e11, e22, e12) and curvatures (k11, k22, k12) [1/m], both (..., 3)."""

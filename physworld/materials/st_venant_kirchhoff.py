@@ -55,4 +55,5 @@ class StVenantKirchhoff(SolidLaw):
         """Stored energy [J/m^3] of deformation gradients (..., 3, 3)."""
         mu, lam = self.lame
         E = 0.5 * (np.swapaxes(F, -1, -2) @ F - np.eye(3))
-        return mu * np.sum(E**2, axis=(-2, -1)) + 0.5 * lam * np.trace(E, axis1=-2, axis2=-1) ** 2
+        energy: Array = mu * np.sum(E**2, axis=(-2, -1)) + 0.5 * lam * np.trace(E, axis1=-2, axis2=-1) ** 2
+        return energy

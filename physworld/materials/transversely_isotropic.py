@@ -75,4 +75,7 @@ class TransverselyIsotropic(SolidLaw):
     def energy_density(self, F: Array) -> Array:
         """Stored energy [J/m^3] of deformation gradients (..., 3, 3); infinite where J <= 0."""
         stretched = np.sum((F @ np.array(self.numbers)) ** 2, axis=-1)
-        return super().energy_density(F) + self.fibre_modulus_pa / 8 * (stretched - 1) ** 2
+        energy: Array = (
+            neo_hookean.energy_density(F, *self.lame) + self.fibre_modulus_pa / 8 * (stretched - 1) ** 2
+        )
+        return energy

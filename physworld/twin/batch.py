@@ -76,7 +76,7 @@ def simulate_batch(
             their clock or what a law must share (:class:`physworld.engine.total.forces.ForcesSideBySide`).
         CFLViolation: the forced time step exceeds the stable limit of one of them.
     """
-    if twin.formulation != "total_lagrangian":
+    if not twin.form.supports("batches"):
         raise BatchRefused(
             f"{len(episodes)} episodes of the updated Lagrangian form: its bodies would meet on one grid"
         )

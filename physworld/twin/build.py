@@ -7,16 +7,20 @@ from dataclasses import replace
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.engine.choose import choose_formulation
+from physworld.engine.formulations import Formulation, choose_formulation
 from physworld.engine.thin.self_contact import COARSE, apart_m, refuse_thickness
 from physworld.engine.thin.triangles import Mesh
 from physworld.engine.updated.transfer import TRANSFERS, Apic
 from physworld.errors import SceneUnsupported
+from physworld.geometry.body import ReferenceBody
 from physworld.geometry.declared import grips_of
-from physworld.geometry.reference import ReferenceBody, reference_body
+from physworld.geometry.reference import reference_body
 from physworld.geometry.rigid import rigid_groups
-from physworld.materials.laws import Law, RodLaw, SheetLaw, SolidLaw
+from physworld.materials.laws import Law
+from physworld.materials.neo_hookean import NeoHookean
 from physworld.materials.plastic import Plasticity
+from physworld.materials.rod import RodLaw
+from physworld.materials.sheet import SheetLaw
 from physworld.scene import AS_MEASURED, Scene
 from physworld.twin.colliders import carried, twin_colliders
 from physworld.twin.grips import declared_region, gripped_nodes, why_no_turn
@@ -61,8 +65,8 @@ def build_twin(
         raise ValueError(f"no transfer is called {transfer!r}; there are {sorted(TRANSFERS)}")
     body = reference_body(scene, particle_budget, refinement, mesh)
     choice = choose_formulation(body.lattice.dim, scene.declared, plasticity, formulation)
-    taken_form = f"{choice.formulation.replace('_', ' ')} form: {choice.reason}"
-    if choice.formulation == "updated_lagrangian":
+    taken_form = f"{choice.formulation.title} form: {choice.reason}"
+    if choice.formulation.on_particles:
         taken_form += f"; transfers by {transfer}"
     body = replace(body, notes=(*body.notes, taken_form))
     _, controls = scene.control_track()
@@ -101,7 +105,7 @@ def build_twin(
         colliders=twin_colliders(scene, body.half_thickness_m, PRIOR_FRICTION),
         self_friction=self_friction,
         plasticity=plasticity,
-        formulation=choice.formulation,
+        formulation=choice.formulation.name,
         transfer=transfer,
         device=device,
     )
@@ -130,7 +134,7 @@ def _turning(
 
 
 def _touching_itself(
-    scene: Scene, body: ReferenceBody, formulation: str
+    scene: Scene, body: ReferenceBody, formulation: Formulation
 ) -> tuple[float | None, tuple[str, ...]]:
     """Friction of a rope or sheet against itself where its scene declares that it touches itself, and notes on that.
 
@@ -141,7 +145,7 @@ def _touching_itself(
     if not declared.get("self_contact"):
         return None, ()
     if body.lattice.dim == 3:
-        if formulation == "updated_lagrangian":
+        if formulation.on_particles:
             return None, ()
         return None, (
             "it is declared to touch itself, and passes through itself: a solid in the total Lagrangian form",
@@ -181,7 +185,7 @@ def _prior_law(scene: Scene, body: ReferenceBody) -> Law:
         density = PRIOR_DENSITY_KG_M3 * section
     modulus = 1e5
     if lattice.dim == 3:
-        return SolidLaw(youngs_modulus_pa=modulus, density_kg_m3=density)
+        return NeoHookean(youngs_modulus_pa=modulus, density_kg_m3=density)
     if lattice.dim == 2:
         membrane = modulus * section / (1 - 0.3**2)
         return SheetLaw(membrane, membrane * section**2 / 12, density_kg_m2=density)

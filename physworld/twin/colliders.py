@@ -93,7 +93,8 @@ def carried(scene: Scene) -> Array:
 
 def to_parts(colliders: tuple[TwinCollider, ...]) -> tuple[list[dict[str, Any]], dict[str, Array]]:
     """Facts fit for JSON and arrays fit for an npz; :func:`from_parts` is the inverse."""
-    facts, arrays = [], {}
+    facts: list[dict[str, Any]] = []
+    arrays: dict[str, Array] = {}
     for number, collider in enumerate(colliders):
         declared = collider.declared
         plain = asdict(replace(declared, mesh=None))
@@ -173,4 +174,5 @@ def _shape(declared: DeclaredCollider, margin_m: float) -> sdf.Shape:
 
 
 def _rotations(quaternions_wxyz: Array) -> Array:
-    return Rotation.from_quat(quaternions_wxyz, scalar_first=True).as_matrix()
+    matrices: Array = Rotation.from_quat(quaternions_wxyz, scalar_first=True).as_matrix()
+    return matrices

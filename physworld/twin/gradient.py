@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import sparse
 
 from physworld.arrays import Array
 from physworld.engine.gradients.adjoint import MEMORY_MB, Adjoint
@@ -90,7 +91,7 @@ class TwinRun:
         Raises:
             NotDifferentiable: also for a twin of the updated Lagrangian form, or a mesh of triangles.
         """
-        if twin.formulation != "total_lagrangian":
+        if not twin.form.supports("gradients"):
             raise NotDifferentiable(
                 "a run of the updated Lagrangian form has no gradient: fit by simulations alone"
             )
@@ -154,7 +155,7 @@ def nodes_bar(twin: Twin, nodes: Array, tracks_bar: Array) -> Array:
 
     def shifted() -> Array:
         if lattice.dim == 2:
-            normal = np.cross(*slopes)
+            normal = np.cross(slopes[0], slopes[1])
             return body.offsets * normal / np.linalg.norm(normal, axis=-1, keepdims=True)
         return np.einsum("tnij,nj->tni", least_rotation(start[None], slopes[0]), body.offsets)
 
@@ -170,9 +171,9 @@ def nodes_bar(twin: Twin, nodes: Array, tracks_bar: Array) -> Array:
     return found
 
 
-def _apply(row: object, nodes: Array) -> Array:
-    return np.stack([row @ frame for frame in nodes])  # type: ignore[operator]
+def _apply(row: sparse.csr_matrix, nodes: Array) -> Array:
+    return np.stack([row @ frame for frame in nodes])
 
 
-def _transposed(row: object, values: Array) -> Array:
-    return np.stack([row.T @ frame for frame in values])  # type: ignore[attr-defined]
+def _transposed(row: sparse.csr_matrix, values: Array) -> Array:
+    return np.stack([row.T @ frame for frame in values])

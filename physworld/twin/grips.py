@@ -20,7 +20,6 @@ from physworld.engine.thin.twist import Twist, span_between
 from physworld.errors import SceneUnsupported
 from physworld.geometry.body import ReferenceBody
 from physworld.geometry.rigid import rigid_motion
-from physworld.materials.rod import RodLaw
 from physworld.scene import Grip
 
 if TYPE_CHECKING:
@@ -44,13 +43,13 @@ def gripped_nodes(body: ReferenceBody, controllers: Array, grip: Grip | None) ->
     particles = lattice.interpolation(lattice.particle_coordinates) @ body.start
     slack, tie = 1e-6, 1e-9
     radius = None if grip is None else grip.radius_m
-    declared = grip is not None and grip.region_min_m is not None
-    if declared and lattice.dim == 3 and np.any(grip.region_max_m <= grip.region_min_m):
-        return _bonded_nodes(body, grip)
+    region = None if grip is None else _region(grip)
+    if region is not None and lattice.dim == 3 and np.any(region[1] <= region[0]):
+        return _bonded_nodes(body, region)
     if radius is not None:
         inside = _within(body, particles, controllers, radius)
-    elif declared:
-        low, high = np.asarray(grip.region_min_m) - slack, np.asarray(grip.region_max_m) + slack
+    elif region is not None:
+        low, high = region[0] - slack, region[1] + slack
         inside = _through(body, particles, low, high)
     else:
         nearest = lattice.particle_coordinates[_nearest(particles, controllers)]
@@ -62,7 +61,7 @@ def gripped_nodes(body: ReferenceBody, controllers: Array, grip: Grip | None) ->
     share = (inside.reshape(lattice.fill.shape) * lattice.fill).sum(axis=1) / np.where(
         material > 0, material, 1.0
     )
-    most = share > 0.5 + tie if declared or radius is not None else share >= 0.5 - tie
+    most = share > 0.5 + tie if region is not None or radius is not None else share >= 0.5 - tie
     cells = most if np.any(most) else share > 0
     if not np.any(cells):
         cells = np.zeros(len(lattice.cells), dtype=bool)
@@ -79,7 +78,8 @@ def _through(body: ReferenceBody, particles: Array, low: Array, high: Array) -> 
     lattice = body.lattice
     if lattice.dim != 2:
         margin = 0.5 * body.thickness_m if lattice.dim == 1 else 0.0
-        return np.all((particles >= low - margin) & (particles <= high + margin), axis=1)
+        inside: Array = np.all((particles >= low - margin) & (particles <= high + margin), axis=1)
+        return inside
     along, across = (
         lattice.interpolation(lattice.particle_coordinates, orders) @ body.start
         for orders in ((1, 0), (0, 1))
@@ -96,7 +96,8 @@ def _through(body: ReferenceBody, particles: Array, low: Array, high: Array) -> 
     ends = np.where(flat, np.array([-np.inf, np.inf])[:, None, None], ends)
     first = np.maximum(ends.min(axis=0).max(axis=1), -body.half_thickness_m)
     last = np.minimum(ends.max(axis=0).min(axis=1), body.half_thickness_m)
-    return (first <= last) & ~outside.any(axis=1)
+    through: Array = (first <= last) & ~outside.any(axis=1)
+    return through
 
 
 def _within(body: ReferenceBody, particles: Array, controllers: Array, radius_m: float) -> Array:
@@ -114,15 +115,21 @@ def _within(body: ReferenceBody, particles: Array, controllers: Array, radius_m:
             f"a grip holds material within {radius_m:.4g} m of its {len(controllers)} controllers; the nearest is "
             f"{nearest:.4g} m away"
         )
-    return distance <= max(radius_m, nearest)
+    within: Array = distance <= max(radius_m, nearest)
+    return within
 
 
 def declared_region(grip: Grip | None, dim: int) -> Array | None:
     """The box that a grip of a solid holds at the start, (2, 3) [m]; None where none with a depth is declared."""
-    if dim != 3 or grip is None or grip.region_min_m is None:
+    box = None if dim != 3 or grip is None else _region(grip)
+    return box if box is not None and np.all(box[1] > box[0]) else None
+
+
+def _region(grip: Grip) -> Array | None:
+    """The declared box, (2, 3) [m], or None."""
+    if grip.region_min_m is None or grip.region_max_m is None:
         return None
-    box = np.array([grip.region_min_m, grip.region_max_m], dtype=float)
-    return box if np.all(box[1] > box[0]) else None
+    return np.array([grip.region_min_m, grip.region_max_m], dtype=float)
 
 
 def softly_held(twin: Twin) -> Twin:
@@ -133,14 +140,14 @@ def softly_held(twin: Twin) -> Twin:
     """
     regions = [region for region in twin.grip_regions if region is not None]
     parts = any(holds_a_part(twin.lattice, twin.body.start, region) for region in regions)
-    if not parts or twin.formulation != "total_lagrangian" or twin.grip_softness > 0:
+    if not parts or not twin.form.supports("soft_grips") or twin.grip_softness > 0:
         return twin
     return replace(twin, grip_softness=AS_HELD)
 
 
 def soft_regions(twin: Twin) -> list[Array]:
     """Boxes (2, 3) [m] that soft grips hold; none where all gripped nodes are prescribed."""
-    if twin.grip_softness <= 0 or twin.formulation != "total_lagrangian":
+    if twin.grip_softness <= 0 or not twin.form.supports("soft_grips"):
         return []
     return [region for region in twin.grip_regions if region is not None]
 
@@ -193,7 +200,7 @@ def why_no_turn(body: ReferenceBody, nodes: Array, points: Array, noise_sigma_m:
 def twist_between_grips(twin: Twin, times: Array, controls: Array) -> tuple[Term, ...]:
     """Twist of a rope's spans between the grips that show a turn, at ``times`` (T,) under ``controls`` (T, K, 3)."""
     turning = [g for g in twin.turning if len(twin.held_nodes[g])]
-    if len(turning) < 2 or not isinstance(twin.law, RodLaw) or twin.law.torsion_n_m2 == 0:
+    if len(turning) < 2 or twin.law.torsion_n_m2 == 0:
         return ()
     extents = {g: _extent(twin.body, twin.held_nodes[g]) for g in turning}
     turning.sort(key=lambda g: sum(extents[g]))
@@ -219,13 +226,14 @@ def _extent(body: ReferenceBody, nodes: Array) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _bonded_nodes(body: ReferenceBody, grip: Grip) -> Array:
+def _bonded_nodes(body: ReferenceBody, region: Array) -> Array:
     """The two layers of nodes whose splines fix an end face: of a grip without depth."""
-    axis = int(np.argmin(grip.region_max_m - grip.region_min_m))
+    axis = int(np.argmin(region[1] - region[0]))
     lattice = body.lattice
-    distance = np.abs(lattice.node_coordinates[:, axis] - grip.region_min_m[axis]) / lattice.spacing[axis]
+    distance = np.abs(lattice.node_coordinates[:, axis] - region[0, axis]) / lattice.spacing[axis]
     return np.flatnonzero(distance < 1.0)
 
 
 def _nearest(particles: Array, targets: Array) -> Array:
-    return np.argmin(np.linalg.norm(targets[:, None] - particles[None], axis=2), axis=1)
+    nearest: Array = np.argmin(np.linalg.norm(targets[:, None] - particles[None], axis=2), axis=1)
+    return nearest

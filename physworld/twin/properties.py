@@ -39,4 +39,5 @@ def carried(field: Array | None, sources: Array, targets: Array) -> Array | None
     distance, near = cKDTree(sources).query(targets, k=min(_NEIGHBOURS, len(sources)))
     distance, near = distance.reshape(len(targets), -1), near.reshape(len(targets), -1)
     weight = 1.0 / np.maximum(distance, 1e-9 * max(float(distance.max()), 1e-12)) ** 2
-    return np.einsum("qn,qnk->qk", weight / weight.sum(axis=1, keepdims=True), field[near])
+    moved: Array = np.einsum("qn,qnk->qk", weight / weight.sum(axis=1, keepdims=True), field[near])
+    return moved

@@ -3,7 +3,7 @@
 A twin is immutable; :meth:`Twin.with_parameters` gives a changed one. Positions go in and out in world coordinates
 [m]; a twin's *particles* are the quadrature points of its lattice, and its *tracked points* are the measured points of
 the scene followed as material points. What a simulation returns are its *carriers*: the nodes of the lattice in the
-total Lagrangian form, the particles in the updated one (:mod:`physworld.engine.choose` says which is taken);
+total Lagrangian form, the particles in the updated one (:mod:`physworld.engine.formulations` says which is taken);
 :meth:`particles_at`, :meth:`track_nodes` and :meth:`observe` read either.
 """
 
@@ -21,7 +21,7 @@ from scipy.sparse.linalg import splu
 from physworld.arrays import Array
 from physworld.effects.base import Effect
 from physworld.effects.registry import in_order
-from physworld.engine.choose import FormulationName
+from physworld.engine.formulations import FORMULATIONS, Formulation, Start
 from physworld.engine.lattice.following import follow
 from physworld.engine.lattice.lattice import Lattice
 from physworld.engine.problem import Problem
@@ -29,9 +29,7 @@ from physworld.engine.terms.contact import GroundContact, ground, touching
 from physworld.engine.terms.soft_grips import soften
 from physworld.engine.terms.term import Term
 from physworld.engine.thin.self_contact import SelfContact
-from physworld.engine.total.formulation import TotalLagrangian, run_again_if_blown_up
-from physworld.engine.updated.formulation import UpdatedLagrangian
-from physworld.engine.updated.transfer import TRANSFERS, Apic
+from physworld.engine.updated.transfer import Apic
 from physworld.errors import EffectRefused, SceneUnsupported
 from physworld.geometry.body import ReferenceBody, applied, material_tracks
 from physworld.materials.laws import Law
@@ -71,7 +69,7 @@ class Twin:
         colliders: rigid bodies that push, still, on their own track or carried by controllers.
         self_friction: Coulomb's coefficient of a rope or sheet against itself; None: it passes through itself.
         plasticity: flow law, or None; updated Lagrangian only.
-        formulation: which form integrates the body.
+        formulation: name of the form that integrates the body; :attr:`form` is the form itself.
         transfer: how particles and grid exchange velocities, "apic" or "asflip"; updated Lagrangian only.
         properties: the fields of the local stage, or None: log factors of stiffness and density, (P, 2), or with the
             ground's friction (P, 3), under everything that a run is given.
@@ -95,7 +93,7 @@ class Twin:
     colliders: tuple[TwinCollider, ...] = ()
     self_friction: float | None = None
     plasticity: Plasticity | None = None
-    formulation: FormulationName = "total_lagrangian"
+    formulation: str = "total_lagrangian"
     transfer: str = Apic.name
     properties: Array | None = None
     device: str = "cpu"
@@ -105,6 +103,11 @@ class Twin:
         """The reference lattice."""
         return self.body.lattice
 
+    @property
+    def form(self) -> Formulation:
+        """The form that integrates the body."""
+        return FORMULATIONS[self.formulation]
+
     @cached_property
     def _particle_rows(self) -> Any:
         return self.lattice.interpolation(self.lattice.particle_coordinates)
@@ -112,12 +115,14 @@ class Twin:
     @property
     def particles_rest(self) -> Array:
         """Particles of the body without stress [m], (P, 3)."""
-        return self._particle_rows @ self.body.rest
+        particles: Array = self._particle_rows @ self.body.rest
+        return particles
 
     @property
     def particles_start(self) -> Array:
         """Particles at the first frame [m], (P, 3)."""
-        return self._particle_rows @ self.body.start
+        particles: Array = self._particle_rows @ self.body.start
+        return particles
 
     @property
     def particle_mass(self) -> Array:
@@ -127,9 +132,7 @@ class Twin:
     @property
     def density(self) -> float:
         """Mass per volume, area or length [kg/m**d]."""
-        return float(
-            getattr(self.law, {3: "density_kg_m3", 2: "density_kg_m2", 1: "density_kg_m"}[self.lattice.dim])
-        )
+        return self.law.density
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -151,11 +154,13 @@ class Twin:
         unknown = set(values) - law_names - own - flow_names
         if unknown:
             raise KeyError(f"unknown parameters {sorted(unknown)}; this twin has {sorted(self.parameters)}")
-        law = replace(self.law, **{k: float(v) for k, v in values.items() if k in law_names})
+        own_values: dict[str, Any] = {k: float(v) for k, v in values.items() if k in own}
+        law_values: dict[str, Any] = {k: float(v) for k, v in values.items() if k in law_names}
+        flow_values: dict[str, Any] = {k: float(v) for k, v in values.items() if k in flow_names}
+        law = replace(self.law, **law_values)
         flow = self.plasticity
         if flow is not None:
-            flow = replace(flow, **{k: float(v) for k, v in values.items() if k in flow_names})
-        own_values = {k: float(v) for k, v in values.items() if k in own}
+            flow = replace(flow, **flow_values)
         return replace(self, law=law, plasticity=flow, **own_values)
 
     def with_effect(self, added: Effect) -> Twin:
@@ -224,31 +229,28 @@ class Twin:
         run = self.integration(
             control_times, control_points, frame_times, properties=properties, from_rest=from_rest
         )
-        start = self.body.start
-        if self.formulation == "total_lagrangian":
-            solver = TotalLagrangian(run.problem)
-            nodes = run_again_if_blown_up(solver, start, run.velocity, run.held, run.knots, progress)
-            return run.at_frames(start, nodes)
-        form = self.flowing_form(run.problem)
-        solid = form.run_particles(start, run.velocity, run.held, run.knots, progress)
-        return run.at_frames(self.particles_start, self.with_empty_particles(form.solid, solid))
+        return self.carriers(self.solver(run.problem), run, progress)
 
-    def flowing_form(self, problem: Problem, time_step_s: float | None = None) -> UpdatedLagrangian:
-        """The updated Lagrangian form of a problem with the twin's transfer and flow law; see there for errors."""
-        transfer = TRANSFERS[self.transfer]()
-        return UpdatedLagrangian(problem, time_step_s, transfer=transfer, plasticity=self.plasticity)
+    def solver(self, problem: Problem, time_step_s: float | None = None) -> Any:
+        """A problem as this twin's form, transfer and flow law integrate it.
 
-    def with_empty_particles(self, numbers: Array, solid: Array) -> Array:
-        """All particles (T, P, 3) from those with material, their ``numbers`` and paths (T, len(numbers), 3).
-
-        Where there is no material they go along with what is near.
+        Raises what :meth:`physworld.engine.formulations.Formulation.solver` does.
         """
-        particles = np.empty((len(solid), len(self.particles_start), 3))
-        particles[:, numbers] = solid
-        empty = np.setdiff1d(np.arange(particles.shape[1]), numbers)
-        if len(empty):
-            particles[:, empty] = follow(self.particles_start[empty], solid)
-        return particles
+        return self.form.solver(problem, time_step_s, self.transfer, self.plasticity)
+
+    def carriers(self, solver: Any, run: Integration, progress: Progress | None = None) -> Array:
+        """Carriers (T, n, 3) [m] at the frames of a run that a solver of this twin integrates. May raise."""
+        carriers = self.form.run(solver, self.start_of(run.velocity), run.held, run.knots, progress)
+        return run.at_frames(self.carriers_start, carriers)
+
+    def start_of(self, velocity: Array) -> Start:
+        """The first frame with nodal velocities (n, 3) [m/s]."""
+        return Start(self.body.start, velocity, self.particles_start)
+
+    @property
+    def carriers_start(self) -> Array:
+        """Carriers at the first frame [m], (n, 3)."""
+        return self.particles_start if self.form.on_particles else self.body.start
 
     def integration(
         self,
@@ -305,14 +307,14 @@ class Twin:
 
     def particles_at(self, nodes: Array) -> Array:
         """Particles (T, P, 3) of the carriers' trajectories (T, n, 3)."""
-        if self.formulation == "updated_lagrangian":
+        if self.form.on_particles:
             return nodes
         return applied(self._particle_rows, nodes)
 
     def track_nodes(self, nodes: Array) -> Array:
         """Tracked points (T, N, 3) of the carriers' trajectories (T, n, 3), from the first frame on."""
         body, lattice = self.body, self.lattice
-        if self.formulation == "updated_lagrangian":
+        if self.form.on_particles:
             material = lattice.particle_measures > 0
             return follow(lattice.interpolation(body.points) @ body.start, nodes[:, material])
         return material_tracks(body, nodes)
@@ -338,7 +340,7 @@ class Twin:
         Where a body is one cell thick its particles do not fix the nodes: the smoothest of them are taken. In the
         updated Lagrangian form the particles are the carriers, and the first frame must be the start.
         """
-        if self.formulation == "updated_lagrangian":
+        if self.form.on_particles:
             return self.track_nodes(np.asarray(particles, dtype=float))
         rows, bends = self._particle_rows, self.lattice.second_differences()
         factor = splu((rows.T @ rows + _SMOOTHING * bends.T @ bends).tocsc())
@@ -377,7 +379,7 @@ class Twin:
     def _friction_factor(self, properties: Array | None) -> Array | None:
         if properties is None or properties.shape[1] < 3:
             return None
-        if self.ground_height_m is None or self.formulation == "updated_lagrangian":
+        if self.ground_height_m is None or not self.form.supports("friction_field"):
             raise SceneUnsupported(
                 f"a field of the ground's friction over {len(properties)} particles needs a ground and the total "
                 f"Lagrangian form; here the ground is at {self.ground_height_m} and the form {self.formulation}"

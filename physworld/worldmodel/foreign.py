@@ -154,8 +154,7 @@ def start_mismatch(recording: Scene, twin: Twin) -> float:
     seen = recording.visible[0]
     if not seen.any():
         return 0.0
-    carriers = twin.body.start if twin.formulation == "total_lagrangian" else twin.particles_start
-    points = twin.track_nodes(carriers[None])[0]
+    points = twin.track_nodes(twin.carriers_start[None])[0]
     return float(np.sqrt(np.mean(np.sum((points - recording.points[0])[seen] ** 2, axis=-1))))
 
 

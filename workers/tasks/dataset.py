@@ -161,7 +161,7 @@ def _made(
     """Arrays and attributes of episode ``index``, alone or as one of its block."""
     seed = config.seed % 2**63
     width = WIDTHS[twin.device.partition(":")[0]]
-    alone = twin.formulation != "total_lagrangian" or not twin.lattice.smooth
+    alone = not twin.form.supports("batches") or not twin.lattice.smooth
     if width == 1 or alone or demonstration.strengths:
         return make_episode(scene, twin, demonstration, derived_seed(seed, index), progress)
     first = index - index % width

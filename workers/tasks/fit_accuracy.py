@@ -98,7 +98,7 @@ def _measured(
 
 def _not_extrapolated(fitted: FitResult) -> str:
     """Why there are no numbers with cells of no size, empty where there are."""
-    if fitted.twin.formulation != "total_lagrangian":
+    if fitted.twin.form.on_particles:
         return "converged: numbers with cells of no size are found in the total Lagrangian form"
     if fitted.cut_short:
         return "converged: the budget of simulations cut the search short, there is no optimum to extrapolate"

@@ -127,7 +127,7 @@ def _local_record(local: LocalResult | None) -> dict[str, Any] | None:
 
 def _formulation_reason(fitted: FitResult) -> str:
     """The note in which the body says why it is integrated that way."""
-    start = fitted.twin.formulation.replace("_", " ")
+    start = fitted.twin.form.title
     return next((note for note in fitted.twin.body.notes if note.startswith(start)), "")
 
 

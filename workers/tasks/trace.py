@@ -17,7 +17,7 @@ import numpy as np
 from physworld.calibrate import CalibrationConfig
 from physworld.calibrate.parameters import bending_ratio
 from physworld.engine.thin.triangles import Mesh
-from physworld.materials.laws import SheetLaw
+from physworld.materials.sheet import SheetLaw
 from physworld.trace import TraceConfig, trace
 from physworld.twin.twin import Twin
 from physworld_schemas.base import Reference

@@ -170,23 +170,11 @@ class RecordedRun:
         self.history.numpy()[row] = self._run.v.numpy()
 
 
-class _Recorder:
+class _Recorder(BoundTerm):
     """The last of the terms: adds no force, keeps velocities, memories and, where friction has stages, forces."""
-
-    frequency_rad_s = 0.0
-    friction_per_s = 0.0
 
     def bind(self, problem: Problem) -> _Recorder:
         return self
-
-    def begin(self, times: Array) -> None:
-        return None
-
-    def pace(self, time_step_s: float) -> None:
-        return None
-
-    def check(self, time_s: float) -> None:
-        return None
 
     def prepare(
         self, history: wp.array, forces: wp.array | None, offset: wp.array, memories: list[Memory]

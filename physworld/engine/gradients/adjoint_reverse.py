@@ -41,7 +41,6 @@ from physworld.engine.terms.soft_grips import BoundSoftGrips
 from physworld.engine.terms.term import BoundTerm
 from physworld.engine.thin.twist import BoundTwist
 from physworld.engine.total.stress import BoundStress
-from physworld.materials.laws import friction_law
 
 if TYPE_CHECKING:
     from physworld.engine.gradients.adjoint import RecordedRun
@@ -124,7 +123,7 @@ class ReversePass:
         stiffness = np.ones(problem.lattice.fill.size) if stiffness is None else stiffness
         self._tangent = InternalTangent(problem.lattice, problem.law, stiffness, problem.rest, device)
         self._law_bar = zeros(self._tangent.particles * len(self._tangent.parameters))
-        self._viscous = friction_law(problem.law) is not None
+        self._viscous = problem.law.friction_law is not None
         terms = solver.terms[:-1]
         self._multiplier = terms[0] if terms and getattr(terms[0], "multiplies", False) else None
         soft = terms[-1] if terms and isinstance(terms[-1], BoundSoftGrips) else None
@@ -317,10 +316,11 @@ class ReversePass:
         )
 
     def _by_log_friction(self) -> Array | None:
-        found = None
+        found: Array | None = None
         for bound, term in zip(self._solver.terms, self._terms, strict=False):
             if isinstance(bound, BoundGround) and isinstance(term, RecordedAdjoint):
-                share = bound.by_log_factor(term.differentiated_bar.numpy())
+                assert term.differentiated_bar is not None
+                share: Array = bound.by_log_factor(term.differentiated_bar.numpy())
                 found = share if found is None else found + share
         return found
 
@@ -328,8 +328,7 @@ class ReversePass:
 def _by_log_density(problem: Problem, mass_bar: Array) -> Array:
     """Derivatives by the log densities of the particles, (P,), from those by the nodal masses (n,)."""
     lattice = problem.lattice
-    name = {3: "density_kg_m3", 2: "density_kg_m2", 1: "density_kg_m"}[lattice.dim]
-    particle_mass = getattr(problem.law, name) * lattice.particle_measures
+    particle_mass = problem.law.density * lattice.particle_measures
     if problem.density_factor is not None:
         particle_mass = particle_mass * problem.density_factor
     weights = lattice.table((0,) * lattice.dim)

@@ -23,7 +23,7 @@ import warp as wp
 
 
 @wp.func
-def stage_step(clock: wp.array[wp.float64], counter: wp.array[wp.int32]):
+def stage_step(clock: wp.array[wp.float64], counter: wp.array[wp.int32]) -> wp.float64:
     """Time that the stages take [s]: a run's first are half a step."""
     if counter[0] == 0 and counter[1] == 0:
         return wp.float64(0.5) * clock[2]

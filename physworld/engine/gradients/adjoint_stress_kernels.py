@@ -236,7 +236,7 @@ def stress_adjoint(model: StressModel) -> Any:
         x_bar: wp.array[wp.float64],
         parameters_bar: wp.array[wp.float64],
         fields_bar: wp.array[wp.float64],
-    ): ...
+    ) -> None: ...
 
     @wp.kernel(module="unique", enable_backward=False)
     def adjoint(

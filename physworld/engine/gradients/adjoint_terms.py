@@ -28,12 +28,6 @@ from physworld.engine.terms.term import BoundTerm
 from physworld.engine.total.stress import BoundStress
 from physworld.errors import NotDifferentiable
 
-_DERIVATIVES = {
-    3: np.eye(3, dtype=int).tolist(),
-    2: [(1, 0), (0, 1), (2, 0), (0, 2), (1, 1)],
-    1: [(1,), (2,)],
-}
-
 
 @dataclass(frozen=True)
 class Reverse:
@@ -183,12 +177,10 @@ class StressAdjoint:
 
     def __init__(self, term: BoundStress, problem: Problem, memories: list[Memory]) -> None:
         lattice, device = problem.lattice, problem.device
-        orders = _DERIVATIVES[lattice.dim]
-        scale = np.ones(3) if lattice.dim == 3 else None
         tables = []
-        for order in orders:
-            size = 1.0 if scale is not None else np.prod(lattice.spacing ** np.array(order))
-            tables.append(lattice.table(tuple(order)) / size)
+        for order in problem.law.strain_orders:
+            size = 1.0 if lattice.dim == 3 else np.prod(lattice.spacing ** np.array(order))
+            tables.append(lattice.table(order) / size)
 
         def array(values: Any) -> wp.array:
             return wp.array(

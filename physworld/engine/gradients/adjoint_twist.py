@@ -29,7 +29,8 @@ class TwistAdjoint:
     @property
     def log_stiffness(self) -> Array:
         """Derivatives by the logarithms of the particles' stiffness, (P,): their sum is that by GJ's logarithm."""
-        return self._by_log_stiffness.numpy() @ self._term.shares
+        slopes: Array = self._by_log_stiffness.numpy() @ self._term.shares
+        return slopes
 
     def take_back(self, now: Reverse) -> None:
         """Add the products to ``now.x_bar``."""

@@ -30,7 +30,6 @@ from physworld.engine.total.forces import InternalForces
 from physworld.engine.total.friction import FrictionForces
 from physworld.engine.total.stress import BoundStress
 from physworld.errors import NotDifferentiable
-from physworld.materials.laws import Law, SheetLaw, SolidLaw, friction_law, without_friction
 
 
 class Setting(Protocol):
@@ -99,15 +98,15 @@ class _Comparison:
         if launched:
             self._by_columns = False
         if launched and not grows and terms and _multiplies(terms[0]):
-            sides = tuple(
-                ((0, p.terms[0].bind(p)), *side) for p, side in zip((high, low), sides, strict=True)
+            sides = (
+                ((0, high.terms[0].bind(high)), *sides[0]),
+                ((0, low.terms[0].bind(low)), *sides[1]),
             )
-        self.pair = None
+        self.pair: ForcePair | None = None
         springs = self._springs(terms)
         if launched or any(sides) or springs is not None:
             self.pair = ForcePair(
-                *(_side(p, own, launched, relaxed) for p, own in zip((high, low), sides, strict=True)),
-                springs,
+                _side(high, sides[0], launched, relaxed), _side(low, sides[1], launched, relaxed), springs
             )
 
     def _springs(self, terms: tuple[BoundTerm, ...]) -> SoftGripsChange | None:
@@ -131,8 +130,8 @@ class _Comparison:
         if g.soft_grips is not None:
             total += g.soft_grips.along(*(grips.held for grips in self._soft))
         if self._by_columns:
-            base = _numbers(self._base.law)
-            change = np.array(_numbers(p.law)) - np.array(_numbers(q.law))
+            base = self._base.law.columns.values()
+            change = np.array([*p.law.columns.values()]) - np.array([*q.law.columns.values()])
             for column, value, step in zip(g.law.T, base, change, strict=True):
                 if step != 0.0:
                     total += float(column.sum()) * step / value
@@ -220,9 +219,9 @@ def _side(
         return ForceSide(None, terms)
     if not relaxed:
         return ForceSide(internal_forces(problem), terms)
-    calm = replace(problem, law=without_friction(problem.law))
+    calm = replace(problem, law=problem.law.without_friction())
     friction = None
-    if friction_law(problem.law) is not None:
+    if problem.law.friction_law is not None:
         factor = _factor(problem)
         friction = FrictionForces(problem.lattice, problem.law, factor, problem.rest, problem.device)
     return ForceSide(internal_forces(calm), terms, friction)
@@ -233,22 +232,6 @@ def internal_forces(problem: Problem) -> InternalForces:
     return InternalForces(problem.lattice, problem.law, _factor(problem), problem.rest, problem.device)
 
 
-def _numbers(law: Law) -> tuple[float, ...]:
-    """Numbers of the columns of :attr:`physworld.engine.gradients.adjoint.Gradient.law`."""
-    if isinstance(law, SolidLaw):
-        return (*law.moduli, law.viscosity_pa_s)
-    if isinstance(law, SheetLaw):
-        return law.membrane_n_m, law.bending_n_m, law.relaxation_s
-    return law.stretching_n, law.bending_n_m2, law.relaxation_s
-
-
-def _shape(law: Law) -> tuple[Any, ...]:
-    """What the columns do not cover."""
-    if isinstance(law, SolidLaw):
-        return (law.numbers,)
-    return (law.membrane_shape, law.bending_shape) if isinstance(law, SheetLaw) else ()
-
-
 def _same_lattice(one: Problem, two: Problem) -> bool:
     a, b = one.lattice, two.lattice
     return a is b or (np.array_equal(a.spacing, b.spacing) and np.array_equal(one.rest, two.rest))
@@ -256,20 +239,19 @@ def _same_lattice(one: Problem, two: Problem) -> bool:
 
 def _moduli_alone_differ(base: Problem, high: Problem, low: Problem) -> bool:
     """Whether internal forces differ by moduli, friction and stiffness field alone, all of them open in the run."""
-    if not (_same_lattice(high, low) and _shape(high.law) == _shape(low.law) == _shape(base.law)):
+    if not (_same_lattice(high, low) and high.law.shape == low.law.shape == base.law.shape):
         return False
-    values = zip(_numbers(base.law), _numbers(high.law), _numbers(low.law), strict=True)
+    values = zip(*(p.law.columns.values() for p in (base, high, low)), strict=True)
     return all(a == b or known != 0.0 for known, a, b in values)
 
 
 def same_internal_forces(high: Problem, low: Problem) -> bool:
     """Whether two problems have the same internal forces."""
-    factors = [_factor(p) for p in (high, low)]
     return (
         _same_lattice(high, low)
-        and _numbers(high.law) == _numbers(low.law)
-        and _shape(high.law) == _shape(low.law)
-        and np.array_equal(*factors)
+        and high.law.columns == low.law.columns
+        and high.law.shape == low.law.shape
+        and np.array_equal(_factor(high), _factor(low))
     )
 
 

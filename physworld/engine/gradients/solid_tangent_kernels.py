@@ -169,7 +169,7 @@ def solid_tangent(stress: Stress, moduli: int) -> wp.Kernel:
         out: wp.array[wp.float64],
         out_previous: wp.array[wp.float64],
         parameter_out: wp.array[wp.float64],
-    ): ...
+    ) -> None: ...
 
     @wp.kernel(module=f"physworld_solid_tangent_{stress.name}", enable_backward=False)
     def tangent(

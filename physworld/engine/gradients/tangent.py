@@ -10,6 +10,9 @@ from positions: nothing is remembered between calls.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import warp as wp
 
 from physworld.arrays import Array
@@ -17,7 +20,13 @@ from physworld.engine.gradients.solid_tangent_kernels import solid_tangent
 from physworld.engine.gradients.thin_tangent_kernels import rod_tangent, sheet_tangent
 from physworld.engine.lattice.lattice import Lattice
 from physworld.engine.total.forces import model_inputs
-from physworld.materials.laws import Law, SheetLaw, SolidLaw
+from physworld.materials.laws import Law
+
+_KERNELS: dict[int, Callable[[Any], wp.Kernel]] = {
+    3: lambda law: solid_tangent(law.stress, len(law.moduli)),
+    2: lambda law: sheet_tangent,
+    1: lambda law: rod_tangent,
+}
 
 
 class InternalTangent:
@@ -37,15 +46,8 @@ class InternalTangent:
         self.particles = lattice.fill.size
         self._cells = len(lattice.cells)
         *self._model, self._viscous = model_inputs(lattice, law, stiffness_factor, rest, device)
-        if isinstance(law, SolidLaw):
-            self._kernel = solid_tangent(law.stress, len(law.moduli))
-            self.parameters = ("mu", "lambda", *law.further_moduli, "viscosity")
-            self.stiffness_columns = tuple(range(len(self.parameters)))
-        else:
-            sheet = isinstance(law, SheetLaw)
-            self._kernel = sheet_tangent if sheet else rod_tangent
-            self.parameters = ("membrane" if sheet else "stretching", "bending", "relaxation")
-            self.stiffness_columns = (0, 1)
+        self._kernel = _KERNELS[lattice.dim](law)
+        self.parameters, self.stiffness_columns = tuple(law.columns), law.stiffness_columns
         self._still = wp.zeros(3, dtype=wp.float64, device=device)
         self._nothing = wp.zeros(1, dtype=wp.float64, device=device)
 

@@ -188,7 +188,7 @@ def sheet_cell(
     out: wp.array[wp.float64],
     out_previous: wp.array[wp.float64],
     parameter_out: wp.array[wp.float64],
-): ...
+) -> None: ...
 
 
 @wp.kernel(enable_backward=False)
@@ -239,7 +239,7 @@ def rod_cell(
     out: wp.array[wp.float64],
     out_previous: wp.array[wp.float64],
     parameter_out: wp.array[wp.float64],
-): ...
+) -> None: ...
 
 
 @wp.kernel(enable_backward=False)

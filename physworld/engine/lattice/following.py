@@ -77,4 +77,5 @@ def _rotation(A: Array) -> Array:
     U, _, Vt = np.linalg.svd(A)
     flip = np.ones((len(A), 3))
     flip[:, 2] = np.linalg.det(U @ Vt)
-    return (U * flip[:, None, :]) @ Vt
+    nearest: Array = (U * flip[:, None, :]) @ Vt
+    return nearest

@@ -43,23 +43,28 @@ class Lattice:
     @property
     def dim(self) -> int:
         """1 for a rod, 2 for a sheet, 3 for a solid."""
-        return self.cells.shape[1]
+        return int(self.cells.shape[1])
 
     @property
     def node_coordinates(self) -> Array:
         """Reference coordinates of the nodes [m], (n, d)."""
-        return self.origin + (self.nodes + 0.5) * self.spacing
+        coordinates: Array = self.origin + (self.nodes + 0.5) * self.spacing
+        return coordinates
 
     @property
     def particle_coordinates(self) -> Array:
         """Reference coordinates of the particles [m], (C * 2**d, d), a cell's particles side by side."""
         local = gauss_points(self.dim)
-        return (self.origin + (self.cells[:, None, :] + local[None]) * self.spacing).reshape(-1, self.dim)
+        coordinates: Array = (self.origin + (self.cells[:, None, :] + local[None]) * self.spacing).reshape(
+            -1, self.dim
+        )
+        return coordinates
 
     @property
     def particle_measures(self) -> Array:
         """Length, area or volume that each particle stands for [m**d], (C * 2**d,)."""
-        return (self.fill * (np.prod(self.spacing) / 2**self.dim)).reshape(-1)
+        measures: Array = (self.fill * (np.prod(self.spacing) / 2**self.dim)).reshape(-1)
+        return measures
 
     def lumped(self, particle_mass: Array) -> Array:
         """Lumped nodal masses [kg], (n,), of particles (P,): rows of the mass matrix summed."""
@@ -113,7 +118,8 @@ class Lattice:
     def outside(self, coordinates: Array) -> Array:
         """Distance of material ``coordinates`` (M, d) from the nearest cell that holds material [m], (M,)."""
         _, local = self._locate(np.asarray(coordinates, dtype=float).reshape(-1, self.dim))
-        return np.linalg.norm((local - np.clip(local, 0.0, 1.0)) * self.spacing, axis=1)
+        distance: Array = np.linalg.norm((local - np.clip(local, 0.0, 1.0)) * self.spacing, axis=1)
+        return distance
 
     def _locate(self, coordinates: Array) -> tuple[Array, Array]:
         """Nearest cell (by distance to its box, among the nearest centres) and local coordinates there."""

@@ -153,7 +153,8 @@ class BoundCollider(BoundTerm):
     @property
     def impulse_n_s(self) -> Array:
         """What the collider gave to the body since the start of the last run [N s], (3,)."""
-        return self._totals.numpy()[:3]
+        impulse: Array = self._totals.numpy()[:3]
+        return impulse
 
     @property
     def deepest_m(self) -> float:
@@ -249,4 +250,5 @@ def reach_of_nodes(matrix: sparse.csr_matrix) -> Array:
     weights = abs(matrix)
     share = np.minimum(1.0, weights.max(axis=0).toarray().reshape(-1) / _LIGHT)
     bearing = np.divide(1.0, share, out=np.zeros_like(share), where=share > 0)
-    return share * float((weights @ bearing).max(initial=0.0))
+    factors: Array = share * float((weights @ bearing).max(initial=0.0))
+    return factors

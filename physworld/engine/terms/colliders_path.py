@@ -56,7 +56,8 @@ class RigidPath:
         """At the knots, (F, 3) [m/s]."""
         if len(self.times) == 1:
             return np.zeros((1, 3))
-        return PchipInterpolator(self.times, self.positions, axis=0).derivative()(self.times)
+        velocities: Array = PchipInterpolator(self.times, self.positions, axis=0).derivative()(self.times)
+        return velocities
 
     @cached_property
     def turns(self) -> Array:
@@ -71,7 +72,8 @@ class RigidPath:
             return np.zeros((1, 3))
         rates = self.turns / np.diff(self.times)[:, None]
         ends = np.concatenate([rates[:1], rates, rates[-1:]])
-        return 0.5 * (ends[:-1] + ends[1:])
+        velocities: Array = 0.5 * (ends[:-1] + ends[1:])
+        return velocities
 
     def poses(self, times: Array) -> tuple[Array, Array, Array, Array]:
         """Positions (T, 3) [m], rotations (T, 3, 3), velocities (T, 3) [m/s] and angular velocities in the world
@@ -128,4 +130,5 @@ def _right_jacobian_inverse(turns: Array) -> Array:
     zero = np.zeros(len(turns))
     x, y, z = turns.T
     skew = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
-    return np.eye(3) + 0.5 * skew + series[:, None, None] * (skew @ skew)
+    inverse: Array = np.eye(3) + 0.5 * skew + series[:, None, None] * (skew @ skew)
+    return inverse

@@ -25,7 +25,7 @@ from physworld.engine.lattice.lattice import Lattice
 from physworld.engine.terms.colliders import BoundCollider, Collider, ContactSurface
 from physworld.engine.terms.colliders_path import RigidPath
 from physworld.engine.terms.ground import BoundGround
-from physworld.materials.laws import Law, SolidLaw
+from physworld.materials.laws import Law
 from physworld.shapes.sdf import half_space
 
 if TYPE_CHECKING:
@@ -80,14 +80,9 @@ def contact_surface(lattice: Lattice, law: Law, offsets: Array | float = 0.0) ->
     """Contact points of a body and their stiffness; see the module's text."""
     points, measures, groups = contact_points(lattice)
     dx = float(lattice.spacing.min())
-    if isinstance(law, SolidLaw):
-        mu, lam = law.lame
-        stiffness, shear, damping = (lam + 2 * mu) / dx, mu / dx, 0.0
-    else:
-        density = float(getattr(law, {2: "density_kg_m2", 1: "density_kg_m"}[lattice.dim]))
-        rate = law.wave_speed_m_s / dx
-        stiffness = shear = density * rate**2
-        damping = 2 * _THIN_DAMPING * density * rate
+    stiffness, shear = law.contact_stiffness(dx)
+    rate = law.wave_speed_m_s / dx
+    damping = 0.0 if lattice.dim == 3 else 2 * _THIN_DAMPING * law.density * rate
     return ContactSurface(
         points=points,
         measures=measures,
@@ -96,7 +91,7 @@ def contact_surface(lattice: Lattice, law: Law, offsets: Array | float = 0.0) ->
         stiffness=stiffness,
         shear_stiffness=shear,
         damping=damping,
-        rate_per_s=law.wave_speed_m_s / dx,
+        rate_per_s=rate,
     )
 
 

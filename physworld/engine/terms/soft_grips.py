@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -61,7 +62,7 @@ def soften(
     if not len(soft.nodes):
         return problem, held
     rate = problem.law.wave_speed_m_s / (softness * float(np.prod(lattice.spacing)) ** (1 / lattice.dim))
-    stiffness = problem.law.density_kg_m3 * rate**2
+    stiffness = problem.law.density * rate**2
     grips = SoftGrips(soft, stiffness * gram_matrix(lattice, regions, soft.nodes))
     return replace(problem, terms=(*problem.terms, grips)), _part(held, ~loose)
 
@@ -70,7 +71,8 @@ def gripped_points(lattice: Lattice, start: Array, region: Array) -> Array:
     """Which of the cells' quadrature points lie in a box (2, 3) [m] when nodes are at ``start`` (n, 3), (C, Q) bool."""
     splines = tensor_weights(_places(lattice.dim), (0,) * lattice.dim)
     places = np.einsum("qa,cai->cqi", splines, start[lattice.cell_nodes])
-    return np.all((places >= region[0] - _SLACK_M) & (places <= region[1] + _SLACK_M), axis=2)
+    inside: Array = np.all((places >= region[0] - _SLACK_M) & (places <= region[1] + _SLACK_M), axis=2)
+    return inside
 
 
 def touched_nodes(lattice: Lattice, shares: Array) -> Array:
@@ -132,14 +134,16 @@ def _grid(lines: Array) -> Array:
 
 def _weights(dim: int) -> Array:
     """Shares of a cell that its quadrature points stand for, (6**dim,)."""
-    return np.prod(_grid(np.tile(np.tile(0.25 * _WEIGHTS, 2)[:, None], dim)), axis=1)
+    shares: Array = np.prod(_grid(np.tile(np.tile(0.25 * _WEIGHTS, 2)[:, None], dim)), axis=1)
+    return shares
 
 
 def _owners(dim: int) -> Array:
     """The particle whose part of the cell each quadrature point lies in, (6**dim,)."""
     corners = (gauss_points(dim) >= 0.5).astype(int)
     sides = (_places(dim) >= 0.5).astype(int)
-    return np.argmax((sides[:, None] == corners[None]).all(axis=2), axis=1)
+    owners: Array = np.argmax((sides[:, None] == corners[None]).all(axis=2), axis=1)
+    return owners
 
 
 @dataclass(frozen=True)
@@ -186,7 +190,7 @@ class BoundSoftGrips(BoundTerm):
     (k, k), times the nodal masses, are on the host.
     """
 
-    model: list
+    model: list[Any]
     pull: wp.array
     gap: wp.array
     squares: Array
@@ -280,7 +284,7 @@ def pull_node(
     pull: wp.array2d[wp.float64],
     gap: wp.array[wp.float64],
     force: wp.array[wp.float64],
-): ...
+) -> None: ...
 
 
 @wp.kernel(enable_backward=False)

@@ -145,7 +145,7 @@ def rod_cell(
     previous: wp.array[wp.float64],
     # out
     force: wp.array[wp.float64],
-): ...
+) -> None: ...
 
 
 @wp.kernel(enable_backward=False)

@@ -26,7 +26,7 @@ _HALF = wp.constant(wp.float64(0.5))
 
 
 @wp.func
-def _hat(body: Body, centre: wp.float64, q: wp.float64):
+def _hat(body: Body, centre: wp.float64, q: wp.float64) -> wp.float64:
     """Share of a rope's point in what acts at ``q``; what lies beyond an end is reflected there."""
     zero = wp.float64(0.0)
     one = wp.float64(1.0)

@@ -51,29 +51,29 @@ class Place:
 
 
 @wp.func
-def cell_at(body: Body, q: wp.vec2d):
+def cell_at(body: Body, q: wp.vec2d) -> tuple[int, wp.vec2d]:
     i = wp.clamp(int(q[0]), 0, body.counts[0] - 1)
     j = wp.clamp(int(q[1]), 0, body.counts[1] - 1)
     return body.table[i * body.counts[1] + j], wp.vec2d(q[0] - wp.float64(i), q[1] - wp.float64(j))
 
 
 @wp.func
-def _weights(u: wp.float64):
+def _weights(u: wp.float64) -> wp.vec3d:
     return wp.vec3d(_HALF * (wp.float64(1.0) - u) * (wp.float64(1.0) - u), _HALF + u - u * u, _HALF * u * u)
 
 
 @wp.func
-def _slopes(u: wp.float64):
+def _slopes(u: wp.float64) -> wp.vec3d:
     return wp.vec3d(u - wp.float64(1.0), wp.float64(1.0) - wp.float64(2.0) * u, u)
 
 
 @wp.func
-def node_at(values: wp.array[wp.float64], node: int):
+def node_at(values: wp.array[wp.float64], node: int) -> wp.vec3d:
     return wp.vec3d(values[3 * node], values[3 * node + 1], values[3 * node + 2])
 
 
 @wp.func
-def value_at(body: Body, values: wp.array[wp.float64], cell: int, u: wp.vec2d):
+def value_at(body: Body, values: wp.array[wp.float64], cell: int, u: wp.vec2d) -> wp.vec3d:
     """What nodal vectors ``values`` (3n,) are at a place."""
     a = _weights(u[0])
     found = wp.vec3d()
@@ -89,7 +89,7 @@ def value_at(body: Body, values: wp.array[wp.float64], cell: int, u: wp.vec2d):
 
 
 @wp.func
-def add_at(body: Body, values: wp.array[wp.float64], cell: int, u: wp.vec2d, vector: wp.vec3d):
+def add_at(body: Body, values: wp.array[wp.float64], cell: int, u: wp.vec2d, vector: wp.vec3d) -> None:
     """Spread a vector at a place over its nodes."""
     a = _weights(u[0])
     b = _weights(u[1])
@@ -105,7 +105,7 @@ def add_at(body: Body, values: wp.array[wp.float64], cell: int, u: wp.vec2d, vec
 
 
 @wp.func
-def share_at(body: Body, mask: wp.array[wp.float64], cell: int, u: wp.vec2d):
+def share_at(body: Body, mask: wp.array[wp.float64], cell: int, u: wp.vec2d) -> wp.float64:
     """A nodal number at a place."""
     a = _weights(u[0])
     b = _weights(u[1])
@@ -121,7 +121,7 @@ def share_at(body: Body, mask: wp.array[wp.float64], cell: int, u: wp.vec2d):
 
 
 @wp.func
-def place_at(body: Body, x: wp.array[wp.float64], q: wp.vec2d):
+def place_at(body: Body, x: wp.array[wp.float64], q: wp.vec2d) -> Place:
     """Position and its derivatives [m, m per cell] at a place."""
     here = Place()
     cell, u = cell_at(body, q)
@@ -167,17 +167,17 @@ def place_at(body: Body, x: wp.array[wp.float64], q: wp.vec2d):
 
 
 @wp.func
-def _bounded(step: wp.float64):
+def _bounded(step: wp.float64) -> wp.float64:
     return wp.clamp(step, -_HALF, _HALF)
 
 
 @wp.func
-def _in_window(body: Body, middle: wp.float64, q: wp.float64):
+def _in_window(body: Body, middle: wp.float64, q: wp.float64) -> wp.float64:
     return wp.clamp(q, wp.max(middle - WINDOW, body.low[0]), wp.min(middle + WINDOW, body.high[0]))
 
 
 @wp.func
-def _step_of_sheet(body: Body, x: wp.array[wp.float64], here: wp.vec3d, r: wp.vec2d):
+def _step_of_sheet(body: Body, x: wp.array[wp.float64], here: wp.vec3d, r: wp.vec2d) -> wp.vec2d:
     """One step towards the place nearest to ``here``."""
     zero = wp.float64(0.0)
     there = place_at(body, x, r)
@@ -201,7 +201,9 @@ def _step_of_sheet(body: Body, x: wp.array[wp.float64], here: wp.vec3d, r: wp.ve
 
 
 @wp.func
-def _step_of_rope(body: Body, x: wp.array[wp.float64], middles: wp.vec2d, q: wp.float64, r: wp.float64):
+def _step_of_rope(
+    body: Body, x: wp.array[wp.float64], middles: wp.vec2d, q: wp.float64, r: wp.float64
+) -> wp.vec2d:
     """One step towards the shortest way between the windows around two points of a rope."""
     zero = wp.float64(0.0)
     here = place_at(body, x, wp.vec2d(q, _HALF))
@@ -239,7 +241,7 @@ def refined(
     own: wp.vec2d,
     other: wp.vec2d,
     steps: int,
-):
+) -> tuple[wp.vec2d, wp.vec2d]:
     """Places of a pair after some steps; ``middles`` are those of a rope's windows."""
     q = own
     r = other

@@ -58,13 +58,13 @@ class Slots:
 
 
 @wp.func
-def along_body(body: Body, q: wp.vec2d, r: wp.vec2d):
+def along_body(body: Body, q: wp.vec2d, r: wp.vec2d) -> wp.float64:
     """Distance of two places in the undeformed body [m]."""
     return wp.length(wp.cw_mul(q - r, body.spacing))
 
 
 @wp.func
-def _bucket(p: wp.vec3d, width: wp.float64, i: int, j: int, k: int, mask: int):
+def _bucket(p: wp.vec3d, width: wp.float64, i: int, j: int, k: int, mask: int) -> int:
     a = int(wp.floor(p[0] / width)) + i
     b = int(wp.floor(p[1] / width)) + j
     c = int(wp.floor(p[2] / width)) + k
@@ -72,13 +72,13 @@ def _bucket(p: wp.vec3d, width: wp.float64, i: int, j: int, k: int, mask: int):
 
 
 @wp.func
-def turn_of(counter: wp.array[wp.int32]):
+def turn_of(counter: wp.array[wp.int32]) -> wp.int32:
     """Where ``moved`` and ``ways`` have the numbers of this substep; the next one takes the other pair."""
     return 2 * (counter[1] % 2)
 
 
 @wp.func
-def searches(counter: wp.array[wp.int32], moved: wp.array[wp.int32]):
+def searches(counter: wp.array[wp.int32], moved: wp.array[wp.int32]) -> wp.bool:
     """Whether pairs are sought in this substep."""
     now = turn_of(counter)
     return moved[now] == 1 and moved[now + 1] == 1
@@ -164,7 +164,7 @@ def place_cells(
 
 
 @wp.func
-def _keep_slots(body: Body, slots: Slots, x: wp.array[wp.float64], point: int):
+def _keep_slots(body: Body, slots: Slots, x: wp.array[wp.float64], point: int) -> None:
     """Drop the pairs of a point that are no longer near, and all but the first of those that met."""
     kept = wp.int32(0)
     base = point * slots.most
@@ -187,7 +187,7 @@ def _keep_slots(body: Body, slots: Slots, x: wp.array[wp.float64], point: int):
 
 
 @wp.func
-def _is_new(slots: Slots, base: int, count: int, r: wp.vec2d):
+def _is_new(slots: Slots, base: int, count: int, r: wp.vec2d) -> wp.bool:
     """Whether no slot has a place beside ``r``."""
     known = wp.int32(0)
     for k in range(count):
@@ -198,7 +198,7 @@ def _is_new(slots: Slots, base: int, count: int, r: wp.vec2d):
 
 
 @wp.func
-def _has_middle(slots: Slots, base: int, count: int, middle: wp.float64):
+def _has_middle(slots: Slots, base: int, count: int, middle: wp.float64) -> wp.bool:
     """Whether a slot of a rope has this partner."""
     known = wp.int32(0)
     for k in range(count):
@@ -215,7 +215,7 @@ def _seek(
     point: int,
     own: wp.vec2d,
     other: wp.vec2d,
-):
+) -> None:
     """Give a point the pair that is found from two places, unless it has it; the nearest are kept."""
     count = slots.counts[point]
     base = point * slots.most

@@ -135,7 +135,7 @@ def sheet_cell(
     previous: wp.array[wp.float64],
     # out
     force: wp.array[wp.float64],
-): ...
+) -> None: ...
 
 
 @wp.kernel(enable_backward=False)

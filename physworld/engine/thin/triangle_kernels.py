@@ -95,7 +95,7 @@ def triangle(
     x: wp.array[wp.float64],
     previous: wp.array[wp.float64],
     force: wp.array[wp.float64],
-): ...
+) -> None: ...
 
 
 @wp.func_native(_EDGE)
@@ -111,7 +111,7 @@ def edge(
     x: wp.array[wp.float64],
     previous: wp.array[wp.float64],
     force: wp.array[wp.float64],
-): ...
+) -> None: ...
 
 
 @wp.kernel(enable_backward=False)

@@ -67,7 +67,8 @@ class TriangleLattice(Lattice):
     @property
     def node_coordinates(self) -> Array:
         """Reference coordinates of the nodes [m], (n, 2)."""
-        return self.origin + self.nodes * self.spacing
+        coordinates: Array = self.origin + self.nodes * self.spacing
+        return coordinates
 
     def table(self, orders: tuple[int, ...]) -> Array:
         """None: what a cell's corners weigh differs from cell to cell.
@@ -112,7 +113,8 @@ class TriangleLattice(Lattice):
 
     def crossed(self, cell: Array) -> Array:
         """Which of the cells (M,) are cut from (1, 0) to (0, 1), (M,) bool."""
-        return (self.cells[cell].sum(axis=1) + int(self.odd)) % 2 == 1
+        odd: Array = (self.cells[cell].sum(axis=1) + int(self.odd)) % 2 == 1
+        return odd
 
     def _weights(self, cell: Array, local: Array, within: Array | None = None) -> Array:
         """Of the corners (M, 4) at ``local`` (M, 2), linear from the triangle that holds ``within`` on."""
@@ -214,4 +216,5 @@ def _turned(edges: Array) -> Array:
 def _cotangent(at: Array, one: Array, other: Array) -> Array:
     """Of the angles at places (M, 2) between two others, (M,)."""
     u, v = one - at, other - at
-    return np.sum(u * v, axis=1) / np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
+    cotangents: Array = np.sum(u * v, axis=1) / np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
+    return cotangents

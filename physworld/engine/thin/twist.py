@@ -26,7 +26,6 @@ from physworld.engine.lattice.lattice import Lattice
 from physworld.engine.terms.term import BoundTerm
 from physworld.engine.thin.twist_kernels import push_twisted, sum_turning, turn_spans
 from physworld.errors import TwistLost
-from physworld.materials.rod import RodLaw
 
 if TYPE_CHECKING:
     from physworld.engine.problem import Problem
@@ -116,7 +115,7 @@ class BoundTwist(BoundTerm):
 
     def __init__(self, spans: tuple[Span, ...], problem: Problem) -> None:
         lattice, law, device = problem.lattice, problem.law, problem.device
-        if not isinstance(law, RodLaw) or law.torsion_n_m2 <= 0:
+        if law.torsion_n_m2 <= 0:
             raise ValueError(f"twist needs a rod with a torsional stiffness, got {law}")
         self.spans, self.device = len(spans), device
         measure = lattice.particle_measures.copy()
@@ -151,12 +150,14 @@ class BoundTwist(BoundTerm):
     @property
     def angles_rad(self) -> Array:
         """Twist of every span in the last substep [rad], (S,)."""
-        return self.angle.numpy().copy()
+        angles: Array = self.angle.numpy().copy()
+        return angles
 
     @property
     def moments_n_m(self) -> Array:
         """Twisting moment of every span in the last substep [N m], (S,)."""
-        return self.state.moment.numpy().copy()
+        moments: Array = self.state.moment.numpy().copy()
+        return moments
 
     def begin(self, times: Array) -> None:
         """A run starts.

@@ -132,7 +132,7 @@ def turn_spans(
 def _neighbours(
     point: int, span: int, begins: wp.array[wp.int32], along: wp.array[wp.vec3d],
     ends: wp.array[wp.vec3d],
-):  # fmt: skip
+) -> tuple[wp.vec3d, wp.vec3d]:  # fmt: skip
     """Unit tangents before and after a particle."""
     before = ends[4 * span]
     if point > begins[span]:

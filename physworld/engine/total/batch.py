@@ -20,11 +20,10 @@ from physworld.engine.lattice.lattice import Lattice
 from physworld.engine.problem import HeldNodes, Problem
 from physworld.engine.terms.term import BoundTerm
 from physworld.engine.total.forces import ForcesSideBySide
-from physworld.engine.total.formulation import Run, check_state, whole_chunks
+from physworld.engine.total.formulation import SteppedRun, check_state, whole_chunks
 from physworld.engine.total.node_kernels import advance_nodes_side_by_side
 from physworld.engine.total.stability import fastest_frequencies, stable_time_step
 from physworld.errors import BatchRefused, CFLViolation, SimulationError
-from physworld.materials.laws import friction_law
 
 _SAME_CLOCK_S = 1e-9
 
@@ -132,13 +131,20 @@ class Batch:
         rests = np.stack([problem.rest for problem in problems])
         frequencies = fastest_frequencies(self.forces, rests, self.masses, cell)
         rates = np.array([float(problem.drag_per_s) for problem in problems])
-        frictions = [friction_law(problem.law) for problem in problems]
-        rubbing = [body for body, friction in enumerate(frictions) if friction is not None]
+        frictions = {
+            body: law
+            for body, law in enumerate(problem.law.friction_law for problem in problems)
+            if law is not None
+        }
+        rubbing = list(frictions)
         if rubbing:
             damper = ForcesSideBySide(
-                self.lattice, [frictions[b] for b in rubbing], [factors[b] for b in rubbing], rests[rubbing],
+                self.lattice,
+                [*frictions.values()],
+                [factors[b] for b in rubbing],
+                [*rests[rubbing]],
                 self.device,
-            )  # fmt: skip
+            )
             rates[rubbing] += fastest_frequencies(damper, rests[rubbing], self.masses[rubbing], cell) ** 2
         for body, terms in enumerate(self.terms):
             for term in terms:
@@ -147,7 +153,7 @@ class Batch:
         return frequencies, rates
 
 
-class _BatchRun(Run):
+class _BatchRun(SteppedRun):
     """A run of bodies side by side; each one's first error is kept and stops nothing.
 
     Attributes:
@@ -167,10 +173,11 @@ class _BatchRun(Run):
         starts = x.reshape(len(batch.problems), -1, 3)
         self._sizes = [float(np.ptp(start, axis=0).max()) + batch.cell_m for start in starts]
         self._acting: list[tuple[tuple[BoundTerm, ...], list[wp.array]]] = []
+        self._batch = batch
         super().__init__(batch, x, v, held, times)
 
     def _begin(self) -> None:
-        batch, width = self._solver, 3 * len(self._solver.lattice.nodes)
+        batch, width = self._batch, 3 * len(self._batch.lattice.nodes)
         for body, terms in enumerate(batch.terms):
             try:
                 for term in terms:
@@ -195,7 +202,7 @@ class _BatchRun(Run):
         return None
 
     def _launch_nodes(self) -> None:
-        batch = self._solver
+        batch = self._batch
         wp.launch(
             advance_nodes_side_by_side,
             dim=len(batch.mass),
@@ -205,11 +212,11 @@ class _BatchRun(Run):
         )
 
     def _fall(self) -> tuple[Array, Array]:
-        nodes = len(self._solver.lattice.nodes)
+        nodes = len(self._batch.lattice.nodes)
         return np.repeat(self._gravity, nodes, axis=0), np.repeat(self._drag, nodes)[:, None]
 
     def _check(self, now: Array, time: float) -> None:
-        batch, dt = self._solver, float(self._clocks[0].numpy()[2])
+        batch, dt = self._batch, float(self._clocks[0].numpy()[2])
         bodies = len(batch.problems)
         inverted = np.count_nonzero(batch.forces.inverted.numpy().reshape(bodies, -1), axis=1)
         states, starts = now.reshape(bodies, -1, 3), self._start.reshape(bodies, -1, 3)

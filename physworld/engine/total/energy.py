@@ -19,14 +19,12 @@ import warp as wp
 
 from physworld.arrays import Array
 from physworld.engine.problem import HeldNodes, Problem
+from physworld.engine.terms.term import BoundTerm
 from physworld.engine.thin.twist import Twist, TwistMeter
 from physworld.engine.total.energy_kernels import keep_forces, sum_friction, sum_works
 from physworld.engine.total.forces import InternalForces
 from physworld.engine.total.formulation import TotalLagrangian
 from physworld.errors import SceneUnsupported
-from physworld.materials.laws import Law, RodLaw, SheetLaw, SolidLaw, without_friction
-from physworld.materials.rod import rod_strains
-from physworld.materials.sheet import sheet_strains
 
 _AFTER_S = 1e-4  # the meter reads a frame when the next one starts: one more, this short, follows the last
 
@@ -64,7 +62,8 @@ class EnergyLedger:
     def lost(self) -> Array:
         """What the numerics lost (negative: gained) since the first frame."""
         accounted = self.grip_work + self.term_work - self.drag - self.internal_friction
-        return accounted - (self.mechanical - self.mechanical[0])
+        remainder: Array = accounted - (self.mechanical - self.mechanical[0])
+        return remainder
 
     @property
     def turnover(self) -> float:
@@ -147,36 +146,18 @@ def elastic_energy(problem: Problem, nodes: Array) -> Array:
     measure = lattice.particle_measures
     if problem.stiffness_factor is not None:
         measure = measure * problem.stiffness_factor
-    orders = {3: np.eye(3, dtype=int), 2: [(1, 0), (0, 1), (2, 0), (0, 2), (1, 1)], 1: [(1,), (2,)]}[
-        lattice.dim
-    ]
-    rows = [
-        lattice.interpolation(lattice.particle_coordinates, tuple(int(o) for o in order)) for order in orders
-    ]
+    rows = [lattice.interpolation(lattice.particle_coordinates, order) for order in law.strain_orders]
     solid = measure > 0
     energies = np.empty(len(nodes))
     for frame, x in enumerate(nodes):
         moved = x - problem.rest if lattice.dim == 3 else x
         derivatives = np.stack([row @ moved for row in rows], axis=1)[solid]
-        energies[frame] = measure[solid] @ _density(law, derivatives)
+        energies[frame] = measure[solid] @ law.energy_of(derivatives)
     return energies
 
 
-def _density(law: Law, derivatives: Array) -> Array:
-    """Energy density (P,) of derivatives (P, k, 3): displacement gradients of a solid, or positions' of a thin body."""
-    if isinstance(law, SolidLaw):
-        return law.energy_density(np.eye(3) + derivatives.transpose(0, 2, 1))
-    if isinstance(law, SheetLaw):
-        return law.energy_density(*sheet_strains(derivatives))
-    assert isinstance(law, RodLaw)
-    return law.energy_density(*rod_strains(derivatives))
-
-
-class _Marker:
+class _Marker(BoundTerm):
     """The first of the terms: keeps the internal forces before anything else adds to them."""
-
-    frequency_rad_s = 0.0
-    friction_per_s = 0.0
 
     def __init__(self, meter: _Meter) -> None:
         self._meter = meter
@@ -185,24 +166,12 @@ class _Marker:
         self._kept = self._meter.allocate(problem)
         return self
 
-    def begin(self, times: Array) -> None:
-        return None
-
-    def pace(self, time_step_s: float) -> None:
-        return None
-
-    def check(self, time_s: float) -> None:
-        return None
-
     def launch(self, x: wp.array, v: wp.array, clock: wp.array, counter: wp.array, force: wp.array) -> None:
         wp.launch(keep_forces, dim=len(force), inputs=[force], outputs=[self._kept], device=force.device)
 
 
-class _Meter:
+class _Meter(BoundTerm):
     """The last of the terms: adds no force, sums the works of all that came before it."""
-
-    frequency_rad_s = 0.0
-    friction_per_s = 0.0
 
     def __init__(self, frames: int) -> None:
         self._frames = frames
@@ -218,7 +187,7 @@ class _Meter:
         stiffness = np.ones(particles) if problem.stiffness_factor is None else problem.stiffness_factor
         self._device = device
         self._elastic_law = InternalForces(
-            problem.lattice, without_friction(problem.law), stiffness, problem.rest, device
+            problem.lattice, problem.law.without_friction(), stiffness, problem.rest, device
         )
         self._constants = [
             wp.array(problem.nodal_mass(), dtype=wp.float64, device=device),
@@ -245,15 +214,6 @@ class _Meter:
 
     def bind(self, problem: Problem) -> _Meter:
         return self
-
-    def begin(self, times: Array) -> None:
-        return None
-
-    def pace(self, time_step_s: float) -> None:
-        return None
-
-    def check(self, time_s: float) -> None:
-        return None
 
     def launch(self, x: wp.array, v: wp.array, clock: wp.array, counter: wp.array, force: wp.array) -> None:
         self._elastic_law.launch(x, clock, self._elastic)
@@ -290,7 +250,8 @@ class _Meter:
         """Works of sub-cycled internal friction and drag at the frames [J], (T, 2, n); 0 where they are explicit."""
         if self._relaxed is None:
             return np.zeros((self._frames, 2, self._outputs[0].shape[2]))
-        return self._friction[3].numpy()[: self._frames].copy()
+        works: Array = self._friction[3].numpy()[: self._frames].copy()
+        return works
 
     def read_twist(self) -> tuple[Array, Array]:
         """Work of grips that turn a rope's ends and energy of its twist at the frames [J], (T,) each."""

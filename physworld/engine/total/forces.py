@@ -6,7 +6,8 @@ spline derivatives) and launches the kernel of its dimension. It knows nothing o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,14 +21,27 @@ from physworld.engine.thin.triangle_kernels import triangle_forces
 from physworld.engine.thin.triangles import TriangleLattice
 from physworld.engine.total.solid_kernels import solid_forces
 from physworld.errors import BatchRefused, SceneUnsupported
-from physworld.materials.laws import Law, RodLaw, SheetLaw, SolidLaw
+from physworld.materials.laws import Law
+from physworld.materials.rod import RodLaw
+from physworld.materials.sheet import SheetLaw
+from physworld.materials.solid import SolidLaw
 
-_SHARED = {
-    3: {1: "gradients", 5: "numbers", 6: "cell size"},
-    2: {1: "derivatives", 4: "shape ratios", 5: "relaxation time"},
-    1: {1: "derivatives", 4: "relaxation time"},
-}  # the model inputs that belong to a law and a lattice, not to a particle: place and name
-_MEMORY = {3: 72, 2: 24, 1: 12}  # numbers a cell that friction remembers from the last substep
+
+@dataclass(frozen=True)
+class _Bodies:
+    """What the bodies of one shape have of their own.
+
+    Attributes:
+        kernel: the kernel of a law.
+        inputs: what it takes as its model; arguments are those of :func:`model_inputs`.
+        memory: numbers a cell that friction remembers from the last substep.
+        shared: the inputs that belong to a law and a lattice, not to a particle: place and name.
+    """
+
+    kernel: Callable[[Any], wp.Kernel]
+    inputs: Callable[[Any, Any, Array, Array, str], list[Any]]
+    memory: int
+    shared: Mapping[int, str]
 
 
 class InternalForces:
@@ -45,23 +59,19 @@ class InternalForces:
     """
 
     def __init__(self, lattice: Lattice, law: Law, stiffness_factor: Array, rest: Array, device: str) -> None:
-        inputs = _triangle_inputs if isinstance(lattice, TriangleLattice) else model_inputs
-        self._own(lattice, law, inputs(lattice, law, stiffness_factor, rest, device), 1, device)
+        model = _of(lattice, law).inputs(lattice, law, stiffness_factor, rest, device)
+        self._own(lattice, law, model, 1, device)
 
     def _own(self, lattice: Lattice, law: Law, model: list[Any], bodies: int, device: str) -> None:
+        known = _of(lattice, law)
         cells = bodies * len(lattice.cells)
         if isinstance(lattice, TriangleLattice):
             cells = len(lattice.triangles) + len(lattice.hinges[0])
         self.device, self.cells, self._model = device, cells, model
-        if isinstance(lattice, TriangleLattice):
-            self._kernel = triangle_forces
-        elif isinstance(law, SolidLaw):
-            self._kernel = solid_forces(law.stress, len(law.moduli))
-        else:
-            self._kernel = sheet_forces if isinstance(law, SheetLaw) else rod_forces
+        self._kernel = known.kernel(law)
         self._solid = lattice.dim == 3
         self.memory = wp.zeros(
-            cells * _MEMORY[lattice.dim], dtype=wp.float32 if self._solid else wp.float64, device=device
+            cells * known.memory, dtype=wp.float32 if self._solid else wp.float64, device=device
         )
         self.inverted = wp.zeros(cells, dtype=wp.int32, device=device)
 
@@ -82,7 +92,7 @@ class ForcesSideBySide(InternalForces):
     Args:
         lattice: the reference body of all of them.
         laws: one for each; they may differ in what is multiplied with a particle's measure (moduli, viscosity), not in
-            what the whole law shares (:data:`_SHARED`).
+            what the whole law shares (``shared`` of the bodies of a shape).
         stiffness_factors: (P,) for each.
         rests: nodal positions of the undeformed bodies in the world [m], (n, 3) for each.
         device: Warp device.
@@ -114,17 +124,18 @@ def _joined(lattice: Lattice, law: Law, bodies: list[list[Any]], device: str) ->
     """The model inputs of bodies side by side from those of each; see :func:`model_inputs` for their order."""
     offsets = np.arange(len(bodies))[:, None] * len(lattice.nodes)
     nodes = (lattice.cell_nodes.reshape(1, -1) + offsets).reshape(-1)
+    shared = _of(lattice, law).shared
     joined: list[Any] = [wp.array(nodes, dtype=wp.int32, device=device)]
     for place, first in enumerate(bodies[0][1:-1], start=1):
         each = [body[place] for body in bodies]
-        if place not in _SHARED[lattice.dim]:
+        if place not in shared:
             values = np.concatenate([values.numpy() for values in each])
             joined.append(wp.array(values, dtype=first.dtype, device=device))
             continue
         for number, other in enumerate(each):
             if not np.array_equal(_numbers(first), _numbers(other)):
                 raise BatchRefused(
-                    f"bodies side by side share the {_SHARED[lattice.dim][place]} of their law ({law.name}): "
+                    f"bodies side by side share the {shared[place]} of their law ({law.name}): "
                     f"{_numbers(first)} of the first, {_numbers(other)} of number {number}"
                 )
         joined.append(first)
@@ -132,60 +143,94 @@ def _joined(lattice: Lattice, law: Law, bodies: list[list[Any]], device: str) ->
 
 
 def _numbers(value: Any) -> Array:
+    numbers: Array
     if isinstance(value, wp.array):
-        return value.numpy()
-    return np.atleast_1d(np.array(getattr(value, "value", value), dtype=float))
+        numbers = value.numpy()
+    else:
+        numbers = np.atleast_1d(np.array(getattr(value, "value", value), dtype=float))
+    return numbers
 
 
 def model_inputs(lattice: Lattice, law: Law, stiffness_factor: Array, rest: Array, device: str) -> list[Any]:
     """What the kernels of a dimension take as their model: arrays on the device, then whether there is friction.
 
+    Args:
+        lattice: the reference body.
+        law: of the lattice's dimension.
+        stiffness_factor: factor on every stiffness and on the friction, a particle, (P,).
+        rest: nodal positions of the undeformed body [m], (n, 3); used by solids.
+        device: Warp device.
+
     Raises:
         ValueError: the law is of another dimension.
     """
-    if not isinstance(law, {1: RodLaw, 2: SheetLaw, 3: SolidLaw}[lattice.dim]):
-        raise ValueError(f"a {type(law).__name__} does not fit a lattice of dimension {lattice.dim}")
+    return _of(lattice, law).inputs(lattice, law, stiffness_factor, rest, device)
 
-    def array(values: Any, dtype: Any) -> wp.array:
-        return wp.array(np.ascontiguousarray(values).reshape(-1), dtype=dtype, device=device)
+
+def _of(lattice: Lattice, law: Law) -> _Bodies:
+    if law.dimension != lattice.dim:
+        raise ValueError(f"a {type(law).__name__} does not fit a lattice of dimension {lattice.dim}")
+    return _TRIANGLES if isinstance(lattice, TriangleLattice) else _SPLINES[lattice.dim]
+
+
+def _uploaded(values: Any, dtype: Any, device: str) -> wp.array:
+    return wp.array(np.ascontiguousarray(values).reshape(-1), dtype=dtype, device=device)
+
+
+def _solid_inputs(
+    lattice: Lattice, law: SolidLaw, stiffness_factor: Array, rest: Array, device: str
+) -> list[Any]:
+    def array(values: Any, dtype: Any = wp.float32) -> wp.array:
+        return _uploaded(values, dtype, device)
 
     measure = lattice.particle_measures * stiffness_factor
-    nodes = array(lattice.cell_nodes, wp.int32)
-    if isinstance(law, SolidLaw):
-        slopes = np.stack([lattice.table(tuple(int(a == j) for a in range(3))) for j in range(3)], axis=1)
-        moduli = measure.reshape(len(lattice.cells), 1, -1) * np.array(law.moduli)[:, None]
-        return [
-            nodes, array(slopes, wp.float32), array(rest, wp.float64), array(moduli, wp.float32),
-            array(law.viscosity_pa_s * measure, wp.float32), array([*law.numbers, 0.0], wp.float32),
-            wp.vec3f(*(1.0 / lattice.spacing)), int(law.viscosity_pa_s > 0),
-        ]  # fmt: skip
-    friction = [wp.float64(law.relaxation_s), int(law.relaxation_s > 0)]
-    if isinstance(law, SheetLaw):
-        orders = [(1, 0), (0, 1), (2, 0), (0, 2), (1, 1)]
-        derivatives = [lattice.table(o) / np.prod(lattice.spacing ** np.array(o)) for o in orders]
-        return [
-            nodes, array(np.stack(derivatives, axis=1), wp.float64), array(law.membrane_n_m * measure, wp.float64),
-            array(law.bending_n_m * measure, wp.float64),
-            array([*law.membrane_shape, *law.bending_shape], wp.float64), *friction,
-        ]  # fmt: skip
-    derivatives = [lattice.table((o,)) / lattice.spacing[0] ** o for o in (1, 2)]
+    slopes = np.stack([lattice.table(order) for order in law.strain_orders], axis=1)
+    moduli = measure.reshape(len(lattice.cells), 1, -1) * np.array(law.moduli)[:, None]
     return [
-        nodes, array(np.stack(derivatives, axis=1), wp.float64), array(law.stretching_n * measure, wp.float64),
-        array(law.bending_n_m2 * measure, wp.float64), *friction,
+        array(lattice.cell_nodes, wp.int32), array(slopes), array(rest, wp.float64), array(moduli),
+        array(law.viscosity_pa_s * measure), array([*law.numbers, 0.0]), wp.vec3f(*(1.0 / lattice.spacing)),
+        int(law.viscosity_pa_s > 0),
+    ]  # fmt: skip
+
+
+def _sheet_inputs(
+    lattice: Lattice, law: SheetLaw, stiffness_factor: Array, rest: Array, device: str
+) -> list[Any]:
+    def array(values: Any, dtype: Any = wp.float64) -> wp.array:
+        return _uploaded(values, dtype, device)
+
+    measure = lattice.particle_measures * stiffness_factor
+    derivatives = [lattice.table(o) / np.prod(lattice.spacing ** np.array(o)) for o in law.strain_orders]
+    return [
+        array(lattice.cell_nodes, wp.int32), array(np.stack(derivatives, axis=1)),
+        array(law.membrane_n_m * measure), array(law.bending_n_m * measure),
+        array([*law.membrane_shape, *law.bending_shape]), wp.float64(law.relaxation_s), int(law.relaxation_s > 0),
+    ]  # fmt: skip
+
+
+def _rod_inputs(
+    lattice: Lattice, law: RodLaw, stiffness_factor: Array, rest: Array, device: str
+) -> list[Any]:
+    def array(values: Any, dtype: Any = wp.float64) -> wp.array:
+        return _uploaded(values, dtype, device)
+
+    measure = lattice.particle_measures * stiffness_factor
+    derivatives = [lattice.table((o,)) / lattice.spacing[0] ** o for (o,) in law.strain_orders]
+    return [
+        array(lattice.cell_nodes, wp.int32), array(np.stack(derivatives, axis=1)),
+        array(law.stretching_n * measure), array(law.bending_n_m2 * measure), wp.float64(law.relaxation_s),
+        int(law.relaxation_s > 0),
     ]  # fmt: skip
 
 
 def _triangle_inputs(
-    lattice: TriangleLattice, law: Law, stiffness_factor: Array, rest: Array, device: str
+    lattice: TriangleLattice, law: SheetLaw, stiffness_factor: Array, rest: Array, device: str
 ) -> list[Any]:
-    """The same of a mesh of triangles, of which two make a cell; they and the edges take the mean of its particles.
+    """Of a mesh of triangles, of which two make a cell; they and the edges take the mean of its particles.
 
     Raises:
-        ValueError: the law is of another dimension.
-        SceneUnsupported: it bends otherwise than an isotropic sheet, which hinges cannot.
+        SceneUnsupported: the law bends otherwise than an isotropic sheet, which hinges cannot.
     """
-    if not isinstance(law, SheetLaw):
-        raise ValueError(f"a {type(law).__name__} does not fit a mesh of triangles")
     plain = (1.0, 1.0, law.poissons_ratio, 1.0 - law.poissons_ratio)
     if not np.allclose(law.bending_shape, plain):
         raise SceneUnsupported(
@@ -194,7 +239,7 @@ def _triangle_inputs(
         )
 
     def array(values: Any, dtype: Any = wp.float64) -> wp.array:
-        return wp.array(np.ascontiguousarray(values).reshape(-1), dtype=dtype, device=device)
+        return _uploaded(values, dtype, device)
 
     factor = stiffness_factor.reshape(len(lattice.cells), -1).mean(axis=1)
     edges, weights, areas = lattice.hinges
@@ -205,3 +250,16 @@ def _triangle_inputs(
         array(law.membrane_shape), array(edges, wp.int32), array(weights), array(bending),
         wp.float64(law.relaxation_s), int(law.relaxation_s > 0),
     ]  # fmt: skip
+
+
+_SPLINES = {
+    3: _Bodies(
+        lambda law: solid_forces(law.stress, len(law.moduli)), _solid_inputs, 72,
+        {1: "gradients", 5: "numbers", 6: "cell size"},
+    ),
+    2: _Bodies(
+        lambda law: sheet_forces, _sheet_inputs, 24, {1: "derivatives", 4: "shape ratios", 5: "relaxation time"}
+    ),
+    1: _Bodies(lambda law: rod_forces, _rod_inputs, 12, {1: "derivatives", 4: "relaxation time"}),
+}  # fmt: skip
+_TRIANGLES = _Bodies(lambda law: triangle_forces, _triangle_inputs, 24, {})

@@ -14,8 +14,9 @@ Substeps run in a captured graph; the host returns once a frame to record, to ch
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import warp as wp
@@ -28,7 +29,6 @@ from physworld.engine.total.node_kernels import advance_counter, advance_nodes
 from physworld.engine.total.relaxation import MARGIN, Relaxation, stages_for
 from physworld.engine.total.stability import Steps, fastest_frequency
 from physworld.errors import BlewUp, CFLViolation, ParticlesLeftTheGrid, UnstableSimulation
-from physworld.materials.laws import friction_law, without_friction
 
 _CHUNK = 8  # substeps in one captured graph
 _REACH = 1e3  # a node farther than this many body sizes from its start has left every workspace
@@ -48,6 +48,7 @@ class TotalLagrangian:
     Attributes:
         relaxed: whether friction is sub-cycled (:mod:`physworld.engine.total.relaxation`).
         steps: the time steps that either way allows.
+        asked_step_s: the forced time step [s], or None.
         friction: the law's, where it is sub-cycled; None otherwise.
         mean_velocity: at which the last step took its friction, (3n,) [m/s], where it is sub-cycled.
 
@@ -69,7 +70,7 @@ class TotalLagrangian:
         self.forces = InternalForces(lattice, law, stiffness, problem.rest, device)
         cell = float(lattice.spacing.min())
         frequency = fastest_frequency(self.forces, problem.rest, self.mass, cell)
-        rubbing, internal = friction_law(law), 0.0
+        rubbing, internal = law.friction_law, 0.0
         if rubbing is not None:
             damper = InternalForces(lattice, rubbing, stiffness, problem.rest, device)
             internal = fastest_frequency(damper, problem.rest, self.mass, cell) ** 2
@@ -90,11 +91,11 @@ class TotalLagrangian:
                 f"time step {time_step_s:.3g} s exceeds the stable {limit:.3g} s of a body whose fastest mode has "
                 f"{frequency:.4g} rad/s (wave speed {law.wave_speed_m_s:.4g} m/s, cell {lattice.spacing.min():.3g} m)"
             )
-        self.steps = steps
+        self.steps, self.asked_step_s = steps, time_step_s
         self.time_step_s = time_step_s or (steps.relaxed_s() if relax else steps.explicit_s())
         self.relaxed, self.friction = relax, None
         if relax:
-            self.forces = InternalForces(lattice, without_friction(law), stiffness, problem.rest, device)
+            self.forces = InternalForces(lattice, law.without_friction(), stiffness, problem.rest, device)
             if rubbing is not None:
                 self.friction = FrictionForces(lattice, law, stiffness, problem.rest, device)
             self.mean_velocity = wp.zeros(3 * len(self.mass), dtype=wp.float64, device=device)
@@ -146,15 +147,46 @@ class TotalLagrangian:
         return whole_chunks(interval, self.time_step_s)
 
 
-class Run:
-    """One run of a solver on its device, frame by frame: see :meth:`TotalLagrangian.run` for the arguments.
+class Stepped(Protocol):
+    """What a run steps: one body, or several side by side.
+
+    Attributes:
+        device: of its arrays.
+        mass: nodal masses [kg], (n,).
+        cell_m: size of the largest cell [m].
+        substeps: so far, of all runs.
+    """
+
+    device: str
+    mass: Array
+    cell_m: float
+    substeps: int
+
+    @property
+    def forces(self) -> InternalForces:
+        """The internal forces."""
+        ...
+
+    def substeps_of(self, interval: float) -> int:
+        """Substeps that an interval between two frames takes."""
+        ...
+
+
+class SteppedRun(ABC):
+    """One run on a device, frame by frame: what one body and several side by side have in common.
+
+    Args:
+        solver: what is stepped.
+        x, v: nodal positions [m] and velocities [m/s] at the first time, (n, 3).
+        held: prescribed nodes; their paths are given at ``times``.
+        times: (T,) [s], strictly increasing.
 
     Attributes:
         x, v: the state, (3n,) float64 [m], [m/s]; velocities half a substep before the positions.
         clock, counter: (frame interval [s], 1/dt [1/s], dt [s]) and (frame, substep, substeps).
     """
 
-    def __init__(self, solver: TotalLagrangian, x: Array, v: Array, held: HeldNodes, times: Array) -> None:
+    def __init__(self, solver: Stepped, x: Array, v: Array, held: HeldNodes, times: Array) -> None:
         device, nodes, frames = solver.device, len(solver.mass), len(times)
         slot = np.full(nodes, -1, dtype=np.int32)
         slot[held.nodes] = np.arange(len(held.nodes), dtype=np.int32)
@@ -162,7 +194,7 @@ class Run:
         def upload(values: Array, dtype: type = wp.float64) -> wp.array:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
 
-        self._solver, self._start, self._times = solver, x, times
+        self._stepped, self._start, self._times = solver, x, times
         self.x, self.v = upload(x.reshape(-1)), upload(v.reshape(-1))
         self.force = wp.zeros(3 * nodes, dtype=wp.float64, device=device)
         self.clock = wp.zeros(3, dtype=wp.float64, device=device)
@@ -199,8 +231,8 @@ class Run:
         graph = self._graph(stages)
         for _ in range(substeps // _CHUNK):
             wp.capture_launch(graph)
-        self._solver.substeps += substeps
-        now = self.x.numpy().reshape(-1, 3).copy()
+        self._stepped.substeps += substeps
+        now: Array = self.x.numpy().reshape(-1, 3).copy()
         self._check(now, self._times[frame + 1])
         return now
 
@@ -214,7 +246,7 @@ class Run:
                 relaxation.stages = asked
             stages = relaxation.stages
         if stages not in self._graphs:
-            with wp.ScopedCapture(device=self._solver.device) as capture:
+            with wp.ScopedCapture(device=self._stepped.device) as capture:
                 for _ in range(_CHUNK):
                     self._substep()
             self._graphs[stages] = capture.graph
@@ -225,15 +257,82 @@ class Run:
         """Stages of friction in a substep of the last frame; 0 where it is explicit."""
         return 0 if self._relaxation is None else self._relaxation.stages
 
+    def _substep(self) -> None:
+        self._stepped.forces.launch(self.x, self.clock, self.force)
+        self._launch_terms()
+        self._launch_nodes()
+        wp.launch(advance_counter, dim=1, inputs=[self.counter], device=self._stepped.device)
+
+    def _set_clock(self, frame: int) -> int:
+        interval = self._times[frame + 1] - self._times[frame]
+        substeps = self._stepped.substeps_of(interval)
+        dt = interval / substeps
+        clock, counter = self._clocks
+        clock.numpy()[:] = interval, 1.0 / dt, dt
+        counter.numpy()[:] = frame, 0, substeps
+        wp.copy(self.clock, clock)
+        wp.copy(self.counter, counter)
+        self._pace(dt)
+        return substeps
+
+    def _half_a_step_back(self, v: Array, interval: float) -> Array:
+        """Velocities (n, 3) half a substep before the start, where a scheme of second order wants them.
+
+        ``self.force`` holds the internal forces at the start; those of the terms are added.
+        """
+        solver = self._stepped
+        dt = interval / self._set_clock(0)
+        self._launch_terms()
+        if self._relaxation is not None:
+            return v  # its first step is half a step
+        pull = self.force.numpy().reshape(-1, 3) / solver.mass[:, None]
+        gravity, drag = self._fall()
+        earlier: Array = v - 0.5 * dt * (pull + gravity - drag * v)
+        return earlier
+
+    @abstractmethod
+    def _begin(self) -> None:
+        """Terms start."""
+
+    @abstractmethod
+    def _pace(self, time_step_s: float) -> None:
+        """Terms learn the length of the substeps [s]."""
+
+    @abstractmethod
+    def _launch_terms(self) -> None:
+        """Terms add their forces."""
+
+    @abstractmethod
+    def _launch_nodes(self) -> None:
+        """Nodes advance under the forces."""
+
+    @abstractmethod
+    def _fall(self) -> tuple[Array, Array | float]:
+        """Gravity [m/s^2] and drag rate [1/s]; they fit velocities (n, 3)."""
+
+    @abstractmethod
+    def _relaxing(self) -> Relaxation | None:
+        """Friction in sub-steps of its own, or None."""
+
+    @abstractmethod
+    def _check(self, now: Array, time: float) -> None:
+        """Refuse positions (n, 3) [m] at ``time`` [s] that cannot be trusted."""
+
+
+class Run(SteppedRun):
+    """One run of one body: see :meth:`TotalLagrangian.run` for the arguments."""
+
+    def __init__(self, solver: TotalLagrangian, x: Array, v: Array, held: HeldNodes, times: Array) -> None:
+        self._solver = solver
+        super().__init__(solver, x, v, held, times)
+
     def _begin(self) -> None:
         for term in self._solver.terms:
             term.begin(self._times)
 
-    def _substep(self) -> None:
-        self._solver.forces.launch(self.x, self.clock, self.force)
-        self._launch_terms()
-        self._launch_nodes()
-        wp.launch(advance_counter, dim=1, inputs=[self.counter], device=self._solver.device)
+    def _pace(self, time_step_s: float) -> None:
+        for term in self._solver.terms:
+            term.pace(time_step_s)
 
     def _launch_terms(self) -> None:
         for term in self._solver.terms:
@@ -253,38 +352,7 @@ class Run:
             device=self._solver.device,
         )
 
-    def _set_clock(self, frame: int) -> int:
-        interval = self._times[frame + 1] - self._times[frame]
-        substeps = self._solver.substeps_of(interval)
-        dt = interval / substeps
-        clock, counter = self._clocks
-        clock.numpy()[:] = interval, 1.0 / dt, dt
-        counter.numpy()[:] = frame, 0, substeps
-        wp.copy(self.clock, clock)
-        wp.copy(self.counter, counter)
-        self._pace(dt)
-        return substeps
-
-    def _pace(self, time_step_s: float) -> None:
-        for term in self._solver.terms:
-            term.pace(time_step_s)
-
-    def _half_a_step_back(self, v: Array, interval: float) -> Array:
-        """Velocities (n, 3) half a substep before the start, where a scheme of second order wants them.
-
-        ``self.force`` holds the internal forces at the start; those of the terms are added.
-        """
-        solver = self._solver
-        dt = interval / self._set_clock(0)
-        self._launch_terms()
-        if self._relaxation is not None:
-            return v  # its first step is half a step
-        pull = self.force.numpy().reshape(-1, 3) / solver.mass[:, None]
-        gravity, drag = self._fall()
-        return v - 0.5 * dt * (pull + gravity - drag * v)
-
     def _fall(self) -> tuple[Array, Array | float]:
-        """Gravity [m/s^2] and drag rate [1/s]; they fit velocities (n, 3)."""
         return self._solver.problem.gravity_m_s2, self._solver.problem.drag_per_s
 
     def _relaxing(self) -> Relaxation | None:

@@ -131,7 +131,7 @@ def prepare_cell(
     x: wp.array[wp.float64],
     # out
     turned: wp.array[wp.float32],
-): ...
+) -> None: ...
 
 
 @wp.func_native(_SOLID)
@@ -148,7 +148,7 @@ def solid_cell(
     v: wp.array[wp.float64],
     # out
     force: wp.array[wp.float64],
-): ...
+) -> None: ...
 
 
 @wp.func_native(_SHEET)
@@ -166,7 +166,7 @@ def sheet_cell(
     v: wp.array[wp.float64],
     # out
     force: wp.array[wp.float64],
-): ...
+) -> None: ...
 
 
 @wp.func_native(_ROD)
@@ -182,7 +182,7 @@ def rod_cell(
     v: wp.array[wp.float64],
     # out
     force: wp.array[wp.float64],
-): ...
+) -> None: ...
 
 
 @wp.kernel(enable_backward=False)

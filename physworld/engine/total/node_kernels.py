@@ -31,7 +31,7 @@ def weighted_sum(
 
 
 @wp.func
-def hermite(s: wp.float64):
+def hermite(s: wp.float64) -> wp.vec3d:
     """Weights of the second place and of the two velocities times the interval, at the share ``s`` of it."""
     s2 = s * s
     s3 = s2 * s
@@ -42,7 +42,7 @@ def hermite(s: wp.float64):
 def on_path(
     path_x: wp.array2d[wp.float64], path_v: wp.array2d[wp.float64], frame: int, k: int,
     s: wp.float64, span: wp.float64,
-):  # fmt: skip
+) -> wp.float64:  # fmt: skip
     """Cubic Hermite between two frames at the share ``s`` of their interval ``span`` [s]."""
     h = hermite(s)
     start = path_x[frame, k]
@@ -64,7 +64,7 @@ def advance(
     force: wp.array[wp.float64],
     x: wp.array[wp.float64],
     v: wp.array[wp.float64],
-):
+) -> None:
     """One symplectic Euler step of a node; its force is read and cleared."""
     dt = clock[2]
     held = slot[node]

@@ -105,7 +105,7 @@ def stage_of_components(
     rate0: wp.array[wp.float64],
     mean: wp.array[wp.float64],
     y2: wp.array[wp.float64],
-): ...
+) -> None: ...
 
 
 @wp.kernel(enable_backward=False)

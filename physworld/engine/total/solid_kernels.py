@@ -177,7 +177,7 @@ def solid_forces(stress: Stress, moduli: int) -> wp.Kernel:
         # out
         force: wp.array[wp.float64],
         inverted: wp.array[wp.int32],
-    ): ...
+    ) -> None: ...
 
     @wp.kernel(module=f"physworld_solid_{stress.name}", enable_backward=False)
     def forces(

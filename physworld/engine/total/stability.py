@@ -13,12 +13,12 @@ is stable while
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import warp as wp
 
 from physworld.arrays import Array
-from physworld.engine.total.forces import InternalForces
 
 SAFETY = 0.6  # share of the limit that is used: large strains stiffen a body
 _ITERATIONS = 40
@@ -29,7 +29,17 @@ EXPLICIT_SHRINK = (
 DRAG_SHRINK = 1.05  # and drag this one: its sub-steps need no cells
 
 
-def fastest_frequency(forces: InternalForces, rest: Array, mass: Array, spacing: float) -> float:
+class NodalForces(Protocol):
+    """Forces at nodal positions, whatever makes them: what a power iteration probes."""
+
+    device: str
+
+    def launch(self, x: wp.array, clock: wp.array, force: wp.array) -> None:
+        """Add the forces [N] at nodal positions ``x`` (3n,) to ``force`` (3n,); ``clock[1]`` is 1/dt [1/s]."""
+        ...
+
+
+def fastest_frequency(forces: NodalForces, rest: Array, mass: Array, spacing: float) -> float:
     """Highest angular frequency [rad/s] about the rest state.
 
     Args:
@@ -41,7 +51,7 @@ def fastest_frequency(forces: InternalForces, rest: Array, mass: Array, spacing:
     return float(fastest_frequencies(forces, rest[None], mass[None], spacing)[0])
 
 
-def fastest_frequencies(forces: InternalForces, rest: Array, mass: Array, spacing: float) -> Array:
+def fastest_frequencies(forces: NodalForces, rest: Array, mass: Array, spacing: float) -> Array:
     """Highest angular frequencies [rad/s], (B,), of B bodies that ``forces`` holds side by side.
 
     Args:
@@ -107,7 +117,8 @@ class Steps:
         return shrink > EXPLICIT_SHRINK or internal / self.explicit_s() > DRAG_SHRINK
 
 
-def _forces_at(forces: InternalForces, x: Array, clock: wp.array) -> Array:
+def _forces_at(forces: NodalForces, x: Array, clock: wp.array) -> Array:
     force = wp.zeros(x.size, dtype=wp.float64, device=forces.device)
     forces.launch(wp.array(x.reshape(-1), dtype=wp.float64, device=forces.device), clock, force)
-    return force.numpy().reshape(x.shape)
+    forces_n: Array = force.numpy().reshape(x.shape)
+    return forces_n

@@ -19,8 +19,6 @@ from physworld.errors import SceneUnsupported
 if TYPE_CHECKING:
     from physworld.engine.problem import Problem
 
-_DERIVATIVES = {2: [(1, 0), (0, 1), (2, 0), (0, 2), (1, 1)], 1: [(1,), (2,)]}
-
 
 @dataclass(frozen=True)
 class StressTerm:
@@ -71,13 +69,12 @@ class StressTerm:
 
         factor = 1.0 if problem.stiffness_factor is None else problem.stiffness_factor
         fields = [lattice.particle_measures * factor, *([] if self.fields is None else self.fields)]
-        cells, spacing = len(lattice.cells), lattice.spacing
+        cells, spacing, orders = len(lattice.cells), lattice.spacing, problem.law.strain_orders
         inputs = [cells, self.model.rows, array(lattice.cell_nodes, wp.int32)]
         if lattice.dim == 3:
-            slopes = np.stack([lattice.table(tuple(int(a == j) for a in range(3))) for j in range(3)], axis=1)
+            slopes = np.stack([lattice.table(o) for o in orders], axis=1)
             inputs += [array(slopes), array(problem.rest, wp.float64), wp.vec3f(*(1.0 / spacing))]
         else:
-            orders = _DERIVATIVES[lattice.dim]
             inputs += [
                 array(np.stack([lattice.table(o) / np.prod(spacing ** np.array(o)) for o in orders], axis=1))
             ]
@@ -100,15 +97,13 @@ class BoundStress(BoundTerm):
 
     model: StressModel
     cells: int
-    inputs: list
+    inputs: list[Any]
     state: wp.array
     device: str
     frequency_rad_s: float
 
-    @property
-    def memory(self) -> tuple[wp.array, ...]:
-        """The rows of memory, if the model has any."""
-        return (self.state,) if self.model.rows else ()
+    def __post_init__(self) -> None:
+        self.memory = (self.state,) if self.model.rows else ()
 
     @property
     def numbers(self) -> wp.array:

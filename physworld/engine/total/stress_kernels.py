@@ -296,7 +296,7 @@ def solid_model(model: str, rows: int = 0) -> StressModel:
         state: wp.array[wp.float32],
         # out
         force: wp.array[wp.float64],
-    ): ...
+    ) -> None: ...
 
     @wp.kernel(module="unique")
     def stress_forces(
@@ -356,7 +356,7 @@ def _thin_model(dim: int, frame: str, model: str, rows: int) -> StressModel:
         state: wp.array[wp.float64],
         # out
         force: wp.array[wp.float64],
-    ): ...
+    ) -> None: ...
 
     @wp.kernel(module="unique")
     def stress_forces(

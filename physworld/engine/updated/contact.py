@@ -84,7 +84,8 @@ class GridContact:
     @property
     def impulse_n_s(self) -> Array:
         """What the collider gave to the body since the start of the last run [N s], (3,)."""
-        return self._totals.numpy()[:3]
+        impulse: Array = self._totals.numpy()[:3]
+        return impulse
 
     @property
     def deepest_m(self) -> float:

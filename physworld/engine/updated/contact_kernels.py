@@ -163,7 +163,7 @@ def carried(
 def push(
     i: int, j: int, k: int, weights: wp.mat33f, box: wp.array[wp.int32], impulse: wp.vec3f,
     velocity: wp.array[wp.vec4f],
-):  # fmt: skip
+) -> None:  # fmt: skip
     """Give an impulse [N s] at a particle to its nodes."""
 
 
@@ -193,7 +193,7 @@ def _sift(
     pose: wp.array[wp.vec3d],
     x: wp.array[wp.float64],
     candidates: wp.array[wp.int32],
-): ...
+) -> None: ...
 
 
 @wp.kernel(enable_backward=False)
@@ -296,7 +296,7 @@ def correct(
     velocity: wp.array[wp.vec4f],
     totals: wp.array[wp.float64],
     hardest: wp.array[wp.float32],
-):
+) -> None:
     """Correct the impulse [N s] of one particle; see :func:`press`."""
     s = stencil_of(wp.vec3d(x[3 * p], x[3 * p + 1], x[3 * p + 2]), origin, inv_dx, box)
     if not inside(s, box):

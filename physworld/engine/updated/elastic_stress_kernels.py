@@ -106,7 +106,7 @@ def elastic_stress(stress: Stress, moduli: int) -> wp.Kernel:
         stress: wp.array[wp.float32],
         ratio: wp.array[wp.float32],
         flags: wp.array[wp.int32],
-    ): ...
+    ) -> None: ...
 
     @wp.kernel(module=f"physworld_particle_{stress.name}", enable_backward=False)
     def particle_stress(

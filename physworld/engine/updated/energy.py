@@ -71,7 +71,8 @@ class ParticleLedger:
     def lost(self) -> Array:
         """The remainder: what the numerics lost (negative: gained) since the first frame."""
         done = self.grip_work + self.contact_work + self.term_work - self.drag - self.dissipated
-        return done - (self.mechanical - self.mechanical[0])
+        remainder: Array = done - (self.mechanical - self.mechanical[0])
+        return remainder
 
     @property
     def turnover(self) -> float:
@@ -197,7 +198,7 @@ def stored_energy(engine: UpdatedLagrangian, F: Array) -> float:
     if problem.stiffness_factor is not None:
         measure = measure * np.asarray(problem.stiffness_factor)[engine.solid]
     if plasticity is None:
-        return float(measure @ problem.law.energy_density(F))
-    mu, lam = problem.law.lame
+        return float(measure @ engine.law.energy_density(F))
+    mu, lam = engine.law.lame
     strain = np.log(np.linalg.svd(F, compute_uv=False))
     return float(measure @ (mu * np.sum(strain**2, axis=1) + 0.5 * lam * np.sum(strain, axis=1) ** 2))

@@ -31,8 +31,8 @@ from physworld.engine.updated.stress import ParticleStress, padded
 from physworld.engine.updated.terms import ParticleBody, ParticleTerms
 from physworld.engine.updated.transfer import Apic, Transfer
 from physworld.errors import CFLViolation, SceneUnsupported
-from physworld.materials.laws import SolidLaw
-from physworld.materials.plastic import DruckerPrager, Identity, Plasticity
+from physworld.materials.plastic import Plasticity
+from physworld.materials.solid import SolidLaw
 
 _LIMIT = 0.9  # stable dt in units of dx / c, measured on the full lattice (tests/unit/engine)
 _SAFETY = 0.45  # share of the limit that is used: dt = 0.4 dx / c
@@ -69,10 +69,10 @@ class UpdatedLagrangian:
             raise SceneUnsupported(
                 f"the updated Lagrangian form integrates solids, got a lattice of dimension {lattice.dim}"
             )
-        self.problem = problem
+        self.problem, self.law = problem, law
         self.transfer = transfer if transfer is not None else Apic()
         self.plasticity = plasticity
-        grains = isinstance(plasticity, DruckerPrager)
+        grains = plasticity is not None and plasticity.granular
         opening, share = self.transfer.separating_volume, self.transfer.velocity_share
         self.separating_volume = (_OPENING if grains else float("inf")) if opening is None else opening
         self.velocity_share = (_GRAIN_SHARE if grains else 1.0) if share is None else share
@@ -86,7 +86,7 @@ class UpdatedLagrangian:
         cell = float(self.grid.spacing.min())
         speed = law.wave_speed_m_s * float(np.sqrt((stiffness / density).max()))
         friction = float((law.viscosity_pa_s * stiffness / (law.density_kg_m3 * density)).max())
-        flows = plasticity is not None and not isinstance(plasticity, Identity)
+        flows = plasticity is not None and plasticity.flows
         body = ParticleBody(problem, self.solid, self.mass, padded(len(self.solid)), flows)
         self.terms = ParticleTerms(body, self.grid)
         frequency = float(np.hypot(2 * speed / (_LIMIT * cell), self.terms.frequency_rad_s))
@@ -162,13 +162,12 @@ class UpdatedLagrangian:
         bends = lattice.second_differences()
         factor = splu((rows.T @ rows + _SMOOTHING * bends.T @ bends).tocsc())
         flat = particles.transpose(1, 0, 2).reshape(len(self.solid), -1)
-        return factor.solve(rows.T @ flat).reshape(len(lattice.nodes), -1, 3).transpose(1, 0, 2)
+        nodes: Array = factor.solve(rows.T @ flat).reshape(len(lattice.nodes), -1, 3).transpose(1, 0, 2)
+        return nodes
 
     def stress(self) -> ParticleStress:
         """A fresh stress state of the particles."""
-        return ParticleStress(
-            self.problem.law, self.plasticity, self.volume, self._stiffness, self.problem.device
-        )
+        return ParticleStress(self.law, self.plasticity, self.volume, self._stiffness, self.problem.device)
 
     def _hung(self) -> Array:
         """Masses [kg], (P,), of the loads that hang from the lattice's nodes: each goes to the material around it."""
@@ -183,9 +182,10 @@ class UpdatedLagrangian:
         """Values at the particles, (P, 3), of a nodal field (n, 3), differentiated ``orders`` times in cells."""
         lattice = self.problem.lattice
         table = lattice.table(orders)
-        return np.einsum("cai,ap->cpi", nodal[lattice.cell_nodes], table, optimize=True).reshape(-1, 3)[
-            self.solid
-        ]
+        values: Array = np.einsum("cai,ap->cpi", nodal[lattice.cell_nodes], table, optimize=True).reshape(
+            -1, 3
+        )[self.solid]
+        return values
 
     def _gradient(self, nodal: Array) -> Array:
         """Gradients at the particles in the reference body, (P, 3, 3), of a nodal field (n, 3)."""

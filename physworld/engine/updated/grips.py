@@ -7,6 +7,7 @@ material; its particles follow those nodes, and carry their velocity and its gra
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -51,7 +52,7 @@ def particle_grips(
     Raises:
         SceneUnsupported: nodes are held, but no whole cell is.
     """
-    held = np.isin(lattice.cell_nodes, nodes).all(axis=1)
+    held = np.asarray(np.isin(lattice.cell_nodes, nodes).all(axis=1))
     if len(nodes) and not held.any():
         raise SceneUnsupported(
             f"{len(nodes)} nodes are held but none of {len(lattice.cells)} cells has all its nodes held: "
@@ -66,8 +67,8 @@ def particle_grips(
     value = lattice.interpolation(coordinates)[:, nodes]
     slopes = [lattice.interpolation(coordinates, axis)[:, nodes] for axis in _AXES]
 
-    def carry(matrix: object, paths: Array) -> Array:
-        flat = matrix @ paths.transpose(1, 0, 2).reshape(paths.shape[1], -1)  # type: ignore[operator]
+    def carry(matrix: Any, paths: Array) -> Array:
+        flat = matrix @ paths.transpose(1, 0, 2).reshape(paths.shape[1], -1)
         return np.asarray(flat).reshape(len(gripped), len(paths), 3).transpose(1, 0, 2)
 
     shape = np.stack([carry(slope, positions) for slope in slopes], axis=-1)

@@ -109,7 +109,7 @@ def _stretch(
     C: wp.array[wp.float32],
     F_state: wp.array[wp.float64],
     eigen: wp.array[eigen_type],
-): ...
+) -> None: ...
 
 
 @wp.kernel(enable_backward=False)
@@ -130,7 +130,7 @@ def stretch(
 
 
 @wp.func
-def outer_sum(eigen: eigen_type, values: wp.vec3d) -> wp.mat33d:
+def outer_sum(eigen: Any, values: wp.vec3d) -> wp.mat33d:
     """The symmetric matrix with the eigenvectors of ``eigen`` and other eigenvalues."""
     total = wp.mat33d()
     for k in range(3):

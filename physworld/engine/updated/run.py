@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -106,7 +106,8 @@ class ParticleRun:
         return ParticleRun(self.engine, self.particles, self.stress, self.engine.grips(held))
 
     def _positions(self) -> Array:
-        return self.particles.x.numpy().reshape(-1, 3).copy()
+        positions: Array = self.particles.x.numpy().reshape(-1, 3).copy()
+        return positions
 
     def _time_step(self, time: float, interval: float) -> float:
         """The stable step, or less where particles are fast: none should cross much of a cell in a substep."""
@@ -192,7 +193,7 @@ class ParticleRun:
         clear = -np.inf if terms.ground_height_m is None else terms.ground_height_m + grid.spacing[2]
         space = [wp.vec3f(*inverse), wp.vec3f(*grid.spacing)]
 
-        def launch(kernel: object, dim: int, inputs: list, outputs: list) -> None:
+        def launch(kernel: object, dim: int, inputs: list[Any], outputs: list[Any]) -> None:
             wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
         if meter is not None:

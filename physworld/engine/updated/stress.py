@@ -10,8 +10,8 @@ import warp as wp
 from physworld.arrays import Array
 from physworld.engine.updated.elastic_stress_kernels import elastic_stress
 from physworld.engine.updated.hencky_kernels import eigen_type, plastic_kernel, stretch
-from physworld.materials.laws import SolidLaw
 from physworld.materials.plastic import Plasticity
+from physworld.materials.solid import SolidLaw
 
 LANES = 8  # particles that an elastic kernel takes at once: arrays are padded to a multiple
 

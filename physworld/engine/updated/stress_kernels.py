@@ -89,7 +89,7 @@ def particle_model(model: str) -> Any:
         # in, out
         state: wp.array[wp.float32],
         stress: wp.array[wp.float32],
-    ): ...
+    ) -> None: ...
 
     @wp.kernel(module="unique", enable_backward=False)
     def add_stress(

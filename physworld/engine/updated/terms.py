@@ -85,9 +85,8 @@ class ParticleTerms:
         problem, count = body.problem, len(body.solid)
         self._device, self._count = problem.device, count
         self.ground_height_m: float | None = None
-        mu, lam = problem.law.lame
         stiffest = 1.0 if problem.stiffness_factor is None else float(np.max(problem.stiffness_factor))
-        modulus = (lam + 2 * mu) * stiffest
+        modulus = problem.law.contact_stiffness(1.0)[0] * stiffest
         contacts: list[GridContact] = []
         bound: list[BoundTerm | BoundParticleStress] = []
         for term in problem.terms:
@@ -132,8 +131,8 @@ class ParticleTerms:
         self, x: wp.array, v: wp.array, F: wp.array, stress: wp.array, clock: wp.array, counter: wp.array
     ) -> None:
         """Before particles go to the grid: change their stress (6P,) [J], and kick their velocities (3P,) [m/s]."""
-        for term in self._stresses:
-            term.launch(F, stress, clock, counter)
+        for stressing in self._stresses:
+            stressing.launch(F, stress, clock, counter)
         if not self._forces:
             return
         size = 3 * self._count

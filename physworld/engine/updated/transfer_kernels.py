@@ -248,7 +248,7 @@ def _scatter(
     momentum: wp.array[wp.vec4f],
     impulse: wp.array[wp.vec4f],
     flags: wp.array[wp.int32],
-): ...
+) -> None: ...
 
 
 @wp.func_native(_GATHER)
@@ -277,7 +277,7 @@ def _gather(
     # out
     flags: wp.array[wp.int32],
     extremes: wp.array[wp.float32],
-): ...
+) -> None: ...
 
 
 @wp.kernel(enable_backward=False)

@@ -24,7 +24,7 @@ from physworld.catalogue import Quantity
 @wp.func
 def _project(
     eps: wp.vec3d, mu: wp.float64, lam: wp.float64, parameters: wp.vec3d, memory: wp.float64, dt: wp.float64
-):
+) -> wp.vec4d:
     three = wp.float64(3.0)
     zero = wp.float64(0.0)
     slope = parameters[0]
@@ -66,6 +66,8 @@ class DruckerPrager:
     equation: ClassVar[str] = "|dev eps| + a (3 lambda + 2 mu) / (2 mu) (tr eps - t) <= 0"
     use: ClassVar[str] = "sand, soil, snow"
     project: ClassVar[Any] = _project
+    flows: ClassVar[bool] = True
+    granular: ClassVar[bool] = True
     initial_memory: ClassVar[float] = 0.0
 
     def __post_init__(self) -> None:

@@ -22,7 +22,7 @@ from physworld.catalogue import Quantity
 @wp.func
 def _project(
     eps: wp.vec3d, mu: wp.float64, lam: wp.float64, parameters: wp.vec3d, memory: wp.float64, dt: wp.float64
-):
+) -> wp.vec4d:
     third = (eps[0] + eps[1] + eps[2]) / wp.float64(3.0)
     deviator = eps - wp.vec3d(third, third, third)
     size = wp.length(deviator)
@@ -57,6 +57,8 @@ class VonMises:
     equation: ClassVar[str] = "|s| - sqrt(2/3) (sigma_y + h a) <= 0"
     use: ClassVar[str] = "metals, clay, dough"
     project: ClassVar[Any] = _project
+    flows: ClassVar[bool] = True
+    granular: ClassVar[bool] = False
     initial_memory: ClassVar[float] = 0.0
 
     def __post_init__(self) -> None:

@@ -8,7 +8,11 @@ from physworld.engine.lattice.lattice import Lattice, box_lattice
 from physworld.engine.problem import HeldNodes, Problem
 from physworld.engine.terms.term import Term
 from physworld.engine.total.formulation import TotalLagrangian
-from physworld.materials.laws import Law, RodLaw, SheetLaw, SolidLaw
+from physworld.materials.laws import Law
+from physworld.materials.neo_hookean import NeoHookean
+from physworld.materials.rod import RodLaw
+from physworld.materials.sheet import SheetLaw
+from physworld.materials.solid import SolidLaw
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 
@@ -65,6 +69,7 @@ def material_point(lattice: Lattice, nodes: np.ndarray, coordinates: tuple[float
 
 __all__ = [
     "GRAVITY",
+    "NeoHookean",
     "RodLaw",
     "SheetLaw",
     "SolidLaw",

@@ -8,7 +8,7 @@ from bodies import rest_nodes
 
 from physworld.engine.lattice.lattice import box_lattice
 from physworld.engine.total.forces import InternalForces
-from physworld.materials.laws import SolidLaw
+from physworld.materials.solid import SolidLaw
 
 LATTICE = box_lattice(np.zeros(3), np.array([0.12, 0.05, 0.04]), (3, 2, 1))
 REST = rest_nodes(LATTICE)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from bodies import (
     GRAVITY,
+    NeoHookean,
     RodLaw,
     SheetLaw,
-    SolidLaw,
     clamped_lattice,
     material_point,
     rest_nodes,
@@ -38,7 +38,7 @@ def ringing(times: np.ndarray, tip: np.ndarray, guess: float) -> tuple[float, fl
 
 def cantilever_error(cells: int) -> tuple[float, float]:
     """Relative errors of droop and frequency of a solid cantilever, nu = 0, against Euler and Bernoulli."""
-    law = SolidLaw(2e6, 0.0, density_kg_m3=600.0)
+    law = NeoHookean(2e6, 0.0, density_kg_m3=600.0)
     lattice = clamped_lattice(LENGTH, (DEPTH, DEPTH), (cells, max(1, cells // 10), max(1, cells // 10)))
     times = np.arange(0.0, 0.6, 0.005)
     nodes = run(lattice, law, times)
@@ -111,7 +111,7 @@ def test_a_slack_rope_settles_on_the_catenary() -> None:
 
 def test_free_vibration_is_hardly_damped_by_the_scheme() -> None:
     """Total Lagrangian without transfer: amplitude loss below a drag of 0.1 1/s (APIC: 0.3 to 0.45)."""
-    law = SolidLaw(9e5, 0.3, density_kg_m3=600.0)
+    law = NeoHookean(9e5, 0.3, density_kg_m3=600.0)
     lattice = clamped_lattice(LENGTH, (0.042, 0.042), (21, 3, 3))
     times = np.arange(0.0, 3.0, 0.01)
     tip = material_point(lattice, run(lattice, law, times), (LENGTH, 0.021, 0.021))[:, 2]
@@ -121,7 +121,7 @@ def test_free_vibration_is_hardly_damped_by_the_scheme() -> None:
 
 
 def test_drag_slows_free_flight_as_its_closed_form_says() -> None:
-    law = SolidLaw(1e5, 0.3)
+    law = NeoHookean(1e5, 0.3)
     lattice = box_lattice(np.zeros(3), np.full(3, 0.05), (2, 2, 2))
     velocity = np.tile([1.0, 0.0, 0.5], (len(lattice.nodes), 1))
     times = np.linspace(0.0, 0.5, 11)
@@ -132,7 +132,7 @@ def test_drag_slows_free_flight_as_its_closed_form_says() -> None:
 
 
 def test_momentum_of_a_free_body_is_conserved() -> None:
-    law = SolidLaw(5e4, 0.3, viscosity_pa_s=5.0)
+    law = NeoHookean(5e4, 0.3, viscosity_pa_s=5.0)
     lattice = box_lattice(np.zeros(3), np.array([0.1, 0.05, 0.05]), (4, 2, 2))
     mass = nodal_mass(lattice, law, None)
     rng = np.random.default_rng(4)
@@ -145,7 +145,7 @@ def test_momentum_of_a_free_body_is_conserved() -> None:
 
 
 def test_a_block_on_the_ground_carries_its_weight_and_slides_to_the_coulomb_distance() -> None:
-    law = SolidLaw(2e5, 0.3, viscosity_pa_s=20.0, density_kg_m3=500.0)
+    law = NeoHookean(2e5, 0.3, viscosity_pa_s=20.0, density_kg_m3=500.0)
     lattice = box_lattice(np.zeros(3), np.array([0.12, 0.12, 0.06]), (4, 4, 2))
     friction, speed = 0.4, 0.8
     ground = GroundContact(0.0, friction)
@@ -158,7 +158,7 @@ def test_a_block_on_the_ground_carries_its_weight_and_slides_to_the_coulomb_dist
 
 
 def test_a_time_step_above_the_stable_limit_is_refused_and_just_below_it_runs() -> None:
-    law = SolidLaw(1e5, 0.3)
+    law = NeoHookean(1e5, 0.3)
     lattice = clamped_lattice(0.2, (0.04, 0.04), (10, 2, 2))
     problem = Problem(lattice, law, rest_nodes(lattice), GRAVITY)
     limit = TotalLagrangian(problem).time_step_s / 0.6
@@ -177,7 +177,7 @@ def test_a_time_step_above_the_stable_limit_is_refused_and_just_below_it_runs() 
 
 def test_the_limit_is_sharp_enough_to_matter() -> None:
     """Well above the limit the run blows up: the limit is no more than a factor of two too careful."""
-    law = SolidLaw(1e5, 0.3)
+    law = NeoHookean(1e5, 0.3)
     lattice = clamped_lattice(0.2, (0.04, 0.04), (10, 2, 2))
     solver = TotalLagrangian(Problem(lattice, law, rest_nodes(lattice), GRAVITY))
     solver.time_step_s *= 2.0 / 0.6

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from bodies import GRAVITY, RodLaw, SheetLaw, SolidLaw, rest_nodes, still_clamp
+from bodies import GRAVITY, NeoHookean, RodLaw, SheetLaw, rest_nodes, still_clamp
 
 from physworld.engine.lattice.lattice import Lattice, box_lattice
 from physworld.engine.problem import HeldNodes, Problem
@@ -16,7 +16,7 @@ from physworld.engine.total.formulation import TotalLagrangian
 from physworld.errors import ContactFailed
 from physworld.shapes import sdf
 
-LAW = SolidLaw(2e5, 0.3, 20.0, 1000.0)
+LAW = NeoHookean(2e5, 0.3, 20.0, 1000.0)
 BLOCK = box_lattice(np.array([-0.05, -0.05, 0.0]), np.array([0.1, 0.1, 0.05]), (4, 4, 2))
 MASS = 0.5
 G = 9.81
@@ -109,7 +109,7 @@ def test_what_a_collider_gives_is_what_the_body_gets_and_nothing_is_held_back() 
 
 
 def test_a_frictionless_collision_conserves_energy_and_a_pusher_gives_what_it_works() -> None:
-    law, rest, times = SolidLaw(2e5, 0.3, 0.0, 1000.0), rest_nodes(BLOCK), np.linspace(0, 0.2, 41)
+    law, rest, times = NeoHookean(2e5, 0.3, 0.0, 1000.0), rest_nodes(BLOCK), np.linspace(0, 0.2, 41)
     still = Collider("ball", sdf.sphere(0.1), RigidPath.still((0.0, 0.0, -0.105)), 0.0)
     velocity = np.broadcast_to([0.0, 0.0, -0.8], rest.shape).copy()
     held = still_clamp(BLOCK, rest, 41, clamped=False)
@@ -146,7 +146,7 @@ def boussinesq(x: np.ndarray, load: float, modulus: float, ratio: float) -> np.n
 def test_a_sphere_pressed_into_a_block_follows_hertz() -> None:
     """The block is a piece of a half space: its far sides move as under a point load of Hertz's size."""
     modulus, ratio, dx, count = 1e5, 0.3, 0.01, 14
-    law = SolidLaw(modulus, ratio, 0.0, 1000.0)
+    law = NeoHookean(modulus, ratio, 0.0, 1000.0)
     size = count * dx
     lattice = box_lattice(
         np.array([-size / 2, -size / 2, -size / 2]), np.array([size, size, size / 2]), (14, 14, 7)

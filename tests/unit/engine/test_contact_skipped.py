@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from bodies import GRAVITY, SolidLaw, rest_nodes, still_clamp
+from bodies import GRAVITY, NeoHookean, rest_nodes, still_clamp
 from scipy import sparse
 from scipy.sparse.linalg import eigsh
 
@@ -16,7 +16,7 @@ from physworld.engine.terms.contact import ColliderContact, contact_points
 from physworld.engine.total.formulation import TotalLagrangian
 from physworld.shapes import sdf
 
-LAW = SolidLaw(2e5, 0.3, 20.0, 1000.0)
+LAW = NeoHookean(2e5, 0.3, 20.0, 1000.0)
 BLOCK = box_lattice(np.array([-0.05, -0.05, 0.05]), np.array([0.1, 0.1, 0.05]), (4, 4, 2))
 TIMES = np.linspace(0, 0.4, 13)
 SHAPES = {"ground": (sdf.half_space(), np.zeros(3)), "ball": (sdf.sphere(0.04), np.array([0.01, 0.0, -0.04]))}

@@ -14,7 +14,10 @@ from physworld.engine.terms.contact import GroundContact
 from physworld.engine.total.energy import EnergyLedger, run_with_ledger
 from physworld.engine.total.formulation import TotalLagrangian
 from physworld.errors import CFLViolation, ParticlesLeftTheGrid, UnstableSimulation
-from physworld.materials.laws import Law, RodLaw, SheetLaw, SolidLaw
+from physworld.materials.laws import Law
+from physworld.materials.neo_hookean import NeoHookean
+from physworld.materials.rod import RodLaw
+from physworld.materials.sheet import SheetLaw
 
 LEAPFROG = 5e-5  # share of the energy exchanged that a leapfrog's bounded oscillation may reach
 ROUND_OFF = 1e-12
@@ -22,8 +25,8 @@ ROUND_OFF = 1e-12
 BODIES: dict[str, tuple[Lattice, Law, Law]] = {
     "solid": (
         clamped_lattice(0.2, (0.03, 0.03), (8, 2, 2)),
-        SolidLaw(2e5, 0.35, density_kg_m3=600.0),
-        SolidLaw(2e5, 0.35, viscosity_pa_s=20.0, density_kg_m3=600.0),
+        NeoHookean(2e5, 0.35, density_kg_m3=600.0),
+        NeoHookean(2e5, 0.35, viscosity_pa_s=20.0, density_kg_m3=600.0),
     ),
     "sheet": (
         clamped_lattice(0.2, (0.1,), (10, 5)),
@@ -90,7 +93,7 @@ def test_the_loss_goes_with_the_square_of_the_time_step() -> None:
 
 def test_a_falling_body_trades_height_for_speed() -> None:
     lattice = box_lattice(np.zeros(3), np.full(3, 0.05), (2, 2, 2))
-    law, rest = SolidLaw(1e5, 0.3), rest_nodes(lattice)
+    law, rest = NeoHookean(1e5, 0.3), rest_nodes(lattice)
     problem = Problem(lattice, law, rest, GRAVITY)
     nobody = HeldNodes(nowhere(), *np.zeros((2, len(TIMES), 0, 3)))
     nodes, ledger = run_with_ledger(problem, rest, np.zeros_like(rest), nobody, TIMES)
@@ -103,7 +106,7 @@ def test_a_falling_body_trades_height_for_speed() -> None:
 
 def test_friction_on_the_ground_takes_the_energy_of_a_slide() -> None:
     lattice = box_lattice(np.zeros(3), np.array([0.12, 0.12, 0.03]), (4, 4, 1))
-    law, rest = SolidLaw(2e5, 0.3, density_kg_m3=500.0), rest_nodes(lattice)
+    law, rest = NeoHookean(2e5, 0.3, density_kg_m3=500.0), rest_nodes(lattice)
     problem = Problem(lattice, law, rest, GRAVITY, terms=(GroundContact(0.0, 0.4),))
     velocity = np.tile([0.6, 0.0, 0.0], (len(rest), 1))
     nobody = HeldNodes(nowhere(), *np.zeros((2, len(TIMES), 0, 3)))
@@ -151,6 +154,6 @@ def test_material_that_leaves_every_workspace_ends_the_run_with_its_distance() -
     rest = rest_nodes(lattice)
     nobody = HeldNodes(nowhere(), *np.zeros((2, 2, 0, 3)))
     with pytest.raises(ParticlesLeftTheGrid, match=r"a node is .* m from its start at t = 1\.0000 s"):
-        TotalLagrangian(Problem(lattice, SolidLaw(1e3, 0.3), rest, np.zeros(3))).run(
+        TotalLagrangian(Problem(lattice, NeoHookean(1e3, 0.3), rest, np.zeros(3))).run(
             rest, np.full_like(rest, 500.0), nobody, np.array([0.0, 1.0])
         )

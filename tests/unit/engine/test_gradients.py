@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from bodies import GRAVITY, RodLaw, SheetLaw, SolidLaw, clamped_lattice, rest_nodes
+from bodies import GRAVITY, NeoHookean, RodLaw, SheetLaw, clamped_lattice, rest_nodes
 
 from physworld.engine.gradients.adjoint import Adjoint, RecordedRun
 from physworld.engine.gradients.adjoint_reverse import Gradient
@@ -28,7 +28,7 @@ def body(shape: str) -> tuple[Problem, np.ndarray, HeldNodes]:
     friction = "friction" in shape
     if shape.startswith("solid"):
         lattice = clamped_lattice(0.12, (0.03, 0.03), (8, 2, 2))
-        law = SolidLaw(5e4, 0.35, viscosity_pa_s=10.0 * friction)
+        law = NeoHookean(5e4, 0.35, viscosity_pa_s=10.0 * friction)
     elif shape.startswith("sheet"):
         lattice = clamped_lattice(0.2, (0.2,), (8, 8))
         law = SheetLaw(300.0, 1e-4, relaxation_s=0.002 * friction)

@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from bodies import GRAVITY, RodLaw, SheetLaw, SolidLaw, rest_nodes
+from bodies import GRAVITY, NeoHookean, RodLaw, SheetLaw, rest_nodes
 
 from physworld.engine.gradients.adjoint import Adjoint
 from physworld.engine.gradients.adjoint_reverse import Gradient
@@ -19,7 +19,7 @@ from physworld.engine.total.formulation import TotalLagrangian
 TIMES = np.linspace(0.0, 0.06, 7)
 SAME = {3: 1e-6, 2: 1e-12, 1: 1e-12}  # [m] solids add up single-precision forces
 AGREES = 0.03
-LAWS = {3: SolidLaw(2e4, 0.3), 2: SheetLaw(100.0, 1e-3, density_kg_m2=0.5), 1: RodLaw(100.0, 1e-3)}
+LAWS = {3: NeoHookean(2e4, 0.3), 2: SheetLaw(100.0, 1e-3, density_kg_m2=0.5), 1: RodLaw(100.0, 1e-3)}
 
 
 def body(dim: int) -> Lattice:

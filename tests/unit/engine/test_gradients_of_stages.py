@@ -11,7 +11,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from bodies import GRAVITY, RodLaw, SheetLaw, SolidLaw, clamped_lattice, rest_nodes
+from bodies import GRAVITY, NeoHookean, RodLaw, SheetLaw, clamped_lattice, rest_nodes
 
 from physworld.engine.gradients.adjoint import Adjoint, RecordedRun
 from physworld.engine.gradients.adjoint_reverse import Gradient
@@ -30,7 +30,7 @@ def body(shape: str) -> tuple[Problem, np.ndarray, HeldNodes]:
     drag = 0.7
     if shape == "solid":
         lattice = clamped_lattice(0.12, (0.03, 0.03), (8, 2, 2))
-        law = SolidLaw(5e4, 0.35, viscosity_pa_s=1000.0, density_kg_m3=600.0)
+        law = NeoHookean(5e4, 0.35, viscosity_pa_s=1000.0, density_kg_m3=600.0)
     elif shape == "sheet":
         lattice, law = clamped_lattice(0.2, (0.2,), (8, 8)), SheetLaw(300.0, 1e-2, relaxation_s=0.05)
     elif shape == "rod":
@@ -40,7 +40,7 @@ def body(shape: str) -> tuple[Problem, np.ndarray, HeldNodes]:
         )
     else:
         lattice, drag = clamped_lattice(0.12, (0.03, 0.03), (8, 2, 2)), 3000.0
-        law = SolidLaw(5e4, 0.35, density_kg_m3=600.0)
+        law = NeoHookean(5e4, 0.35, density_kg_m3=600.0)
     rest = rest_nodes(lattice)
     rng = np.random.default_rng(0)
     factors = np.exp(0.1 * rng.normal(size=(2, lattice.fill.size)))

@@ -15,12 +15,13 @@ from physworld.engine.terms.contact import GroundContact
 from physworld.engine.updated.energy import ParticleLedger, run_particles_with_ledger
 from physworld.engine.updated.formulation import UpdatedLagrangian
 from physworld.engine.updated.transfer import Apic, Asflip, Transfer
-from physworld.materials.laws import SolidLaw
+from physworld.materials.neo_hookean import NeoHookean
 from physworld.materials.plastic import VonMises
+from physworld.materials.solid import SolidLaw
 
 SINGLE = 2e-4  # velocities are single precision and summed substep by substep
 BEAM = clamped_lattice(0.1, (0.03, 0.03), (10, 3, 3))
-LAW = SolidLaw(264e3, 0.35, density_kg_m3=1070.0)
+LAW = NeoHookean(264e3, 0.35, density_kg_m3=1070.0)
 TIMES = np.linspace(0.0, 0.4, 41)
 
 
@@ -134,7 +135,7 @@ def test_a_block_that_slides_to_a_stop_gives_its_energy_to_the_ground() -> None:
 
 def test_plastic_flow_dissipates_the_yield_stress_times_the_strain() -> None:
     """A block pressed by a tenth between two grips: dissipated is sigma_y times strain times volume."""
-    law = SolidLaw(1e6, 0.3, density_kg_m3=1000.0)
+    law = NeoHookean(1e6, 0.3, density_kg_m3=1000.0)
     lattice, rest, problem = block(law, gravity_m_s2=np.zeros(3))
     ends = [np.unique(lattice.cell_nodes[lattice.cells[:, 2] == k]) for k in (0, 5)]
     times = np.linspace(0.0, 0.5, 26)

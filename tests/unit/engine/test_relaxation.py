@@ -9,9 +9,9 @@ import pytest
 import warp as wp
 from bodies import (
     GRAVITY,
+    NeoHookean,
     RodLaw,
     SheetLaw,
-    SolidLaw,
     clamped_lattice,
     material_point,
     rest_nodes,
@@ -34,7 +34,7 @@ SINGLE = 2e-4  # of forces that are differences of single-precision ones over a 
 BODIES: dict[str, tuple[Lattice, Law]] = {
     "solid": (
         clamped_lattice(0.2, (0.03, 0.03), (8, 2, 2)),
-        SolidLaw(2e5, 0.35, viscosity_pa_s=3000.0, density_kg_m3=600.0),
+        NeoHookean(2e5, 0.35, viscosity_pa_s=3000.0, density_kg_m3=600.0),
     ),
     "sheet": (
         clamped_lattice(0.2, (0.1,), (10, 5)),
@@ -137,7 +137,7 @@ def oscillator(times: np.ndarray, frequency: float, ratio: float) -> np.ndarray:
 def test_strong_friction_decays_as_the_closed_form_at_the_frictionless_step(kind: str, shrink: float) -> None:
     if kind == "bar":
         length, axis, tau = 0.3, 0, 4.9e-3 * shrink / 10.0
-        law: Law = SolidLaw(2e5, 0.0, viscosity_pa_s=0.5 * tau * 2e5, density_kg_m3=600.0)
+        law: Law = NeoHookean(2e5, 0.0, viscosity_pa_s=0.5 * tau * 2e5, density_kg_m3=600.0)
         lattice = clamped_lattice(length, (0.03, 0.03), (20, 2, 2))
         rest = rest_nodes(lattice)
         shape = np.sin(0.5 * np.pi * np.clip(rest[:, 0], 0, length) / length)
@@ -203,7 +203,7 @@ def test_a_body_that_nothing_holds_keeps_its_momentum() -> None:
 
 
 def test_the_stages_follow_a_body_that_is_pressed_flat() -> None:
-    law = SolidLaw(2e5, 0.0, viscosity_pa_s=3000.0, density_kg_m3=600.0)
+    law = NeoHookean(2e5, 0.0, viscosity_pa_s=3000.0, density_kg_m3=600.0)
     lattice = box_lattice(np.zeros(3), np.array([0.06, 0.03, 0.03]), (6, 3, 3))
     rest = rest_nodes(lattice)
     ends = [np.unique(lattice.cell_nodes[lattice.cells[:, 0] == k]) for k in (0, 5)]
@@ -245,7 +245,7 @@ def test_weak_friction_stays_explicit_and_gradients_follow_the_engine() -> None:
 @pytest.mark.parametrize("rate", [3e2, 1e4])
 def test_drag_of_any_strength_leaves_the_step(rate: float) -> None:
     lattice = box_lattice(np.zeros(3), np.full(3, 0.05), (2, 2, 2))
-    law, rest = SolidLaw(5e4, 0.3, density_kg_m3=500.0), rest_nodes(lattice)
+    law, rest = NeoHookean(5e4, 0.3, density_kg_m3=500.0), rest_nodes(lattice)
     solver = TotalLagrangian(Problem(lattice, law, rest, GRAVITY, drag_per_s=rate))
     still = TotalLagrangian(Problem(lattice, law, rest, GRAVITY))
     assert solver.relaxed and solver.time_step_s == still.time_step_s

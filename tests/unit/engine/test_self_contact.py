@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from bodies import GRAVITY, RodLaw, SheetLaw, SolidLaw, rest_nodes
+from bodies import GRAVITY, NeoHookean, RodLaw, SheetLaw, rest_nodes
 from pieces import crossings, in_pieces, laid, still
 
 from physworld.engine.gradients.adjoint import Adjoint
@@ -309,7 +309,7 @@ def test_what_starts_nearer_than_its_thickness_is_not_thrown_apart() -> None:
 
 def test_solids_thin_layers_and_gradients_are_refused() -> None:
     block = box_lattice(np.zeros(3), np.ones(3), (2, 2, 2))
-    solid = Problem(block, SolidLaw(1e5), block.node_coordinates, GRAVITY, terms=(SelfContact(0.1, 0.3),))
+    solid = Problem(block, NeoHookean(1e5), block.node_coordinates, GRAVITY, terms=(SelfContact(0.1, 0.3),))
     with pytest.raises(SceneUnsupported, match="a solid touches itself in the updated Lagrangian form only"):
         TotalLagrangian(solid)
     lattice, nodes, _ = closing()

@@ -26,11 +26,11 @@ from physworld.engine.terms.soft_grips import (
     touched_nodes,
 )
 from physworld.engine.total.formulation import TotalLagrangian
-from physworld.materials.laws import SolidLaw
+from physworld.materials.neo_hookean import NeoHookean
 
 SIZE = np.array([0.12, 0.06, 0.06])
 GRIP_LOW, GRIP_HIGH = np.array([0.0, 0.015, 0.015]), np.array([0.03, 0.045, 0.045])
-LAW = SolidLaw(1e5, 0.3, density_kg_m3=1000.0)
+LAW = NeoHookean(1e5, 0.3, density_kg_m3=1000.0)
 GRAVITY = np.array([0.0, 0.0, -1.0])
 TIP = np.array([[0.12, 0.03, 0.03]])
 

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from physworld.engine.lattice.lattice import box_lattice
 from physworld.errors import UnstableSimulation
-from physworld.materials.laws import SolidLaw
 from physworld.materials.library import SOLID_LAWS
+from physworld.materials.solid import SolidLaw
 
 SINGLE_PRECISION = 1e-5  # of the modulus: strains are float32
 ISOTROPIC = [name for name in SOLID_LAWS if name != "transversely_isotropic"]

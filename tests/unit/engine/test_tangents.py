@@ -13,9 +13,11 @@ from scipy.spatial.transform import Rotation
 from physworld.engine.gradients.tangent import InternalTangent
 from physworld.engine.lattice.lattice import Lattice, box_lattice
 from physworld.engine.total.forces import InternalForces
-from physworld.materials.laws import Law, RodLaw, SheetLaw, SolidLaw
+from physworld.materials.laws import Law
 from physworld.materials.library import SOLID_LAWS
-from physworld.materials.sheet import OrthotropicSheetLaw
+from physworld.materials.rod import RodLaw
+from physworld.materials.sheet import OrthotropicSheetLaw, SheetLaw
+from physworld.materials.solid import SolidLaw
 
 TOLERANCE = {3: 1e-3, 2: 1e-6, 1: 1e-6}  # of the largest entry: solids' forces are rounded to float32
 STEP = {3: 2e-5, 2: 1e-7, 1: 1e-7}  # [m] of the differences

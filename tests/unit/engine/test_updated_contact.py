@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 import pytest
 import trimesh
-from bodies import GRAVITY, SolidLaw, rest_nodes
+from bodies import GRAVITY, NeoHookean, SolidLaw, rest_nodes
 
 from physworld.engine.lattice.lattice import Lattice, box_lattice
 from physworld.engine.problem import HeldNodes, Problem
@@ -20,7 +20,7 @@ from physworld.errors import ContactFailed
 from physworld.materials.plastic import DruckerPrager, Plasticity, VonMises
 from physworld.shapes import sdf
 
-LAW = SolidLaw(2e5, 0.3, 20.0, 1000.0)
+LAW = NeoHookean(2e5, 0.3, 20.0, 1000.0)
 BLOCK = box_lattice(np.array([-0.05, -0.05, 0.0]), np.array([0.1, 0.1, 0.05]), (4, 4, 2))
 MASS, G = 0.5, 9.81
 GAUSS = 0.5 - 0.5 / np.sqrt(3.0)
@@ -132,7 +132,7 @@ def test_the_grounds_friction_may_be_a_field_over_the_body() -> None:
 
 
 def test_contact_gives_no_energy_to_a_block_that_bounces() -> None:
-    law, times = SolidLaw(2e5, 0.3, 0.0, 1000.0), np.linspace(0, 1.0, 101)
+    law, times = NeoHookean(2e5, 0.3, 0.0, 1000.0), np.linspace(0, 1.0, 101)
     terms = (GroundContact(-0.05, 0.3),)
     engine, particles, _ = simulate(BLOCK, law, terms, times)
     height = centre(engine, particles)[:, 2]
@@ -194,7 +194,7 @@ def test_a_block_under_a_plate_resists_with_its_modulus(offset: float) -> None:
 
 def test_a_plastic_block_yields_under_a_plate_at_its_stress_and_keeps_the_plates_shape() -> None:
     """Frictionless plates: the force is yield stress times the area that the volume leaves; an elastic one returns."""
-    law, yields, size = SolidLaw(3e5, 0.3, 5.0, 1000.0), 6e3, 0.08
+    law, yields, size = NeoHookean(3e5, 0.3, 5.0, 1000.0), 6e3, 0.08
     lattice = box_lattice(np.array([-0.04, -0.04, 0.0]), np.full(3, size), (6, 6, 6))
     places = [(0, 0, 0.13), (0, 0, 0.10), (0, 0, 0.10), (0, 0, 0.16)]
     plate = Collider("plate", sdf.box((0.3, 0.3, 0.1)), path([0, 0.4, 0.45, 0.65], places), 0.0)
@@ -259,7 +259,7 @@ def test_a_collider_thinner_than_a_cell_holds() -> None:
 
 
 def test_grains_are_swept_by_a_blade_and_none_pass_through() -> None:
-    law = SolidLaw(2e5, 0.3, density_kg_m3=1500.0)
+    law = NeoHookean(2e5, 0.3, density_kg_m3=1500.0)
     lattice = box_lattice(np.array([-0.05, -0.05, 0.0]), np.array([0.1, 0.1, 0.06]), (5, 5, 3))
     blade = Collider(
         "blade", sdf.box((0.02, 0.4, 0.2)), path([0, 0.5], [(-0.07, 0, 0.1), (0.05, 0, 0.1)]), 0.4
@@ -306,7 +306,7 @@ def test_material_that_starts_inside_is_not_thrown_out() -> None:
 
 
 def test_grains_that_a_paddle_crushes_on_the_ground_are_not_trusted() -> None:
-    law = SolidLaw(2e5, 0.3, density_kg_m3=1500.0)
+    law = NeoHookean(2e5, 0.3, density_kg_m3=1500.0)
     lattice = box_lattice(np.array([-0.06, -0.06, 0.0]), np.array([0.12, 0.12, 0.06]), (6, 6, 3))
     paddle = Collider(
         "paddle", sdf.box((0.08, 0.04, 0.06)), path([0, 0.3], [(0, 0, 0.12), (0, 0, 0.032)]), 0.3

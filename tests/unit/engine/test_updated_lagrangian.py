@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from bodies import GRAVITY, RodLaw, SolidLaw, clamped_lattice, material_point, rest_nodes, still_clamp
+from bodies import GRAVITY, NeoHookean, RodLaw, clamped_lattice, material_point, rest_nodes, still_clamp
 
 from physworld.engine.lattice.lattice import Lattice, box_lattice, lattice_from_cells
 from physworld.engine.problem import HeldNodes, Problem
@@ -52,7 +52,7 @@ def test_momentum_of_a_free_body_is_conserved_to_round_off(transfer: Transfer) -
     lattice = block()
     rest = rest_nodes(lattice)
     velocity = np.random.default_rng(0).normal(scale=0.2, size=rest.shape) + np.array([0.5, 0.0, 0.0])
-    problem = Problem(lattice, SolidLaw(5e4, 0.3, 5.0), rest, np.zeros(3))
+    problem = Problem(lattice, NeoHookean(5e4, 0.3, 5.0), rest, np.zeros(3))
     engine = UpdatedLagrangian(problem, transfer=transfer)
     run = engine.prepare(rest, velocity, unheld(3))
     before = momenta(engine, run)
@@ -66,7 +66,7 @@ def test_momentum_of_a_free_body_is_conserved_to_round_off(transfer: Transfer) -
 def test_free_fall_is_exact() -> None:
     lattice = block()
     rest = rest_nodes(lattice)
-    engine = UpdatedLagrangian(Problem(lattice, SolidLaw(5e4, 0.3), rest, GRAVITY))
+    engine = UpdatedLagrangian(Problem(lattice, NeoHookean(5e4, 0.3), rest, GRAVITY))
     times = np.linspace(0.0, 0.5, 6)
     start = np.tile([1.0, 0.0, 2.0], (len(rest), 1))
     fallen = engine.run_particles(rest, start, unheld(6), times)
@@ -78,7 +78,7 @@ def test_free_fall_is_exact() -> None:
 
 def test_a_small_swing_has_the_frequency_of_the_total_lagrangian_form() -> None:
     """The two agree on stiffness and mass; the transfers damp the one and not the other."""
-    law = SolidLaw(2e6, 0.0, density_kg_m3=600.0)
+    law = NeoHookean(2e6, 0.0, density_kg_m3=600.0)
     lattice = clamped_lattice(0.3, (0.045, 0.045), (20, 3, 3))
     rest, times = rest_nodes(lattice), np.arange(0.0, 0.25, 0.0025)
     held = still_clamp(lattice, rest, len(times))
@@ -93,7 +93,7 @@ def test_a_small_swing_has_the_frequency_of_the_total_lagrangian_form() -> None:
 
 
 def test_a_grip_carries_material_as_its_nodes_say() -> None:
-    law = SolidLaw(2e5, 0.3, viscosity_pa_s=20.0)
+    law = NeoHookean(2e5, 0.3, viscosity_pa_s=20.0)
     lattice = clamped_lattice(0.1, (0.05, 0.05), (4, 2, 2))
     rest, times = rest_nodes(lattice), np.linspace(0.0, 0.5, 26)
     held = still_clamp(lattice, rest, len(times))
@@ -114,7 +114,7 @@ def test_a_grip_carries_material_as_its_nodes_say() -> None:
 
 @pytest.mark.parametrize("transfer", [Apic(), Asflip()], ids=["apic", "asflip"])
 def test_a_block_slides_to_the_coulomb_distance_and_rests_without_a_gap(transfer: Transfer) -> None:
-    law = SolidLaw(2e5, 0.3, viscosity_pa_s=20.0, density_kg_m3=500.0)
+    law = NeoHookean(2e5, 0.3, viscosity_pa_s=20.0, density_kg_m3=500.0)
     lattice = box_lattice(np.zeros(3), np.array([0.12, 0.12, 0.06]), (4, 4, 2))
     friction, speed = 0.4, 0.8
     rest = rest_nodes(lattice)
@@ -140,7 +140,7 @@ def test_two_parts_feel_one_another_within_one_and_a_half_cells_and_do_not_pass(
     lattice = lattice_from_cells(np.zeros(3), np.full(3, cell), cells, np.ones((len(cells), 8)))
     rest, times = rest_nodes(lattice), np.linspace(0.0, 0.4, 41)
     is_upper = lattice.particle_coordinates[:, 2] > 3.5 * cell
-    law = SolidLaw(1e5, 0.3, viscosity_pa_s=20.0)
+    law = NeoHookean(1e5, 0.3, viscosity_pa_s=20.0)
     held_nodes = np.unique(lattice.cell_nodes[lattice.cells[:, 2] == 0])
     held = HeldNodes(
         held_nodes, np.repeat(rest[held_nodes][None], 41, axis=0), np.zeros((41, len(held_nodes), 3))
@@ -156,7 +156,7 @@ def test_two_parts_feel_one_another_within_one_and_a_half_cells_and_do_not_pass(
 def sand(angle_deg: float, transfer: Transfer) -> tuple[np.ndarray, np.ndarray]:
     """Particles of a collapsed column at the end, and the last tenth of a second's motion."""
     lattice = box_lattice(np.array([-0.05, -0.05, 0.0]), np.array([0.1, 0.1, 0.1]), (5, 5, 5))
-    law = SolidLaw(2e5, 0.3, density_kg_m3=1500.0)
+    law = NeoHookean(2e5, 0.3, density_kg_m3=1500.0)
     ground = GroundContact(0.0, 0.6)
     rest = rest_nodes(lattice)
     engine = UpdatedLagrangian(
@@ -189,7 +189,7 @@ def test_a_column_of_sand_collapses_to_a_heap_that_its_friction_angle_holds() ->
 
 
 def test_a_von_mises_bar_keeps_its_bend_and_an_elastic_one_does_not() -> None:
-    law = SolidLaw(3e5, 0.3, viscosity_pa_s=50.0, density_kg_m3=1000.0)
+    law = NeoHookean(3e5, 0.3, viscosity_pa_s=50.0, density_kg_m3=1000.0)
     lattice = clamped_lattice(0.16, (0.04, 0.04), (8, 2, 2))
     rest = rest_nodes(lattice)
     times = np.linspace(0.0, 0.6, 31)
@@ -221,7 +221,7 @@ def test_a_von_mises_bar_keeps_its_bend_and_an_elastic_one_does_not() -> None:
 def test_the_grid_follows_a_body_that_travels_far() -> None:
     lattice = block((2, 2, 2))
     rest = rest_nodes(lattice)
-    engine = UpdatedLagrangian(Problem(lattice, SolidLaw(1e5, 0.3), rest, np.zeros(3)))
+    engine = UpdatedLagrangian(Problem(lattice, NeoHookean(1e5, 0.3), rest, np.zeros(3)))
     velocity = np.tile([6.0, -4.0, 0.0], (len(rest), 1))
     path = engine.run_particles(rest, velocity, unheld(2), np.array([0.0, 1.0]))
     assert np.abs(path[1] - path[0] - [6.0, -4.0, 0.0]).max() < 1e-4
@@ -229,7 +229,7 @@ def test_the_grid_follows_a_body_that_travels_far() -> None:
 
 def test_a_time_step_above_the_stable_limit_is_refused_with_its_numbers() -> None:
     lattice = block()
-    problem = Problem(lattice, SolidLaw(1e5, 0.3), rest_nodes(lattice), GRAVITY)
+    problem = Problem(lattice, NeoHookean(1e5, 0.3), rest_nodes(lattice), GRAVITY)
     limit = UpdatedLagrangian(problem).time_step_s / updated_lagrangian._SAFETY
     with pytest.raises(CFLViolation, match=r"exceeds the stable .* s of pressure waves at .* m/s"):
         UpdatedLagrangian(problem, time_step_s=1.01 * limit)
@@ -240,7 +240,7 @@ def test_a_time_step_above_the_stable_limit_is_refused_with_its_numbers() -> Non
 def test_a_run_just_below_the_limit_stays_stable() -> None:
     lattice = block((6, 3, 3))
     rest = rest_nodes(lattice)
-    problem = Problem(lattice, SolidLaw(1e5, 0.3), rest, np.zeros(3))
+    problem = Problem(lattice, NeoHookean(1e5, 0.3), rest, np.zeros(3))
     limit = UpdatedLagrangian(problem).time_step_s / updated_lagrangian._SAFETY
     velocity = np.random.default_rng(2).normal(scale=0.05, size=rest.shape)
     engine = UpdatedLagrangian(problem, time_step_s=0.95 * limit)
@@ -251,7 +251,7 @@ def test_a_run_just_below_the_limit_stays_stable() -> None:
 def test_particles_that_cross_a_cell_in_a_substep_are_refused_with_their_numbers() -> None:
     lattice = block((2, 2, 2))
     rest = rest_nodes(lattice)
-    engine = UpdatedLagrangian(Problem(lattice, SolidLaw(1e5, 0.3), rest, np.zeros(3)))
+    engine = UpdatedLagrangian(Problem(lattice, NeoHookean(1e5, 0.3), rest, np.zeros(3)))
     engine.crossing_limit = 10.0  # no smaller step for fast particles
     with pytest.raises(CFLViolation, match=r"crossed 2\.\d+ cells of 0\.025 m in one substep"):
         engine.run_particles(rest, np.tile([60.0, 0, 0], (len(rest), 1)), unheld(2), np.array([0.0, 0.2]))
@@ -261,7 +261,7 @@ def test_grains_that_scatter_too_far_are_refused_with_their_numbers() -> None:
     lattice = block((2, 2, 2))
     rest = rest_nodes(lattice)
     engine = UpdatedLagrangian(
-        Problem(lattice, SolidLaw(1e4, 0.3), rest, np.zeros(3)), plasticity=DruckerPrager(0.5)
+        Problem(lattice, NeoHookean(1e4, 0.3), rest, np.zeros(3)), plasticity=DruckerPrager(0.5)
     )
     velocity = 4000.0 * (rest - rest.mean(axis=0))
     with pytest.raises(ParticlesLeftTheGrid, match="grid nodes, more than"):
@@ -271,7 +271,7 @@ def test_grains_that_scatter_too_far_are_refused_with_their_numbers() -> None:
 def test_states_that_are_not_finite_are_refused_with_their_numbers() -> None:
     lattice = block((2, 2, 2))
     rest = rest_nodes(lattice)
-    engine = UpdatedLagrangian(Problem(lattice, SolidLaw(1e5, 0.3), rest, np.zeros(3)))
+    engine = UpdatedLagrangian(Problem(lattice, NeoHookean(1e5, 0.3), rest, np.zeros(3)))
     velocity = np.zeros_like(rest)
     velocity[3] = np.nan
     with pytest.raises(UnstableSimulation, match=r"not finite at t = "):
@@ -281,7 +281,7 @@ def test_states_that_are_not_finite_are_refused_with_their_numbers() -> None:
 def test_an_inverted_body_is_refused() -> None:
     lattice = block((2, 2, 2))
     rest = rest_nodes(lattice)
-    engine = UpdatedLagrangian(Problem(lattice, SolidLaw(1e5, 0.3), rest, np.zeros(3)))
+    engine = UpdatedLagrangian(Problem(lattice, NeoHookean(1e5, 0.3), rest, np.zeros(3)))
     with pytest.raises(UnstableSimulation, match="inverted"):
         engine.run_particles(rest * [1, 1, -1], np.zeros_like(rest), unheld(2), np.array([0.0, 0.1]))
 
@@ -296,7 +296,7 @@ def test_what_the_form_cannot_hold_is_refused() -> None:
         UpdatedLagrangian(Problem(rod, RodLaw(100.0, 1e-3), rest_nodes(rod), GRAVITY))
     lattice = block()
     rest = rest_nodes(lattice)
-    engine = UpdatedLagrangian(Problem(lattice, SolidLaw(1e5, 0.3), rest, GRAVITY))
+    engine = UpdatedLagrangian(Problem(lattice, NeoHookean(1e5, 0.3), rest, GRAVITY))
     with pytest.raises(SceneUnsupported, match=r"Draught acts on the nodes .* has 128 particles"):
         UpdatedLagrangian(replace(engine.problem, terms=(Draught(),)))
     single = HeldNodes(np.array([0]), rest[None, :1].repeat(2, axis=0), np.zeros((2, 1, 3)))

@@ -12,8 +12,8 @@ from physworld.effects import plasticity, strain_stiffening
 from physworld.engine.updated.elastic_stress_kernels import elastic_stress
 from physworld.engine.updated.hencky_kernels import plastic_kernel
 from physworld.engine.updated.stress_kernels import particle_model
+from physworld.materials.neo_hookean import NeoHookean
 from physworld.materials.plastic import PLASTICITIES
-from physworld.materials.solid import SolidLaw
 
 
 def compiled(module: object, folder: Path) -> bool:
@@ -39,7 +39,7 @@ def test_the_transfers_compile_for_cuda(name: str, tmp_path: Path) -> None:
 
 def test_the_stresses_compile_for_cuda(tmp_path: Path) -> None:
     wp.init()
-    law = SolidLaw(1e5)
+    law = NeoHookean(1e5)
     assert compiled(elastic_stress(law.stress, len(law.moduli)).module, tmp_path)
 
 

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from physworld.materials.laws import RodLaw, SheetLaw, SolidLaw
 from physworld.materials.library import SHEET_LAWS, SOLID_LAWS, law_class, with_law
-from physworld.materials.rod import rod_strains
-from physworld.materials.sheet import OrthotropicSheetLaw, sheet_strains
+from physworld.materials.neo_hookean import NeoHookean
+from physworld.materials.rod import RodLaw, rod_strains
+from physworld.materials.sheet import OrthotropicSheetLaw, SheetLaw, sheet_strains
+from physworld.materials.solid import SolidLaw
 
 ISOTROPIC = [name for name in SOLID_LAWS if name != "transversely_isotropic"]
 ROUNDING = 1e-12
@@ -54,7 +55,7 @@ def test_energy_of_an_isotropic_law_ignores_rotation_of_the_material(name: str) 
 
 def test_fibres_stiffen_the_direction_they_run_in() -> None:
     law = SOLID_LAWS["transversely_isotropic"](9e4, 0.0, fibre_modulus_pa=3e5, fibre_azimuth_rad=np.pi / 2)
-    plain = SolidLaw(9e4, 0.0)
+    plain = NeoHookean(9e4, 0.0)
     for axis, extra in ((0, 0.0), (1, 3e5), (2, 0.0)):
         F = np.eye(3)
         F[axis, axis] += 1e-3
@@ -96,7 +97,7 @@ def test_strains_of_a_cylinder_and_of_a_ring() -> None:
 
 
 def test_a_law_changes_its_name_and_keeps_its_numbers() -> None:
-    law = SolidLaw(2e5, 0.2, viscosity_pa_s=3.0, density_kg_m3=400.0)
+    law = NeoHookean(2e5, 0.2, viscosity_pa_s=3.0, density_kg_m3=400.0)
     other = with_law(law, "hencky")
     assert type(other).name == "hencky" and with_law(other, "neo_hookean") == law
     assert type(with_law(SheetLaw(80.0, 2e-3), "orthotropic_sheet")) is SHEET_LAWS["orthotropic_sheet"]

@@ -7,10 +7,10 @@ import pytest
 import warp as wp
 
 from physworld.engine.updated.stress import ParticleStress, padded
-from physworld.materials.laws import SolidLaw
+from physworld.materials.neo_hookean import NeoHookean
 from physworld.materials.plastic import DruckerPrager, Identity, Plasticity, StVenantKirchhoff, VonMises
 
-LAW = SolidLaw(1e5, 0.3)
+LAW = NeoHookean(1e5, 0.3)
 MU, LAM = LAW.lame
 DT = 1e-3
 COUNT = 300

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from physworld.engine.choose import choose_formulation
+from physworld.engine.formulations import choose_formulation
 from physworld.errors import SceneUnsupported
 from physworld.materials.plastic import DruckerPrager, Identity, VonMises
 
 
 def test_elastic_bodies_are_integrated_without_transfers() -> None:
     for dimension in (3, 2, 1):
-        assert choose_formulation(dimension, {}).formulation == "total_lagrangian"
+        assert choose_formulation(dimension, {}).formulation.name == "total_lagrangian"
 
 
 @pytest.mark.parametrize(
@@ -28,7 +28,7 @@ def test_what_flows_parts_or_touches_itself_is_carried_by_particles(
     declared: dict, plasticity: object, why: str
 ) -> None:
     choice = choose_formulation(3, declared, plasticity)  # type: ignore[arg-type]
-    assert choice.formulation == "updated_lagrangian"
+    assert choice.formulation.name == "updated_lagrangian"
     assert why in choice.reason
 
 
