@@ -20,6 +20,7 @@ from physworld.engine.gradients.adjoint_reverse import Gradient
 from physworld.engine.gradients.gradient import Direction, gradients
 from physworld.errors import NotDifferentiable
 from physworld.geometry.rigid import least_rotation
+from physworld.twin.integration import Integration
 from physworld.twin.twin import Twin
 
 _STEP = 1e-3  # relative change of a parameter between its two neighbours
@@ -100,9 +101,7 @@ class TwinRun:
                 f"a mesh of {len(twin.lattice.cells)} cells of triangles has no gradient: fit by simulations alone"
             )
         self._twin, self._times = twin, frame_times
-        self._setting = lambda t: t.integration(
-            control_times, control_points, frame_times, properties=properties
-        )
+        self._drive = control_times, control_points, frame_times, properties
         self._integration = self._setting(twin)
         adjoint = Adjoint(self._integration.problem, time_step_s, memory_mb)
         self.time_step_s = adjoint.time_step_s
@@ -115,6 +114,11 @@ class TwinRun:
         )
         self.nodes = self._integration.at_frames(twin.body.start, self.recorded.nodes)
         self.tracks = twin.observe(self.nodes, frame_times)
+
+    def _setting(self, twin: Twin) -> Integration:
+        """A twin under the run's controls."""
+        times, points, frames, properties = self._drive
+        return twin.integration(times, points, frames, properties=properties)
 
     def gradient(
         self, tracks_bar: Array, scalars: Mapping[str, Neighbours] | None = None
@@ -156,8 +160,10 @@ def nodes_bar(twin: Twin, nodes: Array, tracks_bar: Array) -> Array:
     def shifted() -> Array:
         if lattice.dim == 2:
             normal = np.cross(slopes[0], slopes[1])
-            return body.offsets * normal / np.linalg.norm(normal, axis=-1, keepdims=True)
-        return np.einsum("tnij,nj->tni", least_rotation(start[None], slopes[0]), body.offsets)
+            off: Array = body.offsets * normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+        else:
+            off = np.einsum("tnij,nj->tni", least_rotation(start[None], slopes[0]), body.offsets)
+        return off
 
     for row, slope in zip(rows, slopes, strict=True):
         bar = np.empty_like(slope)

@@ -332,7 +332,8 @@ def _by_log_density(problem: Problem, mass_bar: Array) -> Array:
     if problem.density_factor is not None:
         particle_mass = particle_mass * problem.density_factor
     weights = lattice.table((0,) * lattice.dim)
-    return particle_mass * (mass_bar[lattice.cell_nodes] @ weights).reshape(-1)
+    found: Array = particle_mass * (mass_bar[lattice.cell_nodes] @ weights).reshape(-1)
+    return found
 
 
 def adjoint_of(term: BoundTerm, problem: Problem, now: Reverse, memories: list[Memory]) -> TermAdjoint:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import pytest
 
-from physworld.engine.formulations import choose_formulation
+from physworld.engine.formulations import FORMULATIONS, TOTAL, UPDATED, choose_formulation
 from physworld.errors import SceneUnsupported
 from physworld.materials.plastic import DruckerPrager, Identity, VonMises
+from physworld_schemas.fit import FitConfig
 
 
 def test_elastic_bodies_are_integrated_without_transfers() -> None:
@@ -33,10 +36,8 @@ def test_what_flows_parts_or_touches_itself_is_carried_by_particles(
 
 
 def test_a_person_may_overrule_the_choice() -> None:
-    assert (
-        choose_formulation(3, {"body": {"self_contact": True}}, asked="total_lagrangian").formulation
-        == "total_lagrangian"
-    )
+    total = choose_formulation(3, {"body": {"self_contact": True}}, asked="total_lagrangian")
+    assert total.formulation.name == "total_lagrangian"
     assert choose_formulation(3, {}, asked="updated_lagrangian").reason == "asked for"
 
 
@@ -47,3 +48,11 @@ def test_what_cannot_be_is_refused() -> None:
         choose_formulation(3, {}, VonMises(1.0), asked="total_lagrangian")
     with pytest.raises(ValueError, match="no formulation is called 'eulerian'"):
         choose_formulation(3, {}, asked="eulerian")
+
+
+def test_a_formulation_says_what_may_be_asked_of_its_runs() -> None:
+    for ability in ("gradients", "batches", "soft_grips", "friction_field"):
+        assert TOTAL.supports(ability) and not UPDATED.supports(ability)
+    assert UPDATED.on_particles and not TOTAL.on_particles
+    on_the_wire = get_args(FitConfig.model_fields["formulation"].annotation)
+    assert {"auto", *FORMULATIONS} == set(on_the_wire)
