@@ -163,7 +163,7 @@ class Scene:
     @property
     def frame_count(self) -> int:
         """T."""
-        return self.points.shape[0]
+        return len(self.points)
 
     def control_track(self) -> tuple[Array, Array]:
         """Times (Tc,) [s] and controller positions (Tc, K, 3) [m] at the best rate, none before the first frame."""

@@ -39,20 +39,23 @@ class CubicBezier:
         u = np.asarray(u, dtype=np.float64)[..., None]
         v = 1.0 - u
         p0, p1, p2, p3 = self.points
-        return v**3 * p0 + 3.0 * v**2 * u * p1 + 3.0 * v * u**2 * p2 + u**3 * p3
+        point: Array = v**3 * p0 + 3.0 * v**2 * u * p1 + 3.0 * v * u**2 * p2 + u**3 * p3
+        return point
 
     def derivative(self, u: Array) -> Array:
         """B'(u) [m], (n, 3)."""
         u = np.asarray(u, dtype=np.float64)[..., None]
         v = 1.0 - u
         d0, d1, d2 = np.diff(self.points, axis=0)
-        return 3.0 * (v**2 * d0 + 2.0 * v * u * d1 + u**2 * d2)
+        derivative: Array = 3.0 * (v**2 * d0 + 2.0 * v * u * d1 + u**2 * d2)
+        return derivative
 
     def second_derivative(self, u: Array) -> Array:
         """B''(u) [m], (n, 3)."""
         u = np.asarray(u, dtype=np.float64)[..., None]
         e0, e1 = np.diff(self.points, n=2, axis=0)
-        return 6.0 * ((1.0 - u) * e0 + u * e1)
+        second: Array = 6.0 * ((1.0 - u) * e0 + u * e1)
+        return second
 
     def curvature(self, u: Array) -> Array:
         """κ(u) [1/m], (n,); infinite where the curve stands still."""
@@ -130,7 +133,8 @@ class ArcLength:
         low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
         u = low[..., None] + (high - low)[..., None] * GAUSS_NODES
         speed = np.linalg.norm(self.curve.derivative(u), axis=-1)
-        return (high - low) * (speed @ GAUSS_WEIGHTS)
+        length: Array = (high - low) * (speed @ GAUSS_WEIGHTS)
+        return length
 
 
 def straight(start: Array, end: Array) -> CubicBezier:

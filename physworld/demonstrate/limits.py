@@ -162,7 +162,8 @@ def _material_paths(rest_bytes: bytes, start_bytes: bytes, control_bytes: bytes)
     entries = (distances.ravel(), (rows, indices.ravel()))
     graph = sparse.coo_matrix(entries, shape=(count, count)).tocsr()
     _, nearest = cKDTree(start).query(control_points)
-    return csgraph.dijkstra(graph.maximum(graph.T), directed=False, indices=nearest)[:, nearest]
+    paths: Array = csgraph.dijkstra(graph.maximum(graph.T), directed=False, indices=nearest)[:, nearest]
+    return paths
 
 
 def material_between(grips: Sequence[Array], paths: Array) -> Array:
@@ -188,7 +189,7 @@ def _joined_grips(groups: Sequence[Array], track: Array, paths: Array, size: flo
     steady = np.ptp(distances, axis=0) < STEADY_SHARE * distances[0]
     joined = (material < JOINED_SHARE * size) | (steady & (material < CLAMP_SHARE * size))
     count, labels = csgraph.connected_components(sparse.csr_matrix(joined), directed=False)
-    return tuple(np.concatenate([groups[g] for g in np.flatnonzero(labels == c)]) for c in range(count))
+    return tuple(np.concatenate([groups[int(g)] for g in np.flatnonzero(labels == c)]) for c in range(count))
 
 
 def _centres(track: Array, bodies: Sequence[Array]) -> Array:

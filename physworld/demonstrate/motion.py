@@ -153,7 +153,8 @@ def rigid_points(first_pose: Array, displacement: Array, turn: Array) -> Array:
     centre = first_pose.mean(axis=0)
     rotations = Rotation.from_rotvec(turn).as_matrix()
     arms = np.einsum("tij,nj->tni", rotations, first_pose - centre)
-    return centre + displacement[:, None] + arms
+    poses: Array = centre + displacement[:, None] + arms
+    return poses
 
 
 def largest_share(kept: Callable[[float], bool]) -> float:

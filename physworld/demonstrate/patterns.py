@@ -60,7 +60,8 @@ def weighted(names: tuple[str, ...], weights: Mapping[str, float] | None) -> Arr
     given = np.array([float(mix.get(name, 0.0)) for name in names])
     if not given.sum() > 0.0:
         raise SceneUnsupported(f"the mix {dict(mix)} leaves no pattern; this scene allows {', '.join(names)}")
-    return given / given.sum()
+    shares: Array = given / given.sum()
+    return shares
 
 
 def check_weights(weights: Mapping[str, float]) -> None:
@@ -168,5 +169,6 @@ def _unit(vector: Array, limits: MotionLimits) -> Array:
     length = float(np.linalg.norm(vector))
     if length > 1e-6 * limits.size_m:
         return vector / length
-    level = np.cross(limits.up, np.eye(3)[int(np.argmin(np.abs(limits.up)))])
-    return level / np.linalg.norm(level)
+    level: Array = np.cross(limits.up, np.eye(3)[int(np.argmin(np.abs(limits.up)))])
+    level /= np.linalg.norm(level)
+    return level

@@ -29,7 +29,8 @@ JUMP_SIGMAS = 6.0
 def similarity(first: Array, second: Array, length_scale: float) -> Array:
     """S between features (A, F) and (B, F): (A, B) in (0, 1]."""
     squared = np.sum(first**2, axis=1)[:, None] + np.sum(second**2, axis=1)[None, :] - 2.0 * first @ second.T
-    return np.exp(-np.maximum(squared, 0.0) / (2.0 * length_scale**2))
+    similarity: Array = np.exp(-np.maximum(squared, 0.0) / (2.0 * length_scale**2))
+    return similarity
 
 
 def with_space(features: Array, points: Array, length_scale: float, space_scale_m: float) -> Array:
@@ -74,7 +75,8 @@ class PropertyField:
 
     def sample(self, generator: np.random.Generator) -> Array:
         """One draw of N(0, S), (P,)."""
-        return self.factor @ generator.standard_normal(self.factor.shape[1])
+        draw: Array = self.factor @ generator.standard_normal(self.factor.shape[1])
+        return draw
 
     def step_sizes(self, pairs: Array) -> Array:
         """Standard deviation of δ_i - δ_j over σ for pairs (M, 2) of particles, (M,); kept for the same pairs."""

@@ -54,8 +54,8 @@ def make_episodes(
         for place in waiting:
             try:
                 plans[place] = plan_episode(scene, twin, config, try_seed(seeds[place], len(rejected[place])))
-            except SimulationError as error:
-                refused[place] = None, error
+            except SimulationError as failure:
+                refused[place] = None, failure
         for together in _starting_together(twin, plans):
             for place, result in _simulated(twin, {k: plans[k] for k in together}, progress).items():
                 if isinstance(result, SimulationError):

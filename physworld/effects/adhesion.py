@@ -9,7 +9,7 @@ bodies touch the ground, a sheet does with its area and a rod with its diameter 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -107,7 +107,7 @@ class BoundAdhesion(BoundTerm):
     """Surface points on the device. The traction falls with the gap: it adds no frequency."""
 
     points: int
-    inputs: list
+    inputs: list[Any]
     device: str
 
     def launch(self, x: wp.array, v: wp.array, clock: wp.array, counter: wp.array, force: wp.array) -> None:

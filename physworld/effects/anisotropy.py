@@ -19,6 +19,8 @@ from physworld.effects.base import BasinScan, Effect, Strength, Variant
 from physworld.engine.problem import Problem
 from physworld.engine.total.stress import StressTerm
 from physworld.engine.total.stress_kernels import sheet_model, solid_model
+from physworld.materials.sheet import SheetLaw
+from physworld.materials.solid import SolidLaw
 
 if TYPE_CHECKING:
     from physworld.twin.twin import Twin
@@ -64,8 +66,11 @@ class Anisotropy(Effect):
     def derived(self, twin: Twin) -> dict[str, tuple[float, str]]:
         """The fibres' own modulus: a sheet's over its thickness."""
         law = twin.law
-        solid = twin.lattice.dim == 3
-        modulus = law.youngs_modulus_pa if solid else law.membrane_n_m / twin.body.thickness_m
+        if isinstance(law, SolidLaw):
+            modulus = law.youngs_modulus_pa
+        else:
+            assert isinstance(law, SheetLaw)
+            modulus = law.membrane_n_m / twin.body.thickness_m
         return {"fibre_modulus_pa": (float(self.ratio * modulus), "Pa")}
 
     @classmethod
@@ -112,13 +117,15 @@ class Anisotropy(Effect):
     def problem(self, problem: Problem, twin: Twin) -> Problem:
         """Adds the fibres' stress."""
         law, f = problem.law, self.fibre()
-        if twin.lattice.dim == 3:
+        numbers: tuple[float, ...]
+        if isinstance(law, SolidLaw):
             pairs = (f[0] * f[0], f[1] * f[1], f[2] * f[2], f[1] * f[2], f[0] * f[2], f[0] * f[1])
             numbers = (self.ratio * law.youngs_modulus_pa, *pairs)
         else:
+            assert isinstance(law, SheetLaw)
             f = np.array([np.cos(self.azimuth_rad), np.sin(self.azimuth_rad)])
-            pairs = (f[0] * f[0], f[1] * f[1], f[0] * f[1])
-            numbers = (self.ratio * law.membrane_n_m, self.ratio * law.bending_n_m, *pairs)
+            in_plane = (f[0] * f[0], f[1] * f[1], f[0] * f[1])
+            numbers = (self.ratio * law.membrane_n_m, self.ratio * law.bending_n_m, *in_plane)
         return replace(
             problem, terms=(*problem.terms, StressTerm(_MODELS[twin.lattice.dim], numbers, name=self.name))
         )

@@ -114,7 +114,8 @@ def _held_cells(twin: Twin) -> Array:
     for nodes in twin.held_nodes:
         held[nodes] = True
     share = held[twin.lattice.cell_nodes].mean(axis=1)
-    return share == 1.0 if np.any(share == 1.0) else share >= 0.5
+    clamped: Array = share == 1.0 if np.any(share == 1.0) else share >= 0.5
+    return clamped
 
 
 def _gaps(twin: Twin) -> tuple[Array, float]:

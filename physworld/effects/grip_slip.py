@@ -10,7 +10,7 @@ smaller the time step: below the probe the grip is stiffer than the body's own f
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -107,7 +107,7 @@ class GripSprings:
 class BoundGripSprings(BoundTerm):
     """Springs on the device."""
 
-    inputs: list
+    inputs: list[Any]
     device: str
     frequency_rad_s: float
     friction_per_s: float

@@ -46,4 +46,5 @@ class MeasurementClock(Effect):
         wanted = times - self.offset_s
         inside = PchipInterpolator(times, tracks, axis=0)(np.clip(wanted, times[0], times[-1]))
         beyond = np.maximum(wanted - times[-1], 0.0)[:, None, None]
-        return inside + beyond * (tracks[-1] - tracks[-2]) / (times[-1] - times[-2])
+        shifted: Array = inside + beyond * (tracks[-1] - tracks[-2]) / (times[-1] - times[-2])
+        return shifted

@@ -40,4 +40,5 @@ class MeasurementDrift(Effect):
     def measured(self, times: Array, tracks: Array, twin: Twin) -> Array:
         """Shifted in proportion to the time."""
         velocity = np.array([self.x_m_s, self.y_m_s, self.z_m_s])
-        return tracks + (times - times[0])[:, None, None] * velocity
+        shifted: Array = tracks + (times - times[0])[:, None, None] * velocity
+        return shifted

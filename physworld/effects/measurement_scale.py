@@ -58,6 +58,8 @@ class MeasurementScale(Effect):
 def _centre(twin: Twin) -> Array:
     """What the camera shows in its true place [m], (3,) or (N, 3): see the module's text; unheld solids' middle."""
     if twin.lattice.dim < 3:
-        return twin.track_nodes(twin.body.start[None])[0]
+        points: Array = twin.track_nodes(twin.body.start[None])[0]
+        return points
     start = twin.controllers_start if len(twin.controllers_start) else twin.particles_start
-    return start.mean(axis=0)
+    middle: Array = start.mean(axis=0)
+    return middle

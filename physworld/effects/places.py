@@ -27,7 +27,8 @@ def gravity_size(twin: Twin) -> float:
 def free_end(twin: Twin) -> Array:
     """Start of the material that lies farthest from what is held [m], (3,); of nothing is held, from the middle."""
     particles = twin.particles_start[twin.particle_mass > 0]
-    return particles[int(np.argmax(_from_held(twin, particles)))]
+    farthest: Array = particles[int(np.argmax(_from_held(twin, particles)))]
+    return farthest
 
 
 def middle_of_free_end(twin: Twin) -> Array:
@@ -46,7 +47,8 @@ def _from_held(twin: Twin, places: Array) -> Array:
     held = np.concatenate([np.empty(0, dtype=int), *twin.held_nodes]).astype(int)
     middle = twin.particles_start[twin.particle_mass > 0].mean(axis=0, keepdims=True)
     known = twin.body.start[held] if len(held) else middle
-    return np.linalg.norm(places[:, None] - known[None], axis=2).min(axis=1)
+    gaps: Array = np.linalg.norm(places[:, None] - known[None], axis=2).min(axis=1)
+    return gaps
 
 
 def region_weights(twin: Twin, centre: Array, radius: float) -> tuple[Array, Array]:
@@ -67,7 +69,8 @@ def region_shares(twin: Twin, centre: Array, radius: float) -> Array:
     inside = (gap <= radius) & (mass > 0)
     if not inside.any():
         inside = np.arange(len(gap)) == int(np.argmin(np.where(mass > 0, gap, np.inf)))
-    return np.where(inside, mass, 0.0) / mass[inside].sum()
+    shares: Array = np.where(inside, mass, 0.0) / mass[inside].sum()
+    return shares
 
 
 def unit_coordinates(lattice: Lattice) -> Array:
@@ -75,7 +78,8 @@ def unit_coordinates(lattice: Lattice) -> Array:
     places = lattice.particle_coordinates
     filled = places[lattice.particle_measures > 0]
     low, high = filled.min(axis=0), filled.max(axis=0)
-    return (places - 0.5 * (low + high)) / np.maximum(0.5 * (high - low), 1e-12)
+    unit: Array = (places - 0.5 * (low + high)) / np.maximum(0.5 * (high - low), 1e-12)
+    return unit
 
 
 def held_count(twin: Twin) -> int:

@@ -22,6 +22,9 @@ from physworld.effects.places import body_size, gravity_size
 from physworld.engine.problem import Problem
 from physworld.engine.total.stress import StressTerm
 from physworld.engine.total.stress_kernels import rod_model, sheet_model, solid_model
+from physworld.materials.rod import RodLaw
+from physworld.materials.sheet import SheetLaw
+from physworld.materials.solid import SolidLaw
 
 if TYPE_CHECKING:
     from physworld.twin.twin import Twin
@@ -159,16 +162,20 @@ class Plasticity(Effect):
     def problem(self, problem: Problem, twin: Twin) -> Problem:
         """Adds the plastic part of the stress."""
         law, h = problem.law, self.hardening
-        if twin.lattice.dim == 3:
+        numbers: tuple[float, ...]
+        if isinstance(law, SolidLaw):
             if not self.inverse_yield_per_pa:
                 return problem
             mu = law.lame[0]
-            numbers: tuple[float, ...] = (mu, np.sqrt(2 / 3) / self.inverse_yield_per_pa / mu, h)
+            numbers = (mu, np.sqrt(2 / 3) / self.inverse_yield_per_pa / mu, h)
         else:
             if not self.yield_radius_m:
                 return problem
-            stiffness = law.bending_n_m if twin.lattice.dim == 2 else law.bending_n_m2
-            shape = law.bending_shape if twin.lattice.dim == 2 else ()
-            numbers = (stiffness, 1.0 / self.yield_radius_m, h, *shape)
+            bent = 1.0 / self.yield_radius_m
+            if isinstance(law, SheetLaw):
+                numbers = (law.bending_n_m, bent, h, *law.bending_shape)
+            else:
+                assert isinstance(law, RodLaw)
+                numbers = (law.bending_n_m2, bent, h)
         term = StressTerm(_MODELS[twin.lattice.dim], numbers, frequency_rad_s=0.0, name=self.name)
         return replace(problem, terms=(*problem.terms, term))

@@ -20,6 +20,9 @@ from physworld.effects.places import body_size
 from physworld.engine.problem import Problem
 from physworld.engine.total.stress import StressTerm
 from physworld.engine.total.stress_kernels import rod_model, sheet_model, solid_model
+from physworld.materials.rod import RodLaw
+from physworld.materials.sheet import SheetLaw
+from physworld.materials.solid import SolidLaw
 
 if TYPE_CHECKING:
     from physworld.twin.twin import Twin
@@ -105,15 +108,16 @@ class RestShape(Effect):
 
 def _bending(problem: Problem, twin: Twin, bend: tuple[float, float]) -> StressTerm:
     law, lattice = problem.law, problem.lattice
-    if lattice.dim == 2:
+    if isinstance(law, SheetLaw):
         return StressTerm(_MODELS[2], (law.bending_n_m, *bend, *law.bending_shape), frequency_rad_s=0.0)
-    if lattice.dim == 1:
+    if isinstance(law, RodLaw):
         slope = lattice.interpolation(lattice.particle_coordinates, (1,)) @ twin.body.start
         tangent = slope / np.linalg.norm(slope, axis=1, keepdims=True)
         axes = np.linalg.svd(tangent.mean(axis=0)[None])[2][1:]
         rest = sum(b * axis for b, axis in zip(bend, axes, strict=True))
         across = rest - np.sum(rest * tangent, axis=1, keepdims=True) * tangent
         return StressTerm(_MODELS[1], (law.bending_n_m2,), across.T, frequency_rad_s=0.0)
+    assert isinstance(law, SolidLaw)
     places = lattice.particle_coordinates
     filled = lattice.particle_measures > 0
     centred = places - places[filled].mean(axis=0)

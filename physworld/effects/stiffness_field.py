@@ -94,4 +94,5 @@ def log_field(lattice: Lattice, effect: LowRankField) -> Array:
     strengths = effect.values
     centre = np.array([strengths[f"bump_{a}"] for a in axes], dtype=float)
     width, bump = float(strengths["bump_width"] or 1.0), float(strengths["bump"] or 0.0)
-    return slopes + bump * np.exp(-np.sum((xi - centre) ** 2, axis=1) / (2 * width**2))
+    logarithm: Array = slopes + bump * np.exp(-np.sum((xi - centre) ** 2, axis=1) / (2 * width**2))
+    return logarithm

@@ -19,6 +19,9 @@ from physworld.effects.base import Effect, Strength
 from physworld.engine.problem import Problem
 from physworld.engine.total.stress import StressTerm
 from physworld.engine.total.stress_kernels import rod_model, sheet_model, solid_model
+from physworld.materials.rod import RodLaw
+from physworld.materials.sheet import SheetLaw
+from physworld.materials.solid import SolidLaw
 
 if TYPE_CHECKING:
     from physworld.twin.twin import Twin
@@ -69,11 +72,14 @@ class StrainStiffening(Effect):
         """Adds the stress."""
         law, lattice, s = problem.law, problem.lattice, self.coefficient
         half = 0.5 * twin.body.thickness_m
-        numbers = {
-            3: lambda: (s * law.youngs_modulus_pa,),
-            2: lambda: (s * law.membrane_n_m, s * law.bending_n_m * half**2),
-            1: lambda: (s * law.stretching_n, s * law.bending_n_m2 * (2 * half) ** 2),
-        }[lattice.dim]()
+        numbers: tuple[float, ...]
+        if isinstance(law, SolidLaw):
+            numbers = (s * law.youngs_modulus_pa,)
+        elif isinstance(law, SheetLaw):
+            numbers = (s * law.membrane_n_m, s * law.bending_n_m * half**2)
+        else:
+            assert isinstance(law, RodLaw)
+            numbers = (s * law.stretching_n, s * law.bending_n_m2 * (2 * half) ** 2)
         share = np.sqrt(3.0 * s) * _DESIGN_STRAIN  # of the law's own fastest frequency
         frequency = float(share * 2.0 * np.sqrt(lattice.dim) * law.wave_speed_m_s / lattice.spacing.min())
         term = StressTerm(_MODELS[lattice.dim], numbers, frequency_rad_s=frequency, name=self.name)

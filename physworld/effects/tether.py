@@ -10,7 +10,7 @@ where that started, and l is 0.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -94,7 +94,7 @@ class TetherTerm:
 class BoundTether(BoundTerm):
     """The region on the device."""
 
-    inputs: list
+    inputs: list[Any]
     device: str
     frequency_rad_s: float
 

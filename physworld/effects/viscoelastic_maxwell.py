@@ -17,6 +17,9 @@ from physworld.effects.places import body_size, gravity_size
 from physworld.engine.problem import Problem
 from physworld.engine.total.stress import StressTerm
 from physworld.engine.total.stress_kernels import rod_model, sheet_model, solid_model
+from physworld.materials.rod import RodLaw
+from physworld.materials.sheet import SheetLaw
+from physworld.materials.solid import SolidLaw
 
 if TYPE_CHECKING:
     from physworld.twin.twin import Twin
@@ -92,7 +95,7 @@ class ViscoelasticMaxwell(Effect):
     def strengths(cls, twin: Twin) -> tuple[Strength, ...]:
         """A branch up to the size of a stiff law, fading within 5 ms to 5 s."""
         time = Strength("relaxation_s", "s", 5e-3, 5.0, 0.02, gate=False, start=0.1)
-        if twin.lattice.dim < 3:
+        if not isinstance(twin.law, SolidLaw):
             return (Strength("share", "1", 0.0, 5.0, 0.02), time)
         scale = twin.density * gravity_size(twin) * body_size(twin)
         return (Strength("shear_modulus_pa", "Pa", 0.0, 1e4 * scale, 0.02 * twin.law.lame[0]), time)
@@ -109,14 +112,15 @@ class ViscoelasticMaxwell(Effect):
     def problem(self, problem: Problem, twin: Twin) -> Problem:
         """Adds the branch."""
         law, g, tau = problem.law, self.share, self.relaxation_s
-        numbers = {
-            3: lambda: (2.0 * self.shear_modulus_pa, tau),
-            2: lambda: (
-                *(g * law.membrane_n_m, g * law.bending_n_m, tau),
-                *(*law.membrane_shape, *law.bending_shape),
-            ),
-            1: lambda: (g * law.stretching_n, g * law.bending_n_m2, tau),
-        }[twin.lattice.dim]()
+        numbers: tuple[float, ...]
+        if isinstance(law, SolidLaw):
+            numbers = (2.0 * self.shear_modulus_pa, tau)
+        elif isinstance(law, SheetLaw):
+            shape = (*law.membrane_shape, *law.bending_shape)
+            numbers = (g * law.membrane_n_m, g * law.bending_n_m, tau, *shape)
+        else:
+            assert isinstance(law, RodLaw)
+            numbers = (g * law.stretching_n, g * law.bending_n_m2, tau)
         return replace(
             problem, terms=(*problem.terms, StressTerm(_MODELS[twin.lattice.dim], numbers, name=self.name))
         )

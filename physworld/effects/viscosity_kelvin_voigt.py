@@ -15,9 +15,14 @@ from typing import TYPE_CHECKING
 from physworld.effects.base import DISSIPATIVE, Effect, Strength
 from physworld.effects.places import body_size, gravity_size
 from physworld.engine.problem import Problem
+from physworld.materials.sheet import SheetLaw
+from physworld.materials.solid import SolidLaw
 
 if TYPE_CHECKING:
     from physworld.twin.twin import Twin
+
+
+_FRICTION = {3: "viscosity_pa_s", 2: "relaxation_s", 1: "relaxation_s"}  # of a law, by dimension
 
 
 @dataclass(frozen=True)
@@ -36,9 +41,9 @@ class ViscosityKelvinVoigt(Effect):
 
     def derived(self, twin: Twin) -> dict[str, tuple[float, str]]:
         """Of a sheet the viscosity of its material."""
-        if twin.lattice.dim != 2:
-            return {}
         law = twin.law
+        if not isinstance(law, SheetLaw):
+            return {}
         nu, thickness = law.poissons_ratio, twin.body.thickness_m
         modulus = law.membrane_n_m * (1 - nu**2) / thickness
         return {"viscosity_pa_s": (float(self.relaxation_s * modulus / (2 * (1 + 2 * nu**2))), "Pa s")}
@@ -54,12 +59,12 @@ class ViscosityKelvinVoigt(Effect):
     @classmethod
     def refuses(cls, twin: Twin) -> str | None:
         """A law without friction of its own."""
-        wanted = "viscosity_pa_s" if twin.lattice.dim == 3 else "relaxation_s"
+        wanted = _FRICTION[twin.lattice.dim]
         return None if hasattr(twin.law, wanted) else f"a {type(twin.law).__name__} has no {wanted}"
 
     def problem(self, problem: Problem, twin: Twin) -> Problem:
         """Adds to the law's friction."""
         law = problem.law
-        if twin.lattice.dim == 3:
-            return replace(problem, law=replace(law, viscosity_pa_s=law.viscosity_pa_s + self.viscosity_pa_s))
-        return replace(problem, law=replace(law, relaxation_s=law.relaxation_s + self.relaxation_s))
+        own = self.viscosity_pa_s if isinstance(law, SolidLaw) else self.relaxation_s
+        name = _FRICTION[twin.lattice.dim]
+        return replace(problem, law=replace(law, **{name: getattr(law, name) + own}))

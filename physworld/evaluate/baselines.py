@@ -72,7 +72,8 @@ def constant_velocity(scene: Scene) -> Array:
     slope = (offset[..., None] * places).sum(axis=0)
     velocity = np.where(spread[:, None] > 0.0, slope / np.where(spread > 0.0, spread, 1.0)[:, None], 0.0)
     elapsed = scene.times - scene.times[0]
-    return start[None] + elapsed[:, None, None] * velocity[None]
+    tracks: Array = start[None] + elapsed[:, None, None] * velocity[None]
+    return tracks
 
 
 def persistence(scene: Scene) -> Array:
@@ -106,7 +107,7 @@ def start_positions(scene: Scene) -> Array:
     train = scene.visible[scene.train[0] : scene.train[1]]
     first = scene.train[0] + np.argmax(train, axis=0)
     index = np.arange(scene.points.shape[1])
-    start = np.where(scene.visible[0][:, None], scene.points[0], scene.points[first, index])
+    start: Array = np.where(scene.visible[0][:, None], scene.points[0], scene.points[first, index])
     never = ~scene.visible[0] & ~train.any(axis=0)
     known = start[~never]
     if not len(known):
@@ -164,7 +165,8 @@ def _smallest_rotation(direction: Array, towards: Array) -> Array:
         return 2.0 * np.outer(across, across) - np.eye(3)
     cross = np.cross(direction, target)
     skew = np.array([[0.0, -cross[2], cross[1]], [cross[2], 0.0, -cross[0]], [-cross[1], cross[0], 0.0]])
-    return np.eye(3) + skew + skew @ skew / (1.0 + cosine)
+    rotation: Array = np.eye(3) + skew + skew @ skew / (1.0 + cosine)
+    return rotation
 
 
 def _grip_weights(start: Array, controllers: Array, groups: list[Array]) -> Array:
@@ -177,7 +179,8 @@ def _grip_weights(start: Array, controllers: Array, groups: list[Array]) -> Arra
     if len(groups) > BLENDED_GRIPS:
         rank = np.argsort(np.argsort(distance, axis=0, kind="stable"), axis=0, kind="stable")
         weight = np.where(rank < BLENDED_GRIPS, weight, 0.0)
-    return weight / weight.sum(axis=0)
+    shares: Array = weight / weight.sum(axis=0)
+    return shares
 
 
 def _keeps_distance(a: Array, b: Array) -> bool:

@@ -97,12 +97,13 @@ def compare(
 
 def _without_noise(error: Array | float, floor: float) -> Array:
     """What remains of a mean error when noise is taken off in squares [m]."""
-    return np.sqrt(np.maximum(np.square(error) - floor**2, 0.0))
+    remainder: Array = np.sqrt(np.maximum(np.square(error) - floor**2, 0.0))
+    return remainder
 
 
 def _seen(curve: Array) -> Array:
     values = np.asarray(curve, dtype=float)
-    seen = values[np.isfinite(values)]
+    seen: Array = values[np.isfinite(values)]
     if not len(seen):
         raise ValueError(f"none of {len(values)} frames has an error")
     return seen

@@ -164,7 +164,7 @@ def trusted_tracks(
     jobs: dict[str, Job], drive: Drive, poll: Poll | None = None, runner: Runner = in_turn
 ) -> list[Array]:
     """Tracks (frames, N, 3) [m] of jobs by what they are, in their order. Raises SimulationError where one failed."""
-    found = []
+    found: list[Array] = []
     asked = runner(list(jobs.values()), drive, lambda: None if poll is None else poll(len(found), len(jobs)))
     for name, tracks in zip(jobs, asked, strict=True):
         if tracks is None:

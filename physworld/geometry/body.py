@@ -55,7 +55,7 @@ def first_points(scene: Scene) -> Array:
     """
     end = scene.train[1] or scene.frame_count
     visible = scene.visible[:end] if scene.visible[:end].any() else scene.visible
-    points = scene.points[0].astype(float)
+    points: Array = scene.points[0].astype(float)
     for n in np.flatnonzero(~visible[0] & visible.any(axis=0)):
         first = int(np.argmax(visible[:, n]))
         points[n] = scene.points[first, n]

@@ -91,7 +91,8 @@ def _start_velocity(scene: Scene, lattice: Lattice, material: Array, bending: sp
     velocity = coefficients[1].reshape(-1, 3)
     data = lattice.interpolation(material[seen]) / float(lattice.spacing.min())
     normal = data.T @ data + _BENDING_WEIGHT * bending
-    return spsolve(normal.tocsc(), data.T @ (velocity / float(lattice.spacing.min())))
+    nodal: Array = spsolve(normal.tocsc(), data.T @ (velocity / float(lattice.spacing.min())))
+    return nodal
 
 
 def _bending(lattice: Lattice) -> sparse.csr_matrix:
@@ -114,7 +115,11 @@ def _slopes(lattice: Lattice) -> list[sparse.csr_matrix]:
 
 
 def _unstretch(
-    x: Array, data: sparse.csr_matrix, target: Array, bending: sparse.csr_matrix, slopes: list
+    x: Array,
+    data: sparse.csr_matrix,
+    target: Array,
+    bending: sparse.csr_matrix,
+    slopes: list[sparse.csr_matrix],
 ) -> Array:
     """One Gauss-Newton step on data, bending and (|x_,j| - 1)."""
     n = len(x)
@@ -132,4 +137,5 @@ def _unstretch(
     )
     normal = smooth + _STRETCH_WEIGHT * stretch.T @ stretch
     step = spsolve(normal.tocsc(), -(gradient + _STRETCH_WEIGHT * stretch.T @ error))
-    return x + step.reshape(3, n).T
+    moved: Array = x + step.reshape(3, n).T
+    return moved

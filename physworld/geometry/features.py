@@ -63,7 +63,8 @@ def standardise(features: Array) -> Array:
     centred = features - features.mean(axis=0)
     # E|F_i - F_j|² = 2·E|F_i - mean|²
     scale = float(np.sqrt(2.0 * np.mean(np.sum(centred**2, axis=1))))
-    return centred / scale if scale > 0.0 else centred
+    scaled: Array = centred / scale if scale > 0.0 else centred
+    return scaled
 
 
 def neighbor_graph(points: Array, neighbors: int) -> sparse.csr_matrix:

@@ -64,7 +64,8 @@ class FilledBody:
 
     def _inside_shape(self, query: Array) -> Array:
         found = self.mesh.find_simplex(query)
-        return (found >= 0) & self.kept[np.maximum(found, 0)]
+        inside: Array = (found >= 0) & self.kept[np.maximum(found, 0)]
+        return inside
 
 
 def median_spacing(points: Array) -> float:
@@ -131,7 +132,8 @@ def _held(voxels: Array, places: Array) -> Array:
     """Which of ``places`` (Q, 3), in voxels, lie in one that is true."""
     index = np.floor(places).astype(int)
     within = np.all((index >= 0) & (index < voxels.shape), axis=1)
-    return within & voxels[tuple(np.clip(index, 0, np.array(voxels.shape) - 1).T)]
+    held: Array = within & voxels[tuple(np.clip(index, 0, np.array(voxels.shape) - 1).T)]
+    return held
 
 
 def _inside_closed(

@@ -14,6 +14,9 @@ order in the cell size (``docs/verification.md``).
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 
 from physworld.arrays import Array
@@ -84,8 +87,9 @@ def _solid(scene: Scene, budget: int) -> ReferenceBody:
             f"the sheet is not flat at the start ({off_plane:.3g} m rms off its plane, {size.min():.3g} m wide) and is "
             "taken as a solid"
         )
+    test: Callable[[Array], Array] | None = None
     if body.box_min_m is not None and body.box_max_m is not None:
-        low, high, test = body.box_min_m, body.box_max_m, None
+        low, high = body.box_min_m, body.box_max_m
         if np.any(high <= low):
             raise SceneUnsupported(f"the box from {low} to {high} m has no volume")
     else:
@@ -104,11 +108,7 @@ def _solid(scene: Scene, budget: int) -> ReferenceBody:
             _require_volume(cloud, scene.kind)
             notes.append("the volume was filled from points on the surface")
             cell = float((np.prod(np.ptp(cloud, axis=0)) / budget) ** (1 / 3))
-
-            def test(q: Array) -> Array:
-                return inside_surface_points(cloud, q, cell)
-
-            reach = 0.0
+            test, reach = partial(inside_surface_points, cloud, cell=cell), 0.0
             probe = np.random.default_rng(0).uniform(cloud.min(axis=0), cloud.max(axis=0), size=(4000, 3))
             volume = float(test(probe).mean() * np.prod(np.ptp(cloud, axis=0)))
 
@@ -158,7 +158,9 @@ def _require_volume(cloud: Array, kind: str) -> None:
         )
 
 
-def _solid_lattice(scene: Scene, low: Array, high: Array, test, budget: int) -> Lattice:
+def _solid_lattice(
+    scene: Scene, low: Array, high: Array, test: Callable[[Array], Array] | None, budget: int
+) -> Lattice:
     size = np.maximum(high - low, 1e-9)
     cell = float((8 * np.prod(size) / budget) ** (1 / 3))
     grips = grips_of(scene)
@@ -180,19 +182,22 @@ def _solid_lattice(scene: Scene, low: Array, high: Array, test, budget: int) -> 
 def _octants(cells: Array) -> Array:
     """Lower corners of every cell's 8 octants in cell units, (C, 8, 3), in the order of the particles."""
     corner = np.stack(np.meshgrid([0, 0.5], [0, 0.5], [0, 0.5], indexing="ij"), axis=-1).reshape(8, 3)
-    return cells[:, None, :] + corner[None]
+    corners: Array = cells[:, None, :] + corner[None]
+    return corners
 
 
 def _box_fill(cells: Array, origin: Array, spacing: Array, low: Array, high: Array) -> Array:
     begin = origin + _octants(cells) * spacing
     overlap = np.minimum(begin + 0.5 * spacing, high) - np.maximum(begin, low)
-    return np.prod(np.clip(overlap / (0.5 * spacing), 0.0, 1.0), axis=2)
+    fill: Array = np.prod(np.clip(overlap / (0.5 * spacing), 0.0, 1.0), axis=2)
+    return fill
 
 
-def _sampled_fill(cells: Array, origin: Array, spacing: Array, test) -> Array:
+def _sampled_fill(cells: Array, origin: Array, spacing: Array, test: Callable[[Array], Array]) -> Array:
     inner = np.stack(np.meshgrid(*[[0.125, 0.375]] * 3, indexing="ij"), axis=-1).reshape(8, 3)
     samples = origin + (_octants(cells)[:, :, None, :] + inner[None, None]) * spacing
-    return test(samples.reshape(-1, 3)).reshape(len(cells), 8, 8).mean(axis=2)
+    fill: Array = test(samples.reshape(-1, 3)).reshape(len(cells), 8, 8).mean(axis=2)
+    return fill
 
 
 def _rod(scene: Scene, refinement: float) -> ReferenceBody:
@@ -258,7 +263,7 @@ def _marker_arc_lengths(scene: Scene, points: Array) -> tuple[Array, float]:
     return arc, max(float(scene.body.length_m or 0.0), float(arc.max()))
 
 
-def _rod_lattice(scene: Scene, length: float, grip_arcs, refinement: float) -> Lattice:
+def _rod_lattice(scene: Scene, length: float, grip_arcs: Array, refinement: float) -> Lattice:
     if not length > 0:
         raise SceneUnsupported(f"the tracked points of the {scene.kind} span {length} m: no length")
     grips = np.clip(np.atleast_1d(grip_arcs), 0.0, length)

@@ -24,7 +24,7 @@ def least_rotation(start: Array, goal: Array) -> Array:
     axis = np.cross(a, b)
     cosine = np.clip(np.sum(a * b, axis=-1), -1.0, 1.0)[..., None, None]
     skew = _skew(axis)
-    rotation = np.eye(3) + skew + skew @ skew / np.maximum(1.0 + cosine, 1e-9)
+    rotation: Array = np.eye(3) + skew + skew @ skew / np.maximum(1.0 + cosine, 1e-9)
     flipped = cosine[..., 0, 0] < -1.0 + 1e-9
     if np.any(flipped):
         normal = np.cross(a[flipped], np.eye(3)[np.argmin(np.abs(a[flipped]), axis=-1)])

@@ -39,7 +39,8 @@ class GoalPoints:
 
     def distance(self, points: Array) -> Array:
         """See :class:`Goal`."""
-        return np.linalg.norm(points[..., self.index, :] - self.places, axis=-1).mean(axis=-1)
+        mean: Array = np.linalg.norm(points[..., self.index, :] - self.places, axis=-1).mean(axis=-1)
+        return mean
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,8 @@ class GoalShape:
         there, _ = tree.query(points)
         flat = points.reshape(-1, *points.shape[-2:])
         back = np.array([cKDTree(cloud).query(goal)[0].mean() for cloud in flat]).reshape(points.shape[:-2])
-        return 0.5 * (there.mean(axis=-1) + back)
+        chamfer: Array = 0.5 * (there.mean(axis=-1) + back)
+        return chamfer
 
 
 def _spread(count: int) -> Array:
@@ -139,4 +141,5 @@ class GripLimits:
 
 def _shortened(vectors: Array, longest: float) -> Array:
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return vectors * np.minimum(1.0, longest / np.maximum(length, 1e-300))
+    shortened: Array = vectors * np.minimum(1.0, longest / np.maximum(length, 1e-300))
+    return shortened

@@ -202,13 +202,15 @@ def _costs(
 
 
 def _ending(distance: Array, config: MppiConfig) -> Array:
-    return distance[:, -config.settling :].mean(axis=1)
+    mean: Array = distance[:, -config.settling :].mean(axis=1)
+    return mean
 
 
 def _weights(cost: Array, temperature: float) -> Array:
     better = np.sort(cost[np.isfinite(cost)])[: max(2, len(cost) // 2)]
     if len(better) < 2:
-        return (cost == cost.min()) / (cost == cost.min()).sum()
+        alone: Array = (cost == cost.min()) / (cost == cost.min()).sum()
+        return alone
     scale = max(temperature * float(better.std()), 1e-12)
     weights = np.exp(-np.minimum((cost - better[0]) / scale, 700.0))
     return np.asarray(weights / weights.sum())

@@ -55,7 +55,8 @@ class Shape:
     def normal(self, points: Array) -> Array:
         """Outward unit normals (M, 3) of the level sets through ``points`` (M, 3) [m]."""
         gradient = self._evaluate(points)[:, :3]
-        return gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-30)
+        normals: Array = gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-30)
+        return normals
 
     def on_device(self, device: str) -> list[Any]:
         """Leading arguments of :func:`physworld.shapes.sdf_kernels.signed_distance`."""
@@ -72,7 +73,8 @@ class Shape:
         found = wp.zeros(len(points), dtype=wp.vec4d, device="cpu")
         inputs = [*self.on_device("cpu"), wp.array(points, dtype=wp.vec3d, device="cpu")]
         wp.launch(kernels.evaluate, dim=len(points), inputs=inputs, outputs=[found], device="cpu")
-        return found.numpy()
+        values: Array = found.numpy()
+        return values
 
 
 def sphere(radius_m: float) -> Shape:

@@ -25,7 +25,8 @@ class SurfaceMesh:
     @property
     def size_m(self) -> Array:
         """Extents of the bounding box [m], (3,)."""
-        return np.ptp(self.vertices, axis=0)
+        size: Array = np.ptp(self.vertices, axis=0)
+        return size
 
     @property
     def volume_m3(self) -> float:

@@ -169,7 +169,8 @@ class Renderer:
             colour = colour + np.einsum(
                 "gc,gcx->gx", _basis(direction)[:, : harmonics.shape[1] - 1], harmonics[:, 1:]
             )
-        return np.maximum(colour + 0.5, 0.0)
+        shown: Array = np.maximum(colour + 0.5, 0.0)
+        return shown
 
 
 def rotation_matrices(quaternions: Array) -> Array:
