@@ -117,7 +117,11 @@ class Formulation(ABC):
     def run_with_ledger(
         self, solver: Any, start: Start, held: HeldNodes, times: Array, progress: Progress | None = None
     ) -> tuple[Array, EnergyLedger | ParticleLedger]:
-        """The same, and where every joule went; arguments and errors are those of :meth:`run`."""
+        """The same, and where every joule went; errors are those of :meth:`run`.
+
+        Args:
+            solver, start, held, times, progress: as in :meth:`run`.
+        """
 
 
 class TotalForm(Formulation):
@@ -143,7 +147,11 @@ class TotalForm(Formulation):
         transfer: str = Apic.name,
         plasticity: Plasticity | None = None,
     ) -> TotalLagrangian:
-        """See the base class; neither transfer nor flow law is read."""
+        """See the base class; neither transfer nor flow law is read.
+
+        Args:
+            problem, time_step_s, transfer, plasticity: as in :meth:`Formulation.solver`.
+        """
         return TotalLagrangian(problem, time_step_s)
 
     def run(
@@ -154,7 +162,11 @@ class TotalForm(Formulation):
         times: Array,
         progress: Progress | None = None,
     ) -> Array:
-        """Nodes; once more at half the time step where the body blew up."""
+        """Nodes; once more at half the time step where the body blew up.
+
+        Args:
+            solver, start, held, times, progress: as in :meth:`Formulation.run`.
+        """
         return run_again_if_blown_up(solver, start.nodes, start.velocities, held, times, progress)
 
     def run_with_ledger(
@@ -165,7 +177,11 @@ class TotalForm(Formulation):
         times: Array,
         progress: Progress | None = None,
     ) -> tuple[Array, EnergyLedger]:
-        """Nodes and the ledger of the nodes."""
+        """Nodes and the ledger of the nodes.
+
+        Args:
+            solver, start, held, times, progress: as in :meth:`Formulation.run_with_ledger`.
+        """
         return run_with_ledger(
             solver.problem, start.nodes, start.velocities, held, times,
             time_step_s=solver.asked_step_s, progress=progress,
@@ -194,7 +210,11 @@ class UpdatedForm(Formulation):
         transfer: str = Apic.name,
         plasticity: Plasticity | None = None,
     ) -> UpdatedLagrangian:
-        """See the base class."""
+        """See the base class.
+
+        Args:
+            problem, time_step_s, transfer, plasticity: as in :meth:`Formulation.solver`.
+        """
         return UpdatedLagrangian(problem, time_step_s, transfer=TRANSFERS[transfer](), plasticity=plasticity)
 
     def run(
@@ -205,7 +225,11 @@ class UpdatedForm(Formulation):
         times: Array,
         progress: Progress | None = None,
     ) -> Array:
-        """All particles."""
+        """All particles.
+
+        Args:
+            solver, start, held, times, progress: as in :meth:`Formulation.run`.
+        """
         solid = solver.run_particles(start.nodes, start.velocities, held, times, progress)
         return _with_empty(solver.solid, solid, start.particles)
 
@@ -217,7 +241,11 @@ class UpdatedForm(Formulation):
         times: Array,
         progress: Progress | None = None,
     ) -> tuple[Array, ParticleLedger]:
-        """All particles and their ledger."""
+        """All particles and their ledger.
+
+        Args:
+            solver, start, held, times, progress: as in :meth:`Formulation.run_with_ledger`.
+        """
         solid, ledger = run_particles_with_ledger(
             solver, start.nodes, start.velocities, held, times, progress
         )

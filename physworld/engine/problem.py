@@ -69,7 +69,14 @@ class Solver(Protocol):
         times: Array,
         progress: Callable[[int, int], None] | None = None,
     ) -> Array:
-        """Nodal positions at ``times``, (T, n, 3)."""
+        """Nodal positions at ``times``, (T, n, 3) [m].
+
+        Args:
+            x, v: nodal positions [m] and velocities [m/s] at the first time, (n, 3).
+            held: prescribed nodes; their paths are given at ``times``.
+            times: (T,) [s], strictly increasing.
+            progress: called with (frames done, frames in all) once a frame; may raise to stop.
+        """
         ...
 
 

@@ -133,3 +133,17 @@ class Hencky(SolidLaw):
         logs = np.log(np.maximum(stretches, np.finfo(float).tiny))
         W = mu * np.sum(logs**2, axis=-1) + 0.5 * lam * np.sum(logs, axis=-1) ** 2
         return np.where(J > 0, W, np.inf)
+
+
+@dataclass(frozen=True)
+class DruckerPragerElastic(Hencky):
+    """The elastic law that goes with Drucker-Prager plasticity of sand and soil (Klar et al. 2016, section 4).
+
+    On the logarithmic strain the cone |dev ln U| <= -alpha tr ln U has a return mapping in closed form. Here without
+    the yield condition: the total Lagrangian form cannot flow. It has a name of its own, since that is what a choice
+    among elastic laws is asked for.
+    """
+
+    name: ClassVar[str] = "drucker_prager_elastic"
+    title: ClassVar[str] = "Elastic part of Drucker-Prager plasticity"
+    use: ClassVar[str] = "sand and soil before they yield"

@@ -8,9 +8,8 @@ from __future__ import annotations
 from dataclasses import fields
 
 from physworld.catalogue import with_plugins
-from physworld.materials.drucker_prager_elastic import DruckerPragerElastic
 from physworld.materials.fixed_corotated import FixedCorotated
-from physworld.materials.hencky import Hencky
+from physworld.materials.hencky import DruckerPragerElastic, Hencky
 from physworld.materials.laws import Law
 from physworld.materials.neo_hookean import NeoHookean
 from physworld.materials.rod import RodLaw

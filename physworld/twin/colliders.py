@@ -57,7 +57,14 @@ class TwinCollider:
     def contact(
         self, collider: Collider, lattice: Lattice, nodes: Array, start_s: float, offset_m: float
     ) -> Any:
-        """The term between this collider and a body that starts at ``nodes`` (n, 3) [m] at ``start_s``.
+        """The term between this collider and a body.
+
+        Args:
+            collider: this one on its way, as :meth:`on_its_way` gives it.
+            lattice: the body's.
+            nodes: nodal positions of the body at its start [m], (n, 3).
+            start_s: when the body is let go [s].
+            offset_m: of a body that just touches, half the thickness of a sheet [m].
 
         Raises:
             SceneUnsupported: the body starts deep inside the collider.

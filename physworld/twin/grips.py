@@ -178,7 +178,14 @@ def held_paths(twin: Twin, times: Array, controls: Array) -> HeldNodes:
 
 
 def why_no_turn(body: ReferenceBody, nodes: Array, points: Array, noise_sigma_m: float | None) -> str | None:
-    """Why a grip's control points (k, 3) at the start do not show how a rope's section turns; None if they do."""
+    """Why a grip's control points do not show how a rope's section turns; None if they do.
+
+    Args:
+        body: the rope.
+        nodes: that the grip holds.
+        points: its control points at the start [m], (k, 3).
+        noise_sigma_m: of the tracking [m], or None where nobody says.
+    """
     if len(points) < 3:
         return f"{len(points)} control points fix no turn about the axis, 3 are needed"
     local = points - points.mean(axis=0)

@@ -69,7 +69,11 @@ class Adjoint:
         times: Array,
         progress: Callable[[int, int], None] | None = None,
     ) -> RecordedRun:
-        """Integrate and keep what a gradient needs: arguments and errors of :meth:`TotalLagrangian.run`."""
+        """Integrate and keep what a gradient needs: arguments and errors of :meth:`TotalLagrangian.run`.
+
+        Args:
+            x, v, held, times, progress: as in :meth:`TotalLagrangian.run`.
+        """
         return RecordedRun(self, x, v, held, np.asarray(times, dtype=float), progress)
 
 

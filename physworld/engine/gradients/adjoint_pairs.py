@@ -46,7 +46,14 @@ class ForcePair:
         self._sides, self._springs = (high, low), springs
 
     def prepare(self, now: Reverse, x_previous: wp.array, times: Array, memories: list[list[Memory]]) -> None:
-        """Take the arrays of a reverse pass."""
+        """Take the arrays of a reverse pass.
+
+        Args:
+            now: its state and derivatives.
+            x_previous: nodal positions of the substep before [m], (3n,).
+            times: frames of the run, (T,) [s].
+            memories: of the run's terms, as they were in every substep.
+        """
         self._now, self._x_previous, self._memories = now, x_previous, memories
         self._forces = [wp.zeros_like(now.x) for _ in self._sides]
         self._scratch = wp.zeros_like(now.x)

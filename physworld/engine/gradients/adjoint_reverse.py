@@ -31,8 +31,8 @@ from physworld.engine.gradients.adjoint_terms import (
     Reverse,
     StressAdjoint,
     TermAdjoint,
+    TwistAdjoint,
 )
-from physworld.engine.gradients.adjoint_twist import TwistAdjoint
 from physworld.engine.gradients.soft_grips_derivatives import SoftGripsAdjoint, SoftGripsGradient
 from physworld.engine.gradients.tangent import InternalTangent
 from physworld.engine.problem import Problem
@@ -338,6 +338,12 @@ def _by_log_density(problem: Problem, mass_bar: Array) -> Array:
 
 def adjoint_of(term: BoundTerm, problem: Problem, now: Reverse, memories: list[Memory]) -> TermAdjoint:
     """The reverse pass of a bound term whose ``begin`` has been called.
+
+    Args:
+        term: of the run.
+        problem: the run's.
+        now: state and derivatives of the reverse pass.
+        memories: what the term carried from substep to substep, kept in the forward pass.
 
     Raises:
         NotDifferentiable: one of its kernels was compiled without a backward pass.

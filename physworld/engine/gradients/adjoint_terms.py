@@ -1,10 +1,11 @@
 """The reverse pass of terms: d(w . f) / dx and / dv of whatever a bound term adds to the forces.
 
-Terms of two kinds are taken back here, twist by :mod:`physworld.engine.gradients.adjoint_twist`:
+Terms of three kinds are taken back here:
 
 * a term of plain Warp kernels: its launches are recorded once on a tape, and Warp's own adjoint kernels are launched;
 * a :class:`physworld.engine.total.stress.BoundStress`: native code, by
-:mod:`physworld.engine.gradients.adjoint_stress_kernels`.
+:mod:`physworld.engine.gradients.adjoint_stress_kernels`;
+* the twist of a rope, in closed form.
 
 Growing stiffness multiplies the forces that are there: what came before it sees a multiplied w.
 
@@ -25,6 +26,8 @@ from physworld.engine.gradients.adjoint_kernels import keep_rows, load_row, take
 from physworld.engine.gradients.adjoint_stress_kernels import MOST_NUMBERS, stress_adjoint
 from physworld.engine.problem import Problem
 from physworld.engine.terms.term import BoundTerm
+from physworld.engine.thin.twist import BoundTwist
+from physworld.engine.thin.twist_kernels import push_twisted_along, turn_spans_along
 from physworld.engine.total.stress import BoundStress
 from physworld.errors import NotDifferentiable
 
@@ -210,6 +213,47 @@ class StressAdjoint:
             self._kernel, dim=self._cells,
             inputs=[*self._inputs, now.clock, now.counter, now.offset, now.x, rows, now.force_bar, bar],
             outputs=[now.x_bar, self.parameters_bar, self.fields_bar], device=now.x.device,
+        )  # fmt: skip
+
+
+class TwistAdjoint:
+    """One bound twist's reverse pass.
+
+    Twist forces are minus the gradient of an energy, so d(w . f)/dx is the change of the forces with the nodes along w,
+    found in closed form (:mod:`physworld.engine.thin.twist_kernels`). The angle of the last substep only counts turns:
+    nothing is differentiated through it. How the grips turn is given; a scalar that changes it is differenced as every
+    other term is (:mod:`physworld.engine.gradients.gradient`).
+    """
+
+    def __init__(self, term: BoundTwist, memories: list[Memory]) -> None:
+        self._term, self._memories = term, memories
+        points, device = len(term.span_of), term.device
+        self._along_rate = wp.zeros(points, dtype=wp.vec3d, device=device)
+        self._moment_rate = wp.zeros(term.spans, dtype=wp.float64, device=device)
+        self._by_log_stiffness = wp.zeros(term.spans, dtype=wp.float64, device=device)
+
+    @property
+    def log_stiffness(self) -> Array:
+        """Derivatives by the logarithms of the particles' stiffness, (P,): their sum is that by GJ's logarithm."""
+        slopes: Array = self._by_log_stiffness.numpy() @ self._term.shares
+        return slopes
+
+    def take_back(self, now: Reverse) -> None:
+        """Add the products to ``now.x_bar``."""
+        term, state = self._term, self._term.state
+        for memory in self._memories:
+            memory.put_back(now.offset, now.counter)
+        term.turn(now.x, now.clock, now.counter)
+        rates = [self._along_rate, self._moment_rate]
+        wp.launch(
+            turn_spans_along, dim=term.spans,
+            inputs=[term.begins, *term.rows, term.compliance, *state.geometry, state.moment, now.force_bar],
+            outputs=[*rates, self._by_log_stiffness], device=term.device,
+        )  # fmt: skip
+        wp.launch(
+            push_twisted_along, dim=len(term.span_of),
+            inputs=[term.begins, term.span_of, *term.rows, *state.geometry, state.moment, *rates, now.force_bar],
+            outputs=[now.x_bar], device=term.device,
         )  # fmt: skip
 
 

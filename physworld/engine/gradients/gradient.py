@@ -35,9 +35,20 @@ from physworld.errors import NotDifferentiable
 class Setting(Protocol):
     """What is integrated: :class:`physworld.twin.twin.Integration` is one."""
 
-    problem: Problem
-    velocity: Array
-    held: HeldNodes
+    @property
+    def problem(self) -> Problem:
+        """The body and what acts on it."""
+        ...
+
+    @property
+    def velocity(self) -> Array:
+        """Nodal velocities at the first time [m/s], (n, 3)."""
+        ...
+
+    @property
+    def held(self) -> HeldNodes:
+        """Prescribed nodes and their paths."""
+        ...
 
 
 @dataclass(frozen=True)

@@ -137,6 +137,12 @@ class Lattice:
 def lattice_from_cells(origin: Array, spacing: Array, cells: Array, fill: Array) -> Lattice:
     """Number the nodes of the given cells.
 
+    Args:
+        origin: reference coordinates of the corner of cell 0 [m], (d,).
+        spacing: size of the cells [m], (d,).
+        cells: integer places of the cells, (C, d).
+        fill: share of every particle's part of its cell that holds material, (C, 2**d).
+
     Raises:
         ValueError: there is no cell, or a fill lies outside [0, 1].
     """

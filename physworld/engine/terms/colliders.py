@@ -189,7 +189,11 @@ class BoundCollider(BoundTerm):
             )
 
     def launch(self, x: wp.array, v: wp.array, clock: wp.array, counter: wp.array, force: wp.array) -> None:
-        """Add contact forces [N] at nodal positions and velocities (3n,) to ``force``."""
+        """Add contact forces [N] at nodal positions and velocities (3n,) to ``force``.
+
+        Args:
+            x, v, clock, counter, force: as in :meth:`BoundTerm.launch`.
+        """
         device = self.device
         wp.launch(
             move_collider, 1, inputs=[self._times, *self._path, clock, counter],

@@ -100,6 +100,13 @@ def touching(lattice: Lattice, nodes: Array, collider: Collider, time_s: float, 
 
     Points that start inside, by noise or by a thickness that is not quite right, touch there and further in: else the
     penalty would throw them out.
+
+    Args:
+        lattice: the body's.
+        nodes: nodal positions at the start [m], (n, 3).
+        collider: what touches.
+        time_s: when the body is let go [s].
+        thickness_m: offset of a body that just touches [m].
     """
     points, _, _ = contact_points(lattice)
     gap = collider.distance(lattice.interpolation(points) @ nodes, time_s)

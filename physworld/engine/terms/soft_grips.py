@@ -212,7 +212,11 @@ class BoundSoftGrips(BoundTerm):
         self.pull.assign(rows)
 
     def launch(self, x: wp.array, v: wp.array, clock: wp.array, counter: wp.array, force: wp.array) -> None:
-        """Add the pulls [N]; the term must come last, it takes the others' forces into account."""
+        """Add the pulls [N]; the term must come last, it takes the others' forces into account.
+
+        Args:
+            x, v, clock, counter, force: as in :meth:`BoundTerm.launch`.
+        """
         count = self.pull.shape[0]
         inputs = [*self.model, clock, counter, x, v, force]
         wp.launch(distance_from_path, dim=count, inputs=inputs, outputs=[self.gap], device=self.device)

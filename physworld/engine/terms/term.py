@@ -52,9 +52,13 @@ class BoundTerm(Protocol):
         return None
 
     def launch(self, x: wp.array, v: wp.array, clock: wp.array, counter: wp.array, force: wp.array) -> None:
-        """Add forces [N] to ``force`` (3n,) float64 at nodal positions ``x`` [m] and velocities ``v`` [m/s], (3n,).
+        """Add the forces of one substep.
 
-        ``clock`` is (frame interval [s], 1/dt [1/s], dt [s]) float64, ``counter`` (frame, substep, substeps) int32.
+        Args:
+            x, v: nodal positions [m] and velocities [m/s], (3n,) float64.
+            clock: (frame interval [s], 1/dt [1/s], dt [s]) float64.
+            counter: (frame, substep, substeps) int32.
+            force: forces [N], to be added to, (3n,) float64.
         """
         ...
 

@@ -82,7 +82,14 @@ _SCATTER = r"""
 
 
 def scatter(out: str, on_t: str, on_c: str, sign: str = "-", member: str = "") -> str:
-    """The text that adds ``sign`` the forces ``on_t``, ``on_c`` of a cell to the nodes of ``out``."""
+    """The text that adds the forces of a cell to its nodes.
+
+    Args:
+        out: name of the array that they are added to.
+        on_t, on_c: names of the forces by x' and by x''.
+        sign: "-" or "+".
+        member: suffix that takes one number out of each force.
+    """
     text = _SCATTER.replace("OUT", out).replace("ON_T", on_t).replace("ON_C", on_c)
     return text.replace("SIGN", sign).replace("MEMBER", member)
 

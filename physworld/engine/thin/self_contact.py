@@ -232,7 +232,11 @@ class BoundSelfContact(BoundTerm):
             )
 
     def launch(self, x: wp.array, v: wp.array, clock: wp.array, counter: wp.array, force: wp.array) -> None:
-        """Add contact forces [N] at nodal positions and velocities (3n,) to ``force``."""
+        """Add contact forces [N] at nodal positions and velocities (3n,) to ``force``.
+
+        Args:
+            x, v, clock, counter, force: as in :meth:`BoundTerm.launch`.
+        """
         lanes, moved, slots, heads = self._lanes, self._moved, self._slots, self._heads
         most = wp.float64(0.25 * self._skin**2)
         launches = (

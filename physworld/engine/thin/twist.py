@@ -198,7 +198,11 @@ class BoundTwist(BoundTerm):
         )  # fmt: skip
 
     def launch(self, x: wp.array, v: wp.array, clock: wp.array, counter: wp.array, force: wp.array) -> None:
-        """Add the forces of twist [N] at nodal positions ``x`` (3n,) to ``force``."""
+        """Add the forces of twist [N] at nodal positions ``x`` (3n,) to ``force``.
+
+        Args:
+            x, v, clock, counter, force: as in :meth:`BoundTerm.launch`.
+        """
         self.turn(x, clock, counter)
         wp.launch(
             push_twisted, dim=len(self.span_of),

@@ -386,6 +386,13 @@ def run_again_if_blown_up(
     """:meth:`TotalLagrangian.run`, and once more at half the time step where the body blew up.
 
     The stable time step is the undeformed body's; strain may stiffen a body beyond it. Raises what ``run`` raises.
+
+    Args:
+        solver: with the time step of the first attempt.
+        x, v: nodal positions [m] and velocities [m/s] at the first time, (n, 3).
+        held: prescribed nodes; their paths are given at ``times``.
+        times: (T,) [s], strictly increasing.
+        progress: called with (frames done, frames in all) once a frame; may raise to stop.
     """
     try:
         return solver.run(x, v, held, times, progress)

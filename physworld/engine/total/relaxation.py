@@ -129,7 +129,14 @@ class Relaxation:
         return _FROM_BELOW * found
 
     def launch(self, x: wp.array, v: wp.array, force: wp.array, clock: wp.array, counter: wp.array) -> None:
-        """One step of positions and velocities under ``force`` (3n,), which is cleared."""
+        """One step of positions and velocities.
+
+        Args:
+            x, v: nodal positions [m] and velocities [m/s], (3n,) float64; changed.
+            force: of everything but friction [N], (3n,); cleared.
+            clock: (frame interval [s], 1/dt [1/s], dt [s]).
+            counter: (frame, substep, substeps).
+        """
         n, device, friction = len(self._nodes[0]), self._device, self._friction
         _, slot, *paths = self._nodes
         table, shares = coefficients(self.stages)

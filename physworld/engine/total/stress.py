@@ -116,7 +116,11 @@ class BoundStress(BoundTerm):
         return self.inputs[-1]
 
     def launch(self, x: wp.array, v: wp.array, clock: wp.array, counter: wp.array, force: wp.array) -> None:
-        """Add the forces [N] of the model's stresses."""
+        """Add the forces [N] of the model's stresses.
+
+        Args:
+            x, v, clock, counter, force: as in :meth:`BoundTerm.launch`.
+        """
         wp.launch(
             self.model.kernel,
             dim=self.cells,
@@ -155,7 +159,11 @@ class BoundModel(BoundParticleStress):
         self._state = wp.zeros(max(1, model.rows * fields.shape[1]), dtype=wp.float32, device=device)
 
     def launch(self, F: wp.array, stress: wp.array, clock: wp.array, counter: wp.array) -> None:
-        """Add the model's stress."""
+        """Add the model's stress.
+
+        Args:
+            F, stress, clock, counter: as in :meth:`BoundParticleStress.launch`.
+        """
         flat = wp.array(ptr=F.ptr, dtype=wp.float64, shape=9 * len(F), device=self._device)
         wp.launch(
             self._kernel, dim=self._groups, inputs=[*self._inputs, clock, counter, flat],

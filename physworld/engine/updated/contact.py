@@ -159,9 +159,14 @@ class GridContact:
         )  # fmt: skip
 
     def press(self, x: wp.array, box: wp.array, velocity: wp.array, seen: wp.array, again: bool) -> None:
-        """One turn of every near particle on the nodes' ``velocity``; ``again``: with the last substep's impulses.
+        """One turn of every near particle.
 
-        ``seen`` has room for a copy of the velocities where all particles act at once.
+        Args:
+            x: particles [m], (3P,).
+            box: the grid's box on the device.
+            velocity: of the grid's nodes [m/s], changed, (n,) vec4.
+            seen: room for a copy of the velocities where all particles act at once.
+            again: with the last substep's impulses.
         """
         relaxation = _RELAXATION if self.at_once else 1.0
         if self.at_once:
@@ -178,7 +183,12 @@ class GridContact:
 def press_all(
     contacts: tuple[GridContact, ...], x: wp.array, box: wp.array, velocity: wp.array, seen: wp.array
 ) -> None:
-    """All contacts of a substep: the last impulses first, then one correction each, from which the next goes on."""
+    """All contacts of a substep: the last impulses first, then one correction each, from which the next goes on.
+
+    Args:
+        contacts: those of the problem, in the order of its terms.
+        x, box, velocity, seen: as in :meth:`GridContact.press`.
+    """
     for again in (True, False):
         for contact in contacts:
             contact.press(x, box, velocity, seen, again)

@@ -113,6 +113,9 @@ class UpdatedLagrangian:
 
         The smoothest least-squares fit; where material has flowed the lattice means little, and :meth:`run_particles`
         is what to ask. Arguments and errors are those of :meth:`run_particles`.
+
+        Args:
+            x, v, held, times, progress: as in :meth:`run_particles`.
         """
         return self.fit_nodes(self.run_particles(x, v, held, times, progress))
 

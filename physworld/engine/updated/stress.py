@@ -71,7 +71,15 @@ class ParticleStress:
             self._eigen = wp.zeros(len(measure), dtype=eigen_type, device=device)
 
     def launch(self, F: wp.array, C: wp.array, stress: wp.array, clock: wp.array, flags: wp.array) -> None:
-        """Advance ``F`` (P padded, mat33d) by ``clock[2]`` [s] of ``C`` [1/s], and write ``stress`` [J], (6P,)."""
+        """Advance the deformation by a substep and write the stress.
+
+        Args:
+            F: elastic deformation gradients, (P padded,) mat33d; changed.
+            C: velocity gradients [1/s], (9P padded,).
+            stress: volume times Kirchhoff stress [J], (6P padded,); written.
+            clock: (frame interval [s], 1/dt [1/s], dt [s]).
+            flags: counts of particles that inverted or are not finite, (4,) int32.
+        """
         outputs = [stress, self.ratio, flags]
         flat = wp.array(ptr=F.ptr, dtype=wp.float64, shape=9 * len(F), device=self._device)
         if self._plasticity is None:

@@ -23,7 +23,6 @@ from physworld.arrays import Array
 from physworld.engine.terms.contact import ColliderContact, GroundContact, ground
 from physworld.engine.terms.term import BoundTerm, Term
 from physworld.engine.updated.contact import GridContact
-from physworld.engine.updated.force_kernels import kick, widen
 from physworld.engine.updated.grid_box import GridLattice
 from physworld.errors import SceneUnsupported
 
@@ -61,7 +60,14 @@ class BoundParticleStress:
         return None
 
     def launch(self, F: wp.array, stress: wp.array, clock: wp.array, counter: wp.array) -> None:
-        """Change ``stress`` (6P,) [J] of particles with deformation gradients ``F`` (P, mat33d)."""
+        """Change the stress of the particles.
+
+        Args:
+            F: deformation gradients, (P,) mat33d.
+            stress: volume times Kirchhoff stress [J], (6P,); changed.
+            clock: (frame interval [s], 1/dt [1/s], dt [s]).
+            counter: (frame, substep, substeps).
+        """
         raise NotImplementedError(f"{type(self).__name__} launches nothing")
 
 
@@ -130,7 +136,15 @@ class ParticleTerms:
     def launch(
         self, x: wp.array, v: wp.array, F: wp.array, stress: wp.array, clock: wp.array, counter: wp.array
     ) -> None:
-        """Before particles go to the grid: change their stress (6P,) [J], and kick their velocities (3P,) [m/s]."""
+        """Before particles go to the grid: change their stress, and kick their velocities.
+
+        Args:
+            x, v: positions [m] and velocities [m/s], (3P,); the velocities are changed.
+            F: deformation gradients, (P,) mat33d.
+            stress: volume times Kirchhoff stress [J], (6P,); changed.
+            clock: (frame interval [s], 1/dt [1/s], dt [s]).
+            counter: (frame, substep, substeps).
+        """
         for stressing in self._stresses:
             stressing.launch(F, stress, clock, counter)
         if not self._forces:
@@ -151,3 +165,26 @@ def _on_particles(term: Term, body: ParticleBody) -> Any:
             "particles and none of these nodes"
         )
     return bind(body)
+
+
+@wp.kernel(enable_backward=False)
+def widen(v: wp.array[wp.float32], velocity: wp.array[wp.float64]) -> None:
+    """One component of the particles' velocities [m/s] in double precision, as forces read it."""
+    k = wp.tid()
+    velocity[k] = wp.float64(v[k])
+
+
+@wp.kernel(enable_backward=False)
+def kick(
+    # model
+    mass: wp.array[wp.float64],
+    clock: wp.array[wp.float64],
+    # in, cleared
+    force: wp.array[wp.float64],
+    # in, out
+    v: wp.array[wp.float32],
+) -> None:
+    """One component of the velocity [m/s] after the force [N] of a substep."""
+    k = wp.tid()
+    v[k] = wp.float32(wp.float64(v[k]) + clock[2] * force[k] / mass[k // 3])
+    force[k] = wp.float64(0.0)

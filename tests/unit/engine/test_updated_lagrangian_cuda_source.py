@@ -27,7 +27,7 @@ def compiled(module: object, folder: Path) -> bool:
         "updated.transfer_kernels",
         "updated.grid_kernels",
         "updated.contact_kernels",
-        "updated.force_kernels",
+        "updated.terms",
         "updated.stress_kernels",
         "updated.hencky_kernels",
     ],
