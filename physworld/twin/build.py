@@ -220,9 +220,8 @@ def _release_time(scene: Scene) -> float:
     seen = np.where(scene.visible & scene.visible[0], moved, np.nan)
     usable = ~np.isnan(seen).all(axis=1)
     moved = np.zeros(len(seen), dtype=bool)
-    moved[usable] = (
-        np.nanmedian(seen[usable], axis=1) > limit
-    )  # one point's jump is a tracker's, not a release
+    # The median: one point's jump is a tracker's, not a release.
+    moved[usable] = np.nanmedian(seen[usable], axis=1) > limit
     driven = (
         np.linalg.norm(scene.controllers - scene.controllers[0], axis=2).max(axis=1, initial=0.0)
         > _DRIVEN_SHARE * size

@@ -298,9 +298,8 @@ class Twin:
         problem = replace(problem, terms=(*problem.terms, *self._touching_itself(held.nodes), *twists))
         for known in active:
             problem, held = known.attach(problem, held, self)
-        stretch = (
-            problem.lattice.spacing / self.lattice.spacing
-        )  # of a rest shape that is not the declared one
+        # A rest shape that is not the declared one stretches the grips' boxes.
+        stretch = problem.lattice.spacing / self.lattice.spacing
         regions = [region * stretch for region in regions]
         problem, held = soften(problem, held, self.grip_softness, regions)
         return Integration(problem, velocity, held, knots, frame_index)

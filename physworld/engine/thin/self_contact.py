@@ -157,11 +157,10 @@ class BoundSelfContact(BoundTerm):
         cell = float(lattice.spacing.max())
         self._skin = _SKIN * cell
         half = 0.5 * _STRETCH * float(np.linalg.norm(lattice.spacing))
-        self._around = (
-            half if lattice.dim == 2 else 5 * half
-        )  # a rope's windows reach a cell beyond its points
+        # The windows of a rope reach a cell beyond its points.
+        self._around = half if lattice.dim == 2 else 5 * half
         self._width = wp.float64(contact.thickness_m + self._skin + half + self._around)
-        self._body, self._points, self._slots = Body(), Points(), Slots()
+        self._body, self._points, self._slots = Body(), Points(), _empty_slots(points, most, device)
         body = self._body
         body.dim = lattice.dim
         body.cell_nodes = array(lattice.cell_nodes.reshape(-1), wp.int32)
@@ -176,18 +175,6 @@ class BoundSelfContact(BoundTerm):
         self._points.place = array(in_cells(coordinates), wp.vec2d)
         self._points.measure = array(measures, wp.float64)
         self._points.first = array(np.searchsorted(cells, np.arange(count + 1)), wp.int32)
-        slots = self._slots
-        slots.most = most
-        slots.counts = wp.zeros(points, dtype=wp.int32, device=device)
-        slots.own = wp.zeros(points * most, dtype=wp.vec2d, device=device)
-        slots.other = wp.zeros_like(slots.own)
-        slots.middles = wp.zeros_like(slots.own)
-        slots.slip = wp.zeros(points * most, dtype=wp.vec3d, device=device)
-        slots.side = wp.zeros_like(slots.slip)
-        slots.reach = wp.zeros(points * most, dtype=wp.float64, device=device)
-        slots.gap = wp.zeros_like(slots.reach)
-        slots.active = wp.zeros(points, dtype=wp.int32, device=device)
-        slots.actives = wp.zeros(1, dtype=wp.int32, device=device)
         self._lanes = _LANES if wp.get_device(device).is_cpu else count
         self._middle = nodes // 2
         self._cells = array(places, wp.vec2i)
@@ -282,3 +269,20 @@ def _ends(lattice: Lattice) -> tuple[Array, Array]:
         low[axis] = first + size * (1 - halves[begin == first].max())
         high[axis] = last + size * halves[begin == last].max()
     return low, high
+
+
+def _empty_slots(points: int, most: int, device: str) -> Slots:
+    """Room for ``most`` partners of every point of a body, none of them known yet."""
+    slots = Slots()
+    slots.most = most
+    slots.counts = wp.zeros(points, dtype=wp.int32, device=device)
+    slots.own = wp.zeros(points * most, dtype=wp.vec2d, device=device)
+    slots.other = wp.zeros_like(slots.own)
+    slots.middles = wp.zeros_like(slots.own)
+    slots.slip = wp.zeros(points * most, dtype=wp.vec3d, device=device)
+    slots.side = wp.zeros_like(slots.slip)
+    slots.reach = wp.zeros(points * most, dtype=wp.float64, device=device)
+    slots.gap = wp.zeros_like(slots.reach)
+    slots.active = wp.zeros(points, dtype=wp.int32, device=device)
+    slots.actives = wp.zeros(1, dtype=wp.int32, device=device)
+    return slots

@@ -60,9 +60,8 @@ class GridContact:
         self._cell = float(lattice.spacing.min())
         self._half = GAUSS_POINTS[0] * lattice.spacing
         sight = _SIGHT * self._cell
-        self._threads = (
-            count if wp.get_device(device).is_cuda else 1
-        )  # a thread that finds nothing costs as much
+        # On a CPU a thread that finds nothing costs as much as one that does.
+        self._threads = count if wp.get_device(device).is_cuda else 1
         self._plane = collider.shape.kind == HALF_SPACE
         self._reach = collider.shape.reach_m + sight + float(self._half.max())
         self._sight = sight

@@ -149,9 +149,8 @@ class UpdatedLagrangian:
     def prepare(self, x: Array, v: Array, held: HeldNodes) -> ParticleRun:
         """A run at its first time, from nodal positions and velocities (n, 3)."""
         start = x.copy()
-        start[held.nodes] = held.positions[
-            0
-        ]  # a grip that is turned or shifted is so from the first frame on
+        # A grip that is turned or shifted is so from the first frame on.
+        start[held.nodes] = held.positions[0]
         return ParticleRun(self, self._start(start, v), self.stress(), self.grips(held))
 
     def grips(self, held: HeldNodes) -> ParticleGrips:

@@ -168,9 +168,8 @@ class ParticleRun:
         split, gripped = self.engine.transfer.split or self.meter is not None, self.gripped > 0
 
         def nodal(used: bool) -> wp.array:
-            return wp.zeros(
-                nodes + 1 if used else 1, dtype=wp.vec4f, device=device
-            )  # a row reads one node more
+            # A row reads one node more.
+            return wp.zeros(nodes + 1 if used else 1, dtype=wp.vec4f, device=device)
 
         self.momentum, self.impulse, self.grip = nodal(True), nodal(split), nodal(gripped)
         self.velocity, self.velocity_old = nodal(True), nodal(split)

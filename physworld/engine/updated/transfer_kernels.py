@@ -19,12 +19,8 @@ from __future__ import annotations
 
 import warp as wp
 
-RIM, ESCAPED, NOT_FINITE, INVERTED = (
-    0,
-    1,
-    2,
-    3,
-)  # places in ``flags``; ``extremes[0]``: cells crossed in a substep
+# Places in ``flags``; ``extremes[0]`` has the cells crossed in a substep.
+RIM, ESCAPED, NOT_FINITE, INVERTED = 0, 1, 2, 3
 
 _LOCATE = r"""
     for (int p = group * turn; p < group * (turn + 1) && p < count; ++p) {
