@@ -99,7 +99,14 @@ class EpisodePlan:
 
 
 def plan_episode(scene: Scene, twin: Twin, config: DemonstrationConfig, seed: int) -> EpisodePlan:
-    """The episode that ``seed`` stands for."""
+    """The episode that ``seed`` stands for.
+
+    Args:
+        scene: the recording whose controllers, limits and rate the motion keeps.
+        twin: the object's.
+        config: of the demonstrations.
+        seed: of this try; equal seeds give equal plans.
+    """
     if not twin.controller_groups and not pushers_of(scene):
         raise SceneUnsupported(f"scene {scene.name!r} has no controllers: no motion can be demonstrated")
     choice, motion_generator, property_generator = (
@@ -165,6 +172,13 @@ def make_episode(
     scene: Scene, twin: Twin, config: DemonstrationConfig, seed: int, progress: Progress | None = None
 ) -> tuple[dict[str, Array], dict[str, Any]]:
     """Arrays and attributes of an accepted episode; the rejected ones before it are in ``rejected``.
+
+    Args:
+        scene: the recording whose limits the motion keeps.
+        twin: the object's.
+        config: of the demonstrations.
+        seed: of the episode; further tries follow from it.
+        progress: told (frames done, frames in all) of every run, or None.
 
     Raises:
         EpisodeRejected: none of ``config.attempts`` tries was accepted; the message counts the reasons.

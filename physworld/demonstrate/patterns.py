@@ -103,6 +103,12 @@ def push_stroke(limits: MotionLimits, first_pose: Array, body: Array, *, pusher:
     """Towards the object's middle, level for a grip, and back.
 
     A pusher may run through the middle; a grip goes at most as near as ``spread_min_m`` lets it come to the others.
+
+    Args:
+        limits: of the recording.
+        first_pose: control points at the start [m], (K, 3).
+        body: indices of the control points that move, (k,).
+        pusher: whether they push instead of holding.
     """
     towards = limits.object_centre_m - first_pose[body].mean(axis=0)
     if not pusher:

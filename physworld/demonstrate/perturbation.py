@@ -34,7 +34,14 @@ def similarity(first: Array, second: Array, length_scale: float) -> Array:
 
 
 def with_space(features: Array, points: Array, length_scale: float, space_scale_m: float) -> Array:
-    """Features (P, F + 3) whose kernel at ``length_scale`` is that of features times that of ``points`` (P, 3) [m]."""
+    """Features (P, F + 3) whose kernel at ``length_scale`` is that of features times that of ``points`` (P, 3) [m].
+
+    Args:
+        features: of the particles, (P, F).
+        points: their places at rest [m], (P, 3).
+        length_scale: of the kernel over the features.
+        space_scale_m: of the kernel over places [m].
+    """
     if not space_scale_m > 0.0:
         raise ValueError(f"length scale in space {space_scale_m:g} m is not positive")
     return np.concatenate([features, points * (length_scale / space_scale_m)], axis=1)
@@ -136,6 +143,13 @@ def check_field(
 
     A field over features has E|δ_i - δ_j|² = 2σ²(1 - S_ij). A step of more than six of these standard deviations
     between ``neighbours`` (M, 2), pairs of particles side by side, does not belong to it.
+
+    Args:
+        values: natural logarithms of a property over its fitted value, (P,).
+        sigma: their standard deviation.
+        neighbours: indices of particles side by side, (M, 2).
+        field: the Gaussian field that the values were drawn from; None: their steps are not checked.
+        largest_factor: of a property over its fitted value.
 
     Raises:
         UnstableSimulation: with the numbers.

@@ -87,6 +87,12 @@ def draw_properties(
 ) -> Drawn:
     """Everything that ``generator`` decides of an episode's twin.
 
+    Args:
+        scene: the recording; its part features are used where they are asked for.
+        twin: calibrated.
+        config: of the demonstrations.
+        generator: of every draw.
+
     Raises:
         SceneUnsupported: supplied features are asked for and the scene has none.
         UnstableSimulation: a field passes its bounds or jumps.

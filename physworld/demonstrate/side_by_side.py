@@ -40,6 +40,13 @@ def make_episodes(
 ) -> list[Made | SimulationError]:
     """Arrays and attributes of an accepted episode for each seed, or the error of its last attempt.
 
+    Args:
+        scene: the recording whose limits the motions keep.
+        twin: the object's.
+        config: of the demonstrations.
+        seeds: one an episode.
+        progress: told (frames done, frames in all) of every batch, or None.
+
     Raises:
         BatchRefused: the twin cannot be simulated side by side, or its effects differ from episode to episode.
     """

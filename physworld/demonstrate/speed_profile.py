@@ -104,6 +104,13 @@ def profile_for(
 
     The duration follows from distance, peak speed and the ramps' fractions of it; it is stretched (and the
     peak lowered with it) where a ramp would be shorter than ``min_ramp_s`` or pass the acceleration limit.
+
+    Args:
+        distance_m: to cover [m].
+        peak_speed_m_s: that is not passed [m/s].
+        accelerate_fraction, decelerate_fraction: of the duration, at most 1 together.
+        min_ramp_s: shortest ramp [s].
+        acceleration_limit_m_s2: that is not passed [m/s²].
     """
     if not (distance_m > 0.0 and peak_speed_m_s > 0.0):
         raise ValueError(f"a profile over {distance_m:g} m at {peak_speed_m_s:g} m/s: both must be positive")

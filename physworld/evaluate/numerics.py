@@ -148,6 +148,14 @@ def refined_tracks_of(
 ) -> RefinedTracks:
     """Predictions of the recording with half the time step and with finer cells; both are the runner's.
 
+    Args:
+        scene: the recording; its controls and times drive the runs.
+        twin: calibrated.
+        particle_budget: the one that the twin was built with.
+        refinement: factor between the cell sizes.
+        poll: told (runs done, runs in all), or None.
+        runner: of the simulations.
+
     Raises:
         SceneUnsupported: the body is a mesh of triangles, which has no finer cells.
         SimulationError: a run cannot be trusted.
@@ -163,7 +171,14 @@ def refined_tracks_of(
 def trusted_tracks(
     jobs: dict[str, Job], drive: Drive, poll: Poll | None = None, runner: Runner = in_turn
 ) -> list[Array]:
-    """Tracks (frames, N, 3) [m] of jobs by what they are, in their order. Raises SimulationError where one failed."""
+    """Tracks (frames, N, 3) [m] of jobs by what they are, in their order. Raises SimulationError where one failed.
+
+    Args:
+        jobs: simulations by what they are.
+        drive: control points and frame times of them all.
+        poll: told (runs done, runs in all), or None.
+        runner: of the simulations.
+    """
     found: list[Array] = []
     asked = runner(list(jobs.values()), drive, lambda: None if poll is None else poll(len(found), len(jobs)))
     for name, tracks in zip(jobs, asked, strict=True):
@@ -175,6 +190,12 @@ def trusted_tracks(
 
 def refined(scene: Scene, twin: Twin, particle_budget: int, refinement: float = REFINEMENT) -> Twin:
     """The same twin on a lattice whose cells are ``refinement`` times smaller, with the same material points.
+
+    Args:
+        scene: that the twin was built of.
+        twin: calibrated.
+        particle_budget: the one that the twin was built with.
+        refinement: factor between the cell sizes.
 
     Raises:
         SceneUnsupported: the body is a mesh of triangles: its cells are what is supposed of the recording.
@@ -231,6 +252,12 @@ def free_swing(
     """The twin's body, let go at the start of the scene with all physical friction off and its grips at rest.
 
     A body that hangs in balance is kicked sideways first. Frames are those of the scene.
+
+    Args:
+        scene: whose start and frames are used.
+        twin: calibrated.
+        time_step_s: of the run [s]; None: the twin's own.
+        poll: told (frames done, frames in all), or None.
 
     Raises:
         SimulationError: the run cannot be trusted.

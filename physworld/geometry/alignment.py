@@ -37,7 +37,13 @@ class Face:
 
 
 def faces_along(axis: int, low: Array, high: Array, grips: tuple[Grip, ...]) -> list[Face]:
-    """Faces of the grips' regions along an axis of a body from ``low`` to ``high`` (d,), from low to high."""
+    """Faces of the grips' regions along an axis of a body from ``low`` to ``high`` (d,), from low to high.
+
+    Args:
+        axis: of the body.
+        low, high: its corners [m], (d,).
+        grips: declared; those without a region have no face.
+    """
     body = (float(low[axis]), float(high[axis]))
     slack = _SAME * (body[1] - body[0])
     found: dict[tuple[int, int], Face] = {}

@@ -61,6 +61,12 @@ def straight_extent(
 
     Its points (at ``along``) show it whole, unless a longer one is declared: then it reaches back to where it is held,
     and the rest of it past its last point; one that nobody holds reaches as far past its first.
+
+    Args:
+        scene: its declared length and its controllers are used.
+        along: coordinates of the tracked points along ``direction`` [m], (N,).
+        centre, direction: of the rod's axis, (3,) [m] and (3,) of unit length.
+        notes: takes a sentence where the rod reaches past its points.
     """
     begin, length = float(along.min()), float(np.ptp(along))
     declared = scene.body.length_m

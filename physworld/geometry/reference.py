@@ -263,7 +263,7 @@ def _marker_arc_lengths(scene: Scene, points: Array) -> tuple[Array, float]:
     return arc, max(float(scene.body.length_m or 0.0), float(arc.max()))
 
 
-def _rod_lattice(scene: Scene, length: float, grip_arcs: Array, refinement: float) -> Lattice:
+def _rod_lattice(scene: Scene, length: float, grip_arcs: Array | list[float], refinement: float) -> Lattice:
     if not length > 0:
         raise SceneUnsupported(f"the tracked points of the {scene.kind} span {length} m: no length")
     grips = np.clip(np.atleast_1d(grip_arcs), 0.0, length)

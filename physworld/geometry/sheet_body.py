@@ -33,6 +33,12 @@ def sheet_body(
 ) -> ReferenceBody | None:
     """The body of a scene of a sheet, as a mesh if one is given; None if it is not flat at the start.
 
+    Args:
+        scene: of a sheet or a cloth.
+        particle_budget: about how many particles the sheet gets.
+        refinement: factor on the number of cells along a side.
+        mesh: cells of triangles in the place of splines, or None.
+
     Raises:
         SceneUnsupported: its points span no area; or a mesh is given of a sheet that is declared as a grid.
     """

@@ -41,7 +41,13 @@ class PlanningTask:
 
     @classmethod
     def of(cls, model: PublishedModel, twin: Twin, scene: Scene, threads: int = 1) -> PlanningTask:
-        """The task with the limits of the recording. Raises SceneUnsupported without grips."""
+        """The task with the limits of the recording. Raises SceneUnsupported without grips.
+
+        Args:
+            model: published.
+            twin, scene: of the same object.
+            threads: that share a batch of rollouts.
+        """
         motion = limits_of(scene, twin)
         if not motion.grips:
             raise SceneUnsupported(f"scene {scene.name!r} has no grips: nothing can be planned")
@@ -77,7 +83,13 @@ class PlanningTask:
         box_min_m: Array | None = None,
         box_max_m: Array | None = None,
     ) -> PlanningTask:
-        """The task with other limits where they are given; boxes (3,) hold for every grip and hold its start."""
+        """The task with other limits where they are given; boxes (3,) hold for every grip and hold its start.
+
+        Args:
+            speed_m_s, acceleration_m_s2: largest of every grip; None: as it is.
+            box_min_m, box_max_m: of a grip's displacement from where the plan starts [m], (3,) or (G, 3); None: as
+                it is.
+        """
         old = self.limits
         limits = replace(
             old,

@@ -73,6 +73,12 @@ def look_at(
 ) -> Camera:
     """A camera at ``eye`` that looks at ``target`` [m]; the field of view is the vertical one.
 
+    Args:
+        eye, target: places in the world [m], (3,).
+        width, height: of the picture [px].
+        field_of_view_deg: vertical [deg].
+        up: direction in the world that is up in the picture, (3,).
+
     Raises:
         ValueError: the eye is at the target, or the view goes along ``up``.
     """
@@ -96,7 +102,14 @@ def orbit_view(
     width: int = 640,
     height: int = 480,
 ) -> Camera:
-    """A camera that holds all of ``points`` (P, 3) in view, from an angle around the vertical and above the ground."""
+    """A camera that holds all of ``points`` (P, 3) in view, from an angle around the vertical and above the ground.
+
+    Args:
+        points: that the view holds [m], (P, 3).
+        azimuth_deg: around the vertical, from the x axis [deg].
+        elevation_deg: above the ground [deg].
+        width, height: of the picture [px].
+    """
     low, high = points.min(axis=0), points.max(axis=0)
     centre, radius = 0.5 * (low + high), max(0.5 * float(np.linalg.norm(high - low)), 1e-3)
     azimuth, elevation = np.radians([azimuth_deg, elevation_deg])

@@ -17,6 +17,8 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from physworld.arrays import Array
 
+_psnr: Callable[..., float] = peak_signal_noise_ratio  # published without types
+_ssim: Callable[..., float] = structural_similarity
 NOT_MEASURED = "not measured"
 _COVERED = 0.5
 _SSIM_WINDOW_PX = 11
@@ -72,11 +74,9 @@ def compare_frames(
     scores: dict[str, list[float]] = {"psnr_db": [], "ssim": []}
     for one, other in zip(rendered, given, strict=True):
         equal = np.array_equal(one, other)
-        scores["psnr_db"].append(
-            float("inf") if equal else peak_signal_noise_ratio(other, one, data_range=1.0)
-        )
+        scores["psnr_db"].append(float("inf") if equal else _psnr(other, one, data_range=1.0))
         scores["ssim"].append(
-            structural_similarity(
+            _ssim(
                 other, one, channel_axis=2, data_range=1.0, gaussian_weights=True, sigma=1.5,
                 use_sample_covariance=False,
             )
