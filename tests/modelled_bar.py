@@ -10,15 +10,15 @@ from sagging_bar import BUDGET, SIGMA, TRUE_PA, sagging
 from physworld.calibrate.parameters import parameters_of
 from physworld.effects.base import Effect
 from physworld.effects.registry import effect
+from physworld.estimation.refit import Refit, sensitivities
 from physworld.estimation.simulations import Job
+from physworld.estimation.unknowns import Unknown
+from physworld.estimation.whitening import whitener
 from physworld.trace.candidates import Candidate, candidates
 from physworld.trace.comparison import cross_validated
 from physworld.trace.confirm import Confirmation, Model
 from physworld.trace.recordings import JointSimulations, Recordings
-from physworld.trace.refit import Refit
-from physworld.trace.sensitivity import sensitivities
-from physworld.trace.unknowns import Unknown, of_parameter
-from physworld.trace.whitening import whitener
+from physworld.trace.unknowns import of_parameter
 from physworld.twin.build import build_twin
 from physworld.twin.twin import Twin
 

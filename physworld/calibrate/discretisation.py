@@ -20,6 +20,7 @@ from physworld.arrays import Array
 from physworld.calibrate.estimates import Estimate
 from physworld.calibrate.global_stage import FitResult
 from physworld.estimation.simulations import Drive, Job, Runner, in_turn
+from physworld.estimation.unknowns import LOG
 from physworld.evaluate.numerics import REFINEMENT, refined, trusted_tracks
 from physworld.scene import Scene
 
@@ -55,11 +56,9 @@ def converged_parameters(
     places = []
     for parameter in fitted.searched:
         now = parameter.searched(fitted.parameters[parameter.name].value)
-        below = now + parameter.step > parameter.searched(parameter.high)
+        below = now + parameter.step > parameter.bounds[1]
         places.append((parameter, now, -parameter.step if below else parameter.step))
-    jobs = {
-        f"another {p.name}": Job(p.apply(fitted.twin, p.value(now + step)), end) for p, now, step in places
-    }
+    jobs = {f"another {p.name}": Job(p.at(fitted.twin, now + step), end) for p, now, step in places}
     if finer_tracks is None:
         jobs["finer cells"] = Job(refined(scene, fitted.twin, particle_budget, refinement), end)
     tracks = trusted_tracks(jobs, Drive(*scene.control_track(), scene.times), poll, runner)
@@ -77,7 +76,7 @@ def converged_parameters(
         interval = None
         if estimate.ci95 is not None:
             low, high = (
-                -np.inf if parameter.scale == "log" and end <= 0 else parameter.searched(end)
+                -np.inf if parameter.transform is LOG and end <= 0 else parameter.searched(end)
                 for end in estimate.ci95
             )
             half = float(np.hypot(0.5 * (high - low), _DOUBT * shift))

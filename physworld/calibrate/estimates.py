@@ -63,10 +63,10 @@ def estimates(
         theta, value = float(solution.theta[k]), parameter.value(float(solution.theta[k]))
         half = factor * float(np.sqrt(covariance[k, k])) if covariance[k, k] > 0 else float("inf")
         insensitive = not measured or not np.any(solution.jacobian[:, k])
-        low, high = parameter.searched(parameter.low), parameter.searched(parameter.high)
+        low, high = parameter.bounds
         at_bound = not (low + _EDGE < theta < high - _EDGE)
         moving = bool(due[k] > max(half, parameter.step))
-        identified = half < UNIDENTIFIED_HALF_WIDTH[parameter.scale] and not (
+        identified = half < UNIDENTIFIED_HALF_WIDTH[parameter.transform.name] and not (
             at_bound or insensitive or moving
         )
         note = "" if identified else _why_not(at_bound, insensitive, moving)
@@ -110,7 +110,7 @@ def held_at_priors(
         held["stretching_n"] = Estimate(values["stretching_n"], "N", None, False, note)
     by_name = {parameter.name: parameter for parameter in parameters}
     for name, gain in rejected.items():
-        value = values.get(name, by_name[name].prior)
+        value = values.get(name, by_name[name].held)
         share = (
             f"freeing it removes {max(gain, 0.0):.1%} of the training cost"
             if np.isfinite(gain)

@@ -85,9 +85,7 @@ def _starts(kept: list[Parameter], optimum: Optimum, fibres: list[Parameter]) ->
             theta[0] -= 0.5 * np.log1p(
                 ratio
             )  # half way from what was found to the matrix of fibres in its place
-            young = kept[0].value(
-                float(np.clip(theta[0], *(kept[0].searched(end) for end in (kept[0].low, kept[0].high))))
-            )
+            young = kept[0].value(float(np.clip(theta[0], *kept[0].bounds)))
             strength = float(np.clip(ratio * young, modulus.low, modulus.high))
             found.append(np.concatenate([theta, [modulus.searched(strength), *angles_of(vector)]]))
     return found

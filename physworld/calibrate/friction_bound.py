@@ -36,14 +36,14 @@ def affordable(scene: Scene, twin: Twin, parameter: Parameter) -> Parameter:
         run = changed.integration(*controls, scene.times)
         return float(TotalLagrangian(run.problem).steps.explicit_s())
 
-    least_s = step_s(parameter.apply(twin, parameter.prior)) / SLOWEST
+    least_s = step_s(parameter.apply(twin, parameter.held)) / SLOWEST
 
     def spare(searched: float) -> float:
-        return step_s(parameter.apply(twin, parameter.value(searched))) / least_s - 1.0
+        return step_s(parameter.at(twin, searched)) / least_s - 1.0
 
-    low, high = parameter.searched(parameter.low), parameter.searched(parameter.high)
+    low, high = parameter.bounds
     if spare(high) >= 0.0:
         return parameter
     high = brentq(spare, low, high, xtol=_CLOSE) if spare(low) > 0.0 else low + _CLOSE
-    start = tuple(float(min(value, parameter.value(0.5 * (low + high)))) for value in parameter.start)
-    return replace(parameter, high=parameter.value(high), start=start)
+    starts = tuple(float(min(value, parameter.value(0.5 * (low + high)))) for value in parameter.starts)
+    return replace(parameter, high=parameter.value(high), starts=starts)

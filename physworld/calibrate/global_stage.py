@@ -49,6 +49,7 @@ from physworld.engine.thin.triangles import Mesh
 from physworld.estimation.journal import Journal
 from physworld.estimation.least_squares import Solution
 from physworld.estimation.simulations import Runner, in_turn
+from physworld.estimation.unknowns import LINEAR, at
 from physworld.materials.library import with_law
 from physworld.scene import Scene
 from physworld.twin.build import build_twin
@@ -171,7 +172,7 @@ def calibrate(
         optimum = search.solve(kept, optimum.theta, 5)
     search.limit = config.max_simulations
     kept, optimum, solution = _hold_the_unknown(search, kept, optimum, rejected)
-    twin = search.twin_at(kept, optimum.theta)
+    twin = at(search.twin, kept, optimum.theta)
     found, correlated = _estimates(search, kept, optimum, solution)
     if search.cut_short:
         found = cut_short(found, config.max_simulations)
@@ -229,7 +230,7 @@ def select(search: Search, parameters: list[Parameter]) -> tuple[list[Parameter]
     shape = [p for p in parameters if p.stage == "shape"]
     if shape:
         freed = _followed(
-            search, [*kept, *shape], np.append(optimum.theta, [p.searched(p.start[0]) for p in shape])
+            search, [*kept, *shape], np.append(optimum.theta, [p.searched(p.starts[0]) for p in shape])
         )
         gain = 1.0 - freed.cost / optimum.cost
         if gain > min(p.least_gain for p in shape):
@@ -256,14 +257,14 @@ def free_optional(
     search: Search, kept: list[Parameter], optimum: Optimum, candidates: list[Parameter]
 ) -> tuple[list[Parameter], Optimum, dict[str, float]]:
     """What of optional parameters the data ask for, the best first: those kept, their optimum, what others remove."""
-    twin = search.twin_at(kept, optimum.theta)
+    twin = at(search.twin, kept, optimum.theta)
     candidates = [affordable(search.scene, twin, p) for p in candidates]
     rejected: dict[str, float] = {}
     while candidates:
         screened = search.screen(kept, optimum, candidates)
         hopeful = [c for c in candidates if screened[c.name] >= _LEAST_SCREENED * c.least_gain]
         trials = search.solve_each(
-            [Descent([*kept, c], np.append(optimum.theta, c.searched(c.start[0])), 4) for c in hopeful]
+            [Descent([*kept, c], np.append(optimum.theta, c.searched(c.starts[0])), 4) for c in hopeful]
         )
         gains = dict(screened)
         gains.update({c.name: 1.0 - t.cost / optimum.cost for c, t in zip(hopeful, trials, strict=True)})
@@ -300,9 +301,7 @@ def _restarted(search: Search, kept: list[Parameter], optimum: Optimum) -> Optim
     found = [optimum]
     for factor in _RESTARTS:
         theta = optimum.theta.copy()
-        theta[0] = np.clip(
-            theta[0] + np.log(factor), *(kept[0].searched(end) for end in (kept[0].low, kept[0].high))
-        )
+        theta[0] = np.clip(theta[0] + np.log(factor), *kept[0].bounds)
         trial = search.solve(kept, theta, 2)
         if trial.cost < _PROMISING * optimum.cost:
             trial = search.solve(kept, trial.theta, 3)
@@ -321,7 +320,7 @@ def _hold_the_unknown(
     while solution is not None and len(kept) > 1:
         found, _ = _estimates(search, kept, optimum, solution)
         width = {
-            p.name: (e.ci95 is None or _half_width(p, e) >= UNIDENTIFIED_HALF_WIDTH[p.scale])
+            p.name: (e.ci95 is None or _half_width(p, e) >= UNIDENTIFIED_HALF_WIDTH[p.transform.name])
             for p, e in ((p, found[p.name]) for p in kept)
         }
         unknown = [p for p in reversed(kept) if width[p.name] and p.name not in rejected]
@@ -331,7 +330,7 @@ def _hold_the_unknown(
         others = [k for k, p in enumerate(kept) if p is not loose]
         before = search.twin
         if loose.stage == "stiffness":
-            search.twin = loose.apply(before, loose.start[0])
+            search.twin = loose.apply(before, loose.starts[0])
         trial = search.solve([kept[k] for k in others], optimum.theta[others], 3)
         rejected[loose.name] = 1.0 - optimum.cost / trial.cost
         if not trial.cost * (1.0 - _NO_LOSS) <= optimum.cost:
@@ -345,7 +344,7 @@ def _hold_the_unknown(
 
 def _half_width(parameter: Parameter, estimate: Estimate) -> float:
     low, high = estimate.ci95 or (0.0, np.inf)
-    if parameter.scale == "linear":
+    if parameter.transform is LINEAR:
         return 0.5 * (high - low)
     return 0.5 * float(np.log(high / low)) if low > 0 else float("inf")
 

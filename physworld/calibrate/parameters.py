@@ -21,6 +21,7 @@ from typing import Literal
 
 import numpy as np
 
+from physworld.estimation.unknowns import LINEAR, LOG, Transform, Unknown
 from physworld.materials.plastic import (
     PLASTICITIES,
     DruckerPrager,
@@ -56,44 +57,25 @@ _NEVER_PA = 1e12  # a yield stress that nothing reaches
 _SAND_RAD = 0.6  # friction angle of loose dry sand
 
 
-@dataclass(frozen=True)
-class Parameter:
-    """One searched number.
+@dataclass(frozen=True, kw_only=True)
+class Parameter(Unknown):
+    """An unknown of a calibration.
 
     Attributes:
-        name: what reports call it.
-        unit: SI unit.
-        low, high: bounds of the search.
-        start: starts of the search, best first by prior knowledge; for an optional one the value that is tried first.
-        apply: a twin with this value.
+        starts: of the search, in its unit, best first by prior knowledge; an optional one has one.
         stage: "stiffness" parameters come first, and over a grid with them what a "flow" law or a twisted rope has,
             which is dropped again if the data do not need it; those of a "shape" and of "fibres" are freed together,
             "optional" ones one by one, if the data ask for them.
-        scale: searched in the logarithm, or as it is.
-        step: of finite differences, in the searched scale.
-        prior: value of an optional parameter that is not freed.
+        held: value of one that is not freed.
         least_gain: share of the training cost that freeing an optional one must remove.
     """
 
-    name: str
-    unit: str
-    low: float
-    high: float
-    start: tuple[float, ...]
-    apply: Callable[[Twin, float], Twin]
+    starts: tuple[float, ...]
     stage: Literal["stiffness", "flow", "shape", "fibres", "optional"]
+    transform: Transform = LOG
     step: float = _LOG_STEP
-    scale: Literal["log", "linear"] = "log"
-    prior: float = 0.0
+    held: float = 0.0
     least_gain: float = _LEAST_GAIN
-
-    def searched(self, value: float) -> float:
-        """A value in the scale of the search."""
-        return float(np.log(value)) if self.scale == "log" else float(value)
-
-    def value(self, searched: float) -> float:
-        """The inverse of :meth:`searched`."""
-        return float(np.exp(searched)) if self.scale == "log" else float(searched)
 
 
 def parameters_of(
@@ -114,14 +96,14 @@ def parameters_of(
     if isinstance(law, SolidLaw | SheetLaw):
         prior, apply = law.poissons_ratio, _poissons_ratio(twin, separate_bending)
         optional.append(
-            Parameter("poissons_ratio", "1", *_POISSON_BOUNDS, (prior,), apply, "optional", _POISSON_STEP, "linear",
-                      prior, _POISSON_GAIN)
+            Parameter("poissons_ratio", "1", *_POISSON_BOUNDS, apply, transform=LINEAR, step=_POISSON_STEP,
+                      starts=(prior,), stage="optional", held=prior, least_gain=_POISSON_GAIN)
         )  # fmt: skip
     if ground_friction and "ground_friction" in twin.parameters:
         prior = twin.parameters["ground_friction"]
         optional.append(
-            Parameter("ground_friction", "1", *_FRICTION_BOUNDS, (prior,), _set("ground_friction"), "optional",
-                      0.05, prior=prior)
+            Parameter("ground_friction", "1", *_FRICTION_BOUNDS, _set("ground_friction"), step=0.05, starts=(prior,),
+                      stage="optional", held=prior)
         )  # fmt: skip
     return [
         *_stiffness(twin, separate_bending),
@@ -156,8 +138,8 @@ def _torsion(twin: Twin) -> list[Parameter]:
         return []
     starts = tuple(law.torsion_ratio * factor for factor in (1.0, 0.5, 2.0))
     return [
-        Parameter("torsion_ratio", "1", 0.02, 10.0, starts, _set("torsion_ratio"), "flow", 0.05,
-                  prior=law.torsion_ratio)
+        Parameter("torsion_ratio", "1", 0.02, 10.0, _set("torsion_ratio"), step=0.05, starts=starts, stage="flow",
+                  held=law.torsion_ratio)
     ]  # fmt: skip
 
 
@@ -168,8 +150,8 @@ def _twist(twin: Twin) -> list[Parameter]:
         return []
     known = law.bending_twist_ratio
     return [
-        Parameter(TWIST_RATIO, "1", *_TWIST_BOUNDS, (known, 2.5 * known), _set(TWIST_RATIO), "flow", 0.05, prior=known,
-                  least_gain=_BENDING_GAIN)
+        Parameter(TWIST_RATIO, "1", *_TWIST_BOUNDS, _set(TWIST_RATIO), step=0.05, starts=(known, 2.5 * known),
+                  stage="flow", held=known, least_gain=_BENDING_GAIN)
     ]  # fmt: skip
 
 
@@ -182,14 +164,14 @@ def _shape(twin: Twin, separate_bending: bool) -> list[Parameter]:
     if not isinstance(law, SheetLaw):
         return []
     found = [] if not twin.lattice.smooth else [
-        Parameter(BENDING_COUPLING, "1", *_COUPLING_BOUNDS, (law.bending_coupling,), _set(BENDING_COUPLING), "shape",
-                  0.1, "linear", law.bending_coupling, _BENDING_GAIN)
+        Parameter(BENDING_COUPLING, "1", *_COUPLING_BOUNDS, _set(BENDING_COUPLING), transform=LINEAR, step=0.1,
+                  starts=(law.bending_coupling,), stage="shape", held=law.bending_coupling, least_gain=_BENDING_GAIN)
     ]  # fmt: skip
     if not separate_bending:
         ratio = bending_ratio(twin)
         found.append(
-            Parameter(BENDING_RATIO, "1", *_BENDING_BOUNDS, (ratio,), _bends, "shape", 0.05, prior=ratio,
-                      least_gain=_BENDING_GAIN)
+            Parameter(BENDING_RATIO, "1", *_BENDING_BOUNDS, _bends, step=0.05, starts=(ratio,), stage="shape",
+                      held=ratio, least_gain=_BENDING_GAIN)
         )  # fmt: skip
     return found
 
@@ -202,11 +184,11 @@ def _fibres(twin: Twin) -> list[Parameter]:
     soft = twin.density * 9.81 * float(np.ptp(twin.body.start, axis=0).max())
     angles = (law.fibre_azimuth_rad, law.fibre_elevation_rad)
     return [
-        Parameter(FIBRE_MODULUS, "Pa", 0.1 * soft, 1e5 * soft, (10 * soft,), _set(FIBRE_MODULUS), "fibres", 0.05,
-                  least_gain=_FIBRES_GAIN),
+        Parameter(FIBRE_MODULUS, "Pa", 0.1 * soft, 1e5 * soft, _set(FIBRE_MODULUS), step=0.05, starts=(10 * soft,),
+                  stage="fibres", least_gain=_FIBRES_GAIN),
         *(
-            Parameter(name, "rad", known - 2 * np.pi, known + 2 * np.pi, (known,), _set(name), "fibres", 0.03, "linear",
-                      known, _FIBRES_GAIN)
+            Parameter(name, "rad", known - 2 * np.pi, known + 2 * np.pi, _set(name), transform=LINEAR, step=0.03,
+                      starts=(known,), stage="fibres", held=known, least_gain=_FIBRES_GAIN)
             for name, known in zip(FIBRE_ANGLES, angles, strict=True)
         ),
     ]  # fmt: skip
@@ -218,8 +200,8 @@ def _weave(twin: Twin) -> list[Parameter]:
         return []
     one_bending = not twin.lattice.smooth  # hinges have no weft
     return [
-        Parameter(name, "1", *_WEAVE_BOUNDS[name], (getattr(twin.law, name),), _set(name), "optional", 0.05,
-                  prior=getattr(twin.law, name))
+        Parameter(name, "1", *_WEAVE_BOUNDS[name], _set(name), step=0.05, starts=(getattr(twin.law, name),),
+                  stage="optional", held=getattr(twin.law, name))
         for name in WEAVE
         if not (one_bending and name.startswith("bending"))
     ]  # fmt: skip
@@ -240,16 +222,16 @@ def _flow(twin: Twin) -> list[Parameter]:
     if isinstance(twin.plasticity, DruckerPrager):
         angle = twin.plasticity.friction_angle_rad
         return [
-            Parameter("friction_angle_rad", "rad", 0.05, 1.4, (angle, 0.35, 0.85), _set("friction_angle_rad"), "flow",
-                      0.03, "linear", angle)
+            Parameter("friction_angle_rad", "rad", 0.05, 1.4, _set("friction_angle_rad"), transform=LINEAR, step=0.03,
+                      starts=(angle, 0.35, 0.85), stage="flow", held=angle)
         ]  # fmt: skip
     if twin.plasticity is None or isinstance(twin.plasticity, Identity):
         return []
     weight = twin.density * 9.81 * float(np.ptp(twin.body.start, axis=0).max())
     starts = tuple(weight * factor for factor in (1.0, 0.2, 5.0, 25.0))
     return [
-        Parameter("yield_stress_pa", "Pa", 1e-3 * weight, 1e4 * weight, starts, _set("yield_stress_pa"), "flow", 0.05,
-                  prior=_NEVER_PA)
+        Parameter("yield_stress_pa", "Pa", 1e-3 * weight, 1e4 * weight, _set("yield_stress_pa"), step=0.05,
+                  starts=starts, stage="flow", held=_NEVER_PA)
     ]  # fmt: skip
 
 
@@ -260,7 +242,8 @@ def _stiffness(twin: Twin, separate_bending: bool) -> list[Parameter]:
         soft = density * 9.81 * length  # stress under the body's own weight
         grid = tuple(float(soft * f) for f in np.logspace(1.0, 4.0, 9))
         return [
-            Parameter("youngs_modulus_pa", "Pa", soft * 1.5, soft * 1e5, grid, _set("youngs_modulus_pa"), "stiffness"),
+            Parameter("youngs_modulus_pa", "Pa", soft * 1.5, soft * 1e5, _set("youngs_modulus_pa"), starts=grid,
+                      stage="stiffness"),
         ]  # fmt: skip
     if isinstance(law, SheetLaw):
         unit = density * 9.81 * length
@@ -270,21 +253,21 @@ def _stiffness(twin: Twin, separate_bending: bool) -> list[Parameter]:
             scale = (1 - law.poissons_ratio**2) / thickness
             return [
                 Parameter("youngs_modulus_pa", "Pa", grid[0] * scale / 5, grid[-1] * scale * 5,
-                          tuple(g * scale for g in grid), _sheet_modulus(thickness), "stiffness"),
+                          _sheet_modulus(thickness), starts=tuple(g * scale for g in grid), stage="stiffness"),
             ]  # fmt: skip
         bend = unit * length**2
         return [
-            Parameter("bending_n_m", "N m", 1e-7 * bend, 1e-1 * bend, tuple(bend * f for f in (1e-5, 1e-4, 1e-3, 1e-2)),
-                      _set("bending_n_m"), "stiffness", 0.1),
-            Parameter("membrane_n_m", "N/m", unit * 5, unit * 1e3, (unit * 60,), _set("membrane_n_m"), "stiffness",
-                      0.1),
+            Parameter("bending_n_m", "N m", 1e-7 * bend, 1e-1 * bend, _set("bending_n_m"), step=0.1,
+                      starts=tuple(bend * f for f in (1e-5, 1e-4, 1e-3, 1e-2)), stage="stiffness"),
+            Parameter("membrane_n_m", "N/m", unit * 5, unit * 1e3, _set("membrane_n_m"), step=0.1, starts=(unit * 60,),
+                      stage="stiffness"),
         ]  # fmt: skip
     if not isinstance(law, RodLaw):
         raise TypeError(f"no parameters for {type(law).__name__}")
     unit = density * 9.81 * length**3
     return [
-        Parameter("bending_n_m2", "N m^2", 1e-6 * unit, unit, tuple(unit * f for f in (1e-4, 1e-3, 1e-2, 1e-1)),
-                  _set("bending_n_m2"), "stiffness", 0.05),
+        Parameter("bending_n_m2", "N m^2", 1e-6 * unit, unit, _set("bending_n_m2"), step=0.05,
+                  starts=tuple(unit * f for f in (1e-4, 1e-3, 1e-2, 1e-1)), stage="stiffness"),
     ]  # fmt: skip
 
 
@@ -296,7 +279,7 @@ def _internal_friction(twin: Twin) -> Parameter:
 
 
 def _positive(name: str, unit: str, low: float, high: float, start: float) -> Parameter:
-    return Parameter(name, unit, low, high, (start,), _set(name), "optional", 0.1)
+    return Parameter(name, unit, low, high, _set(name), step=0.1, starts=(start,), stage="optional")
 
 
 def _set(name: str) -> Callable[[Twin, float], Twin]:

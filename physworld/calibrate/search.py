@@ -26,6 +26,7 @@ from physworld.estimation.journal import Journal
 from physworld.estimation.least_squares import Descent as LeastSquares
 from physworld.estimation.least_squares import Solution, descent, differences, most_runs, probes_of
 from physworld.estimation.simulations import Drive, Job, Runner, in_turn
+from physworld.estimation.unknowns import at, bounds_of
 from physworld.scene import UNDEFORMED_AT_REST, Scene
 from physworld.twin.twin import Twin
 
@@ -91,12 +92,6 @@ class Search:
         points = np.broadcast_to(np.arange(visible.shape[1]), visible.shape)
         return np.repeat(points[visible], 3)
 
-    def twin_at(self, parameters: list[Parameter], theta: Array) -> Twin:
-        twin = self.twin
-        for parameter, searched in zip(parameters, theta, strict=True):
-            twin = parameter.apply(twin, parameter.value(float(searched)))
-        return twin
-
     def residual(self, parameters: list[Parameter], theta: Array, end: int | None = None) -> Array:
         """Predicted minus measured [m] over the training frames up to ``end``, flat.
 
@@ -120,7 +115,7 @@ class Search:
     def scan(self, parameters: list[Parameter]) -> Optimum:
         """Multi-start over the starts of the first parameter and of a flow law's, then on all training frames."""
         window = self.first_window()
-        tried = [p.start if k == 0 or p.stage == "flow" else p.start[:1] for k, p in enumerate(parameters)]
+        tried = [p.starts if k == 0 or p.stage == "flow" else p.starts[:1] for k, p in enumerate(parameters)]
         starts = [
             np.array([p.searched(value) for p, value in zip(parameters, values, strict=True)])
             for values in product(*tried)
@@ -131,8 +126,8 @@ class Search:
         )
         if not usable:
             raise CalibrationError(
-                f"none of {len(costs)} starts with {parameters[0].name} from {parameters[0].start[0]:.3g} to "
-                f"{parameters[0].start[-1]:.3g} {parameters[0].unit} gave a usable simulation"
+                f"none of {len(costs)} starts with {parameters[0].name} from {parameters[0].starts[0]:.3g} to "
+                f"{parameters[0].starts[-1]:.3g} {parameters[0].unit} gave a usable simulation"
             )
         early = self.solve_each([Descent(parameters, np.array(theta), 3, window) for _, theta in usable[:3]])
         early.sort(key=cost_of)
@@ -205,14 +200,13 @@ class Search:
 
     def begun(self, one: Descent) -> LeastSquares:
         """The descent before its first simulation."""
-        low = np.array([p.searched(p.low) for p in one.parameters])
-        return descent(one.theta, low, self._high(one.parameters), _steps(one.parameters), one.iterations)
+        return descent(one.theta, *bounds_of(one.parameters), _steps(one.parameters), one.iterations)
 
     def linearise(self, parameters: list[Parameter], optimum: Optimum) -> Solution | None:
         """Residual and sensitivities at an optimum; None where the budget does not reach."""
         if not self._reaches(1 + len(parameters)):
             return None
-        probes = probes_of(optimum.theta, self._high(parameters), _steps(parameters))
+        probes = probes_of(optimum.theta, bounds_of(parameters)[1], _steps(parameters))
         now, *there = self.residuals([(parameters, theta, None) for theta in (optimum.theta, *probes)])
         if not np.isfinite(now).all():
             return None
@@ -242,7 +236,7 @@ class Search:
                 effect = there - solution.residual
                 effect = effect - basis @ (basis.T @ effect)
                 along = float(effect @ left)
-                helps = candidate.prior != 0.0 or along < 0.0  # drag and friction push one way only
+                helps = candidate.held != 0.0 or along < 0.0  # drag and friction push one way only
                 size = float(effect @ effect) * float(left @ left)
                 gains[candidate.name] = along**2 / size if helps and size > 0 else 0.0 * size
             return {"gains": gains}
@@ -270,7 +264,7 @@ class Search:
         """Mean residual of every point in the material's frame [m], (N, 3), clipped; None where it cannot be had."""
         if not self._reaches(2 + len(parameters)):
             return None  # the search on the moved points needs a residual and a Jacobian of its own
-        twin = self.twin_at(parameters, theta)
+        twin = at(self.twin, parameters, theta)
         times, controls = self.scene.control_track()
         try:
             nodes = twin.simulate_nodes(
@@ -314,7 +308,7 @@ class Search:
     def job(self, place: Place) -> Job:
         """The simulation of a place."""
         parameters, theta, end = place
-        return Job(self.twin_at(parameters, theta), self.end if end is None else end)
+        return Job(at(self.twin, parameters, theta), self.end if end is None else end)
 
     def run(self, jobs: list[Job]) -> Iterator[Array | None]:
         """Tracks of simulations under this scene's controls, by the runner."""
@@ -345,10 +339,6 @@ class Search:
             values = ", ".join(f"{p.name} {p.value(float(t)):.3g}" for p, t in pairs)
             self.progress(done, self.max_simulations, f"{loss * 1e3:.2f} mm at {values}")
 
-    @staticmethod
-    def _high(parameters: list[Parameter]) -> Array:
-        return np.array([p.searched(p.high) for p in parameters])
-
     def _poll(self, *frames: int) -> None:
         if self.cancelled is not None and self.cancelled():
             where = "" if not frames else f" at frame {frames[0]} of {frames[1]}"
@@ -357,8 +347,8 @@ class Search:
 
 def _probe(candidate: Parameter) -> float:
     """Where a screening tries a candidate: its start, or a few steps beyond a prior that it starts from."""
-    searched = candidate.searched(candidate.start[0])
-    return searched if candidate.prior == 0.0 else searched + 2 * candidate.step
+    searched = candidate.searched(candidate.starts[0])
+    return searched if candidate.held == 0.0 else searched + 2 * candidate.step
 
 
 def _steps(parameters: list[Parameter]) -> Array:

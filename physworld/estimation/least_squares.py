@@ -113,9 +113,13 @@ def _trial(
     high: Array,
 ) -> Array:
     """Where a damped step from ``theta`` (p,) leads."""
-    scaled = normal + damping * np.diag(np.diag(normal) + 1e-12 * np.trace(normal) + 1e-30)
-    step = np.clip(np.linalg.solve(scaled, -gradient), -_MAX_STEP, _MAX_STEP)
+    step = np.clip(np.linalg.solve(damped(normal, damping), -gradient), -_MAX_STEP, _MAX_STEP)
     return np.clip(theta + step, low, high)
+
+
+def damped(normal: Array, damping: float) -> Array:
+    """A normal matrix (p, p) whose diagonal is larger by this share (Levenberg and Marquardt)."""
+    return normal + damping * np.diag(np.diag(normal) + 1e-12 * np.trace(normal) + 1e-30)
 
 
 def most_runs(parameters: int, max_iterations: int) -> int:

@@ -7,12 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from physworld.calibrate import Journal, calibrate
-from physworld.estimation.simulations import Job, Runner
+from physworld.estimation.noise import noise_sigma
+from physworld.estimation.simulations import Job, Ledger, Memory, Progress, Runner
 from physworld.trace.config import TraceConfig
 from physworld.trace.faults import Faults, find_faults
-from physworld.trace.noise import noise_sigma
 from physworld.trace.recordings import JointSimulations, Recordings
-from physworld.trace.simulations import Ledger, Memory, Progress
 from physworld.twin.grips import softly_held
 from physworld.twin.twin import Twin
 

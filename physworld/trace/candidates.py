@@ -11,7 +11,8 @@ from dataclasses import dataclass, field, replace
 
 from physworld.effects.base import Mirror, Shape, Strength
 from physworld.effects.registry import EFFECTS
-from physworld.trace.unknowns import Unknown, of_strength, with_strengths
+from physworld.estimation.unknowns import Unknown
+from physworld.trace.unknowns import of_strength, with_strengths
 from physworld.twin.twin import Twin
 
 _SHAPE_STEP = 0.01  # difference step of a shape, of its range

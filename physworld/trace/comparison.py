@@ -14,7 +14,8 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import lsq_linear
 
 from physworld.arrays import Array
-from physworld.trace.refit import Refit, prior_rows
+from physworld.estimation.refit import Refit, prior_rows
+from physworld.estimation.unknowns import bounds_of
 
 MEANINGFUL = 2.0  # standard errors by which a model must predict better than a simpler one
 _RIDGE = 1e-9  # of the normal matrix's diagonal
@@ -64,8 +65,7 @@ def _within_bounds(normal: Array, gradient: Array, fitted: Refit) -> Array:
         return np.zeros(0)
     scale = 1.0 / np.sqrt(np.diag(normal))
     factor = np.linalg.cholesky(normal * scale * scale[:, None])
-    low = np.array([u.low for u in fitted.unknowns]) - fitted.theta
-    high = np.array([u.high for u in fitted.unknowns]) - fitted.theta
+    low, high = (end - fitted.theta for end in bounds_of(fitted.unknowns))
     bounds = np.minimum(low, 0.0) / scale, np.maximum(high, 0.0) / scale
     target = solve_triangular(factor, gradient * scale, lower=True)
     return scale * lsq_linear(factor.T, target, bounds, method="bvls").x

@@ -12,15 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.estimation.simulations import Job
+from physworld.estimation.refit import Refit, refit
+from physworld.estimation.simulations import Job, Simulations
+from physworld.estimation.unknowns import Unknown, at, bounds_of, starts_of
+from physworld.estimation.whitening import Whitener
 from physworld.trace.candidates import Candidate
 from physworld.trace.comparison import CrossValidation, better_beyond_chance, cross_validated
 from physworld.trace.holds import clamped_otherwise, held_otherwise
-from physworld.trace.refit import Refit, refit
 from physworld.trace.score import Score, orthonormal, project
-from physworld.trace.simulations import Simulations
-from physworld.trace.unknowns import REACH, Unknown, already, at
-from physworld.trace.whitening import Whitener
+from physworld.trace.unknowns import REACH, already
 
 _STARTS, _GLANCE = 3, 2  # variants of an effect that are tried, and iterations after which the best goes on
 _WORSE = 3.0  # a search is left that is this many times as far from the noise as the best so far
@@ -137,7 +137,7 @@ class Confirmation:
             :_TRIED
         ]:
             unknowns = [u.starting(t) for u, t in zip(fitted.unknowns, place, strict=True)]
-            twin = at(fitted.twin, unknowns, np.array([u.start for u in unknowns]))
+            twin = at(fitted.twin, unknowns, starts_of(unknowns))
             hopeless = float(np.sum(best.fitted.residual**2))
             other = refit(
                 self.simulations, self.whitener, twin, unknowns, self.frames, self.iterations, None, hopeless
@@ -296,7 +296,7 @@ def _one_by_one(fitted: Refit, columns: Array, gates: list[Unknown]) -> list[Arr
     for k, gate in enumerate(gates):
         size = float(free[:, k] @ free[:, k])
         one = np.zeros(len(gates))
-        one[k] = np.clip(float(free[:, k] @ left) / size, gate.low, gate.high) if size > 0 else 0.0
+        one[k] = np.clip(float(free[:, k] @ left) / size, *gate.bounds) if size > 0 else 0.0
         if one[k] != 0.0:
             found.append(one)
     return found
@@ -328,14 +328,14 @@ def _other_reaches(fitted: Refit) -> list[Array]:
 
 
 def _bounds(fitted: Refit) -> tuple[Array, Array]:
-    return np.array([u.low for u in fitted.unknowns]), np.array([u.high for u in fitted.unknowns])
+    return bounds_of(fitted.unknowns)
 
 
 def _linear(fitted: Refit, strengths: Array, columns: Array) -> Array:
     """Where the base's unknowns go, to first order, once the candidate has its strengths; (p,)."""
     left = fitted.residual - columns @ strengths
     change = np.linalg.lstsq(fitted.jacobian, left, rcond=1e-8)[0]
-    low, high = np.array([u.low for u in fitted.unknowns]), np.array([u.high for u in fitted.unknowns])
+    low, high = bounds_of(fitted.unknowns)
     limit = 0.3 * (high - low)
     return np.clip(fitted.theta + np.clip(change, -limit, limit), low, high)
 

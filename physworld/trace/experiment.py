@@ -25,11 +25,10 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.effects.registry import EFFECTS
-from physworld.estimation.simulations import Drive
+from physworld.estimation.simulations import Drive, Simulations
 from physworld.scene import Scene
 from physworld.trace.experiment_search import ExperimentConfig, Search, Tried
 from physworld.trace.rivals import Rival, rival_of
-from physworld.trace.simulations import Simulations
 from physworld.twin.twin import Twin
 
 __all__ = ["Experiment", "ExperimentConfig", "Rival", "propose", "rival_of"]

@@ -15,13 +15,12 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.demonstrate.limits import MotionLimits, limits_of
-from physworld.estimation.simulations import Drive, Job
+from physworld.estimation.simulations import Drive, Job, Simulations
+from physworld.estimation.unknowns import at
 from physworld.scene import Scene
 from physworld.trace.probing import COORDINATES, Motion, Probe, motion_of, nudged, random_probe
 from physworld.trace.rivals import Rival, reconciled, refit_of
 from physworld.trace.sensitivity import refinement_of
-from physworld.trace.simulations import Simulations
-from physworld.trace.unknowns import at
 from physworld.twin.twin import Twin
 
 STAGE = "experiment"
@@ -194,7 +193,7 @@ class Search:
 
     def _slopes(self, tried: Tried, number: int, rival: Rival) -> Array | None:
         """Change of a rival's prediction per unknown over the noise, (M, p); None where a run fails."""
-        steps = [-u.step if u.start + u.step > u.high else u.step for u in rival.unknowns]
+        steps = [u.probe for u in rival.unknowns]
         probes = zip(rival.unknowns, steps, strict=True)
         twins = [at(rival.twin, [u], np.array([u.start + step])) for u, step in probes]
         base = tried.tracks[number]

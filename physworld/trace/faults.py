@@ -16,8 +16,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from physworld.arrays import Array
+from physworld.estimation.noise import Split
 from physworld.scene import Scene
-from physworld.trace.split import Split
 
 _LEAP = 8.0  # times the usual change of a residual, along any axis
 _BACK = 0.5  # of a leap: a residual that is nearer than this to where it was has come back

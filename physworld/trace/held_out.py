@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from physworld.arrays import Array
+from physworld.estimation.noise import Split
 from physworld.evaluate.baselines import constant_velocity, rigid_follow, static
 from physworld.evaluate.metrics import chamfer_l2
 from physworld.scene import Scene
-from physworld.trace.split import Split
 
 METRIC = "track_rmse_m"
 """Root mean squared coordinate error of the visible points [m]: sigma for a perfect prediction."""

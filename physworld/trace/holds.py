@@ -10,10 +10,10 @@ from __future__ import annotations
 import numpy as np
 
 from physworld.engine.terms.soft_grips import AS_HELD
-from physworld.trace.refit import Refit, refit
-from physworld.trace.simulations import Simulations
+from physworld.estimation.refit import Refit, refit
+from physworld.estimation.simulations import Simulations
+from physworld.estimation.whitening import Whitener
 from physworld.trace.unknowns import REACH, SOFTNESS
-from physworld.trace.whitening import Whitener
 
 _SHARES = (0.15, 0.4, 1.0)  # of ``AS_HELD``
 _REACHES = (-1.0, 1.0)  # in steps of the reach, quarters of a cell

@@ -8,10 +8,10 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.effects.registry import EFFECTS
+from physworld.estimation.refit import Refit, prior_rows
+from physworld.estimation.unknowns import Unknown, at
 from physworld.trace.confirm import Model
-from physworld.trace.refit import Refit, prior_rows
 from physworld.trace.result import Named, Number
-from physworld.trace.unknowns import Unknown, at
 from physworld.twin.twin import Twin
 
 _STEP = 0.01  # of an unknown's step: what it changes in a derived number
@@ -47,7 +47,7 @@ class Spread:
             value = unknown.value(float(fitted.theta[k]))
             below, above = np.quantile(self.drawn[:, k], [0.025, 0.975])
             ends = min(below, fitted.theta[k] - least[k]), max(above, fitted.theta[k] + least[k])
-            low, high = sorted(unknown.value(float(np.clip(end, unknown.low, unknown.high))) for end in ends)
+            low, high = sorted(unknown.value(float(np.clip(end, *unknown.bounds))) for end in ends)
             other = self.finer.get(unknown.name, value)
             found[unknown.name] = Number(value, unknown.unit, (min(low, other), max(high, other)))
         return found
@@ -59,7 +59,7 @@ class Spread:
         slopes: dict[str, Array] = {key: np.zeros(len(unknowns)) for key in implied}
         for k, unknown in enumerate(unknowns):
             step = np.zeros(len(unknowns))
-            step[k] = _STEP * unknown.step * (1.0 if fitted.theta[k] < unknown.high else -1.0)
+            step[k] = _STEP * unknown.step * (1.0 if fitted.theta[k] < unknown.bounds[1] else -1.0)
             there = _implied(at(fitted.twin, unknowns, fitted.theta + step), name)
             for key, (value, _) in implied.items():
                 slopes[key][k] = (there.get(key, (value, ""))[0] - value) / step[k]

@@ -12,9 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from physworld.arrays import Array
 from physworld.scene import Scene
-from physworld.trace.split import Split
 
 _THIRD = 20.0  # sum of squares of 1, -3, 3, -1
 _MEDIAN_OF_NORMAL = 0.6745
@@ -55,22 +53,3 @@ def remarks(sigma: float | None, asked: bool, numerics: Mapping[str, float]) -> 
         f"{1e3 * sigma:.3g} mm: little that is finer than that can be named. How well the experiment repeats, given as "
         "the noise, asks what can be named at that accuracy",
     ]
-
-
-def noise_sigma(scene: Scene, split: Split, tracks: Array) -> float | None:
-    """Deviation per axis [m]; None where too few points were seen in four training frames in a row.
-
-    Args:
-        tracks: a prediction over the training frames at least, (frames, N, 3).
-    """
-    if scene.noise_sigma_m:
-        return scene.noise_sigma_m
-    window = slice(0, split.train[1])
-    error = scene.points[window] - tracks[window]
-    seen = scene.visible[window]
-    third = error[3:] - 3 * error[2:-1] + 3 * error[1:-2] - error[:-3]
-    row = seen[3:] & seen[2:-1] & seen[1:-2] & seen[:-3]
-    if row.sum() < _FEWEST:
-        return None
-    found = float(np.median(np.abs(third[row])) / (_MEDIAN_OF_NORMAL * np.sqrt(_THIRD)))
-    return found if found > 0 else None

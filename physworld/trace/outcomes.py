@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from physworld.arrays import Array
+from physworld.estimation.whitening import Whitener
 from physworld.scene import Scene
 from physworld.trace.config import TraceConfig
 from physworld.trace.confirm import Model
 from physworld.trace.held_out import HeldOut, Unseen, measure, measure_all
 from physworld.trace.recordings import HELD_OUT, JointSimulations, Recording, Recordings, side_by_side
 from physworld.trace.result import Outcome
-from physworld.trace.whitening import Whitener
 
 
 class Outcomes:

@@ -11,10 +11,10 @@ from __future__ import annotations
 import numpy as np
 
 from physworld.calibrate.parameters import BENDING_RATIO, TWIST_RATIO
-from physworld.trace.refit import Refit, refit
-from physworld.trace.simulations import Simulations
-from physworld.trace.unknowns import at
-from physworld.trace.whitening import Whitener
+from physworld.estimation.refit import Refit, refit
+from physworld.estimation.simulations import Simulations
+from physworld.estimation.unknowns import at
+from physworld.estimation.whitening import Whitener
 
 OWN = (TWIST_RATIO, BENDING_RATIO)
 _PLATE = 0.0  # logarithm of both ratios of a homogeneous plate

@@ -20,12 +20,20 @@ import numpy as np
 from physworld.arrays import Array
 from physworld.engine.thin.triangles import mesh_of
 from physworld.errors import SceneUnsupported
-from physworld.estimation.simulations import Drive, Job, Runner, in_turn, nodes_of
+from physworld.estimation.noise import Split, freeze
+from physworld.estimation.simulations import (
+    Drive,
+    Job,
+    Memory,
+    Progress,
+    Runner,
+    Simulations,
+    in_turn,
+    nodes_of,
+)
+from physworld.estimation.whitening import moved, responses
 from physworld.evaluate.numerics import refined
 from physworld.scene import Scene
-from physworld.trace.simulations import Memory, Progress, Simulations
-from physworld.trace.split import Split, freeze
-from physworld.trace.whitening import moved, responses
 from physworld.twin.build import build_twin
 from physworld.twin.twin import Twin
 

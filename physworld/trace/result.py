@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from physworld.arrays import Array
+from physworld.estimation.noise import Split
 from physworld.trace.candidates import Candidate
 from physworld.trace.confirm import Model
 from physworld.trace.experiment import Experiment
 from physworld.trace.held_out import HeldOut
 from physworld.trace.score import Scores
-from physworld.trace.split import Split
 from physworld.trace.verdict import Verdict
 from physworld.twin.twin import Twin
 

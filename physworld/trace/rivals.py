@@ -14,9 +14,9 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.effects.registry import EFFECTS
+from physworld.estimation.refit import prior_rows
+from physworld.estimation.unknowns import Unknown, at, bounds_of
 from physworld.trace.confirm import Model
-from physworld.trace.refit import prior_rows
-from physworld.trace.unknowns import Unknown, at
 from physworld.twin.twin import Twin
 
 _RIDGE = 1e-9
@@ -59,7 +59,7 @@ class Rival:
 
     def moved(self, change: Array) -> Rival:
         """With its unknowns started elsewhere, (p,), within their bounds."""
-        low, high = (np.array([getattr(u, end) for u in self.unknowns]) for end in ("low", "high"))
+        low, high = bounds_of(self.unknowns)
         there = np.clip(self.start + change, low, high)
         before = np.zeros(len(there)) if self.offset is None else self.offset
         return replace(

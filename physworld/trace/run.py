@@ -21,7 +21,11 @@ from physworld.calibrate import Journal
 from physworld.calibrate.parameters import BENDING_COUPLING, BENDING_RATIO, TWIST_RATIO, parameters_of
 from physworld.engine.thin.triangles import TriangleLattice
 from physworld.errors import SceneUnsupported
-from physworld.estimation.simulations import Job, Runner, in_turn, stage_s
+from physworld.estimation.noise import noise_sigma
+from physworld.estimation.refit import refit
+from physworld.estimation.simulations import Job, Memory, Progress, Runner, in_turn, stage_s
+from physworld.estimation.unknowns import Unknown
+from physworld.estimation.whitening import Whitener, turned_starts, whitener
 from physworld.scene import Scene
 from physworld.trace.beginning import Beginning
 from physworld.trace.candidates import Candidate, candidates
@@ -34,7 +38,7 @@ from physworld.trace.faults import Faults, without_faults
 from physworld.trace.holds import held_otherwise
 from physworld.trace.intervals import calibrated, named, spread_of
 from physworld.trace.mixtures import Mixtures
-from physworld.trace.noise import noise_sigma, remarks, taken_with
+from physworld.trace.noise import remarks, taken_with
 from physworld.trace.outcomes import Outcomes
 from physworld.trace.recordings import (
     FITTED,
@@ -43,7 +47,6 @@ from physworld.trace.recordings import (
     Recordings,
     side_by_side,
 )
-from physworld.trace.refit import refit
 from physworld.trace.result import Stage, Step, TraceResult
 from physworld.trace.score import orthonormal, project
 from physworld.trace.second_resolution import SecondResolution
@@ -53,16 +56,8 @@ from physworld.trace.sensitivity import (
     numerical_directions,
     refinement_of,
 )
-from physworld.trace.simulations import Memory, Progress
-from physworld.trace.start_pose import turned_starts
 from physworld.trace.time_limit import CONFIRMATION, EXPERIMENT, SELECTION, Clock
-from physworld.trace.unknowns import (
-    Unknown,
-    clamp_reach,
-    grip_compliance,
-    grip_softness,
-    of_parameter,
-)
+from physworld.trace.unknowns import clamp_reach, grip_compliance, grip_softness, of_parameter
 from physworld.trace.verdict import (
     DATA,
     NOTHING,
@@ -73,7 +68,6 @@ from physworld.trace.verdict import (
     implausible,
     simplest_first,
 )
-from physworld.trace.whitening import Whitener, whitener
 from physworld.twin.twin import Twin
 
 _POISSON_SPREAD = 0.08  # of what is known of a soft solid's Poisson's ratio beforehand

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from physworld.arrays import Array
+from physworld.estimation.unknowns import bounds_of
 from physworld.trace.candidates import Candidate
 from physworld.trace.sensitivity import Response
 
@@ -137,7 +138,7 @@ def _bounded(columns: Array, left: Array, candidate: Candidate) -> tuple[float, 
     if not np.any(normal):
         return 0.0, np.zeros(len(product))
     unknowns = candidate.unknowns()
-    low, high = (np.array([getattr(u, end) for u in unknowns]) for end in ("low", "high"))
+    low, high = bounds_of(unknowns)
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     root = np.linalg.cholesky(normal / np.outer(scale, scale) + 1e-9 * np.eye(len(scale)))
     target = np.linalg.solve(root, product / scale)

@@ -13,20 +13,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.estimation.simulations import Job
+from physworld.estimation.refit import Refit, refit
+from physworld.estimation.simulations import Job, Simulations
+from physworld.estimation.whitening import Whitener
 from physworld.trace.candidates import Candidate
 from physworld.trace.comparison import better_beyond_chance, cross_validated
 from physworld.trace.config import TraceConfig
 from physworld.trace.confirm import Model
 from physworld.trace.intervals import spread_of
-from physworld.trace.refit import Refit, refit
 from physworld.trace.result import Number
 from physworld.trace.score import orthonormal, project
 from physworld.trace.sensitivity import refinement_of
-from physworld.trace.simulations import Simulations
 from physworld.trace.unknowns import with_strengths
 from physworld.trace.verdict import accounts, as_good, simplest_first
-from physworld.trace.whitening import Whitener
 from physworld.twin.twin import Twin
 
 Values = dict[tuple[str, ...], dict[str, float]]

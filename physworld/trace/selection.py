@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from physworld.arrays import Array
+from physworld.estimation.simulations import Simulations
+from physworld.estimation.whitening import Whitener
 from physworld.trace.comparison import alikeness, cross_validated
 from physworld.trace.compound import has_parts, in_parts, whole_of
 from physworld.trace.config import TraceConfig
@@ -16,11 +18,9 @@ from physworld.trace.plates import as_a_plate
 from physworld.trace.result import Step
 from physworld.trace.score import Score, Scores, orthonormal, project, scores
 from physworld.trace.sensitivity import Response, candidate_responses, decoys
-from physworld.trace.simulations import Simulations
 from physworld.trace.tethers import with_tethers
 from physworld.trace.valleys import with_valleys
 from physworld.trace.verdict import as_good, helps, simplest
-from physworld.trace.whitening import Whitener
 
 Search = Callable[[list[Model]], list[Model]]
 _OUTDONE = 0.5  # share of what a complete model's effect explains that a rival must explain to be refitted

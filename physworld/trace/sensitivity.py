@@ -7,13 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.estimation.simulations import Job
+from physworld.estimation.simulations import Job, Simulations
+from physworld.estimation.whitening import Whitener
 from physworld.evaluate.numerics import refined
 from physworld.scene import Scene
 from physworld.trace.candidates import Candidate
-from physworld.trace.simulations import Simulations
-from physworld.trace.unknowns import Unknown, already, at
-from physworld.trace.whitening import Whitener
+from physworld.trace.unknowns import already
 from physworld.twin.twin import Twin
 
 
@@ -24,36 +23,6 @@ class Response:
     candidate: Candidate
     columns: Array
     failed: bool = False
-
-
-def sensitivities(
-    simulations: Simulations,
-    whitener: Whitener,
-    twin: Twin,
-    base: Array,
-    unknowns: list[Unknown],
-    frames: int,
-) -> tuple[Array, list[bool]]:
-    """Whitened change of the prediction per unit of every unknown at its start, (M, p), and which runs failed.
-
-    Args:
-        base: tracks of the twin with every unknown at its start, (frames, N, 3).
-    """
-    steps = [_step(unknown) for unknown in unknowns]
-    start = np.array([unknown.start for unknown in unknowns])
-    jobs = []
-    for k, step in enumerate(steps):
-        probe = start.copy()
-        probe[k] += step
-        jobs.append(Job(at(twin, unknowns, probe), frames))
-    found = simulations.run(jobs)
-    rows = 3 * len(whitener.measured)
-    columns = [
-        np.zeros(rows) if tracks is None else whitener.change(tracks - base) / step
-        for tracks, step in zip(found, steps, strict=True)
-    ]
-    failed = [tracks is None for tracks in found]
-    return (np.stack(columns, axis=1) if columns else np.zeros((rows, 0))), failed
 
 
 def candidate_responses(
@@ -73,8 +42,8 @@ def candidate_responses(
         prepared = candidate.prepared(twin)
         for unknown in candidate.unknowns():
             here = unknown.starting(already(twin, unknown))
-            step = _step(here)
-            jobs.append(Job(unknown.apply(prepared, here.start + step), frames))
+            step = here.probe
+            jobs.append(Job(unknown.at(prepared, here.start + step), frames))
             owners.append((number, step))
     found = simulations.run(jobs)
     columns: list[list[Array]] = [[] for _ in chosen]
@@ -153,7 +122,3 @@ def refinement_of(twin: Twin, finer: Twin) -> Twin:
         ground_friction=twin.ground_friction,
         effects=twin.effects,
     )
-
-
-def _step(unknown: Unknown) -> float:
-    return -unknown.step if unknown.start + unknown.step > unknown.high else unknown.step

@@ -22,10 +22,10 @@ from physworld.arrays import Array
 from physworld.effects.places import middle_of_free_end
 from physworld.effects.region_force import RegionForce
 from physworld.effects.tether import Tether
+from physworld.estimation.refit import Refit, refit
 from physworld.trace.candidates import Candidate
 from physworld.trace.comparison import cross_validated
 from physworld.trace.confirm import Confirmation, Model, beats
-from physworld.trace.refit import Refit, refit
 from physworld.trace.score import Score, Scores, orthonormal, project
 from physworld.trace.sensitivity import Response
 from physworld.trace.unknowns import of_strength
@@ -132,7 +132,7 @@ def tethers_between(fitted: Refit, responses: list[Response]) -> list[Start]:
             parts = np.concatenate([parts, (distance - 1.0) * rest * every], axis=1)
         size = np.einsum("ik,kl,il->i", parts, normal, parts)
         along = parts @ product
-        stiffness = np.clip(along / np.maximum(size, 1e-300), 0.0, gate.value(gate.high))
+        stiffness = np.clip(along / np.maximum(size, 1e-300), 0.0, gate.value(gate.bounds[1]))
         shares = (2.0 * stiffness * along - stiffness**2 * size) / total
         k = int(np.argmax(shares))
         candidate = _anchored(first, end + distance * rest * every[k], every[k])

@@ -13,8 +13,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
+from physworld.estimation.simulations import Ledger
 from physworld.trace.confirm import Model
-from physworld.trace.simulations import Ledger
 from physworld.trace.verdict import DATA, EQUIVALENT, NAMED, UNEXPLAINED, Verdict
 
 SELECTION, CONFIRMATION, EXPERIMENT = 0.7, 0.95, 1.0

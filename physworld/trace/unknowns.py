@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import fields, replace
 
 import numpy as np
 
-from physworld.arrays import Array
 from physworld.calibrate.parameters import BENDING_RATIO, Parameter, bending_ratio
 from physworld.effects.base import Strength
 from physworld.effects.clamp_offset import ClampOffset
@@ -15,6 +13,7 @@ from physworld.effects.grip_slip import GripSlip
 from physworld.effects.places import gravity_size
 from physworld.effects.registry import EFFECTS
 from physworld.engine.terms.soft_grips import AS_HELD
+from physworld.estimation.unknowns import LOG, Unknown, multiple_of
 from physworld.twin.twin import Twin
 
 CLAMP = ClampOffset.name
@@ -27,48 +26,11 @@ _SOFTNESS_STEP = 0.1
 _CLAMP_STEP, _CLAMP_SPREAD = 0.25, 0.5  # cells: difference step, and deviation of what is known beforehand
 
 
-@dataclass(frozen=True)
-class Unknown:
-    """One number.
-
-    Attributes:
-        name: of the parameter, or ``effect.strength``.
-        unit: SI unit.
-        low, high, start, step: bounds, start and difference step, in the scale of the search.
-        value: from the scale of the search to the number.
-        apply: a twin with the number at a place in the scale of the search.
-        prior: mean and deviation in the scale of the search of what is known beforehand, or None.
-    """
-
-    name: str
-    unit: str
-    low: float
-    high: float
-    start: float
-    step: float
-    value: Callable[[float], float]
-    apply: Callable[[Twin, float], Twin]
-    prior: tuple[float, float] | None = None
-
-    def starting(self, start: float) -> Unknown:
-        """The same from another start, clipped to the bounds."""
-        return replace(self, start=float(np.clip(start, self.low, self.high)))
-
-
 def of_parameter(parameter: Parameter, twin: Twin, spread: float | None) -> Unknown:
     """A calibrated parameter from where the twin has it; ``spread``: deviation of its prior about that, or None."""
     start = parameter.searched(max(_value(twin, parameter), parameter.low))
-    return Unknown(
-        parameter.name,
-        parameter.unit,
-        parameter.searched(parameter.low),
-        parameter.searched(parameter.high),
-        start,
-        parameter.step,
-        parameter.value,
-        lambda changed, searched: parameter.apply(changed, parameter.value(searched)),
-        None if spread is None else (start, spread),
-    )
+    known = (getattr(parameter, own.name) for own in fields(Unknown))
+    return replace(Unknown(*known), start=start, prior=None if spread is None else (start, spread))
 
 
 def _value(twin: Twin, parameter: Parameter) -> float:
@@ -89,12 +51,11 @@ def of_strength(effect: str, strength: Strength, scale: float | None = None, sta
     return Unknown(
         f"{effect}.{strength.name}",
         strength.unit,
-        strength.low / unit,
-        strength.high / unit,
-        start / unit,
-        1.0,
-        lambda searched: float(searched * unit),
-        lambda twin, searched: with_strengths(twin, effect, {strength.name: float(searched * unit)}),
+        strength.low,
+        strength.high,
+        lambda twin, value: with_strengths(twin, effect, {strength.name: value}),
+        multiple_of(unit),
+        start=start / unit,
     )
 
 
@@ -122,12 +83,12 @@ def grip_softness(twin: Twin) -> Unknown | None:
     """
     if twin.grip_softness <= 0:
         return None
-    low, high = (float(np.log(share * AS_HELD)) for share in _SOFTNESS_SHARES)
-    start = float(np.clip(np.log(twin.grip_softness), low, high))
-    return Unknown(
-        SOFTNESS, "cells", low, high, start, _SOFTNESS_STEP, lambda s: float(np.exp(s)),
-        lambda changed, s: replace(changed, grip_softness=float(np.exp(s))),
+    low, high = (share * AS_HELD for share in _SOFTNESS_SHARES)
+    unknown = Unknown(
+        SOFTNESS, "cells", low, high, lambda changed, value: replace(changed, grip_softness=value), LOG,
+        _SOFTNESS_STEP,
     )  # fmt: skip
+    return unknown.starting(float(np.log(twin.grip_softness)))
 
 
 def grip_compliance(twin: Twin) -> Unknown | None:
@@ -161,10 +122,3 @@ def with_strengths(twin: Twin, effect: str, strengths: dict[str, float]) -> Twin
     present = [known for known in twin.effects if known.name == effect]
     now = present[0] if present else EFFECTS[effect]()
     return twin.with_effect(replace(now, **strengths))
-
-
-def at(twin: Twin, unknowns: list[Unknown], theta: Array) -> Twin:
-    """The twin with every unknown at its place (p,)."""
-    for unknown, searched in zip(unknowns, theta, strict=True):
-        twin = unknown.apply(twin, float(searched))
-    return twin

@@ -17,15 +17,13 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.effects.registry import EFFECTS
-from physworld.estimation.simulations import Job
+from physworld.estimation.refit import Refit, sensitivities
+from physworld.estimation.simulations import Job, Simulations
+from physworld.estimation.unknowns import at, bounds_of, starting_at
+from physworld.estimation.whitening import Whitener
 from physworld.trace.candidates import Candidate
 from physworld.trace.confirm import Confirmation, Model
-from physworld.trace.refit import Refit
 from physworld.trace.score import Scores
-from physworld.trace.sensitivity import sensitivities
-from physworld.trace.simulations import Simulations
-from physworld.trace.unknowns import at
-from physworld.trace.whitening import Whitener
 
 _BETTER = 0.7  # share of the squared residual that a valley may leave
 _EARLY = 0.5  # share of the training frames that is looked at
@@ -95,7 +93,7 @@ def valleys(
     if fitted.misfit <= complete:
         return []
     known = [c for c in chosen if EFFECTS[c.effect].basins is not None and len(c.gates) == 1]
-    low, high = (np.array([getattr(u, end) for u in fitted.unknowns]) for end in ("low", "high"))
+    low, high = bounds_of(fitted.unknowns)
     first = np.eye(len(low))[0]
     looked = whitener.first + max(int(np.ceil(_EARLY * (frames - whitener.first))), 1)
     early = whitener.frame_of_row < looked
@@ -108,9 +106,9 @@ def valleys(
             place = np.clip(fitted.theta + shift * first, low, high)
             there = at(prepared, fitted.unknowns, place)
             for share in scan.shares:
-                strength = share * gate.high
+                strength = share * gate.bounds[1]
                 tries.append((candidate, place, strength))
-                jobs.append(Job(gate.apply(there, strength), looked))
+                jobs.append(Job(gate.at(there, strength), looked))
     best: dict[str, tuple[float, Candidate, Array, float]] = {}
     for (candidate, place, strength), tracks in zip(tries, simulations.run(jobs), strict=True):
         if tracks is None:
@@ -133,7 +131,7 @@ def _moved(
     simulations: Simulations, whitener: Whitener, fitted: Refit, place: Array, frames: int
 ) -> Refit | None:
     """The declared physics at another place (p,), which is no optimum; None where it cannot be simulated."""
-    unknowns = [u.starting(t) for u, t in zip(fitted.unknowns, place, strict=True)]
+    unknowns = starting_at(fitted.unknowns, place)
     twin = at(fitted.twin, unknowns, place)
     tracks = simulations.run([Job(twin, frames)])[0]
     if tracks is None:

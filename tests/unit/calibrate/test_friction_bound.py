@@ -44,7 +44,7 @@ def test_the_bound_is_where_the_step_is_so_many_times_smaller(bar: Scene) -> Non
     assert found.high < wide.high
     slowed = step_s(bar, twin) / step_s(bar, found.apply(twin, found.high))
     assert slowed == pytest.approx(SLOWEST, rel=0.1)
-    assert found.low < found.start[0] < found.high
+    assert found.low < found.starts[0] < found.high
 
 
 def test_what_can_be_waited_for_keeps_its_bound(bar: Scene) -> None:

@@ -98,7 +98,7 @@ def test_what_a_weave_may_change_is_searched_where_the_law_has_it() -> None:
     assert names[1] - names[0] == {"weft_ratio", "shear_ratio", "bending_weft_ratio"}
     for parameter in parameters_of(woven, separate_bending=False):
         if parameter.name not in names[0]:
-            assert parameter.prior == 1.0 and parameter.apply(woven, 0.5).parameters[parameter.name] == 0.5
+            assert parameter.held == 1.0 and parameter.apply(woven, 0.5).parameters[parameter.name] == 0.5
 
 
 def test_changing_the_modulus_keeps_how_a_sheet_bends() -> None:

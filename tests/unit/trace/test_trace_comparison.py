@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
+from physworld.estimation.refit import Refit
+from physworld.estimation.unknowns import Unknown
 from physworld.trace.comparison import CrossValidation, better_beyond_chance, cross_validated, difference
-from physworld.trace.refit import Refit
-from physworld.trace.unknowns import Unknown
 
 BLOCKS, ROWS = 5, 12
 
 
 def unknown(name: str, low: float, high: float) -> Unknown:
-    return Unknown(name, "1", low, high, 0.0, 0.1, float, lambda twin, value: twin)
+    return Unknown(name, "1", low, high, lambda twin, value: twin, step=0.1)
 
 
 def refit(jacobian: np.ndarray, observed: np.ndarray, bounds: list[tuple[float, float]]) -> Refit:

@@ -14,19 +14,19 @@ from physworld.calibrate.parameters import parameters_of
 from physworld.demonstrate.limits import limits_of
 from physworld.demonstrate.motion import broken_limit
 from physworld.effects.registry import effect
-from physworld.estimation.simulations import Drive, Job, nodes_of
+from physworld.estimation.noise import Split
+from physworld.estimation.refit import Refit, refit
+from physworld.estimation.simulations import Drive, Job, Simulations, nodes_of
+from physworld.estimation.unknowns import Unknown
+from physworld.estimation.whitening import responses, whitener
 from physworld.report import render
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
 from physworld.trace import TraceConfig, document, trace
 from physworld.trace.experiment import Experiment, ExperimentConfig, Rival, propose
 from physworld.trace.experiment_search import clock_of
 from physworld.trace.probing import COORDINATES, motion_of, nudged, random_probe
-from physworld.trace.refit import Refit, refit
 from physworld.trace.rivals import reconciled, refit_of
-from physworld.trace.simulations import Simulations
-from physworld.trace.split import Split
-from physworld.trace.unknowns import Unknown, of_parameter, of_strength
-from physworld.trace.whitening import responses, whitener
+from physworld.trace.unknowns import of_parameter, of_strength
 from physworld.twin.build import build_twin
 from physworld.twin.twin import Twin
 
@@ -184,9 +184,7 @@ def test_rivals_that_differ_in_what_the_recording_leaves_open_are_brought_togeth
     twin = build_twin(gentle_beam(), 60).with_parameters(youngs_modulus_pa=YOUNGS_MODULUS_PA)
     drag = effect("air_drag_linear")
     rate = next(s for s in drag.strengths(twin) if s.gate)
-    soft = Unknown(
-        "soft", "Pa", 1e3, 9e4, 4e4, 1.0, float, lambda t, v: t.with_parameters(youngs_modulus_pa=v)
-    )
+    soft = Unknown("soft", "Pa", 1e3, 9e4, lambda t, v: t.with_parameters(youngs_modulus_pa=v), start=4e4)
     gate = of_strength(drag.name, rate).starting(20.0)
     first = Rival(("tether",), twin, (soft.starting(5e4),))
     other = Rival((drag.name,), twin, (soft, gate), np.diag([1.0, 4.0]))

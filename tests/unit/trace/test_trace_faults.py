@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from physworld.estimation.noise import Split
 from physworld.trace.faults import find_faults
-from physworld.trace.split import Split
 
 FRAMES, TRAIN, SIGMA = 60, 42, 1e-3
 SPLIT = Split((1, TRAIN), (TRAIN, FRAMES), np.array([1, 20, TRAIN]))

@@ -10,14 +10,13 @@ from made_scene import box_body, made_scene
 
 from physworld.calibrate.parameters import parameters_of
 from physworld.engine.terms.soft_grips import AS_HELD
+from physworld.estimation.refit import Refit, sensitivities
 from physworld.estimation.simulations import Job
+from physworld.estimation.whitening import whitener
 from physworld.scene import UNDEFORMED_AT_REST, Grip
 from physworld.trace.holds import held_otherwise
 from physworld.trace.recordings import JointSimulations, Recordings
-from physworld.trace.refit import Refit
-from physworld.trace.sensitivity import sensitivities
 from physworld.trace.unknowns import SOFTNESS, grip_softness, of_parameter
-from physworld.trace.whitening import whitener
 from physworld.twin.build import build_twin
 from physworld.twin.grips import softly_held
 

@@ -7,10 +7,10 @@ import pytest
 from sagging_bar import BUDGET, sagging
 
 from physworld.effects.registry import effect
+from physworld.estimation.refit import Refit
+from physworld.estimation.unknowns import Unknown
 from physworld.trace.candidates import candidates
 from physworld.trace.intervals import spread_of
-from physworld.trace.refit import Refit
-from physworld.trace.unknowns import Unknown
 from physworld.twin.build import build_twin
 
 ROWS = 60
@@ -23,7 +23,7 @@ def line(noise: float = 1.0) -> Refit:
     left = noise * np.random.default_rng(0).normal(size=ROWS)
     left -= slopes @ np.linalg.lstsq(slopes, left, rcond=None)[0]
     unknowns = [
-        Unknown(name, "1", -50.0, 50.0, start, 1.0, lambda v: v, lambda twin, v: twin)
+        Unknown(name, "1", -50.0, 50.0, lambda twin, v: twin, start=start)
         for name, start in (("offset", 0.3), ("slope", 2.0))
     ]
     return Refit(unknowns, build_twin(sagging(), BUDGET), np.array([0.3, 2.0]), np.empty(0), left, slopes)

@@ -9,14 +9,13 @@ import pytest
 from made_scene import made_scene
 
 from physworld.calibrate.parameters import BENDING_RATIO, TWIST_RATIO, parameters_of
+from physworld.estimation.refit import Refit, sensitivities
 from physworld.estimation.simulations import Job
+from physworld.estimation.whitening import whitener
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Scene
 from physworld.trace.plates import as_a_plate
 from physworld.trace.recordings import JointSimulations, Recordings
-from physworld.trace.refit import Refit
-from physworld.trace.sensitivity import sensitivities
 from physworld.trace.unknowns import clamp_reach, of_parameter
-from physworld.trace.whitening import whitener
 from physworld.twin.build import build_twin
 
 SIDE, THICKNESS, HELD, FRAMES = 0.2, 0.016, 0.04, 20
@@ -75,8 +74,8 @@ def test_a_clamp_reaches_as_far_as_a_body_is_thick(mat: Scene) -> None:
     for budget, most in ((50_000, THICKNESS), (BUDGET, SIDE / 12)):
         reach = clamp_reach(build_twin(mat, budget))
         assert reach is not None
-        assert reach.value(reach.high) == pytest.approx(most, rel=0.05)
-        assert reach.value(reach.low) == pytest.approx(-most, rel=0.05)
+        assert reach.high == pytest.approx(most, rel=0.05)
+        assert reach.low == pytest.approx(-most, rel=0.05)
 
 
 def test_the_cells_of_a_sheet_go_by_the_budget(mat: Scene) -> None:

@@ -11,7 +11,7 @@ from made_scene import box_body, made_scene
 from physworld.calibrate import CalibrationConfig
 from physworld.effects.registry import effect
 from physworld.errors import SceneUnsupported
-from physworld.estimation.simulations import Job
+from physworld.estimation.simulations import Job, Simulations
 from physworld.materials.plastic.von_mises import VonMises
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
 from physworld.trace import TraceConfig, document, trace
@@ -24,7 +24,6 @@ from physworld.trace.recordings import (
     side_by_side,
     taken_over,
 )
-from physworld.trace.simulations import Simulations
 from physworld.trace.unknowns import with_strengths
 from physworld.twin.build import build_twin
 

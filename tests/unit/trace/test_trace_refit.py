@@ -8,7 +8,7 @@ from modelled_bar import Bar
 from sagging_bar import TRUE_PA
 
 from physworld.effects.registry import effect
-from physworld.trace.refit import Refit, refit
+from physworld.estimation.refit import Refit, refit
 
 DRAG_PER_S, FAR_PA = 3.0, 6.5e4
 

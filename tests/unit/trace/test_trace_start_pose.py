@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from made_scene import box_body, made_scene
 
+from physworld.estimation.noise import freeze
 from physworld.estimation.simulations import Drive, Job, nodes_of
+from physworld.estimation.whitening import responses, turned_starts, whitener
 from physworld.scene import AS_MEASURED, UNDEFORMED_AT_REST, Body, Scene
-from physworld.trace.split import freeze
-from physworld.trace.start_pose import turned_starts
-from physworld.trace.whitening import responses, whitener
 from physworld.twin.build import build_twin
 
 SIGMA, LENGTH, FRAMES = 1e-3, 0.4, 24

@@ -11,9 +11,8 @@ from sagging_bar import BUDGET, sagging
 
 from physworld.calibrate import CalibrationConfig
 from physworld.effects.registry import effect
-from physworld.estimation.simulations import Drive, Job, Workers
+from physworld.estimation.simulations import Drive, Job, Ledger, Simulations, TimeUp, Workers
 from physworld.trace import Memory, TraceConfig, document, trace
-from physworld.trace.simulations import Ledger, Simulations, TimeUp
 from physworld.trace.time_limit import CONFIRMATION, SELECTION, Clock
 from physworld.trace.verdict import NAMED, NOTHING, UNEXPLAINED, Verdict
 from physworld.twin.build import build_twin

@@ -10,15 +10,14 @@ from sagging_bar import BUDGET, SIGMA, TRUE_PA, sagging
 
 from physworld.calibrate.parameters import parameters_of
 from physworld.effects.registry import effect
+from physworld.estimation.refit import Refit, sensitivities
 from physworld.estimation.simulations import Job
+from physworld.estimation.whitening import whitener
 from physworld.scene import Scene
 from physworld.trace.candidates import candidates
 from physworld.trace.recordings import JointSimulations, Recordings
-from physworld.trace.refit import Refit
-from physworld.trace.sensitivity import sensitivities
 from physworld.trace.unknowns import of_parameter
 from physworld.trace.valleys import valleys
-from physworld.trace.whitening import whitener
 from physworld.twin.build import build_twin
 
 STIFF_PA, RATE_PER_S, COMPLETE = 1.2e5, 8.0, 1.2

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from physworld.effects.registry import effect
+from physworld.estimation.refit import Refit
+from physworld.estimation.unknowns import Unknown
 from physworld.trace.candidates import Candidate
 from physworld.trace.comparison import cross_validated
 from physworld.trace.config import TraceConfig
 from physworld.trace.confirm import Model
-from physworld.trace.refit import Refit
 from physworld.trace.score import Score, Scores
 from physworld.trace.selection import by_chance
-from physworld.trace.unknowns import Unknown
 from physworld.trace.verdict import Verdict, decide, implausible
 
 BLOCKS, ROWS = 10, 2000
@@ -28,9 +28,7 @@ CONFIG = TraceConfig()
 
 def model(residual: np.ndarray, *effects: str, kind: str = "force", unknowns: int = 1) -> Model:
     """A model whose refit left ``residual``."""
-    known = [
-        Unknown(str(k), "1", -9.0, 9.0, 0.0, 1.0, float, lambda twin, value: twin) for k in range(unknowns)
-    ]
+    known = [Unknown(str(k), "1", -9.0, 9.0, lambda twin, value: twin) for k in range(unknowns)]
     slope = np.full((ROWS, unknowns), 1e-3)
     twin = SimpleNamespace(effects=())
     fitted = Refit(known, twin, np.zeros(unknowns), np.zeros((1, 1, 3)), residual, slope)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from made_scene import made_scene
 
-from physworld.trace.split import freeze
-from physworld.trace.whitening import whitener
+from physworld.estimation.noise import freeze
+from physworld.estimation.whitening import whitener
 
 SIGMA, FRAMES, POINTS = 2e-3, 9, 3
 

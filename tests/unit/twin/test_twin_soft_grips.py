@@ -77,7 +77,7 @@ def test_only_a_grip_that_holds_a_part_of_a_section_holds_softly_and_has_its_sof
     unknown = grip_softness(soft)
     assert unknown is not None and unknown.name == SOFTNESS
     assert unknown.start == pytest.approx(np.log(AS_HELD))
-    assert unknown.apply(corner, np.log(0.05)).grip_softness == pytest.approx(0.05)
+    assert unknown.at(corner, np.log(0.05)).grip_softness == pytest.approx(0.05)
     assert "reach_m" not in {gate.name for c in candidates(soft)[0] for gate in c.gates}
     assert "reach_m" in {gate.name for c in candidates(whole)[0] for gate in c.gates}
     assert "0.16 cells" in candidates(soft, ("grip_slip",))[1]["grip_slip"]

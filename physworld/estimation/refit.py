@@ -12,11 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.estimation.simulations import Job
-from physworld.trace.sensitivity import sensitivities
-from physworld.trace.simulations import Simulations
-from physworld.trace.unknowns import Unknown, at
-from physworld.trace.whitening import Whitener
+from physworld.estimation.least_squares import damped
+from physworld.estimation.simulations import Job, Simulations
+from physworld.estimation.unknowns import Unknown, at, bounds_of, starting_at, starts_of
+from physworld.estimation.whitening import Whitener
 from physworld.twin.twin import Twin
 
 _SCALES = (1.0, 0.3)  # of a Gauss-Newton step, tried together
@@ -53,7 +52,7 @@ class Refit:
     @property
     def free_jacobian(self) -> Array:
         """The sensitivities of the unknowns that no bound holds, (M, r)."""
-        low, high = np.array([u.low for u in self.unknowns]), np.array([u.high for u in self.unknowns])
+        low, high = bounds_of(self.unknowns)
         room = 1e-3 * (high - low)
         return self.jacobian[:, (self.theta > low + room) & (self.theta < high - room)]
 
@@ -89,8 +88,7 @@ def refit(
     Returns:
         The optimum; None where no start gave a usable run.
     """
-    own = np.array([unknown.start for unknown in unknowns])
-    low, high = np.array([u.low for u in unknowns]), np.array([u.high for u in unknowns])
+    own, (low, high) = starts_of(unknowns), bounds_of(unknowns)
     places = [own, *(np.clip(start, low, high) for start in starts or [])]
     looked = _looked(simulations, whitener, twin, unknowns, places, frames)
     best = min(looked, key=_cost, default=None)
@@ -102,7 +100,7 @@ def refit(
         if number >= _PATIENCE and cost > hopeless:
             break
         if slope is None:
-            here = [u.starting(t) for u, t in zip(unknowns, theta, strict=True)]
+            here = starting_at(unknowns, theta)
             slope, _ = sensitivities(simulations, whitener, twin, tracks, here, frames)
             known = slope
         step = _step(unknowns, theta, residual, slope, damping, low, high)
@@ -126,10 +124,40 @@ def refit(
     if slope is None and known is not None and (brief or cost > hopeless):
         slope = known
     if slope is None:
-        here = [u.starting(t) for u, t in zip(unknowns, theta, strict=True)]
+        here = starting_at(unknowns, theta)
         slope, _ = sensitivities(simulations, whitener, twin, tracks, here, frames)
-    final = [u.starting(t) for u, t in zip(unknowns, theta, strict=True)]
+    final = starting_at(unknowns, theta)
     return Refit(final, at(twin, unknowns, theta), theta, tracks, residual, slope)
+
+
+def sensitivities(
+    simulations: Simulations,
+    whitener: Whitener,
+    twin: Twin,
+    base: Array,
+    unknowns: list[Unknown],
+    frames: int,
+) -> tuple[Array, list[bool]]:
+    """Whitened change of the prediction per unit of every unknown at its start, (M, p), and which runs failed.
+
+    Args:
+        base: tracks of the twin with every unknown at its start, (frames, N, 3).
+    """
+    steps = [unknown.probe for unknown in unknowns]
+    start = starts_of(unknowns)
+    jobs = []
+    for k, step in enumerate(steps):
+        probe = start.copy()
+        probe[k] += step
+        jobs.append(Job(at(twin, unknowns, probe), frames))
+    found = simulations.run(jobs)
+    rows = 3 * len(whitener.measured)
+    columns = [
+        np.zeros(rows) if tracks is None else whitener.change(tracks - base) / step
+        for tracks, step in zip(found, steps, strict=True)
+    ]
+    failed = [tracks is None for tracks in found]
+    return (np.stack(columns, axis=1) if columns else np.zeros((rows, 0))), failed
 
 
 Found = tuple[Array, Array, Array, float]
@@ -203,8 +231,7 @@ def _step(
     step = np.zeros(len(theta))
     for _ in range(len(theta)):
         step[:] = 0.0
-        inner = normal[np.ix_(free, free)]
-        inner = inner + damping * np.diag(np.diag(inner) + 1e-12 * np.trace(inner) + 1e-30)
+        inner = damped(normal[np.ix_(free, free)], damping)
         if free.any():
             step[free] = np.linalg.solve(inner, gradient[free])
         room = _BOUND * (high - low)
