@@ -1,14 +1,16 @@
-"""What a calibration says of each number: value, interval, whether the data fix it, and what was held and why."""
+"""What a calibration says: every number with its interval, whether data fix it, what was held and why; its losses."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from physworld.arrays import Array
 from physworld.calibrate.parameters import Parameter
 from physworld.estimation.least_squares import Solution, block_covariance, correlations, interval_factor
+from physworld.evaluate.metrics import chamfer_l2
 from physworld.scene import Scene
 from physworld.twin.twin import Twin
 
@@ -131,3 +133,35 @@ def _why_not(at_bound: bool, insensitive: bool, moving: bool) -> str:
     if at_bound:
         return "at the bound of its search"
     return MOVING if moving else "the data do not fix it"
+
+
+CHAMFER_WEIGHT, TRACK_WEIGHT = 1.0, 0.1
+
+
+def training_losses(scene: Scene, tracks: Array) -> dict[str, Any]:
+    """Losses of predicted tracks (T, N, 3) on the training frames, frame 0 left out.
+
+    Returns:
+        ``paper``: ``total``, ``chamfer_m``, ``track_smooth_l1``; ``rms_m``: root mean squared coordinate error;
+        ``noise_sigma_m``, ``chi2_per_residual`` and ``rms_over_noise``, None where no noise is declared.
+    """
+    window = slice(max(scene.train[0], 1), scene.train[1])
+    visible, measured, predicted = scene.visible[window], scene.points[window], tracks[window]
+    error = (predicted - measured)[visible]
+    size = np.abs(error)
+    smooth = np.where(size < 1.0, 0.5 * error**2, size - 0.5)
+    chamfer = chamfer_l2(predicted, measured, visible)
+    track = float(smooth.sum() / (3 * max(len(error), 1)))
+    square = float(np.mean(error**2))
+    sigma = scene.noise_sigma_m
+    return {
+        "paper": {
+            "total": CHAMFER_WEIGHT * chamfer + TRACK_WEIGHT * track,
+            "chamfer_m": chamfer,
+            "track_smooth_l1": track,
+        },
+        "rms_m": float(np.sqrt(square)),
+        "noise_sigma_m": sigma,
+        "chi2_per_residual": square / sigma**2 if sigma else None,
+        "rms_over_noise": float(np.sqrt(square)) / sigma if sigma else None,
+    }

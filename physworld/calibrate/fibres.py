@@ -14,7 +14,7 @@ from itertools import product
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.calibrate.optimum import Descent, Optimum, cost_of
+from physworld.calibrate.descents import Descent, Optimum, cost_of
 from physworld.calibrate.parameters import Parameter
 from physworld.calibrate.search import Search
 
@@ -30,7 +30,8 @@ def directions() -> Array:
     """Unit vectors (13, 3) along edges and diagonals of a cube, one of every two that are opposite."""
     found = [v for v in product((-1, 0, 1), repeat=3) if v > (0, 0, 0)]
     vectors = np.array(found, dtype=float)
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    units: Array = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    return units
 
 
 def angles_of(vector: Array) -> tuple[float, float]:

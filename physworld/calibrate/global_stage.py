@@ -29,6 +29,7 @@ from typing import Any, Literal
 import numpy as np
 
 from physworld.arrays import Array
+from physworld.calibrate.descents import Descent, Optimum
 from physworld.calibrate.estimates import (
     NOT_CONVERGED,
     UNIDENTIFIED_HALF_WIDTH,
@@ -37,13 +38,11 @@ from physworld.calibrate.estimates import (
     cut_short,
     estimates,
     held_at_priors,
+    training_losses,
 )
 from physworld.calibrate.fibres import free_fibres
-from physworld.calibrate.friction_bound import affordable
 from physworld.calibrate.local_stage import LocalResult
-from physworld.calibrate.losses import training_losses
-from physworld.calibrate.optimum import Descent, Optimum
-from physworld.calibrate.parameters import Parameter, flow_law, parameters_of
+from physworld.calibrate.parameters import Parameter, affordable, flow_law, parameters_of
 from physworld.calibrate.search import Progress, Search
 from physworld.engine.thin.triangles import Mesh
 from physworld.estimation.journal import Journal
@@ -256,7 +255,14 @@ def select(search: Search, parameters: list[Parameter]) -> tuple[list[Parameter]
 def free_optional(
     search: Search, kept: list[Parameter], optimum: Optimum, candidates: list[Parameter]
 ) -> tuple[list[Parameter], Optimum, dict[str, float]]:
-    """What of optional parameters the data ask for, the best first: those kept, their optimum, what others remove."""
+    """What of optional parameters the data ask for, the best first: those kept, their optimum, what others remove.
+
+    Args:
+        search: residuals of the twin.
+        kept: what is searched already.
+        optimum: its optimum, theta (p,) and cost [m^2].
+        candidates: optional parameters.
+    """
     twin = at(search.twin, kept, optimum.theta)
     candidates = [affordable(search.scene, twin, p) for p in candidates]
     rejected: dict[str, float] = {}

@@ -20,7 +20,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from physworld.calibrate.apart import residuals_apart, solve_apart
+from physworld.calibrate.descents import Descent, Optimum, residuals_apart, solve_apart
 from physworld.calibrate.fibres import free_fibres
 from physworld.calibrate.global_stage import (
     CalibrationConfig,
@@ -29,7 +29,6 @@ from physworld.calibrate.global_stage import (
     searched_parameters,
     select,
 )
-from physworld.calibrate.optimum import Descent, Optimum
 from physworld.calibrate.parameters import WEAVE, Parameter
 from physworld.calibrate.search import Progress, Search
 from physworld.errors import LawAnswerRefused, LawAnswerUnavailable, SceneUnsupported
@@ -197,7 +196,17 @@ def cross_validate(
     runner: Runner = in_turn,
     journal: Journal | None = None,
 ) -> LawChoice:
-    """Choose among laws by their error on blocks of training frames that their fit did not see."""
+    """Choose among laws by their error on blocks of training frames that their fit did not see.
+
+    Args:
+        scene: only its training frames are used.
+        config: settings of the fits.
+        candidates: names of laws, the simplest first; None for those of the body's dimension.
+        progress: called with (runs done, runs at most, message).
+        cancelled: polled every frame of every run.
+        runner: where simulations run.
+        journal: keeps the finished steps of the fits.
+    """
     config, journal = replace(config, law=None), journal or Journal()
     twin = prior_twin(scene, config)
     names = candidates or SIMPLEST_FIRST[twin.lattice.dim]
@@ -242,7 +251,7 @@ def cross_validate(
     }
     means = {name: float(np.mean(errors)) for name, errors in scores.items()}
     best = min(means, key=lambda name: means[name])
-    figures = {
+    figures: dict[str, Any] = {
         "held_out_rms_m": {
             name: {"mean": means[name], "blocks": list(errors)} for name, errors in scores.items()
         },

@@ -86,7 +86,8 @@ def field_modes(twin: Twin, scene: Scene, config: LocalConfig) -> Array:
 
     def covariance(a: Array, b: Array) -> Array:
         square = np.sum((a[:, None] - b[None]) ** 2, axis=2)
-        return np.exp(-0.5 * square / config.length**2)
+        found: Array = np.exp(-0.5 * square / config.length**2)
+        return found
 
     values, vectors = np.linalg.eigh(covariance(features[chosen], features[chosen]))
     order = np.argsort(values)[::-1][: config.modes + 1]
@@ -95,7 +96,8 @@ def field_modes(twin: Twin, scene: Scene, config: LocalConfig) -> Array:
     modes = modes - weight @ modes
     power = weight @ modes**2
     leading = np.sort(np.argsort(power)[::-1][: config.modes])
-    return config.deviation * modes[:, leading]
+    scaled: Array = config.deviation * modes[:, leading]
+    return scaled
 
 
 class FieldSearch:
@@ -144,7 +146,7 @@ class FieldSearch:
     @property
     def size(self) -> int:
         """Coefficients of all fields."""
-        return self._basis.shape[1] * len(self.fields)
+        return int(self._basis.shape[1]) * len(self.fields)
 
     @property
     def most(self) -> int:
@@ -220,7 +222,8 @@ class FieldSearch:
         except SimulationError:
             return np.full(end - self.begin, np.nan)
         error, seen = self._residual(self.twin.observe(nodes, self.scene.times[:end]), end)
-        return np.sum(error**2, axis=(1, 2)) / np.maximum(3 * seen.sum(axis=1), 1)
+        squares: Array = np.sum(error**2, axis=(1, 2)) / np.maximum(3 * seen.sum(axis=1), 1)
+        return squares
 
     def validation_error(self, z: Array, split: int) -> float:
         """Mean squared error [m^2] on the validation frames; infinite where the run fails."""
@@ -232,7 +235,14 @@ class FieldSearch:
         return float("inf") if found is None else found
 
     def descend(self, z: Array, end: int, scale: float, strength: float | None) -> tuple[Array, float]:
-        """Coefficients that minimise the objective over the frames up to ``end``; without a strength only constants."""
+        """Coefficients that minimise the objective over the frames up to ``end``; without a strength only constants.
+
+        Args:
+            z: coefficients of the fields, where the descent starts, (k,).
+            end: of the frames that count.
+            scale: of the misfit [m^2].
+            strength: of the prior.
+        """
         constants = np.zeros(self.size, dtype=bool)
         constants[:: self._basis.shape[1]] = True
         free = constants if strength is None else np.ones(self.size, dtype=bool)

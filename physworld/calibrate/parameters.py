@@ -11,16 +11,24 @@ what its declared thickness says, and how its two curvatures are coupled. The *f
 solid are freed together too, modulus and direction (:mod:`physworld.calibrate.fibres`); their prior is none. The others
 are *optional*: air drag, internal friction, Poisson's ratio, the friction of a ground that declares none, and what weft
 and shear of a woven sheet have over its warp; each is freed only if the data ask for it, and else stays at its prior.
+
+Internal friction that is proportional to stiffness damps the lattice's fastest motions most, and an explicit step has
+to resolve that: beyond a point the stable time step is inversely proportional to it. A recording shows nothing of these
+motions. So the search ends where that step is ``SLOWEST`` times smaller than without friction (:func:`affordable`); a
+value found there is reported to be at the bound of its search. Beyond it a run takes sub-steps of friction
+(:mod:`physworld.engine.total.relaxation`) and twice the time and more.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from scipy.optimize import brentq
 
+from physworld.engine.total.formulation import TotalLagrangian
 from physworld.estimation.unknowns import LINEAR, LOG, Transform, Unknown
 from physworld.materials.plastic import (
     PLASTICITIES,
@@ -34,6 +42,7 @@ from physworld.materials.rod import RodLaw
 from physworld.materials.sheet import OrthotropicSheetLaw, SheetLaw
 from physworld.materials.solid import SolidLaw
 from physworld.materials.transversely_isotropic import TransverselyIsotropic
+from physworld.scene import Scene
 from physworld.twin.twin import Twin
 
 TWIST_RATIO = "bending_twist_ratio"
@@ -144,7 +153,7 @@ def _torsion(twin: Twin) -> list[Parameter]:
 
 
 def _twist(twin: Twin) -> list[Parameter]:
-    """How stiff a sheet is in twist beside bending, which decides in which valley its stiffness lies."""
+    """How stiff a sheet is in twist beside bending, which decides in which basin its stiffness lies."""
     law = twin.law
     if not isinstance(law, SheetLaw) or not twin.lattice.smooth:
         return []
@@ -310,3 +319,34 @@ def _poissons_ratio(twin: Twin, separate_bending: bool) -> Callable[[Twin, float
         )
 
     return apply
+
+
+SLOWEST = 8.0  # times
+_NAMES = ("relaxation_s", "viscosity_pa_s")
+_CLOSE = 0.05  # in the logarithm
+
+
+def affordable(scene: Scene, twin: Twin, parameter: Parameter) -> Parameter:
+    """The parameter with the upper bound that ``twin``, otherwise at its optimum, can be simulated at.
+
+    Parameters other than internal friction, and twins of the updated Lagrangian form, keep theirs.
+    """
+    if parameter.name not in _NAMES or twin.form.on_particles:
+        return parameter
+    controls = scene.control_track()
+
+    def step_s(changed: Twin) -> float:
+        run = changed.integration(*controls, scene.times)
+        return float(TotalLagrangian(run.problem).steps.explicit_s())
+
+    least_s = step_s(parameter.apply(twin, parameter.held)) / SLOWEST
+
+    def spare(searched: float) -> float:
+        return step_s(parameter.at(twin, searched)) / least_s - 1.0
+
+    low, high = parameter.bounds
+    if spare(high) >= 0.0:
+        return parameter
+    high = brentq(spare, low, high, xtol=_CLOSE) if spare(low) > 0.0 else low + _CLOSE
+    starts = tuple(float(min(value, parameter.value(0.5 * (low + high)))) for value in parameter.starts)
+    return replace(parameter, high=parameter.value(high), starts=starts)

@@ -17,10 +17,16 @@ from typing import Any
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.calibrate.material_frames import material_frames
-from physworld.calibrate.optimum import Descended, Descent, Optimum, Place, cost_of
+from physworld.calibrate.descents import (
+    Descended,
+    Descent,
+    Optimum,
+    Place,
+    cost_of,
+    in_step,
+    measured_together,
+)
 from physworld.calibrate.parameters import Parameter
-from physworld.calibrate.side_by_side import in_step, measured_together
 from physworld.errors import CalibrationError, Cancelled, SimulationError
 from physworld.estimation.journal import Journal
 from physworld.estimation.least_squares import Descent as LeastSquares
@@ -139,7 +145,14 @@ class Search:
     def costs(
         self, name: str, parameters: list[Parameter], starts: list[Array], end: int
     ) -> list[float | None]:
-        """Mean squared residual [m^2] at every start over the frames up to ``end``; None where the run failed."""
+        """Mean squared residual [m^2] at every start over the frames up to ``end``; None where the run failed.
+
+        Args:
+            name: of the step in the journal.
+            parameters: what is searched (p).
+            starts: places in the scale of the search, (p,) each.
+            end: of the frames that count.
+        """
 
         def measure() -> dict[str, Any]:
             found = self.residuals([(parameters, theta, end) for theta in starts])
@@ -151,7 +164,14 @@ class Search:
     def solve(
         self, parameters: list[Parameter], theta: Array, iterations: int, end: int | None = None
     ) -> Optimum:
-        """Gauss-Newton over the frames up to ``end`` (all training frames by default)."""
+        """Gauss-Newton over the frames up to ``end`` (all training frames by default).
+
+        Args:
+            parameters: what is searched (p).
+            theta: where the descent starts, in the scale of the search, (p,).
+            iterations: Jacobians at most.
+            end: of the frames that count.
+        """
         return self.solve_each([Descent(parameters, theta, iterations, end)])[0]
 
     def solve_each(self, asked: list[Descent]) -> list[Optimum]:
@@ -260,7 +280,9 @@ class Search:
         self.twin = replace(self.twin, body=body)
         return True
 
-    def _mean_offsets(self, parameters: list[Parameter], theta: Array, sigma: float) -> list | None:
+    def _mean_offsets(
+        self, parameters: list[Parameter], theta: Array, sigma: float
+    ) -> list[list[float]] | None:
         """Mean residual of every point in the material's frame [m], (N, 3), clipped; None where it cannot be had."""
         if not self._reaches(2 + len(parameters)):
             return None  # the search on the moved points needs a residual and a Jacobian of its own
@@ -280,7 +302,8 @@ class Search:
         local = np.linalg.solve(gradient, error[..., None])[..., 0]
         seen = np.maximum(mask.sum(axis=0), 1)[:, None]
         limit = _OFFSET_CLIP_SIGMAS * sigma
-        return np.clip(local.sum(axis=0) / seen, -limit, limit).tolist()
+        offsets: list[list[float]] = np.clip(local.sum(axis=0) / seen, -limit, limit).tolist()
+        return offsets
 
     def step(self, name: str, compute: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         """A journalled step; the runs, whether any were left out, and their history are brought to where they were."""
@@ -353,3 +376,32 @@ def _probe(candidate: Parameter) -> float:
 
 def _steps(parameters: list[Parameter]) -> Array:
     return np.array([p.step for p in parameters])
+
+
+_BESIDE = 0.1  # of a cell: how far beside a point its neighbours are followed
+
+
+def material_frames(twin: Twin, carriers: Array) -> Array:
+    """Where material directions point, (T, N, 3, 3): columns of the deformation gradient; a sheet's normal last.
+
+    Carriers that are particles have no shape functions that last: neighbours of a point are followed instead.
+    """
+    lattice, points = twin.lattice, twin.body.points
+    columns = []
+    for axis in range(lattice.dim):
+        if twin.form.on_particles:
+            step = np.zeros(lattice.dim)
+            step[axis] = _BESIDE * lattice.spacing[axis]
+            ends = [
+                replace(twin, body=replace(twin.body, points=points + sign * step)).track_nodes(carriers)
+                for sign in (-1.0, 1.0)
+            ]
+            columns.append((ends[1] - ends[0]) / (2.0 * step[axis]))
+        else:
+            slope = lattice.interpolation(points, tuple(int(a == axis) for a in range(lattice.dim)))
+            flat = carriers.transpose(1, 0, 2).reshape(carriers.shape[1], -1)
+            columns.append((slope @ flat).reshape(len(points), len(carriers), 3).transpose(1, 0, 2))
+    if lattice.dim == 2:
+        normal = np.cross(*columns)
+        columns.append(normal / np.linalg.norm(normal, axis=-1, keepdims=True))
+    return np.stack(columns, axis=-1)

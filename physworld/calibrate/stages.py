@@ -13,10 +13,10 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from physworld.calibrate.estimates import training_losses
 from physworld.calibrate.global_stage import CalibrationConfig, FitResult, calibrate, prior_twin
 from physworld.calibrate.local_search import LocalConfig
 from physworld.calibrate.local_stage import LocalResult, fit_fields
-from physworld.calibrate.losses import training_losses
 from physworld.calibrate.search import Progress
 from physworld.errors import CalibrationError, NotDifferentiable, SceneUnsupported
 from physworld.estimation.journal import Journal

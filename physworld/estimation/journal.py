@@ -37,6 +37,7 @@ class Journal:
 
         An entry of another name means that the way has changed (another version of the code): the rest is dropped.
         """
+        found: dict[str, Any]
         if self._cursor < len(self._entries) and self._entries[self._cursor]["name"] == name:
             found = self._entries[self._cursor]["found"]
         else:

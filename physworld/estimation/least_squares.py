@@ -60,6 +60,13 @@ def gauss_newton(
 
     A residual that is not finite is a failed simulation: the step is shortened. One run per parameter and Jacobian,
     one per trial step; ``max_iterations`` Jacobians at most.
+
+    Args:
+        residual: of a place theta (p,), (m,).
+        theta: start, (p,).
+        low, high: bounds, (p,) each.
+        steps: of the finite differences, (p,).
+        max_iterations: Jacobians at most.
     """
     asking = descent(theta, low, high, steps, max_iterations)
     needed, _ = next(asking)
@@ -73,7 +80,14 @@ def gauss_newton(
 
 def descent(theta: Array, low: Array, high: Array, steps: Array, max_iterations: int = 6) -> Descent:
     """:func:`gauss_newton` for whoever runs its simulations: yields places that do not depend on each other and those
-    that it will likely ask for next, is sent the residuals of the former, in their order, and returns the solution."""
+    that it will likely ask for next, is sent the residuals of the former, in their order, and returns the solution.
+
+    Args:
+        theta: start, (p,).
+        low, high: bounds, (p,) each.
+        steps: of the finite differences, (p,).
+        max_iterations: Jacobians at most.
+    """
     theta = np.clip(theta, low, high)
     (now,) = yield [theta], probes_of(theta, high, steps)
     cost = float(np.mean(now**2))
@@ -114,7 +128,8 @@ def _trial(
 ) -> Array:
     """Where a damped step from ``theta`` (p,) leads."""
     step = np.clip(np.linalg.solve(damped(normal, damping), -gradient), -_MAX_STEP, _MAX_STEP)
-    return np.clip(theta + step, low, high)
+    there: Array = np.clip(theta + step, low, high)
+    return there
 
 
 def damped(normal: Array, damping: float) -> Array:
@@ -144,7 +159,15 @@ def differences(
     probes: list[Array],
     residuals: list[Array],
 ) -> Array:
-    """Jacobian (m, p) at ``theta``, whose residual is ``now``; a column that blew up is zero."""
+    """Jacobian (m, p) at ``theta``, whose residual is ``now``; a column that blew up is zero.
+
+    Args:
+        theta: (p,).
+        now: residual there, (m,).
+        steps: of the finite differences, (p,).
+        probes: places of :func:`probes_of`, (p,) each.
+        residuals: there, (m,) each.
+    """
     jacobian = np.zeros((len(now), len(theta)))
     for k, (probe, there) in enumerate(zip(probes, residuals, strict=True)):
         jacobian[:, k] = np.sign(probe[k] - theta[k]) * (there - now) / steps[k]

@@ -85,7 +85,8 @@ class Whitener:
         for place in self.places:
             normal = place.response.T @ place.response + np.eye(place.response.shape[1])
             found.append(np.linalg.solve(normal, place.response.T @ error[place.rows].reshape(-1)))
-        return np.clip(np.array(found), -3.0, 3.0) * self.sigma
+        errors: Array = np.clip(np.array(found), -3.0, 3.0) * self.sigma
+        return errors
 
     def _seen(self, tracks: Array) -> Array:
         return tracks[self.first : self.first + len(self.visible)][self.visible]

@@ -46,6 +46,11 @@ class Residuals:
 def residuals(scene: Scene, before: Array, after: Array, split: int) -> Residuals:
     """Residuals of two predictions (T, N, 3) [m].
 
+    Args:
+        scene: what was measured.
+        before, after: predictions, (T, N, 3) [m].
+        split: first frame that was held out.
+
     Raises:
         ValueError: a prediction is not shaped as the scene's points.
     """
@@ -80,7 +85,8 @@ def per_point(residual: Array) -> Array:
 
 def carpet(residual: Array, order: Array) -> Array:
     """Length of the residual (T, N, 3) over points in their order and frames, (N, T)."""
-    return np.linalg.norm(residual, axis=2).T[order]
+    lengths: Array = np.linalg.norm(residual, axis=2).T[order]
+    return lengths
 
 
 def mean_component(residual: Array, axis: int) -> Array:

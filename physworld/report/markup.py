@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from html import escape
 
 VOID = {"path", "line", "rect", "circle", "img", "input", "br", "meta", "polyline", "image", "polygon"}
@@ -13,7 +14,7 @@ class Html(str):
     __slots__ = ()
 
 
-Child = str | int | float | None | list["Child"] | tuple["Child", ...]
+Child = str | int | float | None | Sequence["Child"]
 
 
 def tag(name: str, /, *children: Child, **attributes: str | float | bool | None) -> Html:

@@ -44,7 +44,7 @@ def horizon(found: Residuals, sigma: float | None) -> Html:
     if not found.same:
         series.append(Series("after", "after", _mm(per_frame(found.after)[picked])))
     return line_chart(
-        found.times[picked], series, title="Error against horizon", x_label="time since frame 0 [s]",
+        found.times[picked].tolist(), series, title="Error against horizon", x_label="time since frame 0 [s]",
         y_label="rms error [mm]", split=found.split_s, log_y=True, height=340, width=1080,
     )  # fmt: skip
 
@@ -60,7 +60,7 @@ def components(found: Residuals) -> Html:
             series.append(Series("after", "after", _mm(mean_component(found.after, axis)[picked]), 1.8))
         charts.append(
             line_chart(
-                found.times[picked], series, title=f"Mean residual along {name}", x_label="time [s]",
+                found.times[picked].tolist(), series, title=f"Mean residual along {name}", x_label="time [s]",
                 y_label=f"along {name} [mm]", split=found.split_s, height=230, width=380, symmetric=True, named=False,
             )
         )  # fmt: skip

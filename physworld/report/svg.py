@@ -134,7 +134,18 @@ def line_chart(
     symmetric: bool = False,
     named: bool = True,
 ) -> Html:
-    """Lines over x, with a legend if ``named``; what lies after ``split`` is shaded as held out."""
+    """Lines over x, with a legend if ``named``; what lies after ``split`` is shaded as held out.
+
+    Args:
+        x: places along the horizontal axis, (n,).
+        series: curves of n values each.
+        title, x_label, y_label: texts.
+        split: where the held-out frames begin on the horizontal axis.
+        log_y: logarithmic vertical axis.
+        height, width: [px].
+        symmetric: zero in the middle of the vertical axis.
+        named: curves are named.
+    """
     values = [v for s in series for v in s.values if v is not None and math.isfinite(v)]
     x_range = (float(x[0]), float(x[-1])) if len(x) > 1 else (0.0, 1.0)
     axes = Axes(width, height, x_range, _range(values, log_y, symmetric), log_y=log_y)

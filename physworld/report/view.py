@@ -20,7 +20,13 @@ _MISSING = -32768
 
 
 def view(scene: Scene, before: Array, after: Array, found: Residuals) -> Html:
-    """Canvases with their data and controls; the script is :func:`script`."""
+    """Canvases with their data and controls; the script is :func:`script`.
+
+    Args:
+        scene: what was measured.
+        before, after: predictions, (T, N, 3) [m].
+        found: the residuals of both.
+    """
     panes = [("before", "Twin" if found.same else "Before")] + ([] if found.same else [("after", "After")])
     canvases = [
         tag(

@@ -68,7 +68,8 @@ def _within_bounds(normal: Array, gradient: Array, fitted: Refit) -> Array:
     low, high = (end - fitted.theta for end in bounds_of(fitted.unknowns))
     bounds = np.minimum(low, 0.0) / scale, np.maximum(high, 0.0) / scale
     target = solve_triangular(factor, gradient * scale, lower=True)
-    return scale * lsq_linear(factor.T, target, bounds, method="bvls").x
+    step: Array = scale * lsq_linear(factor.T, target, bounds, method="bvls").x
+    return step
 
 
 def seen_through(residual: Array, basis: Array, block_of_row: Array) -> CrossValidation:

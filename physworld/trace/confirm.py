@@ -3,6 +3,16 @@
 The simplest model first. Singles are refitted in the order of their scores, one variant of an effect at a time. Where
 the best single leaves more than it should, what it leaves is scored again with its own sensitivities projected out, and
 pairs of it with the best seconds are refitted.
+
+Stiffness and how a body is held trade along a valley of the misfit: a grip may be softer or harder, a clamp may reach
+farther or less far, and what fits best on one side of where a lattice has its nodes is another basin than on the other.
+Scouts go first, without a Jacobian of their own; the best is refitted from where it ends, if it comes near.
+
+How a sheet bends beside how it stretches, and twists beside how it bends, is calibrated (a mesh of hinges is no plate).
+An effect that a sheet lacks is first answered by those numbers, and what they took they keep while the effect is
+refitted: fibres of a slab came out a third too weak beside a bending stiffness a quarter too high. So the leading
+models are refitted as homogeneous plates too (:func:`as_a_plate`), and of two that predict left-out blocks alike the
+simpler one is taken.
 """
 
 from __future__ import annotations
@@ -12,15 +22,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from physworld.arrays import Array
+from physworld.calibrate.parameters import BENDING_RATIO, TWIST_RATIO
+from physworld.engine.terms.soft_grips import AS_HELD
 from physworld.estimation.refit import Refit, refit
 from physworld.estimation.simulations import Job, Simulations
 from physworld.estimation.unknowns import Unknown, at, bounds_of, starts_of
 from physworld.estimation.whitening import Whitener
 from physworld.trace.candidates import Candidate
 from physworld.trace.comparison import CrossValidation, better_beyond_chance, cross_validated
-from physworld.trace.holds import clamped_otherwise, held_otherwise
 from physworld.trace.score import Score, orthonormal, project
-from physworld.trace.unknowns import REACH, already
+from physworld.trace.unknowns import REACH, SOFTNESS, already
 
 _STARTS, _GLANCE = 3, 2  # variants of an effect that are tried, and iterations after which the best goes on
 _WORSE = 3.0  # a search is left that is this many times as far from the noise as the best so far
@@ -36,6 +47,14 @@ _MULTIPLES = tuple(
 _WORTH_A_LOOK = 4.0  # times a model's squared residual up to which it is searched from there
 _MIRRORED = 2  # times the iterations of a refit: a mirror image is a guess
 _NUDGE = 0.1  # of a probe: where a search starts if the linear estimate says none, so that shapes can show
+_SOFTNESS_SHARES = (0.15, 0.4, 1.0)  # of ``AS_HELD``
+_REACHES = (-1.0, 1.0)  # in steps of the reach, quarters of a cell
+_SCOUTED = 2  # times the iterations of a refit: a scout's steps are cheap
+_POLISHED = 1  # iterations of the best scout's refit: it has come to the optimum already
+_PROMISING = 1.5  # times the squared residual of what there is up to which the best scout is followed
+_STIFFNESSES = (-0.3, -0.15, 0.0, 0.15)  # logarithms of the stiffness that may go with them
+OWN = (TWIST_RATIO, BENDING_RATIO)
+_PLATE = 0.0  # logarithm of both ratios of a homogeneous plate
 
 
 @dataclass(frozen=True)
@@ -116,8 +135,8 @@ class Confirmation:
     def elsewhere(self, model: Model) -> Model:
         """The model refitted from other stiffnesses and clamps, if that is better; else itself.
 
-        What the declared physics made of the recording need not lie in the valley where the effect fits: a stiffness
-        may be a period off, and a clamp's reach is not smooth. Other valleys show as minima of a scan of the stiffness;
+        What the declared physics made of the recording need not lie in the basin where the effect fits: a stiffness
+        may be a period off, and a clamp's reach is not smooth. Other basins show as minima of a scan of the stiffness;
         other reaches are tried with what they ask of the other unknowns.
         """
         fitted = model.fitted
@@ -129,8 +148,8 @@ class Confirmation:
         middle = len(scan) // 2
         line[middle] = float(np.sum(fitted.residual**2))
         padded = np.concatenate([[np.inf], line, [np.inf]])
-        valleys = (line < padded[:-2]) & (line < padded[2:]) & (np.arange(len(line)) != middle)
-        starts = [(line[k], scan[k]) for k in np.flatnonzero(valleys)]
+        basins = (line < padded[:-2]) & (line < padded[2:]) & (np.arange(len(line)) != middle)
+        starts = [(line[k], scan[k]) for k in np.flatnonzero(basins)]
         starts += list(zip(costs[len(scan) :], reaches, strict=True))
         best = model
         for _, place in sorted(((c, p) for c, p in starts if np.isfinite(c)), key=lambda pair: pair[0])[
@@ -166,7 +185,15 @@ class Confirmation:
         return self._with(model, other)
 
     def held_otherwise(self, model: Model) -> Model:
-        """The model refitted from grips that hold harder and softer, if that is better; else itself."""
+        """The model refitted from grips that hold harder and softer, if that is better; else itself.
+
+        Args:
+            fitted: the optimum (p unknowns).
+            simulations: of the recordings.
+            whitener: of their residuals.
+            frames: that count.
+            iterations: of a refit.
+        """
         other = held_otherwise(model.fitted, self.simulations, self.whitener, self.frames, self.iterations)
         return self._with(model, other)
 
@@ -179,7 +206,15 @@ class Confirmation:
         return self._with(model, other)
 
     def clamped_otherwise(self, model: Model) -> Model:
-        """The model refitted from clamps that reach less far and farther, if that is better; else itself."""
+        """The model refitted from clamps that reach less far and farther, if that is better; else itself.
+
+        Args:
+            fitted: the optimum (p unknowns).
+            simulations: of the recordings.
+            whitener: of their residuals.
+            frames: that count.
+            iterations: of a refit.
+        """
         other = clamped_otherwise(model.fitted, self.simulations, self.whitener, self.frames, self.iterations)
         return self._with(model, other)
 
@@ -201,6 +236,12 @@ class Confirmation:
         """``base`` with several effects, from these strengths of their gates and another model's calibrated numbers.
 
         None where no run was usable.
+
+        Args:
+            base: what the effects are added to.
+            members: the effects.
+            strengths: of all their gates in turn, in their units.
+            other: the model whose calibrated numbers the search starts from.
         """
         known = dict(zip([u.name for u in other.fitted.unknowns], other.fitted.theta, strict=True))
         calibrated = [
@@ -221,7 +262,7 @@ class Confirmation:
         """The model refitted from another one's calibrated numbers and what strength of its one gate does best there.
 
         A body that rings down may be fitted by a drag at one stiffness and by a viscosity at another; that one search
-        has found the better valley is no reason to prefer its effect.
+        has found the better basin is no reason to prefer its effect.
         """
         fitted, gate = model.fitted, model.members[-1].unknowns()[0]
         names = [unknown.name for unknown in fitted.unknowns]
@@ -337,7 +378,8 @@ def _linear(fitted: Refit, strengths: Array, columns: Array) -> Array:
     change = np.linalg.lstsq(fitted.jacobian, left, rcond=1e-8)[0]
     low, high = bounds_of(fitted.unknowns)
     limit = 0.3 * (high - low)
-    return np.clip(fitted.theta + np.clip(change, -limit, limit), low, high)
+    place: Array = np.clip(fitted.theta + np.clip(change, -limit, limit), low, high)
+    return place
 
 
 def _away_from_zero(strengths: Array, gates: list[Unknown]) -> Array:
@@ -354,6 +396,12 @@ def best_variants(
     Effects come in turn from two orders, by their best variant alone and by all variants together: many columns explain
     much of anything, and one alone may have the wrong shape. One variant where the effect has no shapes to free, else
     the best three: a linear score does not tell which of them leads to the right shape.
+
+    Args:
+        ranked: scores, best first.
+        least: share of the residual that a variant must explain.
+        count: effects at most.
+        besides: effects that are in the model already.
     """
     found: dict[str, list[Score]] = {}
     for score in ranked:
@@ -371,3 +419,94 @@ def best_variants(
 def explained_direction(model: Model, base: Model, basis: Array) -> Array:
     """What a model explains of the base's residual, (M,), after projection."""
     return project(basis, base.fitted.residual - model.fitted.residual)
+
+
+def held_otherwise(
+    fitted: Refit, simulations: Simulations, whitener: Whitener, frames: int, iterations: int
+) -> Refit:
+    """The best refit from grips that hold harder and softer; itself where none is better or no softness is free.
+
+    Args:
+        fitted: the optimum (p unknowns).
+        simulations: of the recordings.
+        whitener: of their residuals.
+        frames: that count.
+        iterations: of a refit.
+    """
+    values = [float(np.log(share * AS_HELD)) for share in _SOFTNESS_SHARES]
+    return _scouted(fitted, SOFTNESS, values, simulations, whitener, frames, iterations)
+
+
+def clamped_otherwise(
+    fitted: Refit, simulations: Simulations, whitener: Whitener, frames: int, iterations: int
+) -> Refit:
+    """The best refit from clamps that reach less far and farther; itself where none is better or no reach is free.
+
+    Args:
+        fitted: the optimum (p unknowns).
+        simulations: of the recordings.
+        whitener: of their residuals.
+        frames: that count.
+        iterations: of a refit.
+    """
+    return _scouted(fitted, REACH, list(_REACHES), simulations, whitener, frames, iterations)
+
+
+def _scouted(
+    fitted: Refit,
+    name: str,
+    values: list[float],
+    simulations: Simulations,
+    whitener: Whitener,
+    frames: int,
+    iterations: int,
+) -> Refit:
+    """The best refit from these values of the unknown of that name, each with several stiffnesses, if it is better."""
+    names = [unknown.name for unknown in fitted.unknowns]
+    if name not in names:
+        return fitted
+    k, scouts = names.index(name), []
+    limit = _PROMISING * float(np.sum(fitted.residual**2))
+    for value in values:
+        places = [fitted.theta + shift * np.eye(len(names))[0] for shift in _STIFFNESSES]
+        for place in places:
+            place[k] = value
+        unknowns = [u.starting(t) for u, t in zip(fitted.unknowns, places[0], strict=True)]
+        scout = refit(
+            simulations, whitener, fitted.twin, unknowns, frames, _SCOUTED * iterations, places[1:],
+            hopeless=limit, jacobian=fitted.jacobian,
+        )  # fmt: skip
+        scouts += [] if scout is None else [scout]
+    scout = min(scouts, key=lambda s: s.misfit, default=None)
+    if scout is None or float(np.sum(scout.residual**2)) > limit:
+        return fitted
+    other = refit(simulations, whitener, fitted.twin, scout.unknowns, frames, _POLISHED)
+    return fitted if other is None or other.misfit >= fitted.misfit else other
+
+
+def as_a_plate(
+    fitted: Refit, simulations: Simulations, whitener: Whitener, frames: int, iterations: int
+) -> Refit | None:
+    """The refit with both ratios of bending at a homogeneous plate's; None where none is free, or none could be run.
+
+    It is searched from the same stiffness of the membrane, from the same stiffness of bending, and from between.
+
+    Args:
+        fitted: the optimum (p unknowns).
+        simulations: of the recordings.
+        whitener: of their residuals.
+        frames: that count.
+        iterations: of a refit.
+    """
+    names = [unknown.name for unknown in fitted.unknowns]
+    own = [k for k, name in enumerate(names) if name in OWN]
+    if not own:
+        return None
+    theta = fitted.theta.copy()
+    theta[own] = _PLATE
+    twin = at(fitted.twin, fitted.unknowns, theta)
+    kept = np.delete(np.arange(len(names)), own)
+    bends = float(fitted.theta[names.index(BENDING_RATIO)]) if BENDING_RATIO in names else 0.0
+    starts = [theta[kept] + share * bends * np.eye(len(kept))[0] for share in (0.0, 0.5, 1.0)]
+    unknowns = [fitted.unknowns[k].starting(t) for k, t in zip(kept, starts[0], strict=True)]
+    return refit(simulations, whitener, twin, unknowns, frames, iterations, starts[1:])

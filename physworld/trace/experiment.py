@@ -167,7 +167,8 @@ def _difference(tracks: tuple[Array, ...]) -> Array:
     """Root mean squared coordinate difference of the two nearest predictions in every frame, (T,) [m]."""
     pairs = [a - b for k, a in enumerate(tracks) for b in tracks[:k]]
     nearest = min(pairs, key=lambda gap: float(np.linalg.norm(gap)))
-    return np.sqrt(np.mean(nearest**2, axis=(1, 2)))
+    apart: Array = np.sqrt(np.mean(nearest**2, axis=(1, 2)))
+    return apart
 
 
 def _words(
@@ -181,7 +182,7 @@ def _words(
     instead: tuple[str, ...],
 ) -> str:
     known = "" if recorded is None else f" (the recording at hand: {_figure(recorded)})"
-    figure = f"{_figure(best.refitted)} standard deviations of the noise after every refit{known}"
+    figure = f"{_figure(best.refitted or 0.0)} standard deviations of the noise after every refit{known}"
     what = " from ".join((", ".join(labels[:-1]), labels[-1]))
     if separates:
         start = best.motion.words[0].upper() + best.motion.words[1:]
@@ -214,4 +215,5 @@ def _otherwise(instead: tuple[str, ...]) -> str:
 
 def _rounded(values: Array) -> list[Any]:
     """Nested lists to a hundredth of a millimetre or millisecond and better."""
-    return np.round(np.asarray(values, dtype=float), 6).tolist()
+    nested: list[Any] = np.round(np.asarray(values, dtype=float), 6).tolist()
+    return nested

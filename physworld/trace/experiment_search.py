@@ -114,8 +114,9 @@ class Search:
             near = self._try(nudged(best.probe, size, generator))
             if near is not None and near.plain > (best.refitted or 0.0):
                 best = _better(best, self._refitted(near))
-        claims = best is not None and (best.refitted or 0.0) >= config.enough_sigmas
-        return self.confirmed(best) if claims else best
+        if best is None or (best.refitted or 0.0) < config.enough_sigmas:
+            return best
+        return self.confirmed(best)
 
     def _try(self, probe: Probe) -> Tried | None:
         """A motion's predictions; None where a rival's run fails or the budget is spent."""
@@ -137,9 +138,10 @@ class Search:
         cost = sum(len(rival.unknowns) for rival in self.rivals) + 1
         if self.count + cost > self.config.simulations and not forced:
             return None
-        slopes = [self._slopes(tried, k, rival) for k, rival in enumerate(self.rivals)]
+        found = [self._slopes(tried, k, rival) for k, rival in enumerate(self.rivals)]
         numerics = self._numerics(tried)
-        if numerics is None or any(slope is None for slope in slopes):
+        slopes = [slope for slope in found if slope is not None]
+        if numerics is None or len(slopes) < len(found):
             return None
         least = np.inf
         for a, b in permutations(range(len(self.rivals)), 2):

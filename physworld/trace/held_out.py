@@ -1,4 +1,7 @@
-"""The held-out frames, read once, for the report: errors before and after, their intervals, floor and baselines."""
+"""The held-out frames and recordings, read once, for the report: predictions before and after, and their errors.
+
+Errors come with intervals by paired blocks of frames, the noise floor and baselines.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +12,13 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.estimation.noise import Split
+from physworld.estimation.whitening import Whitener
 from physworld.evaluate.baselines import constant_velocity, rigid_follow, static
 from physworld.evaluate.metrics import chamfer_l2
 from physworld.scene import Scene
+from physworld.trace.config import TraceConfig
+from physworld.trace.confirm import Model
+from physworld.trace.recordings import HELD_OUT, JointSimulations, Recording, Recordings, side_by_side
 
 METRIC = "track_rmse_m"
 """Root mean squared coordinate error of the visible points [m]: sigma for a perfect prediction."""
@@ -43,7 +50,15 @@ def measure(
     resamples: int,
     seed: int,
 ) -> HeldOut:
-    """Measure two predictions (T, N, 3) on the held-out frames."""
+    """Measure two predictions (T, N, 3) on the held-out frames.
+
+    Args:
+        scene, split: what was measured, and which of it was held out.
+        before, after: predictions, (T, N, 3) [m].
+        sigma: noise per axis [m], None where it is not known.
+        resamples: of the intervals' blocks.
+        seed: of these.
+    """
     return measure_all([Unseen(scene, split, before, after)], sigma, resamples, seed)
 
 
@@ -73,13 +88,18 @@ class Unseen:
 
 
 def measure_all(parts: Sequence[Unseen], sigma: float | None, resamples: int, seed: int) -> HeldOut:
-    """Measure predictions on the held-out frames of several recordings together, every coordinate alike."""
-    squares = [
-        np.concatenate([part.squares(tracks) for part, tracks in zip(parts, kind, strict=True)])
-        for kind in ([p.before for p in parts], [p.after for p in parts])
-    ]
-    low_high = _intervals(*squares, resamples, seed)
-    was, now = (_root(square) for square in squares)
+    """Measure predictions on the held-out frames of several recordings together, every coordinate alike.
+
+    Args:
+        parts: the recordings with their predictions.
+        sigma: noise per axis [m], None where it is not known.
+        resamples: of the intervals' blocks.
+        seed: of these.
+    """
+    squares_before = np.concatenate([part.squares(part.before) for part in parts])
+    squares_after = np.concatenate([part.squares(part.after) for part in parts])
+    low_high = _intervals(squares_before, squares_after, resamples, seed)
+    was, now = _root(squares_before), _root(squares_after)
     above = was - (sigma or 0.0)
     frames = [part.split.test[1] - part.split.test[0] for part in parts]
     return HeldOut(
@@ -122,5 +142,88 @@ def _intervals(
     was, now = (
         np.sqrt(s[picked, 0].sum(axis=1) / np.maximum(s[picked, 1].sum(axis=1), 1)) for s in (before, after)
     )
-    ends = [np.quantile(values, [0.025, 0.975]) for values in (now, was - now)]
-    return tuple((float(low), float(high)) for low, high in ends)  # type: ignore[return-value]
+    (low, high), (least, most) = (np.quantile(values, [0.025, 0.975]) for values in (now, was - now))
+    return (float(low), float(high)), (float(least), float(most))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One recording of several: its role (fitted, held_out), scored frames, open-loop tracks (T, N, 3) [m], errors."""
+
+    scene: str
+    role: str
+    frames: tuple[int, int]
+    before: Array
+    after: Array
+    held_out: HeldOut
+
+
+class Outcomes:
+    """Of the recordings of one trace.
+
+    Attributes:
+        notes: of runs that could not be trusted.
+    """
+
+    def __init__(self, recordings: Recordings, simulations: JointSimulations, config: TraceConfig) -> None:
+        self.recordings, self.simulations, self.config = recordings, simulations, config
+        self.notes: list[str] = []
+
+    @property
+    def scene(self) -> Scene:
+        """All that are fitted, side by side."""
+        return self.recordings.scene
+
+    def of(self, declared: Model, model: Model, white: Whitener, sigma: float | None) -> list[Outcome]:
+        """Open-loop predictions of every recording before and after, and their errors on frames that were not used.
+
+        Args:
+            declared: the declared physics.
+            model: what the verdict takes.
+            white: whitener of the training frames.
+            sigma: noise per axis [m], None where it is not known.
+        """
+        every = [*self.recordings.fitted, *self.recordings.held_out]
+        before, after = (self._predictions(m, white, every) for m in (declared, model))
+        found = []
+        for recording, was, now in zip(every, before, after, strict=True):
+            noise = recording.scene.noise_sigma_m or sigma
+            errors = measure(
+                recording.scene, recording.split, was, now, noise, self.config.bootstraps, self.config.seed
+            )
+            found.append(
+                Outcome(recording.scene.name, recording.role, recording.split.test, was, now, errors)
+            )
+        return found
+
+    def together(self, outcomes: list[Outcome], sigma: float | None) -> HeldOut:
+        """Those of several recordings together."""
+        if len(outcomes) == 1:
+            return outcomes[0].held_out
+        parts = [
+            Unseen(recording.scene, recording.split, outcome.before, outcome.after)
+            for recording, outcome in zip(self._recordings_of(outcomes), outcomes, strict=True)
+        ]
+        return measure_all(parts, sigma, self.config.bootstraps, self.config.seed)
+
+    def _recordings_of(self, outcomes: list[Outcome]) -> tuple[Recording, ...]:
+        return self.recordings.held_out if outcomes[0].role == HELD_OUT else self.recordings.fitted
+
+    def _predictions(self, model: Model, white: Whitener, recordings: list[Recording]) -> list[Array]:
+        """Open loop over all frames, [(T, N, 3)], with the points' own places from the training frames."""
+        places = white.place_errors(model.fitted.tracks)
+        found = []
+        for recording, tracks in zip(
+            recordings, self.simulations.predictions(model.fitted.twin, places), strict=True
+        ):
+            if tracks is None:
+                self.notes.append(
+                    f"{recording.scene.name}: the run over the frames that were not used cannot be trusted; the last "
+                    "training frame, or without one the first frame, is kept"
+                )
+                known = model.fitted.tracks[: recording.split.train[1], recording.points]
+                if recording.role == HELD_OUT:
+                    known = recording.scene.points[:1]
+                tracks = side_by_side([known], recording.scene.frame_count)
+            found.append(tracks)
+        return found

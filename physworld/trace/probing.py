@@ -71,7 +71,14 @@ def nudged(probe: Probe, size: float, generator: np.random.Generator) -> Probe:
 
 
 def motion_of(probe: Probe, first_pose: Array, limits: MotionLimits, times: Array) -> Motion:
-    """The motion of control points from ``first_pose`` (K, 3) at even ``times`` (T,) [s] from 0."""
+    """The motion of control points from ``first_pose`` (K, 3) at even ``times`` (T,) [s] from 0.
+
+    Args:
+        probe: the motion's numbers.
+        first_pose: of the controllers, (K, 3) [m].
+        limits: reach and speed of the recording's own motion.
+        times: of the control track, (Tc,) [s].
+    """
     held = np.concatenate([limits.grips[g] for g in probe.grips])
     arm = float(np.linalg.norm(first_pose[held] - first_pose[held].mean(axis=0), axis=1).max())
     travel, turn, words = _FAMILIES[probe.family](probe.coordinates, limits, times, arm)

@@ -9,7 +9,7 @@ from physworld.estimation.noise import Split
 from physworld.trace.candidates import Candidate
 from physworld.trace.confirm import Model
 from physworld.trace.experiment import Experiment
-from physworld.trace.held_out import HeldOut
+from physworld.trace.held_out import HeldOut, Outcome
 from physworld.trace.score import Scores
 from physworld.trace.verdict import Verdict
 from physworld.twin.twin import Twin
@@ -40,18 +40,6 @@ class Step:
     scores: Scores
     tried: tuple[Model, ...]
     kept: Model | None
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """One recording of several: its role (fitted, held_out), scored frames, open-loop tracks (T, N, 3) [m], errors."""
-
-    scene: str
-    role: str
-    frames: tuple[int, int]
-    before: Array
-    after: Array
-    held_out: HeldOut
 
 
 @dataclass(frozen=True)

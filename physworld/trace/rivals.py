@@ -1,6 +1,6 @@
 """Rivals: models that explain a recording alike, and what a refit of one could hide of its difference from another.
 
-A recording that says little of a body's stiffness leaves rivals at different ends of the same flat valley. That is a
+A recording that says little of a body's stiffness leaves rivals at different ends of the same flat basin. That is a
 difference of calibration and not of what they claim, so before a search every rival is brought to the first one's
 calibrated numbers, as far as its own fit to the recording allows.
 """
@@ -90,7 +90,7 @@ def reconciled(rivals: list[Rival], cost: Callable[[Twin], float] | None) -> lis
 
 
 def _towards(rival: Rival, first: Rival, cost: Callable[[Twin], float]) -> Rival:
-    """The valley may be curved, so the recording itself is asked: with the rival's own numbers kept, and followed."""
+    """The basin may be curved, so the recording itself is asked: with the rival's own numbers kept, and followed."""
     known = {unknown.name: unknown.start for unknown in first.unknowns}
     shared = np.array([unknown.name in known for unknown in rival.unknowns], dtype=bool)
     if not shared.any():
@@ -138,4 +138,4 @@ def refit_of(
     ridged = normal / np.outer(scale, scale) + _RIDGE * np.eye(count)
     change = np.linalg.solve(ridged, (slope.T @ difference - known @ away) / scale) / scale
     left, there = difference - slope @ change, change + away
-    return change, float(np.sqrt(max(left @ left + there @ known @ there, 0.0)))
+    return change, float(np.sqrt(max(float(left @ left + there @ known @ there), 0.0)))

@@ -27,19 +27,24 @@ from physworld.estimation.simulations import Job, Memory, Progress, Runner, in_t
 from physworld.estimation.unknowns import Unknown
 from physworld.estimation.whitening import Whitener, turned_starts, whitener
 from physworld.scene import Scene
-from physworld.trace.beginning import Beginning
 from physworld.trace.candidates import Candidate, candidates
 from physworld.trace.comparison import cross_validated
 from physworld.trace.config import TraceConfig
-from physworld.trace.confirm import Model
-from physworld.trace.describe import describe
+from physworld.trace.confirm import Model, held_otherwise
 from physworld.trace.experiment import Experiment, propose, rival_of
 from physworld.trace.faults import Faults, without_faults
-from physworld.trace.holds import held_otherwise
+from physworld.trace.held_out import Outcomes
 from physworld.trace.intervals import calibrated, named, spread_of
 from physworld.trace.mixtures import Mixtures
-from physworld.trace.noise import remarks, taken_with
-from physworld.trace.outcomes import Outcomes
+from physworld.trace.preparation import (
+    CONFIRMATION,
+    EXPERIMENT,
+    SELECTION,
+    Beginning,
+    Clock,
+    remarks,
+    taken_with,
+)
 from physworld.trace.recordings import (
     FITTED,
     HELD_OUT,
@@ -47,6 +52,7 @@ from physworld.trace.recordings import (
     Recordings,
     side_by_side,
 )
+from physworld.trace.report import describe
 from physworld.trace.result import Stage, Step, TraceResult
 from physworld.trace.score import orthonormal, project
 from physworld.trace.second_resolution import SecondResolution
@@ -56,7 +62,6 @@ from physworld.trace.sensitivity import (
     numerical_directions,
     refinement_of,
 )
-from physworld.trace.time_limit import CONFIRMATION, EXPERIMENT, SELECTION, Clock
 from physworld.trace.unknowns import clamp_reach, grip_compliance, grip_softness, of_parameter
 from physworld.trace.verdict import (
     DATA,
@@ -205,11 +210,11 @@ class _Trace:
         resolved = float(np.sqrt(np.mean(project(solver, project(basis, declared.fitted.residual)) ** 2)))
         chosen, refused = candidates(declared.fitted.twin, config.candidates)
         simulations.stage = "sensitivities"
-        found = candidate_responses(
+        responses = candidate_responses(
             simulations, white, declared.fitted.twin, declared.fitted.tracks, chosen, self.frames
         )
-        usable = [response for response in found if not response.failed]
-        refused |= {r.candidate.label: "its simulation cannot be trusted" for r in found if r.failed}
+        usable = [response for response in responses if not response.failed]
+        refused |= {r.candidate.label: "its simulation cannot be trusted" for r in responses if r.failed}
         setting = (simulations, white, block_of_row, self.frames, config)
         selection = Selection(*setting)
         self.clock.start()
@@ -298,7 +303,7 @@ class _Trace:
         own = np.array([u.start for u in unknowns])
         axes = dict(zip([u.name for u in unknowns], np.eye(len(own)), strict=True))
         starts = [own + shift * axes[unknowns[0].name] for shift in shifts]
-        if TWIST_RATIO in axes:  # how stiff a sheet is in twist decides in which valley its stiffness lies
+        if TWIST_RATIO in axes:  # how stiff a sheet is in twist decides in which basin its stiffness lies
             starts += [start + _OTHER_TWIST * axes[TWIST_RATIO] for start in [own, *starts]]
         iterations = _THOROUGH * self.config.iterations
         fitted = refit(self.simulations, white, self.twin, unknowns, self.frames, iterations, starts)

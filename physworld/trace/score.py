@@ -62,7 +62,8 @@ class Scores:
 
 def project(basis: Array, values: Array) -> Array:
     """``values`` (M,) or (M, k) less what the orthonormal ``basis`` (M, p) spans."""
-    return values - basis @ (basis.T @ values)
+    left: Array = values - basis @ (basis.T @ values)
+    return left
 
 
 def orthonormal(columns: Array) -> Array:
@@ -163,4 +164,5 @@ def _flipped(columns: Array, left: Array, block_of_row: Array, signs: Array, can
         if len(candidate.gates) == 1 and unknown.low >= 0:
             summed[:, k] = np.maximum(summed[:, k], 0.0)
     inverse = np.linalg.pinv(columns.T @ columns)
-    return np.einsum("rk,kl,rl->r", summed, inverse, summed)
+    explained: Array = np.einsum("rk,kl,rl->r", summed, inverse, summed)
+    return explained

@@ -10,16 +10,15 @@ import numpy as np
 from physworld.arrays import Array
 from physworld.estimation.simulations import Simulations
 from physworld.estimation.whitening import Whitener
+from physworld.trace.basins import with_other_basins
 from physworld.trace.comparison import alikeness, cross_validated
 from physworld.trace.compound import has_parts, in_parts, whole_of
 from physworld.trace.config import TraceConfig
-from physworld.trace.confirm import Confirmation, Model, best_variants, explained_direction
-from physworld.trace.plates import as_a_plate
+from physworld.trace.confirm import Confirmation, Model, as_a_plate, best_variants, explained_direction
 from physworld.trace.result import Step
 from physworld.trace.score import Score, Scores, orthonormal, project, scores
 from physworld.trace.sensitivity import Response, candidate_responses, decoys
 from physworld.trace.tethers import with_tethers
-from physworld.trace.valleys import with_valleys
 from physworld.trace.verdict import as_good, helps, simplest
 
 Search = Callable[[list[Model]], list[Model]]
@@ -29,7 +28,7 @@ _NEAR = 3.0  # times what the best leaves above the noise
 _NEARLY_ALL = 0.1  # share of what there is to explain that such a model may leave
 _FAR = 3.0  # misfit over the noise from which on sensitivities are asked again after an effect was added
 _CLEARLY = 1.02  # misfit over the best one's from which a model that does the same is worth another search
-_ANOTHER_VALLEY = 0.25  # logarithm of the stiffness from which on another search is worth it
+_ANOTHER_BASIN = 0.25  # logarithm of the stiffness from which on another search is worth it
 
 
 @dataclass(frozen=True)
@@ -44,7 +43,8 @@ class Selection:
 
     def path(self, declared: Model, usable: list[Response]) -> tuple[Step, ...]:
         """The steps from the declared physics; ``usable``: what every candidate does to the prediction."""
-        config, path, base = self.config, [], declared
+        path: list[Step] = []
+        config, base = self.config, declared
         confirmation = Confirmation(
             self.simulations, self.white, self.block_of_row, self.frames, config.iterations
         )
@@ -109,8 +109,8 @@ class Selection:
         """What is done to the models with one more effect, in turn; the first to single effects only."""
         floor = self.config.near_floor
         return (
-            ("refit from other valleys",
-             lambda tried: with_valleys(confirmation, base, ranked, columns, tried, floor)),
+            ("refit from other basins",
+             lambda tried: with_other_basins(confirmation, base, ranked, columns, tried, floor)),
             ("refit of tethers",
              lambda tried: with_tethers(confirmation, base, ranked, columns, usable, tried, floor)),
             ("refit of mirror images", lambda tried: self._mirrored(confirmation, base, tried)),
@@ -118,7 +118,7 @@ class Selection:
             ("refit of the grips", lambda tried: self._held_otherwise(confirmation, tried)),
             ("refit of the clamps", lambda tried: self._clamped_otherwise(confirmation, tried)),
             ("refit of the like", lambda tried: self._alike(confirmation, base, tried, columns)),
-            ("refit beside the best", lambda tried: self._beside_the_best(confirmation, tried)),
+            ("refit from better basins", lambda tried: self._from_better_basins(confirmation, tried)),
             ("refit in parts", lambda tried: [*tried, *self._in_parts(confirmation, base, tried, usable)]),
             ("refit as a plate", lambda tried: self._as_plates(base, tried)),
         )  # fmt: skip
@@ -239,15 +239,15 @@ class Selection:
             found.append(model)
         return found
 
-    def _beside_the_best(self, confirmation: Confirmation, tried: list[Model]) -> list[Model]:
+    def _from_better_basins(self, confirmation: Confirmation, tried: list[Model]) -> list[Model]:
         """Models of one strength; those clearly worse than one near the noise are refitted from where that fits.
 
-        Likewise from every complete model in another valley: the best need not be the one that is believed in the end.
+        Likewise from every complete model in another basin: the best need not be the one that is believed in the end.
         """
         ordered = sorted(tried, key=lambda m: m.fitted.misfit)
         if not ordered or ordered[0].fitted.misfit > self.config.acceptable:
             return tried
-        for place in _one_a_valley([ordered[0], *(m for m in ordered[1:] if self._complete(m))]):
+        for place in _one_a_basin([ordered[0], *(m for m in ordered[1:] if self._complete(m))]):
             tried = [
                 confirmation.beside(m, place)
                 if len(m.members[-1].gates) == 1 and m.fitted.misfit > _CLEARLY * place.fitted.misfit
@@ -303,11 +303,11 @@ class Selection:
         )  # fmt: skip
 
 
-def _one_a_valley(models: list[Model]) -> list[Model]:
+def _one_a_basin(models: list[Model]) -> list[Model]:
     """Models, of those with nearly the same stiffness the first."""
     found: list[Model] = []
     for model in models:
-        if all(abs(model.fitted.theta[0] - known.fitted.theta[0]) > _ANOTHER_VALLEY for known in found):
+        if all(abs(model.fitted.theta[0] - known.fitted.theta[0]) > _ANOTHER_BASIN for known in found):
             found.append(model)
     return found
 

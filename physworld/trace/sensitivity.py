@@ -36,6 +36,14 @@ def candidate_responses(
     """Sensitivities of every candidate's gates, one batch of simulations for all.
 
     At zero, or where the twin has them already: a clamp's reach and a rope's grip are calibrated.
+
+    Args:
+        simulations: of the recordings.
+        whitener: of their residuals (M,).
+        twin: the calibrated twin.
+        base: its tracks, (frames, N, 3) [m].
+        chosen: candidates.
+        frames: that count.
     """
     jobs, owners = [], []
     for number, candidate in enumerate(chosen):
@@ -93,6 +101,13 @@ def decoys(
 
     Phases of a real sensitivity's time courses are drawn anew for every point pattern, which leaves the size, the
     slowness and the shapes, and takes away every relation to what was measured.
+
+    Args:
+        responses: of real candidates.
+        whitener: of the residuals (M,).
+        tracks_shape: training frames and points.
+        count: decoys.
+        seed: of their phases.
     """
     rng = np.random.default_rng(seed)
     frames, points = tracks_shape

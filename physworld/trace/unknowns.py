@@ -14,6 +14,7 @@ from physworld.effects.places import gravity_size
 from physworld.effects.registry import EFFECTS
 from physworld.engine.terms.soft_grips import AS_HELD
 from physworld.estimation.unknowns import LOG, Unknown, multiple_of
+from physworld.materials.laws import RodLaw
 from physworld.twin.twin import Twin
 
 CLAMP = ClampOffset.name
@@ -46,7 +47,14 @@ def _value(twin: Twin, parameter: Parameter) -> float:
 
 
 def of_strength(effect: str, strength: Strength, scale: float | None = None, start: float = 0.0) -> Unknown:
-    """A strength in units of ``scale`` (its probe unless given), from ``start``."""
+    """A strength in units of ``scale`` (its probe unless given), from ``start``.
+
+    Args:
+        effect: name in the registry.
+        strength: as the effect declares it.
+        scale: unit of the search, in the strength's unit.
+        start: in the strength's unit.
+    """
     unit = strength.probe if scale is None else scale
     return Unknown(
         f"{effect}.{strength.name}",
@@ -101,7 +109,7 @@ def grip_compliance(twin: Twin) -> Unknown | None:
     """
     slip = EFFECTS[SLIP]
     weight = float(twin.particle_mass.sum()) * gravity_size(twin)
-    if twin.lattice.dim != 1 or slip.refuses(twin) is not None:
+    if not isinstance(twin.law, RodLaw) or slip.refuses(twin) is not None:
         return None
     sheared = twin.body.thickness_m**2 / (1.2 * float(np.sqrt(twin.law.bending_n_m2 * weight)))
     known = next(s for s in slip.strengths(twin) if s.name == "compliance_m_n")

@@ -156,6 +156,14 @@ def claimable(
 
     Where the declared physics is near the noise already, little says that there is anything to explain but the score:
     there it has to be beyond chance.
+
+    Args:
+        declared: the declared physics.
+        models: what was refitted.
+        config: settings.
+        solver: orthonormal directions of the solver's own error, (M, k).
+        block_of_row: block of frames of every residual, (M,).
+        chance: whether chance reaches a model's score.
     """
     quiet = declared.fitted.misfit <= config.acceptable
     return [
@@ -168,7 +176,15 @@ def claimable(
 
 
 def survives(model: Model, declared: Model, solver: Array, block_of_row: Array, config: TraceConfig) -> bool:
-    """Whether what a model explains is more than what other cells and time steps would change."""
+    """Whether what a model explains is more than what other cells and time steps would change.
+
+    Args:
+        model: with an effect.
+        declared: without.
+        solver: orthonormal directions of the solver's own error, (M, k).
+        block_of_row: block of frames of every residual, (M,).
+        config: settings.
+    """
     before, after = (seen_through(m.fitted.residual, solver, block_of_row) for m in (declared, model))
     share = 1.0 - after.mean / before.mean
     return better_beyond_chance(after, before) and share >= config.material_share
@@ -254,6 +270,12 @@ def richer_and_better(model: Model, best: Model, basis: Array, declared: Model, 
     By more than a standard error, and more than the noise is known: then it is the discrepancy allowed to a twin that
     calls them as good, not the data, and one number less is no reason to prefer an effect. One that explains the same
     and a little more (a wind beside a drag) is another matter: of the twin's discrepancy more numbers absorb more.
+
+    Args:
+        model, best: two models.
+        basis: orthonormal directions of the calibrated unknowns, (M, p).
+        declared: the declared physics.
+        alike: correlation from which two effects count as one.
     """
     gap, spread = difference(best.validated, model.validated)
     same = alikeness(explained_direction(model, declared, basis), explained_direction(best, declared, basis))
@@ -266,6 +288,12 @@ def indistinguishable(model: Model, best: Model, basis: Array, declared: Model, 
     As well: within one standard error, or within half of what the better one leaves above the noise, which may as well
     lie between the two as elsewhere. A wind does all that a drag and a tilt do, with a number more: it is they as well
     unless it predicts better beyond chance.
+
+    Args:
+        model, best: two models.
+        basis: orthonormal directions of the calibrated unknowns, (M, p).
+        declared: the declared physics.
+        alike: correlation from which two effects count as one.
     """
     if other_names(model, best):
         return whole_of(best) is not None or as_good(model, best, declared) or not beats(best, model)

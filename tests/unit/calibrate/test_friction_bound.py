@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from made_scene import box_body, made_scene
 
-from physworld.calibrate.friction_bound import SLOWEST, affordable
-from physworld.calibrate.parameters import parameters_of
+from physworld.calibrate.parameters import SLOWEST, affordable, parameters_of
 from physworld.engine.total.formulation import TotalLagrangian
 from physworld.scene import UNDEFORMED_AT_REST, Scene
 from physworld.twin.build import build_twin

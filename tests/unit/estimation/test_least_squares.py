@@ -26,7 +26,7 @@ def test_a_quadratic_is_solved_and_its_cost_is_the_rest() -> None:
     np.testing.assert_allclose(found.jacobian[:, 1], [-1.5, -0.5, 0.5, 1.5], atol=1e-9)
 
 
-def test_a_curved_valley_is_followed() -> None:
+def test_a_curved_basin_is_followed() -> None:
     def rosenbrock(theta: np.ndarray) -> np.ndarray:
         return np.array([10 * (theta[1] - theta[0] ** 2), 1 - theta[0]])
 

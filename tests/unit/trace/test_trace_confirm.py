@@ -45,7 +45,7 @@ def test_a_rival_that_fits_nowhere_near_the_best_model_is_left_as_it_is(bar: Bar
     assert bar.simulations.count == runs + 8  # a look at eight strengths, and no search
 
 
-def test_a_rival_is_searched_in_every_valley_where_a_model_is_complete(
+def test_a_rival_is_searched_in_every_basin_where_a_model_is_complete(
     bar: Bar, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The best may be what is not believed in the end, at a stiffness where no other effect fits."""
@@ -63,7 +63,7 @@ def test_a_rival_is_searched_in_every_valley_where_a_model_is_complete(
         return model
 
     monkeypatch.setattr(Confirmation, "beside", watched)
-    assert selection._beside_the_best(bar.confirmation, [best, right, near, lost])[-1] is lost
+    assert selection._from_better_basins(bar.confirmation, [best, right, near, lost])[-1] is lost
     assert [id(place) for place in asked] == [id(best), id(right)]
 
 

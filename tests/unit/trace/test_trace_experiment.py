@@ -189,15 +189,15 @@ def test_rivals_that_differ_in_what_the_recording_leaves_open_are_brought_togeth
     first = Rival(("tether",), twin, (soft.starting(5e4),))
     other = Rival((drag.name,), twin, (soft, gate), np.diag([1.0, 4.0]))
 
-    def valley(there: Twin) -> float:
+    def basin(there: Twin) -> float:
         return 100.0 + abs(there.parameters["youngs_modulus_pa"] - 4e4) * slope
 
     slope = 1e-5
-    together = reconciled([first, other], valley)[1]
+    together = reconciled([first, other], basin)[1]
     assert together.start == pytest.approx([5e4, 20.0]) and together.twin.effects[0].active
     assert together.twin.parameters["youngs_modulus_pa"] == pytest.approx(5e4)
     slope = 1.0
-    assert reconciled([first, other], valley)[1] is other
+    assert reconciled([first, other], basin)[1] is other
     assert reconciled([first, other], None) == [first, other]
 
 

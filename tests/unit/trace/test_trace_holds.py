@@ -14,7 +14,7 @@ from physworld.estimation.refit import Refit, sensitivities
 from physworld.estimation.simulations import Job
 from physworld.estimation.whitening import whitener
 from physworld.scene import UNDEFORMED_AT_REST, Grip
-from physworld.trace.holds import held_otherwise
+from physworld.trace.confirm import held_otherwise
 from physworld.trace.recordings import JointSimulations, Recordings
 from physworld.trace.unknowns import SOFTNESS, grip_softness, of_parameter
 from physworld.twin.build import build_twin

@@ -13,7 +13,7 @@ from physworld.estimation.refit import Refit, sensitivities
 from physworld.estimation.simulations import Job
 from physworld.estimation.whitening import whitener
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Scene
-from physworld.trace.plates import as_a_plate
+from physworld.trace.confirm import as_a_plate
 from physworld.trace.recordings import JointSimulations, Recordings
 from physworld.trace.unknowns import clamp_reach, of_parameter
 from physworld.twin.build import build_twin

@@ -13,7 +13,7 @@ from physworld.calibrate import CalibrationConfig
 from physworld.effects.registry import effect
 from physworld.estimation.simulations import Drive, Job, Ledger, Simulations, TimeUp, Workers
 from physworld.trace import Memory, TraceConfig, document, trace
-from physworld.trace.time_limit import CONFIRMATION, SELECTION, Clock
+from physworld.trace.preparation import CONFIRMATION, SELECTION, Clock
 from physworld.trace.verdict import NAMED, NOTHING, UNEXPLAINED, Verdict
 from physworld.twin.build import build_twin
 

@@ -14,7 +14,7 @@ from tiny_scene import register, tiny_scene
 from physworld.scene import Body
 from physworld.trace import Memory
 from physworld.trace import TraceConfig as LibraryConfig
-from physworld.trace.time_limit import Clock
+from physworld.trace.preparation import Clock
 from physworld.twin.build import build_twin
 from physworld.twin.twin import Twin
 from physworld_schemas.dataset import DatasetConfig

@@ -1,4 +1,4 @@
-"""Other valleys: where an effect fits with another stiffness than the one that does best without it.
+"""Other basins of the misfit: where an effect fits with another stiffness than the one that does best without it.
 
 Linear scores ask what an effect does near the optimum of the declared physics. That optimum may be a compromise far
 from the truth: a body that rings down is fitted without damping by one so stiff that it hardly rings, and there damping
@@ -25,12 +25,12 @@ from physworld.trace.candidates import Candidate
 from physworld.trace.confirm import Confirmation, Model
 from physworld.trace.score import Scores
 
-_BETTER = 0.7  # share of the squared residual that a valley may leave
+_BETTER = 0.7  # share of the squared residual that a basin may leave
 _EARLY = 0.5  # share of the training frames that is looked at
 
 
 @dataclass(frozen=True)
-class Valley:
+class Basin:
     """A place from which an effect is worth a refit: the calibrated unknowns there, and the effect's strengths (k,).
 
     ``cost`` is the squared residual of the early training frames.
@@ -42,7 +42,7 @@ class Valley:
     cost: float
 
 
-def with_valleys(
+def with_other_basins(
     confirmation: Confirmation,
     base: Model,
     ranked: Scores,
@@ -50,7 +50,7 @@ def with_valleys(
     tried: list[Model],
     complete: float,
 ) -> list[Model]:
-    """The models that were refitted; one from another valley in the place of its like where it is better.
+    """The models that were refitted; one from another basin in the place of its like where it is better.
 
     Args:
         base: the declared physics.
@@ -63,10 +63,10 @@ def with_valleys(
     chosen = [score.candidate for score in ranked.ranked]
     best = {model.names: model for model in tried}
     frames = confirmation.frames
-    found = valleys(confirmation.simulations, confirmation.whitener, base.fitted, chosen, frames, complete)
-    for valley in found:
-        score = replace(scores[valley.candidate.label], strengths=valley.strengths)
-        model = confirmation.model(replace(base, fitted=valley.start), [score], columns)
+    found = basins(confirmation.simulations, confirmation.whitener, base.fitted, chosen, frames, complete)
+    for basin in found:
+        score = replace(scores[basin.candidate.label], strengths=basin.strengths)
+        model = confirmation.model(replace(base, fitted=basin.start), [score], columns)
         if model is None:
             continue
         known = best.get(model.names)
@@ -75,15 +75,15 @@ def with_valleys(
     return list(best.values())
 
 
-def valleys(
+def basins(
     simulations: Simulations,
     whitener: Whitener,
     fitted: Refit,
     chosen: Sequence[Candidate],
     frames: int,
     complete: float,
-) -> list[Valley]:
-    """The best valley of every such effect that leaves at most 70 % of the early squared residual, best first.
+) -> list[Basin]:
+    """The best basin of every such effect that leaves at most 70 % of the early squared residual, best first.
 
     Args:
         fitted: the optimum without the effects; its first unknown is the stiffness.
@@ -123,7 +123,7 @@ def valleys(
     for cost, candidate, place, strength in sorted(best.values(), key=lambda one: one[0]):
         start = _moved(simulations, whitener, fitted, place, frames) if cost <= limit else None
         if start is not None:
-            found.append(Valley(candidate, start, np.array([strength]), cost))
+            found.append(Basin(candidate, start, np.array([strength]), cost))
     return found
 
 

@@ -1,4 +1,4 @@
-"""Valleys: damping is found from a stiffness where a linear score does not see it; near the noise nothing is tried."""
+"""Basins: damping is found from a stiffness where a linear score does not see it; near the noise nothing is tried."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from physworld.estimation.refit import Refit, sensitivities
 from physworld.estimation.simulations import Job
 from physworld.estimation.whitening import whitener
 from physworld.scene import Scene
+from physworld.trace.basins import basins
 from physworld.trace.candidates import candidates
 from physworld.trace.recordings import JointSimulations, Recordings
 from physworld.trace.unknowns import of_parameter
-from physworld.trace.valleys import valleys
 from physworld.twin.build import build_twin
 
 STIFF_PA, RATE_PER_S, COMPLETE = 1.2e5, 8.0, 1.2
@@ -43,11 +43,11 @@ def test_damping_is_found_at_another_stiffness_where_the_misfit_is_far_from_the_
     assert (fitted.misfit > COMPLETE) == far
     before = simulations.count
     chosen, _ = candidates(twin, ("air_drag_linear", "gravity_tilt"))
-    found = valleys(simulations, white, fitted, chosen, frames, COMPLETE)
+    found = basins(simulations, white, fitted, chosen, frames, COMPLETE)
     if not far:
         assert found == [] and simulations.count == before
         return
-    assert [valley.candidate.effect for valley in found] == ["air_drag_linear"]
+    assert [basin.candidate.effect for basin in found] == ["air_drag_linear"]
     assert found[0].start.value("youngs_modulus_pa") == pytest.approx(TRUE_PA, rel=0.25)
     assert found[0].cost < 0.2 * float(np.sum(fitted.residual**2))
     assert found[0].start.jacobian.shape == (len(fitted.residual), 1)
@@ -69,7 +69,7 @@ def test_stiff_fibres_are_found_where_a_small_share_of_them_says_little() -> Non
     slope, _ = sensitivities(simulations, white, plain, tracks, stiffness, frames)
     fitted = Refit(stiffness, plain, np.array([stiffness[0].start]), tracks, white.residual(tracks), slope)
     chosen, _ = candidates(plain, ("anisotropy", "gravity_tilt"))
-    found = valleys(simulations, white, fitted, chosen, frames, COMPLETE)
-    assert [valley.candidate.effect for valley in found] == ["anisotropy"]
+    found = basins(simulations, white, fitted, chosen, frames, COMPLETE)
+    assert [basin.candidate.effect for basin in found] == ["anisotropy"]
     assert found[0].candidate.fixed["azimuth_rad"] == found[0].candidate.fixed["elevation_rad"] == 0.0
     assert found[0].strengths[0] * 0.05 == pytest.approx(2.0, rel=0.3)

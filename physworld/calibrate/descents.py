@@ -1,16 +1,59 @@
-"""Descents and places of searches with the same controls, whose simulations go to the runner together."""
+"""Descents: what is asked of a search, what it found, and several of them side by side.
+
+Descents of searches with the same controls (one recording of which each sees something else, such as the folds of a
+cross-validation) send their simulations to the runner together. What is found is the same as one after the other.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from physworld.arrays import Array
-from physworld.calibrate.optimum import Descended, Descent, Optimum, Place
-from physworld.estimation.simulations import idle_beside
+from physworld.calibrate.parameters import Parameter
+from physworld.estimation.least_squares import most_runs
+from physworld.estimation.simulations import idle_beside, in_turn
 
 if TYPE_CHECKING:
     from physworld.calibrate.search import Search
+
+Place = tuple[list[Parameter], Array, int | None]
+"""Parameters, their values in the scale of the search, and the end of the frames (None: all training frames)."""
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """Where a descent ended: theta (p,) in the scale of the search, and the mean squared residual there [m^2]."""
+
+    theta: Array
+    cost: float
+
+
+@dataclass(frozen=True)
+class Descent:
+    """A descent that is asked for: what it searches, from where, in how many iterations, over frames up to ``end``."""
+
+    parameters: list[Parameter]
+    theta: Array
+    iterations: int
+    end: int | None = None
+
+
+@dataclass(frozen=True)
+class Descended:
+    """A descent that was done beside others: what it found, its runs, and the losses [m] over all training frames."""
+
+    optimum: Optimum
+    runs: int
+    losses: list[float]
+
+
+def cost_of(optimum: Optimum) -> float:
+    """Its cost, infinite where it is not a number: a key to sort by."""
+    return optimum.cost if np.isfinite(optimum.cost) else float("inf")
 
 
 def measured_together(asked: list[tuple[Search, Place]]) -> Iterator[tuple[Array, float | None]]:
@@ -65,3 +108,20 @@ def in_step(several: list[tuple[Search, Descent]]) -> list[Descended]:
                 del asked[k]
         known.update(arriving)
     return [Descended(found[k], runs[k], losses[k]) for k in range(len(several))]
+
+
+def solve_apart(asked: list[tuple[Search, Descent]]) -> list[Optimum]:
+    """Optima of descents of searches whose scenes differ by what is seen in them alone.
+
+    Side by side where their runner shares its simulations and each keeps within its own budget; what is found is the
+    same. Nothing is journalled.
+    """
+    worst = max((most_runs(len(one.parameters), one.iterations) for _, one in asked), default=0)
+    if any(search.runner is in_turn or worst > search.limit for search, _ in asked):
+        return [search.solve(one.parameters, one.theta, one.iterations, one.end) for search, one in asked]
+    return [made.optimum for made in in_step(asked)]
+
+
+def residuals_apart(asked: list[tuple[Search, Place]]) -> list[Array]:
+    """Residuals [m] of places of such searches; NaN where the run failed. Nothing is counted."""
+    return [residual for residual, _ in measured_together(asked)]
