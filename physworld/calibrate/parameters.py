@@ -64,6 +64,11 @@ _FIBRES_GAIN = 0.1  # share of the training cost, of fibres
 _FRICTION_BOUNDS = (0.02, 3.0)
 _NEVER_PA = 1e12  # a yield stress that nothing reaches
 _SAND_RAD = 0.6  # friction angle of loose dry sand
+_FLOW_PRIORS: dict[type[Plasticity], dict[str, float]] = {
+    VonMises: {"yield_stress_pa": _NEVER_PA},
+    StVenantKirchhoff: {"yield_stress_pa": _NEVER_PA},
+    DruckerPrager: {"friction_angle_rad": _SAND_RAD},
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,9 +140,7 @@ def flow_law(name: str) -> Plasticity:
     if name not in PLASTICITIES:
         raise ValueError(f"no flow law {name!r}; there are {sorted(PLASTICITIES)}")
     law = PLASTICITIES[name]
-    if law is VonMises or law is StVenantKirchhoff:
-        return law(yield_stress_pa=_NEVER_PA)
-    return law(friction_angle_rad=_SAND_RAD) if law is DruckerPrager else law()
+    return law(**_FLOW_PRIORS.get(law, {}))
 
 
 def _torsion(twin: Twin) -> list[Parameter]:

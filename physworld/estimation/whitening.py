@@ -96,11 +96,11 @@ class Whitener:
         for place in self.places:
             block = out[place.rows].reshape(-1)
             out[place.rows] = (block - place.basis @ (place.shrink * (place.basis.T @ block))).reshape(-1, 3)
-        flat = out.reshape(-1)
-        if self.common is None:
-            return flat
-        basis, shrink = self.common
-        return flat - basis @ (shrink * (basis.T @ flat))
+        flat: Array = out.reshape(-1)
+        if self.common is not None:
+            basis, shrink = self.common
+            flat = flat - basis @ (shrink * (basis.T @ flat))
+        return flat
 
     def knowing(self, differences: list[Array]) -> Whitener:
         """With changes of the prediction, (frames, N, 3) each, that are as likely as not: one deviation each."""

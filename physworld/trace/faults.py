@@ -96,7 +96,7 @@ def _around(error: Array, start: Array) -> Array:
         return np.zeros_like(error)
     near = cKDTree(start).query(start, count + 1)[1][:, 1:]
     theirs = error[:, near]  # (frames, N, count, 3)
-    none: Array = np.isnan(theirs).all(axis=2)
+    none = np.asarray(np.isnan(theirs).all(axis=2))
     median = np.nanmedian(np.where(none[:, :, None], 0.0, theirs), axis=2)
     return np.where(none, np.nan, median)
 
