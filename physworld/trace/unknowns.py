@@ -14,7 +14,7 @@ from physworld.effects.places import gravity_size
 from physworld.effects.registry import EFFECTS
 from physworld.engine.terms.soft_grips import AS_HELD
 from physworld.estimation.unknowns import LOG, Unknown, multiple_of
-from physworld.materials.laws import RodLaw
+from physworld.materials.rod import RodLaw
 from physworld.twin.twin import Twin
 
 CLAMP = ClampOffset.name
