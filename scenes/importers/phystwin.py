@@ -151,7 +151,8 @@ def _load(data: bytes) -> dict[Any, Any]:
 
 def _turn(points: Array) -> Array:
     """z-down to z-up; adding zero keeps the invisible points' zeros from becoming -0."""
-    return np.asarray(points, dtype=np.float64) * Z_DOWN_TO_Z_UP + 0.0
+    turned: Array = np.asarray(points, dtype=np.float64) * Z_DOWN_TO_Z_UP + 0.0
+    return turned
 
 
 def _invalid(messages: list[str]) -> SceneInvalid:

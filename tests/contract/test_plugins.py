@@ -22,11 +22,11 @@ from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 from physworld.catalogue import Quantity
-from physworld.materials.solid import SolidLaw
+from physworld.materials.neo_hookean import NeoHookean
 
 
 @dataclass(frozen=True)
-class Foam(SolidLaw):
+class Foam(NeoHookean):
     """A neo-Hookean law under another name, with a constant that nothing reads."""
 
     name: ClassVar[str] = "plugin_foam"
