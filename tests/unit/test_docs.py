@@ -18,6 +18,8 @@ from physworld_scenes.declaration import BodyForm, ColliderForm, Declaration, Gr
 from physworld_services.web import create_app
 from physworld_storage.settings import Settings
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
 NAMES = [str(page.relative_to(ROOT)) for page in PAGES]

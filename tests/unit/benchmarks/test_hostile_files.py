@@ -23,6 +23,8 @@ from benchmarks.service.hostile_files.traces import Traces
 from benchmarks.service.web_process import WebProcess, serving
 from physworld_services.api.parser_process import MEMORY_BYTES
 
+pytestmark = pytest.mark.slow
+
 BUNDLE = sound_bundle()
 DECLARATIONS = range(2, 11 * 250, 11)
 

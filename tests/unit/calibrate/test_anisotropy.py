@@ -15,6 +15,8 @@ from physworld.materials.library import with_law
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
 from physworld.twin.build import build_twin
 
+pytestmark = pytest.mark.slow
+
 SIZE = np.array([0.14, 0.07, 0.03])
 MODULUS_PA, FIBRES_PA, AZIMUTH_RAD = 4e4, 6e4, 0.6
 ISOTROPIC, FIBRED = "neo_hookean", "transversely_isotropic"

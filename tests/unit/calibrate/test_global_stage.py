@@ -15,6 +15,8 @@ from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Scene
 from physworld.twin.build import build_twin
 from physworld.twin.twin import Twin
 
+pytestmark = pytest.mark.slow
+
 FRAMES, FPS = 40, 30.0
 SIGMA_M = 2e-4
 YOUNGS_MODULUS_PA = 3.1e4

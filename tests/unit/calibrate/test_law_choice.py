@@ -18,6 +18,8 @@ from physworld.materials.library import with_law
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
 from physworld.twin.build import build_twin
 
+pytestmark = pytest.mark.slow
+
 LOW, HIGH = np.array([0.0, -0.02, -0.02]), np.array([0.16, 0.02, 0.02])
 CONFIG = CalibrationConfig(particle_budget=64, max_simulations=60, damping="none")
 ANSWER = "Elastic: St. Venant-Kirchhoff | Plastic: Purely Elastic | Reason: large rotations, small strains"

@@ -15,6 +15,8 @@ from physworld.scene import UNDEFORMED_AT_REST, Body, Ground, Scene
 from physworld.twin.build import build_twin
 from physworld.twin.twin import Twin
 
+pytestmark = pytest.mark.slow
+
 LENGTH, RADIUS = 0.4, 0.004
 NOISE_M, FRAMES = 5e-5, 30
 SLOPE = -0.8

@@ -19,6 +19,8 @@ from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
 from physworld.twin.build import build_twin
 from physworld.twin.twin import Twin
 
+pytestmark = pytest.mark.slow
+
 SIZE = np.array([0.16, 0.02, 0.02])
 MODULUS_PA, NOISE_M = 4e5, 2e-5
 FRAMES = 24

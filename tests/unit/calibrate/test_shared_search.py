@@ -17,6 +17,8 @@ from physworld.estimation.simulations import Drive, Job, Workers, in_turn
 from physworld.scene import Scene
 from physworld.twin.build import build_twin
 
+pytestmark = pytest.mark.slow
+
 CONFIG = CalibrationConfig(particle_budget=60, max_simulations=140)
 
 

@@ -18,6 +18,8 @@ from physworld.trace import trace
 from physworld.twin.properties import carried, together
 from physworld.twin.twin import Twin
 
+pytestmark = pytest.mark.slow
+
 CONFIG = CalibrationConfig(particle_budget=100, max_simulations=60, damping="none")
 
 

@@ -11,6 +11,8 @@ from physworld.calibrate import CalibrationConfig, calibrate
 from physworld.scene import UNDEFORMED_AT_REST, Body, Scene
 from physworld.twin.build import build_twin
 
+pytestmark = pytest.mark.slow
+
 LENGTH, ARM, FRAMES = 0.4, 0.02, 40
 BENDING_N_M2, TORSION = 2e-3, 0.4
 

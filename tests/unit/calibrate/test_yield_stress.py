@@ -12,6 +12,8 @@ from physworld.materials.plastic import VonMises
 from physworld.scene import Scene
 from physworld.twin.build import build_twin
 
+pytestmark = pytest.mark.slow
+
 YIELD_STRESS_PA = 700.0
 FLOWING = CalibrationConfig(particle_budget=CONFIG.particle_budget, plasticity="von_mises")
 

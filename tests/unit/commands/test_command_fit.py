@@ -29,6 +29,8 @@ from physworld_workers.law_choice import chosen_laws
 from physworld_workers.tasks.fit_accuracy import fit_accuracy, not_measured
 from physworld_workers.tasks.fit_report import fit_report, parameter_json
 
+pytestmark = pytest.mark.slow
+
 FRAMES, BUDGET, SIMULATIONS = 16, 60, 100
 YOUNGS_MODULUS_PA = 4e4
 LOW, HIGH = np.array([0.0, -0.015, -0.015]), np.array([0.12, 0.015, 0.015])

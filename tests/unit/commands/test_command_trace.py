@@ -21,6 +21,8 @@ from physworld_scenes.bundle import read_bundle, write_bundle
 from physworld_workers.commands import trace
 from physworld_workers.commands.terminal import INTERRUPTED
 
+pytestmark = pytest.mark.slow
+
 BUDGET, FRAMES = 60, 10
 
 

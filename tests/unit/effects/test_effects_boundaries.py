@@ -19,6 +19,8 @@ from physworld.engine.total.formulation import TotalLagrangian
 from physworld.errors import CFLViolation
 from physworld.twin.twin import Twin
 
+pytestmark = pytest.mark.slow
+
 FIRST_ROOT = 1.8751  # of cos x cosh x = -1, the clamped-free beam
 
 

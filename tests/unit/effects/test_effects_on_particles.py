@@ -16,6 +16,8 @@ from physworld.errors import SceneUnsupported
 from physworld.materials.plastic import VonMises
 from physworld.twin.twin import Twin
 
+pytestmark = pytest.mark.slow
+
 TIMES = np.linspace(0.0, 0.4, 9)
 SETTLED = np.linspace(0.0, 1.0, 3)
 GRAVITY = (0.0, 0.0, -9.81)

@@ -20,6 +20,8 @@ from physworld.effects.registry import EFFECTS, effect
 from physworld.errors import EffectRefused, UnknownEffect
 from physworld.twin.twin import Twin
 
+pytestmark = pytest.mark.slow
+
 CASES = [
     pytest.param(name, body, id=f"{name}-{body}")
     for name, body in product(EFFECTS, SCENES)

@@ -18,6 +18,8 @@ from physworld.engine.terms.term import BoundTerm
 from physworld.materials.library import with_law
 from physworld.twin.twin import Twin
 
+pytestmark = pytest.mark.slow
+
 SINGLE_PRECISION = 3e-4  # solids carry strains in float32; relative to the largest nodal force
 DOUBLE = 2e-6
 TOLERANCE = {"solid": SINGLE_PRECISION, "sheet": DOUBLE, "rope": DOUBLE}

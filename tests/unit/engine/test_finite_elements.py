@@ -8,6 +8,8 @@ from scipy.optimize import brentq
 
 from benchmarks.peers.finite_elements import Acting, Elements, record
 
+pytestmark = pytest.mark.slow
+
 G = 9.81
 TIMES = np.arange(7) / 30.0
 NOWHERE = np.zeros(3)

@@ -15,6 +15,8 @@ from physworld.engine.problem import HeldNodes, Problem
 from physworld.engine.total.formulation import TotalLagrangian
 from physworld.errors import UnstableSimulation
 
+pytestmark = pytest.mark.slow
+
 SHAPES = ("solid", "solid with friction", "sheet", "sheet with friction", "rod", "rod with friction")
 TIMES = np.array([0.0, 0.010, 0.020, 0.032, 0.040])  # uneven: friction sees a change of the time step
 # solids strain in single precision, which limits the differences; sheets and rods are double throughout

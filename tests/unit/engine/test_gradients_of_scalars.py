@@ -20,6 +20,8 @@ from physworld.twin.build import build_twin
 from physworld.twin.gradient import TwinRun, parameter, strength
 from physworld.twin.twin import Twin
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 3
 NOT_SMOOTH = {
     ("clamp_offset", "reach_m"),

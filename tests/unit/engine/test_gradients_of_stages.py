@@ -18,6 +18,8 @@ from physworld.engine.gradients.adjoint_reverse import Gradient
 from physworld.engine.problem import HeldNodes, Problem
 from physworld.engine.total.formulation import TotalLagrangian
 
+pytestmark = pytest.mark.slow
+
 SHAPES = ("solid", "sheet", "rod", "drag alone")
 TIMES = np.array([0.0, 0.010, 0.020, 0.032, 0.040])  # uneven: stages of several lengths
 TOLERANCE = {3: 5e-3, 2: 1e-4, 1: 1e-4}

@@ -22,6 +22,8 @@ from physworld.engine.total.formulation import TotalLagrangian
 from physworld.twin.gradient import Neighbours, TwinRun, parameter, strength
 from physworld.twin.twin import Twin
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 4
 FREE = {name: replace(twin, ground_height_m=None) for name, twin in TWINS.items()}
 RUBBED = {

@@ -19,6 +19,8 @@ from physworld.materials.neo_hookean import NeoHookean
 from physworld.materials.plastic import VonMises
 from physworld.materials.solid import SolidLaw
 
+pytestmark = pytest.mark.slow
+
 SINGLE = 2e-4  # velocities are single precision and summed substep by substep
 BEAM = clamped_lattice(0.1, (0.03, 0.03), (10, 3, 3))
 LAW = NeoHookean(264e3, 0.35, density_kg_m3=1070.0)

@@ -17,6 +17,8 @@ from physworld.engine.total.energy import run_with_ledger
 from physworld.engine.total.formulation import Run, TotalLagrangian
 from physworld.errors import ContactFailed, NotDifferentiable, SceneUnsupported
 
+pytestmark = pytest.mark.slow
+
 G = 9.81
 X, Y = np.eye(3)[0], np.eye(3)[1]
 DIAMETER = 0.008

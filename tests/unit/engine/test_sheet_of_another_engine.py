@@ -12,6 +12,8 @@ from physworld.materials.sheet import SheetLaw
 from physworld.twin.build import build_twin
 from physworld.twin.twin import Twin
 
+pytestmark = pytest.mark.slow
+
 HINGED = FlexSheet(subdivision=2, frames=16, noise_sigma_m=0.0, seed=1)
 
 

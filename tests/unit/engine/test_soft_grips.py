@@ -28,6 +28,8 @@ from physworld.engine.terms.soft_grips import (
 from physworld.engine.total.formulation import TotalLagrangian
 from physworld.materials.neo_hookean import NeoHookean
 
+pytestmark = pytest.mark.slow
+
 SIZE = np.array([0.12, 0.06, 0.06])
 GRIP_LOW, GRIP_HIGH = np.array([0.0, 0.015, 0.015]), np.array([0.03, 0.045, 0.045])
 LAW = NeoHookean(1e5, 0.3, density_kg_m3=1000.0)

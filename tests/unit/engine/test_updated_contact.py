@@ -20,6 +20,8 @@ from physworld.errors import ContactFailed
 from physworld.materials.plastic import DruckerPrager, Plasticity, VonMises
 from physworld.shapes import sdf
 
+pytestmark = pytest.mark.slow
+
 LAW = NeoHookean(2e5, 0.3, 20.0, 1000.0)
 BLOCK = box_lattice(np.array([-0.05, -0.05, 0.0]), np.array([0.1, 0.1, 0.05]), (4, 4, 2))
 MASS, G = 0.5, 9.81

@@ -15,6 +15,8 @@ from physworld.engine.updated.stress_kernels import particle_model
 from physworld.materials.neo_hookean import NeoHookean
 from physworld.materials.plastic import PLASTICITIES
 
+pytestmark = pytest.mark.slow
+
 
 def compiled(module: object, folder: Path) -> bool:
     wp.compile_aot_module(module, arch=80, module_dir=str(folder), use_ptx=True)

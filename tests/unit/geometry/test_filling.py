@@ -11,6 +11,8 @@ from physworld.geometry.filling import (
     median_spacing,
 )
 
+pytestmark = pytest.mark.slow
+
 STEP = 0.1
 
 

@@ -13,6 +13,8 @@ from physworld_scenes.errors import SceneInvalid
 from physworld_scenes.importers import ImportOptions, import_any
 from physworld_scenes.importers.c3d import ROTATION_FROM_UP, fill_gaps
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 30
 LABELS = ["tip1", "tip2", "tip3", "base1", "base2", "base3"]
 FLOAT32 = 1e-6  # metres: C3D stores float32 millimetres

@@ -10,6 +10,8 @@ from physworld.errors import SceneUnsupported
 from physworld.shapes import sdf
 from physworld.shapes.surface_mesh import SurfaceMesh, merged
 
+pytestmark = pytest.mark.slow
+
 CLOUD = np.random.default_rng(0).uniform(-0.3, 0.3, size=(2000, 3))
 SHAPES = {
     "sphere": (sdf.sphere(0.1), trimesh.creation.icosphere(subdivisions=5, radius=0.1)),

@@ -23,6 +23,8 @@ from physworld_storage.jobs import jobs
 from physworld_storage.patience import WORKING
 from physworld_storage.tables import Base, JobRow, SceneRow, utc_now
 
+pytestmark = pytest.mark.slow
+
 if TYPE_CHECKING:
     from conftest import Work
 

@@ -29,6 +29,8 @@ from physworld_storage.errors import EpisodeCorrupt, NotFound
 from physworld_storage.settings import Settings
 from physworld_storage.store import open_store
 
+pytestmark = pytest.mark.slow
+
 DATASET = "dst_01TEST"
 
 

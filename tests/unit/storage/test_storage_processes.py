@@ -10,12 +10,15 @@ import time
 from multiprocessing.process import BaseProcess
 from typing import TYPE_CHECKING
 
+import pytest
 from sqlalchemy import func, select
 
 from physworld_storage import resources
 from physworld_storage.database import Database
 from physworld_storage.jobs import leases
 from physworld_storage.tables import EpisodeRow, JobRow, ShardRow
+
+pytestmark = pytest.mark.slow
 
 if TYPE_CHECKING:
     from ctypes import c_int

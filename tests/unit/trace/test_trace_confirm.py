@@ -18,6 +18,8 @@ from physworld.trace.confirm import Confirmation, Model
 from physworld.trace.selection import Selection
 from physworld.twin.build import build_twin
 
+pytestmark = pytest.mark.slow
+
 VISCOSITY_PA_S, FAR_PA, STIFF_N_M = 120.0, 1.2e5, 3.0
 
 

@@ -14,6 +14,8 @@ from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
 from physworld.trace import TraceConfig, TraceResult, document, trace
 from physworld.twin.build import build_twin
 
+pytestmark = pytest.mark.slow
+
 LOW, HIGH = np.array([0.0, -0.02, -0.02]), np.array([0.2, 0.02, 0.02])
 FRAMES, SIGMA = 36, 1e-3
 RATE_PER_S, VISCOSITY_PA_S = 2.5, 90.0

@@ -27,6 +27,8 @@ from physworld.trace.recordings import (
 from physworld.trace.unknowns import with_strengths
 from physworld.twin.build import build_twin
 
+pytestmark = pytest.mark.slow
+
 LOW, HIGH = np.array([0.0, -0.015, -0.015]), np.array([0.16, 0.015, 0.015])
 SIGMA, YOUNGS_MODULUS_PA, BUDGET = 5e-4, 1.5e5, 120
 CONFIG = TraceConfig(

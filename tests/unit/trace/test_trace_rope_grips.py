@@ -17,6 +17,8 @@ from physworld.trace.unknowns import grip_compliance
 from physworld.twin.build import build_twin
 from physworld.twin.twin import Twin
 
+pytestmark = pytest.mark.slow
+
 LENGTH, RADIUS, DENSITY, SIGMA, FRAMES = 0.4, 0.0075, 900.0, 2e-4, 40
 YOUNG_PA, POISSON, SHEAR_SHARE = 1e6, 0.4, 0.9
 CONFIG = TraceConfig(

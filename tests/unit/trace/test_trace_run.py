@@ -17,6 +17,8 @@ from physworld.trace import Memory, TraceConfig, TraceResult, document, trace
 from physworld.twin.build import build_twin
 from physworld.twin.twin import Twin
 
+pytestmark = pytest.mark.slow
+
 LOW, HIGH = np.array([0.0, -0.015, -0.015]), np.array([0.16, 0.015, 0.015])
 FRAMES, SIGMA, YOUNGS_MODULUS_PA = 32, 1e-3, 1.5e5
 LIBRARY = ("air_drag_linear", "viscosity_kelvin_voigt", "gravity_tilt", "actuation_lag", "measurement_clock",

@@ -15,6 +15,8 @@ from physworld.trace.score import Scores, orthonormal, project, scores
 from physworld.trace.sensitivity import Response, candidate_responses
 from physworld.trace.tethers import _any_length, tethers_between, with_tethers
 
+pytestmark = pytest.mark.slow
+
 STIFFNESS_N_M, COMPLETE = 2.0, 1.2
 WAY = np.array([0.35, 0.9, -0.25]) / np.linalg.norm([0.35, 0.9, -0.25])
 

@@ -17,6 +17,8 @@ from physworld.trace.preparation import CONFIRMATION, SELECTION, Clock
 from physworld.trace.verdict import NAMED, NOTHING, UNEXPLAINED, Verdict
 from physworld.twin.build import build_twin
 
+pytestmark = pytest.mark.slow
+
 CONFIG = TraceConfig(
     calibration=CalibrationConfig(particle_budget=BUDGET, damping="none"),
     candidates=("air_drag_linear", "gravity_tilt"),

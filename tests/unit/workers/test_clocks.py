@@ -24,6 +24,8 @@ from physworld_storage.jobs import jobs, leases
 from physworld_storage.settings import Settings
 from physworld_storage.tables import ShardRow
 
+pytestmark = pytest.mark.slow
+
 POSTGRES_VARIABLE = "PHYSWORLD_TEST_POSTGRES_URL"
 HOST = Path(__file__).with_name("wrong_clock.py")
 WITHIN_S = 30.0

@@ -29,6 +29,8 @@ from physworld_workers.stores import Stores
 from physworld_workers.tasks.dataset import strength_ranges
 from physworld_workers.tasks.inputs import named, npz_bytes, twin_of
 
+pytestmark = pytest.mark.slow
+
 FIT = FitConfig(particle_budget=60, max_simulations=6)
 
 

@@ -15,6 +15,8 @@ from physworld_storage.jobs import jobs
 from physworld_workers.law_choice import AUTO, chosen_laws
 from physworld_workers.stores import Stores
 
+pytestmark = pytest.mark.slow
+
 SMALL = {"particle_budget": 60, "max_simulations": 8, "damping": "none"}
 
 

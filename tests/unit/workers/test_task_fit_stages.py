@@ -21,6 +21,8 @@ from physworld_storage.jobs import jobs
 from physworld_workers.stores import Stores
 from physworld_workers.tasks.inputs import named, npz_arrays
 
+pytestmark = pytest.mark.slow
+
 SIZE = np.array([0.16, 0.02, 0.02])
 CONFIG = FitConfig(
     particle_budget=60, max_simulations=40, damping="none", stages="global+local", numerics=False

@@ -31,6 +31,8 @@ from physworld_workers.stores import Stores
 from physworld_workers.tasks import trace as task
 from physworld_workers.tasks.inputs import named, npz_arrays, npz_bytes, twin_of
 
+pytestmark = pytest.mark.slow
+
 SMALL = TraceConfig(candidates=["air_drag_linear"], confirmed=1, iterations=1, resamples=100)
 FIT = FitConfig(particle_budget=60, max_simulations=2, damping="none")
 

@@ -27,6 +27,8 @@ from physworld_workers.tasks import fit as fit_task
 from physworld_workers.tasks.inputs import named, npz_arrays, npz_bytes
 from physworld_workers.tasks.shared_runs import JOURNAL, stored_journal
 
+pytestmark = pytest.mark.slow
+
 EPISODES = 3
 
 

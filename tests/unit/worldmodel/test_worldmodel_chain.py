@@ -31,6 +31,8 @@ from physworld.worldmodel.priors.choose import fit_priors, prior_error
 from physworld.worldmodel.rollout import unroll
 from physworld.worldmodel.training import train
 
+pytestmark = pytest.mark.slow
+
 FOLLOWED = 0.04  # mean distance over an episode, as a share of the length; this rope falls and whips
 AGREEMENT_M = 2e-5  # single precision over a tick of some hundred substeps
 ROUND_OFF_M = 1e-6

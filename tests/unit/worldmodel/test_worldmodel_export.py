@@ -23,6 +23,8 @@ from physworld.worldmodel.model.model import WorldModel
 from physworld.worldmodel.native.engine import RolloutEngine
 from physworld.worldmodel.priors.modal import fit_prior
 
+pytestmark = pytest.mark.slow
+
 AGREEMENT_M = 1e-5
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "models.md"
 

@@ -19,6 +19,8 @@ from physworld.worldmodel.published import PublishedModel
 from physworld.worldmodel.rollout import rollout, unroll
 from physworld.worldmodel.training import train
 
+pytestmark = pytest.mark.slow
+
 TRAINING = TrainingConfig(
     steps=150, batch_size=8, look_ahead=6, learning_rate=3e-3, validation_every=50, validation_fraction=0.2
 )

@@ -23,6 +23,8 @@ from physworld.worldmodel.native.engine import RolloutEngine
 from physworld.worldmodel.rollout import unroll
 from physworld.worldmodel.training import train
 
+pytestmark = pytest.mark.slow
+
 CURRENT = dataclasses.replace(SMALL, near_edges="current")
 SCALES = Normalisation(
     velocity=3e-3,

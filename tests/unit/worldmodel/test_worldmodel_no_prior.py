@@ -19,6 +19,8 @@ from physworld.worldmodel.native.engine import RolloutEngine
 from physworld.worldmodel.rollout import unroll
 from physworld.worldmodel.training import TrainingResult, open_loop_error, train
 
+pytestmark = pytest.mark.slow
+
 SETTINGS = TrainingConfig(
     steps=150, look_ahead=10, validation_every=50, learning_rate=1e-2, prior="none", noise_properties=0.1
 )

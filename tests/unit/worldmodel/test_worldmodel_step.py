@@ -28,6 +28,8 @@ from physworld.worldmodel.priors.chain import ChainPhysics, ChainPrior, chain_of
 from physworld.worldmodel.priors.chain_layout import arc_lengths, held_vertices, lay_out
 from physworld.worldmodel.priors.modal import ModalPrior, fit_prior
 
+pytestmark = pytest.mark.slow
+
 AGREEMENT = 1e-4  # of the network's correction; single precision, over the some hundred substeps of a chain
 LEAST_CORRECTION_M = 1e-2
 CURRENT = dataclasses.replace(held_bar.SMALL, near_edges="current")

@@ -21,6 +21,8 @@ from physworld.worldmodel.model.config import TrainingConfig
 from physworld.worldmodel.rollout import rollout
 from physworld.worldmodel.training import train
 
+pytestmark = pytest.mark.slow
+
 SHORT = TrainingConfig(
     steps=12, batch_size=2, look_ahead=2, validation_every=4, checkpoint_every=4, validation_fraction=0.2
 )

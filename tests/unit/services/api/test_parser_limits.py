@@ -11,6 +11,8 @@ import pytest
 
 from physworld_services.api.parser_process import CPU_S, MEBIBYTE, MEMORY_BYTES, Limits
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[4]
 
 

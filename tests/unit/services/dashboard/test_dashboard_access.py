@@ -22,6 +22,8 @@ from physworld_storage.database import Database, open_database
 from physworld_storage.settings import Settings
 from physworld_storage.tables import SessionRow, utc_now
 
+pytestmark = pytest.mark.slow
+
 PAGE = {"accept": "text/html"}
 
 

@@ -28,6 +28,8 @@ from physworld_storage.jobs import jobs, leases
 from physworld_storage.settings import Settings
 from physworld_storage.tables import AssessmentRow, ModelRow, ModelVersionRow, ShardRow, utc_now
 
+pytestmark = pytest.mark.slow
+
 REPORT: dict[str, Any] = {
     "scene": "tiny bar",
     "verdict": "named",

@@ -31,6 +31,8 @@ from physworld_workers.owner import process_owner
 from physworld_workers.stores import Stores
 from physworld_workers.tasks.inputs import named, npz_bytes, twin_of
 
+pytestmark = pytest.mark.slow
+
 WEIGHTS = "model.safetensors"
 FRAMES = 48
 FIT = FitConfig(particle_budget=60, max_simulations=4)

@@ -43,6 +43,8 @@ from physworld_workers.owner import process_owner
 from physworld_workers.stores import Stores
 from physworld_workers.tasks.inputs import scene_of, twin_of
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 24
 FORMER_ARRAYS = ("times", "particles", "controllers", "properties")
 SMALL = TrainingConfig(
