@@ -29,8 +29,8 @@ from physworld_scenes.archives import (
     write_arrays,
     write_zip,
 )
-from physworld_scenes.checks_measured import hold
 from physworld_scenes.colliders import (
+    MAX_MESH_BYTES,
     Fetch,
     collider_facts,
     colliders_of,
@@ -40,7 +40,7 @@ from physworld_scenes.colliders import (
 )
 from physworld_scenes.declaration import SCHEMA_VERSION, UNDEFORMED_TEXT, parse_json
 from physworld_scenes.errors import SceneInvalid
-from physworld_scenes.meshes import MAX_MESH_BYTES
+from physworld_scenes.measured import hold
 from physworld_scenes.validation import check_scene
 from physworld_schemas.base import FieldError
 

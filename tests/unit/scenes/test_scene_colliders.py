@@ -14,8 +14,8 @@ from scene_parts import FRAMES, sound_parts
 
 from physworld_scenes.archives import write_arrays, write_zip
 from physworld_scenes.bundle import bundle_from_bytes, canonical_archive, read_bundle, validate, write_bundle
+from physworld_scenes.colliders import MeshRefused, read_mesh, write_mesh
 from physworld_scenes.errors import SceneInvalid
-from physworld_scenes.meshes import MeshRefused, read_mesh, write_mesh
 
 PEG = trimesh.creation.icosphere(subdivisions=2, radius=0.03)
 

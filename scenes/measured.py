@@ -1,4 +1,4 @@
-"""Checks of a scene's arrays: shapes, times, values, visibility, units, jumps, controllers.
+"""Checks of what was measured: shapes, times, places, visibility, units, jumps, controllers.
 
 Every check adds its findings and lets the next one run, so that one reading names every fault. A *fault* says
 that no result could be trusted; a *warning* says that a person should look. Thresholds stand at the top with
@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from physworld.arrays import Array
+from physworld_schemas.arrays import FARTHEST_M
 from physworld_schemas.base import FieldError
 
 LARGEST_OBJECT_M = 20.0
@@ -51,6 +52,7 @@ ARRAY_SHAPES = {
 }
 REQUIRED = ("points", "visible", "controllers", "times")
 NEVER_EMPTY = ("rest_volume_points", "ctrl_times", "ctrl_points")
+PLACES = ("points", "controllers", "ctrl_points", "rest_volume_points", "surface_points")
 
 
 @dataclass
@@ -160,6 +162,31 @@ def check_times(times: Array, fps: float | None, findings: Findings) -> None:
             f"the median step {median:.6g} s means {1 / median:.4g} frames/s, declared are {fps:.4g}{unit}"
         )
         (findings.fault if factor > FPS_FAULT else findings.warn)(where, message)
+
+
+def check_places(arrays: dict[str, Array], measured: Measured, findings: Findings) -> bool:
+    """Whether all places are within ``FARTHEST_M`` of the origin along each axis; the others are named.
+
+    What is computed with a place of 1e300 m overflows, and at 1 km single precision no longer resolves a
+    tracking error.
+    """
+    near = True
+    cleaned = {"points": measured.points, "controllers": measured.controllers}
+    for name in PLACES:
+        given = cleaned.get(name, arrays.get(name))
+        if given is None or not given.size or given.dtype.kind not in "fiu":
+            continue
+        far = np.nan_to_num(np.abs(given.astype(np.float64)), posinf=0.0)  # those are another check's
+        if far.max() > FARTHEST_M:
+            first = tuple(int(i) for i in np.unravel_index(int(far.argmax()), far.shape))
+            findings.fault(
+                ["scene.npz", name],
+                f"{int((far > FARTHEST_M).sum())} of {far.size} values are farther than {FARTHEST_M:g} m from the"
+                " origin,"
+                f" the farthest {far.max():.4g} m at {first}: not metres?{unit_hint(measured.size_m)}",
+            )
+            near = False
+    return near
 
 
 def check_visibility(measured: Measured, findings: Findings) -> None:
