@@ -9,7 +9,7 @@ that is passed in.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +21,7 @@ from physworld.worldmodel.errors import DatasetUnusable
 from physworld.worldmodel.model.features import Normalisation, cut_rest_length, cut_strain
 from physworld.worldmodel.model.graph import EDGE_KINDS, NEAR, GraphSpec
 from physworld.worldmodel.model.nearest import near_ends
+from physworld.worldmodel.model.properties import EPISODE_FIELDS, PROPERTIES, PhiColumn
 
 SCALE_FLOOR_M = 1e-7
 PROPERTY_FLOOR = 0.05
@@ -55,11 +56,23 @@ def graph_origin(spec: GraphSpec, vertices: Array) -> Array:
 
 
 def read_track(
-    spec: GraphSpec, arrays: dict[str, Array], history: int, strengths: Array | None = None
+    spec: GraphSpec,
+    arrays: dict[str, Array],
+    history: int,
+    columns: Sequence[PhiColumn] = PROPERTIES,
+    values: Mapping[str, float] | None = None,
 ) -> Track:
-    """The graph's vertices of an episode; ``strengths`` (m,) of effects are further columns of Φ after its properties.
+    """The graph's vertices of an episode.
 
-    Raises DatasetUnusable with the numbers.
+    Args:
+        spec: the graph.
+        arrays: the episode's, see the module's text.
+        history: h.
+        columns: of Φ; what the episode holds as a field (``EPISODE_FIELDS``) is read by place.
+        values: the others by name, one number each.
+
+    Raises:
+        DatasetUnusable: with the numbers.
     """
     times, controllers = arrays["times"], arrays["controllers"]
     frames = len(times)
@@ -80,9 +93,11 @@ def read_track(
     else:
         body = arrays["particles"][:, spec.particle_index]
     vertices = np.concatenate([body, controllers[:, spec.control_index]], axis=1, dtype=np.float64)
-    phi = np.asarray(arrays["properties"], dtype=np.float64)[spec.particle_index]
-    if strengths is not None:
-        phi = np.concatenate([phi, np.broadcast_to(strengths, (len(phi), len(strengths)))], axis=1)
+    properties = np.asarray(arrays["properties"], dtype=np.float64)[spec.particle_index]
+    fields = dict(zip(EPISODE_FIELDS, properties.T, strict=False))
+    phi = np.empty((len(properties), len(columns)))
+    for k, column in enumerate(columns):
+        phi[:, k] = fields[column.name] if column.name in fields else (values or {})[column.name]
     if not (np.isfinite(vertices).all() and np.isfinite(phi).all()):
         raise DatasetUnusable("an episode holds values that are not finite")
     vertices -= graph_origin(spec, vertices[0, : spec.object_count])

@@ -7,7 +7,7 @@ the skinned tracked points with the visible measured ones:
     loss = MSE / s² + chamfer_weight · Chamfer / s + smoothness_weight · ‖(Φ - Φ_start) / σ_properties‖²
 
 where s is the root-mean-square excursion of the measured points and Chamfer goes from the measured points
-to the nearest predicted ones. Strengths of effects that the model takes (``WorldModel.strength_count``) are optimised
+to the nearest predicted ones. Strengths of effects that the model takes (``WorldModel.shared_columns``) are optimised
 with Φ, one number each for the whole body, and kept within their intervals. The states are refreshed by a new rollout
 each time the inner validation is made. That one, the open-loop error on the last share of the *training* frames,
 decides when to stop and whether the result is kept at all: a Φ that does not beat the calibrated one there is thrown
@@ -27,7 +27,8 @@ from physworld.arrays import Array
 from physworld.worldmodel.dataset import graph_origin
 from physworld.worldmodel.errors import TrainingCancelled
 from physworld.worldmodel.model.config import FineTuneConfig
-from physworld.worldmodel.model.model import PROPERTY_COUNT, WorldModel
+from physworld.worldmodel.model.model import WorldModel
+from physworld.worldmodel.model.properties import PROPERTIES
 from physworld.worldmodel.model.skinning import Skin
 from physworld.worldmodel.native.engine import RolloutEngine
 
@@ -56,10 +57,12 @@ class Recording:
 
 @dataclass(frozen=True)
 class FineTuneResult:
-    """``phi`` (n, 2), ``strengths`` (m,); the inner validation error [m] before and after; whether they were kept."""
+    """``phi`` (n, 2), ``strengths`` by name of their column; the inner validation error [m] before and after; whether
+    they were kept.
+    """
 
     phi: Array
-    strengths: Array
+    strengths: dict[str, float]
     error_before_m: float
     error_after_m: float
     kept: bool
@@ -73,22 +76,29 @@ def fine_tune(
     skin: Skin,
     config: FineTuneConfig,
     *,
-    bounds: Array | None = None,
     progress: Callable[[int, int, float], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> FineTuneResult:
-    """Optimise ``phi`` (n, 2), and strengths from 0 on, on the recording's training frames; see the module's docstring.
-
-    Args:
-        bounds: smallest and largest value of each strength in the model's units, (m, 2).
+    """Optimise Φ, and strengths from 0 on, on the recording's training frames; see the module's docstring.
 
     A recording without a frame (training ends within the network's history) leaves everything as it is.
+
+    Args:
+        model: whose weights are frozen; the shared columns of its Φ have limits.
+        phi: where Φ starts, (n, 2).
+        recording: what is approached.
+        skin: how vertices carry its points.
+        config: steps, segments, weights of the loss.
+        progress: called after each step with (step, steps, loss).
+        cancelled: asked before each step; true raises TrainingCancelled.
     """
-    limits = np.zeros((0, 2)) if bounds is None else np.asarray(bounds, dtype=float)
-    if limits.shape != (model.strength_count, 2):
-        raise ValueError(f"bounds {limits.shape}, the model takes {model.strength_count} strengths")
+    shared = model.shared_columns
+    if unlimited := [one.name for one in shared if one.limits is None]:
+        raise ValueError(f"no limits for the model's columns {', '.join(unlimited)}")
+    limits = np.array([one.limits for one in shared], dtype=float).reshape(-1, 2)
     if not len(recording.ticks):
-        return FineTuneResult(np.array(phi, dtype=float), np.zeros(len(limits)), np.nan, np.nan, False, 0)
+        still = dict.fromkeys((one.name for one in shared), 0.0)
+        return FineTuneResult(np.array(phi, dtype=float), still, np.nan, np.nan, False, 0)
     trainable = [parameter for parameter in model.parameters() if parameter.requires_grad]
     for parameter in trainable:
         parameter.requires_grad_(False)
@@ -108,14 +118,14 @@ def _optimise(
 ) -> FineTuneResult:
     """Adam on Φ and the strengths until the inner validation stops improving."""
     model, config = task.model, task.config
-    scale = model.norm.properties
+    scale, local_count = model.norm.properties, len(PROPERTIES)
     start = torch.as_tensor(phi, dtype=torch.float32)
     start = torch.cat([start, start.new_zeros(len(start), len(limits))], dim=1)
-    low, high = (torch.as_tensor(side, dtype=torch.float32) / scale[PROPERTY_COUNT:] for side in limits.T)
+    low, high = (torch.as_tensor(side, dtype=torch.float32) / scale[local_count:] for side in limits.T)
     path = task.rollout(start)
     before = best = task.validation_error(path)
     best_phi, best_step, step = start, 0, 0
-    local = torch.zeros_like(start[:, :PROPERTY_COUNT], requires_grad=True)
+    local = torch.zeros_like(start[:, :local_count], requires_grad=True)
     shared = torch.zeros(len(limits), requires_grad=True)
     optimiser = torch.optim.Adam([local, shared], lr=config.learning_rate)
     while step < config.steps and task.segments:
@@ -143,8 +153,9 @@ def _optimise(
             elif step - best_step >= PATIENCE_CHECKS * CHECK_EVERY:
                 break
     found = best_phi.double().numpy()
-    strengths = found[0, PROPERTY_COUNT:].copy()
-    return FineTuneResult(found[:, :PROPERTY_COUNT].copy(), strengths, before, best, best_step > 0, step)
+    names = [one.name for one in model.shared_columns]
+    strengths = dict(zip(names, found[0, local_count:].tolist(), strict=True))
+    return FineTuneResult(found[:, :local_count].copy(), strengths, before, best, best_step > 0, step)
 
 
 class _Task:
@@ -166,7 +177,7 @@ class _Task:
         self.fitting = max(1, round((1.0 - config.validation_fraction) * len(self.left)))
         self.segments = self._segments(int(self.left[self.fitting - 1]))
         self.constants = model.edge_constants()
-        self.engine = None if model.strength_count else RolloutEngine(model)
+        self.engine = None if model.shared_columns else RolloutEngine(model)
 
     def _excursion(self) -> float:
         """s: root mean square distance [m] of the visible measured points from their own means."""
@@ -186,9 +197,14 @@ class _Task:
 
     def rollout(self, phi: Tensor) -> Tensor:
         """Open loop over the training frames, (T, V, 3)."""
-        engine = self.engine or RolloutEngine(self.model.at_strengths(phi[0, PROPERTY_COUNT:]))
-        own = phi[:, :PROPERTY_COUNT].numpy()
+        own = phi[:, : len(PROPERTIES)].numpy()
+        engine = self.engine or RolloutEngine(self.model.at_strengths(self._strengths(phi)))
         return torch.from_numpy(engine.run(self.start, self.driven.numpy()[:, :, 0], own))
+
+    def _strengths(self, phi: Tensor) -> dict[str, float]:
+        """The shared columns of Φ by name."""
+        names = (one.name for one in self.model.shared_columns)
+        return dict(zip(names, phi[0, len(PROPERTIES) :].tolist(), strict=True))
 
     def validation_error(self, path: Tensor) -> float:
         """Mean distance [m] of visible points in the frames that the fit does not see; infinite if not a

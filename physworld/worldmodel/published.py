@@ -11,7 +11,10 @@ Beside the network's tensors (``physworld.worldmodel.model.model``) a version ho
     skin.index (N, 8) int64, skin.weight (N, 8)   tracked point = Σ_k weight · vertex[index]
 
 and the facts (``architecture`` of the card): the ``WorldModelConfig``, ``dt_s``, ``ground_height_m`` (null:
-none), ``vertex_spacing_m``, ``edge_radius_m``, ``object_vertices`` n, ``control_vertices`` C, ``edges``.
+none), ``vertex_spacing_m``, ``edge_radius_m``, ``object_vertices`` n, ``control_vertices`` C, ``edges``, and ``phi``,
+the columns of Φ in their order, each with name, unit, whether it is logarithmic, whether the whole body shares it,
+and its root mean square over the training episodes; versions without the last have stiffness and density, both
+logarithms of ratios.
 
 A rollout starts with ``start.history`` and ``start.controllers``, or from rest: one frame h+1 times with
 still controllers. Its single-precision origin is the mean of the history's last frame; its z is the
@@ -20,6 +23,7 @@ ground's height where there is a ground.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
@@ -33,6 +37,7 @@ from physworld.worldmodel.model.config import WorldModelConfig
 from physworld.worldmodel.model.graph import EDGE_KINDS, GraphSpec
 from physworld.worldmodel.model.inertia import InertialPrior
 from physworld.worldmodel.model.model import WorldModel
+from physworld.worldmodel.model.properties import PhiColumn, columns_of, with_named
 from physworld.worldmodel.model.skinning import Skin
 from physworld.worldmodel.native.engine import RolloutEngine
 from physworld.worldmodel.priors.chain import ChainPrior
@@ -60,14 +65,32 @@ class PublishedModel:
         """The graph."""
         return self.model.spec
 
-    def rollout(self, controllers: Array, *, history: Array | None = None, phi: Array | None = None) -> Array:
-        """Object vertices (T, n, 3) [m] for controllers (T, K, 3) at ticks from the start's first one."""
+    @property
+    def columns(self) -> tuple[PhiColumn, ...]:
+        """What the columns of Φ stand for."""
+        return self.model.columns
+
+    def phi_with(self, named: Mapping[str, float | Array]) -> Array:
+        """The fine-tuned Φ (n, 2) with columns replaced by name, each by a number or by (n,)."""
+        return with_named(self.columns, self.phi, named)
+
+    def rollout(
+        self,
+        controllers: Array,
+        *,
+        history: Array | None = None,
+        phi: Array | Mapping[str, float | Array] | None = None,
+    ) -> Array:
+        """Object vertices (T, n, 3) [m] for controllers (T, K, 3) at ticks from the start's first one.
+
+        ``phi``: (n, 2), or columns of it by name; by default as fine-tuned.
+        """
         return rollout(
             self.model,
             self.spec,
             self.start_history if history is None else history,
             controllers,
-            self.phi if phi is None else phi,
+            self._phi(phi),
         )
 
     @cached_property
@@ -80,18 +103,30 @@ class PublishedModel:
         controllers: Array,
         *,
         history: Array | None = None,
-        phi: Array | None = None,
+        phi: Array | Mapping[str, float | Array] | None = None,
         threads: int = 1,
     ) -> Array:
-        """Object vertices (B, T, n, 3) [m] for candidates (B, T, K, 3) that share their first h+1 ticks."""
+        """Object vertices of every candidate [m], (B, T, n, 3).
+
+        Args:
+            controllers: (B, T, K, 3) [m]; candidates share their first h+1 ticks.
+            history: object vertices at these ticks [m], (h+1, n, 3); by default the recording's.
+            phi: (n, 2) or (B, n, 2), or columns by name; by default as fine-tuned.
+            threads: that share the candidates.
+        """
         return rollout_batch(
             self.engine,
             self.spec,
             self.start_history if history is None else history,
             controllers,
-            self.phi if phi is None else phi,
+            self._phi(phi),
             threads=threads,
         )
+
+    def _phi(self, phi: Array | Mapping[str, float | Array] | None) -> Array:
+        if phi is None:
+            return self.phi
+        return self.phi_with(phi) if isinstance(phi, Mapping) else phi
 
     def to_tensors(self) -> dict[str, Array]:
         """Every array by its published name."""
@@ -133,6 +168,10 @@ class PublishedModel:
             "object_vertices": spec.object_count,
             "control_vertices": spec.control_count,
             "edges": spec.edge_count,
+            "phi": [
+                one.described(float(spread))
+                for one, spread in zip(self.columns, self.model.norm.properties, strict=True)
+            ],
         }
 
     @classmethod
@@ -183,7 +222,7 @@ class PublishedModel:
         )
         prior = _prior_of(tensors)
         _refuse_other_sizes(tensors, prior, config, spec)
-        model = WorldModel(config, spec, prior=prior)
+        model = WorldModel(config, spec, prior=prior, columns=columns_of(facts.get("phi")))
         network = {name: value for name, value in tensors.items() if not name.startswith(_OWN)}
         model.load_state_dict({name: torch.as_tensor(value) for name, value in network.items()})
         return cls(

@@ -44,6 +44,7 @@ from physworld.worldmodel.model.config import TrainingConfig, WorldModelConfig
 from physworld.worldmodel.model.features import Normalisation
 from physworld.worldmodel.model.graph import GraphSpec
 from physworld.worldmodel.model.model import WorldModel
+from physworld.worldmodel.model.properties import PROPERTIES, PhiColumn
 from physworld.worldmodel.priors.choose import Prior, fit_priors, prior_error
 from physworld.worldmodel.priors.prior_step import prior_step
 from physworld.worldmodel.rollout import mean_error, rollout_tracks
@@ -115,6 +116,7 @@ def train(
     config: WorldModelConfig,
     training: TrainingConfig,
     *,
+    columns: tuple[PhiColumn, ...] = PROPERTIES,
     total: int | None = None,
     later: Callable[[int], Track] | None = None,
     checkpoint: bytes | None = None,
@@ -126,6 +128,10 @@ def train(
 
     Args:
         tracks: every episode, or the first :func:`first_episodes` of ``total`` when the others come ``later``.
+        spec: the graph.
+        config: the network.
+        training: steps, batches, rates, seed.
+        columns: what the columns of the tracks' Φ stand for.
         total: how many episodes there will be; by default those of ``tracks``.
         later: gives an episode by its index, when it is there; raises TrainingCancelled while it waits.
         checkpoint: bytes that an earlier, interrupted run gave to ``save_checkpoint``.
@@ -150,7 +156,7 @@ def train(
     prior = priors[chosen]
     alone = prior_step(prior, h)
     scales = measure_scales(fitting, spec, lambda track: alone.residual(track.positions, track.phi))
-    run = _start(config, spec, scales, prior, training)
+    run = _start(config, spec, scales, prior, columns, training)
     identity = _identity(config, training, scales)
     if checkpoint is not None:
         _restore(run, checkpoint, identity)
@@ -215,11 +221,12 @@ def _start(
     spec: GraphSpec,
     scales: Normalisation,
     prior: Prior,
+    columns: tuple[PhiColumn, ...],
     training: TrainingConfig,
 ) -> _Run:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(training.seed)
-        model = WorldModel(config, spec, scales, prior)
+        model = WorldModel(config, spec, scales, prior, columns)
     generator = torch.Generator().manual_seed(training.seed)
     optimiser = torch.optim.Adam(model.parameters(), lr=training.learning_rate)
     return _Run(model, copy.deepcopy(model), optimiser, generator)

@@ -14,6 +14,7 @@ import numpy as np
 from physworld.arrays import Array
 from physworld.worldmodel.controls import on_clock, peak_speed
 from physworld.worldmodel.errors import ControlsInvalid, WorldModelError
+from physworld.worldmodel.model.properties import DENSITY, STIFFNESS
 from physworld.worldmodel.published import PublishedModel
 from physworld_schemas.arrays import FARTHEST_M, ArrayInput, array_of
 from physworld_schemas.rollout import (
@@ -168,7 +169,9 @@ def _phi(request: RolloutCreate, model: PublishedModel, candidates: int) -> Arra
         phi = _read(request.phi, "phi", (2, 3), MAX_LOG_RATIO)
         if phi.shape not in ((n, 2), (candidates, n, 2)):
             raise ControlsInvalid(f"phi of shape {phi.shape}, not ({n}, 2) or ({candidates}, {n}, 2)", "phi")
-    return phi + np.log([request.stiffness_factor, request.density_factor])
+    factors = {STIFFNESS: request.stiffness_factor, DENSITY: request.density_factor}
+    shifts: Array = np.log([factors[column.name] for column in model.columns])
+    return phi + shifts
 
 
 def _check(vertices: Array, first: int, lead: int, dt_s: float) -> None:

@@ -8,17 +8,16 @@ has to be sealed: a version names the digest of the data it learned from.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from physworld.arrays import Array
 from physworld.demonstrate.config import StrengthRange
 from physworld.demonstrate.perturbation import BOUND_SIGMAS
 from physworld.worldmodel.dataset import VERTEX_ARRAYS, Track, has_vertices, read_track
 from physworld.worldmodel.model.graph import GraphSpec
-from physworld.worldmodel.model.model import PROPERTY_COUNT
+from physworld.worldmodel.model.properties import FRICTION, PROPERTIES, PhiColumn
 from physworld_schemas.base import Reference
 from physworld_schemas.dataset import Dataset, Episode
 from physworld_storage import resources
@@ -31,9 +30,17 @@ from physworld_workers.tasks.dataset import demonstration_of
 POLL_S = 0.5
 
 
-def half(one: StrengthRange) -> float:
-    """Half the width of a strength's interval."""
-    return 0.5 * (one.high - one.low)
+def column_of(one: StrengthRange) -> PhiColumn:
+    """A strength as a column of Φ: its distance from the estimate in half-widths of its interval."""
+    half = 0.5 * (one.high - one.low)
+    return PhiColumn(
+        name=f"{one.effect}.{one.name}",
+        logarithmic=False,
+        shared=True,
+        calibrated=one.value,
+        half_width=half,
+        limits=((one.low - one.value) / half, (one.high - one.value) / half),
+    )
 
 
 class Episodes:
@@ -41,8 +48,7 @@ class Episodes:
 
     Attributes:
         total: how many there are, or will be.
-        strengths: of the trace's effects that the episodes differ in, with their intervals.
-        friction: the ground's fitted coefficient where the episodes differ in it, else None.
+        columns: of Φ: the properties, the ground's friction and the effects' strengths if the episodes differ in them.
         reached: steps taken and to take, for the progress while it waits.
     """
 
@@ -61,11 +67,16 @@ class Episodes:
         dataset = self._dataset()
         self.total = dataset.config.episodes
         perturbed = dataset.config.effects != "as_found"
-        self.strengths = tuple(one for one in strengths if perturbed and one.low < one.high)
+        varied = [one for one in strengths if perturbed and one.low < one.high]
+        self._intervals = {column_of(one).name: (one.low, one.high) for one in varied}
         demonstration = demonstration_of(dataset.config)
-        self._friction_sigma = demonstration.sigma_of("friction")
-        self._most_friction = min(BOUND_SIGMAS * self._friction_sigma, np.log(demonstration.largest_factor))
-        self.friction = ground_friction if self._friction_sigma > 0.0 else None
+        sigma, friction = demonstration.sigma_of("friction"), ()
+        if sigma > 0.0 and ground_friction is not None:
+            most = min(BOUND_SIGMAS * sigma, float(np.log(demonstration.largest_factor)))
+            friction = (
+                PhiColumn(FRICTION, "1", shared=True, calibrated=ground_friction, limits=(-most, most)),
+            )
+        self.columns = (*PROPERTIES, *friction, *(column_of(one) for one in varied))
         self.reached = (0, 1)
 
     def track(self, index: int) -> Track:
@@ -82,41 +93,27 @@ class Episodes:
         if not has_vertices(self._spec, arrays):  # of an older release, or more vertices than were kept
             arrays, attributes = read(episode.path, episode.digest)
         drawn = attributes.get("effect_strengths", {})
-        own = [
-            (drawn.get(f"{one.effect}.{one.name}", one.value) - one.value) / half(one)
-            for one in self.strengths
-        ]
-        if (
-            self.friction is not None and arrays["properties"].shape[1] == PROPERTY_COUNT
-        ):  # one factor for all of it
-            drawn_friction = attributes.get("parameters", {}).get("ground_friction", self.friction)
-            own.insert(0, float(np.log(drawn_friction / self.friction)))
-        return read_track(self._spec, arrays, self._history, np.array(own))
+        if (friction := attributes.get("parameters", {}).get("ground_friction")) is not None:
+            drawn = drawn | {FRICTION: friction}  # one factor for all of it, unless the episode holds a field
+        values = {
+            one.name: one.column_of(drawn.get(one.name, one.calibrated))
+            for one in self.columns
+            if one.calibrated is not None
+        }
+        return read_track(self._spec, arrays, self._history, self.columns, values)
 
-    def bounds(self) -> Array:
-        """Ends of what fine-tuning may choose: of log(μ/μ_fit), if the episodes differ in it, and of the strengths'
-        intervals as distances from the estimates in half-widths, (m, 2)."""
-        ends = [[(end - one.value) / half(one) for end in (one.low, one.high)] for one in self.strengths]
-        if self.friction is not None:
-            ends.insert(0, [-self._most_friction, self._most_friction])
-        return np.array(ends).reshape(-1, 2)
-
-    def tuned(self, found: Array) -> dict[str, Any]:
-        """What fine-tuning chose (m,) of :meth:`bounds`, in physical units beside what the calibration said."""
-        values, said = list(found), {}
-        if self.friction is not None:
-            most = float(np.exp(self._most_friction))
-            said["ground.friction"] = {
-                "calibrated": self.friction,
-                "bounds": [self.friction / most, self.friction * most],
-                "tuned": self.friction * float(np.exp(values.pop(0))),
-            }
-        for one, value in zip(self.strengths, values, strict=True):
-            said[f"{one.effect}.{one.name}"] = {
-                "calibrated": one.value,
-                "ci95": [one.low, one.high],
-                "tuned": one.value + half(one) * float(value),
-            }
+    def tuned(self, strengths: Mapping[str, float]) -> dict[str, Any]:
+        """What fine-tuning chose of the shared columns, in physical units beside what the calibration said."""
+        said: dict[str, Any] = {}
+        for one in self.columns:
+            if one.calibrated is None or one.limits is None:
+                continue
+            said[one.name] = {"calibrated": one.calibrated, "tuned": one.quantity_of(strengths[one.name])}
+            if one.logarithmic:
+                most = float(np.exp(one.limits[1]))
+                said[one.name]["bounds"] = [one.calibrated / most, one.calibrated * most]
+            else:
+                said[one.name]["ci95"] = list(self._intervals[one.name])
         return said
 
     def description(self) -> dict[str, Any]:

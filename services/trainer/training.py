@@ -23,7 +23,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import torch
 
 from physworld.demonstrate.config import StrengthRange
 from physworld.worldmodel.errors import CheckpointMismatch, TrainingCancelled
@@ -82,15 +81,14 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
             view.recording(),
             view.skin,
             tuning,
-            bounds=episodes.bounds(),
             cancelled=context.cancelled,
         ),
     )
     tuning_s = time.perf_counter() - started
     context.progress(config.steps, config.steps, "steps", "measuring on the held-out frames")
-    found = torch.as_tensor(tuned.strengths, dtype=torch.float32)
-    published = view.published(trained.model.at_strengths(found), tuned.phi, phi)
-    before = view.published(trained.model.at_strengths(torch.zeros_like(found)), phi, phi)
+    published = view.published(trained.model.at_strengths(tuned.strengths), tuned.phi, phi)
+    untuned = trained.model.at_strengths(dict.fromkeys(tuned.strengths, 0.0))
+    before = view.published(untuned, phi, phi)
     measured = measure(view, published, before)
     seconds = {"training": training_s, "fine_tuning": tuning_s}
     metrics = json_safe(_metrics(view, trained, tuned, measured, seconds))
@@ -143,6 +141,7 @@ def _train(
             view.spec,
             architecture,
             training,
+            columns=episodes.columns,
             total=episodes.total,
             later=episodes.track,
             checkpoint=checkpoint,

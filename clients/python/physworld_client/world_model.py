@@ -28,6 +28,8 @@ from physworld_client.types import Array
 from physworld_schemas.arrays import FARTHEST_M
 
 CARD_SCHEMA = 1
+PHI_NAMES = ("stiffness", "density")
+"""Columns of Φ, which the weights take in this order."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +45,9 @@ class WorldModel:
         start_time_s: time of the first of them in the recording [s].
         rest_vertices: undeformed places of the object vertices, (n, 3).
         control_index: the controller that each control vertex is, (C,).
-        phi: log property ratios (E, density) after fine-tuning, (n, 2).
+        phi: log property ratios after fine-tuning, (n, 2).
         phi_calibrated: before it, (n, 2).
+        phi_names: names of the columns of Φ.
         ground_height_m: height of the ground plane, None without one.
     """
 
@@ -59,6 +62,7 @@ class WorldModel:
     control_index: Array
     phi: Array
     phi_calibrated: Array
+    phi_names: tuple[str, ...]
     ground_height_m: float | None
     _network: Network
     _skin: tuple[Array, Array] | None
@@ -145,6 +149,7 @@ class WorldModel:
             control_index=tensor("control.index"),
             phi=tensor("phi").astype(np.float64),
             phi_calibrated=tensor("phi.calibrated").astype(np.float64),
+            phi_names=_phi_names(name, version, card),
             ground_height_m=ground_height_m,
             _network=network,
             _skin=skin,
@@ -160,23 +165,30 @@ class WorldModel:
         """K, the controllers of the scene."""
         return int(self.start_controllers.shape[1])
 
-    def rollout(self, controllers: Array, phi: Array | None = None, *, history: Array | None = None) -> Array:
+    def rollout(
+        self,
+        controllers: Array,
+        phi: Array | Mapping[str, float | Array] | None = None,
+        *,
+        history: Array | None = None,
+    ) -> Array:
         """Object vertices over time [m], (T, n, 3); the first h+1 frames are the history itself.
 
         Args:
             controllers: all controllers at T ticks [m], (T, K, 3); the first h+1 belong to the history.
-            phi: log property ratios, (n, 2); by default those of the fine-tuning. Adding log 2 to the first
-                column doubles the stiffness.
+            phi: log property ratios, (n, 2), or some of its columns by name, each a number or (n,): ``{"stiffness":
+                np.log(2)}`` is twice the calibrated stiffness. What is not given is that of the fine-tuning.
             history: object vertices at the first h+1 ticks [m], (h+1, n, 3); by default the recording's.
                 From rest: one frame h+1 times, with controllers that stand still as long.
 
         Raises:
-            ValueError: arrays of other shapes, values that are not finite, places beyond ``FARTHEST_M``.
+            ValueError: a name that is no column of Φ, arrays of other shapes, values that are not finite, places
+                beyond ``FARTHEST_M``.
         """
         frames, n = self.history + 1, self._network.object_count
         start = self.start_history if history is None else np.asarray(history, dtype=np.float64)
         driven = np.asarray(controllers, dtype=np.float64)
-        properties = self.phi if phi is None else np.asarray(phi, dtype=np.float64)
+        properties = self._phi(phi)
         if driven.ndim != 3 or driven.shape[1:] != (self.controller_count, 3) or len(driven) < frames:
             raise ValueError(f"controllers {driven.shape}, not (T >= {frames}, {self.controller_count}, 3)")
         if start.shape != (frames, n, 3) or properties.shape != (n, PROPERTY_COUNT):
@@ -203,6 +215,19 @@ class WorldModel:
             path[tick] = self._network.step(path[tick - frames : tick], controls[tick], properties)
         return path[:, :n] + origin
 
+    def _phi(self, given: Array | Mapping[str, float | Array] | None) -> Array:
+        """Φ (n, 2) of what a caller gave."""
+        if given is None:
+            return self.phi
+        if not isinstance(given, Mapping):
+            return np.asarray(given, dtype=np.float64)
+        phi = self.phi.copy()
+        for name, values in given.items():
+            if name not in self.phi_names:
+                raise ValueError(f"Φ has no column {name!r}; it has {', '.join(self.phi_names)}")
+            phi[:, self.phi_names.index(name)] = values
+        return phi
+
     def track(self, vertices: Array) -> Array:
         """The scene's measured points that vertices (T, n, 3) carry [m], (T, N, 3)."""
         if self._skin is None:
@@ -213,3 +238,14 @@ class WorldModel:
         for k in range(1, index.shape[1]):  # one neighbour at a time: all at once take K times the memory
             points += weight[:, k, None] * places[..., index[:, k], :]
         return points
+
+
+def _phi_names(name: str, version: int, card: Mapping[str, Any]) -> tuple[str, ...]:
+    """Names of the columns of Φ; cards of earlier releases do not list them."""
+    listed = card["architecture"].get("phi")
+    names = PHI_NAMES if listed is None else tuple(str(column["name"]) for column in listed)
+    if names != PHI_NAMES:
+        raise ModelUnreadable(
+            f"{name} version {version}: Φ has the columns {', '.join(names)}, this client knows {', '.join(PHI_NAMES)}"
+        )
+    return names

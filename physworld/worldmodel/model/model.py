@@ -88,7 +88,7 @@ exported step (``physworld.worldmodel.export``) up to rounding.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -101,12 +101,11 @@ from physworld.worldmodel.model.features import Normalisation, Scales, vertex_fe
 from physworld.worldmodel.model.graph import EDGE_KINDS, NEAR, GraphSpec
 from physworld.worldmodel.model.inertia import InertialPrior
 from physworld.worldmodel.model.nearest import CurrentEdges, KeptEdges
+from physworld.worldmodel.model.properties import PROPERTIES, PhiColumn
 from physworld.worldmodel.native.messages import EdgeList, as_seen, mean_messages
 from physworld.worldmodel.priors.chain import ChainPrior
 from physworld.worldmodel.priors.modal import ModalPrior, rigid_prior
 from physworld.worldmodel.priors.prior_step import prior_step
-
-PROPERTY_COUNT = 2
 
 Means = Callable[[int, Tensor, Tensor], Tensor]
 """Mean messages (K, V, B, H) of a layer from what is heard and sent (K, V, B, H)."""
@@ -133,13 +132,25 @@ class WorldModel(nn.Module):
         spec: GraphSpec,
         normalisation: Normalisation | None = None,
         prior: ModalPrior | ChainPrior | InertialPrior | None = None,
+        columns: tuple[PhiColumn, ...] = PROPERTIES,
     ) -> None:
+        """Random weights, whose output is 0.
+
+        Args:
+            config: widths and numbers of layers.
+            spec: the graph.
+            normalisation: scales of the data; 1 without them.
+            prior: what is under the network; without one the body follows its grips rigidly.
+            columns: what the columns of Φ stand for, ``PROPERTIES`` first.
+        """
         super().__init__()
         self.config = config
         self.spec = spec
+        self.columns = columns
         hidden, h, layers = config.hidden, config.history, config.message_passing_steps
         normalisation = normalisation or Normalisation()
-        self.strength_count = len(normalisation.properties) - PROPERTY_COUNT
+        if len(normalisation.properties) != len(columns):
+            raise ValueError(f"{len(normalisation.properties)} scales of Φ for {len(columns)} columns")
         vertex_features = 3 * h + 5 + len(normalisation.properties) + (spec.ground_height_m is not None)
         self.encoder = _two_layers(vertex_features, hidden, hidden)
         self.receive = nn.ModuleList(nn.Linear(hidden, hidden) for _ in range(layers))
@@ -261,19 +272,27 @@ class WorldModel(nn.Module):
         ends = (self.skip.weight, self.decoder.out.weight, self.decoder.out.bias)
         return any(bool(torch.any(weight != 0)) for weight in ends)
 
-    def at_strengths(self, strengths: Tensor) -> WorldModel:
-        """The same function at fixed ``strengths`` (m,), as a model of the two properties alone."""
-        if strengths.shape != (self.strength_count,):
-            raise ValueError(f"strengths {tuple(strengths.shape)}, the model has {self.strength_count}")
-        if not self.strength_count:
+    @property
+    def shared_columns(self) -> tuple[PhiColumn, ...]:
+        """The columns of Φ after its properties: one number each for the whole body."""
+        return self.columns[len(PROPERTIES) :]
+
+    def at_strengths(self, strengths: Mapping[str, float]) -> WorldModel:
+        """The same function with the shared columns of Φ fixed, by name, as a model of ``PROPERTIES`` alone."""
+        names = [one.name for one in self.shared_columns]
+        if sorted(strengths) != sorted(names):
+            raise ValueError(f"strengths {sorted(strengths)}, the model has {sorted(names)}")
+        if not names:
             return self
+        kept = len(PROPERTIES)
+        values = torch.tensor([strengths[name] for name in names], dtype=self.norm.properties.dtype)
         fixed = copy.deepcopy(self)
-        first = 3 * self.config.history + 3 + PROPERTY_COUNT
-        scaled = strengths / self.norm.properties[PROPERTY_COUNT:]
+        first = 3 * self.config.history + 3 + kept
+        scaled = values / self.norm.properties[kept:]
         fixed.encoder.add_module("in", _at_inputs(getattr(self.encoder, "in"), first, scaled))
         fixed.skip = _at_inputs(self.skip, first, scaled)
-        fixed.norm.properties = self.norm.properties[:PROPERTY_COUNT].clone()
-        fixed.strength_count = 0
+        fixed.norm.properties = self.norm.properties[:kept].clone()
+        fixed.columns = PROPERTIES
         return fixed
 
     def edge_constants(self) -> EdgeConstants:

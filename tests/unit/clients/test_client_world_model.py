@@ -157,6 +157,12 @@ def test_both_networks_move_the_same_way(
     found = loaded.rollout(controllers, stiffer, history=rest)
     assert np.abs(found - expected).max() < AGREEMENT * np.abs(expected).max()
 
+    by_name = loaded.rollout(controllers, {"stiffness": stiffer[:, 0]}, history=rest)
+    assert np.array_equal(
+        by_name,
+        loaded.rollout(controllers, np.stack([stiffer[:, 0], loaded.phi[:, 1]], axis=1), history=rest),
+    )
+
     points = loaded.track(expected)
     assert points.shape == (FRAMES, 13, 3)
     assert np.abs(points - reference.skin.apply(expected)).max() < 1e-9
@@ -183,6 +189,8 @@ def test_wrong_shapes_are_named(tmp_path: Path) -> None:
         loaded.rollout(driven(model)[:3])
     with pytest.raises(ValueError, match=r"phi \(2,\)"):
         loaded.rollout(driven(model), np.zeros(2))
+    with pytest.raises(ValueError, match="no column 'mass'; it has stiffness, density"):
+        loaded.rollout(driven(model), {"mass": 0.1})
     with pytest.raises(ValueError, match=r"a place 1e\+300 m from the origin.*; 1000 m is the farthest"):
         loaded.rollout(np.where(np.arange(FRAMES)[:, None, None] == 9, 1e300, driven(model)))
     with pytest.raises(ValueError, match="18 values of controllers, history and phi are no finite numbers"):

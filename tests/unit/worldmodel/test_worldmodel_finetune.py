@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 
 import numpy as np
@@ -14,6 +15,7 @@ from physworld.worldmodel.errors import VersionUnreadable
 from physworld.worldmodel.finetune import Recording, fine_tune
 from physworld.worldmodel.model.config import FineTuneConfig, TrainingConfig
 from physworld.worldmodel.model.model import WorldModel
+from physworld.worldmodel.model.properties import PROPERTIES, PhiColumn
 from physworld.worldmodel.model.skinning import affine_skin
 from physworld.worldmodel.published import PublishedModel
 from physworld.worldmodel.rollout import rollout, unroll
@@ -170,6 +172,12 @@ def test_an_index_beyond_the_graph_is_refused(published: PublishedModel, name: s
         PublishedModel.from_tensors(tensors, published.facts())
 
 
+STRENGTHS = tuple(
+    PhiColumn(name, logarithmic=False, shared=True, calibrated=0.0, limits=(-2.0, 2.0))
+    for name in ("drag.rate", "wind.speed")
+)
+
+
 @pytest.fixture(scope="module")
 def with_strength(episodes: list[dict[str, np.ndarray]]) -> WorldModel:
     """The bar whose stiffness comes as the strength of an effect, in units of 0.5, and not as a property."""
@@ -179,33 +187,50 @@ def with_strength(episodes: list[dict[str, np.ndarray]]) -> WorldModel:
             spec,
             arrays | {"properties": np.zeros_like(arrays["properties"])},
             SMALL.history,
-            np.array([arrays["properties"][0, 0] / 0.5, 0.0]),
+            (*PROPERTIES, *STRENGTHS),
+            {"drag.rate": arrays["properties"][0, 0] / 0.5, "wind.speed": 0.0},
         )
         for arrays in episodes
     ]
-    return train(seen, spec, SMALL, dataclasses.replace(TRAINING, steps=60)).model
+    settings = dataclasses.replace(TRAINING, steps=60)
+    return train(seen, spec, SMALL, settings, columns=(*PROPERTIES, *STRENGTHS)).model
+
+
+def at(drag: float, wind: float) -> dict[str, float]:
+    """Strengths by name, in an order that is not the columns'."""
+    return {"wind.speed": wind, "drag.rate": drag}
+
+
+def limited(model: WorldModel, *limits: tuple[float, float]) -> WorldModel:
+    """The same weights with other limits of the strengths."""
+    other = copy.copy(model)
+    shared = (dataclasses.replace(one, limits=ends) for one, ends in zip(STRENGTHS, limits, strict=True))
+    other.columns = (*PROPERTIES, *shared)
+    return other
 
 
 def test_a_model_at_fixed_strengths_is_the_same_function(
     with_strength: WorldModel, episodes: list[dict[str, np.ndarray]]
 ) -> None:
     spec, frames = with_strength.spec, SMALL.history + 1
-    track = read_track(spec, episodes[3], SMALL.history, np.array([0.8, -0.3]))
+    track = read_track(spec, episodes[3], SMALL.history, (*PROPERTIES, *STRENGTHS), at(0.8, -0.3))
     batch = track.positions[:, :, None]
     whole = unroll(
         with_strength, batch[:frames, : spec.object_count], batch[:, spec.object_count :], track.phi[:, None]
     )
-    fixed = with_strength.at_strengths(torch.tensor([0.8, -0.3]))
+    fixed = with_strength.at_strengths(at(0.8, -0.3))
     plain = unroll(
         fixed, batch[:frames, : spec.object_count], batch[:, spec.object_count :], track.phi[:, None, :2]
     )
     assert torch.allclose(whole, plain, atol=2e-5)
-    other = with_strength.at_strengths(torch.tensor([-0.8, -0.3]))
+    other = with_strength.at_strengths(at(-0.8, -0.3))
     moved = unroll(
         other, batch[:frames, : spec.object_count], batch[:, spec.object_count :], track.phi[:, None, :2]
     )
     assert float((moved - plain).abs().max()) > 1e-4, "the strength does nothing"
-    assert with_strength.strength_count == 2 and fixed.strength_count == 0
+    assert with_strength.shared_columns == STRENGTHS and fixed.columns == PROPERTIES
+    with pytest.raises(ValueError, match="the model has"):
+        with_strength.at_strengths({"drag.rate": 0.8})
 
 
 def test_a_strength_moves_towards_the_recording_and_stays_in_its_interval(
@@ -213,19 +238,55 @@ def test_a_strength_moves_towards_the_recording_and_stays_in_its_interval(
 ) -> None:
     controllers = episodes[1]["controllers"].astype(np.float64)
     zero = np.zeros((published.spec.object_count, 2))
-    truth = dataclasses.replace(
-        published, model=with_strength.at_strengths(torch.tensor([1.0, 0.0])), phi=zero
-    )
+    truth = dataclasses.replace(published, model=with_strength.at_strengths(at(1.0, 0.0)), phi=zero)
     recording = _recording(truth, controllers, zero)
     tuning = dataclasses.replace(TUNING, steps=30, learning_rate=0.2)
-    wide = fine_tune(
-        with_strength, zero, recording, published.skin, tuning, bounds=np.array([[-2.0, 2.0], [-2.0, 2.0]])
-    )
+    wide = fine_tune(with_strength, zero, recording, published.skin, tuning)
     assert wide.kept and wide.error_after_m < 0.8 * wide.error_before_m
-    assert 0.2 < wide.strengths[0] <= 2.0
-    narrow = fine_tune(
-        with_strength, zero, recording, published.skin, tuning, bounds=np.array([[-0.1, 0.1], [0.0, 0.0]])
-    )
-    assert narrow.strengths[0] == pytest.approx(0.1) and narrow.strengths[1] == 0.0
-    with pytest.raises(ValueError, match="takes 2 strengths"):
-        fine_tune(with_strength, zero, recording, published.skin, tuning)
+    assert 0.2 < wide.strengths["drag.rate"] <= 2.0
+    near = limited(with_strength, (-0.1, 0.1), (0.0, 0.0))
+    narrow = fine_tune(near, zero, recording, published.skin, tuning)
+    assert narrow.strengths["drag.rate"] == pytest.approx(0.1) and narrow.strengths["wind.speed"] == 0.0
+    endless = limited(with_strength, (-0.1, 0.1), (0.0, 0.0))
+    endless.columns = (*PROPERTIES, *(dataclasses.replace(one, limits=None) for one in STRENGTHS))
+    with pytest.raises(ValueError, match=r"no limits for the model's columns drag.rate, wind.speed"):
+        fine_tune(endless, zero, recording, published.skin, tuning)
+
+
+def test_columns_of_phi_are_asked_for_by_name(published: PublishedModel) -> None:
+    controllers = np.repeat(published.start_controllers[:1], 12, axis=0)
+    controllers[6:] += 0.004
+    by_place = published.phi.copy()
+    by_place[:, 1] = 0.3
+    named = published.rollout(controllers, phi={"density": 0.3})
+    assert np.array_equal(named, published.rollout(controllers, phi=by_place))
+    assert not np.array_equal(named, published.rollout(controllers))
+    with pytest.raises(ValueError, match="no column 'mass'; it has stiffness, density"):
+        published.rollout(controllers, phi={"mass": 0.3})
+
+
+def test_a_card_tells_the_columns_of_phi_and_one_without_them_is_read(published: PublishedModel) -> None:
+    tensors, facts = published.to_tensors(), published.facts()
+    assert [(one["name"], one["unit"]) for one in facts["phi"]] == [
+        ("stiffness", "Pa"),
+        ("density", "kg/m^3"),
+    ]
+    spreads = [one["prior_spread"] for one in facts["phi"]]
+    assert spreads == pytest.approx(tensors["norm.properties"].tolist())
+    before = {name: value for name, value in facts.items() if name != "phi"}
+    for told in (facts, before):
+        assert PublishedModel.from_tensors(tensors, told).columns == PROPERTIES
+    turned = facts | {"phi": facts["phi"][::-1]}
+    with pytest.raises(VersionUnreadable, match="the columns 'density', 'stiffness'; a version has"):
+        PublishedModel.from_tensors(tensors, turned)
+
+
+def test_a_column_goes_from_quantities_to_values_and_back() -> None:
+    friction = PhiColumn("ground.friction", "1", shared=True, calibrated=0.4)
+    assert friction.column_of(0.8) == pytest.approx(np.log(2.0))
+    rate = PhiColumn("drag.rate", logarithmic=False, shared=True, calibrated=3.0, half_width=0.5)
+    assert rate.column_of(3.25) == pytest.approx(0.5)
+    for column in (friction, rate):
+        assert column.quantity_of(column.column_of(1.7)) == pytest.approx(1.7)
+    with pytest.raises(ValueError, match="'stiffness' has no single calibrated value"):
+        PROPERTIES[0].column_of(1e5)
