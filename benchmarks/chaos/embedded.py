@@ -26,7 +26,7 @@ from benchmarks.chaos.plan import Fault
 from benchmarks.chaos.processes import CannotRun, Clock
 from storage.settings import Settings
 
-DISK_BYTES = 1 << 30
+DISK_BYTES = 2 << 30
 START_WITHIN_S, END_WITHIN_S, REMOUNT_WITHIN_S = 120.0, 40.0, 3.0
 START_AGAIN_S = 0.5
 BALLAST = "ballast"
