@@ -1,7 +1,13 @@
-"""What nobody needs any more is removed, now and then, by the dispatcher: scratch files and episodes without a row."""
+"""What nobody needs any more is removed from the store: scratch files, and episodes and artifacts without a row.
+
+The dispatcher lets it be done in a thread beside its own work, since a store may be large, slow or silent.
+"""
 
 from __future__ import annotations
 
+import logging
+import threading
+import time
 from datetime import timedelta
 
 from sqlalchemy import select
@@ -10,12 +16,49 @@ from schemas.job import TERMINAL_STATES
 from storage import resources
 from storage.clock import database_now
 from storage.database import Database
+from storage.errors import StorageError
+from storage.orphans import remove_orphan_artifacts
 from storage.scratch import ScratchStore
 from storage.settings import Settings
 from storage.tables import DatasetRow, JobRow
 
+logger = logging.getLogger(__name__)
+
+ARTIFACTS_EVERY_S = 86400.0  # all of them are listed
 FAILED_KEPT = timedelta(days=7)  # journals and checkpoints of a failed job
 SWEPT_FOR = timedelta(days=1)  # a dataset that failed or was cancelled, so long after its end
+
+
+class Housekeeping:
+    """One thread at a time; another begins once the last one is done."""
+
+    def __init__(self, settings: Settings, database: Database) -> None:
+        self._settings, self._database = settings, database
+        self._thread: threading.Thread | None = None
+        self._artifacts_due = 0.0
+
+    def begin(self) -> None:
+        """Tidy up in the background, unless that still goes on."""
+        if self._thread is None or not self._thread.is_alive():
+            self._thread = threading.Thread(target=self._tidy, name="housekeeping", daemon=True)
+            self._thread.start()
+
+    def wait(self, seconds: float) -> None:
+        """Wait for what was begun, at most so long; it may be broken off at any time."""
+        if self._thread is not None:
+            self._thread.join(seconds)
+
+    def _tidy(self) -> None:
+        try:
+            remove_ended_scratch(ScratchStore(self._settings), self._database)
+            remove_orphan_episodes(self._settings, self._database)
+            if time.monotonic() >= self._artifacts_due:
+                removed = remove_orphan_artifacts(self._settings, self._database)
+                self._artifacts_due = time.monotonic() + ARTIFACTS_EVERY_S
+                if removed:
+                    logger.info("removed %d artifacts that no row names", len(removed))
+        except StorageError as error:
+            logger.warning("not everything was tidied up: %s", error)
 
 
 def remove_ended_scratch(scratch: ScratchStore, database: Database) -> list[str]:

@@ -18,7 +18,7 @@ from benchmarks.chaos import ledger
 from benchmarks.chaos.distributed import Distributed
 from benchmarks.chaos.embedded import Embedded
 from benchmarks.chaos.processes import CannotRun
-from benchmarks.chaos.run import LEASE_S, run
+from benchmarks.chaos.run import LEASE_S, ORPHAN_S, run
 from benchmarks.harness import Report, write_json, write_section
 
 DEPLOYMENTS = {"embedded": Embedded, "distributed": Distributed}
@@ -67,7 +67,7 @@ def main(arguments: list[str] | None = None) -> int:
     with tempfile.TemporaryDirectory(prefix="physworld-chaos-", ignore_cleanup_errors=True) as temporary:
         folder = given.keep or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
-        service = DEPLOYMENTS[given.deployment](folder, LEASE_S)
+        service = DEPLOYMENTS[given.deployment](folder, LEASE_S, ORPHAN_S)
         try:
             found = run(
                 service,
@@ -109,7 +109,8 @@ def _report(found: dict[str, Any], deployment: str, seed: int) -> Report:
             f"Beside the kills: {_listed(found['faults'])}.",
             f"Skipped, because this machine cannot play them or the target did not run: {_listed(found['skipped'])}.",
             f"Files that no row names: {_listed(found['orphans_by_kind'])}.",
-            f"Leases of {LEASE_S:g} s; {found['harmed_s']:g} s under faults.",
+            f"Leases of {LEASE_S:g} s; a file without a row goes after {ORPHAN_S:g} s; "
+            f"{found['harmed_s']:g} s under faults.",
         ],
         seed=seed,
     )

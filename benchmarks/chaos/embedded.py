@@ -22,8 +22,9 @@ from typing import Any
 import psutil
 
 from benchmarks.chaos import processes
+from benchmarks.chaos.clocks import Clock, clock_library
 from benchmarks.chaos.plan import Fault
-from benchmarks.chaos.processes import CannotRun, Clock
+from benchmarks.chaos.processes import CannotRun
 from storage.settings import Settings
 
 DISK_BYTES = 2 << 30
@@ -41,7 +42,7 @@ class Embedded:
         ("stop", "broker"), ("stop", "supervisor"), ("clock", "all"), ("disk_full", "all"), ("read_only", "all"),
     )  # fmt: skip
 
-    def __init__(self, folder: Path, lease_s: float, workers: int = 2) -> None:
+    def __init__(self, folder: Path, lease_s: float, orphan_s: float, workers: int = 2) -> None:
         self.folder, self.data = folder, folder / "data"
         self.starts = 0
         self._workers = [f"worker-{number}" for number in range(1, workers + 1)]
@@ -49,13 +50,16 @@ class Embedded:
         self._ended_at = 0.0
         self._mounted: list[Path] = []
         self._clock: Clock | None = None
-        self._variables = {"PHYSWORLD_LEASE_SECONDS": f"{lease_s:g}"}
+        self._variables = {
+            "PHYSWORLD_LEASE_SECONDS": f"{lease_s:g}",
+            "PHYSWORLD_ORPHAN_SECONDS": f"{orphan_s:g}",
+        }
 
     def start(self) -> None:
         """Make the folder, start the service, and wait until it serves."""
         self.data.mkdir(mode=0o700)
         self._mount()
-        if (library := processes.faketime_library()) is not None:
+        if (library := clock_library(self.folder)) is not None:
             self._clock = Clock(library, self.folder / "clock")
             self._variables |= self._clock.variables
         self._start()
