@@ -10,12 +10,16 @@ commit. That no file goes that somebody is about to name rests on three things:
   the difference between the clocks of store and database. An attempt that has lost its lease can commit nothing.
 - Each file is looked at once more right before it goes, since it may have been put again meanwhile.
 
+Lost attempts leave a file now and then. Where most files have no row, the store belongs to another database as well, or
+the settings name the wrong one: then nothing goes, and the log says so.
+
 What is left is the moment between that last look and the removal: whoever puts the very bytes of a file that nobody
 named for a day, within it, would have to write them again. Objects have no removal that depends on their age.
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Iterator
 from datetime import datetime, timedelta
 from typing import Any
@@ -50,6 +54,10 @@ MANY = ("episode", "simulation")
 """Kinds of shards that a job has by the thousand; they put no artifacts."""
 NAMING_SHARDS = tuple(kind for kind in QUEUE_OF_SHARD if kind not in MANY)
 ROWS_AT_A_TIME = 1000
+FEW, SHARE = 20, 0.1
+"""So many files without a row, or such a share of all, may be of lost attempts."""
+
+logger = logging.getLogger(__name__)
 
 
 def remove_orphan_artifacts(settings: Settings, database: Database) -> list[str]:
@@ -64,8 +72,12 @@ def remove_orphan_artifacts(settings: Settings, database: Database) -> list[str]
     if not old:
         return []
     with database.reading() as session:
-        old.difference_update(_named(session))
-    return [sha256 for sha256 in sorted(old) if artifacts.remove_if_written_before(sha256, before)]
+        orphans = old.difference(_named(session))
+    if len(orphans) > max(FEW, SHARE * len(old)):
+        told = "%d of %d artifacts have no row in this database, none is removed: is the store another's, too?"
+        logger.error(told, len(orphans), len(old))
+        return []
+    return [sha256 for sha256 in sorted(orphans) if artifacts.remove_if_written_before(sha256, before)]
 
 
 def _nobody_writes_before(session: Session, age: timedelta) -> datetime | None:

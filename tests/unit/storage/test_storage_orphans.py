@@ -15,7 +15,7 @@ from schemas.fit import FitConfig
 from storage import jobs, leases, orphans
 from storage.artifacts import ArtifactStore
 from storage.database import Database
-from storage.orphans import NAMING, remove_orphan_artifacts
+from storage.orphans import FEW, NAMING, remove_orphan_artifacts
 from storage.settings import Settings
 from storage.tables import Base, FitRow, ShardRow, utc_now
 
@@ -183,6 +183,18 @@ def add_row(session: Session, row: type[Base], **given: object) -> None:
             found = None if owner is None else session.scalar(select(owner.column).limit(1))
             given[column.name] = plain[column.type.python_type] if found is None else found
     session.execute(insert(row).values(given))
+
+
+def test_nothing_goes_from_a_store_whose_rows_are_in_another_database(
+    tmp_path, database: Database, clock: Clock, caplog: pytest.LogCaptureFixture
+) -> None:
+    settings = Settings(data_dir=tmp_path)
+    artifacts = ArtifactStore(settings)
+    files = [artifacts.put_bytes(f"{number}".encode(), "twin.npz").sha256 for number in range(FEW + 1)]
+    clock.ahead = 2 * DAY
+    assert remove_orphan_artifacts(settings, database) == []
+    assert "21 of 21 artifacts have no row in this database" in caplog.text
+    assert all(artifacts.exists(sha256) for sha256 in files)
 
 
 def test_what_the_shard_of_a_job_was_given_or_has_told_stays(
