@@ -74,7 +74,9 @@ def remove_orphan_artifacts(settings: Settings, database: Database) -> list[str]
     with database.reading() as session:
         orphans = old.difference(_named(session))
     if len(orphans) > max(FEW, SHARE * len(old)):
-        told = "%d of %d artifacts have no row in this database, none is removed: is the store another's, too?"
+        told = (
+            "%d of %d artifacts have no row in this database, none is removed: is the store another's, too?"
+        )
         logger.error(told, len(orphans), len(old))
         return []
     return [sha256 for sha256 in sorted(orphans) if artifacts.remove_if_written_before(sha256, before)]
