@@ -31,15 +31,18 @@ from storage.traces import leaves_twin, trace_row
 _SHARES = {"fit": 0.35, "trace": 0.6, "dataset": 0.35, "training": 0.30}  # of a pipeline's time, about
 
 
-def open_next(session: Session, parent: JobRow, children: Sequence[JobRow]) -> bool:
-    """Open what follows the last child, when all have succeeded; False when nothing does."""
+def open_next(session: Session, parent: JobRow, ended: JobRow, children: Sequence[JobRow]) -> bool:
+    """Open what follows the child that has just ended, when all have succeeded; False when nothing does.
+
+    Times say nothing of what followed what: children are made by several hosts, whose clocks may differ and be set.
+    """
     if any(job.state not in TERMINAL_STATES for job in children):
         return True  # a training runs beside its dataset; the end of the later one decides
     request = PipelineCreate.model_validate(parent.config)
-    outputs = {job.kind: str(job.outputs[0]["id"]) for job in children}
-    last = children[-1].kind
+    outputs = {job.kind: str(job.outputs[0]["id"]) for job in (*children, ended)}
+    last = ended.kind
     if last == "dataset" and _has_training(children, outputs["dataset"]):
-        last = "training"  # it ran beside its dataset: the two were made at once, by clocks that may differ
+        last = "training"  # it ran beside its dataset and ended first
     if last == "fit" and request.close_the_loop:
         particles = min(request.fit.particle_budget, TRACE_PARTICLES)
         declared = request.fit.model_copy(update={"damping": "none", "particle_budget": particles})
