@@ -1,7 +1,7 @@
-"""Content-addressed files: ``artifacts/ab/<sha256>``, written once, never changed.
+"""Content-addressed files: ``artifacts/ab/<sha256>``, whose bytes never change.
 
-A write is atomic (a reader sees the whole file or none). Writing the same bytes again reads what is there and leaves
-it, unless it has rotted: then it is replaced.
+A write is atomic (a reader sees the whole file or none). Putting the same bytes again writes them again: a file that
+has rotted is replaced, and the time of the last write tells when somebody last put it (``storage.orphans``).
 """
 
 from __future__ import annotations
@@ -9,6 +9,8 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Iterator
+from contextlib import suppress
+from datetime import datetime
 from pathlib import Path
 
 import obstore
@@ -19,6 +21,7 @@ from physworld_storage.patience import WORKING, Patience
 from physworld_storage.settings import Settings
 from physworld_storage.store import open_store, reading, writing
 
+FOLDER = "artifacts"
 CHUNK_BYTES = 1 << 20
 DEFAULT_MEDIA_TYPE = "application/octet-stream"
 SHA256 = re.compile(r"[0-9a-f]{64}")
@@ -35,9 +38,8 @@ class ArtifactStore:
     def put_bytes(self, data: bytes, name: str, media_type: str = DEFAULT_MEDIA_TYPE) -> Artifact:
         """Store ``data``. Raises StoreWriteFailed or StoreFull; nothing is then visible."""
         sha256 = hashlib.sha256(data).hexdigest()
-        if not self._has(sha256, len(data)):
-            with writing(f"artifact {name}", len(data), self._settings):
-                obstore.put(self._uploads, _key(sha256), data)
+        with writing(f"artifact {name}", len(data), self._settings):
+            obstore.put(self._uploads, _key(sha256), data)
         return Artifact(name=name, sha256=sha256, size=len(data), media_type=media_type)
 
     def put_file(
@@ -49,9 +51,8 @@ class ArtifactStore:
             sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
             size = stream.tell()
         name = name or path.name
-        if not self._has(sha256, size):
-            with writing(f"artifact {name}", size, self._settings):
-                obstore.put(self._uploads, _key(sha256), path)
+        with writing(f"artifact {name}", size, self._settings):
+            obstore.put(self._uploads, _key(sha256), path)
         return Artifact(name=name, sha256=sha256, size=size, media_type=media_type)
 
     def open(self, sha256: str, start: int = 0, end: int | None = None) -> Iterator[bytes]:
@@ -89,16 +90,34 @@ class ArtifactStore:
         with reading("artifact", sha256, self._settings):
             return int(obstore.head(self._store, _key(sha256))["size"])
 
-    def _has(self, sha256: str, size: int) -> bool:
-        """Whether the file is there and still what it was: it is read, as a write would move as many bytes."""
+    def last_written_before(self, time: datetime) -> Iterator[str]:
+        """Digests of the files whose last write, by the store's clock, lies before ``time``."""
+        with reading("artifacts", "older ones", self._settings):
+            for batch in obstore.list(self._store, prefix=FOLDER):
+                for entry in batch:
+                    sha256 = entry["path"].rpartition("/")[2]
+                    if entry["last_modified"] < time and SHA256.fullmatch(sha256):
+                        yield sha256
+
+    def remove_if_written_before(self, sha256: str, time: datetime) -> bool:
+        """Remove a file unless it is gone or somebody has put it since ``time``; whether it was removed."""
         try:
-            if self.size(sha256) != size:
-                return False
-            for _ in self.open(sha256):
-                pass
-        except (NotFound, ArtifactCorrupt):
+            with reading("artifact", sha256, self._settings):
+                if obstore.head(self._store, _key(sha256))["last_modified"] >= time:
+                    return False
+        except NotFound:
             return False
+        with writing(f"the removal of artifact {sha256}", 0, self._settings):
+            obstore.delete(self._store, _key(sha256))
         return True
+
+    def remove_unfinished(self, time: datetime) -> None:
+        """Remove ``NAME#1`` of before ``time``: a killed writer leaves it in a local folder, and no list shows it."""
+        folder = self._settings.store_folder
+        for part in () if folder is None else (folder / FOLDER).glob("*/*#*"):
+            with writing(f"the removal of {part.name}", 0, self._settings), suppress(FileNotFoundError):
+                if part.stat().st_mtime < time.timestamp():
+                    part.unlink()
 
     def _pieces(
         self, stream: obstore.BytesStream | Iterator[bytes], sha256: str, *, whole: bool
@@ -115,4 +134,4 @@ class ArtifactStore:
 
 
 def _key(sha256: str) -> str:
-    return f"artifacts/{sha256[:2]}/{sha256}"
+    return f"{FOLDER}/{sha256[:2]}/{sha256}"

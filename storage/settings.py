@@ -48,6 +48,7 @@ class Settings(BaseSettings):
     lease_seconds: float = Field(default=30.0, gt=0)
     max_attempts: int = Field(default=5, ge=1)
     republish_seconds: float = Field(default=60.0, gt=0)
+    orphan_seconds: float = Field(default=86400.0, ge=60.0)
     max_upload_bytes: int = Field(default=512 * 2**20, ge=1)
     signing_key: SecretStr | None = None
     signing_key_file: Path | None = None

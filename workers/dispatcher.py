@@ -5,7 +5,8 @@ outbox: publish first, then mark; a crash in between publishes twice, which a cl
 Every second while shards wait or run: publish those whose time has come, take back leases that ran out, at once those
 whose owner on this host is provably dead, and look how deep the broker's queues are. While there is no work: one
 question to the database every two seconds, should a change have gone unheard, and none to the broker. Every five
-minutes: forget the idempotency keys of more than a day ago, and remove what jobs that have ended left in the scratch.
+minutes: forget the idempotency keys of more than a day ago, and let the store be tidied up
+(``physworld_workers.housekeeping``).
 
 A queue that is empty in two looks while shards of it wait has lost their messages: they are published again
 after two seconds instead of ``republish_seconds``. A queue that is deep gets nothing more, so the broker
@@ -36,10 +37,9 @@ from physworld_storage.changes import Changes
 from physworld_storage.database import Database, open_database
 from physworld_storage.errors import DatabaseUnavailable, StoreError
 from physworld_storage.jobs import leases
-from physworld_storage.scratch import ScratchStore
 from physworld_storage.settings import Settings, get_settings
 from physworld_workers.app import READY_FILE_VARIABLE, create_app
-from physworld_workers.housekeeping import remove_ended_scratch, remove_orphan_episodes
+from physworld_workers.housekeeping import Housekeeping
 from physworld_workers.owner import owner_is_gone
 
 logger = logging.getLogger(__name__)
@@ -53,6 +53,7 @@ LARGE_ANSWER_BYTES, LARGE_ANSWERS_KEPT = 64 * 1024, timedelta(minutes=15)
 """Rollouts answer with up to some MiB, many times a minute: kept for as long as a client tries again."""
 LOST_AFTER_S = 2.0
 PAUSE_AFTER_ERROR_S = 1.0
+STOP_WITHIN_S = 2.0
 BROKER_SILENCE = {"socket_timeout": 5.0}
 """Of the dispatcher, whose commands are answered at once; a worker waits longer in commands that block."""
 MAX_DEPTH = 64
@@ -66,6 +67,7 @@ class Dispatcher:
         self._settings = settings
         self._database = database
         self._changes = Changes(database)
+        self.housekeeping = Housekeeping(settings, database)
         self._app = app
         self._connection = app.connection_for_write(transport_options=BROKER_SILENCE)
         self._depth = dict.fromkeys((SIMULATION, TRAINING, INFERENCE), 0)
@@ -88,6 +90,7 @@ class Dispatcher:
                 logger.warning("database or store away: %s", error)
                 stop.wait(PAUSE_AFTER_ERROR_S)
             stop.wait(TICK_S)
+        self.housekeeping.wait(STOP_WITHIN_S)
         self._changes.close()
 
     def tick(self) -> None:
@@ -98,8 +101,7 @@ class Dispatcher:
         if time.monotonic() >= self._forget_due:
             self._forget_due = time.monotonic() + FORGET_EVERY_S
             self._forget_old_keys()
-            remove_ended_scratch(ScratchStore(self._settings), self._database)
-            remove_orphan_episodes(self._settings, self._database)
+            self.housekeeping.begin()
 
     def _due_in(self) -> float:
         """Seconds until there is something to do although nobody has committed."""

@@ -12,6 +12,7 @@ that is such a child itself says so by ``limit_here``, and parses the file witho
 from __future__ import annotations
 
 import json
+import math
 import re
 import struct
 import subprocess
@@ -58,6 +59,8 @@ ROTATION_FROM_UP = {
 
 C3D_MAGIC = 0x50
 BLOCK_BYTES = 512
+MOST_DESCRIBED = 127
+"""Characters of a description: the library takes the byte that counts them for one with a sign."""
 CHILD_SECONDS = 120.0
 GAP_WARNING = 0.1
 
@@ -228,6 +231,35 @@ def _check_header(data: bytes) -> None:
         raise _invalid(
             [f"is cut short: {len(data)} bytes, {frames} frames of {markers} markers need {needed}"]
         )
+    _check_parameters(data, processor_at + 1, endian)
+
+
+def _check_parameters(data: bytes, at: int, endian: str) -> None:
+    """That every parameter lies in the file; the library would count one that does not to its end, for minutes.
+
+    An entry: length and characters of its name, group, distance to the next one; of a parameter also the bytes of a
+    value, how often along each of its dimensions, the values; length and characters of its description.
+    """
+    while at + 2 <= len(data) and data[at] != 0:
+        name, group = struct.unpack_from("bb", data, at)
+        at += 2 + abs(name)
+        entry = data[at : at + 4]
+        if len(entry) < 4:
+            raise _invalid([f"is cut short: {len(data)} bytes, within a parameter's name"])
+        (distance,) = struct.unpack_from(f"{endian}H", entry)
+        end, counted = at + 2, 0
+        if group >= 0:
+            size, counts = abs(struct.unpack_from("b", entry, 2)[0]), data[at + 4 : at + 4 + entry[3]]
+            end += 2 + entry[3] + size * math.prod(counts)
+            counted = math.prod(max(1, count) for count in counts)
+        described = data[end] if max(end, counted) < len(data) else len(data)
+        if described > MOST_DESCRIBED or end + described >= len(data):
+            raise _invalid(
+                [f"is cut short: {len(data)} bytes, a parameter at byte {at} does not end within them"]
+            )
+        if distance == 0:
+            return
+        at += distance
 
 
 def _scale(recording: Recording) -> float:

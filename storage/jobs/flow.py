@@ -171,7 +171,7 @@ def _child_succeeded(session: Session, child: JobRow, now: datetime) -> None:
     append_event(session, parent.id, "log", {"message": message, "child": child.id, "kind": child.kind})
     progress = _parent_progress(session, parent, child)
     _set_progress(session, parent, progress.model_copy(update={"message": message}))
-    if not kind_of(parent).open_next(session, parent, _children(session, parent)):
+    if not kind_of(parent).open_next(session, parent, child, _children(session, parent)):
         parent.finished_at = now
         _set_state(session, parent, "succeeded")
 

@@ -113,8 +113,8 @@ class JobKind:
         """Where the API serves what such a job has made, below ``/v1``."""
         return f"{self.makes}s/{output_id}"
 
-    def open_next(self, session: Session, parent: JobRow, children: Sequence[JobRow]) -> bool:
-        """Open the child that follows those of a parent; False when all is done."""
+    def open_next(self, session: Session, parent: JobRow, ended: JobRow, children: Sequence[JobRow]) -> bool:
+        """Open what follows the child of a parent that has just ended; False when all is done."""
         raise NotImplementedError
 
     def stage_opened(self, session: Session, parent: JobRow, child: JobRow) -> None:

@@ -20,7 +20,7 @@ from benchmarks.service.chaos import ledger
 from benchmarks.service.chaos.distributed import Distributed
 from benchmarks.service.chaos.embedded import Embedded
 from benchmarks.service.chaos.processes import CannotRun
-from benchmarks.service.chaos.run import LEASE_S, run
+from benchmarks.service.chaos.run import LEASE_S, ORPHAN_S, run
 
 DEPLOYMENTS = {"embedded": Embedded, "distributed": Distributed}
 CANNOT_RUN = 2
@@ -31,14 +31,16 @@ ROWS = (
     ("pipelines_doubled", "begun twice"),
     ("jobs", "jobs"),
     ("jobs_lost", "failed or never ended"),
-    ("jobs_refused", "refused for want of disk, before their first episode"),
+    ("pipelines_retried", "pipelines refused for want of disk and retried"),
     ("episodes_expected", "episodes expected"),
     ("episodes_lost", "lost"),
     ("episodes_doubled", "there twice"),
     ("episodes_corrupt", "not what was committed"),
     ("models_published", "models published"),
+    ("models_missing", "pipelines without a model"),
     ("models_doubled", "published twice"),
     ("models_corrupt", "files of models that are not what their digests say"),
+    ("files_missing", "files that a row names and the store lacks"),
     ("orphans", "files that no row names"),
     ("shards_tried_again", "shards that were begun again"),
     ("most_attempts", "attempts at one shard, at most"),
@@ -66,7 +68,7 @@ def main(arguments: list[str] | None = None) -> int:
     with tempfile.TemporaryDirectory(prefix="physworld-chaos-", ignore_cleanup_errors=True) as temporary:
         folder = given.keep or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
-        service = DEPLOYMENTS[given.deployment](folder, LEASE_S)
+        service = DEPLOYMENTS[given.deployment](folder, LEASE_S, ORPHAN_S)
         try:
             found = run(
                 service,
@@ -108,7 +110,8 @@ def _report(found: dict[str, Any], deployment: str, seed: int) -> Report:
             f"Beside the kills: {_listed(found['faults'])}.",
             f"Skipped, because this machine cannot play them or the target did not run: {_listed(found['skipped'])}.",
             f"Files that no row names: {_listed(found['orphans_by_kind'])}.",
-            f"Leases of {LEASE_S:g} s; {found['harmed_s']:g} s under faults.",
+            f"Leases of {LEASE_S:g} s; a file without a row goes after {ORPHAN_S:g} s; "
+            f"{found['harmed_s']:g} s under faults.",
         ],
         seed=seed,
     )

@@ -30,8 +30,9 @@ from botocore.exceptions import BotoCoreError
 from sqlalchemy import create_engine, make_url, text
 
 from benchmarks.service.chaos import processes
+from benchmarks.service.chaos.clocks import Clock, clock_library
 from benchmarks.service.chaos.plan import Fault
-from benchmarks.service.chaos.processes import CannotRun, Clock
+from benchmarks.service.chaos.processes import CannotRun
 from benchmarks.service.chaos.store_proxy import RefusingProxy
 from physworld_services.embedded.broker import choose_broker
 from physworld_services.embedded.folder import DataFolder
@@ -70,11 +71,12 @@ class Distributed:
         ("read_only", "store"),
     )  # fmt: skip
 
-    def __init__(self, folder: Path, lease_s: float, workers: int = 2) -> None:
+    def __init__(self, folder: Path, lease_s: float, orphan_s: float, workers: int = 2) -> None:
         self.folder = folder
         self.token = "pw_" + secrets.token_hex(20)
         self.url = ""
-        self._lease_s, self._workers = lease_s, [f"worker-{number}" for number in range(1, workers + 1)]
+        self._lease_s, self._orphan_s = lease_s, orphan_s
+        self._workers = [f"worker-{number}" for number in range(1, workers + 1)]
         self._parts: dict[str, Part] = {}
         self._proxies: dict[str, RefusingProxy] = {}
         self._postgres_folder: Path | None = None
@@ -107,6 +109,7 @@ class Distributed:
             "PHYSWORLD_S3_ACCESS_KEY_ID": "chaos",
             "PHYSWORLD_S3_SECRET_ACCESS_KEY": "chaos-secret",
             "PHYSWORLD_LEASE_SECONDS": f"{self._lease_s:g}",
+            "PHYSWORLD_ORPHAN_SECONDS": f"{self._orphan_s:g}",
         }
         self._direct = {
             **common,
@@ -154,8 +157,8 @@ class Distributed:
         return processes.kill(self._find(fault))
 
     def possible(self, fault: Fault) -> bool:
-        """Clocks need libfaketime."""
-        return fault.kind != "clock" or processes.faketime_library() is not None
+        """Clocks need a library that is compiled here."""
+        return fault.kind != "clock" or clock_library(self.folder) is not None
 
     def begin(self, fault: Fault) -> Callable[[], None] | None:
         """Begin a fault that lasts; what ends it, None where its target does not run now."""
@@ -205,11 +208,9 @@ class Distributed:
         self.url = f"http://127.0.0.1:{port}"
         commands = [("web", (*python, "physworld_services.web", "--port", str(port)), signal.SIGTERM)]
         commands.append(("dispatcher", (*python, "physworld_workers.dispatcher"), signal.SIGTERM))
-        commands += [
-            (name, (*python, "physworld_workers", "--name", name), signal.SIGQUIT) for name in self._workers
-        ]
+        commands += [(name, (*python, "workers", "--name", name), signal.SIGQUIT) for name in self._workers]
         commands.append(("trainer", (*python, "physworld_services.trainer"), signal.SIGQUIT))
-        library = processes.faketime_library()
+        library = clock_library(self.folder)
         for name, command, stop in commands:
             clock = None
             if library is not None and name != "web":

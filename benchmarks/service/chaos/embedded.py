@@ -22,11 +22,12 @@ from typing import Any
 import psutil
 
 from benchmarks.service.chaos import processes
+from benchmarks.service.chaos.clocks import Clock, clock_library
 from benchmarks.service.chaos.plan import Fault
-from benchmarks.service.chaos.processes import CannotRun, Clock
+from benchmarks.service.chaos.processes import CannotRun
 from physworld_storage.settings import Settings
 
-DISK_BYTES = 1 << 30
+DISK_BYTES = 2 << 30
 START_WITHIN_S, END_WITHIN_S, REMOUNT_WITHIN_S = 120.0, 40.0, 3.0
 START_AGAIN_S = 0.5
 BALLAST = "ballast"
@@ -42,7 +43,7 @@ class Embedded:
         ("stop", "broker"), ("stop", "supervisor"), ("clock", "all"), ("disk_full", "all"), ("read_only", "all"),
     )  # fmt: skip
 
-    def __init__(self, folder: Path, lease_s: float, workers: int = 2) -> None:
+    def __init__(self, folder: Path, lease_s: float, orphan_s: float, workers: int = 2) -> None:
         self.folder, self.data = folder, folder / "data"
         self.starts = 0
         self._workers = [f"worker-{number}" for number in range(1, workers + 1)]
@@ -50,13 +51,16 @@ class Embedded:
         self._ended_at = 0.0
         self._mounted: list[Path] = []
         self._clock: Clock | None = None
-        self._variables = {"PHYSWORLD_LEASE_SECONDS": f"{lease_s:g}"}
+        self._variables = {
+            "PHYSWORLD_LEASE_SECONDS": f"{lease_s:g}",
+            "PHYSWORLD_ORPHAN_SECONDS": f"{orphan_s:g}",
+        }
 
     def start(self) -> None:
         """Make the folder, start the service, and wait until it serves."""
         self.data.mkdir(mode=0o700)
         self._mount()
-        if (library := processes.faketime_library()) is not None:
+        if (library := clock_library(self.folder)) is not None:
             self._clock = Clock(library, self.folder / "clock")
             self._variables |= self._clock.variables
         self._start()

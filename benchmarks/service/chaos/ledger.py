@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import obstore
-from sqlalchemy import select
+from sqlalchemy import func, select
 
 from benchmarks.service.chaos.work import Asked
 from physworld_schemas.dataset import Episode
@@ -37,9 +37,6 @@ from physworld_storage.tables import (
 
 HOLDERS = (SceneRow, FitRow, TraceRow, DatasetRow, ModelVersionRow, RunRow)
 ENDED = frozenset({"succeeded", "failed", "cancelled"})
-REFUSED = "NotEnoughDisk"
-"""How a dataset is refused, before its first episode, that would not fit on the disk as it is then; its pipeline ends
-with it. That is what the service promises for a full disk, so it is counted on a line of its own."""
 
 
 def count(settings: Settings, asked: Sequence[Asked], episodes: int) -> dict[str, Any]:
@@ -60,7 +57,7 @@ def faults_of(ledger: dict[str, Any]) -> dict[str, int]:
     """The counts that must be zero, those of them that are not."""
     names = (
         "episodes_lost", "episodes_doubled", "episodes_corrupt", "jobs_lost", "pipelines_lost", "pipelines_doubled",
-        "models_doubled", "models_corrupt",
+        "models_missing", "models_doubled", "models_corrupt", "files_missing",
     )  # fmt: skip
     return {name: ledger[name] for name in names if ledger[name]}
 
@@ -72,8 +69,7 @@ def _count_jobs(database: Database, asked: Sequence[Asked]) -> dict[str, Any]:
             select(JobRow.id, JobRow.kind, JobRow.state, JobRow.error, JobRow.config)
         ).all()
         attempts = session.execute(select(ShardRow.kind, ShardRow.attempt)).all()
-    refused = [row for row in rows if _is_refused(row.error)]
-    lost = [row for row in rows if row.state != "succeeded" and not _is_refused(row.error)]
+    lost = [row for row in rows if row.state != "succeeded"]
     known = {row.id for row in rows}
     names = Counter(str(row.config.get("model_name")) for row in rows if row.kind == "pipeline")
     promised = [each for each in asked if each.job_id is not None]
@@ -88,7 +84,7 @@ def _count_jobs(database: Database, asked: Sequence[Asked]) -> dict[str, Any]:
         "pipelines_doubled": sum(found - 1 for found in names.values()),
         "jobs": len(rows),
         "jobs_lost": len(lost),
-        "jobs_refused": len(refused),
+        "pipelines_retried": sum(each.retried > 0 for each in asked),
         "lost_because": dict(reasons),
         "lost_details": [
             f"{row.kind} {row.id}: {row.state}: {(row.error or {}).get('detail', '')}"[:400] for row in lost
@@ -99,17 +95,12 @@ def _count_jobs(database: Database, asked: Sequence[Asked]) -> dict[str, Any]:
     }
 
 
-def _is_refused(error: dict[str, Any] | None) -> bool:
-    return REFUSED in str((error or {}).get("detail"))
-
-
 def _count_episodes(database: Database, settings: Settings, episodes: int) -> dict[str, Any]:
     """Episodes by pipeline and index: missing, there twice, or not what was committed."""
     store = EpisodeStore(settings)
     with database.reading() as session:
         parent_of = dict(session.execute(select(JobRow.id, JobRow.parent_id)).tuples().all())
-        asked = session.execute(select(JobRow.id, JobRow.error).where(JobRow.kind == "pipeline"))
-        pipelines = [row.id for row in asked if not _is_refused(row.error)]
+        pipelines = session.scalars(select(JobRow.id).where(JobRow.kind == "pipeline")).all()
         datasets = session.execute(select(DatasetRow.id, DatasetRow.job_id, DatasetRow.digest)).all()
         found = {row.id: resources.all_episodes(session, row.id) for row in datasets}
     times: Counter[tuple[str | None, int]] = Counter()
@@ -153,6 +144,7 @@ def _count_models(database: Database, settings: Settings) -> dict[str, Any]:
         rows = session.execute(
             select(ModelVersionRow.name, ModelVersionRow.state, ModelVersionRow.artifacts)
         ).all()
+        wanted = session.scalar(select(func.count()).where(JobRow.kind == "pipeline"))
     ready = [row for row in rows if row.state == "ready"]
     corrupt = 0
     for artifact in (artifact for row in ready for artifact in row.artifacts):
@@ -162,34 +154,41 @@ def _count_models(database: Database, settings: Settings) -> dict[str, Any]:
             corrupt += 1
     return {
         "models_published": len(ready),
+        "models_missing": int(wanted or 0) - len({row.name for row in ready}),
         "models_doubled": len(ready) - len({row.name for row in ready}),
         "models_corrupt": corrupt,
     }
 
 
 def _count_orphans(database: Database, settings: Settings) -> dict[str, Any]:
-    """Files of the store that no row names, by their folder: artifacts, datasets, scratch; and writes cut short."""
+    """Files that rows name and the store lacks; files that no row names, by their folder; and writes cut short."""
     with database.reading() as session:
-        named = {
+        held = {
             artifact["sha256"]
             for holder in HOLDERS
             for artifacts in session.scalars(select(holder.artifacts))
             for artifact in artifacts
         }
-        named |= {digest for digest in session.scalars(select(DatasetRow.digest)) if digest}
+        named = held | {digest for digest in session.scalars(select(DatasetRow.digest)) if digest}
         named |= {digest for digest in session.scalars(select(ModelVersionRow.sha256)) if digest}
         named |= _digests_in(session.scalars(select(ShardRow.result)))
         named |= _digests_in(session.scalars(select(AssessmentRow.figures)))
         paths = set(session.scalars(select(EpisodeRow.path)))
     kinds: Counter[str] = Counter()
+    present = set()
     for batch in obstore.list(open_store(settings)):
         for entry in batch:
             path = str(entry["path"])
+            present.add(path.rpartition("/")[2])
             if path.rpartition("/")[2] not in named and path not in paths:
                 kinds[path.partition("/")[0]] += 1
     if settings.store_folder is not None:
         kinds["unfinished"] += sum(1 for _ in settings.store_folder.rglob("*#*"))
-    return {"orphans": sum(kinds.values()), "orphans_by_kind": {k: n for k, n in kinds.items() if n}}
+    return {
+        "files_missing": len(held - present),
+        "orphans": sum(kinds.values()),
+        "orphans_by_kind": {k: n for k, n in kinds.items() if n},
+    }
 
 
 def _digests_in(values: Iterable[Any]) -> set[str]:

@@ -17,13 +17,6 @@ import psutil
 
 ROOT = Path(__file__).resolve().parents[3]
 PR_SET_PDEATHSIG = 1
-FAKETIME_PLACES = (
-    "usr/lib/*/faketime/libfaketime.so.1",
-    "usr/lib/faketime/libfaketime.so.1",
-    "usr/local/lib/faketime/libfaketime.so.1",
-)
-FAKETIME_VARIABLE = "PHYSWORLD_CHAOS_FAKETIME"
-"""Names the library where it lies elsewhere."""
 
 
 class CannotRun(Exception):
@@ -129,34 +122,6 @@ def until(condition: Callable[[], bool], what: str, seconds: float) -> None:
         if time.monotonic() > deadline:
             raise CannotRun(f"{what} within {seconds:.0f} s")
         time.sleep(0.1)
-
-
-def faketime_library() -> Path | None:
-    """libfaketime, where it is installed."""
-    named = os.environ.get(FAKETIME_VARIABLE)
-    found = [named] if named else [path for place in FAKETIME_PLACES for path in Path("/").glob(place)]
-    return Path(found[0]) if found else None
-
-
-class Clock:
-    """The clock of the processes that are started with its variables; monotonic clocks are left as they are."""
-
-    def __init__(self, library: Path, file: Path) -> None:
-        self._file = file
-        self.step(0.0)
-        self.variables = {
-            "LD_PRELOAD": str(library),
-            "FAKETIME_TIMESTAMP_FILE": str(file),
-            "FAKETIME_CACHE_DURATION": "1",
-            "FAKETIME_DONT_FAKE_MONOTONIC": "1",
-            "DONT_FAKE_MONOTONIC": "1",
-        }
-
-    def step(self, seconds: float) -> None:
-        """Set it so far from the true time [s]; processes notice within a second."""
-        part = self._file.with_suffix(".part")
-        part.write_text(f"{seconds:+.3f}\n")
-        part.replace(self._file)
 
 
 def _die_with_parent() -> None:

@@ -1,7 +1,8 @@
 """The work that goes on under the faults: recordings are uploaded, pipelines asked for and waited for, by the SDK.
 
 Every pipeline has a name of its own, and a recording of its own: a bar held at one end and moved up and down, by a
-little more each time. So the ledger can say of each name whether it was done once, twice or never.
+little more each time. So the ledger can say of each name whether it was done once, twice or never. A pipeline whose
+dataset was refused for want of disk is retried, as its user would once there is room again; any other end is left.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ TRAINING = TrainingConfig(
     fine_tune_steps=5, formats=[],
 )  # fmt: skip
 ANSWER_S, WAIT_S, PAUSE_S = 15.0, 30.0, 1.0
+REFUSED = "NotEnoughDisk"
+RETRY_AFTER_S = 5.0
 RETRIES = 1000
 """The client goes on with the same Idempotency-Key until the run ends it."""
 
@@ -73,6 +76,7 @@ class Asked:
     job_id: str | None = None
     state: str = "asked"
     asked_again: int = 0
+    retried: int = 0
 
 
 @dataclass
@@ -134,8 +138,13 @@ class Work:
         archive = self.folder / f"{asked.name}.zip"
         archive.write_bytes(canonical_archive(bar(number)))
         job: Job | None = None
+        refused = False
         while not self._give_up.is_set():
+            again, refused = refused, False
             try:
+                if job is not None and again:
+                    asked.retried += 1
+                    client.jobs.retry(job.id)
                 if job is None:
                     scene = client.scenes.create(archive)
                     body = PipelineCreate(
@@ -151,7 +160,10 @@ class Work:
                 break
             except (JobFailed, JobCancelled) as error:
                 asked.state = error.job.state
-                break
+                refused = error.job.error is not None and REFUSED in str(error.job.error.detail)
+                if not refused:
+                    break
+                self._give_up.wait(RETRY_AFTER_S)
             except PhysWorldError:  # a full store (507), a stream that broke, a wait that was too short
                 asked.asked_again += 1
                 self._give_up.wait(PAUSE_S)

@@ -60,15 +60,18 @@ class PipelineJobs(JobKind):
     def fail(self, session: Session, job: JobRow, message: str) -> None:
         """Nothing of its own: what it makes is its children's."""
 
-    def open_next(self, session: Session, parent: JobRow, children: Sequence[JobRow]) -> bool:
-        """Open what follows the last child, when all have succeeded; False when nothing does."""
+    def open_next(self, session: Session, parent: JobRow, ended: JobRow, children: Sequence[JobRow]) -> bool:
+        """Open what follows the child that has just ended, when all have succeeded; False when nothing does.
+
+        Times say nothing of what followed what: children are made by several hosts, whose clocks may differ and be set.
+        """
         if any(job.state not in TERMINAL_STATES for job in children):
             return True  # a training runs beside its dataset; the end of the later one decides
         request = PipelineCreate.model_validate(parent.config)
-        outputs = {job.kind: output_of(job) for job in children}
-        last = children[-1].kind
+        outputs = {job.kind: output_of(job) for job in (*children, ended)}
+        last = ended.kind
         if last == DATASET and _has_training(children, outputs[DATASET]):
-            last = TRAINING  # it ran beside its dataset: the two were made at once, by clocks that may differ
+            last = TRAINING  # it ran beside its dataset and ended first
         if last == FIT and request.close_the_loop:
             particles = min(request.fit.particle_budget, TRACE_PARTICLES)
             declared = request.fit.model_copy(update={"damping": "none", "particle_budget": particles})

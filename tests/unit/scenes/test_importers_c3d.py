@@ -9,11 +9,9 @@ import ezc3d
 import numpy as np
 import pytest
 
-from physworld_scenes.errors import SceneInvalid
-from physworld_scenes.importers import ImportOptions, import_any
+from physworld_scenes.importers import ImportOptions, c3d, import_any
 from physworld_scenes.importers.c3d import ROTATION_FROM_UP, fill_gaps
-
-pytestmark = pytest.mark.slow
+from physworld_storage.errors import SceneInvalid
 
 FRAMES = 30
 LABELS = ["tip1", "tip2", "tip3", "base1", "base2", "base3"]
@@ -121,12 +119,37 @@ def test_a_file_cut_short_is_named(keep: int, tmp_path: Path) -> None:
         import_any(data[:keep], "cut.c3d")
 
 
-def test_a_forged_header_ends_the_child_and_not_this_process(tmp_path: Path) -> None:
+def test_a_forged_header_ends_the_child_and_not_this_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(c3d, "_check_parameters", lambda *_: None)
     data = bytearray(write(tmp_path / "forged.c3d", markers()))
     data[512 + 4 : 700] = bytes([0xFF]) * (700 - 516)
     with pytest.raises(SceneInvalid) as caught:
         import_any(bytes(data), "forged.c3d")
     assert caught.value.faults[0].loc == ["c3d"]
+
+
+@pytest.mark.parametrize("bent", ["counts", "no values", "description"])
+def test_a_parameter_that_does_not_end_within_the_file_is_refused_before_the_library_reads_it(
+    bent: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The library would count to the end of values that are not there, or take 4 GiB for a text of -1 characters."""
+    data = bytearray(write(tmp_path / "swing.c3d", markers()))
+    import_any(bytes(data), "swing.c3d")
+    at = data.index(b"LABELS") + len(b"LABELS")  # distance (2), bytes of a value (1), dimensions (1), counts
+    if bent == "counts":
+        data[at + 3 : at + 9] = bytes([5, 255, 255, 255, 255, 255])
+    elif bent == "no values":
+        data[at + 3 : at + 9] = bytes([5, 255, 255, 255, 255, 0])
+    else:
+        across, along = data[at + 4 : at + 6]
+        data[at + 6 + across * along] = 255
+    monkeypatch.setattr(c3d, "_parsed_in_child", lambda source: pytest.fail("the library was asked"))
+    with pytest.raises(
+        SceneInvalid, match=r"cut short: \d+ bytes, a parameter at byte \d+ does not end within them"
+    ):
+        import_any(bytes(data), "swing.c3d")
 
 
 def test_gaps_at_the_ends_are_held() -> None:

@@ -66,13 +66,6 @@ def test_a_file_that_has_rotted_is_replaced_by_the_next_write(
         assert artifacts.read_bytes(sha256) == data
 
 
-def test_a_file_that_is_sound_is_not_written_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    artifacts = ArtifactStore(Settings(data_dir=tmp_path))
-    artifacts.put_bytes(b"hello", "greeting.txt")
-    monkeypatch.setattr(obstore, "put", lambda *_: pytest.fail("written again"))
-    artifacts.put_bytes(b"hello", "greeting.txt")
-
-
 def test_a_range_is_what_lies_between(artifacts: ArtifactStore) -> None:
     artifact = artifacts.put_bytes(b"0123456789", "digits")
     assert b"".join(artifacts.open(artifact.sha256, 2, 5)) == b"234"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from datetime import timedelta
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +20,7 @@ from physworld_storage.errors import Conflict, ResultInvalid
 from physworld_storage.jobs import helpers, jobs, leases
 from physworld_storage.scratch import ScratchStore
 from physworld_storage.settings import Settings
-from physworld_storage.tables import ShardRow, utc_now
+from physworld_storage.tables import JobRow, ShardRow, utc_now
 
 if TYPE_CHECKING:
     from conftest import Work
@@ -167,9 +168,13 @@ def test_a_report_of_the_wrong_form_is_refused_before_anything_changes(
     assert work.job(job).state == "running"
 
 
-def finish(work: Work, database: Database, job: Job, verdict: str) -> list[str]:
-    """Do the whole pipeline with this verdict; the kinds of its children."""
+def finish(
+    work: Work, database: Database, job: Job, verdict: str, clocks: random.Random | None = None
+) -> list[str]:
+    """Do the whole pipeline with this verdict, made by hosts with such clocks; the kinds of its children."""
     while work.job(job).state in {"queued", "running"}:
+        if clocks is not None:
+            _set_clocks(database, job, clocks)
         lease = work.claim()
         added = [TWIN] if verdict == "named" else []
         answer = {**REPORT, "verdict": verdict, "artifacts": added}
@@ -177,6 +182,30 @@ def finish(work: Work, database: Database, job: Job, verdict: str) -> list[str]:
         with database.session() as session:
             assert leases.complete(session, lease, result)
     return [work.job(child).kind for child in work.job(job).children]
+
+
+def _set_clocks(database: Database, job: Job, clocks: random.Random) -> None:
+    """The children were made at times that do not tell their order."""
+    with database.session() as session:
+        for row in session.query(JobRow).where(JobRow.parent_id == job.id):
+            row.created_at = job.created_at + timedelta(seconds=clocks.uniform(-3600.0, 3600.0))
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("beside", [False, True], ids=["after", "beside"])
+def test_what_follows_what_does_not_depend_on_clocks(
+    work: Work, database: Database, seed: int, beside: bool
+) -> None:
+    training = TrainingConfig(start_share=0.5) if beside else TrainingConfig()
+    scene = work.scene()
+    clocks = random.Random(seed)
+    plain = PipelineCreate(scene_id=scene.id, dataset=DatasetConfig(episodes=2), training=training)
+    with database.session() as session:
+        job = jobs.create_pipeline(session, plain)
+    assert sorted(finish(work, database, job, "", clocks)) == ["dataset", "fit", "training"]
+    looped = closed_loop(work, database, scene.id, training=training)
+    found = sorted(finish(work, database, looped, "named", clocks))
+    assert found == ["dataset", "dataset", "fit", "trace", "training", "training"]
 
 
 def closed_loop(work: Work, database: Database, scene_id: str, **more: Any) -> Job:

@@ -128,6 +128,7 @@ def test_idempotency_keys_of_more_than_a_day_ago_are_forgotten_once_an_hour(
     monkeypatch.setattr(time, "monotonic", lambda: later)
     dispatcher.tick()
     assert kept() == {"fresh"}
+    dispatcher.housekeeping.wait(WITHIN_S)
     app.close()
 
 
@@ -147,7 +148,8 @@ def test_a_dispatcher_without_work_asks_the_database_seldom_and_the_broker_never
     statements: list[str] = []
     app, stop = create_app(settings), threading.Event()
     dispatcher = Dispatcher(settings, stores.database, app)
-    dispatcher.tick()  # the first one forgets old keys too
+    dispatcher.tick()  # the first one forgets old keys too, and has the store tidied up
+    dispatcher.housekeeping.wait(WITHIN_S)
     event.listen(stores.database.engine, "before_cursor_execute", lambda *given: statements.append(given[2]))
     commands = broker.info("stats")["total_commands_processed"]
     thread = threading.Thread(target=dispatcher.run, args=(stop,))

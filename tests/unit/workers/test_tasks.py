@@ -322,6 +322,25 @@ def test_episodes_without_a_row_go_with_a_cancelled_dataset(runtime_with, fit: F
     assert known.exists() and not orphan.exists()
 
 
+def test_an_episode_that_a_stopped_worker_wrote_after_the_seal_goes(
+    runtime_with, fit: Fit, stores: Stores
+) -> None:
+    runtime = runtime_with()
+    with stores.database.session() as session:
+        job = jobs.create_dataset(session, fit.id, DatasetConfig(episodes=2, frames=8))
+    _drain(runtime)
+    assert _job(stores, job).state == "succeeded"
+    with stores.database.reading() as session:
+        first, second = resources.all_episodes(session, job.outputs[0].id)
+    store = runtime.settings.store_folder
+    late = (store / first.path).with_name("00000-e9.zarr.zip")
+    late.write_bytes((store / first.path).read_bytes())
+    assert remove_orphan_episodes(runtime.settings, stores.database) == []
+    removed = remove_orphan_episodes(runtime.settings, stores.database, sealed=True)
+    assert [(store / path) for path in removed] == [late]
+    assert (store / first.path).exists() and (store / second.path).exists() and not late.exists()
+
+
 def test_arrays_survive_the_npz_and_the_same_arrays_give_the_same_bytes() -> None:
     arrays = {"a": np.arange(6.0).reshape(2, 3), "b": np.array("text")}
     data = npz_bytes(arrays)
