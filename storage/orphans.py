@@ -27,11 +27,10 @@ from typing import Any
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from physworld_schemas.queues import QUEUE_OF_SHARD
 from physworld_storage.artifacts import SHA256, ArtifactStore
 from physworld_storage.clock import database_now
 from physworld_storage.database import Database
-from physworld_storage.jobs.opening import RUNNING
+from physworld_storage.jobs.shards import RUNNING
 from physworld_storage.settings import Settings
 from physworld_storage.tables import (
     AssessmentRow,
@@ -52,7 +51,6 @@ NAMING = (
 )
 MANY = ("episode", "simulation")
 """Kinds of shards that a job has by the thousand; they put no artifacts."""
-NAMING_SHARDS = tuple(kind for kind in QUEUE_OF_SHARD if kind not in MANY)
 ROWS_AT_A_TIME = 1000
 FEW, SHARE = 20, 0.1
 """So many files without a row, or such a share of all, may be of lost attempts."""
@@ -96,7 +94,7 @@ def _named(session: Session) -> Iterator[str]:
     """The digest of every file that a row names, or that the work of a shard was given or has told."""
     shards = (ShardRow.payload, ShardRow.result)
     statements = [select(column) for column in NAMING]
-    statements += [select(column).where(ShardRow.kind.in_(NAMING_SHARDS)) for column in shards]
+    statements += [select(column).where(ShardRow.kind.not_in(MANY)) for column in shards]
     for statement in statements:
         yield from _digests(session.scalars(statement.execution_options(yield_per=ROWS_AT_A_TIME)))
 
