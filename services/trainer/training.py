@@ -20,7 +20,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -46,6 +46,7 @@ from physworld_workers.tasks.inputs import made_from, scene_of, twin_of
 logger = logging.getLogger(__name__)
 
 CHECKPOINT = "training.pt"
+Result = TypeVar("Result")
 
 
 def run(context: TaskContext, stores: Stores) -> HandlerResult:
@@ -157,7 +158,7 @@ def _train(
         return _stopping(context, lambda: attempt(None))
 
 
-def _stopping(context: TaskContext, work: Callable[[], TrainingResult]) -> TrainingResult:
+def _stopping(context: TaskContext, work: Callable[[], Result]) -> Result:
     """``work()``; a cancellation that it noticed ends the shard as the worker's own does."""
     try:
         return work()
