@@ -158,7 +158,8 @@ class WorldModel:
     @property
     def history(self) -> int:
         """h: a step looks back so many ticks."""
-        return self._network.history
+        history: int = self._network.history
+        return history
 
     @property
     def controller_count(self) -> int:
