@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from celery import Celery, signals
-from kombu import Exchange, Queue
+from kombu.entity import Exchange, Queue
 
 from physworld_schemas.queues import INFERENCE, SIMULATION, TASK_NAME, TRAINING
 from physworld_storage.settings import Settings
@@ -30,7 +30,7 @@ HARD_LIMIT_S = 12 * 3600
 SOFT_LIMIT_S = HARD_LIMIT_S - 60
 VISIBILITY_TIMEOUT_S = HARD_LIMIT_S + 3600
 TASKS_PER_CHILD = 1000  # a fresh process loads the physics kernels again, which takes seconds
-EXCHANGE = Exchange("physworld", type="direct")
+EXCHANGE = Exchange("physworld", type="direct")  # type: ignore[no-untyped-call]  # kombu has no types
 READY_FILE_VARIABLE = "PHYSWORLD_READY_FILE"
 HEAVY_MODULES = ("torch", "warp")
 
@@ -51,7 +51,10 @@ def create_app(settings: Settings) -> Celery:
         task_create_missing_queues=False,
         task_default_queue=SIMULATION,
         task_ignore_result=True,
-        task_queues=[Queue(name, EXCHANGE, routing_key=name) for name in (SIMULATION, TRAINING, INFERENCE)],
+        task_queues=[
+            Queue(name, EXCHANGE, routing_key=name)  # type: ignore[no-untyped-call]  # kombu has no types
+            for name in (SIMULATION, TRAINING, INFERENCE)
+        ],
         task_reject_on_worker_lost=True,
         task_serializer="json",
         task_soft_time_limit=SOFT_LIMIT_S,

@@ -36,7 +36,8 @@ from physworld.twin.build import build_twin
 
 NULLS = 120
 METHOD = tuple(
-    f"physworld/{room}" for room in ("trace", "calibrate", "effects", "mpm", "geometry", "evaluate")
+    f"physworld/{room}"
+    for room in ("trace", "calibrate", "estimation", "effects", "engine", "geometry", "evaluate", "twin")
 )
 _OFF = 1.3  # stiffness that a trace starts from, over the true one
 _STIFFNESS = ("youngs_modulus_pa", "membrane_n_m", "bending_n_m", "bending_n_m2")

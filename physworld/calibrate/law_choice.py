@@ -78,7 +78,8 @@ _LONGEST_REASON = 1000
 class Ask(Protocol):
     """A vision-language model: a prompt and PNG images in, its text out. Raises LawAnswerUnavailable."""
 
-    name: str
+    @property
+    def name(self) -> str: ...
 
     def __call__(self, prompt: str, images: list[bytes]) -> str: ...
 

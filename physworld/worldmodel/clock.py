@@ -43,7 +43,8 @@ def resample(values: Array, times: Array, at: Array) -> Array:
     left = np.clip(np.searchsorted(times, at, side="right") - 1, 0, times.shape[0] - 2)
     weight = (at - times[left]) / (times[left + 1] - times[left])
     weight = weight.reshape((-1,) + (1,) * (values.ndim - 1))
-    return (1.0 - weight) * values[left] + weight * values[left + 1]
+    between: Array = (1.0 - weight) * values[left] + weight * values[left + 1]
+    return between
 
 
 def resample_smooth(values: Array, times: Array, at: Array) -> Array:
@@ -62,9 +63,10 @@ def resample_smooth(values: Array, times: Array, at: Array) -> Array:
     shape = (-1,) + (1,) * (values.ndim - 1)
     width = (times[left + 1] - times[left]).reshape(shape)
     s = (at - times[left]).reshape(shape) / width
-    return (
+    between: Array = (
         (1.0 + 2.0 * s) * (1.0 - s) ** 2 * values[left]
         + s * (1.0 - s) ** 2 * width * slopes[left]
         + s**2 * (3.0 - 2.0 * s) * values[left + 1]
         + s**2 * (s - 1.0) * width * slopes[left + 1]
     )
+    return between

@@ -49,7 +49,7 @@ def graph_origin(spec: GraphSpec, vertices: Array) -> Array:
     """Where single precision counts from, (3,): the vertices' mean (…, n, 3), with z at the ground if there
     is one.
     """
-    origin = np.asarray(vertices, dtype=np.float64).reshape(-1, 3).mean(axis=0)
+    origin: Array = np.asarray(vertices, dtype=np.float64).reshape(-1, 3).mean(axis=0)
     if spec.ground_height_m is not None:
         origin[2] = spec.ground_height_m
     return origin

@@ -24,6 +24,7 @@ import logging
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import cast
 
 import numpy as np
 import torch
@@ -32,7 +33,7 @@ from torch import Tensor, nn
 from physworld.arrays import Array
 from physworld.worldmodel.model.features import edge_features, vertex_features
 from physworld.worldmodel.model.graph import EDGE_KINDS, NEAR, GraphSpec
-from physworld.worldmodel.model.model import WorldModel
+from physworld.worldmodel.model.model import EdgeWeights, WorldModel
 from physworld.worldmodel.model.nearest import near_ends
 from physworld.worldmodel.priors.chain_step import ChainStep
 
@@ -80,14 +81,15 @@ class StepProgram(nn.Module):
         degree = window.new_zeros(EDGE_KINDS * count).scatter_add(0, ends, torch.ones_like(edges[:, 0]))
         state = self.encoder(features)
         for layer in range(len(self.receive)):
-            weight = self.edge[layer].weight.transpose(1, 2).flatten(0, 1)
+            weight = cast(EdgeWeights, self.edge[layer]).weight.transpose(1, 2).flatten(0, 1)
             heard, sent = self.receive[layer](state), self.send[layer](state)
             messages = torch.relu(
                 heard.index_select(0, receivers) + sent.index_select(0, senders) + by_kind @ weight
             )
             total = torch.zeros_like(state).repeat(EDGE_KINDS, 1)
             total = total.scatter_add(0, ends[:, None].expand_as(messages), messages)
-            means = (total / degree.clamp(min=1.0)[:, None]).unflatten(0, (EDGE_KINDS, count))
+            means = total / degree.clamp(min=1.0)[:, None]
+            means = means.unflatten(0, (EDGE_KINDS, count))  # type: ignore[no-untyped-call]  # torch's has no types
             inner = self.update_in[layer](torch.cat([state, *means.unbind(0)], dim=-1))
             state = state + self.update_out[layer](torch.relu(inner))
         correction = self.decoder(state[:n]) + self.skip(features[:n])
@@ -100,7 +102,7 @@ def edge_list(spec: GraphSpec, places: Array | None = None) -> dict[str, Array]:
     With ``places`` (V or n, 3) [m] also its NEAR edges there, if they are those of the current shape.
     """
     receivers, slots = np.nonzero(spec.neighbours < spec.vertex_count)
-    edges = {
+    edges: dict[str, Array] = {
         "senders": spec.neighbours[receivers, slots].astype(np.int64),
         "receivers": receivers.astype(np.int64),
         "kinds": spec.edge_kind[receivers, slots].astype(np.int64),
@@ -110,7 +112,7 @@ def edge_list(spec: GraphSpec, places: Array | None = None) -> dict[str, Array]:
         return edges
     n, rest = spec.object_count, spec.rest_vertices.astype(np.float32)
     _, hears, heard = near_ends(places[None, :n], spec.current_neighbours, spec.edge_radius_m)
-    near = {
+    near: dict[str, Array] = {
         "senders": heard,
         "receivers": hears,
         "kinds": np.full(len(heard), NEAR),
@@ -122,7 +124,7 @@ def edge_list(spec: GraphSpec, places: Array | None = None) -> dict[str, Array]:
 def example_inputs(model: WorldModel) -> dict[str, Array]:
     """Inputs of the program at rest."""
     spec, frames = model.spec, model.config.history + 1
-    rest = model._reference.numpy(force=True)
+    rest: Array = model._reference.numpy(force=True)
     return {
         "window": np.repeat(rest[None], frames, axis=0).astype(np.float32),
         "control_next": rest[spec.object_count :].astype(np.float32),
@@ -150,7 +152,8 @@ def onnx_program(model: WorldModel) -> bytes:
             verbose=False,
             optimize=not isinstance(model.prior, ChainStep),  # a minute for what a runtime does by itself
         )
-    return program.model_proto.SerializeToString()
+    content: bytes = cast(torch.onnx.ONNXProgram, program).model_proto.SerializeToString()
+    return content
 
 
 def _exported(model: WorldModel) -> torch.export.ExportedProgram:

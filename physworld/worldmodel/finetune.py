@@ -135,7 +135,7 @@ def _optimise(
         change = torch.cat([local, shared.expand(len(start), -1)], dim=1)
         loss = task.loss(path, start + change * scale)
         loss = loss + config.smoothness_weight * change.square().sum(dim=1).mean()
-        loss.backward()
+        loss.backward()  # type: ignore[no-untyped-call]  # torch's has no types
         torch.nn.utils.clip_grad_norm_([local, shared], 1.0)
         optimiser.step()
         with torch.no_grad():

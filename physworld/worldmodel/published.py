@@ -251,8 +251,9 @@ def _prior_of(tensors: dict[str, Array]) -> ModalPrior | ChainPrior | InertialPr
         return InertialPrior(len(tensors["rest.vertices"]))
     if "prior.spread" not in tensors:
         return ModalPrior(**{part: tensors[f"prior.{part}"] for part in ModalPrior.__dataclass_fields__})
-    parts = {part: tensors[f"prior.{part}"] for part in ChainPrior.__dataclass_fields__}
-    return ChainPrior(**(parts | {"substeps": int(parts["substeps"][0])}))
+    parts: dict[str, Any] = {part: tensors[f"prior.{part}"] for part in ChainPrior.__dataclass_fields__}
+    parts["substeps"] = int(parts["substeps"][0])
+    return ChainPrior(**parts)
 
 
 def _refuse_other_sizes(

@@ -41,7 +41,8 @@ def rollout(
         controllers: all controllers at frames 0 … T-1 [m], (T, K, 3).
         phi: log property ratios, (n, 2).
     """
-    return rollout_batch(RolloutEngine(model), spec, initial_history, controllers[None], phi)[0]
+    batch = rollout_batch(RolloutEngine(model), spec, initial_history, controllers[None], phi)
+    return np.asarray(batch[0])
 
 
 def rollout_batch(

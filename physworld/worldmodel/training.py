@@ -259,7 +259,7 @@ def _train_step(run: _Run, sampler: WindowSampler, training: TrainingConfig, loo
     for group in run.optimiser.param_groups:
         group["lr"] = rate
     run.optimiser.zero_grad(set_to_none=True)
-    loss.backward()
+    loss.backward()  # type: ignore[no-untyped-call]  # torch's has no types
     norm = torch.nn.utils.clip_grad_norm_(model.parameters(), training.gradient_clip)
     if not _usable(run, loss.item(), norm.item()):
         return

@@ -70,7 +70,8 @@ class Episodes:
         varied = [one for one in strengths if perturbed and one.low < one.high]
         self._intervals = {column_of(one).name: (one.low, one.high) for one in varied}
         demonstration = demonstration_of(dataset.config)
-        sigma, friction = demonstration.sigma_of("friction"), ()
+        sigma = demonstration.sigma_of("friction")
+        friction: tuple[PhiColumn, ...] = ()
         if sigma > 0.0 and ground_friction is not None:
             most = min(BOUND_SIGMAS * sigma, float(np.log(demonstration.largest_factor)))
             friction = (

@@ -20,7 +20,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -43,9 +43,11 @@ from physworld_workers.stores import Stores
 from physworld_workers.tasks.dataset import strength_ranges
 from physworld_workers.tasks.inputs import made_from, scene_of, twin_of
 
+Result = TypeVar("Result")
 logger = logging.getLogger(__name__)
 
 CHECKPOINT = "training.pt"
+Result = TypeVar("Result")
 
 
 def run(context: TaskContext, stores: Stores) -> HandlerResult:
@@ -157,7 +159,7 @@ def _train(
         return _stopping(context, lambda: attempt(None))
 
 
-def _stopping(context: TaskContext, work: Callable[[], TrainingResult]) -> TrainingResult:
+def _stopping(context: TaskContext, work: Callable[[], Result]) -> Result:
     """``work()``; a cancellation that it noticed ends the shard as the worker's own does."""
     try:
         return work()

@@ -148,7 +148,7 @@ def _trace(given: argparse.Namespace) -> None:
             several = result.recordings if len(result.recordings) > 1 else ()
             tracks = {f"before_{k}": known.before for k, known in enumerate(several)}
             tracks |= {f"after_{k}": known.after for k, known in enumerate(several)}
-            np.savez(file, before=result.before, after=result.after, **tracks)
+            np.savez(file, allow_pickle=False, before=result.before, after=result.after, **tracks)
     if given.html is not None:
         given.html.parent.mkdir(parents=True, exist_ok=True)
         given.html.write_text(render(report, scene, result.before, result.after), encoding="utf-8")

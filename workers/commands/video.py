@@ -139,10 +139,14 @@ def _camera(given: argparse.Namespace, moved: Array) -> Any:
         try:
             facts = json.loads(given.camera.read_text())
             return Camera(
-                int(facts["width"]), int(facts["height"]),
-                *(float(facts[key]) for key in ("fx", "fy", "cx", "cy")),
-                np.asarray(facts["world_to_camera"], dtype=np.float64),
-            )  # fmt: skip
+                width=int(facts["width"]),
+                height=int(facts["height"]),
+                fx=float(facts["fx"]),
+                fy=float(facts["fy"]),
+                cx=float(facts["cx"]),
+                cy=float(facts["cy"]),
+                world_to_camera=np.asarray(facts["world_to_camera"], dtype=np.float64),
+            )
         except (KeyError, TypeError, json.JSONDecodeError) as error:
             raise ValueError(f"{given.camera} is no camera: {error!r}") from error
     width, times, height = given.size.partition("x")

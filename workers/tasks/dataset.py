@@ -187,7 +187,7 @@ def demonstration_of(config: DatasetConfig, strengths: tuple[StrengthRange, ...]
     return DemonstrationConfig(
         frames=config.frames,
         motion=config.motion,
-        patterns=None if config.patterns is None else dict(config.patterns),
+        patterns=None if config.patterns is None else dict(config.patterns.items()),
         replay_share=config.replay_share,
         curvature_limit=config.curvature_limit,
         perturbation=config.perturbation,

@@ -79,7 +79,7 @@ class Network:
         self.object_count = object_count
         self.control_count = vertex_count - object_count
         kinds, _, features = self._tensor("edge.0.weight").shape
-        self.history = (features - 8) // 3
+        self.history: int = (features - 8) // 3
         inputs = self._tensor("encoder.in.weight").shape[1] - (3 * self.history + 5 + PROPERTY_COUNT)
         fits = features == 3 * self.history + 8 and kinds == EDGE_KINDS and inputs in (0, 1)
         if self.control_count < 0 or not fits:

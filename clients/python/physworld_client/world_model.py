@@ -158,7 +158,8 @@ class WorldModel:
     @property
     def history(self) -> int:
         """h: a step looks back so many ticks."""
-        return self._network.history
+        history: int = self._network.history
+        return history
 
     @property
     def controller_count(self) -> int:
@@ -213,7 +214,8 @@ class WorldModel:
         path[:, n:] = controls
         for tick in range(frames, len(driven)):
             path[tick] = self._network.step(path[tick - frames : tick], controls[tick], properties)
-        return path[:, :n] + origin
+        vertices: Array = path[:, :n] + origin
+        return vertices
 
     def _phi(self, given: Array | Mapping[str, float | Array] | None) -> Array:
         """Φ (n, 2) of what a caller gave."""

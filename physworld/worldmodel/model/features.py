@@ -129,7 +129,8 @@ def edge_features(
 def cut_strain(strain: Tensor, radius: float) -> Tensor:
     """s̄ of s (…, 3) of a NEAR edge found at a step (:mod:`physworld.worldmodel.model.nearest`)."""
     size = torch.linalg.vector_norm(strain, dim=-1, keepdim=True)
-    return strain * (radius / size.clamp(min=radius))
+    cut: Tensor = strain * (radius / size.clamp(min=radius))
+    return cut
 
 
 def cut_rest_length(rest_length: Tensor, radius: float) -> Tensor:

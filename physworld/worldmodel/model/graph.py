@@ -70,12 +70,12 @@ class GraphSpec:
     @property
     def object_count(self) -> int:
         """n."""
-        return self.rest_vertices.shape[0]
+        return len(self.rest_vertices)
 
     @property
     def control_count(self) -> int:
         """C."""
-        return self.control_index.shape[0]
+        return len(self.control_index)
 
     @property
     def vertex_count(self) -> int:

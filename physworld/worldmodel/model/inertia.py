@@ -25,6 +25,8 @@ class InertialPrior:
 class InertialStep(nn.Module):
     """x̂^{t+1} of the object vertices."""
 
+    lags: Tensor
+
     def __init__(self, prior: InertialPrior, history: int) -> None:
         super().__init__()
         self.objects, self.history = prior.objects, history

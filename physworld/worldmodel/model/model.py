@@ -90,6 +90,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import torch
@@ -126,6 +127,13 @@ class EdgeConstants:
 class WorldModel(nn.Module):
     """Encode, process, decode: what every object vertex does in one step beyond the prior."""
 
+    _reference: Tensor
+    _offset: Tensor
+    _constants: Tensor
+    _share: Tensor
+    _senders: Tensor
+    _receivers: Tensor
+
     def __init__(
         self,
         config: WorldModelConfig,
@@ -152,13 +160,13 @@ class WorldModel(nn.Module):
         if len(normalisation.properties) != len(columns):
             raise ValueError(f"{len(normalisation.properties)} scales of Φ for {len(columns)} columns")
         vertex_features = 3 * h + 5 + len(normalisation.properties) + (spec.ground_height_m is not None)
-        self.encoder = _two_layers(vertex_features, hidden, hidden)
+        self.encoder = TwoLayers(vertex_features, hidden, hidden)
         self.receive = nn.ModuleList(nn.Linear(hidden, hidden) for _ in range(layers))
         self.send = nn.ModuleList(nn.Linear(hidden, hidden, bias=False) for _ in range(layers))
-        self.edge = nn.ModuleList(_EdgeWeights(hidden, 3 * h + 8) for _ in range(layers))
+        self.edge = nn.ModuleList(EdgeWeights(hidden, 3 * h + 8) for _ in range(layers))
         self.update_in = nn.ModuleList(nn.Linear((1 + EDGE_KINDS) * hidden, hidden) for _ in range(layers))
         self.update_out = nn.ModuleList(nn.Linear(hidden, hidden) for _ in range(layers))
-        self.decoder = _two_layers(hidden, hidden, 3)
+        self.decoder = TwoLayers(hidden, hidden, 3)
         self.skip = nn.Linear(vertex_features, 3, bias=False)
         for start in (self.skip.weight, self.decoder.out.weight, self.decoder.out.bias):
             nn.init.zeros_(start)  # an untrained network leaves the prior as it is
@@ -212,12 +220,14 @@ class WorldModel(nn.Module):
         mean_of = means(window[-1], shifted, constants)
         state = self.encoder(features)
         for layer in range(self.config.message_passing_steps):
-            placed = torch.bmm(places, constants.position[layer]).unflatten(1, window.shape[1:3])
+            placed = torch.bmm(places, constants.position[layer])
+            placed = placed.unflatten(1, window.shape[1:3])  # type: ignore[no-untyped-call]  # torch's has no types
             heard, sent = as_seen(self.receive[layer](state), self.send[layer](state), placed)
             mean = mean_of(layer, heard, sent)
             inner = self.update_in[layer](torch.cat([state, *mean.unbind(0)], dim=-1))
             state = state + self.update_out[layer](torch.relu(inner))
-        return self.decoder(state[:n]) + self.skip(features[:n])
+        correction: Tensor = self.decoder(state[:n]) + self.skip(features[:n])
+        return correction
 
     def _material_means(self, now: Tensor, shifted: Tensor, constants: EdgeConstants) -> Means:
         """Mean messages of a layer over the graph's own edges, at places and displacements from the reference (V, B,
@@ -289,7 +299,7 @@ class WorldModel(nn.Module):
         fixed = copy.deepcopy(self)
         first = 3 * self.config.history + 3 + kept
         scaled = values / self.norm.properties[kept:]
-        fixed.encoder.add_module("in", _at_inputs(getattr(self.encoder, "in"), first, scaled))
+        fixed.encoder.add_module("in", _at_inputs(self.encoder.first, first, scaled))
         fixed.skip = _at_inputs(self.skip, first, scaled)
         fixed.norm.properties = self.norm.properties[:kept].clone()
         fixed.columns = PROPERTIES
@@ -297,8 +307,12 @@ class WorldModel(nn.Module):
 
     def edge_constants(self) -> EdgeConstants:
         """What of the edge products depends on weights and graph only; valid until the weights change."""
-        terms = [self._edge_terms(layer.weight) for layer in self.edge]
+        terms = [self._edge_terms(weights) for weights in self.edge_weights()]
         return EdgeConstants(*(tuple(layer[term] for layer in terms) for term in range(4)))
+
+    def edge_weights(self) -> list[Tensor]:
+        """``edge.{l}.weight`` (3, H, 3h+8) of every layer."""
+        return [cast(EdgeWeights, layer).weight for layer in self.edge]
 
     def _edge_terms(self, weights: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Bias, position, length and NEAR terms of one layer from its weights (3, H, 3h+8)."""
@@ -308,12 +322,12 @@ class WorldModel(nn.Module):
         moves, rest = weight[:, 6 : 6 + 3 * h] / drift_scale, weight[:, 6 + 3 * h] / norm.length
         stretch = weight[:, 7 + 3 * h] / norm.stretch[:, None]
         table = torch.cat([near, strain, (rest - stretch)[:, None]], dim=1)
-        parts = self._constants.split(self._edges_by_kind)
+        parts = self._constants.split(self._edges_by_kind)  # type: ignore[no-untyped-call]  # torch's has no types
         bias = torch.cat([part @ table[kind] for kind, part in enumerate(parts)])
         return bias, torch.cat([near + strain, moves], dim=1), stretch, table[NEAR]
 
 
-class _EdgeWeights(nn.Module):
+class EdgeWeights(nn.Module):
     """``weight`` (3, H, F): one linear map of the edge features for each kind of edge."""
 
     def __init__(self, hidden: int, features: int) -> None:
@@ -335,13 +349,21 @@ def _at_inputs(layer: nn.Linear, first: int, values: Tensor) -> nn.Linear:
     return fixed
 
 
-def _two_layers(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
+class TwoLayers(nn.Sequential):
     """``in`` → ReLU → ``out``."""
-    layers = nn.Sequential()
-    layers.add_module("in", nn.Linear(inputs, hidden))
-    layers.add_module("relu", nn.ReLU())
-    layers.add_module("out", nn.Linear(hidden, outputs))
-    return layers
+
+    out: nn.Linear
+
+    def __init__(self, inputs: int, hidden: int, outputs: int) -> None:
+        super().__init__()
+        self.add_module("in", nn.Linear(inputs, hidden))
+        self.add_module("relu", nn.ReLU())
+        self.add_module("out", nn.Linear(hidden, outputs))
+
+    @property
+    def first(self) -> nn.Linear:
+        """``in``, whose name is a keyword of the language."""
+        return cast(nn.Linear, self.get_submodule("in"))
 
 
 def _reference_positions(spec: GraphSpec) -> Array:
@@ -352,4 +374,5 @@ def _reference_positions(spec: GraphSpec) -> Array:
     reference = np.concatenate([spec.rest_vertices, np.zeros((spec.control_count, 3))])
     for vertex in range(n, spec.vertex_count):
         reference[vertex] = reference[spec.neighbours[vertex, 0]] - spec.rest_relative[vertex, 0]
-    return reference - reference[:n].mean(axis=0)
+    centred: Array = reference - reference[:n].mean(axis=0)
+    return centred

@@ -130,8 +130,8 @@ class CurrentEdges:
     ) -> Tensor:
         """Mean messages (K, V, B, H); ``near_table`` (7, H) and ``kept_bias`` (E, H) are the layer's edge terms."""
         bias = torch.cat([self.near @ near_table, kept_bias[self.rows]])
-        one = (side.flatten(1, 2)[:, :, None] for side in (heard, sent))
-        return mean_messages(self.edges, *one, bias, self.length, weight).view_as(heard)
+        hears, says = (side.flatten(1, 2)[:, :, None] for side in (heard, sent))
+        return mean_messages(self.edges, hears, says, bias, self.length, weight).view_as(heard)
 
 
 @cache

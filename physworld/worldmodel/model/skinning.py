@@ -41,7 +41,7 @@ class Skin:
     def apply(self, vertices: Array) -> Array:
         """Points (…, M, 3) of vertices (…, n, 3)."""
         vertices = np.asarray(vertices)
-        points = self.weight[:, :1] * vertices[..., self.index[:, 0], :]
+        points: Array = self.weight[:, :1] * vertices[..., self.index[:, 0], :]
         for k in range(
             1, self.index.shape[1]
         ):  # one neighbour at a time: all at once take K times the memory
@@ -71,7 +71,8 @@ def inverse_distance_weights(distance: Array) -> Array:
     """w ∝ 1/distance, rows summing to 1, (M, K)."""
     floor = DISTANCE_FLOOR * distance[:, -1:] + np.finfo(np.float64).tiny
     weight = 1.0 / np.maximum(distance, floor)
-    return weight / weight.sum(axis=1, keepdims=True)
+    normalised: Array = weight / weight.sum(axis=1, keepdims=True)
+    return normalised
 
 
 def affine_skin(points: Array, vertices: Array, neighbours: int = 8) -> Skin:
@@ -115,7 +116,8 @@ def local_rotations(rest: Array, moved: Array, neighbours: int = 8, *, index: Ar
         left[line], _, right[line] = np.linalg.svd(along + LEAST_TURN * np.eye(3))
     flip = np.ones((*covariance.shape[:-1],))
     flip[..., 2] = np.sign(np.linalg.det(left @ right))
-    return (left * flip[..., None, :]) @ right
+    rotations: Array = (left * flip[..., None, :]) @ right
+    return rotations
 
 
 def quaternion_of(rotation: Array) -> Array:
@@ -137,7 +139,7 @@ def quaternion_of(rotation: Array) -> Array:
         axis=-2,
     )
     best = np.argmax(square, axis=-1)
-    quaternion = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
+    quaternion: Array = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
     quaternion = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
     return np.where(quaternion[..., :1] < 0.0, -quaternion, quaternion)
 

@@ -82,11 +82,11 @@ _ROLL = (
 
 
 @wp.func_native(_FLOW)
-def _flow(sizes: wp.uint64, arrays: wp.uint64): ...
+def _flow(sizes: wp.uint64, arrays: wp.uint64) -> None: ...
 
 
 @wp.func_native(_ROLL)
-def _roll(sizes: wp.uint64, arrays: wp.uint64): ...
+def _roll(sizes: wp.uint64, arrays: wp.uint64) -> None: ...
 
 
 @wp.kernel

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 from types import ModuleType
 from typing import Any
@@ -118,7 +119,7 @@ class NativeFlow:
 
     def __call__(self, *tensors: Tensor) -> Tensor:
         """Places (K, M, 3) after a tick: place, velocity, here, slope, turn (K, M, 3); pull, bend, ease (K', M, 1)."""
-        return _Flow.apply(self, *tensors)
+        return _flow(self, *tensors)
 
     def launch(self, count: int, given: dict[str, Array], back: bool) -> None:
         """One call of the kernel."""
@@ -184,6 +185,9 @@ class _Flow(torch.autograd.Function):
                 for k, n in ((5, "by_pulls"), (6, "by_bends"), (7, "by_eases"))
             ),
         )
+
+
+_flow: Callable[..., Tensor] = _Flow.apply
 
 
 def _launch(kernel: Any, sizes: list[int], addresses: list[int]) -> None:

@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from itertools import pairwise
 from types import ModuleType
+from typing import cast
 
 import numpy as np
 import torch
@@ -56,7 +57,8 @@ class RolloutEngine:
             }
         modal = model.prior if isinstance(model.prior, PriorStep) else None
         self._placing = None if modal is None else modal.placing.numpy(force=True).astype(np.float64)
-        self._span = (0.0, 0.0) if modal is None else tuple(modal.span.tolist())
+        low, high = (0.0, 0.0) if modal is None else modal.span.tolist()
+        self._span: tuple[float, float] = low, high
         self._property_scale = norm.properties.numpy(force=True)
         change, velocity, length = (float(x) for x in (norm.change, norm.velocity, norm.length))
         scalars = [1.0 / velocity, change, 1.0 / length, spec.edge_radius_m, REST_RADII * spec.edge_radius_m]
@@ -83,7 +85,8 @@ class RolloutEngine:
 
     def run(self, start: Array, driven: Array, phi: Array) -> Array:
         """All vertices (T, V, 3) float32 from object frames (h+1, n, 3), control vertices (T, C, 3), Φ (n, 2)."""
-        return self.run_batch(start, driven[None], phi)[0]
+        path: Array = self.run_batch(start, driven[None], phi)[0]
+        return path
 
     def run_batch(self, start: Array, driven: Array, phi: Array, *, threads: int = 1) -> Array:
         """All vertices of every candidate, (B, T, V, 3) float32.
@@ -119,7 +122,8 @@ class RolloutEngine:
         """ζ of the modal prior from Φ (B, n, 2), (B,); 0 where there is another one or none."""
         if self._placing is None:
             return np.zeros(len(phi))
-        return np.clip(np.tensordot(phi, self._placing, axes=2), *self._span)
+        soft: Array = np.clip(np.tensordot(phi, self._placing, axes=2), *self._span)
+        return soft
 
     def _with_room(self, nearest: int) -> dict[str, Array]:
         """Edge arrays of one call with room for the NEAR edges of a step, and the search's working memory."""
@@ -183,16 +187,19 @@ def _pack_weights(model: WorldModel, hidden: int) -> dict[str, Array]:
     own, wide = model.config.hidden, hidden
 
     def stack(layers: torch.nn.ModuleList, blocks: int = 1) -> Array:
-        parts = [_padded(part.T, wide, wide) for layer in layers for part in layer.weight.split(own, dim=1)]
+        weights = (cast(torch.nn.Linear, layer).weight for layer in layers)
+        split = (weight.split(own, dim=1) for weight in weights)  # type: ignore[no-untyped-call]  # torch's has no types
+        parts = [_padded(part.T, wide, wide) for block in split for part in block]
         return np.stack(parts).reshape(len(layers), blocks, wide, wide)
 
     def biases(layers: torch.nn.ModuleList) -> Array:
-        return np.stack([_padded(layer.bias[None], 1, wide)[0] for layer in layers])
+        return np.stack([_padded(cast(torch.nn.Linear, layer).bias[None], 1, wide)[0] for layer in layers])
 
-    encoder_in, encoder_out = getattr(model.encoder, "in"), model.encoder.out
-    decoder_in, decoder_out = getattr(model.decoder, "in"), model.decoder.out
+    encoder_in, encoder_out = model.encoder.first, model.encoder.out
+    decoder_in, decoder_out = model.decoder.first, model.decoder.out
     inputs = encoder_in.in_features
-    kinds, norm, h = [layer.weight.transpose(1, 2) for layer in model.edge], model.norm, model.config.history
+    kinds = [weights.transpose(1, 2) for weights in model.edge_weights()]
+    norm, h = model.norm, model.config.history
     near = [part[:3] / norm.length for layer in kinds for part in layer]
     strain = [part[3:6] / norm.strain[kind] for layer in kinds for kind, part in enumerate(layer)]
     rest = [
@@ -207,7 +214,8 @@ def _pack_weights(model: WorldModel, hidden: int) -> dict[str, Array]:
     ]
     lengths = [_padded(part[None], 1, wide) for layer in constants.length for part in layer]
     gap = model._constants[:, 3:6]
-    gaps = [float(part.abs().max()) if len(part) else 0.0 for part in gap.split(model._edges_by_kind)]
+    by_kind = gap.split(model._edges_by_kind)  # type: ignore[no-untyped-call]  # torch's has no types
+    gaps = [float(part.abs().max()) if len(part) else 0.0 for part in by_kind]
     return {
         "encode_in": _padded(encoder_in.weight.T, inputs, wide),
         "encode_in_bias": _padded(encoder_in.bias[None], 1, wide),

@@ -304,7 +304,7 @@ _ROLLOUT = (
 
 
 @wp.func_native(_ROLLOUT)
-def rollout_rows(sizes: wp.uint64, scalars: wp.uint64, arrays: wp.uint64): ...
+def rollout_rows(sizes: wp.uint64, scalars: wp.uint64, arrays: wp.uint64) -> None: ...
 
 
 @wp.kernel

@@ -156,7 +156,7 @@ def message_mean_rows(
     weight: wp.uint64,
     # out
     out: wp.uint64,
-): ...
+) -> None: ...
 
 
 @wp.func_native(_ADJOINT)
@@ -182,7 +182,7 @@ def message_mean_adjoint_rows(
     grad_bias: wp.uint64,
     grad_length: wp.uint64,
     grad_weight: wp.uint64,
-): ...
+) -> None: ...
 
 
 @wp.kernel

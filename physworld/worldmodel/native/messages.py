@@ -9,6 +9,7 @@ plain torch does.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from types import ModuleType
@@ -58,7 +59,7 @@ def mean_messages(
 ) -> Tensor:
     """Mean messages of every vertex, by kind, (K, V, B, H); 0 where it has no edge of that kind."""
     if heard.device.type == "cpu" and heard.dtype == torch.float32:
-        return _NativeMean.apply(edges, heard, sent, bias, length, weight)
+        return _native_mean(edges, heard, sent, bias, length, weight)
     return mean_messages_torch(edges, heard, sent, bias, length, weight)
 
 
@@ -110,10 +111,13 @@ class _AsSeen(torch.autograd.Function):
         return heard.sum(0), sent.sum(0), sent - heard  # autograd's own way takes a pass more
 
 
+_native_mean: Callable[..., Tensor] = _NativeMean.apply
+_as_seen: Callable[..., tuple[Tensor, Tensor]] = _AsSeen.apply
+
+
 def as_seen(heard: Tensor, sent: Tensor, placed: Tensor) -> tuple[Tensor, Tensor]:
     """What is heard and sent (V, B, H) with the places of both ends (K, V, B, H), of which the difference counts."""
-    seen: tuple[Tensor, Tensor] = _AsSeen.apply(heard, sent, placed)
-    return seen
+    return _as_seen(heard, sent, placed)
 
 
 def _launch(name: str, edges: EdgeList, tensors: tuple[Tensor, ...], shape: torch.Size) -> None:
@@ -132,7 +136,8 @@ def warp_module() -> ModuleType:
 
     warp.config.quiet = True
     warp.init()
-    return warp
+    module: ModuleType = warp
+    return module
 
 
 @cache

@@ -96,7 +96,7 @@ def nearest_rows(
     senders: wp.uint64,
     found: wp.uint64,
     room: wp.uint64,
-): ...
+) -> None: ...
 
 
 @wp.kernel

@@ -33,6 +33,7 @@ density too. Positions in metres, world axes. NumPy only.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.linalg import expm
@@ -194,7 +195,8 @@ def chain_of(layout: ChainLayout, physics: ChainPhysics, dt_s: float, reach: Arr
         gravity=physics.gravity_m_s2 * dt_s**2,
         substeps=substeps,
     )
-    return replace(prior, **{name: np.float32(v) for name, v in vars(prior).items() if name != "substeps"})
+    single: dict[str, Any] = {name: np.float32(v) for name, v in vars(prior).items() if name != "substeps"}
+    return replace(prior, **single)
 
 
 def _short_waves(stiffness: Array, mass: Array, free: Array, dt_s: float) -> Array:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -65,9 +66,7 @@ def fit_chain(episodes: list[Array], phis: list[Array], spec: GraphSpec, history
         reach = np.array(
             [np.abs(np.stack([layout.share @ phi[:, k] for phi in phis])).max() + MARGIN for k in range(2)]
         )
-        prior = _fit(
-            layout, lambda p, at=layout, r=reach: chain_of(at, _physics(p), spec.dt_s, r), taught, history
-        )
+        prior = _fit(layout, partial(_chain_at, layout=layout, dt_s=spec.dt_s, reach=reach), taught, history)
         found.append((_error(prior, judged, history), prior))
     best = min(found, key=lambda one: one[0], default=None)
     return None if best is None or not np.isfinite(best[0]) else best[1]
@@ -83,7 +82,10 @@ def _fit(
         gap = (_rolled(build(parameters), windows, history) - windows.paths)[
             :, history + 1 :, :n:EVERY_VERTEX
         ]
-        return np.nan_to_num(np.clip(gap, -length, length), nan=length).ravel().astype(float) / length
+        missed: Array = (
+            np.nan_to_num(np.clip(gap, -length, length), nan=length).ravel().astype(float) / length
+        )
+        return missed
 
     def fitted(start: Array, windows: _Seen, soft: bool) -> tuple[float, Array]:
         answer = least_squares(
@@ -116,8 +118,13 @@ def _fit(
     return best[1]
 
 
+def _chain_at(parameters: Array, *, layout: ChainLayout, dt_s: float, reach: Array) -> ChainPrior:
+    return chain_of(layout, _physics(parameters), dt_s, reach)
+
+
 def _physics(parameters: Array) -> ChainPhysics:
-    return ChainPhysics(*(float(value) for value in np.exp(parameters[:4])), G * parameters[4:])
+    wave, bending, friction, drag = (float(value) for value in np.exp(parameters[:4]))
+    return ChainPhysics(wave, bending, friction, drag, G * parameters[4:])
 
 
 def _rolled(prior: ChainPrior, seen: _Seen, history: int) -> Array:

@@ -76,7 +76,7 @@ def arc_lengths(spec: GraphSpec) -> Array | None:
     """Places of the object vertices along the straight line that they lie on at rest [m], (n,); None if on none."""
     rest = spec.rest_vertices - spec.rest_vertices.mean(axis=0)
     _, _, axes = np.linalg.svd(rest, full_matrices=False)
-    along = rest @ axes[0]
+    along: Array = rest @ axes[0]
     off = np.linalg.norm(rest - np.outer(along, axes[0]), axis=1).max()
     if len(rest) < FEWEST_VERTICES or off > STRAIGHT * np.ptp(along):
         return None

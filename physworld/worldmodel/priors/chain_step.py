@@ -26,6 +26,34 @@ _LENGTH_FLOOR_M2 = 1e-24
 class ChainStep(nn.Module):
     """x̂^{t+1} of the object vertices; buffers are the fields of :class:`ChainPrior`."""
 
+    spread: Tensor
+    read: Tensor
+    hold: Tensor
+    member: Tensor
+    offset: Tensor
+    anchor: Tensor
+    first: Tensor
+    second: Tensor
+    axis: Tensor
+    markers: Tensor
+    length: Tensor
+    pull: Tensor
+    mass: Tensor
+    curve: Tensor
+    bend: Tensor
+    dash: Tensor
+    keep: Tensor
+    calm: Tensor
+    smooth: Tensor
+    slack: Tensor
+    share: Tensor
+    reach: Tensor
+    gravity: Tensor
+    substeps: Tensor
+    _differ: Tensor
+    _free: Tensor
+    _lightness: Tensor
+
     def __init__(self, prior: ChainPrior, history: int) -> None:
         super().__init__()
         self.history = history
@@ -97,7 +125,7 @@ class ChainStep(nn.Module):
         times = step * torch.arange(substeps + 1, dtype=place.dtype)[:, None, None, None]
         led = torch.diff(here + times * (slope + 0.5 * times * turn), dim=0)
         for substep in range(substeps):
-            pulled, bent = (self._differ @ place).split(self._counts, dim=1)
+            pulled, bent = (self._differ @ place).split(self._counts, dim=1)  # type: ignore[no-untyped-call]  # torch's has no types
             size = torch.sqrt(pulled.square().sum(dim=0) + _LENGTH_FLOOR_M2)
             tension = -tense if before is None else dash * (size - before) - tense
             before = size
@@ -150,10 +178,12 @@ class ChainStep(nn.Module):
             axis = torch.linalg.cross(self.axis[grip].expand_as(along), along).expand_as(offset)
             once = torch.linalg.cross(axis, offset)
             lean = 1.0 + (along * self.axis[grip]).sum(dim=-1, keepdim=True)
-            return offset + once + torch.linalg.cross(axis, once) / lean.clamp(min=LEAN_FLOOR)
+            turned: Tensor = offset + once + torch.linalg.cross(axis, once) / lean.clamp(min=LEAN_FLOOR)
+            return turned
         normal = _unit(torch.linalg.cross(along, torch.tensordot(self.second[grip], controls, dims=1)))
         across = torch.linalg.cross(normal, along)
-        return offset[..., :1] * along + offset[..., 1:2] * across + offset[..., 2:] * normal
+        turned = offset[..., :1] * along + offset[..., 1:2] * across + offset[..., 2:] * normal
+        return turned
 
     def _rigid(self, place: Tensor, change: Tensor) -> Tensor:
         """``change`` (K, B, 3) of ``place`` without what lengthens segments."""
@@ -165,9 +195,12 @@ class ChainStep(nn.Module):
 
 
 def _unit(vector: Tensor) -> Tensor:
-    return vector / torch.linalg.vector_norm(vector, dim=-1, keepdim=True)
+    unit: Tensor = vector / torch.linalg.vector_norm(vector, dim=-1, keepdim=True)
+    return unit
 
 
 def _times(matrix: Tensor, values: Tensor) -> Tensor:
     """(R, K) times (K, B, ·)."""
-    return (matrix @ values.flatten(1)).unflatten(1, values.shape[1:])
+    product = matrix @ values.flatten(1)
+    places: Tensor = product.unflatten(1, values.shape[1:])  # type: ignore[no-untyped-call]  # torch's has no types
+    return places

@@ -138,7 +138,8 @@ def fit_prior(episodes: list[Array], phis: list[Array], n: int, history: int, mo
 
 def _control_shape(path: Array, n: int) -> Array:
     """Control vertices around their mean, (T, C, 3)."""
-    return path[:, n:] - path[:, n:].mean(axis=1, keepdims=True)
+    shape: Array = path[:, n:] - path[:, n:].mean(axis=1, keepdims=True)
+    return shape
 
 
 def _drive(path: Array, n: int, shape: Array, history: int) -> Array:

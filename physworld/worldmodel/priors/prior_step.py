@@ -24,6 +24,14 @@ def prior_step(
 class PriorStep(nn.Module):
     """The modal prior's step, in single precision; tensors ``prior.*``."""
 
+    mean: Tensor
+    basis: Tensor
+    shape: Tensor
+    weight: Tensor
+    response: Tensor
+    placing: Tensor
+    span: Tensor
+
     def __init__(self, prior: ModalPrior, history: int) -> None:
         super().__init__()
         self.history = history
@@ -54,7 +62,8 @@ class PriorStep(nn.Module):
         softness = torch.minimum(torch.maximum(softness, self.span[0]), self.span[1])[:, None]
         next_amplitudes = regressors @ self.weight.T + softness * (first + softness * second)
         ahead = torch.tensordot(next_amplitudes, self.basis, dims=1)
-        return ahead.transpose(0, 1) + self.mean[:, None] + centre[0]
+        places: Tensor = ahead.transpose(0, 1) + self.mean[:, None] + centre[0]
+        return places
 
     def residual(self, positions: Tensor, phi: Tensor) -> Tensor:
         """What the prior leaves of each step of a track (T, V, 3) with Φ (n, 2): x^{t+1} - x̂^{t+1}, (n, T-1-h, 3)."""
