@@ -1,7 +1,7 @@
 """Content-addressed files: ``artifacts/ab/<sha256>``, whose bytes never change.
 
 A write is atomic (a reader sees the whole file or none). Putting the same bytes again writes them again: a file that
-has rotted is replaced, and the time of the last write tells when somebody last put it (``storage.orphans``).
+has rotted is replaced, and the time of the last write tells when somebody last put it (``physworld_storage.orphans``).
 """
 
 from __future__ import annotations

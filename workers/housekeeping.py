@@ -17,10 +17,10 @@ from physworld_storage import resources
 from physworld_storage.clock import database_now
 from physworld_storage.database import Database
 from physworld_storage.errors import StorageError
+from physworld_storage.orphans import remove_orphan_artifacts
 from physworld_storage.scratch import ScratchStore
 from physworld_storage.settings import Settings
 from physworld_storage.tables import DatasetRow, JobRow
-from storage.orphans import remove_orphan_artifacts
 
 logger = logging.getLogger(__name__)
 

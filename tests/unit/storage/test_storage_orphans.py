@@ -16,9 +16,9 @@ from physworld_storage import orphans
 from physworld_storage.artifacts import ArtifactStore
 from physworld_storage.database import Database
 from physworld_storage.jobs import jobs, leases
+from physworld_storage.orphans import FEW, NAMING, remove_orphan_artifacts
 from physworld_storage.settings import Settings
 from physworld_storage.tables import Base, FitRow, ShardRow, utc_now
-from storage.orphans import FEW, NAMING, remove_orphan_artifacts
 
 DAY = timedelta(days=1)
 

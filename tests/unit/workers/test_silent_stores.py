@@ -28,11 +28,10 @@ from physworld_storage.patience import Patience
 from physworld_storage.settings import Settings
 from physworld_storage.tables import ShardRow
 from physworld_workers.app import create_app
-from physworld_workers.context import TaskContext
+from physworld_workers.context import HandlerResult, TaskContext
 from physworld_workers.dispatcher import STOP_WITHIN_S, Dispatcher
 from physworld_workers.execute import Runtime, run_shard
 from physworld_workers.owner import process_owner
-from physworld_workers.registry import HandlerResult
 from physworld_workers.stores import Stores
 
 WITHIN_S = 30.0
