@@ -18,6 +18,7 @@ import json
 import os
 import sys
 from collections.abc import Callable
+from inspect import CO_OPTIMIZED
 from pathlib import Path
 from types import CodeType, FrameType
 from typing import Any
@@ -35,6 +36,7 @@ def followed(work: Callable[[], Any], tree: Path) -> list[str]:
     names: dict[CodeType, str | None] = {}
     entered: list[FrameType] = []
     stays: list[str] = []
+    imports: list[FrameType] = []
 
     def name_of(code: CodeType) -> str | None:
         """The file of a function of ours that has not been read yet."""
@@ -49,7 +51,13 @@ def followed(work: Callable[[], Any], tree: Path) -> list[str]:
             stays.append(name)
 
     def watch(frame: FrameType, event: str, _: Any) -> None:
-        if event == "call" and frame.f_code not in names:
+        if event == "call" and frame.f_code.co_name == "<module>":
+            imports.append(frame)
+        elif event == "return" and imports and imports[-1] is frame:
+            imports.pop()
+        elif imports:
+            return
+        elif event == "call" and frame.f_code.co_flags & CO_OPTIMIZED and frame.f_code not in names:
             name = names[frame.f_code] = name_of(frame.f_code)
             if name is not None:
                 entered.append(frame)

@@ -14,6 +14,8 @@ from physworld.estimation.least_squares import Solution, block_covariance, corre
 from physworld.evaluate.numerics import refined
 from physworld.twin.build import build_twin
 
+pytestmark = pytest.mark.slow
+
 DRAWS, COVERED = 100, 90
 BUDGET = 500  # particles of the coarse twin
 NAMES, STEPS = ("youngs_modulus_pa", "air_drag_per_s"), (0.02, 0.1)

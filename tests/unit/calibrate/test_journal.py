@@ -13,6 +13,8 @@ from physworld.errors import Cancelled
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
 from physworld.twin.build import build_twin
 
+pytestmark = pytest.mark.slow
+
 CONFIG = CalibrationConfig(particle_budget=60, max_simulations=60)
 LOW, HIGH = np.array([0.0, -0.015, -0.015]), np.array([0.12, 0.015, 0.015])
 

@@ -25,6 +25,8 @@ from physworld.errors import (
     UnstableSimulation,
 )
 
+pytestmark = pytest.mark.slow
+
 CONFIG = DemonstrationConfig(frames=12)
 
 

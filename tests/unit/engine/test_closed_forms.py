@@ -23,6 +23,8 @@ from physworld.engine.terms.contact import GroundContact
 from physworld.engine.total.formulation import TotalLagrangian
 from physworld.errors import CFLViolation, UnstableSimulation
 
+pytestmark = pytest.mark.slow
+
 LENGTH, DEPTH = 0.3, 0.03
 FIRST_ROOT = 1.8751  # of cos x cosh x = -1, the clamped-free beam
 

@@ -16,6 +16,8 @@ from physworld.engine.total.formulation import TotalLagrangian
 from physworld.errors import ContactFailed
 from physworld.shapes import sdf
 
+pytestmark = pytest.mark.slow
+
 LAW = NeoHookean(2e5, 0.3, 20.0, 1000.0)
 BLOCK = box_lattice(np.array([-0.05, -0.05, 0.0]), np.array([0.1, 0.1, 0.05]), (4, 4, 2))
 MASS = 0.5

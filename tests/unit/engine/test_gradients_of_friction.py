@@ -16,6 +16,8 @@ from physworld.engine.problem import HeldNodes, Problem
 from physworld.engine.terms.contact import GroundContact
 from physworld.engine.total.formulation import TotalLagrangian
 
+pytestmark = pytest.mark.slow
+
 TIMES = np.linspace(0.0, 0.06, 7)
 SAME = {3: 1e-6, 2: 1e-12, 1: 1e-12}  # [m] solids add up single-precision forces
 AGREES = 0.03

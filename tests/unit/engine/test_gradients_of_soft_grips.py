@@ -23,6 +23,8 @@ from physworld.twin.build import build_twin
 from physworld.twin.gradient import Neighbours, TwinRun, parameter, strength
 from physworld.twin.twin import Twin
 
+pytestmark = pytest.mark.slow
+
 SUBSTEPS, FRAMES = 400, 6
 TOLERANCE = 1e-2
 LOW, HIGH = np.array([0.0, -0.03, -0.03]), np.array([0.12, 0.03, 0.03])

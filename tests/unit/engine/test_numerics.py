@@ -12,6 +12,8 @@ from physworld.evaluate.numerics import dominant_frequency, free_swing, measure_
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
 from physworld.twin.build import build_twin
 
+pytestmark = pytest.mark.slow
+
 LOW, HIGH = np.array([0.0, -0.015, -0.015]), np.array([0.15, 0.015, 0.015])
 FRAMES = 45
 BUDGET = 150

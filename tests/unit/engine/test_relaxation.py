@@ -30,6 +30,8 @@ from physworld.engine.total.stability import DRAG_SHRINK, EXPLICIT_SHRINK
 from physworld.errors import CFLViolation
 from physworld.materials.laws import Law
 
+pytestmark = pytest.mark.slow
+
 SINGLE = 2e-4  # of forces that are differences of single-precision ones over a small displacement
 BODIES: dict[str, tuple[Lattice, Law]] = {
     "solid": (

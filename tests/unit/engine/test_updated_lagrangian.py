@@ -19,6 +19,8 @@ from physworld.engine.updated.transfer import Apic, Asflip, Transfer
 from physworld.errors import CFLViolation, ParticlesLeftTheGrid, SceneUnsupported, UnstableSimulation
 from physworld.materials.plastic import DruckerPrager, Identity, VonMises
 
+pytestmark = pytest.mark.slow
+
 SINGLE = 2e-6  # velocities and the grid are single precision
 
 

@@ -7,6 +7,8 @@ import pytest
 
 from benchmarks.verification import contact as contact
 
+pytestmark = pytest.mark.slow
+
 
 def test_crossing_rods_come_as_near_to_a_diameter_as_cells_are_small() -> None:
     coarse, fine = contact.separation(11), contact.separation(22)

@@ -8,6 +8,8 @@ import pytest
 from benchmarks.verification import solids as solids
 from benchmarks.verification.cases import observed_order
 
+pytestmark = pytest.mark.slow
+
 ROUND_OFF = 1e-12
 
 

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from benchmarks.verification import solids as solids
 from benchmarks.verification import updated as updated
 from physworld.engine.updated.transfer import Apic, Asflip
+
+pytestmark = pytest.mark.slow
 
 SINGLE = 2e-6  # momentum is summed over particles in single precision
 

@@ -31,6 +31,8 @@ from physworld_scenes.bundle import (
 )
 from physworld_scenes.errors import SceneInvalid
 
+pytestmark = pytest.mark.slow
+
 
 def sound_scene() -> Scene:
     """The sound parts as a scene."""

@@ -17,6 +17,8 @@ from physworld_storage.jobs import jobs, leases, shards
 from physworld_storage.jobs.kinds.pipeline import model_name_of
 from physworld_storage.jobs.shards import STAGE_WINDOW, count_shards
 
+pytestmark = pytest.mark.slow
+
 if TYPE_CHECKING:
     from conftest import Work
 

@@ -22,6 +22,8 @@ from physworld_storage.scratch import ScratchStore
 from physworld_storage.settings import Settings
 from physworld_storage.tables import JobRow, ShardRow, utc_now
 
+pytestmark = pytest.mark.slow
+
 if TYPE_CHECKING:
     from conftest import Work
 

@@ -13,6 +13,8 @@ from physworld_storage.clock import CLOCK
 from physworld_storage.jobs import leases, losses
 from physworld_storage.tables import ShardRow, utc_now
 
+pytestmark = pytest.mark.slow
+
 if TYPE_CHECKING:
     from conftest import Work
 

@@ -20,6 +20,8 @@ from physworld.trace.unknowns import SOFTNESS, grip_softness, of_parameter
 from physworld.twin.build import build_twin
 from physworld.twin.grips import softly_held
 
+pytestmark = pytest.mark.slow
+
 BUDGET, TRUE_PA, HARD, SIGMA = 200, 4e4, 0.3 * AS_HELD, 5e-4
 
 

@@ -25,6 +25,8 @@ from physworld.report.svg import decades, round_ticks
 from physworld.report.words import VERDICTS, headline, interval, label, number, quantity
 from physworld.scene import Scene
 
+pytestmark = pytest.mark.slow
+
 FRAMES, SPLIT = 20, 14
 NAMES = {
     "rate_per_s",

@@ -15,6 +15,8 @@ from physworld.shapes.surface_mesh import SurfaceMesh
 from physworld.twin.build import build_twin
 from physworld.twin.twin import Twin
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 31
 TIMES = np.linspace(0.0, 0.6, FRAMES)
 LOW, HIGH = np.array([-0.05, -0.05, 0.0]), np.array([0.05, 0.05, 0.05])

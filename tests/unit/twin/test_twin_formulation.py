@@ -16,6 +16,8 @@ from physworld.twin.build import build_twin
 from physworld.twin.colliders import TwinCollider
 from physworld.twin.twin import Twin
 
+pytestmark = pytest.mark.slow
+
 BUDGET = 300
 
 

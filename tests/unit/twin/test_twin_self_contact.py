@@ -20,6 +20,8 @@ from physworld.twin.build import PRIOR_FRICTION, build_twin
 from physworld.twin.gradient import TwinRun
 from physworld.twin.twin import Twin
 
+pytestmark = pytest.mark.slow
+
 LENGTH, RADIUS, FRAMES = 0.6, 0.006, 13
 
 

@@ -27,6 +27,8 @@ from physworld_workers.app import create_app
 from physworld_workers.dispatcher import FORGET_EVERY_S, IDLE_SWEEP_S, MAX_DEPTH, Dispatcher
 from physworld_workers.stores import Stores
 
+pytestmark = pytest.mark.slow
+
 WITHIN_S = 20.0
 
 

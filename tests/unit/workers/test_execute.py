@@ -21,6 +21,8 @@ from physworld_workers.errors import Cancelled
 from physworld_workers.execute import Runtime, problem_of, run_shard
 from physworld_workers.stores import Stores
 
+pytestmark = pytest.mark.slow
+
 FIT_RESULT = {"parameters": {}, "metrics": {}, "artifacts": []}
 
 

@@ -15,6 +15,8 @@ from physworld_workers.app import HARD_LIMIT_S, create_app
 from physworld_workers.errors import UnknownShardKind
 from physworld_workers.execute import handler_of
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def settings(tmp_path) -> Settings:

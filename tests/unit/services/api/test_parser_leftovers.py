@@ -8,8 +8,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from benchmarks.service.hostile_files.corpus import Corpus, sound_bundle
 from physworld_services.api.parsing import ROOT
+
+pytestmark = pytest.mark.slow
 
 C3D_FILES = range(8, 11 * 60, 11)
 

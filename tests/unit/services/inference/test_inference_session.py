@@ -9,6 +9,8 @@ from published_tiny import tiny_model
 from physworld.worldmodel.published import PublishedModel
 from physworld_services.inference.session import HEAD, SET_BACK, LiveSession
 
+pytestmark = pytest.mark.slow
+
 
 def flags(frame: bytes) -> int:
     return int(HEAD.unpack_from(frame)[3])
