@@ -43,7 +43,6 @@ from physworld_workers.stores import Stores
 from physworld_workers.tasks.dataset import strength_ranges
 from physworld_workers.tasks.inputs import made_from, scene_of, twin_of
 
-Result = TypeVar("Result")
 logger = logging.getLogger(__name__)
 
 CHECKPOINT = "training.pt"
