@@ -208,7 +208,9 @@ class Distributed:
         self.url = f"http://127.0.0.1:{port}"
         commands = [("web", (*python, "physworld_services.web", "--port", str(port)), signal.SIGTERM)]
         commands.append(("dispatcher", (*python, "physworld_workers.dispatcher"), signal.SIGTERM))
-        commands += [(name, (*python, "workers", "--name", name), signal.SIGQUIT) for name in self._workers]
+        commands += [
+            (name, (*python, "physworld_workers", "--name", name), signal.SIGQUIT) for name in self._workers
+        ]
         commands.append(("trainer", (*python, "physworld_services.trainer"), signal.SIGQUIT))
         library = clock_library(self.folder)
         for name, command, stop in commands:
