@@ -121,6 +121,7 @@ class Child:
         except subprocess.TimeoutExpired:
             ended = False
         self._kill_session()
+        self.process.kill()  # one that was forked a moment ago has no session of its own yet
         self.process.wait()
         self.process = None
         return ended
