@@ -62,7 +62,7 @@ class Corpus:
     def __init__(self, folder: Path, bundle: bytes, seed: int = 0) -> None:
         self._folder, self._bundle, self._seed = folder, bundle, seed
         self._parts = unzipped(bundle)
-        self._sound = {
+        self.sound = {
             "scene.zip": bundle,
             "scene.tar": _tar(self._parts),
             "scene.tar.gz": gzip.compress(_tar(self._parts), mtime=0),
@@ -96,8 +96,8 @@ class Corpus:
             yield Hostile(name, bomb.filename, bomb.make(self._bundle))
 
     def _changed(self, rng: np.random.Generator) -> tuple[str, bytes]:
-        name = str(rng.choice(list(self._sound)))
-        return name, mutated(rng, self._sound[name])
+        name = str(rng.choice(list(self.sound)))
+        return name, mutated(rng, self.sound[name])
 
     def _changed_within(self, rng: np.random.Generator) -> tuple[str, bytes]:
         """The archive is sound, what is in it is not."""
@@ -250,12 +250,12 @@ class Corpus:
                 whole = pickle.dumps(_physical_twin() | {"object_points": np.zeros((7, 7, 3))}, protocol=2)
                 data = whole.replace(b"K\x07K\x07K\x03", shape[2 : shape.index(b"\x87")])
             case _:
-                data = mutated(rng, self._sound["final_data.pkl"])
+                data = mutated(rng, self.sound["final_data.pkl"])
         return "final_data.pkl", data
 
     def _c3d_header(self, rng: np.random.Generator) -> tuple[str, bytes]:
         """Words of the header and of the parameters, which say how much follows."""
-        data = bytearray(self._sound["arm.c3d"])
+        data = bytearray(self.sound["arm.c3d"])
         for _ in range(int(rng.integers(1, 6))):
             place = int(rng.integers(1, min(len(data), 2048) // 2)) * 2
             data[place : place + 2] = one(rng, WORDS)
