@@ -43,6 +43,7 @@ from physworld.calibrate.estimates import (
 from physworld.calibrate.fibres import free_fibres
 from physworld.calibrate.local_stage import LocalResult
 from physworld.calibrate.parameters import Parameter, affordable, flow_law, parameters_of
+from physworld.calibrate.rods import calibrate_rod
 from physworld.calibrate.search import Progress, Search
 from physworld.engine.thin.triangles import Mesh
 from physworld.estimation.journal import Journal
@@ -160,9 +161,10 @@ def calibrate(
     """
     config = config or CalibrationConfig()
     started = time.perf_counter()
-    search = Search(
-        scene, prior_twin(scene, config), config.max_simulations, progress, cancelled, journal, runner
-    )
+    prior = prior_twin(scene, config)
+    if prior.natural is not None:
+        return calibrate_rod(scene, prior, config, progress, cancelled, journal)
+    search = Search(scene, prior, config.max_simulations, progress, cancelled, journal, runner)
     parameters = searched_parameters(scene, search.twin, config)
     search.limit = config.max_simulations - min(_KEPT_BACK, config.max_simulations // 4)
     kept, optimum, rejected = select(search, parameters)

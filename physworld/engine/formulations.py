@@ -20,12 +20,13 @@ import numpy as np
 from physworld.arrays import Array
 from physworld.engine.lattice.following import follow
 from physworld.engine.problem import HeldNodes, Problem
+from physworld.engine.rods.discrete_rods import DiscreteRods
 from physworld.engine.total.energy import EnergyLedger, run_with_ledger
 from physworld.engine.total.formulation import TotalLagrangian, run_again_if_blown_up
 from physworld.engine.updated.energy import ParticleLedger, run_particles_with_ledger
 from physworld.engine.updated.formulation import UpdatedLagrangian
 from physworld.engine.updated.transfer import TRANSFERS, Apic
-from physworld.errors import SceneUnsupported
+from physworld.errors import SceneUnsupported, SimulationError
 from physworld.materials.plastic import Plasticity
 
 Ability = Literal["gradients", "batches", "soft_grips", "friction_field"]
@@ -265,8 +266,77 @@ def _with_empty(numbers: Array, solid: Array, start: Array) -> Array:
     return particles
 
 
-TOTAL, UPDATED = TotalForm(), UpdatedForm()
-FORMULATIONS: dict[str, Formulation] = {form.name: form for form in (TOTAL, UPDATED)}
+class RodForm(Formulation):
+    """Chains of edges with directors, whose rest shape is their own (:mod:`physworld.engine.rods.discrete_rods`)."""
+
+    name = "discrete_rod"
+    dimensions = frozenset({1})
+    on_particles = False
+    abilities = frozenset()
+
+    def refuse(self, dimension: int, plasticity: Plasticity | None, asked: str) -> None:
+        """Solids, sheets and flow laws."""
+        if dimension not in self.dimensions or plasticity is not None:
+            raise SceneUnsupported(
+                f"a discrete rod is elastic and of dimension 1; the body has dimension {dimension} and its flow law is "
+                f"{None if plasticity is None else plasticity.name}"
+            )
+
+    def solver(
+        self,
+        problem: Problem,
+        time_step_s: float | None = None,
+        transfer: str = Apic.name,
+        plasticity: Plasticity | None = None,
+    ) -> DiscreteRods:
+        """See the base class; neither transfer nor flow law is read.
+
+        Args:
+            problem, time_step_s, transfer, plasticity: as in :meth:`Formulation.solver`.
+        """
+        return DiscreteRods([problem], time_step_s)
+
+    def run(
+        self,
+        solver: DiscreteRods,
+        start: Start,
+        held: HeldNodes,
+        times: Array,
+        progress: Progress | None = None,
+    ) -> Array:
+        """Nodes.
+
+        Args:
+            solver, start, held, times, progress: as in :meth:`Formulation.run`.
+        """
+        found = solver.run(start.nodes, start.velocities, [held], times, progress)[0]
+        if isinstance(found, SimulationError):
+            raise found
+        return found
+
+    def run_with_ledger(
+        self,
+        solver: DiscreteRods,
+        start: Start,
+        held: HeldNodes,
+        times: Array,
+        progress: Progress | None = None,
+    ) -> tuple[Array, EnergyLedger]:
+        """None is kept.
+
+        Args:
+            solver, start, held, times, progress: as in :meth:`Formulation.run_with_ledger`.
+
+        Raises:
+            SceneUnsupported: always.
+        """
+        raise SceneUnsupported(
+            f"no energy ledger of a discrete rod of {len(solver.chain.parent)} nodes is kept"
+        )
+
+
+TOTAL, UPDATED, RODS = TotalForm(), UpdatedForm(), RodForm()
+FORMULATIONS: dict[str, Formulation] = {form.name: form for form in (TOTAL, UPDATED, RODS)}
 
 
 @dataclass(frozen=True)

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from physworld.arrays import Array
 from physworld.engine.lattice.lattice import Lattice
 from physworld.engine.terms.term import Term
 from physworld.materials.laws import Law
+
+if TYPE_CHECKING:
+    from physworld.engine.rods.discrete_rods import Sections
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,7 @@ class Problem:
         added_mass: lumped masses that hang from the nodes [kg], (n,), or None.
         terms: what else acts on the nodes, contacts and effects, in the order of their launches.
         span_s: first and last time of the run, for terms that change in time; None where nobody says.
+        sections: of a discrete rod, what its sections do; None of other bodies.
     """
 
     lattice: Lattice
@@ -48,6 +52,7 @@ class Problem:
     terms: tuple[Term, ...] = ()
     friction_factor: Array | None = None
     span_s: tuple[float, float] | None = None
+    sections: Sections | None = None
     device: str = field(default="cpu")
 
     def nodal_mass(self) -> Array:

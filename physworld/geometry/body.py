@@ -29,6 +29,7 @@ class ReferenceBody:
         thickness_m: thickness of a sheet or radius of a rod, declared or assumed.
         notes: what was assumed, in words.
         added_mass: declared loads as lumped nodal masses [kg], (n,), or None.
+        settles: a discrete rod starts as it hangs still under its grips, near ``start``.
     """
 
     lattice: Lattice
@@ -40,6 +41,7 @@ class ReferenceBody:
     thickness_m: float
     notes: tuple[str, ...] = ()
     added_mass: Array | None = None
+    settles: bool = False
 
     @property
     def half_thickness_m(self) -> float:

@@ -28,6 +28,7 @@ from physworld.geometry.body import ReferenceBody, first_points
 from physworld.geometry.curves import fit_nodes, straight_extent
 from physworld.geometry.declared import grips_of, load_of
 from physworld.geometry.filling import filled_body, inside_surface_points
+from physworld.geometry.rod_body import rod_body
 from physworld.geometry.sheet_body import SHEET_KINDS, THIN, plane_of, sheet_body
 from physworld.scene import AS_MEASURED, Scene
 
@@ -41,7 +42,11 @@ _BOX_FILL = 0.93  # a cloud that fills this share of its bounding box is a box, 
 
 
 def reference_body(
-    scene: Scene, particle_budget: int, refinement: float = 1.0, mesh: Mesh | None = None
+    scene: Scene,
+    particle_budget: int,
+    refinement: float = 1.0,
+    mesh: Mesh | None = None,
+    discrete_rod: bool = False,
 ) -> ReferenceBody:
     """Build the body that the scene declares or shows.
 
@@ -51,6 +56,7 @@ def reference_body(
             root, 24 at 2000 and at least 12. Rods have 32 cells.
         refinement: cells are this many times smaller along every axis, whatever the body.
         mesh: of a sheet, the mesh of triangles that it is to be instead.
+        discrete_rod: the body is a chain of edges (:mod:`physworld.geometry.rod_body`).
 
     Raises:
         SceneUnsupported: the scene shows or declares too little, with the missing key.
@@ -60,16 +66,14 @@ def reference_body(
         raise SceneUnsupported(
             f"{frames} frames with {count} points, {int(scene.visible.sum())} sightings in all: no motion to follow"
         )
+    if discrete_rod and mesh is None:
+        return rod_body(scene, refinement)
     if scene.kind in ROD_KINDS and mesh is None:
         return _rod(scene, refinement)
     if scene.kind in SHEET_KINDS:
         sheet = sheet_body(scene, particle_budget, refinement, mesh)
         if sheet is not None:
             return sheet
-    if scene.kind == "branched_rope":
-        raise SceneUnsupported(
-            "branched ropes are not covered yet: a rod has two ends, this scene's topology has more"
-        )
     if mesh is not None:
         raise SceneUnsupported(
             f"a body of kind {scene.kind}, or one that is not flat at the start, is no {mesh}"

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import fields
 
 from physworld.catalogue import with_plugins
+from physworld.materials.cable import CableLaw
 from physworld.materials.fixed_corotated import FixedCorotated
 from physworld.materials.hencky import DruckerPragerElastic, Hencky
 from physworld.materials.laws import Law
@@ -28,6 +29,7 @@ _BUILT_IN: tuple[type[Law], ...] = (
     SheetLaw,
     OrthotropicSheetLaw,
     RodLaw,
+    CableLaw,
 )
 ELASTIC_LAWS: dict[str, type[Law]] = with_plugins("physworld.laws", Law, {law.name: law for law in _BUILT_IN})
 _OLD_NEO_HOOKEAN = "SolidLaw"  # in archives of version 0.1

@@ -11,6 +11,7 @@ import numpy as np
 from physworld.arrays import Array
 from physworld.effects.registry import effect
 from physworld.engine.lattice.lattice import Lattice
+from physworld.engine.rods.chain import Chain
 from physworld.engine.thin.triangles import TriangleLattice
 from physworld.geometry.body import ReferenceBody
 from physworld.materials.library import law_class
@@ -38,6 +39,7 @@ def arrays_of(twin: Twin) -> dict[str, Array]:
         "grip_regions": [None if region is None else region.tolist() for region in twin.grip_regions],
         "thickness_m": body.thickness_m,
         "notes": list(body.notes),
+        "settles": body.settles,
         "groups": [g.tolist() for g in twin.controller_groups],
         "held": [h.tolist() for h in twin.held_nodes],
         "turning": list(twin.turning),
@@ -58,6 +60,7 @@ def arrays_of(twin: Twin) -> dict[str, Array]:
         **{f"body_{name}": getattr(body, name) for name in _BODY},
         **({} if body.added_mass is None else {"body_added_mass": body.added_mass}),
         **({} if twin.properties is None else {"properties": twin.properties}),
+        **({} if twin.natural is None else {"natural": twin.natural}),
         **collider_arrays,
     }
 
@@ -67,13 +70,17 @@ def parts_of(arrays: dict[str, Array]) -> dict[str, Any]:
     facts = json.loads(str(arrays["facts"]))
     flow = facts.get("plasticity")
     held = {f.name: arrays[f"lattice_{f.name}"] for f in fields(Lattice)}
-    meshed = "lattice_odd" in arrays
-    lattice = TriangleLattice(**held, odd=bool(arrays["lattice_odd"])) if meshed else Lattice(**held)
+    lattice = Lattice(**held)
+    if "lattice_odd" in arrays:
+        lattice = TriangleLattice(**held, odd=bool(arrays["lattice_odd"]))
+    elif "lattice_parent" in arrays:
+        lattice = Chain(**held, parent=arrays["lattice_parent"], lengths=arrays["lattice_lengths"])
     body = ReferenceBody(
         lattice=lattice,
         thickness_m=facts["thickness_m"],
         notes=tuple(facts["notes"]),
         added_mass=arrays.get("body_added_mass"),
+        settles=facts.get("settles", False),
         **{name: arrays[f"body_{name}"] for name in _BODY},
     )
     return {
@@ -99,4 +106,5 @@ def parts_of(arrays: dict[str, Array]) -> dict[str, Any]:
         "formulation": facts.get("formulation", "total_lagrangian"),
         "transfer": facts.get("transfer", "apic"),
         "properties": arrays.get("properties"),
+        "natural": arrays.get("natural"),
     }

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.engine.formulations import Formulation, choose_formulation
+from physworld.engine.formulations import RODS, Formulation, choose_formulation
+from physworld.engine.rods.chain import Chain
 from physworld.engine.thin.self_contact import COARSE, apart_m, refuse_thickness
 from physworld.engine.thin.triangles import Mesh
 from physworld.engine.updated.transfer import TRANSFERS, Apic
@@ -16,6 +17,9 @@ from physworld.geometry.body import ReferenceBody
 from physworld.geometry.declared import grips_of
 from physworld.geometry.reference import reference_body
 from physworld.geometry.rigid import rigid_groups
+from physworld.geometry.rod_body import KINDS as ROD_KINDS
+from physworld.geometry.rod_body import is_discrete
+from physworld.materials.cable import CableLaw
 from physworld.materials.laws import Law
 from physworld.materials.neo_hookean import NeoHookean
 from physworld.materials.plastic import Plasticity
@@ -24,6 +28,7 @@ from physworld.materials.sheet import SheetLaw
 from physworld.scene import AS_MEASURED, Scene
 from physworld.twin.colliders import carried, twin_colliders
 from physworld.twin.grips import declared_region, gripped_nodes, why_no_turn
+from physworld.twin.rods import natural_of
 from physworld.twin.twin import Twin
 
 PRIOR_DENSITY_KG_M3 = 1000.0
@@ -63,8 +68,13 @@ def build_twin(
     """
     if transfer not in TRANSFERS:
         raise ValueError(f"no transfer is called {transfer!r}; there are {sorted(TRANSFERS)}")
-    body = reference_body(scene, particle_budget, refinement, mesh)
-    choice = choose_formulation(body.lattice.dim, scene.declared, plasticity, formulation)
+    asked = formulation
+    if formulation == "auto" and plasticity is None and is_discrete(scene):
+        asked = RODS.name
+    body = reference_body(
+        scene, particle_budget, refinement, mesh, asked == RODS.name and scene.kind in ROD_KINDS
+    )
+    choice = choose_formulation(body.lattice.dim, scene.declared, plasticity, asked)
     taken_form = f"{choice.formulation.title} form: {choice.reason}"
     if choice.formulation.on_particles:
         taken_form += f"; transfers by {transfer}"
@@ -102,6 +112,7 @@ def build_twin(
         controllers_start=controls[0],
         release_s=_release_time(scene),
         turning=turning,
+        natural=natural_of(body, len(groups)),
         colliders=twin_colliders(scene, body.half_thickness_m, PRIOR_FRICTION),
         self_friction=self_friction,
         plasticity=plasticity,
@@ -189,7 +200,8 @@ def _prior_law(scene: Scene, body: ReferenceBody) -> Law:
     if lattice.dim == 2:
         membrane = modulus * section / (1 - 0.3**2)
         return SheetLaw(membrane, membrane * section**2 / 12, density_kg_m2=density)
-    prior = RodLaw(stretching_n=density * 40.0**2, bending_n_m2=density * 1e-2, density_kg_m=density)
+    of_rods = CableLaw if isinstance(lattice, Chain) else RodLaw
+    prior = of_rods(stretching_n=density * 40.0**2, bending_n_m2=density * 1e-2, density_kg_m=density)
     return replace(prior, torsion_ratio=_torsion_ratio(scene, prior.torsion_ratio))
 
 

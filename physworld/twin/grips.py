@@ -14,6 +14,7 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.engine.problem import HeldNodes
+from physworld.engine.rods.chain import Chain
 from physworld.engine.terms.soft_grips import AS_HELD, gripped_points, holds_a_part, touched_nodes
 from physworld.engine.terms.term import Term
 from physworld.engine.thin.twist import Twist, span_between
@@ -21,6 +22,7 @@ from physworld.errors import SceneUnsupported
 from physworld.geometry.body import ReferenceBody
 from physworld.geometry.rigid import rigid_motion
 from physworld.scene import Grip
+from physworld.twin.rods import gripped_of_chain
 
 if TYPE_CHECKING:
     from physworld.twin.twin import Twin
@@ -40,6 +42,8 @@ def gripped_nodes(body: ReferenceBody, controllers: Array, grip: Grip | None) ->
         SceneUnsupported: no material lies within the radius.
     """
     lattice = body.lattice
+    if isinstance(lattice, Chain):
+        return gripped_of_chain(lattice, body.start, controllers, grip)
     particles = lattice.interpolation(lattice.particle_coordinates) @ body.start
     slack, tie = 1e-6, 1e-9
     radius = None if grip is None else grip.radius_m

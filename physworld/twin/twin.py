@@ -39,6 +39,7 @@ from physworld.twin.colliders import TwinCollider
 from physworld.twin.grips import held_paths, soft_regions, twist_between_grips, with_touched_nodes
 from physworld.twin.integration import Integration, solver_knots
 from physworld.twin.properties import together
+from physworld.twin.rods import sections_of
 
 Progress = Callable[[int, int], None]
 
@@ -73,6 +74,7 @@ class Twin:
         transfer: how particles and grid exchange velocities, "apic" or "asflip"; updated Lagrangian only.
         properties: the fields of the local stage, or None: log factors of stiffness and density, (P, 2), or with the
             ground's friction (P, 3), under everything that a run is given.
+        natural: of a discrete rod, what its curvature and twist are made of (:mod:`physworld.twin.rods`), (R, 3).
         device: Warp device of the simulations; not part of the twin's identity.
     """
 
@@ -96,6 +98,7 @@ class Twin:
     formulation: str = "total_lagrangian"
     transfer: str = Apic.name
     properties: Array | None = None
+    natural: Array | None = None
     device: str = "cpu"
 
     @property
@@ -294,7 +297,7 @@ class Twin:
         if regions:
             gripped = with_touched_nodes(gripped, self.body.start)
         held = held_paths(gripped, knots, controls)
-        twists = twist_between_grips(gripped, knots, controls)
+        twists = () if self.natural is not None else twist_between_grips(gripped, knots, controls)
         problem = replace(problem, terms=(*problem.terms, *self._touching_itself(held.nodes), *twists))
         for known in active:
             problem, held = known.attach(problem, held, self)
@@ -302,6 +305,8 @@ class Twin:
         stretch = problem.lattice.spacing / self.lattice.spacing
         regions = [region * stretch for region in regions]
         problem, held = soften(problem, held, self.grip_softness, regions)
+        if self.natural is not None:
+            problem = replace(problem, sections=sections_of(gripped, held, knots, controls))
         return Integration(problem, velocity, held, knots, frame_index)
 
     def particles_at(self, nodes: Array) -> Array:

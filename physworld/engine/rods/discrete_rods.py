@@ -1,0 +1,358 @@
+"""Discrete elastic rods: problems of one chain, integrated side by side (:mod:`physworld.engine.rods.kernels`).
+
+A rod whose rest shape nobody knows starts where it was measured, or, where too few of its points are seen for that,
+from the shape in which it hangs still: it is then let settle under strong drag before the run. Terms (contacts,
+effects) push the nodes; with them a run is launched substep by substep instead of as a whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from physworld.arrays import Array
+from physworld.engine.problem import HeldNodes, Problem
+from physworld.engine.rods.chain import Chain
+from physworld.engine.rods.kernels import SCALARS, run_rods
+from physworld.errors import BlewUp, CFLViolation, ParticlesLeftTheGrid, SceneUnsupported, SimulationError
+from physworld.materials.cable import CableLaw
+
+STEP_SHARE = 0.006
+"""Time step over sqrt(L / g), the time in which the rod falls about its length: 1.9 ms for a metre."""
+_GRAVITY = 9.81
+_MODE_SHARE = 0.3  # of the fourth mode's period over 2 pi
+_FOURTH_MODE = 120.9  # (beta_4 L)^2 of a clamped rod
+_STRETCH_RELAXATION_S = 1e-3
+_TERM_SHARE = 0.5  # of a term's own limit of the time step
+_SETTLE_S, _SETTLE_KNOTS, _SETTLE_DRAG_PER_S, _SETTLE_RELAXATION_S = 6.0, 13, 6.0, 0.05
+_GYRATION = 1.0 / np.sqrt(2.0)  # radius of gyration of a round section about its axis, over its radius
+_REACH = 50.0  # of the rod's length: where a node cannot be
+
+
+@dataclass(frozen=True, eq=False)
+class Sections:
+    """What a rod's sections do beside its centre line.
+
+    Attributes:
+        natural: curvatures about the two directors and twist that the rod has by itself, at the parent of every node
+            [1/m], (n, 3).
+        radius_m: of the section, for its inertia about the axis.
+        edges: that grips hold, by the node at which they end, (E,).
+        turns: angles by which the grips turn them about their tangents since the start, at the knots [rad], (T, E).
+        settles: the run begins with the rod hanging still.
+    """
+
+    natural: Array
+    radius_m: float
+    edges: Array
+    turns: Array
+    settles: bool = False
+
+
+class DiscreteRods:
+    """Copies of one rod, side by side: other numbers, the same chain, grips' nodes and times.
+
+    Args:
+        problems: with a :class:`Chain`, a :class:`CableLaw` and their ``sections``; terms only where there is one
+            problem.
+        time_step_s: forced time step [s], or None for one by the rod's length and stiffness.
+
+    Raises:
+        SceneUnsupported: a body or a law of another kind, or terms beside others.
+        CFLViolation: a forced time step beyond what a term allows.
+    """
+
+    def __init__(self, problems: Sequence[Problem], time_step_s: float | None = None) -> None:
+        first = problems[0]
+        lattice = first.lattice
+        laws = [p.law for p in problems if isinstance(p.law, CableLaw)]
+        if not isinstance(lattice, Chain) or len(laws) < len(problems):
+            names = sorted({p.law.name for p in problems})
+            raise SceneUnsupported(
+                f"a discrete rod needs a chain and the law cable, got a body of dimension {lattice.dim} and {names}"
+            )
+        if any(p.sections is None for p in problems):
+            raise SceneUnsupported(
+                f"{len(problems)} rods without sections: nothing says how their directors are held"
+            )
+        if len(problems) > 1 and any(p.terms for p in problems):
+            raise SceneUnsupported(
+                f"{len(problems)} rods side by side, some of them with terms: these run alone"
+            )
+        self.problems, self.chain, self.laws = list(problems), lattice, laws
+        self.terms = [term.bind(first) for term in first.terms]
+        limit = self._term_limit()
+        self.asked_step_s = time_step_s
+        if time_step_s is not None and time_step_s > limit:
+            raise CFLViolation(
+                f"time step {time_step_s:.3g} s exceeds the limit {limit:.3g} s of what acts on the rod"
+            )
+        self.time_step_s = min(self._own_step(), limit) if time_step_s is None else time_step_s
+
+    def run(
+        self,
+        x: Array,
+        v: Array,
+        held: Sequence[HeldNodes],
+        times: Array,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> list[Array | SimulationError]:
+        """Nodal positions of every copy at ``times``, (T, n, 3) [m], or why they cannot be trusted.
+
+        Args:
+            x, v: nodal positions [m] and velocities [m/s] at the first time, (n, 3).
+            held: prescribed nodes of each copy, or of all of them; their paths are given at ``times``.
+            times: (T,) [s], strictly increasing.
+            progress: called with (frames done, frames in all) before and after; may raise to stop.
+        """
+        if progress is not None:
+            progress(0, len(times))
+        launch = _Launch(self, x, v, held, times)
+        if self.problems[0].sections.settles:  # type: ignore[union-attr]
+            launch.settle()
+        out = launch.whole() if not self.terms else launch.stepwise(progress)
+        if progress is not None:
+            progress(len(times), len(times))
+        size = float(self.chain.lengths.sum())
+        return [_trusted(tracks, x, size, self.time_step_s) for tracks in out]
+
+    def _own_step(self) -> float:
+        length = float(self.chain.distances.max())
+        gravity = max(float(np.linalg.norm(self.problems[0].gravity_m_s2)), _GRAVITY)
+        speed = max(np.sqrt(_columns(p)["bending"] / p.law.density) for p in self.problems)
+        mode = _FOURTH_MODE * speed / length**2
+        return float(min(STEP_SHARE * np.sqrt(length / gravity), _MODE_SHARE / mode))
+
+    def _term_limit(self) -> float:
+        square = sum(term.frequency_rad_s**2 for term in self.terms)
+        rate = sum(term.friction_per_s for term in self.terms)
+        limits = [2.0 / np.sqrt(square)] if square > 0 else []
+        limits += [2.0 / rate] if rate > 0 else []
+        return _TERM_SHARE * float(min(limits, default=np.inf))
+
+
+class _Launch:
+    """Device arrays of one run."""
+
+    def __init__(
+        self, rods: DiscreteRods, x: Array, v: Array, held: Sequence[HeldNodes], times: Array
+    ) -> None:
+        self.rods, self.times = rods, np.asarray(times, dtype=float)
+        self.device = rods.problems[0].device
+        chain, sections = rods.chain, [p.sections for p in rods.problems]
+        copies, count = len(sections), len(chain.parent)
+        self.shape = (copies, count)
+        numbers = _numbers(held[0].nodes, count)
+        edges = _numbers(sections[0].edges, count)  # type: ignore[union-attr]
+        directors = directors_along(chain, x)
+        self.model = [
+            self._array(np.maximum(chain.parent, 0), wp.int32), self._array(chain.lengths),
+            self._array(numbers, wp.int32), self._array(edges, wp.int32),
+        ]  # fmt: skip
+        self.path = [
+            self._array(np.stack([one.positions for one in held]), wp.vec3d),
+            self._array(np.stack([one.velocities for one in held]), wp.vec3d),
+            self._array(np.stack([s.turns for s in sections][: len(held)])),  # type: ignore[union-attr]
+        ]
+        start = np.where((numbers >= 0)[:, None], 0.0, v)
+        start[held[0].nodes] = held[0].velocities[0]
+
+        def copied(values: Array, dtype: type) -> wp.array:
+            return self._array(np.broadcast_to(values, (copies, *values.shape)), dtype)
+
+        self.state = [
+            copied(x, wp.vec3d), copied(start, wp.vec3d), copied(directors, wp.vec3d),
+            self._zeros(wp.float64), self._zeros(wp.float64, 2), self._zeros(wp.float64, 2),
+        ]  # fmt: skip
+        self.start = self._array(np.broadcast_to(start, (copies, *start.shape)), wp.vec3d)
+        self.push = self._zeros(wp.vec3d)
+        kinds = [wp.vec3d, wp.float64, wp.mat33d, wp.mat33d, wp.mat33d, wp.vec3d, *[wp.float64] * 3]
+        self.scratch = [self._zeros(kind) for kind in kinds]
+
+    def whole(self) -> Array:
+        """The run in one launch: positions at the times, (C, T, n, 3)."""
+        steps = self._steps(self.times)
+        return self._go(self._numbers_of(), self.times, steps, self.path)
+
+    def stepwise(self, progress: Callable[[int, int], None] | None) -> Array:
+        """The run of one rod substep by substep, with its terms."""
+        terms, steps, numbers = self.rods.terms, self._steps(self.times), self._numbers_of()
+        times, counts = self._array(self.times), self._array(steps, wp.int32)
+        out = wp.zeros((1, len(self.times), self.shape[1]), dtype=wp.vec3d, device=self.device)
+        flat = [_flat(array) for array in (self.state[0], self.state[1], self.push)]
+        for term in terms:
+            term.begin(self.times)
+        clock = wp.zeros(3, dtype=wp.float64, device=self.device)
+        counter = wp.zeros(3, dtype=wp.int32, device=self.device)
+        for frame, (span, count) in enumerate(zip(np.diff(self.times), steps, strict=True)):
+            dt = float(span) / int(count)
+            clock.assign(np.array([span, 1.0 / dt, dt]))
+            for term in terms:
+                term.pace(dt)
+            for step in range(int(count)):
+                counter.assign(np.array([frame, step, count], dtype=np.int32))
+                self.push.zero_()
+                for term in terms:
+                    term.launch(flat[0], flat[1], clock, counter, flat[2])
+                wp.launch(
+                    run_rods, dim=1,
+                    inputs=[*self.model, *numbers, times, counts, *self.path, self.push, frame, frame + 1,
+                            step, step + 1, *self.state, *self.scratch],
+                    outputs=[out], device=self.device,
+                )  # fmt: skip
+            for term in terms:
+                term.check(float(self.times[frame + 1]))
+            if progress is not None:
+                progress(frame + 1, len(self.times))
+        found: Array = out.numpy()
+        return found
+
+    def settle(self) -> None:
+        """Let the rods come to rest under their grips as these are at the first time, without friction or creep."""
+        times = np.linspace(0.0, _SETTLE_S, _SETTLE_KNOTS)
+        numbers = self._numbers_of(settling=True)
+        still = [
+            self._array(np.repeat(array.numpy()[:, :1], len(times), axis=1), array.dtype)
+            for array in self.path
+        ]
+        still[1].zero_()
+        self._go(numbers, times, self._steps(times), still)
+        wp.copy(self.state[1], self.start)
+        for memory in (self.state[3], self.state[4]):
+            memory.zero_()
+
+    def _go(self, numbers: list[wp.array], times: Array, steps: Array, path: list[wp.array]) -> Array:
+        copies, count = self.shape
+        out = wp.zeros((copies, len(times), count), dtype=wp.vec3d, device=self.device)
+        wp.launch(
+            run_rods, dim=copies,
+            inputs=[*self.model, *numbers, self._array(times), self._array(steps, wp.int32), *path, self.push,
+                    0, len(steps), 0, int(steps.max()), *self.state, *self.scratch],
+            outputs=[out], device=self.device,
+        )  # fmt: skip
+        found: Array = out.numpy()
+        return found
+
+    def _steps(self, times: Array) -> Array:
+        return np.maximum(1, np.ceil(np.diff(times) / self.rods.time_step_s - 1e-9)).astype(np.int32)
+
+    def _numbers_of(self, settling: bool = False) -> list[wp.array]:
+        """Masses, stiffnesses, natural curvatures, scalars and gravity of every copy."""
+        problems, chain = self.rods.problems, self.rods.chain
+        columns = [_columns(p) for p in problems]
+        factors = [_edge_factors(chain, p.stiffness_factor) for p in problems]
+        stretching = np.stack([c["stretching"] * f for c, f in zip(columns, factors, strict=True)])
+        bending = np.stack([c["bending"] * f for c, f in zip(columns, factors, strict=True)])
+        torsion = np.stack([law.torsion_ratio * b for law, b in zip(self.rods.laws, bending, strict=True)])
+        return [
+            self._array(np.stack([p.nodal_mass() for p in problems])),
+            self._array(stretching),
+            self._array(np.repeat(bending[..., None], 2, axis=2)),
+            self._array(torsion),
+            self._array(np.stack([p.sections.natural for p in problems])),  # type: ignore[union-attr]
+            self._array(np.stack([_scalars(p, settling) for p in problems])),
+            self._array(np.stack([np.asarray(p.gravity_m_s2, dtype=float) for p in problems]), wp.vec3d),
+        ]
+
+    def _zeros(self, dtype: type, depth: int = 0) -> wp.array:
+        return wp.zeros((*self.shape, depth) if depth else self.shape, dtype=dtype, device=self.device)
+
+    def _array(self, values: Array, dtype: type = wp.float64) -> wp.array:
+        return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
+
+
+def directors_along(chain: Chain, x: Array) -> Array:
+    """A director of every edge at nodal positions ``x`` (n, 3) [m], carried along the rod without twist, (n, 3)."""
+    directors = np.zeros_like(x)
+    tangents = np.zeros_like(x)
+    for node in range(1, len(x)):
+        before = chain.parent[node]
+        edge = x[node] - x[before]
+        t = tangents[node] = edge / np.linalg.norm(edge)
+        if before == 0:
+            across = np.cross(t, np.eye(3)[np.argmin(np.abs(t))])
+            directors[node] = across / np.linalg.norm(across)
+            continue
+        s, d = tangents[before], directors[before]
+        axis = np.cross(s, t)
+        once = np.cross(axis, d)
+        directors[node] = d + once + np.cross(axis, once) / (1.0 + s @ t)
+    directors[0] = directors[1]
+    return directors
+
+
+def joint_angles(chain: Chain, x: Array) -> Array:
+    """Curvatures of every joint about the two directors at nodal positions ``x`` (n, 3) [m], as angles (n, 2) [rad].
+
+    Directors are those of :func:`directors_along`; a joint stands at the parent of its node.
+    """
+    directors, found = directors_along(chain, x), np.zeros((len(x), 2))
+    for node in np.flatnonzero(chain.parent > 0):
+        middle = chain.parent[node]
+        pair = [x[middle] - x[chain.parent[middle]], x[node] - x[middle]]
+        before, after = (edge / np.linalg.norm(edge) for edge in pair)
+        binormal = 2.0 * np.cross(before, after) / (1.0 + before @ after)
+        first = directors[middle], directors[node]
+        second = np.cross(before, first[0]) + np.cross(after, first[1])
+        found[node] = 0.5 * binormal @ second, -0.5 * binormal @ (first[0] + first[1])
+    return found
+
+
+def _columns(problem: Problem) -> dict[str, float]:
+    return problem.law.columns
+
+
+def _scalars(problem: Problem, settling: bool) -> Array:
+    """A row of the kernel's scalars; of a rod that settles with strong drag, no friction, and creep at its end."""
+    law, sections = problem.law, problem.sections
+    assert isinstance(law, CableLaw) and sections is not None
+    row = np.zeros(SCALARS)
+    relaxation = law.relaxation_s
+    row[:3] = relaxation, relaxation, _STRETCH_RELAXATION_S
+    row[3], row[4] = problem.drag_per_s, law.drag_normal_per_m
+    row[5], row[6] = law.friction_per_m, law.friction_onset_per_m
+    row[7], row[8] = law.creep_ratio, law.creep_s
+    row[9] = _GYRATION * sections.radius_m
+    if settling:
+        row[:2], row[3], row[5], row[8] = _SETTLE_RELAXATION_S, _SETTLE_DRAG_PER_S, 0.0, 1e-3
+    return row
+
+
+def _edge_factors(chain: Chain, factor: Array | None) -> Array:
+    """A field over the particles (P,) as one over the edges, by the node at which they end, (n,)."""
+    factors = np.ones(len(chain.parent))
+    if factor is not None:
+        factors[1:] = np.asarray(factor).reshape(-1, 2).mean(axis=1)
+    return factors
+
+
+def _numbers(places: Array, count: int) -> Array:
+    """Place of every node or edge in a list, (count,); -1 where it is not in it."""
+    numbers = np.full(count, -1, dtype=np.int32)
+    numbers[np.asarray(places, dtype=int)] = np.arange(len(places), dtype=np.int32)
+    return numbers
+
+
+def _flat(array: wp.array) -> wp.array:
+    """The numbers of a (1, n) array of vectors as (3n,), the same memory."""
+    return wp.array(
+        ptr=array.ptr, dtype=wp.float64, shape=(3 * array.shape[1],), device=array.device, copy=False
+    )
+
+
+def _trusted(tracks: Array, start: Array, size: float, dt: float) -> Array | SimulationError:
+    """Positions (T, n, 3), or why they cannot be trusted."""
+    bad = ~np.isfinite(tracks).all(axis=(1, 2))
+    if bad.any():
+        return BlewUp(
+            f"the rod blew up at frame {int(np.argmax(bad))} of {len(tracks)} with time step {dt:.3g} s"
+        )
+    farthest = float(np.abs(tracks - start).max())
+    if farthest > _REACH * size:
+        return ParticlesLeftTheGrid(
+            f"a node went {farthest:.3g} m from its start; the rod is {size:.3g} m long"
+        )
+    return tracks

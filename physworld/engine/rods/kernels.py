@@ -1,0 +1,342 @@
+"""The whole run of a discrete elastic rod in one launch: one thread integrates one copy of it.
+
+Nodes are numbered so that a parent comes before its children; edge i ends at node i and begins at its parent, joint i
+is where it meets its parent edge. Every joint has two curvatures, about the directors of the two edges that meet there,
+and a twist (Bergou et al. 2008, "Discrete elastic rods"; gradients as in Bergou et al. 2010, "Discrete viscous
+threads").
+
+    (M + dt D + dt^2 K / 4) dv = dt (f - D v)        x += dt v
+
+with D and K the positive parts of damping and stiffness at the present positions. Without damping this is Newmark's
+method of constant average acceleration: no step is too long for a stiff rod, and no energy is lost. A block of the
+matrix couples a node with its parent and its grandparent only, so it is solved from the leaves to the root without
+fill. Twist is solved likewise, fully implicitly: it settles within a few steps, as it does within a frame in a rope.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+# columns of `scalars`, one row a copy
+RELAXATION_S = wp.constant(0)
+TWIST_RELAXATION_S = wp.constant(1)
+STRETCH_RELAXATION_S = wp.constant(2)
+DRAG_PER_S = wp.constant(3)
+DRAG_NORMAL_PER_M = wp.constant(4)
+FRICTION_PER_M = wp.constant(5)
+FRICTION_ONSET_PER_M = wp.constant(6)
+CREEP_RATIO = wp.constant(7)
+CREEP_S = wp.constant(8)
+GYRATION_M = wp.constant(9)
+SCALARS = 10
+
+
+@wp.func
+def turned(d: wp.vec3d, t: wp.vec3d, u: wp.vec3d) -> wp.vec3d:
+    """``d`` carried by the least rotation that takes the unit vector t to u."""
+    axis = wp.cross(t, u)
+    once = wp.cross(axis, d)
+    return d + once + wp.cross(axis, once) / (wp.float64(1.0) + wp.dot(t, u))
+
+
+@wp.func
+def projected(t: wp.vec3d, along: wp.float64, across: wp.float64) -> wp.mat33d:
+    """along t t' + across (1 - t t')."""
+    one = wp.identity(n=3, dtype=wp.float64)
+    return across * one + (along - across) * wp.outer(t, t)
+
+
+@wp.kernel(enable_backward=False)
+def run_rods(
+    # model, shared by all copies
+    parent: wp.array[wp.int32],
+    rest_length: wp.array[wp.float64],
+    held: wp.array[wp.int32],
+    held_edge: wp.array[wp.int32],
+    # model, a row a copy
+    mass: wp.array2d[wp.float64],
+    stretching: wp.array2d[wp.float64],
+    bending: wp.array3d[wp.float64],
+    torsion: wp.array2d[wp.float64],
+    natural: wp.array3d[wp.float64],
+    scalars: wp.array2d[wp.float64],
+    gravity: wp.array[wp.vec3d],
+    # time and what is prescribed
+    times: wp.array[wp.float64],
+    steps: wp.array[wp.int32],
+    path: wp.array3d[wp.vec3d],
+    path_rate: wp.array3d[wp.vec3d],
+    roll: wp.array3d[wp.float64],
+    push: wp.array2d[wp.vec3d],
+    # which substeps: all, or one of one interval
+    first_knot: int,
+    last_knot: int,
+    first_step: int,
+    last_step: int,
+    # in, out: state
+    x: wp.array2d[wp.vec3d],
+    v: wp.array2d[wp.vec3d],
+    director: wp.array2d[wp.vec3d],
+    spin: wp.array2d[wp.float64],
+    slip: wp.array3d[wp.float64],
+    flow: wp.array3d[wp.float64],
+    # scratch
+    tangent: wp.array2d[wp.vec3d],
+    length: wp.array2d[wp.float64],
+    own: wp.array2d[wp.mat33d],
+    up: wp.array2d[wp.mat33d],
+    upup: wp.array2d[wp.mat33d],
+    right: wp.array2d[wp.vec3d],
+    twist_own: wp.array2d[wp.float64],
+    twist_up: wp.array2d[wp.float64],
+    torque: wp.array2d[wp.float64],
+    # out
+    out: wp.array3d[wp.vec3d],
+) -> None:
+    """Positions at ``times`` (T,) of every copy; ``steps`` (T - 1,) substeps each. See the module's text."""
+    c = wp.tid()
+    n = x.shape[1]
+    zero = wp.float64(0.0)
+    one = wp.float64(1.0)
+    half = wp.float64(0.5)
+    quarter = wp.float64(0.25)
+    tau = scalars[c, RELAXATION_S]
+    tau_twist = scalars[c, TWIST_RELAXATION_S]
+    tau_stretch = scalars[c, STRETCH_RELAXATION_S]
+    at = wp.min(c, path.shape[0] - 1)  # copies may share their grips
+    for i in range(1, n):
+        e = x[c, i] - x[c, parent[i]]
+        length[c, i] = wp.length(e)
+        tangent[c, i] = e / length[c, i]
+    if first_knot == 0 and first_step == 0:
+        for i in range(n):
+            out[c, 0, i] = x[c, i]
+    for k in range(first_knot, last_knot):
+        count = steps[k]
+        span = times[k + 1] - times[k]
+        dt = span / wp.float64(count)
+        for s in range(first_step, wp.min(last_step, count)):
+            # own inertia, gravity and drag
+            for i in range(n):
+                p = parent[i]
+                m = mass[c, i]
+                t = tangent[c, wp.max(i, 1)]
+                speed = v[c, i]
+                along = wp.dot(speed, t)
+                across = wp.length(speed - along * t)
+                rate_t = scalars[c, DRAG_PER_S]
+                rate_n = rate_t + scalars[c, DRAG_NORMAL_PER_M] * across
+                drag = projected(t, m * rate_t, m * rate_n)
+                own[c, i] = m * wp.identity(n=3, dtype=wp.float64) + dt * drag
+                up[c, i] = wp.mat33d()
+                upup[c, i] = wp.mat33d()
+                right[c, i] = dt * (m * gravity[c] + push[c, i] - drag * speed)
+                inertia = zero
+                if i > 0:
+                    gyration = scalars[c, GYRATION_M]
+                    inertia = half * (m + mass[c, p]) * gyration * gyration
+                twist_own[c, i] = inertia
+                twist_up[c, i] = zero
+                torque[c, i] = zero
+            # stretch
+            for i in range(1, n):
+                p = parent[i]
+                t = tangent[c, i]
+                stiff = stretching[c, i] / rest_length[i]
+                tension = stiff * (length[c, i] - rest_length[i])
+                damp = stiff * tau_stretch
+                rate = wp.dot(v[c, i] - v[c, p], t)
+                f = (tension + damp * rate) * t
+                side = quarter * dt * dt * wp.max(tension, zero) / length[c, i]
+                block = projected(t, dt * damp + quarter * dt * dt * stiff, side)
+                own[c, i] = own[c, i] + block
+                own[c, p] = own[c, p] + block
+                up[c, i] = up[c, i] - block
+                right[c, i] = right[c, i] - dt * f
+                right[c, p] = right[c, p] + dt * f
+            # bending and twist
+            for i in range(2, n):
+                p = parent[i]
+                if p > 0:
+                    g = parent[p]
+                    ta = tangent[c, p]
+                    tb = tangent[c, i]
+                    a1 = director[c, p]
+                    b1 = director[c, i]
+                    a2 = wp.cross(ta, a1)
+                    b2 = wp.cross(tb, b1)
+                    chi = one + wp.dot(ta, tb)
+                    kb = wp.float64(2.0) * wp.cross(ta, tb) / chi
+                    mean = (ta + tb) / chi
+                    d1 = (a1 + b1) / chi
+                    d2 = (a2 + b2) / chi
+                    k1 = half * wp.dot(kb, a2 + b2)
+                    k2 = -half * wp.dot(kb, a1 + b1)
+                    la = length[c, p]
+                    lb = length[c, i]
+                    ga1 = (wp.cross(tb, d2) - k1 * mean) / la
+                    gb1 = (-wp.cross(ta, d2) - k1 * mean) / lb
+                    ga2 = (-wp.cross(tb, d1) - k2 * mean) / la
+                    gb2 = (wp.cross(ta, d1) - k2 * mean) / lb
+                    u = turned(a1, ta, tb)
+                    twist = wp.atan2(wp.dot(wp.cross(u, b1), tb), wp.dot(u, b1))
+                    gat = half * kb / la
+                    gbt = half * kb / lb
+                    ha1 = -half * wp.dot(kb, a1)
+                    hb1 = -half * wp.dot(kb, b1)
+                    ha2 = -half * wp.dot(kb, a2)
+                    hb2 = -half * wp.dot(kb, b2)
+                    l = half * (rest_length[p] + rest_length[i])
+                    va = v[c, p] - v[c, g]
+                    vb = v[c, i] - v[c, p]
+                    wa = spin[c, p]
+                    wb = spin[c, i]
+                    rate1 = wp.dot(ga1, va) + wp.dot(gb1, vb) + ha1 * wa + hb1 * wb
+                    rate2 = wp.dot(ga2, va) + wp.dot(gb2, vb) + ha2 * wa + hb2 * wb
+                    rate3 = wp.dot(gat, va) + wp.dot(gbt, vb) + wb - wa
+                    s1 = bending[c, i, 0] / l
+                    s2 = bending[c, i, 1] / l
+                    s3 = torsion[c, i] / l
+                    # rate-independent friction (Dahl) and one Maxwell branch, as angles of the joint
+                    extra = zero
+                    m1 = s1 * (k1 - natural[c, i, 0] * l + tau * rate1)
+                    m2 = s2 * (k2 - natural[c, i, 1] * l + tau * rate2)
+                    m3 = s3 * (twist - natural[c, i, 2] * l + (tau_twist + dt) * rate3)
+                    friction = scalars[c, FRICTION_PER_M]
+                    if friction > zero:
+                        onset = scalars[c, FRICTION_ONSET_PER_M] * l
+                        move = dt * wp.sqrt(rate1 * rate1 + rate2 * rate2) / onset
+                        z1 = (slip[c, i, 0] + dt * rate1 / onset) / (one + move)
+                        z2 = (slip[c, i, 1] + dt * rate2 / onset) / (one + move)
+                        slip[c, i, 0] = z1
+                        slip[c, i, 1] = z2
+                        m1 += s1 * l * friction * z1
+                        m2 += s2 * l * friction * z2
+                        extra += friction * l / onset
+                    ratio = scalars[c, CREEP_RATIO]
+                    if ratio > zero:
+                        fade = wp.exp(-dt / scalars[c, CREEP_S])
+                        q1 = k1 + (flow[c, i, 0] - k1) * fade
+                        q2 = k2 + (flow[c, i, 1] - k2) * fade
+                        flow[c, i, 0] = q1
+                        flow[c, i, 1] = q2
+                        m1 += ratio * s1 * (k1 - q1)
+                        m2 += ratio * s2 * (k2 - q2)
+                        extra += ratio
+                    fa = m1 * ga1 + m2 * ga2 + m3 * gat
+                    fb = m1 * gb1 + m2 * gb2 + m3 * gbt
+                    right[c, g] = right[c, g] + dt * fa
+                    right[c, p] = right[c, p] - dt * (fa - fb)
+                    right[c, i] = right[c, i] - dt * fb
+                    w1 = s1 * (dt * tau + quarter * dt * dt * (one + extra))
+                    w2 = s2 * (dt * tau + quarter * dt * dt * (one + extra))
+                    w3 = s3 * dt * (tau_twist + dt)
+                    aa = w1 * wp.outer(ga1, ga1) + w2 * wp.outer(ga2, ga2) + w3 * wp.outer(gat, gat)
+                    bb = w1 * wp.outer(gb1, gb1) + w2 * wp.outer(gb2, gb2) + w3 * wp.outer(gbt, gbt)
+                    ba = w1 * wp.outer(gb1, ga1) + w2 * wp.outer(gb2, ga2) + w3 * wp.outer(gbt, gat)
+                    ab = wp.transpose(ba)
+                    own[c, g] = own[c, g] + aa
+                    own[c, p] = own[c, p] + aa + bb - ab - ba
+                    own[c, i] = own[c, i] + bb
+                    up[c, p] = up[c, p] - aa + ba
+                    up[c, i] = up[c, i] + ba - bb
+                    upup[c, i] = upup[c, i] - ba
+                    torque[c, p] = torque[c, p] - m1 * ha1 - m2 * ha2 + m3
+                    torque[c, i] = torque[c, i] - m1 * hb1 - m2 * hb2 - m3
+                    y1 = s1 * (dt * tau + dt * dt * (one + extra))
+                    y2 = s2 * (dt * tau + dt * dt * (one + extra))
+                    y3 = s3 * dt * (tau_twist + dt)
+                    twist_own[c, p] = twist_own[c, p] + y1 * ha1 * ha1 + y2 * ha2 * ha2 + y3
+                    twist_own[c, i] = twist_own[c, i] + y1 * hb1 * hb1 + y2 * hb2 * hb2 + y3
+                    twist_up[c, i] = twist_up[c, i] + y1 * ha1 * hb1 + y2 * ha2 * hb2 - y3
+            # what is prescribed at the end of the substep
+            w = wp.float64(s + 1) / wp.float64(count)
+            w2_ = w * w
+            w3_ = w2_ * w
+            h00 = wp.float64(2.0) * w3_ - wp.float64(3.0) * w2_ + one
+            h10 = (w3_ - wp.float64(2.0) * w2_ + w) * span
+            h01 = one - h00
+            h11 = (w3_ - w2_) * span
+            kick = one  # velocities are those of half a step later: the first push is a half one
+            if k == 0 and s == 0:
+                kick = half
+            for i in range(n):
+                right[c, i] = kick * right[c, i]
+            # leaves to root
+            for back in range(n):
+                i = n - 1 - back
+                p = parent[i]
+                j = held[i]
+                if j >= 0:
+                    goal = (
+                        h00 * path[at, k, j]
+                        + h10 * path_rate[at, k, j]
+                        + h01 * path[at, k + 1, j]
+                        + h11 * path_rate[at, k + 1, j]
+                    )
+                    dv = (goal - x[c, i]) / dt - v[c, i]
+                    if i > 0:
+                        right[c, p] = right[c, p] - wp.transpose(up[c, i]) * dv
+                        if p > 0:
+                            g = parent[p]
+                            right[c, g] = right[c, g] - wp.transpose(upup[c, i]) * dv
+                    right[c, i] = dv
+                else:
+                    inverse = wp.inverse(own[c, i])
+                    own[c, i] = inverse
+                    if i > 0:
+                        yp = inverse * up[c, i]
+                        r = right[c, i]
+                        own[c, p] = own[c, p] - wp.transpose(up[c, i]) * yp
+                        right[c, p] = right[c, p] - wp.transpose(yp) * r
+                        if p > 0:
+                            g = parent[p]
+                            yg = inverse * upup[c, i]
+                            own[c, g] = own[c, g] - wp.transpose(upup[c, i]) * yg
+                            up[c, p] = up[c, p] - wp.transpose(up[c, i]) * yg
+                            right[c, g] = right[c, g] - wp.transpose(yg) * r
+                if i > 0:
+                    q = held_edge[i]
+                    if q >= 0:
+                        change = (roll[at, k + 1, q] - roll[at, k, q]) / span - spin[c, i]
+                        torque[c, p] = torque[c, p] - twist_up[c, i] * change / dt
+                        torque[c, i] = change
+                        twist_own[c, i] = one
+                        twist_up[c, i] = zero
+                    else:
+                        ratio_up = twist_up[c, i] / twist_own[c, i]
+                        twist_own[c, p] = twist_own[c, p] - twist_up[c, i] * ratio_up
+                        torque[c, p] = torque[c, p] - ratio_up * torque[c, i]
+                        torque[c, i] = dt * torque[c, i] / twist_own[c, i]
+                        twist_up[c, i] = ratio_up
+            # root to leaves
+            for i in range(n):
+                p = parent[i]
+                if held[i] < 0:
+                    r = right[c, i]
+                    if i > 0:
+                        r = r - up[c, i] * right[c, p]
+                        if p > 0:
+                            r = r - upup[c, i] * right[c, parent[p]]
+                    right[c, i] = own[c, i] * r
+                v[c, i] = v[c, i] + right[c, i]
+                x[c, i] = x[c, i] + dt * v[c, i]
+                if i > 0:
+                    turn = torque[c, i]
+                    if p > 0 and held_edge[i] < 0:
+                        turn = turn - twist_up[c, i] * torque[c, p]
+                    torque[c, i] = turn
+                    spin[c, i] = spin[c, i] + turn
+                    e = x[c, i] - x[c, p]
+                    longer = wp.length(e)
+                    t = e / longer
+                    angle = dt * spin[c, i]
+                    d = turned(director[c, i], tangent[c, i], t)
+                    d = d * wp.cos(angle) + wp.cross(t, d) * wp.sin(angle)
+                    d = d - wp.dot(d, t) * t
+                    director[c, i] = d / wp.length(d)
+                    tangent[c, i] = t
+                    length[c, i] = longer
+        if last_step >= count:
+            for i in range(n):
+                out[c, k + 1, i] = x[c, i]
