@@ -34,7 +34,7 @@ class FitConfig(Request):
     damping: Literal["auto", "none"] = "auto"
     law: Annotated[str, NamesOf("law")] | None = None
     plasticity: Annotated[str, NamesOf("flow law")] | None = None
-    formulation: Literal["auto", "total_lagrangian", "updated_lagrangian"] = "auto"
+    formulation: Literal["auto", "total_lagrangian", "updated_lagrangian", "discrete_rod"] = "auto"
     transfer: Literal["apic", "asflip"] = "apic"
     mesh: str | None = Field(default=None, pattern=r"^[1-9]\d{0,2}x[1-9]\d{0,2}(odd)?$")
     stages: Literal["global", "global+local"] = "global"

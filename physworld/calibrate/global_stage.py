@@ -50,6 +50,7 @@ from physworld.estimation.journal import Journal
 from physworld.estimation.least_squares import Solution
 from physworld.estimation.simulations import Runner, in_turn
 from physworld.estimation.unknowns import LINEAR, at
+from physworld.materials.cable import CableLaw
 from physworld.materials.library import with_law
 from physworld.scene import Scene
 from physworld.twin.build import build_twin
@@ -209,7 +210,13 @@ def prior_twin(scene: Scene, config: CalibrationConfig) -> Twin:
         transfer=config.transfer,
         mesh=config.mesh,
     )
-    return twin if config.law is None else replace(twin, law=with_law(twin.law, config.law))
+    if config.law is None:
+        return twin
+    if (config.law == CableLaw.name) != (twin.natural is not None):
+        raise ValueError(
+            f"no law {config.law!r} for a body of the {twin.form.title} form: discrete rods have the law {CableLaw.name}"
+        )
+    return replace(twin, law=with_law(twin.law, config.law))
 
 
 def searched_parameters(scene: Scene, twin: Twin, config: CalibrationConfig) -> list[Parameter]:

@@ -1,11 +1,12 @@
-"""The two ways to integrate a body, what each supports, and which one a body takes.
+"""The three ways to integrate a body, what each supports, and which one a body takes.
 
 The total Lagrangian form does not damp, so it is taken wherever it can describe the motion. The updated Lagrangian
-form is taken where material flows, parts, or touches itself: a flow law says so, or the scene does. A sheet or rod has
-only the total form, and touches itself there (:mod:`physworld.engine.thin.self_contact`).
+form is taken where material flows, parts, or touches itself: a flow law says so, or the scene does. A sheet has only the
+total form, and touches itself there (:mod:`physworld.engine.thin.self_contact`); so does a rod that starts straight. A
+rod that was measured has a curvature of its own, and is a discrete rod (:mod:`physworld.engine.rods`).
 
-What a run returns are its *carriers*: the nodes of the lattice in the total form, the particles in the updated one.
-A third form is a subclass of :class:`Formulation` and an entry of :data:`FORMULATIONS`.
+What a run returns are its *carriers*: the nodes of the lattice, in the updated form the particles.
+Another form is a subclass of :class:`Formulation` and an entry of :data:`FORMULATIONS`.
 """
 
 from __future__ import annotations
@@ -352,6 +353,7 @@ def choose_formulation(
     declared: dict[str, Any],
     plasticity: Plasticity | None = None,
     asked: str = "auto",
+    own_shape: bool = False,
 ) -> Choice:
     """The formulation for a body.
 
@@ -360,6 +362,7 @@ def choose_formulation(
         declared: the scene's declaration; ``body.self_contact`` and ``body.topology_change`` are read.
         plasticity: the body's flow law.
         asked: "auto", or the name of a formulation, which is then taken.
+        own_shape: it is a rod whose rest shape nobody knows.
 
     Raises:
         ValueError: ``asked`` is no formulation.
@@ -370,14 +373,16 @@ def choose_formulation(
     choice = (
         Choice(FORMULATIONS[asked], "asked for")
         if asked != "auto"
-        else _best(dimension, declared, plasticity)
+        else _best(dimension, declared, plasticity, own_shape)
     )
     choice.formulation.refuse(dimension, plasticity, asked)
     return choice
 
 
-def _best(dimension: int, declared: dict[str, Any], plasticity: Plasticity | None) -> Choice:
+def _best(dimension: int, declared: dict[str, Any], plasticity: Plasticity | None, own_shape: bool) -> Choice:
     """What a body takes where nobody asks for a form."""
+    if own_shape:
+        return Choice(RODS, "a rod whose rest shape is not known: its curvature and twist need directors")
     if dimension not in UPDATED.dimensions:
         return Choice(TOTAL, f"a body of dimension {dimension} has no other form")
     if plasticity is not None:

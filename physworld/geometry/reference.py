@@ -28,7 +28,7 @@ from physworld.geometry.body import ReferenceBody, first_points
 from physworld.geometry.curves import fit_nodes, straight_extent
 from physworld.geometry.declared import grips_of, load_of
 from physworld.geometry.filling import filled_body, inside_surface_points
-from physworld.geometry.rod_body import rod_body
+from physworld.geometry.rod_body import BRANCHED, rod_body
 from physworld.geometry.sheet_body import SHEET_KINDS, THIN, plane_of, sheet_body
 from physworld.scene import AS_MEASURED, Scene
 
@@ -70,6 +70,10 @@ def reference_body(
         return rod_body(scene, refinement)
     if scene.kind in ROD_KINDS and mesh is None:
         return _rod(scene, refinement)
+    if scene.kind == BRANCHED:
+        raise SceneUnsupported(
+            f"a branched cable of {count} points has no form but discrete_rod: a rod of splines has two ends"
+        )
     if scene.kind in SHEET_KINDS:
         sheet = sheet_body(scene, particle_budget, refinement, mesh)
         if sheet is not None:

@@ -68,13 +68,10 @@ def build_twin(
     """
     if transfer not in TRANSFERS:
         raise ValueError(f"no transfer is called {transfer!r}; there are {sorted(TRANSFERS)}")
-    asked = formulation
-    if formulation == "auto" and plasticity is None and is_discrete(scene):
-        asked = RODS.name
-    body = reference_body(
-        scene, particle_budget, refinement, mesh, asked == RODS.name and scene.kind in ROD_KINDS
-    )
-    choice = choose_formulation(body.lattice.dim, scene.declared, plasticity, asked)
+    discrete = scene.kind in ROD_KINDS and formulation == RODS.name
+    discrete |= formulation == "auto" and plasticity is None and is_discrete(scene)
+    body = reference_body(scene, particle_budget, refinement, mesh, discrete)
+    choice = choose_formulation(body.lattice.dim, scene.declared, plasticity, formulation, discrete)
     taken_form = f"{choice.formulation.title} form: {choice.reason}"
     if choice.formulation.on_particles:
         taken_form += f"; transfers by {transfer}"

@@ -37,7 +37,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--simulations", type=_count, default=None, help="most simulations of the search")
     parser.add_argument("--law", default=None, help="elastic law by name, or auto: choose it by the data")
     parser.add_argument("--plasticity", default=None, help="flow law by name; its yield is calibrated too")
-    parser.add_argument("--formulation", default="auto", help="total_lagrangian, updated_lagrangian or auto")
+    parser.add_argument(
+        "--formulation", default="auto", help="total_lagrangian, updated_lagrangian, discrete_rod or auto"
+    )
     parser.add_argument("--transfer", default="apic", help="of the updated Lagrangian form: apic or asflip")
     parser.add_argument(
         "--mesh",

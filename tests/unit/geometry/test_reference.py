@@ -174,7 +174,7 @@ REFUSED = {
         made_scene(CLOUD[:5], "blob", rest_volume_points=CLOUD * [1, 1, 0]),
         "1500 points lie in a plane.*no volume",
     ),
-    "a branched rope": (made_scene(line(5), "branched_rope"), "branched ropes are not covered"),
+    "a branched rope": (made_scene(line(5), "branched_rope"), "5 points has no form but discrete_rod"),
     "wrong number of lengths": (
         made_scene(line(5), "rope", body=Body(segment_rest_lengths_m=np.full(7, 0.1))),
         "7 segment rest lengths for 5 tracked points",

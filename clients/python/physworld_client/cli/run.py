@@ -42,7 +42,7 @@ def run(
         str | None, typer.Option(help="Flow law by name; its yield is calibrated too.")
     ] = None,
     formulation: Annotated[
-        str | None, typer.Option(help="total_lagrangian, updated_lagrangian or auto.")
+        str | None, typer.Option(help="total_lagrangian, updated_lagrangian, discrete_rod or auto.")
     ] = None,
     transfer: Annotated[
         str | None, typer.Option(help="Of the updated Lagrangian form: apic or asflip.")
