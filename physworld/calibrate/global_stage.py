@@ -214,7 +214,7 @@ def prior_twin(scene: Scene, config: CalibrationConfig) -> Twin:
         return twin
     if (config.law == CableLaw.name) != (twin.natural is not None):
         raise ValueError(
-            f"no law {config.law!r} for a body of the {twin.form.title} form: discrete rods have the law {CableLaw.name}"
+            f"no law {config.law!r} for a body of the {twin.form.title} form: discrete rods have {CableLaw.name}"
         )
     return replace(twin, law=with_law(twin.law, config.law))
 

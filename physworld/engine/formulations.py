@@ -1,9 +1,9 @@
 """The three ways to integrate a body, what each supports, and which one a body takes.
 
 The total Lagrangian form does not damp, so it is taken wherever it can describe the motion. The updated Lagrangian
-form is taken where material flows, parts, or touches itself: a flow law says so, or the scene does. A sheet has only the
-total form, and touches itself there (:mod:`physworld.engine.thin.self_contact`); so does a rod that starts straight. A
-rod that was measured has a curvature of its own, and is a discrete rod (:mod:`physworld.engine.rods`).
+form is taken where material flows, parts, or touches itself: a flow law says so, or the scene does. A sheet has only
+the total form, and touches itself there (:mod:`physworld.engine.thin.self_contact`); so does a rod that starts
+straight. A rod that was measured has a curvature of its own, and is a discrete rod (:mod:`physworld.engine.rods`).
 
 What a run returns are its *carriers*: the nodes of the lattice, in the updated form the particles.
 Another form is a subclass of :class:`Formulation` and an entry of :data:`FORMULATIONS`.

@@ -25,7 +25,7 @@ from typing import Protocol
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.engine.total.formulation import TotalLagrangian
+from physworld.engine.formulations import TOTAL
 from physworld.errors import Cancelled, CFLViolation, SimulationError, WorkerLost
 from physworld.twin.twin import Twin
 
@@ -116,7 +116,8 @@ def nodes_of(job: Job, drive: Drive, poll: Callable[[int, int], None] | None = N
 def stage_s(twin: Twin, drive: Drive) -> float:
     """How far one evaluation of its forces brings a twin [s]: its stable time step, or a stage of its friction."""
     run = twin.integration(drive.control_times, drive.control_points, drive.times[:2])
-    return TotalLagrangian(run.problem).stage_s
+    form = TOTAL if twin.form.on_particles else twin.form
+    return float(form.solver(run.problem).stage_s)
 
 
 def tracks_of(job: Job, drive: Drive, poll: Callable[[int, int], None] | None = None) -> Array | None:

@@ -16,8 +16,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from physworld.calibrate import Journal, calibrate
+from physworld.engine.formulations import TOTAL
 from physworld.estimation.noise import noise_sigma
 from physworld.estimation.simulations import Job, Ledger, Memory, Progress, Runner
+from physworld.geometry.reference import ROD_KINDS
 from physworld.scene import Scene
 from physworld.trace.config import TraceConfig
 from physworld.trace.confirm import Model
@@ -82,9 +84,12 @@ class Beginning:
     ) -> tuple[JointSimulations, Twin, int]:
         """The simulations, the declared physics calibrated on the training frames, and the runs that this took."""
         config, runs, begun = self.config, 0, time.perf_counter()
-        if twin is None:
+        form = config.calibration.formulation
+        if form == "auto" and recordings.lead.scene.kind in ROD_KINDS:
+            form = TOTAL.name  # the effects on stress act on the cells of splines
+        if twin is None or twin.form.name != (form if form != "auto" else twin.form.name):
             # fibres would go into a free shape of bending
-            declared = replace(config.calibration, bending="declared")
+            declared = replace(config.calibration, bending="declared", formulation=form)
             fitted = calibrate(
                 recordings.lead.scene, declared, self.progress, self.cancelled, journal, runner=self.runner
             )

@@ -119,6 +119,11 @@ class DiscreteRods:
         size = float(self.chain.lengths.sum())
         return [_trusted(tracks, x, size, self.time_step_s) for tracks in out]
 
+    @property
+    def stage_s(self) -> float:
+        """Time that one evaluation of forces advances [s]: the step, which has one."""
+        return self.time_step_s
+
     def _own_step(self) -> float:
         length = float(self.chain.distances.max())
         gravity = max(float(np.linalg.norm(self.problems[0].gravity_m_s2)), _GRAVITY)
