@@ -1,5 +1,6 @@
 """Calibration of a twin on the training frames of a recording."""
 
+from physworld.calibrate.carry import carried_over
 from physworld.calibrate.estimates import Correlations, Estimate
 from physworld.calibrate.global_stage import CalibrationConfig, FitResult, calibrate
 from physworld.calibrate.stages import Stages, calibrate_in_stages
@@ -14,4 +15,5 @@ __all__ = [
     "Stages",
     "calibrate",
     "calibrate_in_stages",
+    "carried_over",
 ]

@@ -83,6 +83,8 @@ class CalibrationConfig:
             elastic body.
         mesh: of a sheet, the mesh of triangles that recorded it (:mod:`physworld.engine.thin.triangles`); None for a
         plate.
+        held: of a discrete rod, the numbers that are not searched and stay as the declared physics has them: names of
+            :func:`physworld.calibrate.rods.rod_parameters`, or how they begin.
     """
 
     particle_budget: int = 2000
@@ -95,6 +97,7 @@ class CalibrationConfig:
     transfer: str = "apic"
     plasticity: str | None = None
     mesh: Mesh | None = None
+    held: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

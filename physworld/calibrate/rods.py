@@ -59,7 +59,7 @@ _ENOUGH, _SETTLED = 1e-4, 3e-3  # relative falls of the cost: what counts, and w
 _CORRELATED = 2.0  # times sqrt(L / g)
 _SIGMA_SHARE = 0.005  # of the length: what a rod leaves before anything is known
 _GRIP_RAD, _BRANCH_RAD = 0.5, 0.3
-_COIL = 2.0  # curvature of its own times the length, of the smoothest shape
+_COIL = 4.0  # curvature of its own times the length, of the smoothest shape: a cable that was coiled
 _GRAVITY = 9.81
 _Z95 = 1.96
 
@@ -107,14 +107,24 @@ def rod_parameters(scene: Scene, twin: Twin) -> list[Parameter]:
 
 
 @dataclass
-class _Search:
-    """Launches of one calibration."""
+class RodSearch:
+    """Launches of one calibration, and what they have to explain.
+
+    Attributes:
+        scene: the recording.
+        twin: of a discrete rod; what is launched differs from it by its numbers.
+        limit: launches at most.
+        progress: called with (launches done, launches at most, message).
+        cancelled: polled before every launch.
+        simulations: launches done.
+        cut_short: something was left out for want of launches.
+    """
 
     scene: Scene
     twin: Twin
     limit: int
-    progress: Progress | None
-    cancelled: Callable[[], bool] | None
+    progress: Progress | None = None
+    cancelled: Callable[[], bool] | None = None
     simulations: int = 0
     cut_short: bool = False
 
@@ -288,11 +298,11 @@ def calibrate_rod(
     from physworld.calibrate.global_stage import FitResult
 
     begun = time.perf_counter()
-    search = _Search(scene, twin, config.max_simulations, progress, cancelled)
+    search = RodSearch(scene, twin, config.max_simulations, progress, cancelled)
     journal = journal or Journal()
     unknowns = rod_parameters(scene, twin)
-    if config.damping == "none":
-        unknowns = [u for u in unknowns if u.name not in _LOSSES]
+    held = (*config.held, *(_LOSSES if config.damping == "none" else ()))
+    unknowns = [u for u in unknowns if not u.name.startswith(held)]
     ends = [max(4, round(share * search.end)) for share in _WINDOWS]
 
     def step(name: str, compute: Callable[[], tuple[Array, float]]) -> tuple[Array, float]:
@@ -347,7 +357,7 @@ _LOSSES = ("relaxation_s", "air_drag_per_s", "drag_normal_per_m", "friction_per_
            "creep_ratio", "creep_s")  # fmt: skip
 
 
-def _scan(search: _Search, first: list[Parameter], ends: list[int]) -> tuple[Array, float]:
+def _scan(search: RodSearch, first: list[Parameter], ends: list[int]) -> tuple[Array, float]:
     """The best of descents from several stiffnesses over the first windows."""
     twin = search.twin
     weight = twin.density * _GRAVITY * float(twin.lattice.distances.max()) ** 3  # type: ignore[attr-defined]
@@ -363,7 +373,7 @@ def _scan(search: _Search, first: list[Parameter], ends: list[int]) -> tuple[Arr
 
 
 def _estimates(
-    search: _Search, unknowns: list[Parameter], theta: Array
+    search: RodSearch, unknowns: list[Parameter], theta: Array
 ) -> tuple[dict[str, Estimate], Correlations]:
     """Numbers with the intervals of the posterior's Gaussian about its mode."""
     names = tuple(u.name for u in unknowns)

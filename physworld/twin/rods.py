@@ -24,8 +24,8 @@ from physworld.scene import Grip
 if TYPE_CHECKING:
     from physworld.twin.twin import Twin
 
-MODES = 6
-"""Shapes of the natural curvature, from the constant one to five half waves over the rod."""
+MODES = 8
+"""Shapes of the natural curvature, from the constant one to seven half waves over the rod."""
 _OFF_LINE = 0.05  # second extent of control points over the first, below which they are on a line
 
 
