@@ -157,7 +157,7 @@ class RodSearch:
             for twin in twins
         ]
         frames = run.frame_index[:end]
-        knots = int(frames.max()) + 1
+        knots = max(2, int(frames.max()) + 1)
         held = replace(run.held, positions=run.held.positions[:knots], velocities=run.held.velocities[:knots])
         for k, problem in enumerate(problems):
             assert problem.sections is not None

@@ -1,9 +1,13 @@
-"""The body of a measured rope, rod or branched cable: a chain whose nodes lie at its tracked points and between them.
+"""The body of a measured rope, rod, branched cable, arm or trunk: a chain of nodes at tracked points and between them.
 
 The rest shape is not known and is calibrated; what a scene has to say is which points follow each other, and how far
 apart along the material they are: ``body.segment_rest_lengths_m`` with ``body.topology`` for branches, else the order
 of the points from the grip and the largest distances that are seen between neighbours. Where points are few, a rod that
 starts at rest begins as it hangs still (the run finds that shape), else on splines through the first frame.
+
+An arm or a trunk of which only a few markers are tracked, and no volume is declared, is a rod too, from the middle of
+its base's controllers on: through markers that follow each other along it, or, where all of them sit around its tip, to
+their middle, with which they move as a rigid section.
 """
 
 from __future__ import annotations
@@ -20,13 +24,17 @@ from physworld.errors import SceneUnsupported
 from physworld.geometry.body import ReferenceBody, first_points
 from physworld.scene import AS_MEASURED, Scene
 
-KINDS = ("rope", "rod", "branched_rope")
+SLENDER = ("arm", "trunk")
+KINDS = ("rope", "rod", "branched_rope", *SLENDER)
 BRANCHED = "branched_rope"
 RADIUS_M = 0.004  # where none is declared
 _EDGES = 30  # of the whole length, beside those that markers ask for
 _SHOWN_GAP = 0.25  # of the length: points farther apart do not show the shape between them
 _STILL_SHARE = 0.02  # of sqrt(g L): slower points rest
+_CLOUD = 30  # points that bound a solid
+_TIP_SHARE = 0.2  # of the distance from the base: markers within it along the axis sit on one section
 _STILL_S, _VELOCITY_S, _LEAST_FRAMES = 0.1, 0.05, 5
+_ON_AXIS = 1e-6  # of the length: nearer points are on the curve
 _NEAR_SHARE = 0.03  # of the length: a declared length within it is that of the last point
 
 
@@ -45,6 +53,10 @@ def is_discrete(scene: Scene) -> bool:
     """
     if scene.kind == BRANCHED:
         return True
+    if scene.kind in SLENDER:
+        body = scene.body
+        solid = body.box_min_m is not None or scene.rest_volume_points is not None or scene.surface_points is not None
+        return not solid and scene.points.shape[1] < _CLOUD and len(scene.controllers[0]) > 0
     touching = (scene.declared.get("body") or {}).get("self_contact")
     return scene.kind in KINDS and scene.initial_state == AS_MEASURED and not touching
 
@@ -59,9 +71,12 @@ def rod_body(scene: Scene, refinement: float) -> ReferenceBody:
     Raises:
         SceneUnsupported: the scene says too little, or what it says is no tree.
     """
-    points = first_points(scene)
+    tracked = first_points(scene)
     notes = ["the rest shape is not known: its curvature and twist are calibrated"]
-    paths = _paths(scene, points, notes)
+    if scene.kind in SLENDER:
+        points, paths = _slender(scene, tracked, notes)
+    else:
+        points, paths = tracked, _paths(scene, tracked, notes)
     radius = scene.body.radius_m or RADIUS_M
     if scene.body.radius_m is None:
         notes.append(f"radius not declared: {radius} m assumed (only the inertia about the axis)")
@@ -77,7 +92,14 @@ def rod_body(scene: Scene, refinement: float) -> ReferenceBody:
         )
         velocity = np.zeros_like(start)
     else:
-        velocity = _curve(lattice, paths, numbers, _velocities(scene))
+        moving = np.zeros_like(points)
+        moving[: len(tracked)] = _velocities(scene)
+        velocity = _curve(lattice, paths, numbers, moving)
+    coordinates = coordinates[: len(tracked)]
+    if len(points) == len(tracked) + 2:  # a base and a tip beside the markers
+        coordinates = np.repeat(lattice.node_coordinates[numbers[-1:]], len(tracked), axis=0)
+    offsets = tracked - lattice.interpolation(coordinates) @ start
+    offsets[np.linalg.norm(offsets, axis=1) < _ON_AXIS * total] = 0.0
     rest = np.zeros((len(lattice.nodes), 3))
     rest[:, 0] = lattice.node_coordinates[:, 0]
     return ReferenceBody(
@@ -86,7 +108,7 @@ def rod_body(scene: Scene, refinement: float) -> ReferenceBody:
         start,
         velocity,
         coordinates,
-        np.zeros((len(points), 3)),
+        offsets,
         radius,
         tuple(notes),
         settles=settles,
@@ -121,6 +143,33 @@ def _paths(scene: Scene, points: Array, notes: list[str]) -> list[Path]:
     held = [k for k in ends[1:] if float(gap[k].min()) < _NEAR_SHARE * sum(lengths)]
     goal = held[0] if held else None
     return _split(beside, root, goal, count)
+
+
+def _slender(scene: Scene, points: Array, notes: list[str]) -> tuple[Array, list[Path]]:
+    """Points with a base, and a tip where all markers sit around one, at the end; and the path through them.
+
+    Returns:
+        points (N + 1, 3), base last, or (N + 2, 3), base and tip last [m]; the path from the base.
+    """
+    base = scene.controllers[0].mean(axis=0)
+    middle = points.mean(axis=0)
+    reach = float(np.linalg.norm(middle - base))
+    if reach <= 0.0:
+        raise SceneUnsupported(f"{len(points)} markers of a {scene.kind} lie around its base: nothing shows its axis")
+    along = (points - base) @ (middle - base) / reach
+    count = len(points)
+    if np.ptp(along) <= _TIP_SHARE * reach:
+        length = scene.body.length_m or reach
+        notes.append(f"{count} markers sit around the tip: a rod of {length:.4g} m from the middle of its base to theirs")
+        return np.concatenate([points, base[None], middle[None]]), [Path([count, count + 1], [length])]
+    order = np.argsort(along)
+    line = np.concatenate([base[None], points[order]])
+    lengths = np.linalg.norm(np.diff(line, axis=0), axis=1)
+    declared = scene.body.length_m
+    if declared is not None and declared > lengths.sum():
+        lengths = lengths * (declared / lengths.sum())
+    notes.append(f"a rod of {lengths.sum():.4g} m from the middle of its base through {count} markers")
+    return np.concatenate([points, base[None]]), [Path([count, *order.tolist()], lengths.tolist())]
 
 
 def _split(beside: dict[int, dict[int, float]], root: int, goal: int | None, count: int) -> list[Path]:
@@ -175,7 +224,7 @@ def _ordered(scene: Scene, points: Array, notes: list[str]) -> Path:
 
 
 def _chain(paths: list[Path], edge_m: float) -> tuple[Chain, Array]:
-    """Edges of about ``edge_m`` between the points, and the node at each point, (N,)."""
+    """Edges of about ``edge_m`` between the points, and the node at each point, (N,); -1 of those on no path."""
     parent, lengths = [-1], [0.0]
     at = {paths[0].points[0]: 0}
     for path in paths:
@@ -189,7 +238,9 @@ def _chain(paths: list[Path], edge_m: float) -> tuple[Chain, Array]:
             at[point] = node
     if len(parent) < 4:  # two points alone: room to bend
         return _chain(paths, 0.5 * edge_m)
-    return chain(np.array(parent), np.array(lengths)), np.array([at[k] for k in range(len(at))])
+    numbers = np.full(max(at) + 1, -1)
+    numbers[list(at)] = list(at.values())
+    return chain(np.array(parent), np.array(lengths)), numbers
 
 
 def _curve(lattice: Chain, paths: list[Path], numbers: Array, values: Array) -> Array:

@@ -107,7 +107,7 @@ def build_twin(
             declared_region(grips[k] if grips else None, body.lattice.dim) for k in range(len(groups))
         ),
         controllers_start=controls[0],
-        release_s=_release_time(scene),
+        release_s=0.0 if body.settles else _release_time(scene),
         turning=turning,
         natural=natural_of(body, len(groups)),
         colliders=twin_colliders(scene, body.half_thickness_m, PRIOR_FRICTION),
