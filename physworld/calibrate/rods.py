@@ -41,7 +41,7 @@ from physworld.estimation.least_squares import correlations
 from physworld.estimation.unknowns import LINEAR, LOG, at
 from physworld.materials.cable import CableLaw
 from physworld.scene import Scene
-from physworld.twin.rods import first_mode, is_pose, shapes
+from physworld.twin.rods import driven_at, first_mode, is_pose, shapes
 from physworld.twin.twin import Twin
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 Progress = Callable[[int, int, str], None]
 
 _WINDOWS = (0.17, 0.43, 0.71, 1.0)
-_STARTS = (5e-4, 2e-3, 8e-3, 3e-2)  # of rho A g L^3: bending stiffnesses that hang visibly
+_STARTS = (5e-4, 2e-3, 8e-3, 3e-2, 0.2, 1.5)  # of rho A g L^3: bending stiffnesses that hang visibly
 _FIRST = ("bending_n_m2", "relaxation_s", "air_drag_per_s")
 _FIRST_STEPS, _STEPS = 5, 8
 _DAMPINGS = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
@@ -59,6 +59,12 @@ _ENOUGH, _SETTLED = 1e-4, 3e-3  # relative falls of the cost: what counts, and w
 _CORRELATED = 2.0  # times sqrt(L / g)
 _SIGMA_SHARE = 0.005  # of the length: what a rod leaves before anything is known
 _GRIP_RAD, _BRANCH_RAD = 0.5, 0.3
+_STEP_S, _QUIET, _GOES = (
+    0.1,
+    0.05,
+    0.2,
+)  # of a step that is driven from inside: shares of how far the points go in all
+_ONSET_S, _LAG_S = 0.05, 0.03
 _COIL = 4.0  # curvature of its own times the length, of the smoothest shape: a cable that was coiled
 _GRAVITY = 9.81
 _Z95 = 1.96
@@ -98,6 +104,7 @@ def rod_parameters(scene: Scene, twin: Twin) -> list[Parameter]:
         spread = _COIL / (length * (1 + mode))
         found += [_natural(twin, row, axis, f"curvature_{mode}_{axis}", "1/m", spread) for axis in range(2)]
     found.append(_natural(twin, first_mode(twin), 2, "natural_twist", "1/m", 1.0 / length))
+    found += [u for step in range(len(_steps(twin))) for u in _driven(twin, step, length)]
     for number, particles in enumerate(_branches(lattice)):
         found += [
             _branch(number, particles, 0, "stiffness", 2.0, len(twin.particles_rest)),
@@ -145,6 +152,8 @@ class RodSearch:
             raise Cancelled(f"calibration cancelled after {self.simulations} runs")
         run, base = self.run, self.run.problem
         assert base.sections is not None
+        frames = run.frame_index[:end]
+        knots = max(2, int(frames.max()) + 1)
         problems = [
             replace(
                 base,
@@ -152,18 +161,16 @@ class RodSearch:
                 drag_per_s=twin.air_drag_per_s,
                 stiffness_factor=None if twin.properties is None else np.exp(twin.properties[:, 0]),
                 density_factor=None if twin.properties is None else np.exp(twin.properties[:, 1]),
-                sections=replace(base.sections, natural=self.shapes @ twin.natural),
+                sections=replace(
+                    base.sections,
+                    natural=self.shapes @ twin.natural,
+                    driven=driven_at(twin.drive, run.knots[:knots]),
+                    turns=base.sections.turns[:knots],
+                ),
             )
             for twin in twins
         ]
-        frames = run.frame_index[:end]
-        knots = max(2, int(frames.max()) + 1)
         held = replace(run.held, positions=run.held.positions[:knots], velocities=run.held.velocities[:knots])
-        for k, problem in enumerate(problems):
-            assert problem.sections is not None
-            problems[k] = replace(
-                problem, sections=replace(problem.sections, turns=problem.sections.turns[:knots])
-            )
         self.simulations += 1
         rods = self._solver(problems)
         found = rods.run(self.twin.body.start, run.velocity, [held], run.knots[:knots])
@@ -300,6 +307,8 @@ def calibrate_rod(
     begun = time.perf_counter()
     search = RodSearch(scene, twin, config.max_simulations, progress, cancelled)
     journal = journal or Journal()
+    if twin.drive is None:
+        twin = search.twin = replace(twin, drive=steps_seen(scene))
     unknowns = rod_parameters(scene, twin)
     held = (*config.held, *(_LOSSES if config.damping == "none" else ()))
     unknowns = [u for u in unknowns if not u.name.startswith(held)]
@@ -316,7 +325,7 @@ def calibrate_rod(
         search.history, search.cut_short = list(kept["history"]), kept["cut_short"]
         return np.array(kept["theta"]), float("inf") if kept["cost"] is None else float(kept["cost"])
 
-    first = [u for u in unknowns if u.name in _FIRST]
+    first = [u for u in unknowns if u.name in _FIRST or u.name.startswith("drive_")]
     theta, cost = step("rod scan", lambda: _scan(search, first, ends[:2]))
     if not np.isfinite(cost):
         raise CalibrationError(
@@ -413,6 +422,67 @@ def _number(name: str, unit: str, mean: float, spread: float, step: float = 0.02
         transform=LOG, step=step, start=float(np.log(mean)), prior=(float(np.log(mean)), spread), starts=(mean,),
         stage="optional",
     )  # fmt: skip
+
+
+def _driven(twin: Twin, step: int, length: float) -> list[Parameter]:
+    """A step of what drives a rod from inside: when, how fast, and how far."""
+    begin = float(_steps(twin)[step, 0])
+    numbers = [
+        (0, f"drive_{step}_s", "s", begin, _ONSET_S, LINEAR, 0.002),
+        (1, f"drive_{step}_lag_s", "s", _LAG_S, 1.0, LOG, 0.05),
+        (2, f"drive_{step}_curvature_0", "1/m", 0.0, _COIL / length, LINEAR, 0.01 / length),
+        (3, f"drive_{step}_curvature_1", "1/m", 0.0, _COIL / length, LINEAR, 0.01 / length),
+        (4, f"drive_{step}_stretch", "1", 0.0, 0.05, LINEAR, 1e-3),
+    ]  # fmt: skip
+    found = []
+    for column, name, unit, mean, spread, transform, difference in numbers:
+
+        def apply(changed: Twin, value: float, column: int = column) -> Twin:
+            drive = _steps(changed).copy()
+            drive[step, column] = value
+            return replace(changed, drive=drive)
+
+        start = transform.searched(mean)
+        ends = start - 5.0 * spread, start + 5.0 * spread
+        found.append(
+            Parameter(
+                name, unit, transform.value(ends[0]), transform.value(ends[1]), apply, transform=transform,
+                step=difference, start=start, prior=(start, spread), starts=(mean,), stage="optional",
+            )
+        )  # fmt: skip
+    return found
+
+
+def _steps(twin: Twin) -> Array:
+    return np.zeros((0, 5)) if twin.drive is None else twin.drive
+
+
+def steps_seen(scene: Scene) -> Array | None:
+    """Steps of a body that moves by itself, (J, 5), when they begin and otherwise nothing; None where there are none.
+
+    Its base stands still, it starts at rest, and then, out of rest, its points go far within a tenth of a second.
+    """
+    end = scene.train[1]
+    times, moved = scene.times[:end], scene.controllers[:end] - scene.controllers[0]
+    seen = scene.visible[:end].all(axis=1)
+    if np.abs(moved).max(initial=0.0) > 0.0 or seen.sum() < 4:
+        return None
+    path = scene.points[:end][seen].mean(axis=1)
+    times = times[seen]
+    spread = float(np.linalg.norm(path - path[0], axis=1).max())
+    found: list[float] = []
+    for k in range(len(times)):
+        before, after = np.searchsorted(times, [times[k] - _STEP_S, times[k] + _STEP_S])
+        after = min(after, len(times) - 1)
+        quiet = np.linalg.norm(path[before : k + 1] - path[k], axis=1).max() < _QUIET * spread
+        goes = np.linalg.norm(path[after] - path[k]) > _GOES * spread
+        if quiet and goes and (not found or times[k] - found[-1] > 2.0 * _STEP_S):
+            found.append(float(times[k]))
+    if not found:
+        return None
+    drive = np.zeros((len(found), 5))
+    drive[:, 0], drive[:, 1] = found, _LAG_S
+    return drive
 
 
 def _natural(twin: Twin, row: int, column: int, name: str, unit: str, spread: float) -> Parameter:

@@ -55,7 +55,11 @@ def is_discrete(scene: Scene) -> bool:
         return True
     if scene.kind in SLENDER:
         body = scene.body
-        solid = body.box_min_m is not None or scene.rest_volume_points is not None or scene.surface_points is not None
+        solid = (
+            body.box_min_m is not None
+            or scene.rest_volume_points is not None
+            or scene.surface_points is not None
+        )
         return not solid and scene.points.shape[1] < _CLOUD and len(scene.controllers[0]) > 0
     touching = (scene.declared.get("body") or {}).get("self_contact")
     return scene.kind in KINDS and scene.initial_state == AS_MEASURED and not touching
@@ -155,12 +159,16 @@ def _slender(scene: Scene, points: Array, notes: list[str]) -> tuple[Array, list
     middle = points.mean(axis=0)
     reach = float(np.linalg.norm(middle - base))
     if reach <= 0.0:
-        raise SceneUnsupported(f"{len(points)} markers of a {scene.kind} lie around its base: nothing shows its axis")
+        raise SceneUnsupported(
+            f"{len(points)} markers of a {scene.kind} lie around its base: nothing shows its axis"
+        )
     along = (points - base) @ (middle - base) / reach
     count = len(points)
     if np.ptp(along) <= _TIP_SHARE * reach:
         length = scene.body.length_m or reach
-        notes.append(f"{count} markers sit around the tip: a rod of {length:.4g} m from the middle of its base to theirs")
+        notes.append(
+            f"{count} markers sit around the tip: a rod of {length:.4g} m from the middle of its base to theirs"
+        )
         return np.concatenate([points, base[None], middle[None]]), [Path([count, count + 1], [length])]
     order = np.argsort(along)
     line = np.concatenate([base[None], points[order]])

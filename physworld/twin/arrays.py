@@ -61,6 +61,7 @@ def arrays_of(twin: Twin) -> dict[str, Array]:
         **({} if body.added_mass is None else {"body_added_mass": body.added_mass}),
         **({} if twin.properties is None else {"properties": twin.properties}),
         **({} if twin.natural is None else {"natural": twin.natural}),
+        **({} if twin.drive is None else {"drive": twin.drive}),
         **collider_arrays,
     }
 
@@ -107,4 +108,5 @@ def parts_of(arrays: dict[str, Array]) -> dict[str, Any]:
         "transfer": facts.get("transfer", "apic"),
         "properties": arrays.get("properties"),
         "natural": arrays.get("natural"),
+        "drive": arrays.get("drive"),
     }

@@ -4,6 +4,10 @@ The natural curvature and twist are sums of a few shapes (:func:`shapes`), whose
 ``Twin.natural``: first, for every grip, the angles of the joint next to it [rad] (a gripper seldom holds a rod exactly
 along its axis), then, for every branch, those of the joint where it leaves the cable [rad], then the smoothest fields
 over the rod [1/m], the constant one first.
+
+A body whose base stands still and that starts to move by itself is driven from inside, by chambers or tendons whose
+pressure or pull nobody recorded. ``Twin.drive`` holds the steps of its rest shape, each a first-order lag: curvatures
+about both directors and a stretch, the same all along.
 """
 
 from __future__ import annotations
@@ -142,8 +146,24 @@ def sections_of(twin: Twin, held: HeldNodes, knots: Array, controls: Array) -> S
         radius_m=twin.body.thickness_m,
         edges=edges,
         turns=turns,
+        driven=driven_at(twin.drive, knots),
         settles=twin.body.settles,
     )
+
+
+def driven_at(drive: Array | None, times: Array) -> Array:
+    """Curvatures [1/m] and stretch that steps drive at ``times`` (T,) [s], (T, 3).
+
+    Args:
+        drive: a step a row: when it begins [s], its lag [s], what it adds in the end (3), (J, 5); None for none.
+        times: [s].
+    """
+    found = np.zeros((len(times), 3))
+    if drive is not None:
+        for begin, lag, *added in drive:
+            passed = np.maximum(times - begin, 0.0) / max(lag, 1e-9)
+            found += (1.0 - np.exp(-passed))[:, None] * np.array(added)
+    return found
 
 
 def _turned(edges: Array, rotations: Array) -> Array:

@@ -23,8 +23,8 @@ from physworld.materials.cable import CableLaw
 STEP_SHARE = 0.006
 """Time step over sqrt(L / g), the time in which the rod falls about its length: 1.9 ms for a metre."""
 _GRAVITY = 9.81
-_MODE_SHARE = 0.3  # of the fourth mode's period over 2 pi
-_FOURTH_MODE = 120.9  # (beta_4 L)^2 of a clamped rod
+_MODE_SHARE = 0.3  # of the second mode's period over 2 pi
+_SECOND_MODE = 22.03  # (beta_2 L)^2 of a clamped rod
 _STRETCH_RELAXATION_S = 1e-3
 _TERM_SHARE = 0.5  # of a term's own limit of the time step
 _SETTLE_S, _SETTLE_KNOTS, _SETTLE_DRAG_PER_S, _SETTLE_RELAXATION_S = 6.0, 13, 6.0, 0.05
@@ -42,6 +42,7 @@ class Sections:
         radius_m: of the section, for its inertia about the axis.
         edges: that grips hold, by the node at which they end, (E,).
         turns: angles by which the grips turn them about their tangents since the start, at the knots [rad], (T, E).
+        driven: curvatures [1/m] and stretch that chambers or tendons add to the rest shape, at the knots, (T, 3).
         settles: the run begins with the rod hanging still.
     """
 
@@ -49,6 +50,7 @@ class Sections:
     radius_m: float
     edges: Array
     turns: Array
+    driven: Array
     settles: bool = False
 
 
@@ -128,7 +130,7 @@ class DiscreteRods:
         length = float(self.chain.distances.max())
         gravity = max(float(np.linalg.norm(self.problems[0].gravity_m_s2)), _GRAVITY)
         speed = max(np.sqrt(_columns(p)["bending"] / p.law.density) for p in self.problems)
-        mode = _FOURTH_MODE * speed / length**2
+        mode = _SECOND_MODE * speed / length**2
         return float(min(STEP_SHARE * np.sqrt(length / gravity), _MODE_SHARE / mode))
 
     def _term_limit(self) -> float:
@@ -161,6 +163,7 @@ class _Launch:
             self._array(np.stack([one.positions for one in held]), wp.vec3d),
             self._array(np.stack([one.velocities for one in held]), wp.vec3d),
             self._array(np.stack([s.turns for s in sections][: len(held)])),  # type: ignore[union-attr]
+            self._array(np.stack([s.driven for s in sections]), wp.vec3d),  # type: ignore[union-attr]
         ]
         start = np.where((numbers >= 0)[:, None], 0.0, v)
         start[held[0].nodes] = held[0].velocities[0]

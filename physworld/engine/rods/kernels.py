@@ -67,6 +67,7 @@ def run_rods(
     path: wp.array3d[wp.vec3d],
     path_rate: wp.array3d[wp.vec3d],
     roll: wp.array3d[wp.float64],
+    driven: wp.array2d[wp.vec3d],
     push: wp.array2d[wp.vec3d],
     # which substeps: all, or one of one interval
     first_knot: int,
@@ -116,6 +117,9 @@ def run_rods(
         span = times[k + 1] - times[k]
         dt = span / wp.float64(count)
         for s in range(first_step, wp.min(last_step, count)):
+            # rest strains that are driven from inside: two curvatures and a stretch, all along the rod
+            share = (wp.float64(s) + half) / wp.float64(count)
+            drive = (one - share) * driven[c, k] + share * driven[c, k + 1]
             # own inertia, gravity and drag
             for i in range(n):
                 p = parent[i]
@@ -143,7 +147,7 @@ def run_rods(
                 p = parent[i]
                 t = tangent[c, i]
                 stiff = stretching[c, i] / rest_length[i]
-                tension = stiff * (length[c, i] - rest_length[i])
+                tension = stiff * (length[c, i] - rest_length[i] * (one + drive[2]))
                 damp = stiff * tau_stretch
                 rate = wp.dot(v[c, i] - v[c, p], t)
                 f = (tension + damp * rate) * t
@@ -199,8 +203,8 @@ def run_rods(
                     s3 = torsion[c, i] / l
                     # rate-independent friction (Dahl) and one Maxwell branch, as angles of the joint
                     extra = zero
-                    m1 = s1 * (k1 - natural[c, i, 0] * l + tau * rate1)
-                    m2 = s2 * (k2 - natural[c, i, 1] * l + tau * rate2)
+                    m1 = s1 * (k1 - (natural[c, i, 0] + drive[0]) * l + tau * rate1)
+                    m2 = s2 * (k2 - (natural[c, i, 1] + drive[1]) * l + tau * rate2)
                     m3 = s3 * (twist - natural[c, i, 2] * l + (tau_twist + dt) * rate3)
                     friction = scalars[c, FRICTION_PER_M]
                     if friction > zero:
