@@ -16,7 +16,7 @@ import warp as wp
 from physworld.arrays import Array
 from physworld.engine.problem import HeldNodes, Problem
 from physworld.engine.rods.chain import Chain
-from physworld.engine.rods.kernels import SCALARS, run_rods
+from physworld.engine.rods.kernels import OPENING, SCALARS, SHRUNK, run_rods
 from physworld.errors import BlewUp, CFLViolation, ParticlesLeftTheGrid, SceneUnsupported, SimulationError
 from physworld.materials.cable import CableLaw
 
@@ -27,8 +27,9 @@ _MODE_SHARE = 0.3  # of the second mode's period over 2 pi
 _SECOND_MODE = 22.03  # (beta_2 L)^2 of a clamped rod
 _STRETCH_RELAXATION_S = 1e-3
 _TERM_SHARE = 0.5  # of a term's own limit of the time step
-_SETTLE_S, _SETTLE_KNOTS, _SETTLE_DRAG_PER_S, _SETTLE_RELAXATION_S = 6.0, 13, 6.0, 0.05
+_SETTLE_TIME, _SETTLE_KNOTS, _SETTLE_DRAG, _SETTLE_RELAXATION = 19.0, 13, 1.9, 0.16  # in units of sqrt(L / g)
 _GYRATION = 1.0 / np.sqrt(2.0)  # radius of gyration of a round section about its axis, over its radius
+_TINY = 1e-12
 _REACH = 50.0  # of the rod's length: where a node cannot be
 
 
@@ -42,16 +43,17 @@ class Sections:
         radius_m: of the section, for its inertia about the axis.
         edges: that grips hold, by the node at which they end, (E,).
         turns: angles by which the grips turn them about their tangents since the start, at the knots [rad], (T, E).
-        driven: curvatures [1/m] and stretch that chambers or tendons add to the rest shape, at the knots, (T, 3).
         settles: the run begins with the rod hanging still.
+        driven: curvatures [1/m] and stretch that chambers or tendons add to the rest shape, at the knots, (T, 3); None:
+            nothing is driven.
     """
 
     natural: Array
     radius_m: float
     edges: Array
     turns: Array
-    driven: Array
     settles: bool = False
+    driven: Array | None = None
 
 
 class DiscreteRods:
@@ -109,10 +111,14 @@ class DiscreteRods:
             held: prescribed nodes of each copy, or of all of them; their paths are given at ``times``.
             times: (T,) [s], strictly increasing.
             progress: called with (frames done, frames in all) before and after; may raise to stop.
+
+        Raises:
+            SceneUnsupported: an edge has no length at the start.
         """
+        self._check_start(x)
         if progress is not None:
             progress(0, len(times))
-        launch = _Launch(self, x, v, held, times)
+        launch = Launch(self, x, v, held, times)
         if self.problems[0].sections.settles:  # type: ignore[union-attr]
             launch.settle()
         out = launch.whole() if not self.terms else launch.stepwise(progress)
@@ -121,17 +127,32 @@ class DiscreteRods:
         size = float(self.chain.lengths.sum())
         return [_trusted(tracks, x, size, self.time_step_s) for tracks in out]
 
+    def _check_start(self, x: Array) -> None:
+        lengths = np.linalg.norm(x[1:] - x[self.chain.parent[1:]], axis=1)
+        share = lengths / self.chain.lengths[1:]
+        if not share.min() > SHRUNK:
+            edge = int(np.argmin(np.where(np.isfinite(share), share, -1.0)))
+            raise SceneUnsupported(
+                f"edge {edge} of {len(share)} is {lengths[edge]:.3g} m long at the start, at rest "
+                f"{self.chain.lengths[edge + 1]:.3g} m: it has no direction"
+            )
+
     @property
     def stage_s(self) -> float:
         """Time that one evaluation of forces advances [s]: the step, which has one."""
         return self.time_step_s
 
+    @property
+    def fall_s(self) -> float:
+        """sqrt(L / g), the time in which the rod falls about its length [s]; g is Earth's at least."""
+        gravity = max(float(np.linalg.norm(self.problems[0].gravity_m_s2)), _GRAVITY)
+        return float(np.sqrt(self.chain.distances.max() / gravity))
+
     def _own_step(self) -> float:
         length = float(self.chain.distances.max())
-        gravity = max(float(np.linalg.norm(self.problems[0].gravity_m_s2)), _GRAVITY)
         speed = max(np.sqrt(_columns(p)["bending"] / p.law.density) for p in self.problems)
         mode = _SECOND_MODE * speed / length**2
-        return float(min(STEP_SHARE * np.sqrt(length / gravity), _MODE_SHARE / mode))
+        return float(min(STEP_SHARE * self.fall_s, _MODE_SHARE / mode))
 
     def _term_limit(self) -> float:
         square = sum(term.frequency_rad_s**2 for term in self.terms)
@@ -141,7 +162,7 @@ class DiscreteRods:
         return _TERM_SHARE * float(min(limits, default=np.inf))
 
 
-class _Launch:
+class Launch:
     """Device arrays of one run."""
 
     def __init__(
@@ -163,7 +184,7 @@ class _Launch:
             self._array(np.stack([one.positions for one in held]), wp.vec3d),
             self._array(np.stack([one.velocities for one in held]), wp.vec3d),
             self._array(np.stack([s.turns for s in sections][: len(held)])),  # type: ignore[union-attr]
-            self._array(np.stack([s.driven for s in sections]), wp.vec3d),  # type: ignore[union-attr]
+            self._array(np.stack([_driven(p, len(self.times)) for p in rods.problems]), wp.vec3d),
         ]
         start = np.where((numbers >= 0)[:, None], 0.0, v)
         start[held[0].nodes] = held[0].velocities[0]
@@ -173,11 +194,11 @@ class _Launch:
 
         self.state = [
             copied(x, wp.vec3d), copied(start, wp.vec3d), copied(directors, wp.vec3d),
-            self._zeros(wp.float64), self._zeros(wp.float64, 2), self._zeros(wp.float64, 2),
+            self._zeros(wp.float64), self._zeros(wp.float64, 2), copied(joint_angles(chain, x), wp.float64),
         ]  # fmt: skip
         self.start = self._array(np.broadcast_to(start, (copies, *start.shape)), wp.vec3d)
         self.push = self._zeros(wp.vec3d)
-        kinds = [wp.vec3d, wp.float64, wp.mat33d, wp.mat33d, wp.mat33d, wp.vec3d, *[wp.float64] * 3]
+        kinds = [wp.vec3d, wp.float64, wp.mat33d, wp.mat33d, wp.mat33d, wp.vec3d, *[wp.float64] * 4]
         self.scratch = [self._zeros(kind) for kind in kinds]
 
     def whole(self) -> Array:
@@ -220,7 +241,7 @@ class _Launch:
 
     def settle(self) -> None:
         """Let the rods come to rest under their grips as these are at the first time, without friction or creep."""
-        times = np.linspace(0.0, _SETTLE_S, _SETTLE_KNOTS)
+        times = np.linspace(0.0, _SETTLE_TIME * self.rods.fall_s, _SETTLE_KNOTS)
         numbers = self._numbers_of(settling=True)
         still = [
             self._array(np.repeat(array.numpy()[:, :1], len(times), axis=1), array.dtype)
@@ -261,7 +282,7 @@ class _Launch:
             self._array(np.repeat(bending[..., None], 2, axis=2)),
             self._array(torsion),
             self._array(np.stack([p.sections.natural for p in problems])),  # type: ignore[union-attr]
-            self._array(np.stack([_scalars(p, settling) for p in problems])),
+            self._array(np.stack([_scalars(p, self.rods.fall_s if settling else None) for p in problems])),
             self._array(np.stack([np.asarray(p.gravity_m_s2, dtype=float) for p in problems]), wp.vec3d),
         ]
 
@@ -287,7 +308,7 @@ def directors_along(chain: Chain, x: Array) -> Array:
         s, d = tangents[before], directors[before]
         axis = np.cross(s, t)
         once = np.cross(axis, d)
-        directors[node] = d + once + np.cross(axis, once) / (1.0 + s @ t)
+        directors[node] = d + once + np.cross(axis, once) / max(1.0 + s @ t, _TINY)
     directors[0] = directors[1]
     return directors
 
@@ -302,7 +323,7 @@ def joint_angles(chain: Chain, x: Array) -> Array:
         middle = chain.parent[node]
         pair = [x[middle] - x[chain.parent[middle]], x[node] - x[middle]]
         before, after = (edge / np.linalg.norm(edge) for edge in pair)
-        binormal = 2.0 * np.cross(before, after) / (1.0 + before @ after)
+        binormal = 2.0 * np.cross(before, after) / max(1.0 + before @ after, OPENING)
         first = directors[middle], directors[node]
         second = np.cross(before, first[0]) + np.cross(after, first[1])
         found[node] = 0.5 * binormal @ second, -0.5 * binormal @ (first[0] + first[1])
@@ -313,8 +334,13 @@ def _columns(problem: Problem) -> dict[str, float]:
     return problem.law.columns
 
 
-def _scalars(problem: Problem, settling: bool) -> Array:
-    """A row of the kernel's scalars; of a rod that settles with strong drag, no friction, and creep at its end."""
+def _scalars(problem: Problem, settle_s: float | None) -> Array:
+    """A row of the kernel's scalars; of a rod that settles with strong drag, no friction, and creep at its end.
+
+    Args:
+        problem: the rod.
+        settle_s: sqrt(L / g) [s] of a rod that settles, else None.
+    """
     law, sections = problem.law, problem.sections
     assert isinstance(law, CableLaw) and sections is not None
     row = np.zeros(SCALARS)
@@ -324,9 +350,15 @@ def _scalars(problem: Problem, settling: bool) -> Array:
     row[5], row[6] = law.friction_per_m, law.friction_onset_per_m
     row[7], row[8] = law.creep_ratio, law.creep_s
     row[9] = _GYRATION * sections.radius_m
-    if settling:
-        row[:2], row[3], row[5], row[8] = _SETTLE_RELAXATION_S, _SETTLE_DRAG_PER_S, 0.0, 1e-3
+    if settle_s is not None:
+        row[:2], row[3], row[5], row[8] = _SETTLE_RELAXATION * settle_s, _SETTLE_DRAG / settle_s, 0.0, 1e-3
     return row
+
+
+def _driven(problem: Problem, knots: int) -> Array:
+    """What is driven from inside at the knots, (T, 3)."""
+    sections = problem.sections
+    return np.zeros((knots, 3)) if sections is None or sections.driven is None else sections.driven
 
 
 def _edge_factors(chain: Chain, factor: Array | None) -> Array:

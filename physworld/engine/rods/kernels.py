@@ -1,9 +1,10 @@
 """The whole run of a discrete elastic rod in one launch: one thread integrates one copy of it.
 
 Nodes are numbered so that a parent comes before its children; edge i ends at node i and begins at its parent, joint i
-is where it meets its parent edge. Every joint has two curvatures, about the directors of the two edges that meet there,
-and a twist (Bergou et al. 2008, "Discrete elastic rods"; gradients as in Bergou et al. 2010, "Discrete viscous
-threads").
+is where it meets its parent edge. Every joint has two curvatures and a twist (Bergou et al. 2008, "Discrete elastic
+rods"; gradients as in Bergou et al. 2010, "Discrete viscous threads"). Its curvatures are about the directors half way
+between those of the two edges that meet there, not about their mean, which is shorter where the rod is twisted: a rod
+without natural curvature then bends alike whatever its twist.
 
     (M + dt D + dt^2 K / 4) dv = dt (f - D v)        x += dt v
 
@@ -11,6 +12,9 @@ with D and K the positive parts of damping and stiffness at the present position
 method of constant average acceleration: no step is too long for a stiff rod, and no energy is lost. A block of the
 matrix couples a node with its parent and its grandparent only, so it is solved from the leaves to the root without
 fill. Twist is solved likewise, fully implicitly: it settles within a few steps, as it does within a frame in a rope.
+What tension does across an edge is explicit as far as that is stable (``taut``): as part of the matrix, which then
+changes from step to step, it feeds energy into a limp rope that whips.
+Velocities are those of half a step after the positions.
 """
 
 from __future__ import annotations
@@ -30,13 +34,21 @@ CREEP_S = wp.constant(8)
 GYRATION_M = wp.constant(9)
 SCALARS = 10
 
+OPENING = 0.02
+"""1 + cos of the angle between two edges: beyond 168 degrees a joint bends no stiffer."""
+SHRUNK = 1e-3
+"""Length of an edge over its rest length below which it has no direction."""
+_OPENING = wp.constant(wp.float64(OPENING))
+_SHRUNK = wp.constant(wp.float64(SHRUNK))
+_TINY = wp.constant(wp.float64(1e-12))
+
 
 @wp.func
 def turned(d: wp.vec3d, t: wp.vec3d, u: wp.vec3d) -> wp.vec3d:
     """``d`` carried by the least rotation that takes the unit vector t to u."""
     axis = wp.cross(t, u)
     once = wp.cross(axis, d)
-    return d + once + wp.cross(axis, once) / (wp.float64(1.0) + wp.dot(t, u))
+    return d + once + wp.cross(axis, once) / wp.max(wp.float64(1.0) + wp.dot(t, u), _TINY)
 
 
 @wp.func
@@ -91,6 +103,7 @@ def run_rods(
     twist_own: wp.array2d[wp.float64],
     twist_up: wp.array2d[wp.float64],
     torque: wp.array2d[wp.float64],
+    pull: wp.array2d[wp.float64],
     # out
     out: wp.array3d[wp.vec3d],
 ) -> None:
@@ -107,11 +120,13 @@ def run_rods(
     at = wp.min(c, path.shape[0] - 1)  # copies may share their grips
     for i in range(1, n):
         e = x[c, i] - x[c, parent[i]]
-        length[c, i] = wp.length(e)
+        length[c, i] = wp.max(wp.length(e), _SHRUNK * rest_length[i])
         tangent[c, i] = e / length[c, i]
     if first_knot == 0 and first_step == 0:
         for i in range(n):
             out[c, 0, i] = x[c, i]
+            if i > 0:
+                pull[c, i] = stretching[c, i] * (length[c, i] / rest_length[i] - one)
     for k in range(first_knot, last_knot):
         count = steps[k]
         span = times[k + 1] - times[k]
@@ -120,6 +135,15 @@ def run_rods(
             # rest strains that are driven from inside: two curvatures and a stretch, all along the rod
             share = (wp.float64(s) + half) / wp.float64(count)
             drive = (one - share) * driven[c, k] + share * driven[c, k + 1]
+            before = zero  # the step before, half of whose push is in this one: none of it in the first
+            if s > 0:
+                before = dt
+            elif k > 0:
+                before = (times[k] - times[k - 1]) / wp.float64(steps[k - 1])
+            kick = half * (before + dt) / dt
+            ahead = zero  # velocities at the start are not yet those of half a step later
+            if before == zero:
+                ahead = half * dt
             # own inertia, gravity and drag
             for i in range(n):
                 p = parent[i]
@@ -149,10 +173,13 @@ def run_rods(
                 stiff = stretching[c, i] / rest_length[i]
                 tension = stiff * (length[c, i] - rest_length[i] * (one + drive[2]))
                 damp = stiff * tau_stretch
-                rate = wp.dot(v[c, i] - v[c, p], t)
-                f = (tension + damp * rate) * t
-                side = quarter * dt * dt * wp.max(tension, zero) / length[c, i]
-                block = projected(t, dt * damp + quarter * dt * dt * stiff, side)
+                apart = v[c, i] - v[c, p]
+                rate = wp.dot(apart, t)
+                taut = wp.max(pull[c, i] - half * mass[c, i] * length[c, i] / (dt * dt), zero) / length[c, i]
+                f = (tension + damp * rate) * t + ahead * projected(t, stiff, taut) * apart
+                pull[c, i] = tension + damp * rate
+                along = dt * damp + quarter * dt * dt * stiff
+                block = projected(t, along, quarter * dt * dt * taut)
                 own[c, i] = own[c, i] + block
                 own[c, p] = own[c, p] + block
                 up[c, i] = up[c, i] - block
@@ -169,27 +196,34 @@ def run_rods(
                     b1 = director[c, i]
                     a2 = wp.cross(ta, a1)
                     b2 = wp.cross(tb, b1)
-                    chi = one + wp.dot(ta, tb)
+                    chi = wp.max(one + wp.dot(ta, tb), _OPENING)
                     kb = wp.float64(2.0) * wp.cross(ta, tb) / chi
                     mean = (ta + tb) / chi
                     d1 = (a1 + b1) / chi
                     d2 = (a2 + b2) / chi
-                    k1 = half * wp.dot(kb, a2 + b2)
-                    k2 = -half * wp.dot(kb, a1 + b1)
                     la = length[c, p]
                     lb = length[c, i]
-                    ga1 = (wp.cross(tb, d2) - k1 * mean) / la
-                    gb1 = (-wp.cross(ta, d2) - k1 * mean) / lb
-                    ga2 = (-wp.cross(tb, d1) - k2 * mean) / la
-                    gb2 = (wp.cross(ta, d1) - k2 * mean) / lb
                     u = turned(a1, ta, tb)
-                    twist = wp.atan2(wp.dot(wp.cross(u, b1), tb), wp.dot(u, b1))
+                    sine = wp.dot(wp.cross(u, b1), tb)
+                    cosine = wp.dot(u, b1)
+                    twist = wp.atan2(sine, cosine)
                     gat = half * kb / la
                     gbt = half * kb / lb
-                    ha1 = -half * wp.dot(kb, a1)
-                    hb1 = -half * wp.dot(kb, b1)
-                    ha2 = -half * wp.dot(kb, a2)
-                    hb2 = -half * wp.dot(kb, b2)
+                    # the mean of the two directors is cos(twist / 2) long
+                    tangent_half = sine / wp.max(one + cosine, _OPENING)
+                    longer_by = wp.sqrt(one + tangent_half * tangent_half)
+                    k1 = half * longer_by * wp.dot(kb, a2 + b2)
+                    k2 = -half * longer_by * wp.dot(kb, a1 + b1)
+                    by1 = half * tangent_half * k1
+                    by2 = half * tangent_half * k2
+                    ga1 = (longer_by * wp.cross(tb, d2) - k1 * mean) / la + by1 * gat
+                    gb1 = (-longer_by * wp.cross(ta, d2) - k1 * mean) / lb + by1 * gbt
+                    ga2 = (-longer_by * wp.cross(tb, d1) - k2 * mean) / la + by2 * gat
+                    gb2 = (longer_by * wp.cross(ta, d1) - k2 * mean) / lb + by2 * gbt
+                    ha1 = -half * longer_by * wp.dot(kb, a1) - by1
+                    hb1 = -half * longer_by * wp.dot(kb, b1) + by1
+                    ha2 = -half * longer_by * wp.dot(kb, a2) - by2
+                    hb2 = -half * longer_by * wp.dot(kb, b2) + by2
                     l = half * (rest_length[p] + rest_length[i])
                     va = v[c, p] - v[c, g]
                     vb = v[c, i] - v[c, p]
@@ -203,8 +237,8 @@ def run_rods(
                     s3 = torsion[c, i] / l
                     # rate-independent friction (Dahl) and one Maxwell branch, as angles of the joint
                     extra = zero
-                    m1 = s1 * (k1 - (natural[c, i, 0] + drive[0]) * l + tau * rate1)
-                    m2 = s2 * (k2 - (natural[c, i, 1] + drive[1]) * l + tau * rate2)
+                    m1 = s1 * (k1 - (natural[c, i, 0] + drive[0]) * l + (tau + ahead) * rate1)
+                    m2 = s2 * (k2 - (natural[c, i, 1] + drive[1]) * l + (tau + ahead) * rate2)
                     m3 = s3 * (twist - natural[c, i, 2] * l + (tau_twist + dt) * rate3)
                     friction = scalars[c, FRICTION_PER_M]
                     if friction > zero:
@@ -261,9 +295,6 @@ def run_rods(
             h10 = (w3_ - wp.float64(2.0) * w2_ + w) * span
             h01 = one - h00
             h11 = (w3_ - w2_) * span
-            kick = one  # velocities are those of half a step later: the first push is a half one
-            if k == 0 and s == 0:
-                kick = half
             for i in range(n):
                 right[c, i] = kick * right[c, i]
             # leaves to root
@@ -323,6 +354,10 @@ def run_rods(
                         if p > 0:
                             r = r - upup[c, i] * right[c, parent[p]]
                     right[c, i] = own[c, i] * r
+                if i > 0:  # the mean tension over the step
+                    rate = wp.dot(right[c, i] - right[c, p], tangent[c, i])
+                    stiff = stretching[c, i] / rest_length[i]
+                    pull[c, i] = pull[c, i] + (tau_stretch + quarter * dt) * stiff * rate
                 v[c, i] = v[c, i] + right[c, i]
                 x[c, i] = x[c, i] + dt * v[c, i]
                 if i > 0:
@@ -332,7 +367,7 @@ def run_rods(
                     torque[c, i] = turn
                     spin[c, i] = spin[c, i] + turn
                     e = x[c, i] - x[c, p]
-                    longer = wp.length(e)
+                    longer = wp.max(wp.length(e), _SHRUNK * rest_length[i])
                     t = e / longer
                     angle = dt * spin[c, i]
                     d = turned(director[c, i], tangent[c, i], t)
