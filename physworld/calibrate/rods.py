@@ -64,7 +64,7 @@ _STEP_S, _QUIET, _GOES = (
     0.05,
     0.2,
 )  # of a step that is driven from inside: shares of how far the points go in all
-_ONSET_S, _LAG_S = 0.05, 0.03
+_ONSET_S, _RISE_S = 0.05, 0.06
 _COIL = 4.0  # curvature of its own times the length, of the smoothest shape: a cable that was coiled
 _GRAVITY = 9.81
 _Z95 = 1.96
@@ -429,7 +429,7 @@ def _driven(twin: Twin, step: int, length: float) -> list[Parameter]:
     begin = float(_steps(twin)[step, 0])
     numbers = [
         (0, f"drive_{step}_s", "s", begin, _ONSET_S, LINEAR, 0.002),
-        (1, f"drive_{step}_lag_s", "s", _LAG_S, 1.0, LOG, 0.05),
+        (1, f"drive_{step}_rise_s", "s", _RISE_S, 1.0, LOG, 0.05),
         (2, f"drive_{step}_curvature_0", "1/m", 0.0, _COIL / length, LINEAR, 0.01 / length),
         (3, f"drive_{step}_curvature_1", "1/m", 0.0, _COIL / length, LINEAR, 0.01 / length),
         (4, f"drive_{step}_stretch", "1", 0.0, 0.05, LINEAR, 1e-3),
@@ -481,7 +481,7 @@ def steps_seen(scene: Scene) -> Array | None:
     if not found:
         return None
     drive = np.zeros((len(found), 5))
-    drive[:, 0], drive[:, 1] = found, _LAG_S
+    drive[:, 0], drive[:, 1] = found, _RISE_S
     return drive
 
 

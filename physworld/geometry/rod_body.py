@@ -28,7 +28,7 @@ SLENDER = ("arm", "trunk")
 KINDS = ("rope", "rod", "branched_rope", *SLENDER)
 BRANCHED = "branched_rope"
 RADIUS_M = 0.004  # where none is declared
-_EDGES = 30  # of the whole length, beside those that markers ask for
+_EDGES, _EDGES_A_GAP = 30, 10  # of the whole length at most, and between two points
 _SHOWN_GAP = 0.25  # of the length: points farther apart do not show the shape between them
 _STILL_SHARE = 0.02  # of sqrt(g L): slower points rest
 _CLOUD = 30  # points that bound a solid
@@ -85,7 +85,8 @@ def rod_body(scene: Scene, refinement: float) -> ReferenceBody:
     if scene.body.radius_m is None:
         notes.append(f"radius not declared: {radius} m assumed (only the inertia about the axis)")
     total = sum(sum(path.lengths) for path in paths)
-    lattice, numbers = _chain(paths, total / (refinement * _EDGES))
+    edges = min(_EDGES, _EDGES_A_GAP * sum(len(path.lengths) for path in paths))
+    lattice, numbers = _chain(paths, total / (refinement * edges))
     coordinates = lattice.node_coordinates[numbers]
     start = _curve(lattice, paths, numbers, points)
     gaps = np.concatenate([path.lengths for path in paths])

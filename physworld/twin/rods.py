@@ -6,7 +6,7 @@ along its axis), then, for every branch, those of the joint where it leaves the 
 over the rod [1/m], the constant one first.
 
 A body whose base stands still and that starts to move by itself is driven from inside, by chambers or tendons whose
-pressure or pull nobody recorded. ``Twin.drive`` holds the steps of its rest shape, each a first-order lag: curvatures
+pressure or pull nobody recorded. ``Twin.drive`` holds the steps of its rest shape, each a ramp: curvatures
 about both directors and a stretch, the same all along.
 """
 
@@ -155,14 +155,13 @@ def driven_at(drive: Array | None, times: Array) -> Array:
     """Curvatures [1/m] and stretch that steps drive at ``times`` (T,) [s], (T, 3).
 
     Args:
-        drive: a step a row: when it begins [s], its lag [s], what it adds in the end (3), (J, 5); None for none.
+        drive: a step a row: when it begins [s], how long it rises [s], what it adds in the end (3), (J, 5); None for none.
         times: [s].
     """
     found = np.zeros((len(times), 3))
     if drive is not None:
-        for begin, lag, *added in drive:
-            passed = np.maximum(times - begin, 0.0) / max(lag, 1e-9)
-            found += (1.0 - np.exp(-passed))[:, None] * np.array(added)
+        for begin, rise, *added in drive:
+            found += np.clip((times - begin) / max(rise, 1e-9), 0.0, 1.0)[:, None] * np.array(added)
     return found
 
 
