@@ -166,7 +166,7 @@ def _slender(scene: Scene, points: Array, notes: list[str]) -> tuple[Array, list
     along = (points - base) @ (middle - base) / reach
     count = len(points)
     if np.ptp(along) <= _TIP_SHARE * reach:
-        length = scene.body.length_m or reach
+        length = max(reach, scene.body.length_m or 0.0)
         notes.append(
             f"{count} markers sit around the tip: a rod of {length:.4g} m from the middle of its base to theirs"
         )
