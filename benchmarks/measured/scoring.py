@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from physworld.arrays import Array
+from physworld.baselines import PEERS
 from physworld.errors import PhysworldError, SceneUnsupported
 from physworld.evaluate.baselines import BASELINES
 from physworld.evaluate.metrics import metrics, track_error
@@ -51,8 +52,8 @@ FAILURES = (
 
 
 def fits() -> dict[str, Fit]:
-    """Everything beside the twin, by name: what does nothing first."""
-    return {name: partial(_as_it_is, baseline) for name, baseline in BASELINES.items()}
+    """Everything beside the twin, by name: what does nothing first, then other people's models."""
+    return {name: partial(_as_it_is, baseline) for name, baseline in BASELINES.items()} | PEERS
 
 
 def fit_all(scene: Scene) -> tuple[dict[str, Model], Reasons]:

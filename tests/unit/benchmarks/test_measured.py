@@ -63,6 +63,7 @@ def test_a_predictor_that_fails_has_a_reason_and_the_rest_go_on(monkeypatch: pyt
         raise ValueError("2 links, 3 needed")
 
     monkeypatch.setattr(scoring, "BASELINES", {"fails": fails, "static": BASELINES["static"]})
+    monkeypatch.setattr(scoring, "PEERS", {})
     models, unfit = scoring.fit_all(scene)
     tracks, reasons = scoring.predict(scene, models)
     assert tracks["fails"] is None and tracks["static"] is not None
