@@ -34,7 +34,8 @@ def least_squares(
     best = int(np.argmin(costs))
     if not np.isfinite(costs[best]):
         raise CalibrationError(f"none of {len(starts)} starts could be simulated")
-    theta, cost = starts[best].copy(), costs[best]
+    theta: Array = starts[best].copy()
+    cost = costs[best]
     for _ in range(iterations):
         sign = np.where(theta + _DIFFERENCE > upper, -1.0, 1.0)
         found = residuals(np.concatenate([theta[None], theta + np.diag(sign * _DIFFERENCE)]))
