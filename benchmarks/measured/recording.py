@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.measured import scoring
-from physworld.calibrate import CalibrationConfig, FitResult, calibrate
+from physworld.calibrate import CalibrationConfig, FitResult, calibrate, carried_over
 from physworld.estimation.simulations import engine
 from physworld.evaluate.metrics import noise_floor
 from physworld.evaluate.numerics import dominant_frequency
@@ -79,7 +79,10 @@ def measure(name: str, scene: Scene, config: CalibrationConfig, steps: Path) -> 
 def transfer(
     source: Scene, twin: Path, scene: Scene, config: CalibrationConfig, own: dict[str, float | None]
 ) -> dict[str, Any]:
-    """A recording predicted with the material of another one.
+    """A recording predicted with the material of another one (:func:`physworld.calibrate.carried_over`).
+
+    Of a discrete rod two angles, how it was rolled when it was gripped, are found on this recording's training frames;
+    otherwise nothing of it is fitted to. The other models are those fitted to the other recording.
 
     Args:
         source: the other recording; every model is fitted to its training frames.
@@ -97,7 +100,7 @@ def transfer(
     def compute() -> Any:
         with np.load(twin) as stored:
             fitted = Twin.from_arrays(dict(stored), config.device)
-        return scoring.transferred(fitted, scene, config.particle_budget)
+        return scoring.tracks_of(carried_over(fitted, scene, config.particle_budget), scene)
 
     if twin.exists():
         whole["twin"], failure = scoring.attempt(compute, scene)

@@ -25,7 +25,7 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.baselines import PEERS
-from physworld.errors import PhysworldError, SceneUnsupported
+from physworld.errors import PhysworldError
 from physworld.evaluate.baselines import BASELINES
 from physworld.evaluate.metrics import metrics, track_error
 from physworld.scene import AS_MEASURED, Scene
@@ -154,7 +154,9 @@ def restarted(
         return {"reason": reason}
     later = cut(scene, scene.test[0])
     tracks, reasons = predict(later, models)
-    tracks["twin"], failed = attempt(lambda: transferred(fitted, later, particle_budget), later)
+    tracks["twin"], failed = attempt(
+        lambda: tracks_of(with_material(fitted, later, particle_budget), later), later
+    )
     if failed is not None:
         reasons["twin"] = failed
     return {
@@ -202,28 +204,25 @@ def cut(scene: Scene, first: int) -> Scene:
     )
 
 
-def transferred(fitted: Twin, scene: Scene, particle_budget: int) -> Array:
-    """Tracks (T, N, 3) [m] of another recording by a twin of its own with this one's material; nothing is fitted.
+def with_material(fitted: Twin, scene: Scene, particle_budget: int) -> Twin:
+    """A twin of the scene with the fitted law, drag, softness of grips and effects; nothing is fitted.
 
-    What goes over: the law with its constants, air drag, friction against itself, the softness of grips. What does
-    not: where tracked points sit, a rod's natural curvature and its angles at the grips, which are a recording's own.
-
-    Raises:
-        SceneUnsupported: the two are not bodies of one form.
+    Unlike :func:`physworld.calibrate.carried_over`, which finds a rod's roll on training frames, it leaves a rod
+    without natural curvature: a restarted recording has no frame to find it on.
     """
-    twin = build_twin(scene, particle_budget, fitted.device)
-    if type(twin.law) is not type(fitted.law) and twin.lattice.dim != fitted.lattice.dim:
-        raise SceneUnsupported(
-            f"{type(fitted.law).__name__} of a body of dimension {fitted.lattice.dim} is no material of one of "
-            f"dimension {twin.lattice.dim}"
-        )
-    twin = replace(
+    twin = build_twin(scene, particle_budget, fitted.device, formulation=fitted.formulation)
+    return replace(
         twin,
         law=fitted.law,
         air_drag_per_s=fitted.air_drag_per_s,
         self_friction=None if twin.self_friction is None else fitted.self_friction,
         grip_softness=fitted.grip_softness,
+        effects=fitted.effects,
     )
+
+
+def tracks_of(twin: Twin, scene: Scene) -> Array:
+    """Tracked points (T, N, 3) [m] over the whole recording, open loop from its first frame."""
     return twin.observe(twin.simulate_nodes(*scene.control_track(), scene.times), scene.times)
 
 
