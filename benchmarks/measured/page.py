@@ -99,7 +99,7 @@ def _transfers(transfers: dict[str, Any]) -> list[str]:
             f"{mm(here['twin_fitted_here'])}), {hertz[0]} Hz of {hertz[1]} measured"
         )
     return [
-        "Material of one recording in another, over all its frames, twin / best of the others [mm] (of a rod its roll is "
+        "Material of one recording in another, over all its frames, twin / best of the others [mm] (a rod's roll is "
         "found on the training frames): " + "; ".join(parts) + "."
     ]
 
