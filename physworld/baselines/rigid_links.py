@@ -12,6 +12,7 @@ link that it holds; where along the chain the tracked points between its ends si
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -25,6 +26,7 @@ from physworld.scene import Scene
 
 KINDS = ("rod", "foam_rod")
 LINKS = 8
+EARLY = 0.25  # of the training frames
 SETTLE_DRAG, SETTLE_TIME = 4.0, 8.0
 """Drag and time of the settling to rest, in units of the rate √(g/L) of a hanging rod of that length."""
 _SHIFT = 0.1  # most share of the length by which a tracked point may sit elsewhere than its chord says
@@ -55,12 +57,15 @@ def fit_rigid_links(scene: Scene) -> Callable[[Scene], Array]:
         ]
     )
 
-    def residuals(theta: Array) -> Array:
-        tracks = simulate(scene, theta, last)[:, 1:]
-        error = np.where(seen[None, ..., None], tracks - scene.points[None, 1:last], 0.0)
+    def residuals(end: int, theta: Array) -> Array:
+        tracks = simulate(scene, theta, end)[:, 1:]
+        error = np.where(seen[None, : end - 1, :, None], tracks - scene.points[None, 1:end], 0.0)
         return error.reshape(len(theta), -1)
 
-    theta = least_squares(residuals, starts, lower, upper)
+    # over all frames at once a descent ends in the nearest of many minima: first an early window, from every start
+    early = partial(residuals, max(4, round(EARLY * last)))
+    found = [least_squares(early, start[None], lower, upper) for start in starts]
+    theta = least_squares(partial(residuals, last), np.stack(found), lower, upper)
     return lambda other: simulate(other, theta[None], other.frame_count)[0]
 
 
