@@ -34,11 +34,9 @@ PARTS: dict[str, Callable[..., Report]] = {
     "identifiability": calibration_known.identifiability,
     "sheets": calibration_sheets.sheets,
     "undeclared": calibration_measured.undeclared,
-    "beam": calibration_measured.beam,
-    "ropes_and_cloths": calibration_measured.ropes_and_cloths,
     "shared": calibration_shared.shared,
 }
-NEEDS_RECORDINGS = ("undeclared", "beam", "ropes_and_cloths", "shared")
+NEEDS_RECORDINGS = ("undeclared", "shared")
 BEGIN, END = "<!-- calibration {}: begin -->", "<!-- calibration {}: end -->"
 
 
