@@ -476,7 +476,9 @@ def steps_seen(scene: Scene) -> Array | None:
         after = min(after, len(times) - 1)
         quiet = np.linalg.norm(path[before : k + 1] - path[k], axis=1).max() < _QUIET * spread
         goes = np.linalg.norm(path[after] - path[k]) > _GOES * spread
-        if quiet and goes and (not found or times[k] - found[-1] > 2.0 * _STEP_S):
+        if quiet and goes:
+            if found and times[k] - found[-1] <= 2.0 * _STEP_S:
+                found.pop()  # the last quiet moment is the one
             found.append(float(times[k]))
     if not found:
         return None

@@ -18,7 +18,7 @@ from physworld.geometry.declared import grips_of
 from physworld.geometry.reference import reference_body
 from physworld.geometry.rigid import rigid_groups
 from physworld.geometry.rod_body import KINDS as ROD_KINDS
-from physworld.geometry.rod_body import is_discrete
+from physworld.geometry.rod_body import SLENDER, is_discrete
 from physworld.materials.cable import CableLaw
 from physworld.materials.laws import Law
 from physworld.materials.neo_hookean import NeoHookean
@@ -78,6 +78,8 @@ def build_twin(
     body = replace(body, notes=(*body.notes, taken_form))
     _, controls = scene.control_track()
     reach = 0.6 * float(np.ptp(body.start, axis=0).max())
+    if discrete and scene.kind in SLENDER:  # all markers that keep their distances are on its base
+        reach = np.inf
     grips = grips_of(scene)
     if grips:
         groups = tuple(np.array(g.controllers, dtype=int) for g in grips)

@@ -155,7 +155,7 @@ def driven_at(drive: Array | None, times: Array) -> Array:
     """Curvatures [1/m] and stretch that steps drive at ``times`` (T,) [s], (T, 3).
 
     Args:
-        drive: a step a row: when it begins [s], how long it rises [s], what it adds in the end (3), (J, 5); None for none.
+        drive: a step a row: when it begins [s], how long it rises [s], what it adds in the end (3), (J, 5); or None.
         times: [s].
     """
     found = np.zeros((len(times), 3))
