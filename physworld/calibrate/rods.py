@@ -6,9 +6,9 @@ r are the residuals of the tracked points on the training frames. sigma is what 
 goes on (the tracking noise at least); neighbouring frames err alike, so that n_c of them, those within 2 sqrt(L / g),
 count as one. Nothing is selected: a number that the data do not ask for stays near its prior, and the report says so.
 
-1. Stiffness, internal friction and drag from starts two octaves apart, over the first frames.
-2. All unknowns, Gauss-Newton, over 17, 43, 71 and 100 % of the training frames: a window that grows finds the basin
-   that all frames at once miss.
+1. Stiffness, internal friction and drag from several starts, over the first frames.
+2. All unknowns, Gauss-Newton, over 17, 43, 71 and 100 % of the training frames (of a body that is driven from inside,
+   since the first step): a window that grows finds the basin that all frames at once miss.
 
 A launch integrates a twin and what differs from it by one step in each number, side by side; it is counted as one
 simulation. Priors: curvature of its own as of a coil of some windings, torsion of a round section, air drag of ropes
@@ -20,6 +20,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -51,6 +52,7 @@ Progress = Callable[[int, int, str], None]
 
 _WINDOWS = (0.17, 0.43, 0.71, 1.0)
 _STARTS = (5e-4, 2e-3, 8e-3, 3e-2, 0.2, 1.5)  # of rho A g L^3: bending stiffnesses that hang visibly
+_STIFF_STARTS = (0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2)  # of what rings by itself: denser, for its phase
 _FIRST = ("bending_n_m2", "relaxation_s", "air_drag_per_s")
 _FIRST_STEPS, _STEPS = 5, 8
 _DAMPINGS = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
@@ -312,7 +314,8 @@ def calibrate_rod(
     unknowns = rod_parameters(scene, twin)
     held = (*config.held, *(_LOSSES if config.damping == "none" else ()))
     unknowns = [u for u in unknowns if not u.name.startswith(held)]
-    ends = [max(4, round(share * search.end)) for share in _WINDOWS]
+    still = 0 if twin.drive is None else int(np.searchsorted(scene.times, twin.drive[0, 0]))
+    ends = [max(4, still + round(share * (search.end - still))) for share in _WINDOWS]
 
     def step(name: str, compute: Callable[[], tuple[Array, float]]) -> tuple[Array, float]:
         def counted() -> dict[str, Any]:
@@ -371,7 +374,7 @@ def _scan(search: RodSearch, first: list[Parameter], ends: list[int]) -> tuple[A
     twin = search.twin
     weight = twin.density * _GRAVITY * float(twin.lattice.distances.max()) ** 3  # type: ignore[attr-defined]
     found = []
-    for share in _STARTS:
+    for share in _STARTS if twin.drive is None else _STIFF_STARTS:
         theta = np.array([np.log(share * weight) if u.name == _FIRST[0] else u.start for u in first])
         cost = np.inf
         for end in ends:
@@ -425,8 +428,8 @@ def _number(name: str, unit: str, mean: float, spread: float, step: float = 0.02
 
 
 def _driven(twin: Twin, step: int, length: float) -> list[Parameter]:
-    """A step of what drives a rod from inside: when, how fast, and how far."""
-    begin = float(_steps(twin)[step, 0])
+    """A step of what drives a rod from inside: when, how fast, and how far; one that vents goes back to nothing."""
+    begin, vents = float(_steps(twin)[step, 0]), bool(_vents(_steps(twin))[step])
     numbers = [
         (0, f"drive_{step}_s", "s", begin, _ONSET_S, LINEAR, 0.002),
         (1, f"drive_{step}_rise_s", "s", _RISE_S, 1.0, LOG, 0.05),
@@ -435,11 +438,13 @@ def _driven(twin: Twin, step: int, length: float) -> list[Parameter]:
         (4, f"drive_{step}_stretch", "1", 0.0, 0.05, LINEAR, 1e-3),
     ]  # fmt: skip
     found = []
-    for column, name, unit, mean, spread, transform, difference in numbers:
+    for column, name, unit, mean, spread, transform, difference in numbers[: 2 if vents else None]:
 
         def apply(changed: Twin, value: float, column: int = column) -> Twin:
             drive = _steps(changed).copy()
             drive[step, column] = value
+            for row in np.flatnonzero(_vents(drive)):
+                drive[row, 2:5] = -drive[:row, 2:5].sum(axis=0)
             return replace(changed, drive=drive)
 
         start = transform.searched(mean)
@@ -454,13 +459,20 @@ def _driven(twin: Twin, step: int, length: float) -> list[Parameter]:
 
 
 def _steps(twin: Twin) -> Array:
-    return np.zeros((0, 5)) if twin.drive is None else twin.drive
+    return np.zeros((0, 6)) if twin.drive is None else twin.drive
+
+
+def _vents(drive: Array) -> Array:
+    """Which steps (J, 6) go back to nothing."""
+    vents: Array = drive[:, 5] > 0.0
+    return vents
 
 
 def steps_seen(scene: Scene) -> Array | None:
-    """Steps of a body that moves by itself, (J, 5), when they begin and otherwise nothing; None where there are none.
+    """Steps of a body that moves by itself, (J, 6), when they begin and which of them vent; None where there are none.
 
-    Its base stands still, it starts at rest, and then, out of rest, its points go far within a tenth of a second.
+    """Steps of a body that moves by itself, (J, 6), when they begin and which vent; None where there are none.
+    after which they are about where they began vents: what drove them is gone.
     """
     end = scene.train[1]
     times, moved = scene.times[:end], scene.controllers[:end] - scene.controllers[0]
@@ -482,8 +494,11 @@ def steps_seen(scene: Scene) -> Array | None:
             found.append(float(times[k]))
     if not found:
         return None
-    drive = np.zeros((len(found), 5))
+    drive = np.zeros((len(found), 6))
     drive[:, 0], drive[:, 1] = found, _RISE_S
+    for row, (begin, until) in enumerate(pairwise([*found, float(times[-1]) + 2.0 * _STEP_S])):
+        after = path[(times > begin + _STEP_S) & (times < until - _STEP_S)]
+        drive[row, 5] = len(after) > 0 and np.linalg.norm(after.mean(axis=0) - path[0]) < _GOES * spread
     return drive
 
 

@@ -155,12 +155,13 @@ def driven_at(drive: Array | None, times: Array) -> Array:
     """Curvatures [1/m] and stretch that steps drive at ``times`` (T,) [s], (T, 3).
 
     Args:
-        drive: a step a row: when it begins [s], how long it rises [s], what it adds in the end (3), (J, 5); or None.
+        drive: a step a row: when it begins [s], how long it rises [s], what it adds in the end (3), and whether a
+            calibration takes it for one back to nothing, (J, 6); or None.
         times: [s].
     """
     found = np.zeros((len(times), 3))
     if drive is not None:
-        for begin, rise, *added in drive:
+        for begin, rise, *added in drive[:, :5]:
             found += np.clip((times - begin) / max(rise, 1e-9), 0.0, 1.0)[:, None] * np.array(added)
     return found
 

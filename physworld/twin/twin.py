@@ -75,7 +75,7 @@ class Twin:
         properties: the fields of the local stage, or None: log factors of stiffness and density, (P, 2), or with the
             ground's friction (P, 3), under everything that a run is given.
         natural: of a discrete rod, what its curvature and twist are made of (:mod:`physworld.twin.rods`), (R, 3).
-        drive: of a discrete rod, steps of its rest shape that are driven from inside, (J, 5); None of others.
+        drive: of a discrete rod, steps of its rest shape that are driven from inside, (J, 6); None of others.
         device: Warp device of the simulations; not part of the twin's identity.
     """
 
