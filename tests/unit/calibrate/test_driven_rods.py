@@ -10,7 +10,7 @@ import pytest
 from made_scene import made_scene, recorded_by
 
 from physworld.calibrate import CalibrationConfig, calibrate
-from physworld.calibrate.rods import steps_seen
+from physworld.calibrate.rod_parameters import steps_seen
 from physworld.evaluate.table import held_out_table
 from physworld.scene import Body, Scene
 from physworld.twin.build import build_twin
