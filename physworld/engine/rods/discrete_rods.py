@@ -26,6 +26,7 @@ _GRAVITY = 9.81
 _MODE_SHARE = 0.3  # of the second mode's period over 2 pi
 _SECOND_MODE = 22.03  # (beta_2 L)^2 of a clamped rod
 _STRETCH_RELAXATION_S = 1e-3
+_LEAST_TORSION = 0.02  # GJ / EI; a curved rod without torsion has no directors
 _TERM_SHARE = 0.5  # of a term's own limit of the time step
 _SETTLE_TIME, _SETTLE_KNOTS, _SETTLE_DRAG, _SETTLE_RELAXATION = 19.0, 13, 1.9, 0.16  # in units of sqrt(L / g)
 _GYRATION = 1.0 / np.sqrt(2.0)  # radius of gyration of a round section about its axis, over its radius
@@ -275,7 +276,12 @@ class Launch:
         factors = [_edge_factors(chain, p.stiffness_factor) for p in problems]
         stretching = np.stack([c["stretching"] * f for c, f in zip(columns, factors, strict=True)])
         bending = np.stack([c["bending"] * f for c, f in zip(columns, factors, strict=True)])
-        torsion = np.stack([law.torsion_ratio * b for law, b in zip(self.rods.laws, bending, strict=True)])
+        torsion = np.stack(
+            [
+                max(law.torsion_ratio, _LEAST_TORSION) * b
+                for law, b in zip(self.rods.laws, bending, strict=True)
+            ]
+        )
         return [
             self._array(np.stack([p.nodal_mass() for p in problems])),
             self._array(stretching),

@@ -40,6 +40,7 @@ SHRUNK = 1e-3
 """Length of an edge over its rest length below which it has no direction."""
 _OPENING = wp.constant(wp.float64(OPENING))
 _SHRUNK = wp.constant(wp.float64(SHRUNK))
+_STIFF = wp.constant(wp.float64(0.05))  # of a step: least relaxation of joints far too stiff for it
 _TINY = wp.constant(wp.float64(1e-12))
 
 
@@ -56,6 +57,22 @@ def projected(t: wp.vec3d, along: wp.float64, across: wp.float64) -> wp.mat33d:
     """along t t' + across (1 - t t')."""
     one = wp.identity(n=3, dtype=wp.float64)
     return across * one + (along - across) * wp.outer(t, t)
+
+
+@wp.func
+def inverse_of(m: wp.mat33d) -> wp.mat33d:
+    """Inverse of a symmetric matrix, of which the upper triangle is read: symmetric to the bit.
+
+    What rounding makes of the lower one would grow from edge to edge of an elimination.
+    """
+    a = m[1, 1] * m[2, 2] - m[1, 2] * m[1, 2]
+    b = m[0, 2] * m[1, 2] - m[0, 1] * m[2, 2]
+    c = m[0, 1] * m[1, 2] - m[0, 2] * m[1, 1]
+    d = m[0, 0] * m[2, 2] - m[0, 2] * m[0, 2]
+    e = m[0, 1] * m[0, 2] - m[0, 0] * m[1, 2]
+    f = m[0, 0] * m[1, 1] - m[0, 1] * m[0, 1]
+    over = wp.float64(1.0) / (m[0, 0] * a + m[0, 1] * b + m[0, 2] * c)
+    return wp.matrix_from_rows(wp.vec3d(a, b, c), wp.vec3d(b, d, e), wp.vec3d(c, e, f)) * over
 
 
 @wp.kernel(enable_backward=False)
@@ -235,10 +252,13 @@ def run_rods(
                     s1 = bending[c, i, 0] / l
                     s2 = bending[c, i, 1] / l
                     s3 = torsion[c, i] / l
+                    stiff = wp.float64(4.0) * dt * dt * s1 / (l * l * mass[c, p])
+                    stiff = stiff * stiff
+                    relax = tau + _STIFF * dt * stiff / (one + stiff)
                     # rate-independent friction (Dahl) and one Maxwell branch, as angles of the joint
                     extra = zero
-                    m1 = s1 * (k1 - (natural[c, i, 0] + drive[0]) * l + (tau + ahead) * rate1)
-                    m2 = s2 * (k2 - (natural[c, i, 1] + drive[1]) * l + (tau + ahead) * rate2)
+                    m1 = s1 * (k1 - (natural[c, i, 0] + drive[0]) * l + (relax + ahead) * rate1)
+                    m2 = s2 * (k2 - (natural[c, i, 1] + drive[1]) * l + (relax + ahead) * rate2)
                     m3 = s3 * (twist - natural[c, i, 2] * l + (tau_twist + dt) * rate3)
                     friction = scalars[c, FRICTION_PER_M]
                     if friction > zero:
@@ -266,8 +286,8 @@ def run_rods(
                     right[c, g] = right[c, g] + dt * fa
                     right[c, p] = right[c, p] - dt * (fa - fb)
                     right[c, i] = right[c, i] - dt * fb
-                    w1 = s1 * (dt * tau + quarter * dt * dt * (one + extra))
-                    w2 = s2 * (dt * tau + quarter * dt * dt * (one + extra))
+                    w1 = s1 * (dt * relax + quarter * dt * dt * (one + extra))
+                    w2 = s2 * (dt * relax + quarter * dt * dt * (one + extra))
                     w3 = s3 * dt * (tau_twist + dt)
                     aa = w1 * wp.outer(ga1, ga1) + w2 * wp.outer(ga2, ga2) + w3 * wp.outer(gat, gat)
                     bb = w1 * wp.outer(gb1, gb1) + w2 * wp.outer(gb2, gb2) + w3 * wp.outer(gbt, gbt)
@@ -281,8 +301,8 @@ def run_rods(
                     upup[c, i] = upup[c, i] - ba
                     torque[c, p] = torque[c, p] - m1 * ha1 - m2 * ha2 + m3
                     torque[c, i] = torque[c, i] - m1 * hb1 - m2 * hb2 - m3
-                    y1 = s1 * (dt * tau + dt * dt * (one + extra))
-                    y2 = s2 * (dt * tau + dt * dt * (one + extra))
+                    y1 = s1 * (dt * relax + dt * dt * (one + extra))
+                    y2 = s2 * (dt * relax + dt * dt * (one + extra))
                     y3 = s3 * dt * (tau_twist + dt)
                     twist_own[c, p] = twist_own[c, p] + y1 * ha1 * ha1 + y2 * ha2 * ha2 + y3
                     twist_own[c, i] = twist_own[c, i] + y1 * hb1 * hb1 + y2 * hb2 * hb2 + y3
@@ -317,7 +337,7 @@ def run_rods(
                             right[c, g] = right[c, g] - wp.transpose(upup[c, i]) * dv
                     right[c, i] = dv
                 else:
-                    inverse = wp.inverse(own[c, i])
+                    inverse = inverse_of(own[c, i])
                     own[c, i] = inverse
                     if i > 0:
                         yp = inverse * up[c, i]

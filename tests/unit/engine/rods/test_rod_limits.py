@@ -94,6 +94,25 @@ def test_very_stiff_and_very_soft_ropes_swing_without_gaining_energy(
         assert total < 0.05 * weight  # of a metre: it starts with none
 
 
+@pytest.mark.parametrize("edges", [60, 240])
+@pytest.mark.parametrize("changes", [{}, {"relaxation_s": 0.02}, {"torsion_ratio": 0.0}], ids=str)
+def test_a_fine_rope_swings_as_a_coarse_one(edges: int, changes: dict[str, float]) -> None:
+    tips = []
+    for count in (30, edges):
+        lattice = line(count)
+        start = along(lattice)
+        one = problem(
+            lattice,
+            replace(LAW, **changes),
+            gravity=FALL,
+            drag_per_s=0.3,
+            natural=uniform(lattice, 2.0, 1.0, 0.5),
+        )
+        path, _ = run(one, start, np.array([0.0, 0.6]), held=still([0], start, 2))
+        tips.append(path[-1, -1])
+    assert tips[1] == pytest.approx(tips[0], abs=0.03)
+
+
 def test_a_node_far_away_is_named() -> None:
     lattice = line(10)
     start = along(lattice)
