@@ -34,7 +34,13 @@ def recorded() -> Scene:
     swing[:, 0, 1] = 0.1 * (1.0 - np.cos(5.0 * times)) * (times < 2.5)
     controllers = grips + swing
     scene = replace(
-        scene, times=times, fps=RATE_HZ, controllers=controllers, noise_sigma_m=2e-3, train=(0, 22), test=(22, FRAMES)
+        scene,
+        times=times,
+        fps=RATE_HZ,
+        controllers=controllers,
+        noise_sigma_m=2e-3,
+        train=(0, 22),
+        test=(22, FRAMES),
     )
     twin = build_twin(scene, 500).with_parameters(density_kg_m2=0.3, bending_n_m=5e-5, membrane_n_m=50.0)
     for effect in (AirOnSheet(0.1, DRAG, 0.1), ActuationLag(LATE_S), MeasurementTurn(z_rad=TURN_RAD)):

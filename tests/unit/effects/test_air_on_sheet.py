@@ -51,7 +51,7 @@ def test_linear_drag_slows_as_an_exponential() -> None:
 def test_a_turned_camera_turns_displacements() -> None:
     twin = loose("sheet")
     begin = twin.track_nodes(twin.carriers_start[None])
-    tracks = np.concatenate([begin, begin + [1.0, 0.0, 0.0]])
+    tracks = np.concatenate([begin, begin + np.array([1.0, 0.0, 0.0])])
     seen = MeasurementTurn(z_rad=0.1).measured(TIMES[:2], tracks, twin)
     np.testing.assert_allclose(seen[0], begin[0])
     np.testing.assert_allclose(seen[1] - tracks[1], np.tile([0.0, 0.1, 0.0], (len(begin[0]), 1)), atol=1e-12)

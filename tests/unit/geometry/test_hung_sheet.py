@@ -42,9 +42,7 @@ def test_points_keep_their_places_within_the_edges() -> None:
 def test_noise_of_the_first_frame_neither_stretches_nor_bends_the_sheet() -> None:
     body = hung_sheet(hung(NOISE_M), 2000, 1.0)
     gaps = np.linalg.norm(body.start[:, None] - body.start[None], axis=2)
-    np.testing.assert_allclose(
-        gaps, np.linalg.norm(body.rest[:, None] - body.rest[None], axis=2), atol=1e-12
-    )
+    np.testing.assert_allclose(gaps, np.linalg.norm(body.rest[:, None] - body.rest[None], axis=2), atol=1e-12)
     assert not body.start_velocity.any()
 
 
