@@ -29,6 +29,7 @@ from typing import Any, Literal
 import numpy as np
 
 from physworld.arrays import Array
+from physworld.calibrate.cloths import calibrate_cloth
 from physworld.calibrate.descents import Descent, Optimum
 from physworld.calibrate.estimates import (
     NOT_CONVERGED,
@@ -50,6 +51,7 @@ from physworld.estimation.journal import Journal
 from physworld.estimation.least_squares import Solution
 from physworld.estimation.simulations import Runner, in_turn
 from physworld.estimation.unknowns import LINEAR, at
+from physworld.geometry.sheet_body import is_hung_sheet
 from physworld.materials.cable import CableLaw
 from physworld.materials.library import with_law
 from physworld.scene import Scene
@@ -168,6 +170,8 @@ def calibrate(
     prior = prior_twin(scene, config)
     if prior.natural is not None:
         return calibrate_rod(scene, prior, config, progress, cancelled, journal)
+    if is_hung_sheet(scene, config.mesh):
+        return calibrate_cloth(scene, prior, config, progress, cancelled, journal)
     search = Search(scene, prior, config.max_simulations, progress, cancelled, journal, runner)
     parameters = searched_parameters(scene, search.twin, config)
     search.limit = config.max_simulations - min(_KEPT_BACK, config.max_simulations // 4)

@@ -14,6 +14,7 @@ from physworld.effects.actuation_lag import ActuationLag
 from physworld.effects.adhesion import Adhesion
 from physworld.effects.air_drag_linear import AirDragLinear
 from physworld.effects.air_drag_quadratic import AirDragQuadratic
+from physworld.effects.air_on_sheet import AirOnSheet
 from physworld.effects.anisotropy import Anisotropy
 from physworld.effects.base import Effect
 from physworld.effects.buoyancy import Buoyancy
@@ -26,6 +27,7 @@ from physworld.effects.measurement_clock import MeasurementClock
 from physworld.effects.measurement_drift import MeasurementDrift
 from physworld.effects.measurement_scale import MeasurementScale
 from physworld.effects.measurement_smoothing import MeasurementSmoothing
+from physworld.effects.measurement_turn import MeasurementTurn
 from physworld.effects.plasticity import Plasticity
 from physworld.effects.region_force import RegionForce
 from physworld.effects.rest_shape import RestShape
@@ -59,7 +61,9 @@ _BUILT_IN: tuple[type[Effect], ...] = (
     ActuationLag,
     ClampOffset,
     GripSlip,
+    AirOnSheet,
     TimeVaryingStiffness,
+    MeasurementTurn,
     MeasurementScale,
     MeasurementClock,
     MeasurementSmoothing,

@@ -13,6 +13,7 @@ from physworld.geometry.alignment import cells_along, faces_along
 from physworld.geometry.body import ReferenceBody, first_points
 from physworld.geometry.curves import fit_nodes
 from physworld.geometry.declared import grips_of
+from physworld.geometry.hung_sheet import hangs_from_a_bar, hung_sheet
 from physworld.scene import Grip, Scene
 
 SHEET_KINDS = ("sheet", "cloth")
@@ -42,6 +43,8 @@ def sheet_body(
     Raises:
         SceneUnsupported: its points span no area; or a mesh is given of a sheet that is declared as a grid.
     """
+    if is_hung_sheet(scene, mesh):
+        return hung_sheet(scene, particle_budget, refinement)
     points = first_points(scene)
     notes: list[str] = []
     thickness = scene.body.thickness_m
@@ -92,6 +95,11 @@ def sheet_body(
         start, velocity = fit_nodes(scene, lattice, material)
         offsets = np.zeros((len(points), 1))
     return ReferenceBody(lattice, rest, start, velocity, material, offsets, thickness, tuple(notes))
+
+
+def is_hung_sheet(scene: Scene, mesh: Mesh | None = None) -> bool:
+    """Whether the body of a scene is a sheet that hangs from a bar (:mod:`physworld.geometry.hung_sheet`)."""
+    return mesh is None and scene.kind in SHEET_KINDS and hangs_from_a_bar(scene)
 
 
 def _grip_faces(scene: Scene, flat_map: tuple[Array, Array] | None) -> Array:

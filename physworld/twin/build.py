@@ -15,10 +15,12 @@ from physworld.engine.updated.transfer import TRANSFERS, Apic
 from physworld.errors import SceneUnsupported
 from physworld.geometry.body import ReferenceBody
 from physworld.geometry.declared import grips_of
+from physworld.geometry.hung_sheet import upper_edge
 from physworld.geometry.reference import reference_body
 from physworld.geometry.rigid import rigid_groups
 from physworld.geometry.rod_body import KINDS as ROD_KINDS
 from physworld.geometry.rod_body import SLENDER, is_discrete
+from physworld.geometry.sheet_body import is_hung_sheet
 from physworld.materials.cable import CableLaw
 from physworld.materials.laws import Law
 from physworld.materials.neo_hookean import NeoHookean
@@ -92,6 +94,8 @@ def build_twin(
         nodes = np.setdiff1d(gripped_nodes(body, controls[0, group], region), taken)
         held.append(nodes)
         taken = np.concatenate([taken, nodes])
+    if is_hung_sheet(scene, mesh):
+        groups, held = (np.arange(2),), [upper_edge(body.lattice)]
     turning, notes = _turning(scene, body, controls[0], groups, held)
     self_friction, touching = _touching_itself(scene, body, choice.formulation)
     body = replace(body, notes=(*body.notes, *notes, *touching))
