@@ -43,7 +43,7 @@ from physworld.calibrate.estimates import (
 )
 from physworld.calibrate.fibres import free_fibres
 from physworld.calibrate.local_stage import LocalResult
-from physworld.calibrate.parameters import Parameter, affordable, flow_law, parameters_of
+from physworld.calibrate.parameters import Parameter, affordable, flow_law, parameters_of, relaxing
 from physworld.calibrate.rods import calibrate_rod
 from physworld.calibrate.search import Progress, Search
 from physworld.engine.thin.triangles import Mesh
@@ -234,6 +234,8 @@ def searched_parameters(scene: Scene, twin: Twin, config: CalibrationConfig) -> 
         damping=config.damping == "auto",
         ground_friction=scene.ground is not None and scene.ground.friction is None,
     )
+    if config.damping == "auto":
+        found += relaxing(twin, scene.times[: scene.train[1]])
     return found if config.bending == "auto" else [p for p in found if p.stage != "shape"]
 
 

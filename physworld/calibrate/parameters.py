@@ -9,8 +9,9 @@ stiff a sheet is in twist beside bending, if the body has them and the data show
 value that nothing reaches. A *shape* of the bending energy is freed next, as a whole: how stiff a sheet bends beside
 what its declared thickness says, and how its two curvatures are coupled. The *fibres* of a transversely isotropic
 solid are freed together too, modulus and direction (:mod:`physworld.calibrate.fibres`); their prior is none. The others
-are *optional*: air drag, internal friction, Poisson's ratio, the friction of a ground that declares none, and what weft
-and shear of a woven sheet have over its warp; each is freed only if the data ask for it, and else stays at its prior.
+are *optional*: air drag, internal friction, Poisson's ratio, the friction of a ground that declares none, the
+share of a solid's stiffness that fades (:func:`relaxing`), and what weft and shear of a woven sheet have over its warp;
+each is freed only if the data ask for it, and else stays at its prior.
 
 Internal friction that is proportional to stiffness damps the lattice's fastest motions most, and an explicit step has
 to resolve that: beyond a point the stable time step is inversely proportional to it. A recording shows nothing of these
@@ -28,6 +29,8 @@ from typing import Literal
 import numpy as np
 from scipy.optimize import brentq
 
+from physworld.arrays import Array
+from physworld.effects.viscoelastic_maxwell import ViscoelasticMaxwell
 from physworld.engine.total.formulation import TotalLagrangian
 from physworld.estimation.unknowns import LINEAR, LOG, Transform, Unknown
 from physworld.materials.plastic import (
@@ -62,6 +65,9 @@ WEAVE = ("weft_ratio", "shear_ratio", "bending_weft_ratio")
 _WEAVE_BOUNDS = {"weft_ratio": (0.05, 20.0), "shear_ratio": (0.003, 5.0), "bending_weft_ratio": (0.02, 50.0)}
 _FIBRES_GAIN = 0.1  # share of the training cost, of fibres
 _FRICTION_BOUNDS = (0.02, 3.0)
+RELAXING_SHARE = "relaxing_share"
+_RELAXING_GAIN = 0.1  # share of the training cost, of stiffness that fades
+_MOST_BRANCHES = 5  # of one decade each
 _NEVER_PA = 1e12  # a yield stress that nothing reaches
 _SAND_RAD = 0.6  # friction angle of loose dry sand
 _FLOW_PRIORS: dict[type[Plasticity], dict[str, float]] = {
@@ -129,6 +135,31 @@ def parameters_of(
         *_weave(twin),
         *optional,
     ]
+
+
+def relaxing(twin: Twin, times: Array) -> list[Parameter]:
+    """How much of an elastic solid's stiffness fades, the same share in every decade from a frame to the recording.
+
+    Elastomers lose about the same share of their energy in slow and in fast swings, and creep with it; internal
+    friction alone damps slow swings too little, and makes what hangs at rest as stiff as what rings.
+
+    Args:
+        twin: the twin to calibrate.
+        times: of the frames [s], (T,).
+    """
+    if not isinstance(twin.law, SolidLaw) or twin.plasticity is not None or twin.form.on_particles:
+        return []
+    first = 0.5 * float(np.median(np.diff(times)))
+    decades = 1 + int(np.ceil(np.log10(float(times[-1] - times[0]) / first)))
+
+    def apply(changed: Twin, share: float) -> Twin:
+        branches = min(decades, _MOST_BRANCHES)
+        return changed.with_effect(ViscoelasticMaxwell(share=share, relaxation_s=first, branches=branches))
+
+    return [
+        Parameter(RELAXING_SHARE, "1", 1e-3, 1.0, apply, step=0.1, starts=(0.04,), stage="optional",
+                  least_gain=_RELAXING_GAIN)
+    ]  # fmt: skip
 
 
 def flow_law(name: str) -> Plasticity:

@@ -68,7 +68,7 @@ def test_planted_stiffness_is_found_within_a_percent_and_its_interval(undamped: 
     low, high = estimate.ci95
     assert low < YOUNGS_MODULUS_PA < high < 1.05 * low
     # damping that the bar does not have is told apart from damping that it has
-    assert {"air_drag_per_s", "viscosity_pa_s", "poissons_ratio"} == set(found.rejected)
+    assert {"air_drag_per_s", "viscosity_pa_s", "poissons_ratio", "relaxing_share"} == set(found.rejected)
     assert found.twin.air_drag_per_s == 0.0 and found.parameters["air_drag_per_s"].value == 0.0
     assert "not needed" in found.parameters["air_drag_per_s"].note
     # held-out frames, open loop

@@ -27,12 +27,12 @@ WEIGHT = {3: np.array([1, 1, 1, 2, 2, 2.0]), 2: np.array([1, 1, 2.0])}
 
 
 class Applied:
-    """The last term of an effect on a twin, driven by hand from the undeformed body."""
+    """A term of an effect on a twin, its last by default, driven by hand from the undeformed body."""
 
-    def __init__(self, twin: Twin, added: Effect) -> None:
+    def __init__(self, twin: Twin, added: Effect, number: int = -1) -> None:
         self.twin = twin
         problem = Problem(twin.lattice, twin.law, twin.body.rest, np.zeros(3))
-        self.bound: BoundTerm = added.problem(problem, twin).terms[-1].bind(problem)
+        self.bound: BoundTerm = added.problem(problem, twin).terms[number].bind(problem)
         self.substep = 0
 
     def __call__(self, x: np.ndarray, dt: float = 0.0) -> np.ndarray:
@@ -167,6 +167,33 @@ def test_the_stress_of_a_held_stretched_body_relaxes_exponentially(body: str) ->
     left = [np.linalg.norm(applied(x, dt)) / first for _ in range(2000)]
     expected = np.exp(-np.arange(1, 2001) * dt / tau)
     np.testing.assert_allclose(left, expected, rtol=2e-3)
+
+
+@pytest.mark.parametrize("body", ["solid", "rope"])
+def test_a_ladder_of_branches_relaxes_as_its_prony_series(body: str) -> None:
+    twin, tau, dt = TWINS[body], 0.01, 1e-4
+    ladder = effect("viscoelastic_maxwell", share=0.3, relaxation_s=tau, branches=3)
+    applied = [Applied(twin, ladder, number) for number in range(-3, 0)]
+    x = deformed(twin)
+    for branch in applied:
+        branch(twin.body.rest)
+    first = np.linalg.norm(sum(branch(x, 1e-9) for branch in applied))
+    left = [np.linalg.norm(sum(branch(x, dt) for branch in applied)) / first for _ in range(1000)]
+    times = np.arange(1, 1001)[:, None] * dt
+    series = np.exp(-times / (tau * 10.0 ** np.arange(3))).mean(axis=1)
+    np.testing.assert_allclose(left, series, rtol=4e-3)  # the first branch decays in 100 implicit steps
+
+
+def test_a_share_of_a_solid_is_that_of_its_shear_modulus() -> None:
+    twin = TWINS["solid"]
+    x = deformed(twin)
+    shear = twin.law.youngs_modulus_pa / (2.0 * (1.0 + twin.law.poissons_ratio))
+    forces = []
+    for strengths in ({"share": 0.25}, {"shear_modulus_pa": 0.25 * shear}):
+        applied = Applied(twin, effect("viscoelastic_maxwell", **strengths))
+        applied(twin.body.rest)
+        forces.append(applied(x, 1e-9))
+    np.testing.assert_allclose(*forces, rtol=0, atol=1e-6 * np.abs(forces[0]).max())
 
 
 def test_a_relaxed_branch_lets_slow_motion_pass() -> None:
