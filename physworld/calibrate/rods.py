@@ -56,7 +56,10 @@ _FIRST = ("bending_n_m2", "relaxation_s", "air_drag_per_s")
 _FIRST_STEPS, _STEPS = 5, 8
 _DAMPINGS = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
 _LONGEST_STEP = 1.0
-_AGAIN, _STEADY = 6, 0.95  # descents on all frames while what is left of them still falls to less than this share
+_AGAIN, _STEADY = (
+    6,
+    0.95,
+)  # descents on all frames while what is left of them still falls to less than this share
 _ENOUGH, _SETTLED = 1e-4, 3e-3  # relative falls of the cost: what counts, and what is worth another Jacobian
 _CORRELATED = 2.0  # times sqrt(L / g)
 _SIGMA_SHARE = 0.005  # of the length: what a rod leaves before anything is known
