@@ -350,7 +350,7 @@ def _estimates(
     for k, unknown in enumerate(unknowns):
         half = _Z95 * float(np.sqrt(covariance[k, k]))
         known = half < 0.5 * _Z95 / prior[k]
-        sure = known and (unknown.transform is LINEAR or half < UNIDENTIFIED_HALF_WIDTH["log"])
+        sure = bool(known and (unknown.transform is LINEAR or half < UNIDENTIFIED_HALF_WIDTH["log"]))
         ends = (unknown.value(theta[k] - half), unknown.value(theta[k] + half))
         note = "" if sure else "the data say little beyond its prior"
         if search.cut_short or residual is None:
