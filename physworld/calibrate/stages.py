@@ -61,9 +61,7 @@ def calibrate_in_stages(
         prior = prior_twin(scene, config)
         form = prior.form
         if not prior.lattice.smooth:
-            raise SceneUnsupported(
-                f"the local stage needs gradients, which a mesh of {len(prior.lattice.cells)} cells of triangles lacks"
-            )
+            raise SceneUnsupported(f"the local stage needs gradients, which {prior.lattice.title} lacks")
         if not form.supports("gradients"):
             raise SceneUnsupported(
                 f"the local stage needs the total Lagrangian form, whose runs have a gradient; this body is of the "

@@ -159,7 +159,7 @@ class Effect:
     def why_not(cls, twin: Twin) -> str | None:
         """Why a twin cannot have the effect: it makes no sense there, or its engine cannot do it; None if it can."""
         if cls.strains and not twin.lattice.smooth:
-            return f"it acts on strains; a mesh of {len(twin.lattice.cells)} cells of triangles has none of splines"
+            return f"it acts on strains of splines; {twin.lattice.title} has none"
         return cls.refuses(twin)
 
     def placed(self, twin: Twin) -> Effect:

@@ -154,6 +154,13 @@ class TimeVaryingStiffness(Effect):
         """Up to a factor e in two seconds."""
         return (Strength("log_rate_per_s", "1/s", -0.5, 0.5, 0.02),)
 
+    @classmethod
+    def refuses(cls, twin: Twin) -> str | None:
+        """Discrete rods: their forces are no launch of their own that could be scaled."""
+        return (
+            None if twin.natural is None else f"the stiffness of {twin.lattice.title} does not change in time"
+        )
+
     def problem(self, problem: Problem, twin: Twin) -> Problem:
         """Puts the term before the others."""
         return replace(problem, terms=(GrowingStiffness(self.log_rate_per_s), *problem.terms))

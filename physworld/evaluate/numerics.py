@@ -201,9 +201,7 @@ def refined(scene: Scene, twin: Twin, particle_budget: int, refinement: float = 
         SceneUnsupported: the body is a mesh of triangles: its cells are what is supposed of the recording.
     """
     if not twin.lattice.smooth:
-        raise SceneUnsupported(
-            f"a mesh of {len(twin.lattice.cells)} cells of triangles has no finer ones: they are its recorder's"
-        )
+        raise SceneUnsupported(f"{twin.lattice.title} has no finer ones to be asked")
     finer = build_twin(
         scene, particle_budget, twin.device, refinement, twin.plasticity, twin.formulation, twin.transfer
     )

@@ -81,7 +81,7 @@ def simulate_batch(
             f"{len(episodes)} episodes of the updated Lagrangian form: its bodies would meet on one grid"
         )
     if not twin.lattice.smooth:
-        raise BatchRefused(f"{len(episodes)} episodes of a mesh of triangles: it is integrated alone")
+        raise BatchRefused(f"{len(episodes)} episodes of {twin.lattice.title}: it is integrated alone")
     changed = [twin.with_parameters(**episode.parameters) for episode in episodes]
     runs = [
         one.integration(

@@ -98,7 +98,7 @@ class TwinRun:
             )
         if not twin.lattice.smooth:
             raise NotDifferentiable(
-                f"a mesh of {len(twin.lattice.cells)} cells of triangles has no gradient: fit by simulations alone"
+                f"{twin.lattice.title} has no gradient: fit by simulations alone"
             )
         self._twin, self._times = twin, frame_times
         self._drive = control_times, control_points, frame_times, properties

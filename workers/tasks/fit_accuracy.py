@@ -64,7 +64,7 @@ def _measured(
     runner: Runner,
 ) -> dict[str, Any]:
     if not fitted.twin.lattice.smooth:
-        return not_measured("a mesh of triangles is the recorder's own: there are no finer cells to ask")
+        return not_measured(f"{fitted.twin.lattice.title} has no finer cells to be asked")
     none = _not_extrapolated(fitted)
     total = MEASURED_RUNS + (0 if none else len(fitted.searched))
 

@@ -46,6 +46,11 @@ class Lattice:
         return int(self.cells.shape[1])
 
     @property
+    def title(self) -> str:
+        """For people."""
+        return f"a body of {len(self.cells)} cells of splines"
+
+    @property
     def node_coordinates(self) -> Array:
         """Reference coordinates of the nodes [m], (n, d)."""
         coordinates: Array = self.origin + (self.nodes + 0.5) * self.spacing

@@ -47,6 +47,11 @@ class Chain(Lattice):
         return begins[1:]
 
     @property
+    def title(self) -> str:
+        """For people."""
+        return f"a discrete rod of {len(self.cells)} edges"
+
+    @property
     def node_coordinates(self) -> Array:
         """Material coordinates of the nodes [m], (n, 1)."""
         return np.concatenate([[0.0], self.begins + self.lengths[1:]])[:, None]

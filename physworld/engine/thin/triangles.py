@@ -65,6 +65,11 @@ class TriangleLattice(Lattice):
     smooth: ClassVar[bool] = False
 
     @property
+    def title(self) -> str:
+        """For people."""
+        return f"a mesh of {len(self.cells)} cells of triangles"
+
+    @property
     def node_coordinates(self) -> Array:
         """Reference coordinates of the nodes [m], (n, 2)."""
         coordinates: Array = self.origin + self.nodes * self.spacing

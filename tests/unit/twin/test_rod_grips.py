@@ -134,3 +134,12 @@ def test_an_effect_that_is_idle_runs_as_none() -> None:
     plain = twin.simulate_nodes(*track)
     breeze = twin.with_effect(effect("wind", rate_per_s=1e-12)).simulate_nodes(*track)
     assert breeze == pytest.approx(plain, abs=1e-9)
+
+
+def test_a_grip_that_gives_lets_go_of_its_nodes() -> None:
+    from physworld.effects.registry import effect
+
+    twin = build_twin(rope(POSE, Grip((0, 1, 2))))
+    track = rope_track(twin, np.repeat(POSE[None], 12, axis=0))
+    gives = twin.with_effect(effect("grip_slip", compliance_m_n=1e-4))
+    assert np.isfinite(gives.simulate_nodes(*track)).all()
