@@ -76,12 +76,12 @@ def simulate_batch(
             their clock or what a law must share (:class:`physworld.engine.total.forces.ForcesSideBySide`).
         CFLViolation: the forced time step exceeds the stable limit of one of them.
     """
+    if not twin.lattice.smooth:
+        raise BatchRefused(f"{len(episodes)} episodes of {twin.lattice.title}: it is integrated alone")
     if not twin.form.supports("batches"):
         raise BatchRefused(
             f"{len(episodes)} episodes of the updated Lagrangian form: its bodies would meet on one grid"
         )
-    if not twin.lattice.smooth:
-        raise BatchRefused(f"{len(episodes)} episodes of {twin.lattice.title}: it is integrated alone")
     changed = [twin.with_parameters(**episode.parameters) for episode in episodes]
     runs = [
         one.integration(

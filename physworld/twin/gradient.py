@@ -92,13 +92,11 @@ class TwinRun:
         Raises:
             NotDifferentiable: also for a twin of the updated Lagrangian form, or a mesh of triangles.
         """
+        if not twin.lattice.smooth:
+            raise NotDifferentiable(f"{twin.lattice.title} has no gradient: fit by simulations alone")
         if not twin.form.supports("gradients"):
             raise NotDifferentiable(
                 "a run of the updated Lagrangian form has no gradient: fit by simulations alone"
-            )
-        if not twin.lattice.smooth:
-            raise NotDifferentiable(
-                f"{twin.lattice.title} has no gradient: fit by simulations alone"
             )
         self._twin, self._times = twin, frame_times
         self._drive = control_times, control_points, frame_times, properties
