@@ -183,7 +183,8 @@ def _cloud(site: Site, version: ModelVersion) -> Cloud:
         ("vertices", "Vertices", "model", 0.75),
     ):
         if key in arrays:
-            points = resampled(arrays[key], arrays["times"], recording.times)
+            own = "tick_times" if key == "vertices" and "tick_times" in arrays else "times"  # its own clock's
+            points = resampled(arrays[key], arrays[own], recording.times)
             pairs = "measured" if key == "tracks" else None
             layers.append(thinned(Layer(key, label, role, points, opacity=opacity, pairs=pairs)))
     return scene_cloud(recording, layers)
