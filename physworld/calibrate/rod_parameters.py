@@ -30,7 +30,7 @@ LOSSES = (
 """Numbers by which a rod loses energy."""
 _GRIP_RAD, _BRANCH_RAD = 0.5, 0.3
 _COIL = 4.0  # curvature of its own times the length, of the smoothest shape: a cable that was coiled
-_STEP_S = 0.1  # in which a step that is driven from inside shows
+_STEP_S, _REST_S = 0.1, 0.3  # in which a step that is driven from inside shows, and of the rest before it
 _QUIET, _GOES = 0.05, 0.2  # shares of how far the points go in all
 _ONSET_S, _RISE_S = 0.05, 0.06
 
@@ -94,7 +94,9 @@ def steps_seen(scene: Scene) -> Array | None:
     spread = float(np.linalg.norm(path - path[0], axis=1).max())
     found: list[float] = []
     for k in range(len(times)):
-        before, after = np.searchsorted(times, [times[k] - _STEP_S, times[k] + _STEP_S])
+        if times[k] < times[0] + _STEP_S:
+            continue
+        before, after = np.searchsorted(times, [times[k] - _REST_S, times[k] + _STEP_S])
         after = min(after, len(times) - 1)
         quiet = np.linalg.norm(path[before : k + 1] - path[k], axis=1).max() < _QUIET * spread
         goes = np.linalg.norm(path[after] - path[k]) > _GOES * spread

@@ -30,7 +30,7 @@ from physworld.materials.sheet import SheetLaw
 from physworld.scene import AS_MEASURED, Scene
 from physworld.twin.colliders import carried, twin_colliders
 from physworld.twin.grips import declared_region, gripped_nodes, why_no_turn
-from physworld.twin.rods import natural_of
+from physworld.twin.rods import clamped, natural_of
 from physworld.twin.twin import Twin
 
 PRIOR_DENSITY_KG_M3 = 1000.0
@@ -92,6 +92,8 @@ def build_twin(
     for number, group in enumerate(groups):
         region = grips[number] if grips else None
         nodes = np.setdiff1d(gripped_nodes(body, controls[0, group], region), taken)
+        if isinstance(body.lattice, Chain) and scene.kind in SLENDER:
+            nodes = clamped(body.lattice, nodes)
         held.append(nodes)
         taken = np.concatenate([taken, nodes])
     if is_hung_sheet(scene, mesh):

@@ -71,8 +71,7 @@ def gripped_of_chain(lattice: Chain, start: Array, controllers: Array, grip: Gri
     else:
         near = np.unique(np.argmin(distance, axis=0))
         nodes = _between(lattice, near)
-        if len(nodes) == 1 and is_pose(controllers):
-            nodes = np.union1d(nodes, _beside(lattice, int(nodes[0])))
+        nodes = clamped(lattice, nodes) if is_pose(controllers) else nodes
     if not len(nodes):
         raise SceneUnsupported(
             f"a declared grip with {len(controllers)} controllers holds no node of the rod"
@@ -86,6 +85,11 @@ def is_pose(controllers: Array) -> bool:
         return False
     extents = np.linalg.svd(controllers - controllers.mean(axis=0), compute_uv=False)
     return bool(extents[1] > _OFF_LINE * extents[0])
+
+
+def clamped(lattice: Chain, nodes: Array) -> Array:
+    """The nodes that a grip holds, and of a single one its neighbour too: a base holds an edge, not a point."""
+    return nodes if len(nodes) != 1 else np.union1d(nodes, _beside(lattice, int(nodes[0])))
 
 
 def shapes(twin: Twin) -> Array:

@@ -64,6 +64,14 @@ def test_only_what_moves_by_itself_is_driven() -> None:
     assert steps_seen(scene) is None  # nothing moves
     carried = replace(recorded, controllers=recorded.controllers + 1e-3 * recorded.times[:, None, None])
     assert steps_seen(carried) is None  # its base does
+    swings = 0.01 * np.sin(2 * np.pi * scene.times)[:, None, None]
+    assert steps_seen(replace(scene, points=scene.points + swings)) is None  # it never rested
+
+
+def test_a_base_of_one_marker_holds_an_edge() -> None:
+    scene = arm()
+    twin = build_twin(replace(scene, controllers=scene.controllers[:, :1] * [0.0, 0.0, 1.0]))
+    assert twin.held_nodes[0].tolist() == [0, 1]
 
 
 @pytest.mark.slow
