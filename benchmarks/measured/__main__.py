@@ -88,8 +88,8 @@ def run(
         "schema_version": SCHEMA_VERSION,
         "machine": describe_machine(),
         "settings": {"particle_budget": config.particle_budget, "max_simulations": config.max_simulations},
-        "recordings": {},
-        "transfers": {},
+        "recordings": {n: e for n, e in earlier.get("recordings", {}).items() if n not in paths},
+        "transfers": {n: e for n, e in earlier.get("transfers", {}).items() if n.split("->")[0] not in paths},
     }
     scenes: dict[str, Scene] = {}
     for place, (name, path) in enumerate(paths.items(), 1):

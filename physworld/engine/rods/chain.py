@@ -30,8 +30,8 @@ class Chain(Lattice):
         lengths: of the edge that ends at each node [m], (n,); 0 of the first.
     """
 
-    parent: Array = None  # type: ignore[assignment]
-    lengths: Array = None  # type: ignore[assignment]
+    parent: Array
+    lengths: Array
     smooth: ClassVar[bool] = False
 
     @cached_property

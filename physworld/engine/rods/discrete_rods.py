@@ -79,7 +79,8 @@ class DiscreteRods:
             raise SceneUnsupported(
                 f"a discrete rod needs a chain and the law cable, got a body of dimension {lattice.dim} and {names}"
             )
-        if any(p.sections is None for p in problems):
+        sections = [p.sections for p in problems if p.sections is not None]
+        if len(sections) < len(problems):
             raise SceneUnsupported(
                 f"{len(problems)} rods without sections: nothing says how their directors are held"
             )
@@ -88,6 +89,7 @@ class DiscreteRods:
                 f"{len(problems)} rods side by side, some of them with terms: these run alone"
             )
         self.problems, self.chain, self.laws = list(problems), lattice, laws
+        self.sections = sections
         self.terms = [term.bind(first) for term in first.terms]
         limit = self._term_limit()
         self.asked_step_s = time_step_s
@@ -120,7 +122,7 @@ class DiscreteRods:
         if progress is not None:
             progress(0, len(times))
         launch = Launch(self, x, v, held, times)
-        if self.problems[0].sections.settles:  # type: ignore[union-attr]
+        if self.sections[0].settles:
             launch.settle()
         out = launch.whole() if not self.terms else launch.stepwise(progress)
         if progress is not None:
@@ -171,11 +173,11 @@ class Launch:
     ) -> None:
         self.rods, self.times = rods, np.asarray(times, dtype=float)
         self.device = rods.problems[0].device
-        chain, sections = rods.chain, [p.sections for p in rods.problems]
+        chain, sections = rods.chain, rods.sections
         copies, count = len(sections), len(chain.parent)
         self.shape = (copies, count)
         numbers = _numbers(held[0].nodes, count)
-        edges = _numbers(sections[0].edges, count)  # type: ignore[union-attr]
+        edges = _numbers(sections[0].edges, count)
         directors = directors_along(chain, x)
         self.model = [
             self._array(np.maximum(chain.parent, 0), wp.int32), self._array(chain.lengths),
@@ -184,7 +186,7 @@ class Launch:
         self.path = [
             self._array(np.stack([one.positions for one in held]), wp.vec3d),
             self._array(np.stack([one.velocities for one in held]), wp.vec3d),
-            self._array(np.stack([s.turns for s in sections][: len(held)])),  # type: ignore[union-attr]
+            self._array(np.stack([s.turns for s in sections][: len(held)])),
             self._array(np.stack([_driven(p, len(self.times)) for p in rods.problems]), wp.vec3d),
         ]
         start = np.where((numbers >= 0)[:, None], 0.0, v)
@@ -287,7 +289,7 @@ class Launch:
             self._array(stretching),
             self._array(np.repeat(bending[..., None], 2, axis=2)),
             self._array(torsion),
-            self._array(np.stack([p.sections.natural for p in problems])),  # type: ignore[union-attr]
+            self._array(np.stack([s.natural for s in self.rods.sections])),
             self._array(np.stack([_scalars(p, self.rods.fall_s if settling else None) for p in problems])),
             self._array(np.stack([np.asarray(p.gravity_m_s2, dtype=float) for p in problems]), wp.vec3d),
         ]
