@@ -9,12 +9,12 @@ without natural curvature then bends alike whatever its twist.
     (M + dt D + dt^2 K / 4) dv = dt (f - D v)        x += dt v
 
 with D and K the positive parts of damping and stiffness at the present positions. Without damping this is Newmark's
-method of constant average acceleration: no step is too long for a stiff rod, and bending and stretch lose no energy. A
-block of the matrix couples a node with its parent and its grandparent only, so it is solved from the leaves to the root
-without fill. Twist is solved likewise, fully implicitly: it settles within a few steps, as it does within a frame in a rope.
-What tension does across an edge is explicit as far as that is stable (``taut``): as part of the matrix, which then
-changes from step to step, it feeds energy into a limp rope that whips.
-Velocities are those of half a step after the positions.
+method of constant average acceleration: no step is too long for a stiff rod, and bending and stretch lose no energy.
+A block of the matrix couples a node with its parent and its grandparent only, so it is solved from the leaves to the
+root without fill. Twist is solved likewise, fully implicitly: it settles within a few steps, as it does within a
+frame in a rope. What tension does across an edge is explicit as far as that is stable (``taut``): as part of the
+matrix, which then changes from step to step, it feeds energy into a limp rope that whips. Velocities are those of
+half a step after the positions.
 """
 
 from __future__ import annotations
