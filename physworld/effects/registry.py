@@ -12,6 +12,7 @@ from __future__ import annotations
 from physworld.catalogue import with_plugins
 from physworld.effects.actuation_lag import ActuationLag
 from physworld.effects.adhesion import Adhesion
+from physworld.effects.air_drag_across import AirDragAcross
 from physworld.effects.air_drag_linear import AirDragLinear
 from physworld.effects.air_drag_quadratic import AirDragQuadratic
 from physworld.effects.air_on_sheet import AirOnSheet
@@ -22,6 +23,7 @@ from physworld.effects.clamp_offset import ClampOffset
 from physworld.effects.gravity_tilt import GravityTilt
 from physworld.effects.grip_slip import GripSlip
 from physworld.effects.ground_friction import GroundFriction
+from physworld.effects.internal_friction import InternalFriction
 from physworld.effects.mass_field import MassField
 from physworld.effects.measurement_clock import MeasurementClock
 from physworld.effects.measurement_drift import MeasurementDrift
@@ -49,6 +51,8 @@ _BUILT_IN: tuple[type[Effect], ...] = (
     Wind,
     AirDragLinear,
     AirDragQuadratic,
+    AirDragAcross,
+    InternalFriction,
     ViscosityKelvinVoigt,
     ViscoelasticMaxwell,
     Anisotropy,

@@ -22,6 +22,7 @@ from physworld.effects.places import body_size, gravity_size
 from physworld.engine.problem import Problem
 from physworld.engine.total.stress import StressTerm
 from physworld.engine.total.stress_kernels import rod_model, sheet_model, solid_model
+from physworld.materials.cable import CableLaw
 from physworld.materials.rod import RodLaw
 from physworld.materials.sheet import SheetLaw
 from physworld.materials.solid import SolidLaw
@@ -98,6 +99,11 @@ class ViscoelasticMaxwell(Effect):
     branches: int = 1
 
     @classmethod
+    def why_not(cls, twin: Twin) -> str | None:
+        """Strains of splines, or the branch that the law of discrete rods has."""
+        return None if isinstance(twin.law, CableLaw) else super().why_not(twin)
+
+    @classmethod
     def strengths(cls, twin: Twin) -> tuple[Strength, ...]:
         """A branch up to the size of a stiff law, fading within 5 ms to 5 s."""
         time = Strength("relaxation_s", "s", 5e-3, 5.0, 0.02, gate=False, start=0.1)
@@ -116,7 +122,12 @@ class ViscoelasticMaxwell(Effect):
         ]
 
     def problem(self, problem: Problem, twin: Twin) -> Problem:
-        """Adds the branches."""
+        """Adds the branches; the law of discrete rods has one of its own."""
+        if isinstance(problem.law, CableLaw):
+            law = replace(
+                problem.law, creep_ratio=problem.law.creep_ratio + self.share, creep_s=self.relaxation_s
+            )
+            return replace(problem, law=law)
         model, times = _MODELS[twin.lattice.dim], [self.relaxation_s * 10.0**k for k in range(self.branches)]
         added = [StressTerm(model, self._numbers(problem, tau), name=self.name) for tau in times]
         return replace(problem, terms=(*problem.terms, *added))

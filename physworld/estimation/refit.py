@@ -15,7 +15,7 @@ from physworld.arrays import Array
 from physworld.estimation.least_squares import damped
 from physworld.estimation.simulations import Job, Simulations
 from physworld.estimation.unknowns import Unknown, at, bounds_of, starting_at, starts_of
-from physworld.estimation.whitening import Whitener
+from physworld.estimation.whitening import Whitening
 from physworld.twin.twin import Twin
 
 _SCALES = (1.0, 0.3)  # of a Gauss-Newton step, tried together
@@ -65,7 +65,7 @@ class Refit:
 
 def refit(
     simulations: Simulations,
-    whitener: Whitener,
+    whitener: Whitening,
     twin: Twin,
     unknowns: list[Unknown],
     frames: int,
@@ -132,7 +132,7 @@ def refit(
 
 def sensitivities(
     simulations: Simulations,
-    whitener: Whitener,
+    whitener: Whitening,
     twin: Twin,
     base: Array,
     unknowns: list[Unknown],
@@ -169,7 +169,7 @@ def _cost(found: Found) -> float:
 
 def _looked(
     simulations: Simulations,
-    whitener: Whitener,
+    whitener: Whitening,
     twin: Twin,
     unknowns: list[Unknown],
     places: list[Array],

@@ -15,6 +15,7 @@ are fitted to several frames it is not known.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -39,6 +40,20 @@ class Place:
     response: Array
     basis: Array
     shrink: Array
+
+
+class Whitening(Protocol):
+    """What a fit asks of a whitener."""
+
+    @property
+    def measured(self) -> Array:
+        """Sightings, (V, 3) [m]."""
+
+    def residual(self, tracks: Array) -> Array:
+        """Whitened measured minus predicted, (M,), of tracks (frames, N, 3)."""
+
+    def change(self, difference: Array) -> Array:
+        """Whitened change of a prediction, (M,)."""
 
 
 @dataclass(frozen=True)

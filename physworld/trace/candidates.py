@@ -45,6 +45,11 @@ class Candidate:
         """For reports."""
         return self.effect if not self.variant else f"{self.effect} ({self.variant})"
 
+    @property
+    def scanned(self) -> bool:
+        """Whether a score to first order may miss the effect, so that it is looked for over its whole range."""
+        return EFFECTS[self.effect].basins is not None
+
     def unknowns(self) -> list[Unknown]:
         """The gates, in units of their probes; with what is known of them beforehand."""
         return [

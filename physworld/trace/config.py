@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 from physworld.calibrate import CalibrationConfig
 from physworld.trace.experiment_search import ExperimentConfig
@@ -19,6 +20,7 @@ class TraceConfig:
     Attributes:
         calibration: of the declared physics only; on coarser cells than a fit's, for a trace simulates a lot, and finer
             ones are asked in the end.
+        method: "selection": effect by effect, by rules; "evidence": by one likelihood and a posterior.
         family_wise_level: probability of naming an effect where residuals are without one.
         resamples: sign patterns of the max statistic.
         blocks: time blocks of the training frames, at most; never shorter than ``shortest_block`` frames.
@@ -50,6 +52,7 @@ class TraceConfig:
     """
 
     calibration: CalibrationConfig = field(default_factory=_declared)
+    method: Literal["selection", "evidence"] = "selection"
     family_wise_level: float = 0.05
     resamples: int = 2000
     blocks: int = 12

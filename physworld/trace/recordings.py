@@ -191,6 +191,7 @@ def taken_over(twin: Twin, other: Twin) -> Twin:
     """``other``'s body, start and grips with the parameters and effects of ``twin``."""
     return replace(
         other,
+        natural=twin.natural if other.natural is not None else None,
         law=twin.law,
         air_drag_per_s=twin.air_drag_per_s,
         grip_softness=twin.grip_softness,

@@ -42,7 +42,7 @@ def document(result: TraceResult) -> dict[str, Any]:
         "scene": result.scene,
         "verdict": result.verdict.name,
         "reason": result.verdict.reason,
-        "effects": [_effect(effect) for effect in result.effects],
+        "effects": [{**_effect(effect), **_support(result, effect.name)} for effect in result.effects],
         "equivalent": [_effect(effect) for model in result.equivalent for effect in model],
         "candidates": list(best.values()),
         "refused": result.refused,
@@ -83,6 +83,17 @@ def document(result: TraceResult) -> dict[str, Any]:
         ],
         "calibrated": {name: _number(number) for name, number in result.calibrated.items()},
         "unexplained": {"rms_m": result.remainder_m, "description": result.remainder},
+        "remainder": _remainder(result),
+        "hypotheses": [
+            {
+                "effects": list(s.effects),
+                "posterior": s.posterior,
+                "misfit": s.misfit,
+                "left_out": s.left_out,
+                "discrepancy_m": s.discrepancy_m,
+            }
+            for s in result.supported
+        ],
         "suggested_experiment": None if result.experiment is None else result.experiment.document(),
         "notes": list(result.notes),
         "stages": [
@@ -93,6 +104,26 @@ def document(result: TraceResult) -> dict[str, Any]:
     }
     answer: dict[str, Any] = _finite(found)
     return answer
+
+
+def _support(result: TraceResult, name: str) -> dict[str, float | None]:
+    """An effect's posterior, and the share of the held-out error that it takes away; null where neither was asked."""
+    asked = bool(result.supported)
+    return {
+        "posterior": sum(s.posterior for s in result.supported if name in s.effects) if asked else None,
+        "share_of_held_out_error": result.shares.get(name),
+    }
+
+
+def _remainder(result: TraceResult) -> dict[str, Any]:
+    """What is left on held-out frames: beyond the noise [m], over the noise, as a share of the error before."""
+    out, noise = result.held_out, result.held_out.noise_floor
+    return {
+        "rms_m": math.sqrt(max(out.after**2 - (noise or 0.0) ** 2, 0.0)),
+        "over_noise": out.after / noise if noise else None,
+        "share": out.after / out.before if out.before > 0 else None,
+        "description": result.remainder,
+    }
 
 
 def _errors(out: HeldOut) -> dict[str, Any]:

@@ -52,6 +52,25 @@ class Stage:
 
 
 @dataclass(frozen=True)
+class Supported:
+    """A set of effects (none: the declared physics), its posterior and what it leaves.
+
+    Attributes:
+        effects: names.
+        posterior: probability among all sets that were fitted.
+        misfit: on the training frames, over the noise.
+        left_out: error on left-out blocks, over the noise.
+        discrepancy_m: estimated amplitude of what the twin lacks still [m].
+    """
+
+    effects: tuple[str, ...]
+    posterior: float
+    misfit: float
+    left_out: float
+    discrepancy_m: float
+
+
+@dataclass(frozen=True)
 class TraceResult:
     """See :mod:`physworld.trace.run`.
 
@@ -73,6 +92,8 @@ class TraceResult:
         simulations, seconds: cost.
         notes: what a reader has to know.
         recordings: every recording of its own, those that are held out last.
+        supported: by evidence, every set of effects with its posterior, the best first.
+        shares: by evidence, the share of the held-out error that each named effect takes away.
         stages: what each has cost, in the order in which they began.
     """
 
@@ -100,6 +121,8 @@ class TraceResult:
     notes: tuple[str, ...] = field(default_factory=tuple)
     recordings: tuple[Outcome, ...] = ()
     stages: tuple[Stage, ...] = ()
+    supported: tuple[Supported, ...] = ()
+    shares: dict[str, float] = field(default_factory=dict)
 
     @property
     def better(self) -> Twin | None:

@@ -71,6 +71,12 @@ def _parser() -> argparse.ArgumentParser:
         help="after about so long searches are left and the answer is made of what there is; 0: never",
     )
     parser.add_argument(
+        "--method",
+        choices=("selection", "evidence"),
+        default="selection",
+        help="how it decides: effect by effect by rules, or by one likelihood with a posterior for every set of effects",
+    )
+    parser.add_argument(
         "--noise",
         type=_metres,
         default=None,
@@ -118,7 +124,9 @@ def _trace(given: argparse.Namespace) -> None:
     scenes = [read_scene(path) for path in given.scenes]
     held_out = [read_scene(path) for path in given.held_out]
     scene = scenes[0]
-    config = TraceConfig(time_limit_s=60.0 * given.time_limit or None, noise_m=given.noise)
+    config = TraceConfig(
+        time_limit_s=60.0 * given.time_limit or None, noise_m=given.noise, method=given.method
+    )
     if given.particles is not None:
         config = replace(config, calibration=replace(config.calibration, particle_budget=given.particles))
     if given.mesh is not None:
@@ -127,7 +135,9 @@ def _trace(given: argparse.Namespace) -> None:
     if given.resume is not None:
         memory = Memory(given.resume / "simulations")
         journal = journal_in(
-            given.resume / "calibration.json", scene, f"{config.calibration}{given.noise or ''}"
+            given.resume / "calibration.json",
+            scene,
+            f"{config.calibration}{given.noise or ''}{'' if given.method == 'selection' else given.method}",
         )
     pool = Workers(given.processes) if given.processes > 1 else nullcontext(in_turn)
     with progress_bar(f"trace {scene.name}") as shown, pool as runner:

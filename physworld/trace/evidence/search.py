@@ -1,0 +1,348 @@
+"""One search over sets of effects: forward additions, backward deletions, starts that every hypothesis shares.
+
+Every candidate is scored to first order first: the fall of the log marginal likelihood with its sensitivities, the
+discrepancy estimated anew. The most promising are fitted with the full simulator. A fit starts from its linear
+estimate, from multiples of it (a strength is underestimated where motion has run out of phase), from where other
+hypotheses have come to rest (their *basins*), and from the best of a low-discrepancy design over stiffness and
+strengths on the first part of the recording, where phases have not slipped yet.
+
+Then another effect is added to the best set as long as the posterior asks for it, at most three; of every larger set
+each effect is taken out again and exchanged, from the larger set's basin, so that a pair whose first half was wrong
+comes apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.optimize import lsq_linear
+from scipy.stats import qmc
+
+from physworld.arrays import Array
+from physworld.estimation.noise import Split
+from physworld.estimation.refit import prior_rows
+from physworld.estimation.simulations import Job
+from physworld.estimation.unknowns import Unknown, at, bounds_of
+from physworld.estimation.whitening import Whitener
+from physworld.trace.candidates import Candidate
+from physworld.trace.evidence.hypotheses import Hypothesis, Setting, Values
+from physworld.trace.evidence.likelihood import Linear, marginal
+from physworld.trace.evidence.posterior import HALF, posterior, removes
+from physworld.trace.sensitivity import Response, candidate_responses
+
+_KAPPAS = (1.0, 0.25, 0.06, 0.0)  # of the base's discrepancy: with a candidate there may be less of it
+_MULTIPLES = (0.3, 3.0, 9.0)  # of a linear estimate
+_VARIANTS = 3  # shapes of an effect that are fitted before its best is freed
+_DESIGN = 16  # places of the low-discrepancy design
+_STIFFNESS = 0.8  # logarithms of the stiffness that it spans, up and down
+_EARLY = 0.4  # share of the training frames that it looks at
+_LEAST_SHARE = 0.01  # of a strength's bound, where the design begins
+_WORTH = 0.2  # share of what is left above the noise that an effect explains to first order, to be fitted
+_BASINS = 3  # other hypotheses' optima from which a fit starts
+_WORSE = 3.0  # times the best one's squared error above the noise: a fit that is left
+_APART = 0.05  # logarithm of the stiffness by which two optima are two basins
+
+
+@dataclass(frozen=True)
+class Screened:
+    """A candidate's first-order score against a hypothesis.
+
+    Attributes:
+        candidate: which.
+        gain: rise of the log marginal likelihood.
+        values: linear estimates of all unknowns, by name, in the scale of the search.
+        share: of the squared residual above the noise that goes, to first order.
+    """
+
+    candidate: Candidate
+    gain: float
+    values: Values
+    share: float
+
+
+@dataclass
+class Search:
+    """State of a search.
+
+    Attributes:
+        setting: what all hypotheses share.
+        chosen: candidates.
+        early: whitener of the first part of the training frames, and their end; None: no design.
+        singles, additions, most: candidates that are fitted first, and on top of a set; effects at most.
+        seed: of the designs.
+    """
+
+    setting: Setting
+    chosen: list[Candidate]
+    early: tuple[Whitener, int] | None
+    singles: int
+    additions: int
+    most: int
+    seed: int = 0
+    hypotheses: dict[tuple[str, ...], Hypothesis] = field(default_factory=dict)
+    screens: list[tuple[Hypothesis, list[Screened]]] = field(default_factory=list)
+
+    @property
+    def library(self) -> int:
+        """Number of effects that are asked."""
+        return len({candidate.effect for candidate in self.chosen})
+
+    def run(self, declared: Hypothesis) -> list[Hypothesis]:
+        """Hypotheses with their fits, ``declared`` first."""
+        simulations = self.setting.simulations
+        self.hypotheses[()] = declared
+        base = declared
+        for size in range(self.most):
+            with simulations.time_permitting(
+                "sensitivities" if not size else "sensitivities of another effect"
+            ):
+                self._add(base, self.additions if size else self.singles)
+            for known in sorted(self._of_size(size + 1), key=self._total, reverse=True)[:1] if size else []:
+                with simulations.time_permitting("fits without one of the effects"):
+                    self._take_out(known)
+            best = max(self.admitted(), key=self._total)
+            if len(best.members) <= size or simulations.ledger.cut:
+                break
+            base = best
+        return list(self.hypotheses.values())
+
+    def admitted(self) -> list[Hypothesis]:
+        """Hypotheses of which every effect removes a half of what is left above the noise without it; ours is no
+        true twin, and what smaller shares of its error look like is no evidence."""
+        return [h for h in self.hypotheses.values() if h.believed and self._relevant(h)]
+
+    def _relevant(self, hypothesis: Hypothesis) -> bool:
+        for member in hypothesis.members:
+            rest = self.hypotheses.get(_names([m for m in hypothesis.members if m is not member]))
+            without = self.hypotheses[()] if rest is None else rest
+            if removes(without.left, hypothesis.left) < HALF:
+                return False
+        return True
+
+    def weights(self) -> Array:
+        """Posterior of the admitted hypotheses, (H,), in their order."""
+        known = self.admitted()
+        return posterior(
+            [h.evidence.left_out for h in known], [len(h.members) for h in known], self.library, self.seed
+        )
+
+    def _total(self, hypothesis: Hypothesis) -> float:
+        return hypothesis.score - len(hypothesis.members) * float(np.log(2.0 * self.library))
+
+    def _of_size(self, size: int) -> list[Hypothesis]:
+        return [h for h in self.hypotheses.values() if len(h.members) == size]
+
+    def _add(self, base: Hypothesis, count: int) -> None:
+        """Fits with one effect more than ``base``."""
+        screened = self.screened(base)
+        self.screens.append((base, screened))
+        price = float(np.log(2.0 * self.library)) if base.members else 0.0
+        by_effect: dict[str, list[Screened]] = {}
+        for one in screened:
+            by_effect.setdefault(one.candidate.effect, []).append(one)
+        if removes(base.left, 0.0) == 0.0:
+            return
+        order = [own for own in by_effect.values() if own[0].gain > price and own[0].share > _WORTH]
+        restless = base.fitted.misfit > 1.2 and not base.members
+        order = order[:count]
+        if restless:  # a score to first order says nothing of an effect that is large
+            order += [own for own in by_effect.values() if own not in order and own[0].candidate.scanned]
+        for own in order:
+            self.setting.simulations.stage = f"fit with {own[0].candidate.effect}"
+            self._fit(base, own)
+
+    def _take_out(self, larger: Hypothesis) -> None:
+        """Fits without one of the effects of a set, and with another one in its place, from the set's basin."""
+        for member in larger.members:
+            rest = tuple(m for m in larger.members if m is not member)
+            known = self.hypotheses.get(_names(rest))
+            values = larger.values
+            again = self.setting.fitted(rest, values, [known.values] if known else [])
+            if again is not None and (known is None or again.score > known.score):
+                self.hypotheses[_names(rest)] = known = again
+            if known is not None and known.members and self._total(known) < self._total(larger):
+                self._add(known, self.additions)
+
+    def _fit(self, base: Hypothesis, variants: list[Screened]) -> None:
+        """Fits ``base`` with an effect more, the best variants' shapes first as they are, then free."""
+        candidate = variants[0].candidate
+        members = (*base.members, candidate)
+        names = _names(members)
+        shaped = bool(candidate.shapes)
+        hopeless = self._hopeless(base)
+        best: Hypothesis | None = None
+        for one in variants[: _VARIANTS if shaped else 1]:
+            own = (*base.members, one.candidate)
+            starts = self._starts(base, one)
+            linear = {**base.values, **one.values}
+            found = self.setting.fitted(own, linear, starts, hopeless=hopeless, shapes=not shaped)
+            if found is not None and (best is None or found.score > best.score):
+                best = found
+        if best is not None and shaped:
+            places = [best.values]
+            mirror = best.members[-1].mirror
+            if mirror is not None:
+                places.append({**best.values, **_mirrored(best, best.members[-1])})
+            for place in places:
+                found = self.setting.fitted(best.members, place)
+                if found is not None and found.score > best.score:
+                    best = found
+        known = self.hypotheses.get(names)
+        if best is not None and (known is None or best.score > known.score):
+            self.hypotheses[names] = best
+
+    def _hopeless(self, base: Hypothesis) -> float:
+        """Squared residual above which a fit is left: it is far from removing a half of what ``base`` leaves, and the
+        best one of its size does far better."""
+        rows = float(len(base.fitted.residual))
+        left = min(
+            (h.fitted.misfit**2 for h in self._of_size(len(base.members) + 1)), default=base.fitted.misfit**2
+        )
+        return rows * (1.0 + max(_WORSE * max(left - 1.0, 0.0), 0.5 * (base.fitted.misfit**2 - 1.0)))
+
+    def _starts(self, base: Hypothesis, one: Screened) -> list[Values]:
+        """Places to start from beside the linear estimate."""
+        gates = [u.name for u in one.candidate.unknowns()]
+        linear = {**base.values, **one.values}
+        strengths = {name: linear[name] for name in gates}
+        starts: list[Values] = [{**base.values, **strengths}]
+        starts += [{**linear, **{n: f * s for n, s in strengths.items()}} for f in _MULTIPLES]
+        for other in self._basins(base):
+            kept = {n: v for n, v in other.values.items() if n in base.values}
+            starts += [
+                {**base.values, **kept, **{n: f * s for n, s in strengths.items()}} for f in (1.0, 0.3, 3.0)
+            ]
+        if base.members or base.fitted.misfit > 1.2:
+            starts += self._designed(base, one)
+        return starts
+
+    def _basins(self, base: Hypothesis) -> list[Hypothesis]:
+        """The best hypotheses whose stiffness is another one than that of ``base``."""
+        first = self.setting.calibrated[0].name
+        found: list[Hypothesis] = []
+        for other in sorted(self.hypotheses.values(), key=self._total, reverse=True):
+            here = [base.values.get(first, 0.0), *(h.values.get(first, 0.0) for h in found)]
+            if other is not base and all(abs(other.values.get(first, 0.0) - t) > _APART for t in here):
+                found.append(other)
+        return found[:_BASINS]
+
+    def _designed(self, base: Hypothesis, one: Screened) -> list[Values]:
+        """The best place of a low-discrepancy design over stiffness and strengths on the early frames."""
+        if self.early is None:
+            return []
+        white, frames = self.early
+        candidate, first = one.candidate, self.setting.calibrated[0].name
+        twin, unknowns = self.setting.assembled(
+            (*base.members, candidate), base.values, shapes=bool(base.members)
+        )
+        names = [u.name for u in unknowns]
+        gates = candidate.unknowns()
+        drawn = qmc.Sobol(1 + len(gates), seed=self.seed).random(_DESIGN)
+        places = []
+        for row in drawn:
+            place = {u.name: u.start for u in unknowns}
+            place[first] += _STIFFNESS * (2.0 * row[0] - 1.0)
+            for share, gate in zip(row[1:], gates, strict=True):
+                lowest, highest = gate.bounds
+                signed = 2.0 * float(share) - 1.0 if lowest < 0 else float(share)
+                size = _LEAST_SHARE ** (1.0 - abs(signed))
+                place[gate.name] = float(np.sign(signed) * size * (highest if signed > 0 else -lowest))
+            places.append(place)
+        low, high = bounds_of(unknowns)
+        thetas = [np.clip([place[n] for n in names], low, high) for place in places]
+        runs = self.setting.simulations.run([Job(at(twin, unknowns, theta), frames) for theta in thetas])
+        costs = [np.inf if tracks is None else float(np.sum(white.residual(tracks) ** 2)) for tracks in runs]
+        before = float(np.sum(white.residual(base.fitted.tracks[:frames]) ** 2))
+        best = int(np.argmin(costs))
+        if not costs[best] < before:
+            return []
+        return [dict(zip(names, (float(t) for t in thetas[best]), strict=True))]
+
+    def screened(self, base: Hypothesis) -> list[Screened]:
+        """First-order scores of all candidates that ``base`` has not, best first."""
+        setting = self.setting
+        chosen = [c for c in self.chosen if c.effect not in base.names]
+        responses = candidate_responses(
+            setting.simulations, setting.white, base.fitted.twin, base.fitted.tracks, chosen, setting.frames
+        )
+        found = [self._screen(base, response) for response in responses if not response.failed]
+        return sorted((one for one in found if one is not None), key=lambda one: -one.gain)
+
+    def _screen(self, base: Hypothesis, response: Response) -> Screened | None:
+        candidate, columns = response.candidate, response.columns
+        if not np.any(columns):
+            return None
+        gates = candidate.unknowns()
+        freed = {gate.name for gate in gates}
+        kept = [k for k, u in enumerate(base.fitted.unknowns) if u.name not in freed]
+        known = [base.fitted.unknowns[k] for k in kept]
+        start = np.concatenate([base.fitted.theta[kept], [base.values.get(g.name, 0.0) for g in gates]])
+        unknowns = [u.starting(t) for u, t in zip([*known, *gates], start, strict=True)]
+        jacobian = np.concatenate([base.fitted.jacobian[:, kept], columns], axis=1)
+        before = base.evidence.marginal
+        best: Screened | None = None
+        square = max(base.fitted.misfit**2 - 1.0, 1e-12)
+        for kappa in dict.fromkeys(f * base.evidence.kappa for f in _KAPPAS):
+            change = self._bounded(base, jacobian, unknowns, start, kappa)
+            theta = start + change
+            residual = base.fitted.residual - jacobian @ change
+            there = [u.starting(t) for u, t in zip(unknowns, theta, strict=True)]
+            after, _ = marginal(Linear(residual, jacobian, there, theta), self.setting.discrepancy)
+            if best is None or after - before > best.gain:
+                share = (base.fitted.misfit**2 - float(np.mean(residual**2))) / square
+                values = {u.name: float(t) for u, t in zip(unknowns, theta, strict=True)}
+                best = Screened(candidate, after - before, values, share)
+        return best
+
+    def _bounded(
+        self, base: Hypothesis, jacobian: Array, unknowns: list[Unknown], start: Array, kappa: float
+    ) -> Array:
+        """Linear change of all unknowns (p,) within their bounds, under a discrepancy of ``kappa`` [m]."""
+        discrepancy = self.setting.discrepancy
+        slope, residual = (
+            discrepancy.whitened(jacobian, kappa),
+            discrepancy.whitened(base.fitted.residual, kappa),
+        )
+        prior_residual, prior_slope = prior_rows(unknowns, start)
+        normal = slope.T @ slope + prior_slope.T @ prior_slope
+        gradient = slope.T @ residual + prior_slope.T @ prior_residual
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+        root = np.linalg.cholesky(normal * scale * scale[:, None] + 1e-9 * np.eye(len(scale)))
+        low, high = bounds_of(unknowns)
+        reach = 0.3 * (high - low)
+        low, high = np.maximum(low, start - reach), np.minimum(high, start + reach)
+        bounds = np.minimum(low - start, 0.0) / scale, np.maximum(high - start, 1e-12) / scale
+        target = np.linalg.solve(root, gradient * scale)
+        change: Array = scale * lsq_linear(root.T, target, bounds, method="bvls").x
+        return change
+
+
+def early_part(white: Whitener, split: Split) -> tuple[Whitener, int]:
+    """The whitener of the first part of the training frames, and the frame at which that ends."""
+    end = split.train[0] + max(int(np.ceil(_EARLY * (split.train[1] - split.train[0]))), 3)
+    kept = white.frames < end
+    shorter = replace(
+        white,
+        measured=white.measured[kept],
+        visible=white.visible[: end - white.first],
+        frames=white.frames[kept],
+        points=white.points[kept],
+        places=(),
+        common=None,
+    )
+    return shorter, end
+
+
+def _names(members: Sequence[Candidate]) -> tuple[str, ...]:
+    return tuple(sorted(member.effect for member in members))
+
+
+def _mirrored(hypothesis: Hypothesis, member: Candidate) -> dict[str, float]:
+    """The mirror image of a member's shape, by name, in the scale of the search."""
+    assert member.mirror is not None
+    effect = next(e for e in hypothesis.fitted.twin.effects if e.name == member.effect)
+    image = member.mirror({name: float(value or 0.0) for name, value in effect.values.items()})
+    pairs = zip(member.shape_unknowns(), member.shapes, strict=True)
+    return {u.name: u.searched(image[s.name]) for u, s in pairs}
