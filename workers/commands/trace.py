@@ -74,7 +74,7 @@ def _parser() -> argparse.ArgumentParser:
         "--method",
         choices=("selection", "evidence"),
         default="selection",
-        help="how it decides: effect by effect by rules, or by one likelihood with a posterior for every set of effects",
+        help="how it decides: effect by effect by rules, or by one likelihood with a posterior for every set",
     )
     parser.add_argument(
         "--noise",

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from physworld.arrays import Array
 from physworld.estimation.refit import Refit, refit
 from physworld.estimation.simulations import Simulations
 from physworld.estimation.unknowns import Unknown, at

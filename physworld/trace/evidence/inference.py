@@ -3,7 +3,8 @@
 1. Noise; whitening by noise, by the points' own places and by what finer cells and a smaller step change (their
    estimated error as one standard deviation, Richardson's for second order).
 2. The declared physics under noise and discrepancy; the search over sets of effects; their posterior.
-3. The answer: the sets that hold 95 % of the posterior, four at most. What remains is told beside it and forbids no name.
+3. The answer: the sets that hold 95 % of the posterior, four at most. What remains is told beside it and forbids no
+   name.
 """
 
 from __future__ import annotations

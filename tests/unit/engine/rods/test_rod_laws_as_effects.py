@@ -13,7 +13,8 @@ from physworld.effects.registry import EFFECTS, effect
 
 TWIN = SimpleNamespace(law=LAW, lattice=SimpleNamespace(dim=1, smooth=False, title="a chain"))
 SAME = [
-    ("internal_friction", {"moment_per_m": 2.0, "onset_per_m": 0.7}, {"friction_per_m": 2.0, "friction_onset_per_m": 0.7}),
+    ("internal_friction", {"moment_per_m": 2.0, "onset_per_m": 0.7},
+     {"friction_per_m": 2.0, "friction_onset_per_m": 0.7}),
     ("air_drag_across", {"coefficient_per_m": 0.4}, {"drag_normal_per_m": 0.4}),
     ("viscosity_kelvin_voigt", {"relaxation_s": 0.03}, {"relaxation_s": 0.03}),
     ("viscoelastic_maxwell", {"share": 0.5, "relaxation_s": 0.3}, {"creep_ratio": 0.5, "creep_s": 0.3}),
@@ -21,7 +22,9 @@ SAME = [
 
 
 @pytest.mark.parametrize(("name", "strengths", "numbers"), SAME, ids=[name for name, _, _ in SAME])
-def test_a_strength_is_a_number_of_the_law(name: str, strengths: dict[str, float], numbers: dict[str, float]) -> None:
+def test_a_strength_is_a_number_of_the_law(
+    name: str, strengths: dict[str, float], numbers: dict[str, float]
+) -> None:
     rod = problem(line(6))
     changed = effect(name, **strengths).problem(rod, TWIN)
     assert changed.law == replace(LAW, **numbers)
