@@ -1,8 +1,9 @@
 """What the cameras look at: a beam, a rope and a cloth of known material, moved by engines that are not ours.
 
-The beam is MuJoCo's flex of ``scripts/make_sample_scene.py``, the rope the chain of ``scripts/make_sample_rope.py``, the
-cloth MuJoCo's flex of ``benchmarks.peers.flex_cloths``. A gripper of boxes holds them, covers what it holds, and carries
-an ArUco marker; a stick goes by between object and camera in the second second.
+The beam is MuJoCo's flex of ``scripts/make_sample_scene.py``, the rope the chain of
+``scripts/make_sample_rope.py``, the cloth MuJoCo's flex of ``benchmarks.peers.flex_cloths``. A gripper of boxes
+holds them, covers what it holds, and carries an ArUco marker; a stick goes by between object and camera in the
+second second.
 """
 
 from __future__ import annotations
@@ -94,7 +95,7 @@ def beam(frames: int = FRAMES) -> Play:
         },
         "grip": {
             "region_min_m": low.tolist(),
-            "region_max_m": (low + [recipe.grip_m, size[1], size[2]]).tolist(),
+            "region_max_m": (low + np.array((recipe.grip_m, size[1], size[2]))).tolist(),
         },
     }
     truth = {
@@ -155,9 +156,7 @@ def cloth(frames: int = FRAMES) -> Play:
         gain = 1.0 - np.exp(-((t / 0.4) ** 2))
         shift = gain * np.array([0.04 * np.sin(2.3 * t), 0.05 * np.sin(4.0 * t), 0.02 * np.sin(3.1 * t)])
         angle = gain * 0.3 * np.sin(2.0 * t)
-        turn = np.array(
-            [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]]
-        )
+        turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
         return turn, shift
 
     positions = mesh.record(

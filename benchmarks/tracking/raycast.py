@@ -28,8 +28,8 @@ class Surface:
 
     Attributes:
         triangles: (F, 3) indices into the vertices.
-        rest: places of the vertices in the undeformed body [m], (V, 3); of a marker, its picture's coordinates in 0 to 1.
-        paint: SPECKLED, PLAIN or MARKER.
+        rest: places of the vertices in the undeformed body [m], (V, 3); of a marker, its picture's coordinates in
+        0 to 1. paint: SPECKLED, PLAIN or MARKER.
         colour: red, green, blue in 0 to 1.
         grain_m: size of the speckles.
     """
@@ -52,9 +52,7 @@ class Stage:
 
     def __init__(self, surfaces: list[Surface], table_m: float, marker: Array | None = None) -> None:
         starts = np.cumsum([0, *(len(surface.rest) for surface in surfaces)])
-        triangles = [
-            surface.triangles + start for surface, start in zip(surfaces, starts[:-1], strict=True)
-        ]
+        triangles = [surface.triangles + start for surface, start in zip(surfaces, starts[:-1], strict=True)]
         self._triangles = wp.array(np.concatenate(triangles).ravel(), dtype=wp.int32)
         self._rest = wp.array(np.concatenate([surface.rest for surface in surfaces]), dtype=wp.vec3)
         owner = np.repeat(np.arange(len(surfaces)), [len(surface.triangles) for surface in surfaces])
@@ -139,14 +137,12 @@ def _cast(
         if sample == SAMPLES * SAMPLES:
             dx = 0.5
             dy = 0.5
-        local = wp.vec3(
-            (float(column) + dx - lens[2]) / lens[0], (float(row) + dy - lens[3]) / lens[1], 1.0
-        )
+        local = wp.vec3((float(column) + dx - lens[2]) / lens[0], (float(row) + dy - lens[3]) / lens[1], 1.0)
         length = wp.length(local)
         direction = turn * (local / length)
         far = float(FAR_M)
         colour = wp.vec3(0.35, 0.37, 0.4)
-        seen = int(-1)
+        seen = -1
         if direction[2] < 0.0:
             reach = (table - eye[2]) / direction[2]
             if reach < far:
@@ -162,7 +158,7 @@ def _cast(
             c = rest[triangles[3 * hit.face + 2]]
             place = hit.u * a + hit.v * b + (1.0 - hit.u - hit.v) * c
             bright = 0.55 + 0.45 * wp.abs(wp.dot(hit.normal, light))
-            tone = float(1.0)
+            tone = 1.0
             if paint[seen] == SPECKLED:
                 tone = 0.75 + 0.8 * _speckles(place, grain[seen])
             if paint[seen] == MARKER:

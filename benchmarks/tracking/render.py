@@ -1,7 +1,8 @@
 """Writes a play as a depth camera's recording, in PhysTwin's layout, with its truth beside it.
 
-``color/CAMERA/FRAME.png``, ``depth/CAMERA/FRAME.png`` (uint16 [mm]), ``metadata.json`` (``intrinsics``, ``WH``, ``fps``),
-``calibrate.json`` (camera to world, as PhysTwin's ``calibrate.pkl``), and for the measurement ``truth.npz``, ``truth.json``.
+``color/CAMERA/FRAME.png``, ``depth/CAMERA/FRAME.png`` (uint16 [mm]), ``metadata.json`` (``intrinsics``, ``WH``,
+``fps``), ``calibrate.json`` (camera to world, as PhysTwin's ``calibrate.pkl``), and for the measurement ``truth.npz``,
+``truth.json``.
 """
 
 from __future__ import annotations
@@ -44,7 +45,11 @@ def render(play: Play, folder: Path, cameras: int = 1, seed: int = 0) -> None:
         for frame, vertices in enumerate(play.vertices):
             exact, depth, _ = stage.show(vertices, camera)
             colour = errors.colour(exact, rng)
-            cv2.imwrite(str(folder / f"color/{number}/{frame}.png"), colour[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])
+            cv2.imwrite(
+                str(folder / f"color/{number}/{frame}.png"),
+                colour[..., ::-1],
+                [cv2.IMWRITE_PNG_COMPRESSION, 1],
+            )
             cv2.imwrite(
                 str(folder / f"depth/{number}/{frame}.png"), errors.depth_mm(depth, camera.fx, pattern, rng)
             )

@@ -1,7 +1,7 @@
 """Points of the first frame sought in the whole picture, for when nothing is left to go on from.
 
-SIFT (Lowe 2004; OpenCV) describes the surroundings of every point in the first frame and every feature of a later one; a
-point is found where its best match is clearly better than the second and the match holds the other way round.
+SIFT (Lowe 2004; OpenCV) describes the surroundings of every point in the first frame and every feature of a later
+one; a point is found where its best match is clearly better than the second and the match holds the other way round.
 """
 
 from __future__ import annotations

@@ -2,7 +2,8 @@
 
 A depth camera gives every pixel an error and loses some; the pixels of a patch together give its middle better than
 any of them. On a plane 1/Z is linear in the pixel, so that is what is fitted. Pixels of the patch that were not on the
-object in the first frame are left out, and those far from the patch's median, which are of something before or behind it.
+object in the first frame are left out, and those far from the patch's median, which are of something before or
+behind it.
 """
 
 from __future__ import annotations
@@ -64,9 +65,7 @@ def patch_depth(depth: Array, pixels: Array, spread: Array, inside: Array, expec
     return found
 
 
-def plane_in(
-    depth: Array, camera: Camera, rows: Array, columns: Array
-) -> tuple[float, float, float] | None:
+def plane_in(depth: Array, camera: Camera, rows: Array, columns: Array) -> tuple[float, float, float] | None:
     """Coefficients (a, b, c) of 1/Z = a + b u + c v [1/m, 1/(m px)] of the pixels' plane; None: too few have depth.
 
     Args:

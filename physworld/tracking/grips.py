@@ -1,9 +1,10 @@
-"""The motion of what holds the object: from a marker on the gripper, a picked patch of it, its colour, or a robot's log.
+"""The motion of what holds the object: from a marker on the gripper, a picked patch of it, its colour, or a
+robot's log.
 
 Each gives a rigid path, rotation and shift of the gripper at every frame since the first one, and the path carries
-whatever points the scene shall have as controllers. A marker's corners are found to a fraction of a pixel; their depth is
-that of the plane through all depth pixels of the marker, which is far better than that of any pixel. Where a gripper is
-not seen, its path is interpolated, and the scene says how often.
+whatever points the scene shall have as controllers. A marker's corners are found to a fraction of a pixel; their
+depth is that of the plane through all depth pixels of the marker, which is far better than that of any pixel.
+Where a gripper is not seen, its path is interpolated, and the scene says how often.
 """
 
 from __future__ import annotations
@@ -49,15 +50,11 @@ class RigidPath:
     def carry(self, points: Array) -> Array:
         """Points (K, 3) [m] of the first frame at every frame, (T, K, 3)."""
         matrices = Rotation.from_rotvec(self.turns).as_matrix()
-        carried: Array = (
-            np.einsum("tij,kj->tki", matrices, points - self.places[0]) + self.places[:, None]
-        )
+        carried: Array = np.einsum("tij,kj->tki", matrices, points - self.places[0]) + self.places[:, None]
         return carried
 
 
-def marker_corners(
-    view: View, identity: int | None = None, dictionary: str = "4X4_50"
-) -> Array:
+def marker_corners(view: View, identity: int | None = None, dictionary: str = "4X4_50") -> Array:
     """Corners of an ArUco or AprilTag marker in every frame [m], (T, 4, 3), nan where it is not seen.
 
     Args:
@@ -88,7 +85,9 @@ def marker_corners(
             corners[frame] = _in_space(view, frame, quad)
     if np.isnan(corners).all():
         named = "no marker" if identity is None else f"marker {identity} of {dictionary}"
-        raise TrackingFailed(f"{named} is seen; seen were {sorted(seen_of) or 'none'} in {view.frames} frames")
+        raise TrackingFailed(
+            f"{named} is seen; seen were {sorted(seen_of) or 'none'} in {view.frames} frames"
+        )
     return corners
 
 
@@ -110,8 +109,8 @@ def rigid_path(points: Array, smoothed_frames: int = SMOOTHED_FRAMES) -> RigidPa
     Raises:
         TrackingFailed: in no frame are three points seen, or they are not in the first.
     """
-    known = np.isfinite(points).all(axis=2)
-    seen = known.sum(axis=1) >= 3
+    known: Array = np.asarray(np.isfinite(points).all(axis=2))
+    seen: Array = np.asarray(known.sum(axis=1) >= 3)
     if not seen.any():
         raise TrackingFailed(f"three points of the gripper are seen in none of {len(points)} frames")
     first = int(np.argmax(seen))
@@ -125,7 +124,9 @@ def rigid_path(points: Array, smoothed_frames: int = SMOOTHED_FRAMES) -> RigidPa
                 back[frame] = points[frame] @ turn.T + shift
         with np.errstate(invalid="ignore"):
             count = np.isfinite(back).all(axis=2).sum(axis=0)
-            shape = np.where(count[:, None] > 0, np.nansum(back, axis=0) / np.maximum(count, 1)[:, None], np.nan)
+            shape = np.where(
+                count[:, None] > 0, np.nansum(back, axis=0) / np.maximum(count, 1)[:, None], np.nan
+            )
     usable = np.isfinite(shape).all(axis=1)
     middle = shape[usable].mean(axis=0)
     turns, places = np.zeros((len(points), 3)), np.zeros((len(points), 3))
@@ -167,7 +168,9 @@ def colour_middles(view: View, at: tuple[int, int], tolerance: int = 12, least_p
     column, row = at
     patch = first[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3].reshape(-1, 3)
     if not len(patch):
-        raise TrackingFailed(f"the pixel {column},{row} is outside of the picture {first.shape[1]} x {first.shape[0]}")
+        raise TrackingFailed(
+            f"the pixel {column},{row} is outside of the picture {first.shape[1]} x {first.shape[0]}"
+        )
     wanted = np.median(patch, axis=0)
     middles = np.full((view.frames, 3), np.nan)
     place: Array = np.array([column, row], dtype=float)
@@ -175,7 +178,9 @@ def colour_middles(view: View, at: tuple[int, int], tolerance: int = 12, least_p
         hsv = cv2.cvtColor(np.ascontiguousarray(view.colour(frame)), cv2.COLOR_RGB2HSV).astype(int)
         hue = np.abs((hsv[..., 0] - wanted[0] + 90) % 180 - 90)
         alike = (hue <= tolerance) & (np.abs(hsv[..., 1:] - wanted[1:]) <= 5 * tolerance).all(axis=2)
-        count, labels, facts, centres = cv2.connectedComponentsWithStats(alike.astype(np.uint8), connectivity=8)
+        count, labels, facts, centres = cv2.connectedComponentsWithStats(
+            alike.astype(np.uint8), connectivity=8
+        )
         large = [n for n in range(1, count) if facts[n, cv2.CC_STAT_AREA] >= least_pixels]
         if not large:
             continue
@@ -196,7 +201,7 @@ def translated(middles: Array, smoothed_frames: int = SMOOTHED_FRAMES) -> RigidP
     Raises:
         TrackingFailed: there is none at all.
     """
-    seen = np.isfinite(middles).all(axis=1)
+    seen: Array = np.asarray(np.isfinite(middles).all(axis=1))
     if not seen.any():
         raise TrackingFailed(f"the gripper is seen in none of {len(middles)} frames")
     none = np.zeros((len(middles), 3))
@@ -205,9 +210,7 @@ def translated(middles: Array, smoothed_frames: int = SMOOTHED_FRAMES) -> RigidP
     return RigidPath(none, places, seen, places[:1], 0.0)
 
 
-def logged(
-    log_times: Array, places: Array, quaternions_wxyz: Array | None, times: Array
-) -> RigidPath:
+def logged(log_times: Array, places: Array, quaternions_wxyz: Array | None, times: Array) -> RigidPath:
     """The path of a robot's log at the frames' times.
 
     Args:
@@ -221,7 +224,8 @@ def logged(
     """
     if log_times[0] > times[0] + 1e-6 or log_times[-1] < times[-1] - 1e-6:
         raise TrackingFailed(
-            f"the log runs from {log_times[0]:.3f} to {log_times[-1]:.3f} s, the recording from {times[0]:.3f} to {times[-1]:.3f} s"
+            f"the log runs from {log_times[0]:.3f} to {log_times[-1]:.3f} s, the recording from "
+            f"{times[0]:.3f} to {times[-1]:.3f} s"
         )
     there = np.stack([np.interp(times, log_times, places[:, axis]) for axis in range(3)], axis=1)
     turns = np.zeros((len(times), 3))

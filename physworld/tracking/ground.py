@@ -1,8 +1,8 @@
 """The plane that the object stands on or hangs above, and the world that it gives: z up, the plane at z = 0.
 
 RANSAC (Fischler & Bolles 1981) over the depth pixels outside of the object; the plane must look up in the picture,
-since walls are planes too. The error of depth grows with its square, and so does the distance at which a pixel counts as in the
-plane.
+since walls are planes too. The error of depth grows with its square, and so does the distance at which a pixel
+counts as in the plane.
 """
 
 from __future__ import annotations

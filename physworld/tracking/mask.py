@@ -1,8 +1,9 @@
 """The object's pixels in the first frame: a box that a person draws, grown by depth and by colour.
 
 Depth first: what stands in the box at another distance than its middle, or on the ground, is background. Colour then:
-GrabCut (Rother, Kolmogorov, Blake 2004; OpenCV), which knows everything outside of the box as background, so that a gripper
-that reaches into the box goes with the gripper outside. Pixels without depth belong to the mask where colour says so.
+GrabCut (Rother, Kolmogorov, Blake 2004; OpenCV), which knows everything outside of the box as background, so that
+a gripper that reaches into the box goes with the gripper outside. Pixels without depth belong to the mask where
+colour says so.
 """
 
 from __future__ import annotations
@@ -19,6 +20,9 @@ from physworld.tracking.view import back_project
 
 BEFORE_SHARE, BEHIND_SHARE = 0.4, 0.8
 """How far before and behind its nearest large part the object may reach, in diagonals of the box."""
+ROOM_M, ROOM_SHARE = 0.012, 0.1
+"""Around the cloud of the other cameras: a length, and a share of its middle extent; a gripper beside it is none
+of it."""
 GROUND_CLEARANCE_M = 0.006
 ROUNDS = 6
 LEAST_PIXELS = 60
@@ -39,12 +43,11 @@ class Box:
         Raises:
             TrackingFailed: nothing is.
         """
-        inside = Box(
-            max(self.left, 0), max(self.top, 0), min(self.right, width), min(self.bottom, height)
-        )
+        inside = Box(max(self.left, 0), max(self.top, 0), min(self.right, width), min(self.bottom, height))
         if inside.right - inside.left < 4 or inside.bottom - inside.top < 4:
             raise TrackingFailed(
-                f"the box {self.left},{self.top},{self.right},{self.bottom} has nothing of the picture of {width} x {height} px"
+                f"the box {self.left},{self.top},{self.right},{self.bottom} has nothing of the "
+                f"picture of {width} x {height} px"
             )
         return inside
 
@@ -106,7 +109,15 @@ def mask_near_cloud(
     margin = 0.08 * np.linalg.norm(high - low) + 4
     left, top = (int(v) for v in np.floor(low - margin))
     right, bottom = (int(v) for v in np.ceil(high + margin))
-    return mask_in_box(colour, depth, camera, Box(left, top, right, bottom), ground_m)
+    mask = mask_in_box(colour, depth, camera, Box(left, top, right, bottom), ground_m)
+    extent = np.sort(np.percentile(cloud, 99, axis=0) - np.percentile(cloud, 1, axis=0))
+    room = ROOM_M + ROOM_SHARE * extent[1]
+    rows, columns = np.nonzero(mask & (depth > 0))
+    place = back_project(camera, np.stack([columns, rows], axis=1) + 0.5, depth[rows, columns])
+    low, high = np.percentile(cloud, 1, axis=0) - room, np.percentile(cloud, 99, axis=0) + room
+    within = np.zeros(mask.shape, dtype=bool)
+    within[rows, columns] = ((place > low) & (place < high)).all(axis=1)
+    return _largest(within)
 
 
 def _near(depth: Array, camera: Camera, box: Box, ground_m: float | None) -> Array:

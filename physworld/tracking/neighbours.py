@@ -96,9 +96,7 @@ def rigid_misfit(start: Array, now: Array, known: Array, neighbours: Array) -> t
         total = np.maximum(weights.sum(axis=1), 1e-12)[:, None]
         mean_from = np.einsum("nk,nki->ni", weights, offsets) / total
         mean_to = np.einsum("nk,nki->ni", weights, moved) / total
-        cross = np.einsum(
-            "nk,nki,nkj->nij", weights, moved - mean_to[:, None], offsets - mean_from[:, None]
-        )
+        cross = np.einsum("nk,nki,nkj->nij", weights, moved - mean_to[:, None], offsets - mean_from[:, None])
         left, _, right = np.linalg.svd(cross)
         sign = np.ones((len(start), 3))
         sign[:, 2] = np.sign(np.linalg.det(left @ right))

@@ -107,13 +107,14 @@ def _blurred(grey: Array, blur_px: float) -> Array:
 def _sample(picture: Array, at: Array) -> Array:
     """Bilinear values (N, P) of a picture (H, W) at pixels (N, P, 2)."""
     places = to_opencv(at)
-    return cv2.remap(
+    values: Array = cv2.remap(
         picture,
         np.ascontiguousarray(places[..., 0]),
         np.ascontiguousarray(places[..., 1]),
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
     ).astype(np.float64)
+    return values
 
 
 def _normalised(values: Array, weights: Array) -> tuple[Array, Array]:

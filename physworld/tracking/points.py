@@ -1,10 +1,10 @@
 """Material points followed through one camera's pictures.
 
-In every frame: Lucas-Kanade from the last frame with a check backwards (OpenCV); what neighbours make of it, which is the
-guess for lost points too and turns the patches; the patch of the first frame found again at that place, coarse and
-fine; depth at it; and at last whether the point goes with the material around it. A point that fails is not seen in this
-frame and is sought again in the next, so that it comes back when what covered it has gone; where few are left, features of
-the first frame are sought in the whole picture. Places come from the first
+In every frame: Lucas-Kanade from the last frame with a check backwards (OpenCV); what neighbours make of it, which
+is the guess for lost points too and turns the patches; the patch of the first frame found again at that place,
+coarse and fine; depth at it; and at last whether the point goes with the material around it. A point that fails is
+not seen in this frame and is sought again in the next, so that it comes back when what covered it has gone; where
+few are left, features of the first frame are sought in the whole picture. Places come from the first
 frame's patch alone: nothing adds up from frame to frame.
 """
 
@@ -91,7 +91,8 @@ def choose(grey: Array, mask: Array, depth: Array, count: int) -> Array:
         return np.zeros((0, 2))
     pixels = from_opencv(corners[:, 0])
     row, column = pixels[:, 1].astype(int), pixels[:, 0].astype(int)
-    return pixels[depth[row, column] > 0][:count]
+    kept: Array = pixels[depth[row, column] > 0][:count]
+    return kept
 
 
 def follow(
@@ -132,6 +133,11 @@ class _Tracker:
             )
         grey = cv2.cvtColor(np.ascontiguousarray(colour), cv2.COLOR_RGB2GRAY)
         pixels = choose(grey, mask, depth, config.points)
+        if len(pixels) < LEAST_POINTS:
+            raise TrackingFailed(
+                f"{len(pixels)} points of the object can be followed, {LEAST_POINTS} are needed: "
+                f"its {int(mask.sum())} pixels have no texture, or no depth where they have"
+            )
         fine = cut(grey.astype(np.float32), mask, pixels, config.patch_px)
         coarse = cut(grey.astype(np.float32), mask, pixels, config.patch_px + 3, 2.0)
         close = np.abs(fine.offsets).max(axis=1) <= config.depth_px
@@ -147,7 +153,8 @@ class _Tracker:
         if kept.sum() < LEAST_POINTS:
             raise TrackingFailed(
                 f"{int(kept.sum())} points of the object can be followed, {LEAST_POINTS} are needed: "
-                f"{len(pixels)} corners, {int(fine.usable.sum())} with contrast, {int(np.isfinite(distance).sum())} with depth"
+                f"{len(pixels)} corners, {int(fine.usable.sum())} with contrast, "
+                f"{int(np.isfinite(distance).sum())} with depth"
             )
         self._fine, self._coarse = _kept(fine, kept), _kept(coarse, kept)
         self._close, self._inside = close, inside[kept]
@@ -179,13 +186,17 @@ class _Tracker:
         guess, maps = self._guess(grey, frame)
         picture = grey.astype(np.float32)
         near, rough = find(picture, self._coarse, guess, maps, 2.0)
+        onward = self._onward(frame)
+        also, better = find(picture, self._coarse, onward, self._last_maps, 2.0)
+        better = np.where(_apart(also, onward, 12.0), better, -1.0)
+        swapped = (better > rough + 0.02) | ((better > rough) & ~_apart(near, guess, 12.0))
+        near = np.where(swapped[:, None], also, near)
+        rough, guess = np.where(swapped, better, rough), np.where(swapped[:, None], also, guess)
         near = np.where(((rough > 0.6) & _apart(near, guess, 12.0))[:, None], near, guess)
         places, correlation = find(picture, self._fine, near, maps)
         area = np.abs(np.linalg.det(maps))
         seen = (
-            (correlation >= config.least_correlation)
-            & _apart(places, near, 4.0)
-            & (area > config.least_area)
+            (correlation >= config.least_correlation) & _apart(places, near, 4.0) & (area > config.least_area)
         )
         # the places found turn the patches better than the flow did
         again, maps = self._surroundings(places, seen, guess)
@@ -222,6 +233,13 @@ class _Tracker:
         places, maps = self._surroundings(flow, sure, last)
         return np.where(sure[:, None], flow, places), maps
 
+    def _onward(self, frame: int) -> Array:
+        """Places (N, 2) if points go on as they went: thin things before a still background carry the flow off."""
+        last: Array = self._pixels[frame - 1]
+        if frame >= 2:
+            last = last + np.clip(last - self._pixels[frame - 2], -60.0, 60.0)
+        return last
+
     def _rediscovered(self, grey: Array, frame: int) -> tuple[Array, Array]:
         """The same from features of the first frame that are found anywhere in the picture."""
         last, known = self._pixels[frame - 1], self._visible[frame - 1]
@@ -230,7 +248,8 @@ class _Tracker:
         return self._surroundings(places, sure | known, last)
 
     def _surroundings(self, places: Array, sure: Array, otherwise: Array) -> tuple[Array, Array]:
-        """Where neighbours put points, and how their patches are turned; of a point without any, what all points say."""
+        """Where neighbours put points, and how their patches are turned; of a point without any, what all points
+        say."""
         if sure.sum() < LEAST_POINTS:
             return otherwise.copy(), self._last_maps
         there, maps, count = picture_motion(self._start, places, sure, self._neighbours)
@@ -266,7 +285,8 @@ class _Tracker:
 
 def _apart(one: Array, other: Array, most: float) -> Array:
     """Whether places (N, 2) are not farther apart than ``most`` [px], (N,) bool."""
-    return np.linalg.norm(one - other, axis=1) <= most
+    near: Array = np.linalg.norm(one - other, axis=1) <= most
+    return near
 
 
 def _kept(patches: Patches, kept: Array) -> Patches:

@@ -1,7 +1,7 @@
 """A recording of one or several cameras to the arrays of a scene: points, grips, the cloud of the first frame.
 
-Every camera follows its own points. Those of different cameras that lie on each other in the first frame are one place of
-the object; the one that is seen longer stays.
+Every camera follows its own points. Those of different cameras that lie on each other in the first frame are one
+place of the object; the one that is seen longer stays.
 """
 
 from __future__ import annotations
@@ -134,13 +134,14 @@ def follow_all(
 
 
 def thinned(points: Array, cell_m: float) -> Array:
-    """The mean of the points of every cell that holds two or more, (S, 3); lone ones are strays of the depth."""
+    """The mean of the points of every cell, (S, 3); where cells hold several, lone ones are strays of the depth."""
     cells, index, count = np.unique(
         np.floor(points / cell_m).astype(np.int64), axis=0, return_inverse=True, return_counts=True
     )
     total = np.zeros((len(cells), 3))
     np.add.at(total, index.ravel(), points)
-    means: Array = (total / count[:, None])[count >= 2]
+    least = 2 if np.median(count) >= 3 else 1
+    means: Array = (total / count[:, None])[count >= least]
     return means
 
 

@@ -1,17 +1,13 @@
 """Folders of pictures with depth: which files there are, how they are calibrated, one frame at a time.
 
-===============  ========================================================================================================
-layout           files
-===============  ========================================================================================================
-PhysTwin         ``color/CAMERA/FRAME.png`` or ``color/CAMERA.mp4``; ``depth/CAMERA/FRAME.npy`` or ``.png``;
-                 ``metadata.json`` (``intrinsics``, ``fps``); ``calibrate.pkl`` or ``.json``, camera to world a camera
-Open3D           ``color/FRAME.jpg`` or ``.png``; ``depth/FRAME.png``; ``camera_intrinsic.json`` (``intrinsic_matrix``, by columns)
-plain            either order of files, and ``cameras.json``: a list of ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy`` and
-                 ``world_to_camera`` (absent: not calibrated), the form of ``physworld video --camera``
-===============  ========================================================================================================
+- PhysTwin: ``color/CAMERA/FRAME.png`` or ``color/CAMERA.mp4``; ``depth/CAMERA/FRAME.npy`` or ``.png``;
+  ``metadata.json`` (``intrinsics``, ``fps``); ``calibrate.pkl`` or ``.json``, camera to world of each camera.
+- Open3D: ``color/FRAME.jpg`` or ``.png``; ``depth/FRAME.png``; ``camera_intrinsic.json`` (its matrix by columns).
+- plain: either order of files, and ``cameras.json``: a list of ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy``
+  and ``world_to_camera`` (absent: not calibrated), the form of ``physworld video --camera``.
 
-``color`` may be called ``rgb`` or ``image``. Whole numbers of depth are millimetres unless ``depth_scale`` says otherwise,
-others metres. Every picture's size is known before it is decoded, and is the same in all of a camera.
+``color`` may be called ``rgb`` or ``image``. Whole numbers of depth are millimetres unless ``depth_scale`` says
+otherwise, others metres. Every picture's size is known before it is decoded, and is the same in all of a camera.
 """
 
 from __future__ import annotations
@@ -126,13 +122,11 @@ def _view(
     kept = list(range(count))[frames or slice(None)]
     if len(kept) < 2:
         raise refused("color", f"camera {number} has {len(kept)} frames; a motion needs 2 or more")
-    height, width = (film[0].shape[:2] if film is not None else _size(colour[0])[::-1])
+    height, width = film[0].shape[:2] if film is not None else _size(colour[0])[::-1]
     pose = np.eye(4) if calibration.poses is None else np.linalg.inv(calibration.poses[number])
     matrix = calibration.matrices[number]
     try:
-        camera = Camera(
-            width, height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], pose
-        )
+        camera = Camera(width, height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], pose)
     except ValueError as error:
         raise refused("cameras", f"camera {number}: {error}") from error
 
@@ -158,7 +152,9 @@ def _cameras_in(root: Path) -> list[list[Path]]:
     cameras = (
         [_frames_in(entry) for entry in folders]
         if folders
-        else [[film] for film in films] if films else [_frames_in(root)]
+        else [[film] for film in films]
+        if films
+        else [_frames_in(root)]
     )
     if len(cameras) > MOST_CAMERAS:
         raise refused(root.name, f"{len(cameras)} cameras, at most {MOST_CAMERAS} are read")
@@ -191,7 +187,9 @@ def _size(path: Path) -> tuple[int, int]:
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise refused(path.name, f"is no picture: {str(error)[:160]}") from error
     if min(size) < 16 or size[0] * size[1] > MOST_PIXELS:
-        raise refused(path.name, f"has {size[0]} x {size[1]} pixels; 16 a side to {MOST_PIXELS} in all are read")
+        raise refused(
+            path.name, f"has {size[0]} x {size[1]} pixels; 16 a side to {MOST_PIXELS} in all are read"
+        )
     return size
 
 
@@ -250,7 +248,9 @@ def _film(path: Path) -> list[Array]:
                 frames.append(frame.to_ndarray(format="rgb24"))
                 total += frames[-1].nbytes
                 if total > MOST_FILM_BYTES:
-                    raise refused(path.name, f"has more than {MOST_FILM_BYTES} bytes of frames; give pictures")
+                    raise refused(
+                        path.name, f"has more than {MOST_FILM_BYTES} bytes of frames; give pictures"
+                    )
     except (av.FFmpegError, OSError, IndexError, ValueError) as error:
         raise refused(path.name, f"is no film: {str(error)[:160]}") from error
     if not frames:
@@ -267,7 +267,8 @@ def _calibration(folder: Path, cameras: int) -> _Calibration:
         if (folder / name).is_file():
             return _open3d(_json(folder / name), name, cameras)
     raise refused(
-        folder.name, f"says nothing of its lens: neither cameras.json, metadata.json nor {', '.join(INTRINSICS)}"
+        folder.name,
+        f"says nothing of its lens: neither cameras.json, metadata.json nor {', '.join(INTRINSICS)}",
     )
 
 
@@ -318,8 +319,8 @@ def _phystwin(folder: Path, cameras: int) -> _Calibration:
 def _open3d(content: Any, name: str, cameras: int) -> _Calibration:
     if cameras != 1:
         raise refused(name, f"describes one camera, there are {cameras}")
-    matrix = _expect(name, lambda: np.array(content["intrinsic_matrix"], dtype=float).reshape(3, 3).T)
-    return _Calibration([_matrix(matrix, 3)], None, None, "Open3D")
+    matrix = _expect(name, lambda: _matrix(np.reshape(content["intrinsic_matrix"], (3, 3)).T, 3))
+    return _Calibration([matrix], None, None, "Open3D")
 
 
 def _matrix(values: Any, size: int) -> Array:
@@ -354,6 +355,7 @@ IMPORTER = FolderImporter(
     "rgbd",
     "folder of pictures with depth",
     (),
-    "one or several calibrated cameras, PhysTwin's or Open3D's layout; what is in a box is followed: by `physworld import` alone",
+    "one or several calibrated cameras, PhysTwin's or Open3D's layout; what is in a box is "
+    "followed: by `physworld import` alone",
     is_pictures,
 )

@@ -1,9 +1,9 @@
 """Import of a depth camera's pictures: a folder of colours and depth to a scene, on a CPU.
 
-What a person says: where the object is in the first picture (a box or a mask), what moves the gripper (a marker on it, a
-picked patch, its colour, or a robot's log) and what it holds. What is found: the ground and which way is up, the object's
-pixels, points on it and their tracks, the gripper's path, the cloud of the first frame, the noise. What was found or guessed
-stands in the scene's notes.
+What a person says: where the object is in the first picture (a box or a mask), what moves the gripper (a marker on
+it, a picked patch, its colour, or a robot's log) and what it holds. What is found: the ground and which way is up, the
+object's pixels, points on it and their tracks, the gripper's path, the cloud of the first frame, the noise. What
+was found or guessed stands in the scene's notes.
 """
 
 from __future__ import annotations
@@ -167,7 +167,9 @@ def _upright(
         axis = axis_along(np.mean(ups, axis=0)) if recording.placed else "-y"
         how = "guessed from how the cameras stand"
         if axis != "z":
-            warnings.append(f"up is guessed to be {axis} of the cameras' world, which is turned; --up names another")
+            warnings.append(
+                f"up is guessed to be {axis} of the cameras' world, which is turned; --up names another"
+            )
     turn = np.eye(4)
     turn[:3, :3] = ROTATION_FROM_UP[axis].T
     views = [_in_world(view, view.camera.world_to_camera @ turn) for view in recording.views]
@@ -204,7 +206,9 @@ def _mask(path: Path | None, camera: Camera) -> Array | None:
     try:
         with Image.open(path, formats=("PNG",)) as picture:
             if picture.size != (camera.width, camera.height):
-                raise refused(path.name, f"has {picture.size} pixels, the camera {camera.width, camera.height}")
+                raise refused(
+                    path.name, f"has {picture.size} pixels, the camera {camera.width, camera.height}"
+                )
             return np.asarray(picture.convert("L")) > 127
     except (OSError, ValueError, SyntaxError) as error:
         raise refused(path.name, f"is no mask: {str(error)[:160]}") from error
@@ -334,10 +338,14 @@ def _controllers(
         mask = followed.masks[0]
         held = cloud_of(view.camera, view.depth(0), window & mask if mask.size else window)[0]
         if len(held) < 4:
-            raise refused("held", f"the box around what is held has {len(held)} pixels of the object with depth")
+            raise refused(
+                "held", f"the box around what is held has {len(held)} pixels of the object with depth"
+            )
         region = np.stack([held.min(axis=0) - GRIP_MARGIN_M, held.max(axis=0) + GRIP_MARGIN_M])
     if region is not None:
-        corners = np.array([[region[i, 0], region[j, 1], region[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+        corners = np.array(
+            [[region[i, 0], region[j, 1], region[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+        )
         entry = {
             "controllers": list(range(8)),
             "region_min_m": region[0].tolist(),
@@ -352,4 +360,3 @@ def _controllers(
         f"what the gripper holds is not said: all within {radius:.3f} m of the points that were followed on it is taken"
     )
     return controllers, [{"controllers": list(range(len(controllers[0]))), "radius_m": radius}]
-

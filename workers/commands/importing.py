@@ -1,8 +1,8 @@
 """``python -m physworld_workers.commands.importing SOURCE --out SCENE``: a recording of any form to a scene.
 
 SOURCE is a file of motion capture or tracks, an archive, or a folder of pictures with depth, in which the object is
-followed (``--box``). What was found and guessed is printed; what a person knows better is an option. ``--picture`` draws
-the first frame with the object's pixels and points, and the last one, for a look before anything is fitted.
+followed (``--box``). What was found and guessed is printed; what a person knows better is an option. ``--picture``
+draws the first frame with the object's pixels and points, and the last one, for a look before anything is fitted.
 """
 
 from __future__ import annotations
@@ -36,20 +36,28 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--out", type=Path, required=True, help="folder for the scene")
     parser.add_argument("--name", default=None, help="of the scene")
     parser.add_argument("--kind", default=None, help="of the object: beam, block, rope, sheet, toy ...")
-    parser.add_argument("--fps", type=float, default=None, help="frames per second, where the source has none")
+    parser.add_argument(
+        "--fps", type=float, default=None, help="frames per second, where the source has none"
+    )
     parser.add_argument("--noise", type=float, default=None, help="tracking noise per axis [m]")
     parser.add_argument("--body", default=None, help="what is known of the body: keys of scene.json, as JSON")
-    parser.add_argument("--up", default=None, help="axis of the recording that points up: x, y, z, -x, -y, -z")
+    parser.add_argument(
+        "--up", default=None, help="axis of the recording that points up: x, y, z, -x, -y, -z"
+    )
     parser.add_argument("--unit", default=None, help="of a table's lengths: m, cm, mm, in")
     parser.add_argument("--controllers", default=None, help="labels of driven or clamped markers, by commas")
     parser.add_argument(
         "--box", action="append", default=[], help="around the object: [CAMERA:]LEFT,TOP,RIGHT,BOTTOM"
     )
-    parser.add_argument("--mask", action="append", default=[], help="instead: PNG, white on it: [CAMERA:]FILE")
+    parser.add_argument(
+        "--mask", action="append", default=[], help="instead: PNG, white on it: [CAMERA:]FILE"
+    )
     parser.add_argument("--marker", default=None, help="on the gripper: NUMBER[:DICTIONARY], or any")
     parser.add_argument("--patch", default=None, help="instead, of the gripper: LEFT,TOP,RIGHT,BOTTOM")
     parser.add_argument("--colour", default=None, help="instead, a pixel of its colour: COLUMN,ROW")
-    parser.add_argument("--log", type=Path, default=None, help="instead, the robot's log, CSV: t,x,y,z[,qw,qx,qy,qz]")
+    parser.add_argument(
+        "--log", type=Path, default=None, help="instead, the robot's log, CSV: t,x,y,z[,qw,qx,qy,qz]"
+    )
     parser.add_argument("--log-delay", type=float, default=0.0, help="pictures' clock behind the log's [s]")
     parser.add_argument("--held", default=None, help="box around what it holds: LEFT,TOP,RIGHT,BOTTOM")
     parser.add_argument("--held-m", default=None, help="instead, in the world [m]: X,Y,Z,X,Y,Z")
@@ -101,9 +109,7 @@ def _options(given: argparse.Namespace) -> ImportOptions:
     return ImportOptions(**{name: value for name, value in known.items() if value is not None})
 
 
-def _pictures(
-    given: argparse.Namespace, options: ImportOptions
-) -> tuple[Scene, list[str], Followed]:
+def _pictures(given: argparse.Namespace, options: ImportOptions) -> tuple[Scene, list[str], Followed]:
     from physworld_scenes.importers.rgbd import read_folder
     from physworld_workers.commands.terminal import progress_bar
 
@@ -200,13 +206,17 @@ def _draw(given: argparse.Namespace, followed: Followed) -> None:
     for frame in (0, view.frames - 1):
         colour = view.colour(frame).copy()
         if frame == 0 and followed.masks[0].size:
-            colour[followed.masks[0]] = colour[followed.masks[0]] // 2 + np.array([0, 60, 110], dtype=np.uint8)
+            colour[followed.masks[0]] = colour[followed.masks[0]] // 2 + np.array(
+                [0, 60, 110], dtype=np.uint8
+            )
         picture = Image.fromarray(colour)
         pen = ImageDraw.Draw(picture)
         for point in np.flatnonzero(followed.cameras == 0):
             x, y = followed.pixels[frame, point]
             if np.isfinite([x, y]).all():
-                pen.ellipse((x - 2, y - 2, x + 2, y + 2), fill="lime" if followed.visible[frame, point] else "red")
+                pen.ellipse(
+                    (x - 2, y - 2, x + 2, y + 2), fill="lime" if followed.visible[frame, point] else "red"
+                )
         pictures.append(np.asarray(picture))
     given.picture.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(np.hstack(pictures)).save(given.picture)

@@ -1,4 +1,5 @@
-"""``physworld import SOURCE --out SCENE``: a recording of any form to a scene, in this process as ``physworld fit`` does."""
+"""``physworld import SOURCE --out SCENE``: a recording of any form to a scene, in this process as ``physworld
+fit`` does."""
 
 from __future__ import annotations
 
@@ -13,7 +14,9 @@ MODULE = "physworld_workers.commands.importing"
 
 
 def import_recording(
-    source: Annotated[Path, typer.Argument(help="File of tracks or markers, archive, or folder of pictures.")],
+    source: Annotated[
+        Path, typer.Argument(help="File of tracks or markers, archive, or folder of pictures.")
+    ],
     out: Annotated[Path, typer.Option(help="Folder for the scene.")],
     name: Annotated[str | None, typer.Option(help="Of the scene.")] = None,
     kind: Annotated[str | None, typer.Option(help="Of the object: beam, rope, sheet, toy ...")] = None,
@@ -27,9 +30,7 @@ def import_recording(
         list[str] | None, typer.Option(help="Around the object: [CAMERA:]LEFT,TOP,RIGHT,BOTTOM.")
     ] = None,
     mask: Annotated[list[str] | None, typer.Option(help="Instead: PNG, white on it: [CAMERA:]FILE.")] = None,
-    marker: Annotated[
-        str | None, typer.Option(help="On the gripper: NUMBER[:DICTIONARY], or any.")
-    ] = None,
+    marker: Annotated[str | None, typer.Option(help="On the gripper: NUMBER[:DICTIONARY], or any.")] = None,
     patch: Annotated[str | None, typer.Option(help="Of the gripper: LEFT,TOP,RIGHT,BOTTOM.")] = None,
     colour: Annotated[str | None, typer.Option(help="A pixel of the gripper's colour: COLUMN,ROW.")] = None,
     log: Annotated[Path | None, typer.Option(help="The robot's log, CSV: t,x,y,z[,qw,qx,qy,qz].")] = None,
