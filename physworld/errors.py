@@ -17,6 +17,7 @@ PhysworldError
 ├── CalibrationError        no parameter gave a usable simulation
 ├── LawAnswerRefused        a model's answer names no law of the library, or not in the asked form
 ├── LawAnswerUnavailable    the model that was asked gave no answer
+├── TrackingFailed          pictures show too little of the object to follow it
 ├── Cancelled               the caller asked to stop
 ├── WorkerLost              a process that shares simulations ended
 └── TrainingDiverged        a loss or a weight is not finite
@@ -91,6 +92,10 @@ class LawAnswerRefused(PhysworldError):
 
 class LawAnswerUnavailable(PhysworldError):
     """The model that was asked gave no answer."""
+
+
+class TrackingFailed(PhysworldError):
+    """Pictures show too little of the object, or of its grips, to follow them."""
 
 
 class Cancelled(PhysworldError):

@@ -151,7 +151,7 @@ def read_arrays(data: bytes, limits: ArchiveLimits = DEFAULT_LIMITS) -> dict[str
         raise
     except DAMAGED as error:
         raise ArchiveRefused(f"the npz of {len(data)} bytes is damaged or truncated: {error}") from error
-    return {name.removesuffix(".npy"): _parse_array(name, content) for name, content in files.items()}
+    return {name.removesuffix(".npy"): parse_array(name, content) for name, content in files.items()}
 
 
 def write_arrays(arrays: dict[str, Array]) -> bytes:
@@ -378,8 +378,12 @@ def _check_total(total: int, packed: int, limits: ArchiveLimits, verb: str) -> N
         )
 
 
-def _parse_array(name: str, content: bytes) -> Array:
-    """One ``npy`` file; plain numbers only."""
+def parse_array(name: str, content: bytes) -> Array:
+    """The array in the content of an ``npy`` file called ``name``.
+
+    Raises:
+        ArchiveRefused: it holds something else than plain numbers, or not as many as it claims.
+    """
     stream = io.BytesIO(content)
     try:
         version = np.lib.format.read_magic(stream)

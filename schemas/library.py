@@ -78,7 +78,8 @@ class Metric(Resource):
 
 
 class Importer(Resource):
-    """A form of recording that ``POST /v1/scenes`` reads; the content decides, not the suffix."""
+    """A form of recording: ``POST /v1/scenes`` reads those with suffixes, and the content decides; ``physworld
+    import`` all."""
 
     name: str
     title: str

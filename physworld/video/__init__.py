@@ -1,6 +1,6 @@
 """Pictures of a motion: 3D Gaussians that vertices carry, rendered to frames and film, compared with given frames."""
 
-from physworld.video.camera import Camera, look_at, orbit_view
+from physworld.camera import Camera, look_at, orbit_view
 from physworld.video.film import FrameScores, compare_frames, encode_mp4, frames_per_second
 from physworld.video.gaussians import Gaussians, from_ply, gaussians_at_points, to_ply
 from physworld.video.moving import GaussianCarrier

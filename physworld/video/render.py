@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from physworld.arrays import Array
-from physworld.video.camera import Camera
+from physworld.camera import Camera
 from physworld.video.gaussians import SH_DC, Gaussians
 from physworld.video.render_kernels import TILE, blend
 

@@ -11,11 +11,11 @@ from physworld.scene import Scene
 from physworld_scenes.archives import is_tar, is_zip
 from physworld_scenes.bundle import bundle_from_bytes
 from physworld_scenes.errors import SceneInvalid
-from physworld_scenes.importers import c3d, phystwin
-from physworld_scenes.importers.options import Importer, ImportOptions
+from physworld_scenes.importers import c3d, phystwin, pictures
+from physworld_scenes.importers.options import FolderImporter, Importer, ImportOptions
 from physworld_schemas.base import FieldError
 
-__all__ = ["IMPORTERS", "ImportOptions", "Importer", "import_any"]
+__all__ = ["FOLDERS", "IMPORTERS", "FolderImporter", "ImportOptions", "Importer", "import_any"]
 
 BUNDLE = Importer(
     "bundle",
@@ -26,6 +26,8 @@ BUNDLE = Importer(
     lambda data, name, options: bundle_from_bytes(data),
 )
 IMPORTERS = (BUNDLE, c3d.IMPORTER, phystwin.IMPORTER)
+FOLDERS = (pictures.IMPORTER,)
+"""Forms that are folders: the command ``physworld import`` reads them, the service does not."""
 
 
 def import_any(

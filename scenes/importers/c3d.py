@@ -29,6 +29,7 @@ from physworld.scene import Scene
 from physworld_scenes.archives import ArchiveRefused, read_arrays
 from physworld_scenes.bundle import checked, scene_from_parts
 from physworld_scenes.errors import SceneInvalid
+from physworld_scenes.importers.axes import ROTATION_FROM_UP
 from physworld_scenes.importers.c3d_child import content_of
 from physworld_scenes.importers.options import Importer, ImportOptions, estimate_noise, split_of
 from physworld_schemas.base import FieldError
@@ -46,16 +47,6 @@ METRES_PER_UNIT = {
     "millimeters": 1e-3,
     "in": 0.0254,
 }
-
-ROTATION_FROM_UP = {
-    "z": np.eye(3),
-    "-z": np.diag([1.0, -1.0, -1.0]),
-    "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
-    "-y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
-    "x": np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]),
-    "-x": np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]),
-}
-"""Proper rotations that turn the named axis to +z."""
 
 C3D_MAGIC = 0x50
 BLOCK_BYTES = 512

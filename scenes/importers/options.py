@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,8 +32,9 @@ class ImportOptions:
         noise_sigma_m: tracking noise per axis [m]; None estimates it from third differences.
         gravity_m_s2: in the scene's frame, z up.
         body: keys of ``scene.json``'s ``body``.
-        controllers: C3D: labels of the driven or clamped markers.
-        up: C3D: the axis of the recording that points up, one of x, y, z, -x, -y, -z.
+        controllers: C3D and tables: labels of the driven or clamped markers.
+        up: the axis of the recording that points up, one of x, y, z, -x, -y, -z.
+        unit: tables: of lengths, one of m, cm, mm, in; None: as the file says, or guessed by its numbers.
     """
 
     name: str | None = None
@@ -43,6 +45,7 @@ class ImportOptions:
     body: dict[str, Any] = field(default_factory=dict)
     controllers: tuple[str, ...] | None = None
     up: str = "z"
+    unit: str | None = None
 
 
 @dataclass(frozen=True)
@@ -64,6 +67,24 @@ class Importer:
     help: str
     recognises: Callable[[bytes, str], bool]
     read: Callable[[bytes, str, ImportOptions | None], tuple[Scene, list[str]]]
+
+
+@dataclass(frozen=True)
+class FolderImporter:
+    """A form of recording that is a folder; the command ``physworld import`` reads it.
+
+    Attributes:
+        name, title: in the catalogue; a few words for people.
+        suffixes: what the folder holds.
+        help: what of it is read.
+        recognises: whether a folder is of this form.
+    """
+
+    name: str
+    title: str
+    suffixes: tuple[str, ...]
+    help: str
+    recognises: Callable[[Path], bool]
 
 
 def split_of(frames: int) -> dict[str, list[int]]:

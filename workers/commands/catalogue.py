@@ -63,7 +63,7 @@ def registered(package: str = OWN) -> Catalogue:
     from physworld.materials.library import ELASTIC_LAWS
     from physworld.materials.plastic import PLASTICITIES
     from physworld.twin.build import build_twin
-    from physworld_scenes.importers import IMPORTERS
+    from physworld_scenes.importers import FOLDERS, IMPORTERS
     from physworld_workers.commands.effects import everyday_scenes
 
     def own(thing: Any) -> bool:
@@ -77,7 +77,7 @@ def registered(package: str = OWN) -> Catalogue:
         materials=laws + flows,
         effects=[_effect(kind, twins) for kind in EFFECTS.values() if own(kind)],
         metrics=[_described(Metric, metric) for metric in metrics().values() if own(metric.per_frame)],
-        importers=[_described(Importer, importer) for importer in IMPORTERS if package == OWN],
+        importers=[_described(Importer, importer) for importer in (*IMPORTERS, *FOLDERS) if package == OWN],
     )
 
 

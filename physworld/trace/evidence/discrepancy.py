@@ -3,11 +3,11 @@
     r ~ N(0, I + kappa^2 K)        r: residual, whitened by noise, points' places and the solver's own error
 
 No twin of a real object is right to the last micrometre of a camera. What it leaves is smooth: in time on the scale
-of the motion, along the body on the scale of its length (Kennedy and O'Hagan 2001; Brynjarsdottir and O'Hagan 2014). K is
-the product of a Matern kernel of order 3/2 over time and a squared exponential over the points' places at rest, alike in
-x, y and z and independent from one block of frames to the next; its amplitude kappa [m] is estimated together with
-everything else by marginal likelihood under a prior that prefers zero (half a Cauchy of the noise's width). A recording
-that a twin meets has kappa near 0, and then r is white.
+of the motion, along the body on the scale of its length (Kennedy and O'Hagan 2001; Brynjarsdottir and O'Hagan 2014).
+K is the product of a Matern kernel of order 3/2 over time and a squared exponential over the points' places at rest,
+alike in x, y and z and independent from one block of frames to the next; its amplitude kappa [m] is estimated together
+with everything else by marginal likelihood under a prior that prefers zero (half a Cauchy of the noise's width). A
+recording that a twin meets has kappa near 0, and then r is white.
 
 Within a block K has few directions that matter (U, with factors s), so that every kappa costs a few products.
 """

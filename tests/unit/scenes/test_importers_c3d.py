@@ -11,7 +11,8 @@ import pytest
 
 from physworld_scenes.errors import SceneInvalid
 from physworld_scenes.importers import ImportOptions, c3d, import_any
-from physworld_scenes.importers.c3d import ROTATION_FROM_UP, fill_gaps
+from physworld_scenes.importers.axes import ROTATION_FROM_UP
+from physworld_scenes.importers.c3d import fill_gaps
 
 FRAMES = 30
 LABELS = ["tip1", "tip2", "tip3", "base1", "base2", "base3"]

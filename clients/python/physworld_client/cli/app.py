@@ -19,7 +19,7 @@ from pydantic import ValidationError
 import physworld_client.cli.actions
 import physworld_client.cli.loop
 import physworld_client.cli.registry  # noqa: F401  (adds commands to the groups)
-from physworld_client.cli import catalogue, effects, fit, lists, predict, run, trace, up, video
+from physworld_client.cli import catalogue, effects, fit, importing, lists, predict, run, trace, up, video
 from physworld_client.cli.options import connected
 from physworld_client.cli.output import stderr
 from physworld_client.errors import PhysWorldError
@@ -39,6 +39,7 @@ app.command("trace", cls=trace.ManyHeldOut)(trace.trace)
 connected(app, "rollout")(predict.rollout)
 connected(app, "plan")(predict.plan)
 app.command("video")(video.video)
+app.command("import")(importing.import_recording)
 app.command("catalogue")(catalogue.catalogue)
 app.add_typer(effects.effects, name="effects")
 for name, group in lists.GROUPS.items():

@@ -1,0 +1,48 @@
+"""``python -m benchmarks.tracking render NAME FOLDER [--cameras N]`` and ``... measure FOLDER... [--json FILE]``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from benchmarks.tracking.plays import FRAMES, PLAYS
+
+
+def main() -> None:
+    """Render a recording, or follow and score recordings."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.tracking", description=__doc__)
+    commands = parser.add_subparsers(dest="command", required=True)
+    render = commands.add_parser("render", help="write a recording of known truth")
+    render.add_argument("name", choices=sorted(PLAYS))
+    render.add_argument("folder", type=Path)
+    render.add_argument("--cameras", type=int, default=1, choices=(1, 2, 3))
+    render.add_argument("--frames", type=int, default=FRAMES)
+    render.add_argument("--seed", type=int, default=0)
+    measure = commands.add_parser("measure", help="follow and score recordings")
+    measure.add_argument("folders", type=Path, nargs="+")
+    measure.add_argument("--json", type=Path, default=None, help="write the figures to this file")
+    measure.add_argument("--scenes", type=Path, default=None, help="keep the scenes in this folder")
+    given = parser.parse_args()
+    if given.command == "render":
+        from benchmarks.tracking.render import write
+
+        write(given.name, given.folder, given.cameras, given.frames, given.seed)
+        return
+    from benchmarks.tracking.measure import scene_of, score, table
+    from physworld_scenes.bundle import write_bundle
+
+    figures = []
+    for folder in given.folders:
+        scene, seconds = scene_of(folder)
+        figures.append(score(folder, scene, seconds).figures)
+        print(json.dumps(figures[-1]), flush=True)
+        if given.scenes is not None:
+            write_bundle(scene, given.scenes / folder.name)
+    print(table(figures))
+    if given.json is not None:
+        given.json.write_text(json.dumps(figures, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,290 @@
+"""What the cameras look at: a beam, a rope and a cloth of known material, moved by engines that are not ours.
+
+The beam is MuJoCo's flex of ``scripts/make_sample_scene.py``, the rope the chain of
+``scripts/make_sample_rope.py``, the cloth MuJoCo's flex of ``benchmarks.peers.flex_cloths``. A gripper of boxes
+holds them, covers what it holds, and carries an ArUco marker; a stick goes by between object and camera in the
+second second.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import cv2
+import numpy as np
+
+from benchmarks.tracking.raycast import MARKER, PLAIN, Surface
+from physworld.arrays import Array
+from physworld.camera import Camera, look_at
+from scripts import make_sample_rope, make_sample_scene
+
+FPS, FRAMES = 30.0, 90
+MARKER_SIDE_M = 0.05
+"""Of the marker itself; the plate that it is printed on is a fifth wider on every side."""
+MARKER_ID = 7
+
+Pose = Callable[[float], tuple[Array, Array]]
+"""Time [s] to a rotation (3, 3) and a shift (3,) [m] about the gripper's middle."""
+
+
+@dataclass(frozen=True)
+class Play:
+    """A motion in front of cameras.
+
+    Attributes:
+        kind: of the scene.
+        surfaces: the object first.
+        vertices: of all of them, (T, V, 3) [m].
+        object_vertices: how many of them are the object's.
+        cameras: the first is the one that a recording with one camera has.
+        table_m: height of the table [m].
+        box_px: around the object in the first camera's first picture, left, top, right, bottom.
+        declared: what a person knows: keys of ``scene.json``.
+        truth: what nobody tells the tracker.
+        grip_poses: rotation and shift at every frame, (T, 3, 3) and (T, 3).
+        grip_centre: what the gripper turns about, at rest, (3,) [m].
+    """
+
+    kind: str
+    surfaces: list[Surface]
+    vertices: Array
+    object_vertices: int
+    cameras: list[Camera]
+    table_m: float
+    declared: dict[str, Any]
+    truth: dict[str, Any]
+    grip_poses: tuple[Array, Array]
+    grip_centre: Array
+    box_px: tuple[int, int, int, int] = field(default=(0, 0, 0, 0))
+
+    @property
+    def triangles(self) -> Array:
+        """Of the object, (F, 3)."""
+        return self.surfaces[0].triangles
+
+
+def marker_picture() -> Array:
+    """The plate with its marker, (n, n) uint8; the marker takes the middle 5/7."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    picture = cv2.aruco.generateImageMarker(dictionary, MARKER_ID, 120)
+    return cv2.copyMakeBorder(picture, 24, 24, 24, 24, cv2.BORDER_CONSTANT, value=255)
+
+
+def beam(frames: int = FRAMES) -> Play:
+    """A soft beam that a gripper holds at one end, lifts, swings aside and turns."""
+    recipe = make_sample_scene.Recipe()
+    mesh = make_sample_scene.build_mesh(recipe)
+    positions, _ = make_sample_scene.simulate(recipe, mesh, frames)
+    triangles = boundary(mesh.tetrahedra)
+    low, size = np.array(recipe.corner_m), recipe.size_m
+    centre = low + 0.5 * np.array([recipe.grip_m, size[1], size[2]])
+    jaws = [
+        box([-0.015, -0.026, 0.52], [0.03, 0.026, 0.535]),
+        box([-0.015, -0.026, 0.465], [0.03, 0.026, 0.48]),
+        box([-0.09, -0.02, 0.47], [-0.015, 0.02, 0.53]),
+    ]
+    plate = plate_at([-0.052, -0.024, 0.5])
+    declared = {
+        "body": {
+            "box_min_m": low.tolist(),
+            "box_max_m": (low + size).tolist(),
+            "size_m": size.tolist(),
+            "density_kg_m3": recipe.density_kg_m3,
+        },
+        "grip": {
+            "region_min_m": low.tolist(),
+            "region_max_m": (low + np.array((recipe.grip_m, size[1], size[2]))).tolist(),
+        },
+    }
+    truth = {
+        "youngs_modulus_pa": recipe.young_pa,
+        "converged_modulus_pa": 2.85e5,
+        "note": "the coarse mesh bends as a converged one of 2.85e5 Pa",
+    }
+    return _play(
+        "beam", Surface(triangles, mesh.vertices), positions, jaws, plate, make_sample_scene.grip_pose,
+        centre, declared, truth, target=(0.1, 0.0, 0.5), distance=0.62, table_m=0.25,
+    )  # fmt: skip
+
+
+def rope(frames: int = FRAMES) -> Play:
+    """A rope that hangs from a gripper, swayed and lifted."""
+    recipe = replace(make_sample_rope.Recipe(), radius_m=0.006)
+    path = make_sample_rope.simulate(recipe, frames)
+    around = 12
+    tube = np.stack([tube_around(line, recipe.radius_m, around) for line in path])
+    triangles = tube_triangles(recipe.masses, around)
+    top = np.array([0.0, 0.0, recipe.top_m])
+    jaws = [
+        box([-0.02, -0.014, recipe.top_m - 0.02], [-0.006, 0.014, recipe.top_m + 0.02]),
+        box([0.006, -0.014, recipe.top_m - 0.02], [0.02, 0.014, recipe.top_m + 0.02]),
+    ]
+    plate = plate_at([0.06, -0.016, recipe.top_m + 0.01])
+    declared = {
+        "body": {"length_m": recipe.length_m, "radius_m": recipe.radius_m},
+        "grip": {
+            "region_min_m": [-0.01, -0.01, recipe.top_m - 0.0201],
+            "region_max_m": [0.01, 0.01, recipe.top_m + 0.01],
+        },
+    }
+    truth = {"stretching_n": recipe.stretching_n, "bending_n_m2": recipe.bending_n_m2}
+
+    def pose(t: float) -> tuple[Array, Array]:
+        return np.eye(3), make_sample_rope.gripped(recipe, t)
+
+    return _play(
+        "rope", Surface(triangles, tube[0], grain_m=0.004), tube, jaws, plate, pose, top, declared, truth,
+        target=(0.0, 0.0, 0.78), distance=1.05, table_m=0.2,
+    )  # fmt: skip
+
+
+def cloth(frames: int = FRAMES) -> Play:
+    """A cloth that hangs from a bar along its upper edge and is swung to and from the camera."""
+    from benchmarks.peers.finite_elements import Acting
+    from benchmarks.peers.flex_cloths import Mesh
+
+    width, height, thickness, density, young = 0.25, 0.27, 0.0045, 370.0, 2e5
+    mesh = Mesh((width, height), (20, 18), young_pa=young, thickness_m=thickness, density_kg_m3=density,
+                steps_per_frame=460)  # fmt: skip
+    rest = mesh.vertices()
+    held = np.flatnonzero(rest[:, 2] >= rest[:, 2].max() - 1e-6)
+    centre = rest[held].mean(axis=0)
+
+    def pose(t: float) -> tuple[Array, Array]:
+        gain = 1.0 - np.exp(-((t / 0.4) ** 2))
+        shift = gain * np.array([0.04 * np.sin(2.3 * t), 0.05 * np.sin(4.0 * t), 0.02 * np.sin(3.1 * t)])
+        angle = gain * 0.3 * np.sin(2.0 * t)
+        turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
+        return turn, shift
+
+    positions = mesh.record(
+        Acting(), [(held, pose)], (rest[:, [0, 2]] - rest[:, [0, 2]].min(axis=0)) / [width, height],
+        np.arange(frames) / FPS,
+    )  # fmt: skip
+    low, high = rest.min(axis=0), rest.max(axis=0)
+    top = float(high[2])
+    jaws = [
+        box([low[0] - 0.01, centre[1] - 0.012, top - 0.008], [high[0] + 0.01, centre[1] + 0.012, top + 0.01])
+    ]
+    plate = plate_at([centre[0], centre[1] - 0.014, top + 0.045])
+    declared = {
+        "body": {
+            "size_m": [width, thickness, height],
+            "thickness_m": thickness,
+            "density_kg_m3": density,
+        },
+        "grip": {
+            "region_min_m": [low[0] - 1e-3, centre[1] - 1e-2, top - 1e-3],
+            "region_max_m": [high[0] + 1e-3, centre[1] + 1e-2, top + 1e-3],
+        },
+    }
+    return _play(
+        "sheet", Surface(mesh.triangles(), rest), positions, jaws, plate, pose, centre, declared,
+        {"youngs_modulus_pa": young}, target=(centre[0], centre[1], top - 0.13), distance=0.62, table_m=top - 0.45,
+    )  # fmt: skip
+
+
+PLAYS = {"beam": beam, "rope": rope, "cloth": cloth}
+
+
+def _play(
+    kind: str,
+    surface: Surface,
+    positions: Array,
+    jaws: list[tuple[Array, Array]],
+    plate: tuple[Array, Array, Array],
+    pose: Pose,
+    centre: Array,
+    declared: dict[str, Any],
+    truth: dict[str, Any],
+    target: tuple[float, float, float],
+    distance: float,
+    table_m: float,
+) -> Play:
+    frames = len(positions)
+    turns, shifts = (np.stack(part) for part in zip(*(pose(t / FPS) for t in range(frames)), strict=True))
+    surfaces, parts = [surface], [positions]
+    for corners, triangles in jaws:
+        surfaces.append(Surface(triangles, corners, PLAIN, (0.25, 0.27, 0.3)))
+        parts.append(np.einsum("tij,vj->tvi", turns, corners - centre) + centre + shifts[:, None])
+    corners, triangles, uv = plate
+    surfaces.append(Surface(triangles, uv, MARKER, (1.0, 1.0, 1.0)))
+    parts.append(np.einsum("tij,vj->tvi", turns, corners - centre) + centre + shifts[:, None])
+    eyes = [around(np.array(target), distance, azimuth, 24.0) for azimuth in (-90.0, -35.0, -145.0)]
+    cameras = [look_at(eye, np.array(target), field_of_view_deg=43.0) for eye in eyes]
+    stick, triangles = box([-0.008, -0.008, -0.4], [0.008, 0.008, 0.4])
+    share = np.clip((np.arange(frames) / FPS - 0.9) / 1.0, 0.0, 1.0)
+    way = np.array(target) + [-0.45, -0.25, 0.0] + share[:, None] * [0.9, 0.0, 0.0]
+    surfaces.append(Surface(triangles, stick, PLAIN, (0.15, 0.3, 0.5)))
+    parts.append(stick + way[:, None])
+    pixels, _ = cameras[0].project(positions[0])
+    low, high = np.floor(pixels.min(axis=0)).astype(int) - 6, np.ceil(pixels.max(axis=0)).astype(int) + 6
+    return Play(
+        kind,
+        surfaces,
+        np.concatenate(parts, axis=1),
+        positions.shape[1],
+        cameras,
+        table_m,
+        declared,
+        truth,
+        (turns, shifts),
+        centre,
+        (int(low[0]), int(low[1]), int(high[0]), int(high[1])),
+    )
+
+
+def around(target: Array, distance: float, azimuth_deg: float, elevation_deg: float) -> Array:
+    """A place (3,) [m] so far from the target, in that direction."""
+    a, e = np.radians([azimuth_deg, elevation_deg])
+    return target + distance * np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
+
+
+def boundary(tetrahedra: Array) -> Array:
+    """Triangles (F, 3) that belong to one tetrahedron alone."""
+    faces = np.concatenate([tetrahedra[:, list(f)] for f in ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3))])
+    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    return faces[first[count == 1]]
+
+
+def box(low: Any, high: Any) -> tuple[Array, Array]:
+    """Corners (8, 3) and triangles (12, 3) of a box."""
+    import trimesh
+
+    shape = trimesh.creation.box(bounds=[low, high])
+    return np.asarray(shape.vertices), np.asarray(shape.faces)
+
+
+def plate_at(middle: Any) -> tuple[Array, Array, Array]:
+    """Corners (4, 3), triangles (2, 3) and picture coordinates (4, 3) of a plate that looks along -y."""
+    half = 0.5 * MARKER_SIDE_M * 7.0 / 5.0
+    uv = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
+    offset = np.stack([uv[:, 0] - 0.5, np.zeros(4), 0.5 - uv[:, 1]], axis=1) * 2.0 * half
+    return np.asarray(middle) + offset, np.array([[0, 2, 1], [0, 3, 2]]), uv
+
+
+def tube_around(line: Array, radius_m: float, around: int) -> Array:
+    """Vertices (n * around, 3) of a tube along a line (n, 3), its section carried on without twist."""
+    tangent = np.gradient(line, axis=0)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    first = np.cross(tangent[0], [0.0, 1.0, 0.0])
+    normals = [first / np.linalg.norm(first)]
+    for now in tangent[1:]:
+        carried = normals[-1] - (normals[-1] @ now) * now
+        normals.append(carried / np.linalg.norm(carried))
+    normal = np.stack(normals)
+    side = np.cross(tangent, normal)
+    angle = 2.0 * np.pi * np.arange(around) / around
+    ring = np.cos(angle)[None, :, None] * normal[:, None] + np.sin(angle)[None, :, None] * side[:, None]
+    return (line[:, None] + radius_m * ring).reshape(-1, 3)
+
+
+def tube_triangles(rings: int, around: int) -> Array:
+    """Triangles of ``tube_around``, open at the ends, (F, 3)."""
+    i, j = np.meshgrid(np.arange(rings - 1), np.arange(around), indexing="ij")
+    a, b = i * around + j, i * around + (j + 1) % around
+    return np.concatenate(
+        [np.stack([a, b, b + around], axis=-1), np.stack([a, b + around, a + around], axis=-1)]
+    ).reshape(-1, 3)

@@ -1,0 +1,73 @@
+"""``physworld import SOURCE --out SCENE``: a recording of any form to a scene, in this process as ``physworld
+fit`` does."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from physworld_client.cli.fit import become
+
+MODULE = "physworld_workers.commands.importing"
+
+
+def import_recording(
+    source: Annotated[
+        Path, typer.Argument(help="File of tracks or markers, archive, or folder of pictures.")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for the scene.")],
+    name: Annotated[str | None, typer.Option(help="Of the scene.")] = None,
+    kind: Annotated[str | None, typer.Option(help="Of the object: beam, rope, sheet, toy ...")] = None,
+    fps: Annotated[float | None, typer.Option(help="Frames per second, where the source has none.")] = None,
+    noise: Annotated[float | None, typer.Option(help="Tracking noise per axis [m].")] = None,
+    body: Annotated[str | None, typer.Option(help="What is known of the body, JSON.")] = None,
+    up: Annotated[str | None, typer.Option(help="Axis that points up: x, y, z, -x, -y, -z.")] = None,
+    unit: Annotated[str | None, typer.Option(help="Of a table's lengths: m, cm, mm, in.")] = None,
+    controllers: Annotated[str | None, typer.Option(help="Labels of driven markers, by commas.")] = None,
+    box: Annotated[
+        list[str] | None, typer.Option(help="Around the object: [CAMERA:]LEFT,TOP,RIGHT,BOTTOM.")
+    ] = None,
+    mask: Annotated[list[str] | None, typer.Option(help="Instead: PNG, white on it: [CAMERA:]FILE.")] = None,
+    marker: Annotated[str | None, typer.Option(help="On the gripper: NUMBER[:DICTIONARY], or any.")] = None,
+    patch: Annotated[str | None, typer.Option(help="Of the gripper: LEFT,TOP,RIGHT,BOTTOM.")] = None,
+    colour: Annotated[str | None, typer.Option(help="A pixel of the gripper's colour: COLUMN,ROW.")] = None,
+    log: Annotated[Path | None, typer.Option(help="The robot's log, CSV: t,x,y,z[,qw,qx,qy,qz].")] = None,
+    log_delay: Annotated[float | None, typer.Option(help="Pictures' clock behind the log's [s].")] = None,
+    held: Annotated[str | None, typer.Option(help="Box around what is held: LEFT,TOP,RIGHT,BOTTOM.")] = None,
+    held_m: Annotated[str | None, typer.Option(help="Instead, in the world [m]: X,Y,Z,X,Y,Z.")] = None,
+    depth_scale: Annotated[float | None, typer.Option(help="Depth values a metre.")] = None,
+    frames: Annotated[str | None, typer.Option(help="FIRST:LAST of the pictures.")] = None,
+    points: Annotated[int | None, typer.Option(min=8, help="To follow in each camera.")] = None,
+    undeformed: Annotated[
+        bool, typer.Option("--undeformed", help="The first frame is undeformed and at rest.")
+    ] = False,
+    picture: Annotated[Path | None, typer.Option(help="PNG of what was followed.")] = None,
+) -> None:
+    """Make a scene of a recording; needs no service."""
+    given = {
+        "--out": out,
+        "--name": name,
+        "--kind": kind,
+        "--fps": fps,
+        "--noise": noise,
+        "--body": body,
+        "--up": up,
+        "--unit": unit,
+        "--controllers": controllers,
+        "--marker": marker,
+        "--patch": patch,
+        "--colour": colour,
+        "--log": log,
+        "--log-delay": log_delay,
+        "--held": held,
+        "--held-m": held_m,
+        "--depth-scale": depth_scale,
+        "--frames": frames,
+        "--points": points,
+        "--picture": picture,
+    }
+    options = [f"{option}={value}" for option, value in given.items() if value is not None]
+    options += [f"--box={value}" for value in box or []] + [f"--mask={value}" for value in mask or []]
+    become(MODULE, [*options, *(["--undeformed"] if undeformed else []), "--", str(source)])
