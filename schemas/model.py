@@ -5,9 +5,10 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import Field
+from pydantic import Field, computed_field
 
 from physworld_schemas.base import Artifact, Lineage, Request, Resource, Seed
+from physworld_schemas.quality import Quality, quality_of
 
 Format = Literal["torch_export", "onnx"]
 FORMATS: tuple[Format, ...] = get_args(Format)
@@ -52,7 +53,10 @@ class TrainingCreate(Request):
 
 
 class ModelVersion(Resource):
-    """A published version; immutable once ready. ``sha256`` is the digest of its manifest."""
+    """A published version; immutable once ready. ``sha256`` is the digest of its manifest.
+
+    ``quality``: the verdict of the gate; a version that failed it stays ready and is never ``latest``.
+    """
 
     name: str
     version: int
@@ -73,13 +77,24 @@ class ModelVersion(Resource):
     lineage: Lineage = Field(default_factory=Lineage)
     artifacts: list[Artifact] = Field(default_factory=list)
 
+    @computed_field  # type: ignore[prop-decorator]  # pydantic's own advice
+    @property
+    def quality(self) -> Quality:
+        """The verdict of the gate, from the metrics."""
+        return quality_of(self.metrics)
+
 
 class Model(Resource):
-    """A registered name with its newest version and aliases."""
+    """A registered name with its aliases.
+
+    ``latest_version``: the newest number, whatever became of it; ``latest``: what that word stands for, the newest
+    version that is ready and did not fail the quality gate.
+    """
 
     name: str
     created_at: datetime
     latest_version: int | None = None
+    latest: int | None = None
     aliases: dict[str, int] = Field(default_factory=dict)
 
 
