@@ -21,8 +21,9 @@ class TrainingConfig(Request):
     The defaults are meant for some minutes on one core. ``patience``: validations without a better one after which
     the training ends (0: never). ``start_share`` below 1: the training may begin once that share of the dataset's
     episodes is committed, and takes the others in as it goes (``physworld.worldmodel.training``). ``prior``: what the
-    network corrects; ``none``: it stands alone. ``near_edges``: ``current`` finds the neighbours anew at every step, so
-    that parts of the object that meet see each other.
+    network corrects; ``none``: it stands alone. ``frame``: the axes of a step, ``world``, ``grip`` (the grip's frame,
+    where the scene has one) or ``auto``: what errs less on episodes that are not learned from. ``near_edges``:
+    ``current`` finds the neighbours anew at every step, so that parts of the object that meet see each other.
     """
 
     hidden: int = Field(default=64, ge=8, le=1024)
@@ -34,6 +35,7 @@ class TrainingConfig(Request):
     batch_size: int = Field(default=6, ge=1, le=256)
     learning_rate: float = Field(default=1e-3, gt=0, le=1)
     prior: Literal["auto", "modal", "chain", "none"] = "auto"
+    frame: Literal["auto", "world", "grip"] = "auto"
     near_edges: Literal["material", "current"] = "material"
     patience: int = Field(default=8, ge=0, le=1000)
     start_share: float = Field(default=1.0, gt=0, le=1)
