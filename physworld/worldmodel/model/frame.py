@@ -3,25 +3,26 @@
     y^s = Rᵀ (x^s - c̄^{t+1} - ½ g ((s - t) dt)²)        s = t-h … t+1, one R for the whole step
     R   = polar(A + cof A / |A|),   A = Σ_k (c_k^{t+1} - c̄^{t+1}) shape_kᵀ / Σ_k |shape_k|²
 
-A step in world axes has to learn what each turn of the grips does to the body, and a turn that no demonstration showed
-is extrapolated. R is fixed during a step, so that y is an inertial frame: nothing of the mechanics changes in it, no
-centrifugal force has to be learned, and a turned body looks as the unturned one does. What does change is the direction
-of gravity. It would be an input of its own; but a frame that falls freely has none (the principle of equivalence):
-there the grips accelerate against it, and their path already is an input of prior and network. So nothing of theirs changes,
-neither a tensor nor an equation: the step is ŷ = step(y), and x^{t+1} = R ŷ^{t+1} + c̄^{t+1} + ½ g dt².
+A step in world axes has to learn what each turn of the grips does to the body, and a turn that no demonstration
+showed is extrapolated. R is fixed during a step, so that y is an inertial frame: nothing of the mechanics changes
+in it, no centrifugal force has to be learned, and a turned body looks as the unturned one does. What does change is
+the direction of gravity. It would be an input of its own; but a frame that falls freely has none (the principle of
+equivalence): there the grips accelerate against it, and their path already is an input of prior and network. So
+nothing of theirs changes, neither a tensor nor an equation: the step is ŷ = step(y), and x^{t+1} = R ŷ^{t+1} +
+c̄^{t+1} + ½ g dt².
 
-``shape``: control vertices around their mean, as the episodes start. cof A, the matrix of cofactors, stands in for the
-third direction of points in a plane. The polar factor is found by Newton's iteration with Higham's scaling (SIAM J.
-Sci. Stat. Comput. 7, 1986), the same ``NEWTON`` rounds in every form of the step but the client's, which takes a singular
-value decomposition. Where the points lie on a line along u, no turn about it shows; R is then the least turn that takes
-u to d = A u / |A u|, with k = u × d and [k] its matrix of the cross product:
+``shape``: control vertices around their mean, as the episodes start. cof A, the matrix of cofactors, stands in for
+the third direction of points in a plane. The polar factor is found by Newton's iteration with Higham's scaling
+(SIAM J. Sci. Stat. Comput. 7, 1986), the same ``NEWTON`` rounds in every form of the step but the client's, which
+takes a singular value decomposition. Where the points lie on a line along u, no turn about it shows; R is then the
+least turn that takes u to d = A u / |A u|, with k = u × d and [k] its matrix of the cross product:
 
     R   = I + [k] + [k]² / (1 + u · d)
 
 Scenes with a ground have no such frame: what a body touches does not turn with its grips.
 
-Tensors: graph.frame_shape (C, 3) [m], graph.frame_fall (3,): ½ g dt² [m], graph.frame_line (3,): u, 0 for points in a
-plane or in space.
+Tensors: graph.frame_shape (C, 3) [m], graph.frame_fall (3,): ½ g dt² [m], graph.frame_line (3,): u, 0 for points in
+a plane or in space.
 """
 
 from __future__ import annotations
