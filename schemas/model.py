@@ -5,9 +5,10 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import Field
+from pydantic import Field, computed_field
 
 from physworld_schemas.base import Artifact, Lineage, Request, Resource, Seed
+from physworld_schemas.quality import Quality, quality_of
 
 Format = Literal["torch_export", "onnx"]
 FORMATS: tuple[Format, ...] = get_args(Format)
@@ -20,8 +21,9 @@ class TrainingConfig(Request):
     The defaults are meant for some minutes on one core. ``patience``: validations without a better one after which
     the training ends (0: never). ``start_share`` below 1: the training may begin once that share of the dataset's
     episodes is committed, and takes the others in as it goes (``physworld.worldmodel.training``). ``prior``: what the
-    network corrects; ``none``: it stands alone. ``near_edges``: ``current`` finds the neighbours anew at every step, so
-    that parts of the object that meet see each other.
+    network corrects; ``none``: it stands alone. ``frame``: the axes of a step, ``world``, ``grip`` (the grip's frame,
+    where the scene has one) or ``auto``: what errs less on episodes that are not learned from. ``near_edges``:
+    ``current`` finds the neighbours anew at every step, so that parts of the object that meet see each other.
     """
 
     hidden: int = Field(default=64, ge=8, le=1024)
@@ -33,6 +35,7 @@ class TrainingConfig(Request):
     batch_size: int = Field(default=6, ge=1, le=256)
     learning_rate: float = Field(default=1e-3, gt=0, le=1)
     prior: Literal["auto", "modal", "chain", "none"] = "auto"
+    frame: Literal["auto", "world", "grip"] = "auto"
     near_edges: Literal["material", "current"] = "material"
     patience: int = Field(default=8, ge=0, le=1000)
     start_share: float = Field(default=1.0, gt=0, le=1)
@@ -52,7 +55,10 @@ class TrainingCreate(Request):
 
 
 class ModelVersion(Resource):
-    """A published version; immutable once ready. ``sha256`` is the digest of its manifest."""
+    """A published version; immutable once ready. ``sha256`` is the digest of its manifest.
+
+    ``quality``: the verdict of the gate; a version that failed it stays ready and is never ``latest``.
+    """
 
     name: str
     version: int
@@ -73,13 +79,24 @@ class ModelVersion(Resource):
     lineage: Lineage = Field(default_factory=Lineage)
     artifacts: list[Artifact] = Field(default_factory=list)
 
+    @computed_field  # type: ignore[prop-decorator]  # pydantic's own advice
+    @property
+    def quality(self) -> Quality:
+        """The verdict of the gate, from the metrics."""
+        return quality_of(self.metrics)
+
 
 class Model(Resource):
-    """A registered name with its newest version and aliases."""
+    """A registered name with its aliases.
+
+    ``latest_version``: the newest number, whatever became of it; ``latest``: what that word stands for, the newest
+    version that is ready and did not fail the quality gate.
+    """
 
     name: str
     created_at: datetime
     latest_version: int | None = None
+    latest: int | None = None
     aliases: dict[str, int] = Field(default_factory=dict)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from sqlalchemy import func, select
+from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from physworld_schemas.base import Artifact, Lineage, Page
@@ -134,7 +134,7 @@ def list_models(session: Session, *, limit: int = 50, cursor: str | None = None)
 
 
 def get_version(session: Session, name: str, version: int | str) -> ModelVersion:
-    """A version by number, alias or ``latest`` (the newest that is ready)."""
+    """A version by number, alias or ``latest``: the newest that is ready and did not fail the quality gate."""
     row = version_row(session, name, resolve(session, name, version))
     return _version(row, _aliases_of(session, name, row.version))
 
@@ -158,7 +158,10 @@ def list_versions(
 
 
 def resolve(session: Session, name: str, version: int | str) -> int:
-    """The number behind a number, an alias or ``latest``. Raises NotFound."""
+    """The number behind a number, an alias or ``latest``.
+
+    Raises NotFound, or Conflict where there are ready versions and all of them failed the quality gate.
+    """
     if isinstance(version, int):
         return version
     if version.isdecimal():
@@ -167,13 +170,15 @@ def resolve(session: Session, name: str, version: int | str) -> int:
         return int(version)
     _model_row(session, name)
     if version == LATEST:
-        newest = session.scalar(
-            select(func.max(ModelVersionRow.version)).where(
-                ModelVersionRow.name == name, ModelVersionRow.state == "ready"
-            )
-        )
-        if newest is None:
+        newest, refused = _latest(session, name)
+        if newest is None and refused is None:
             raise NotFound("ready version of model", name)
+        if newest is None:
+            assert refused is not None
+            raise Conflict(
+                f"no version of {name} passed the quality gate, so none is {LATEST}; version {refused.version}, the "
+                f"newest that is ready, can be had by its number: {'; '.join(refused.quality.reasons)}"
+            )
         return newest
     alias = session.get(AliasRow, (name, version))
     if alias is None:
@@ -272,6 +277,22 @@ def version_row(session: Session, name: str, version: int) -> ModelVersionRow:
     return row
 
 
+def _latest(session: Session, name: str) -> tuple[int | None, ModelVersion | None]:
+    """What ``latest`` stands for, None without one; and the newest ready version that failed the gate on the way."""
+    statement = (
+        select(ModelVersionRow)
+        .where(ModelVersionRow.name == name, ModelVersionRow.state == "ready")
+        .order_by(ModelVersionRow.version.desc())
+    )
+    refused: ModelVersion | None = None
+    for row in session.scalars(statement.execution_options(yield_per=1)):
+        version = _version(row, [])
+        if version.quality.verdict != "failed":
+            return row.version, refused
+        refused = refused or version
+    return None, refused
+
+
 def _aliases_of(session: Session, name: str, version: int) -> list[str]:
     statement = select(AliasRow.alias).where(AliasRow.name == name, AliasRow.version == version)
     return list(session.scalars(statement.order_by(AliasRow.alias)))
@@ -283,6 +304,7 @@ def _model(session: Session, row: ModelRow) -> Model:
         name=row.name,
         created_at=row.created_at,
         latest_version=row.last_version or None,
+        latest=_latest(session, row.name)[0],
         aliases={alias.alias: alias.version for alias in aliases},
     )
 

@@ -19,6 +19,7 @@ from torch import Tensor
 from physworld.arrays import Array
 from physworld.worldmodel.errors import DatasetUnusable
 from physworld.worldmodel.model.features import Normalisation, cut_rest_length, cut_strain
+from physworld.worldmodel.model.frame import turn_of
 from physworld.worldmodel.model.graph import EDGE_KINDS, NEAR, GraphSpec
 from physworld.worldmodel.model.nearest import near_ends
 from physworld.worldmodel.model.properties import EPISODE_FIELDS, PROPERTIES, PhiColumn
@@ -130,6 +131,7 @@ def measure_scales(
     squares: dict[str, float] = {}
     for track in tracks:
         x = track.positions
+        turns = None if spec.frame is None else turn_of(spec.frame, x[:, n:].transpose(0, 1))[0]
         _add(squares, "velocity", x[1:, :n] - x[:-1, :n])
         _add(squares, "change", residual(track))
         for kind in range(EDGE_KINDS):
@@ -140,9 +142,10 @@ def measure_scales(
             taken = (spec.neighbours < spec.vertex_count) & (spec.edge_kind == kind)
             rest = torch.as_tensor(spec.rest_relative[taken], dtype=torch.float32)
             relative = x[:, spec.neighbours[taken]] - x[:, np.nonzero(taken)[0]]
+            turned = relative if turns is None else relative @ turns
             stretch = torch.linalg.vector_norm(relative, dim=-1) - torch.linalg.vector_norm(rest, dim=-1)
             _add(squares, f"relative{kind}", relative[1:] - relative[:-1])
-            _add(squares, f"strain{kind}", relative - rest)
+            _add(squares, f"strain{kind}", turned - rest)
             _add(squares, f"stretch{kind}", stretch)
     scales = {name: max((total / len(tracks)) ** 0.5, SCALE_FLOOR_M) for name, total in squares.items()}
     spread = torch.stack([track.phi for track in tracks]).square().mean(dim=(0, 1)).sqrt()

@@ -32,6 +32,7 @@ from torch import Tensor, nn
 
 from physworld.arrays import Array
 from physworld.worldmodel.model.features import edge_features, vertex_features
+from physworld.worldmodel.model.frame import enter, leave
 from physworld.worldmodel.model.graph import EDGE_KINDS, NEAR, GraphSpec
 from physworld.worldmodel.model.model import EdgeWeights, WorldModel
 from physworld.worldmodel.model.nearest import near_ends
@@ -55,6 +56,7 @@ class StepProgram(nn.Module):
         self.receive, self.send, self.edge = model.receive, model.send, model.edge
         self.update_in, self.update_out, self.skip = model.update_in, model.update_out, model.skip
         self.norm, self.prior = model.norm, model.prior
+        self.frame = spec.frame
         self.radius = spec.edge_radius_m if spec.current_neighbours else None
 
     def forward(
@@ -68,7 +70,11 @@ class StepProgram(nn.Module):
         rest_relative: Tensor,
     ) -> Tensor:
         """Positions (V, 3) at t + 1."""
-        n, count = self.objects, self.vertices
+        n, count, frame = self.objects, self.vertices, self.frame
+        moved_to = control_next
+        if frame is not None:
+            turn, local, ahead_of = enter(frame, window[:, :, None], control_next[:, None], n)
+            window, control_next = local[:, :, 0], ahead_of[:, 0]
         prior = self.prior(window[:, :, None], control_next[:, None], phi[:, None])[:, 0]
         ahead = torch.cat([prior, control_next])
         moves = (window[1:] - window[:-1]).flip(0)
@@ -93,7 +99,10 @@ class StepProgram(nn.Module):
             inner = self.update_in[layer](torch.cat([state, *means.unbind(0)], dim=-1))
             state = state + self.update_out[layer](torch.relu(inner))
         correction = self.decoder(state[:n]) + self.skip(features[:n])
-        return torch.cat([prior + self.norm.change * correction, control_next])
+        moved = prior + self.norm.change * correction
+        if frame is not None:
+            moved = leave(frame, turn, moved[:, None])[:, 0]
+        return torch.cat([moved, moved_to])
 
 
 def edge_list(spec: GraphSpec, places: Array | None = None) -> dict[str, Array]:

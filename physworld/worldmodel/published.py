@@ -34,6 +34,7 @@ import torch
 from physworld.arrays import Array
 from physworld.worldmodel.errors import VersionUnreadable, WorldModelError
 from physworld.worldmodel.model.config import WorldModelConfig
+from physworld.worldmodel.model.frame import GripFrame
 from physworld.worldmodel.model.graph import EDGE_KINDS, GraphSpec
 from physworld.worldmodel.model.inertia import InertialPrior
 from physworld.worldmodel.model.model import WorldModel
@@ -141,12 +142,18 @@ class PublishedModel:
             "skin.weight": self.skin.weight,
         }
         whole = {
-            _table_name(spec.current_neighbours): spec.neighbours,
+            _table_name(spec.current_neighbours, spec.frame is not None): spec.neighbours,
             "graph.edge_kind": spec.edge_kind,
             "particle.index": spec.particle_index,
             "control.index": spec.control_index,
             "skin.index": self.skin.index,
         }
+        if spec.frame is not None:
+            single |= {
+                "graph.frame_shape": spec.frame.shape,
+                "graph.frame_fall": spec.frame.fall,
+                "graph.frame_line": spec.frame.line,
+            }
         if spec.current_neighbours:
             whole["graph.current_neighbours"] = np.array([spec.current_neighbours])
         network = {name: value.numpy(force=True) for name, value in self.model.state_dict().items()}
@@ -168,6 +175,7 @@ class PublishedModel:
             "object_vertices": spec.object_count,
             "control_vertices": spec.control_count,
             "edges": spec.edge_count,
+            "frame": "world" if spec.frame is None else "grip",
             "phi": [
                 one.described(float(spread))
                 for one, spread in zip(self.columns, self.model.norm.properties, strict=True)
@@ -212,13 +220,14 @@ class PublishedModel:
             rest_vertices=tensors["rest.vertices"].astype(np.float64),
             particle_index=tensors["particle.index"],
             control_index=tensors["control.index"],
-            neighbours=tensors[_table_name(current)],
+            neighbours=tensors[_table_name(current, "graph.frame_shape" in tensors)],
             edge_kind=tensors["graph.edge_kind"],
             rest_relative=tensors["graph.rest_relative"].astype(np.float64),
             vertex_spacing_m=facts["vertex_spacing_m"],
             edge_radius_m=facts["edge_radius_m"],
             ground_height_m=facts["ground_height_m"],
             current_neighbours=current,
+            frame=_frame_of(tensors),
         )
         prior = _prior_of(tensors)
         _refuse_other_sizes(tensors, prior, config, spec)
@@ -239,10 +248,22 @@ class PublishedModel:
 _FACTS_BEFORE = {"near_edges": "material"}  # what versions were that do not say it
 
 
-def _table_name(current_neighbours: int) -> str:
-    """Tensor of the edges that are kept: another name where the NEAR ones are not among them, so that a reader that
-    does not know of it finds none."""
+def _table_name(current_neighbours: int, framed: bool) -> str:
+    """Tensor of the edges that are kept: another name where the NEAR ones are not among them or where a step is taken
+    in the grip's frame, so that a reader that does not know of it finds none."""
+    if framed:
+        return "graph.turned_neighbours"
     return "graph.kept_neighbours" if current_neighbours else "graph.neighbours"
+
+
+def _frame_of(tensors: dict[str, Array]) -> GripFrame | None:
+    """The grip's frame, None where a step is taken in world axes."""
+    if "graph.frame_shape" not in tensors:
+        return None
+    parts = {name: tensors[f"graph.frame_{name}"].astype(np.float64) for name in ("shape", "fall", "line")}
+    if not np.any(parts["shape"]):
+        raise ValueError("graph.frame_shape of points that are all in one place")
+    return GripFrame(**parts)
 
 
 def _prior_of(tensors: dict[str, Array]) -> ModalPrior | ChainPrior | InertialPrior:
@@ -264,13 +285,15 @@ def _refuse_other_sizes(
 ) -> None:
     """Raises ValueError where arrays are not of the graph's sizes: what rolls out reads them by these."""
     n, controls, frames = spec.object_count, spec.control_count, config.history + 1
-    table = _table_name(spec.current_neighbours)
+    table = _table_name(spec.current_neighbours, spec.frame is not None)
     slots = (spec.vertex_count, spec.neighbours.shape[1])
     expected = {"phi": (n, 2), "phi.calibrated": (n, 2), "start.history": (frames, n, 3)}
     expected |= {"rest.vertices": (n, 3), "particle.index": (n,), "control.index": (controls,)}
     expected |= {table: slots, "graph.edge_kind": slots, "graph.rest_relative": (*slots, 3)}
     expected["start.controllers"] = (frames, tensors["start.controllers"].shape[1], 3)
     expected["skin.index"] = tensors["skin.weight"].shape
+    if spec.frame is not None:
+        expected |= {"graph.frame_shape": (controls, 3), "graph.frame_fall": (3,), "graph.frame_line": (3,)}
     if isinstance(prior, ModalPrior):
         modes = len(prior.basis)
         expected["prior.mean"] = (n, 3)

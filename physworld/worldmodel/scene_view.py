@@ -120,6 +120,7 @@ def view_scene(scene: Scene, twin: Twin, config: WorldModelConfig) -> SceneView:
         config=config,
         control_groups=twin.controller_groups,
         ground_height_m=twin.ground_height_m,
+        gravity_m_s2=np.asarray(twin.gravity_m_s2),
     )
     vertices, tracks = particles[:, spec.particle_index], twin.track(particles)
     states = np.unique(np.linspace(0, len(times) - 1, SKIN_STATES).round().astype(np.int64))

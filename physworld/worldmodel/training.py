@@ -43,10 +43,11 @@ from physworld.worldmodel.errors import (
 from physworld.worldmodel.model.config import TrainingConfig, WorldModelConfig
 from physworld.worldmodel.model.features import Normalisation
 from physworld.worldmodel.model.graph import GraphSpec
+from physworld.worldmodel.model.inertia import one_step_residual
 from physworld.worldmodel.model.model import WorldModel
 from physworld.worldmodel.model.properties import PROPERTIES, PhiColumn
-from physworld.worldmodel.priors.choose import Prior, fit_priors, prior_error
-from physworld.worldmodel.priors.prior_step import prior_step
+from physworld.worldmodel.priors.choose import Prior, choose, fit_priors, prior_error, spec_for
+from physworld.worldmodel.priors.prior_step import framed_prior, prior_step
 from physworld.worldmodel.rollout import mean_error, rollout_tracks
 
 WARM_UP_SHARE = 0.1
@@ -150,12 +151,17 @@ def train(
     fitting, held_out = split_tracks(list(tracks[:first]), training.validation_fraction, training.seed)
     h = config.history
     positions, phis = [track.positions.numpy() for track in fitting], [track.phi.numpy() for track in fitting]
-    priors = fit_priors(positions, phis, spec, config, training.prior)
-    prior_errors = {name: prior_error(prior, held_out, spec, h) for name, prior in priors.items()}
-    chosen = min(prior_errors, key=prior_errors.__getitem__)
-    prior = priors[chosen]
-    alone = prior_step(prior, h)
-    scales = measure_scales(fitting, spec, lambda track: alone.residual(track.positions, track.phi))
+    priors = fit_priors(positions, phis, spec, config, training.prior, training.frame)
+    graphs = {name: spec_for(name, spec, training.frame) for name in priors}
+    prior_errors = {name: prior_error(prior, held_out, graphs[name], h) for name, prior in priors.items()}
+    chosen = choose(prior_errors)
+    prior, spec = priors[chosen], graphs[chosen]
+    ahead = framed_prior(prior_step(prior, h), spec)
+    scales = measure_scales(
+        fitting,
+        spec,
+        lambda track: one_step_residual(ahead, track.positions, track.phi, spec.object_count, h),
+    )
     run = _start(config, spec, scales, prior, columns, training)
     identity = _identity(config, training, scales)
     if checkpoint is not None:
@@ -248,7 +254,7 @@ def _train_step(run: _Run, sampler: WindowSampler, training: TrainingConfig, loo
         left = left + _squared(predicted[:n] - truth[:n])
         window = torch.cat([window[1:], predicted[None]])
         with torch.no_grad():
-            ahead = model.prior(alone, truth[n:], phi)
+            ahead = model.prior_ahead(alone, truth[n:], phi)
             beside = beside + _squared(ahead - truth[:n])
             alone = torch.cat([alone[1:], torch.cat([ahead, truth[n:]])[None]])
     loss = (left / (beside + look_ahead * change.square())).mean()

@@ -14,6 +14,7 @@ from physworld.evaluate.blocks import mean_with_interval
 from physworld.evaluate.metrics import metrics
 from physworld.evaluate.table import held_out_table
 from physworld.worldmodel.clock import resample_smooth
+from physworld.worldmodel.energy import still_energy
 from physworld.worldmodel.published import PublishedModel
 from physworld.worldmodel.scene_view import SceneView
 
@@ -22,7 +23,8 @@ SPEED_REPEATS = 3
 
 @dataclass(frozen=True)
 class Measured:
-    """Predictions of tracked points at the measured times (T, N, 3) [m], their table, steps per second."""
+    """Predictions of tracked points at the measured times (T, N, 3) [m], their table, steps per second, and the energy
+    while the grips stand still."""
 
     tracks: Array
     tracks_calibrated: Array
@@ -30,6 +32,7 @@ class Measured:
     vertices: Array
     table: dict[str, Any]
     steps_per_second: dict[str, float]
+    energy: dict[str, Any]
 
 
 def measure(view: SceneView, published: PublishedModel, before: PublishedModel | None = None) -> Measured:
@@ -57,6 +60,7 @@ def measure(view: SceneView, published: PublishedModel, before: PublishedModel |
             "twin": view.twin_steps_per_second,
             "world_model": (len(rolled) - view.history - 1) / min(seconds),
         },
+        energy=still_energy(published, controllers),
     )
 
 

@@ -29,6 +29,7 @@ def translate(
             validation_every=interval,
             patience=config.patience,
             prior=config.prior,
+            frame=config.frame,
             start_share=config.start_share,
             checkpoint_every=interval,
             threads=int(os.environ.get("PHYSWORLD_TRAINER_THREADS", "1")),

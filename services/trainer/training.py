@@ -31,6 +31,7 @@ from physworld.worldmodel.model import config as settings_of
 from physworld.worldmodel.scene_view import SceneView, view_scene
 from physworld.worldmodel.training import TrainingResult, first_episodes, train
 from physworld_schemas.model import TrainingConfig
+from physworld_schemas.quality import quality_of
 from physworld_services.trainer.closed_loop import closed_loop
 from physworld_services.trainer.episodes import Episodes
 from physworld_services.trainer.measuring import Measured, json_safe, measure
@@ -98,6 +99,7 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     dataset = episodes.sealed()
     lineage = lineage_of([dataset, *made_from(stores, payload)], payload["config"], {"training": config.seed})
     card = card_of(payload, config, published, metrics, lineage) | {"trained_on": episodes.description()}
+    card["quality"] = quality_of(metrics).model_dump(mode="json")
     artifacts = store_version(stores, payload, published, view, measured, card)
     manifest = next(artifact for artifact in artifacts if artifact.name == MANIFEST_NAME)
     context.check()
@@ -176,6 +178,7 @@ def _metrics(
 ) -> dict[str, Any]:
     return {
         "held_out": measured.table,
+        "energy": measured.energy,
         "steps_per_second": measured.steps_per_second,
         "noise_floor_m": measured.table["noise_floor_m"],
         "seconds": seconds,

@@ -24,6 +24,7 @@ from physworld_client.types import Array
 EDGE_KINDS = 3  # near, coarse, grip
 PROPERTY_COUNT = 2
 NEAR = 0
+OPPOSITE = 1e-3  # least 1 + cos of the turn of a grip whose points lie on a line
 REST_RADII = 2.0  # longest rest length that a NEAR edge found at a step tells, in edge radii
 
 
@@ -74,7 +75,10 @@ class Network:
         self._tensors = tensors
         self.layers = sum(name.startswith("receive.") and name.endswith(".weight") for name in tensors)
         self._nearest = int(tensors.get("graph.current_neighbours", np.zeros(1))[0])
+        self._framed = "graph.frame_shape" in tensors
         self._table = "graph.kept_neighbours" if self._nearest else "graph.neighbours"
+        if self._framed:
+            self._table = "graph.turned_neighbours"
         vertex_count = self._tensor(self._table).shape[0]
         self.object_count = object_count
         self.control_count = vertex_count - object_count
@@ -102,6 +106,31 @@ class Network:
             control_next: control vertices at t + 1 [m], (C, 3).
             phi: log property ratios of the object vertices, (n, 2).
         """
+        if not self._framed:
+            return self._step(window, control_next, phi)
+        turn, middle = self._turn(control_next)
+        fall = self._tensor("graph.frame_fall").astype(np.float64)
+        ticks = np.arange(1 - len(window), 1)[:, None, None]
+        local = (window - middle - ticks**2 * fall) @ turn
+        moved = self._step(local, (control_next - middle - fall) @ turn, phi)
+        return np.concatenate([moved[: self.object_count] @ turn.T + middle + fall, control_next])
+
+    def _turn(self, controls: Array) -> tuple[Array, Array]:
+        """R (3, 3) and the middle (3,) of control vertices (C, 3): ``physworld.worldmodel.model.frame``."""
+        shape, line = (self._tensor(f"graph.frame_{name}").astype(np.float64) for name in ("shape", "line"))
+        middle = controls.mean(axis=0)
+        seen = (controls - middle).T @ shape / np.sum(shape**2)
+        if line.any():
+            onto = seen @ line / np.linalg.norm(seen @ line)
+            x, y, z = np.cross(line, onto)
+            cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+            return np.eye(3) + cross + cross @ cross / max(1.0 + float(onto @ line), OPPOSITE), middle
+        cofactors = np.array([np.cross(seen[(i + 1) % 3], seen[(i + 2) % 3]) for i in range(3)])
+        left, _, right = np.linalg.svd(seen + cofactors / np.linalg.norm(seen))
+        return np.asarray(left @ right), middle
+
+    def _step(self, window: Array, control_next: Array, phi: Array) -> Array:
+        """The same in the axes that it is given in."""
         n = self.object_count
         ahead = np.concatenate([self._prior(window, control_next, phi), control_next])
         features = self._vertex_features(window, ahead, phi)

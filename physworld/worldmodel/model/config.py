@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 PRIORS = ("auto", "modal", "chain", "none")
 NEAR_EDGES = ("material", "current")
+FRAMES = ("auto", "world", "grip")
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,8 @@ class TrainingConfig:
         patience: validations in a row without a better one after which the training ends early; 0: never.
         prior: what stands under the network: "modal", "chain", "auto": whichever of the two errs less on validation
             episodes, or "none": the network alone gives the accelerations (``physworld.worldmodel.model.inertia``).
+        frame: in which axes a step is taken: "world"; "grip": in the grip's frame where the scene has one
+            (``physworld.worldmodel.model.frame``); "auto": what errs less on validation episodes.
         start_share: share of the episodes that the training begins with; 1: it has all of them from the start.
         checkpoint_every: steps between checkpoints.
         threads: torch threads.
@@ -88,6 +91,7 @@ class TrainingConfig:
     validation_every: int = 250
     patience: int = 0
     prior: str = "auto"
+    frame: str = "auto"
     start_share: float = 1.0
     checkpoint_every: int = 250
     threads: int = 1
@@ -100,6 +104,8 @@ class TrainingConfig:
             )
         if self.prior not in PRIORS:
             raise ValueError(f"prior {self.prior!r}; known are {', '.join(PRIORS)}")
+        if self.frame not in FRAMES:
+            raise ValueError(f"frame {self.frame!r}; known are {', '.join(FRAMES)}")
 
 
 @dataclass(frozen=True)

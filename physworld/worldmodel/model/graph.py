@@ -29,6 +29,7 @@ import numpy as np
 from physworld.arrays import Array
 from physworld.worldmodel.errors import GraphInvalid
 from physworld.worldmodel.model.config import WorldModelConfig
+from physworld.worldmodel.model.frame import GripFrame, grip_frame
 
 NEAR, COARSE, GRIP = 0, 1, 2
 EDGE_KINDS = 3
@@ -53,6 +54,7 @@ class GraphSpec:
         ground_height_m: the plane's height, or None.
         current_neighbours: how many nearest object vertices each of them hears by NEAR edges, found at every step; 0:
             the NEAR edges are material and stand in ``neighbours``.
+        frame: the grip's frame in which a step is taken (``physworld.worldmodel.model.frame``); None: world axes.
     """
 
     dt_s: float
@@ -66,6 +68,7 @@ class GraphSpec:
     edge_radius_m: float
     ground_height_m: float | None = None
     current_neighbours: int = 0
+    frame: GripFrame | None = None
 
     @property
     def object_count(self) -> int:
@@ -134,6 +137,7 @@ def build_graph(
     config: WorldModelConfig,
     control_groups: tuple[Array, ...] = (),
     ground_height_m: float | None = None,
+    gravity_m_s2: Array | None = None,
 ) -> GraphSpec:
     """The graph of a body.
 
@@ -145,6 +149,7 @@ def build_graph(
         config: number of vertices and neighbours.
         control_groups: controllers that move as one rigid grip.
         ground_height_m: height of the ground plane, or None.
+        gravity_m_s2: (3,); with it the graph has a grip's frame, unless there is a ground or NEAR edges are found anew.
     """
     if particles_rest.shape != particles_start.shape or particles_rest.shape[0] < 2:
         raise GraphInvalid(f"rest {particles_rest.shape} and start {particles_start.shape} make no body")
@@ -178,6 +183,7 @@ def build_graph(
     neighbours, edge_kind = _slot_table(kind)
     reference = np.concatenate([start, controllers[control]])
     undeformed = np.concatenate([rest, np.zeros((len(control), 3))])
+    framed = gravity_m_s2 is not None and ground_height_m is None and material
     return GraphSpec(
         dt_s=dt_s,
         rest_vertices=rest,
@@ -190,6 +196,7 @@ def build_graph(
         edge_radius_m=radius,
         ground_height_m=ground_height_m,
         current_neighbours=0 if material else nearest,
+        frame=grip_frame(controllers[control], np.asarray(gravity_m_s2), dt_s) if framed else None,
     )
 
 

@@ -52,6 +52,10 @@ tensors are ``prior.`` and the fields of ``ChainPrior``, float32, and prior.subs
 
 **No prior**: ``physworld.worldmodel.model.inertia``; prior.lags (2,) in place of the modal prior's tensors.
 
+**In the grip's frame**, where ``graph.frame_shape`` is among the tensors: all of the above holds for y in place of x
+(``physworld.worldmodel.model.frame``). The edges then stand in ``graph.turned_neighbours``, of the shape and meaning of
+``graph.neighbours``, which such a model lacks.
+
 **NEAR edges of the current shape**, where ``graph.current_neighbours`` (1,) int64 is among the tensors:
 ``physworld.worldmodel.model.nearest`` says which they are and what is cut off their features. The others then stand in
 ``graph.kept_neighbours``, of the shape and meaning of ``graph.neighbours``, which such a model lacks.
@@ -99,6 +103,7 @@ from torch import Tensor, nn
 from physworld.arrays import Array
 from physworld.worldmodel.model.config import WorldModelConfig
 from physworld.worldmodel.model.features import Normalisation, Scales, vertex_features
+from physworld.worldmodel.model.frame import enter, leave
 from physworld.worldmodel.model.graph import EDGE_KINDS, NEAR, GraphSpec
 from physworld.worldmodel.model.inertia import InertialPrior
 from physworld.worldmodel.model.nearest import CurrentEdges, KeptEdges
@@ -106,7 +111,7 @@ from physworld.worldmodel.model.properties import PROPERTIES, PhiColumn
 from physworld.worldmodel.native.messages import EdgeList, as_seen, mean_messages
 from physworld.worldmodel.priors.chain import ChainPrior
 from physworld.worldmodel.priors.modal import ModalPrior, rigid_prior
-from physworld.worldmodel.priors.prior_step import prior_step
+from physworld.worldmodel.priors.prior_step import framed_prior, prior_step
 
 Means = Callable[[int, Tensor, Tensor], Tensor]
 """Mean messages (K, V, B, H) of a layer from what is heard and sent (K, V, B, H)."""
@@ -272,10 +277,20 @@ class WorldModel(nn.Module):
         """Positions of all vertices at t + 1 [m], (V, B, 3); control vertices go to ``control_next`` (C, B,
         3).
         """
-        n = self.spec.object_count
-        ahead = torch.cat([self.prior(window, control_next, phi), control_next])
-        correction = self.forward(window, ahead, phi, constants)
-        return torch.cat([ahead[:n] + self.norm.change * correction, control_next])
+        n, frame = self.spec.object_count, self.spec.frame
+        if frame is None:
+            ahead = torch.cat([self.prior(window, control_next, phi), control_next])
+            correction = self.forward(window, ahead, phi, constants)
+            return torch.cat([ahead[:n] + self.norm.change * correction, control_next])
+        turn, local, control_local = enter(frame, window, control_next, n)
+        ahead = torch.cat([self.prior(local, control_local, phi), control_local])
+        correction = self.forward(local, ahead, phi, constants)
+        moved = leave(frame, turn, ahead[:n] + self.norm.change * correction)
+        return torch.cat([moved, control_next])
+
+    def prior_ahead(self, window: Tensor, control_next: Tensor, phi: Tensor) -> Tensor:
+        """x̂^{t+1} of the object vertices in world axes [m], (n, B, 3), of the same arguments as :meth:`step`."""
+        return framed_prior(self.prior, self.spec)(window, control_next, phi)
 
     def corrects_prior(self) -> bool:
         """Whether the network adds anything to the prior: not before the first step of training."""

@@ -55,6 +55,16 @@ class RolloutEngine:
                 "prior_weight": _floats(model.prior.weight),
                 "prior_response": _floats(model.prior.response),
             }
+        frame = spec.frame
+        if frame is not None:
+            self._fixed |= {
+                name: np.ascontiguousarray(values, dtype=np.float32)
+                for name, values in (
+                    ("frame_shape", frame.shape),
+                    ("frame_fall", frame.fall),
+                    ("frame_line", frame.line),
+                )
+            }
         modal = model.prior if isinstance(model.prior, PriorStep) else None
         self._placing = None if modal is None else modal.placing.numpy(force=True).astype(np.float64)
         low, high = (0.0, 0.0) if modal is None else modal.span.tolist()
@@ -80,6 +90,7 @@ class RolloutEngine:
             "inputs": model.skip.in_features,
             "places_width": 3 * (config.history + 2),
             "grounded": int(spec.ground_height_m is not None),
+            "framed": 0 if frame is None else 1 + int(np.any(frame.line)),
         }
         self._sizes |= chain_sizes(chain, config.history) if chain is not None else {}
 
@@ -153,6 +164,7 @@ class RolloutEngine:
             "length": edges + self.objects * sizes["nearest"],
             "regressors": self._fixed["prior_weight"].shape[1] if sizes["modes"] else 0,
             "ahead": 3 * self.vertices,
+            "window": 3 * self.vertices * (self.history + 2) if sizes["framed"] else 0,
         }
         arrays = self._fixed | {name: np.zeros(count, dtype=np.float32) for name, count in scratch.items()}
         arrays |= {"paths": path, "phis": phi, "softnesses": soft, "logs": logs}

@@ -8,7 +8,7 @@ of 16 with zeros, which a ReLU leaves zero. ``product`` keeps the sums of a tile
 once for all vertices of the tile: four vertices by 32 columns where registers hold 16 floats, six by 16 where there are
 16 registers of 8 (AVX2); fewer sums would wait for each other, more would not stay there. Products are fused with sums
 by hand, since Warp's compiler does not contract them.
-Equations: ``physworld.worldmodel.model.model``. CPU only.
+Equations: ``physworld.worldmodel.model.model``; in the grip's frame ``frame_text``. CPU only.
 """
 
 from __future__ import annotations
@@ -17,13 +17,15 @@ import warp as wp
 
 from physworld.worldmodel.native.chain_kernels import CHAIN_ARRAYS, CHAIN_SIZES
 from physworld.worldmodel.native.chain_text import STEP, TEXT, VECTORS
+from physworld.worldmodel.native.frame_text import FRAME
 from physworld.worldmodel.native.nearest_kernels import NEAREST
 
 wp.set_module_options({"enable_backward": False})
 
 SIZES = (
     "candidates", "corrected", "first", "frames", "history", "objects", "vertices", "edges", "layers", "hidden",
-    "modes", "controls", "inputs", "places_width", "grounded", "chained", "inertial", "nearest", *CHAIN_SIZES,
+    "modes", "controls", "inputs", "places_width", "grounded", "chained", "inertial", "nearest", "framed",
+    *CHAIN_SIZES,
 )  # fmt: skip
 SCALARS = ("per_velocity", "change", "per_length", "radius", "longest_rest")
 ARRAYS = (
@@ -35,7 +37,8 @@ ARRAYS = (
     "update_in", "update_in_bias", "update_out", "update_out_bias",
     "decode_in", "decode_in_bias", "decode_out", "decode_out_bias", "skip",
     "features", "places", "state", "hear", "say", "placed", "heard", "sent", "sums", "inner", "correction",
-    "length", "regressors", "ahead", "logs", "found", "search_room", *CHAIN_ARRAYS,
+    "length", "regressors", "ahead", "logs", "found", "search_room",
+    "frame_shape", "frame_fall", "frame_line", "window", *CHAIN_ARRAYS,
 )  # fmt: skip
 INTEGER_ARRAYS = frozenset({"offsets", "edge_sender", "edge_receiver", "gapped", "found"})
 
@@ -61,6 +64,7 @@ _ROLLOUT = (
     + TEXT
     + STEP
     + NEAREST
+    + FRAME
     + r"""
 #if defined(__AVX512F__)
     const int ROWS = 4, COLUMNS = 2;
@@ -126,12 +130,18 @@ _ROLLOUT = (
         }
     };
     for (int b = 0; b < candidates; ++b) {
-        path = paths + (long long)b * frames * VN * 3;
+        float* world = paths + (long long)b * frames * VN * 3;
+        path = world;
         const float* phi = phis + (long long)b * N * 2;
         const float softness = softnesses[b];
         if (chained) load(logs + (long long)b * N * 2);
-        for (int t = first - history; t < first && !chained; ++t) project(t);
+        for (int t = first - history; t < first && !chained && !framed; ++t) project(t);
         for (int t = first; t < frames - 1; ++t) {
+            if (framed) {  // the step's window, seen from the grips at its end, stands in for the path
+                enter(world + (long long)(t - history) * VN * 3);
+                path = window - (long long)(t - history) * VN * 3;
+                for (int s = t - history; s < t && !inertial; ++s) project(s);
+            }
             const float* now = path + (long long)t * VN * 3;
             float* next = path + (long long)(t + 1) * VN * 3;
             if (chained) {
@@ -176,6 +186,7 @@ _ROLLOUT = (
             for (int i = 3 * N; i < 3 * VN; ++i) ahead[i] = next[i];
             if (!corrected) {
                 for (int i = 0; i < 3 * N; ++i) next[i] = ahead[i];
+                if (framed) leave(next, world + (long long)(t + 1) * VN * 3);
                 continue;
             }
             // vertex features, places
@@ -297,6 +308,7 @@ _ROLLOUT = (
             product(correction, features, skip, nullptr, N, inputs, 16, true);
             for (int i = 0; i < N; ++i)
                 for (int k = 0; k < 3; ++k) next[i * 3 + k] = ahead[i * 3 + k] + change * correction[i * 16 + k];
+            if (framed) leave(next, world + (long long)(t + 1) * VN * 3);
         }
     }
 """

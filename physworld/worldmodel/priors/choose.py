@@ -1,10 +1,14 @@
 """Which prior stands under the network: the modal one, or the chain where the body is a rope.
 
-Every prior that can be made of the episodes is rolled out alone over whole held-out ones; the training takes the one
-that errs least, and the card says what each erred (``validation.priors_m``).
+Every prior that can be made of the episodes is rolled out alone over whole held-out ones, the modal one in world axes
+and in the grip's frame; the training takes the one that errs least, and the card says what each erred
+(``validation.priors_m``). The frame is for turns of the grips that validation episodes may not show: the modal prior in
+it is taken unless another one is clearly better.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -17,10 +21,12 @@ from physworld.worldmodel.model.inertia import InertialPrior
 from physworld.worldmodel.priors.chain import ChainPrior
 from physworld.worldmodel.priors.chain_fit import fit_chain
 from physworld.worldmodel.priors.modal import ModalPrior, fit_prior
-from physworld.worldmodel.priors.prior_step import prior_step
+from physworld.worldmodel.priors.prior_step import framed_prior, prior_step
 from physworld.worldmodel.rollout import mean_error, unroll_tracks
 
-MODAL, CHAIN, NONE = "modal", "chain", "none"
+MODAL, CHAIN, NONE, TURNED = "modal", "chain", "none", "modal_in_grip_frame"
+IN_FRAME = frozenset({TURNED})
+CLEARLY = 0.95  # times the error in the grip's frame: what world axes must stay below to be taken
 Prior = ModalPrior | ChainPrior | InertialPrior
 
 
@@ -30,10 +36,12 @@ def fit_priors(
     spec: GraphSpec,
     config: WorldModelConfig,
     wanted: str = "auto",
+    frame: str = "auto",
 ) -> dict[str, Prior]:
     """Priors by name of vertex tracks (T, V, 3) and Φ (n, ·): the ``wanted`` one, or with "auto" all there are.
 
-    A chain that is wanted where the body is no rope gives way to the modal prior.
+    A chain that is wanted where the body is no rope gives way to the modal prior. ``frame``: "world" or "grip" axes of
+    the modal prior, or with "auto" both, where the graph has a grip's frame. The chain is in world axes.
     """
     if wanted == NONE:
         return {NONE: InertialPrior(spec.object_count)}
@@ -43,15 +51,35 @@ def fit_priors(
         if chain is not None:
             found[CHAIN] = chain
     if wanted != CHAIN or not found:
-        found[MODAL] = fit_prior(positions, phis, spec.object_count, config.history, config.modes)
+        sizes = (spec.object_count, config.history, config.modes)
+        framed = spec.frame is not None and frame != "world"
+        if frame != "grip" or not framed:
+            found[MODAL] = fit_prior(positions, phis, *sizes)
+        if framed and CHAIN not in found:
+            found[TURNED] = fit_prior(positions, phis, *sizes, spec.frame)
     return found
 
 
+def spec_for(name: str, spec: GraphSpec, frame: str = "auto") -> GraphSpec:
+    """The graph for the prior ``name``: with its grip's frame, or without. The network alone has it but for "world"."""
+    framed = name in IN_FRAME or (name == NONE and frame != "world")
+    return spec if framed else replace(spec, frame=None)
+
+
+def choose(errors: dict[str, float]) -> str:
+    """The prior with the least error; one in the grip's frame also where another is not clearly better."""
+    best = min(errors, key=errors.__getitem__)
+    for name in IN_FRAME & set(errors):
+        if errors[best] > CLEARLY * errors[name]:
+            return name
+    return best
+
+
 def prior_error(prior: Prior, tracks: list[Track], spec: GraphSpec, history: int) -> float:
-    """Mean distance [m] of object vertices over whole episodes, predicted by the prior alone."""
-    step = prior_step(prior, history)
+    """Mean distance [m] of object vertices over whole episodes, predicted by the prior alone, in the graph's frame."""
+    alone = framed_prior(prior_step(prior, history), spec)
 
     def ahead(window: Tensor, control_next: Tensor, phi: Tensor) -> Tensor:
-        return torch.cat([step(window, control_next, phi), control_next])
+        return torch.cat([alone(window, control_next, phi), control_next])
 
     return mean_error(unroll_tracks(ahead, tracks, spec.object_count, history), tracks, spec)

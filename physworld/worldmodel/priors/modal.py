@@ -32,6 +32,7 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.worldmodel.errors import DatasetUnusable
+from physworld.worldmodel.model.frame import GripFrame, turns_of
 from physworld.worldmodel.priors.modal_places import find_places, mean_placing
 from physworld.worldmodel.priors.modal_poles import without_growth
 from physworld.worldmodel.priors.modal_regression import (
@@ -40,6 +41,7 @@ from physworld.worldmodel.priors.modal_regression import (
     Choice,
     Grams,
     Seen,
+    Turning,
     errors,
     grams_of,
     regress,
@@ -105,23 +107,51 @@ def rigid_prior(vertices: Array, controls: Array, history: int) -> ModalPrior:
     )
 
 
-def fit_prior(episodes: list[Array], phis: list[Array], n: int, history: int, most_modes: int) -> ModalPrior:
-    """The prior of vertex tracks (T, V, 3), object vertices first, and their log property ratios (n, 2 or more)."""
+def fit_prior(
+    episodes: list[Array],
+    phis: list[Array],
+    n: int,
+    history: int,
+    most_modes: int,
+    frame: GripFrame | None = None,
+) -> ModalPrior:
+    """The prior of vertex tracks (T, V, 3), object vertices first, and their log property ratios (n, 2 or more).
+
+    With a ``frame`` it is that of a step in the grip's frame (``physworld.worldmodel.model.frame``).
+    """
     if episodes[0].shape[1] == n:
         raise DatasetUnusable("the graph has no control vertex: there is nothing to move the object by")
     paths = [np.asarray(episode, dtype=np.float64) for episode in episodes]
-    shape = np.mean([_control_shape(path, n)[0] for path in paths], axis=0)
-    relative = [path[:, :n] - path[:, n:].mean(axis=1, keepdims=True) for path in paths]
-    flat = np.concatenate(relative).reshape(-1, 3 * n)
-    mean = flat.mean(axis=0)
+    rotations = [None if frame is None else turns_of(frame, path[:, n:]) for path in paths]
+    shape = np.mean(
+        [_control_shape(path, n, turns)[0] for path, turns in zip(paths, rotations, strict=True)], axis=0
+    )
+    relative = [_relative(path, n, turns) for path, turns in zip(paths, rotations, strict=True)]
+    framed = [(path, turns) for path, turns in zip(paths, rotations, strict=True) if turns is not None]
+    lagged = [_lagged(path, n, history, turns) for path, turns in framed]
+    mean = np.concatenate(relative).reshape(-1, 3 * n).mean(axis=0)
+    flat = np.concatenate([*relative, *(past[:, -1] for past in lagged)]).reshape(-1, 3 * n)
     variance, modes = np.linalg.eigh((flat - mean).T @ (flat - mean) / len(flat))
     size = np.sqrt(np.clip(variance[::-1], 0.0, None))
     basis = np.ascontiguousarray(modes[:, ::-1].T[: min(most_modes, len(size))])
     size = np.maximum(size[: len(basis)], max(SCALE_FLOOR * size[0], np.finfo(float).tiny))
+    fall = None if frame is None else frame.fall
     seen = [
-        Seen((gone.reshape(-1, 3 * n) - mean) @ basis.T, _drive(path, n, shape, history), 0.0)
-        for gone, path in zip(relative, paths, strict=True)
+        Seen((gone.reshape(-1, 3 * n) - mean) @ basis.T, _drive(path, n, shape, history, turns, fall), 0.0)
+        for gone, path, turns in zip(relative, paths, rotations, strict=True)
     ]
+    if frame is not None:
+        turning = _turning(basis.reshape(-1, n, 3), mean.reshape(n, 3))
+        seen = [
+            replace(
+                s,
+                lagged=(past.reshape(*past.shape[:2], 3 * n) - mean) @ basis.T,
+                turns=_between(turns, history),
+                turning=turning,
+            )
+            for s, past, turns in zip(seen, lagged, rotations, strict=True)
+            if turns is not None
+        ]
     fields = np.stack([np.asarray(phi, dtype=np.float64)[:, :2] for phi in phis])
     placing = find_places(seen, fields, size, history)
     zeta = np.tensordot(fields, placing, axes=2)
@@ -136,20 +166,56 @@ def fit_prior(episodes: list[Array], phis: list[Array], n: int, history: int, mo
     return ModalPrior(mean.reshape(n, 3), kept, shape, weight, response, placing, np.array(span))
 
 
-def _control_shape(path: Array, n: int) -> Array:
-    """Control vertices around their mean, (T, C, 3)."""
+def _control_shape(path: Array, n: int, turns: Array | None = None) -> Array:
+    """Control vertices around their mean, (T, C, 3), seen from ``turns`` (T, 3, 3)."""
     shape: Array = path[:, n:] - path[:, n:].mean(axis=1, keepdims=True)
-    return shape
+    return shape if turns is None else shape @ turns
 
 
-def _drive(path: Array, n: int, shape: Array, history: int) -> Array:
+def _relative(path: Array, n: int, turns: Array | None) -> Array:
+    """Object vertices against the grips, (T, n, 3), each frame seen from its own turn."""
+    gone: Array = path[:, :n] - path[:, n:].mean(axis=1, keepdims=True)
+    return gone if turns is None else gone @ turns
+
+
+def _lagged(path: Array, n: int, history: int, turns: Array) -> Array:
+    """Object vertices at t … t-h against the grips of their time, seen from the turn at t+1: (T-1-h, h+1, n, 3)."""
+    t, gone = np.arange(history, len(path) - 1), _relative(path, n, None)
+    past: Array = np.stack([gone[t - lag] @ turns[t + 1] for lag in range(history + 1)], axis=1)
+    return past
+
+
+def _between(turns: Array, history: int) -> Array:
+    """Q from the frame of each step t = h … T-2 to the next one's, (T-1-h, 3, 3); none after the last."""
+    after = np.minimum(np.arange(history + 2, len(turns) + 1), len(turns) - 1)
+    between: Array = turns[after].transpose(0, 2, 1) @ turns[history + 1 :]
+    return between
+
+
+def _turning(basis: Array, mean: Array) -> Turning:
+    """What turns modes of ``basis`` (R, n, 3) about ``mean`` (n, 3)."""
+    products = np.einsum("rik,sil->klrs", basis, basis, optimize=True)
+    means = np.einsum("rik,il->klr", basis, mean)
+    return Turning(products, means, np.einsum("rik,ik->r", basis, mean))
+
+
+def _drive(
+    path: Array, n: int, shape: Array, history: int, turns: Array | None = None, fall: Array | None = None
+) -> Array:
     """The regressors that the grips give for each step t → t+1, t = h … T-2, (T-1-h, ·)."""
-    own, centre = _control_shape(path, n) - shape, path[:, n:].mean(axis=1)
+    own, centre = _control_shape(path, n), path[:, n:].mean(axis=1)
     t = np.arange(history, len(path) - 1)
     lags = [1, *range(0, -history - 1, -1)]
-    turns = [own[t + lag].reshape(len(t), -1) for lag in lags]
+    shapes = [own[t + lag] for lag in lags]
     moves = [centre[t + lag] - centre[t] for lag in lags if lag != 0]
-    return np.concatenate([*turns, *moves, np.ones((len(t), 1))], axis=1)
+    if turns is not None and fall is not None:
+        shapes = [one @ turns[t + 1] for one in shapes]
+        falling = [lag**2 * fall for lag in lags if lag != 0]
+        moves = [
+            ((one - fallen)[:, None] @ turns[t + 1])[:, 0] for one, fallen in zip(moves, falling, strict=True)
+        ]
+    turned = [(one - shape).reshape(len(t), -1) for one in shapes]
+    return np.concatenate([*turned, *moves, np.ones((len(t), 1))], axis=1)
 
 
 def _choose(seen: list[Seen], size: Array, grams: Grams, span: tuple[float, float], history: int) -> Choice:

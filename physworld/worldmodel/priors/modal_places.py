@@ -45,7 +45,7 @@ def find_places(seen: list[Seen], fields: Array, size: Array, history: int) -> A
     if len(seen) < FEWEST or means.std() < LEAST_SPREAD:
         return uniform
     modes = min(MODES, seen[0].amplitudes.shape[1])
-    few = [replace(s, amplitudes=s.amplitudes[:, :modes]) for s in seen]
+    few = [s.of(modes) for s in seen]
     scale, choice = scale_of(few, size[:modes], history), Choice(modes, RIDGE, RIDGE)
     trials = means.mean() + means.std() * np.linspace(-REACH, REACH, TRIALS)
     placing, least, proposed = uniform, np.inf, uniform

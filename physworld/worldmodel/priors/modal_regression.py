@@ -1,14 +1,18 @@
 """The ridge regression under the modal prior, from normal equations, and its error in open loop.
 
 A step's regressors are [past L, drive D, ζ past L, ζ, ζ² past L, ζ²] for all modes; those of fewer modes are a part of
-them, so that one set of normal equations serves every choice.
+them, so that one set of normal equations serves every choice. In a grip's frame (``physworld.worldmodel.model.frame``)
+the past of a step is seen from how the grips are turned at its end: ``lagged`` holds it, and in open loop the modes are
+turned from step to step, with Q = R_{t+2}ᵀ R_{t+1} and B the basis:
+
+    a' = B (Q (mean + Bᵀ a) - mean)
 
 Legend: as in :mod:`physworld.worldmodel.priors.modal`; G regressors in all, E episodes. NumPy only.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,12 +23,51 @@ POWERS = 2  # of ζ
 
 
 @dataclass(frozen=True)
+class Turning:
+    """What turns modes: ``products`` (3, 3, R, R), B_k B_lᵀ of the basis's components; ``means`` (3, 3, R), B_k mean_l;
+    ``rest`` (R,), B mean."""
+
+    products: Array
+    means: Array
+    rest: Array
+
+    def turned(self, amplitudes: Array, turns: Array) -> Array:
+        """Amplitudes (E, h+1, R) turned by Q (E, 3, 3)."""
+        count = amplitudes.shape[2]
+        maps = np.tensordot(turns, self.products[:, :, :count, :count], axes=2)
+        constant = np.tensordot(turns, self.means[:, :, :count], axes=2) - self.rest[:count]
+        seen: Array = np.matmul(amplitudes, maps.transpose(0, 2, 1)) + constant[:, None]
+        return seen
+
+
+@dataclass(frozen=True)
 class Seen:
-    """An episode: amplitudes (T, R), what the grips do (T-1-h, D), ζ."""
+    """An episode: amplitudes (T, R), what the grips do (T-1-h, D), ζ.
+
+    In a grip's frame each amplitude is seen from its own moment's; ``lagged`` (T-1-h, h+1, R): the past of every step
+    from the frame at its end, newest first; ``turns`` (T-1-h, 3, 3): Q from a step's frame to the next one's;
+    ``turning``: of the basis.
+    """
 
     amplitudes: Array
     drive: Array
     softness: float
+    lagged: Array | None = None
+    turns: Array | None = None
+    turning: Turning | None = None
+
+    def of(self, modes: int) -> Seen:
+        """The same with the first ``modes`` of the modes."""
+        lagged = None if self.lagged is None else self.lagged[..., :modes]
+        return replace(self, amplitudes=self.amplitudes[:, :modes], lagged=lagged)
+
+    def past(self, history: int) -> Array:
+        """[a^t … a^{t-h}] for t = h … T-2, (T-1-h, (h+1) R)."""
+        if self.lagged is not None:
+            flat: Array = self.lagged.reshape(len(self.lagged), -1)
+            return flat
+        t = np.arange(history, len(self.amplitudes) - 1)
+        return np.concatenate([self.amplitudes[t - lag] for lag in range(history + 1)], axis=1)
 
 
 @dataclass(frozen=True)
@@ -54,7 +97,7 @@ def grams_of(seen: list[Seen], scale: Array, history: int) -> Grams:
     inputs = np.zeros((len(scale), len(scale)))
     targets, rows = np.zeros((len(scale), seen[0].amplitudes.shape[1])), 0
     for s in seen:
-        past = _past(s.amplitudes, history)
+        past = s.past(history)
         answer = np.append(past, np.ones((len(past), 1)), axis=1)
         powers = [s.softness**k * answer for k in range(1, POWERS + 1)]
         given = np.concatenate([past, s.drive, *powers], axis=1) / scale
@@ -107,9 +150,14 @@ def errors(weight: Array, response: Array, judged: list[Seen], softness: Array, 
     frames = max(len(s.amplitudes) for s in judged)
     path = np.zeros((frames, len(judged), count))
     driven = np.zeros((frames, len(judged), count))
+    turns = np.tile(np.eye(3), (frames, len(judged), 1, 1))
     for k, s in enumerate(judged):
         path[: history + 1, k] = s.amplitudes[: history + 1, :count]
+        if s.turns is not None and s.lagged is not None:
+            path[: history + 1, k] = s.lagged[0, ::-1, :count]
+            turns[history + 1 : len(s.amplitudes), k] = s.turns
         driven[history + 1 : len(s.amplitudes), k] = s.drive @ weight[:, lags:].T
+    predicted = path if judged[0].turning is None else np.zeros_like(path)
     maps = np.concatenate([weight[:, :lags], *response[:, :, :lags]]).T
     for k, part in enumerate(response):
         driven += zeta ** (k + 1) * part[:, -1]
@@ -120,15 +168,15 @@ def errors(weight: Array, response: Array, judged: list[Seen], softness: Array, 
             path[t + 1] = own + driven[t + 1]
             for k, answer in enumerate(answers):
                 path[t + 1] += zeta ** (k + 1) * answer
+            if (turning := judged[0].turning) is not None:
+                predicted[t + 1] = path[t + 1]
+                lately = path[t + 1 - history : t + 2].transpose(1, 0, 2)
+                path[t + 1 - history : t + 2] = turning.turned(lately, turns[t + 1]).transpose(1, 0, 2)
         found = np.empty(len(judged))
         for k, s in enumerate(judged):
-            gap = path[: len(s.amplitudes), k] - s.amplitudes[:, :count]
+            gap = predicted[: len(s.amplitudes), k] - s.amplitudes[:, :count]
             square = (gap**2).sum(axis=1) + (s.amplitudes[:, count:] ** 2).sum(axis=1)
+            if s.turning is not None:
+                square = square[history + 1 :]
             found[k] = np.sqrt(square.mean())
     return np.where(np.isfinite(found), found, np.inf)
-
-
-def _past(amplitudes: Array, history: int) -> Array:
-    """[a^t … a^{t-h}] for t = h … T-2."""
-    t = np.arange(history, len(amplitudes) - 1)
-    return np.concatenate([amplitudes[t - lag] for lag in range(history + 1)], axis=1)

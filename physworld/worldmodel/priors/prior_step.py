@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 
 from physworld.arrays import Array
+from physworld.worldmodel.model.frame import enter, leave
+from physworld.worldmodel.model.graph import GraphSpec
 from physworld.worldmodel.model.inertia import InertialPrior, InertialStep, one_step_residual
 from physworld.worldmodel.priors.chain import ChainPrior
 from physworld.worldmodel.priors.chain_step import ChainStep
@@ -19,6 +23,22 @@ def prior_step(
     if isinstance(prior, InertialPrior):
         return InertialStep(prior, history)
     return ChainStep(prior, history) if isinstance(prior, ChainPrior) else PriorStep(prior, history)
+
+
+def framed_prior(step: nn.Module, spec: GraphSpec) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
+    """x̂^{t+1} in world axes by a prior's ``step``, which is taken in the grip's frame where the graph has one."""
+    frame, n = spec.frame, spec.object_count
+
+    def ahead(window: Tensor, control_next: Tensor, phi: Tensor) -> Tensor:
+        found: Tensor
+        if frame is None:
+            found = step(window, control_next, phi)
+            return found
+        turn, local, control_local = enter(frame, window, control_next, n)
+        found = leave(frame, turn, step(local, control_local, phi))
+        return found
+
+    return ahead
 
 
 class PriorStep(nn.Module):

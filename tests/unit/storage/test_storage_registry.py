@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import threading
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from pydantic import TypeAdapter
@@ -23,13 +23,24 @@ if TYPE_CHECKING:
     from physworld_storage.database import Database
 
 
-def publish(database: Database, name: str, *, ready: bool = True) -> int:
+DIVERGED = {"held_out": {"track_m": {"static": 0.1, "rigid_follow": 0.014, "world_model_finetuned": 0.752}}}
+
+
+def publish(
+    database: Database, name: str, *, ready: bool = True, metrics: dict[str, Any] | None = None
+) -> int:
     with database.session() as session:
         row = registry.allot_version(session, name, config=TrainingConfig())
         if ready:
             lineage = Lineage()
             registry.publish(
-                session, name, row.version, artifacts=[], sha256="e" * 64, metrics={}, lineage=lineage
+                session,
+                name,
+                row.version,
+                artifacts=[],
+                sha256="e" * 64,
+                metrics=metrics or {},
+                lineage=lineage,
             )
         return row.version
 
@@ -71,6 +82,29 @@ def test_latest_is_the_newest_that_is_ready(database: Database) -> None:
     publish(database, "rope", ready=False)
     with database.reading() as session, pytest.raises(NotFound, match="no ready version of model rope"):
         registry.get_version(session, "rope", "latest")
+
+
+def test_a_version_that_fails_the_quality_gate_is_ready_and_not_latest(database: Database) -> None:
+    good = publish(database, "beam")
+    bad = publish(database, "beam", metrics=DIVERGED)
+    with database.reading() as session:
+        assert registry.get_version(session, "beam", "latest").version == good
+        assert registry.get_model(session, "beam").latest == good
+        marked = registry.get_version(session, "beam", bad)
+    assert (marked.state, marked.quality.verdict) == ("ready", "failed")
+    with database.session() as session:  # whoever means it may still point an alias at it
+        registry.set_alias(session, "beam", "champion", bad)
+    following = publish(database, "beam")
+    with database.reading() as session:
+        assert registry.get_version(session, "beam", "latest").version == following
+
+
+def test_a_model_all_of_whose_versions_fail_the_gate_has_no_latest(database: Database) -> None:
+    publish(database, "beam", metrics=DIVERGED)
+    with database.reading() as session:
+        assert registry.get_model(session, "beam").latest is None
+        with pytest.raises(Conflict, match=r"version 1, the newest that is ready, .*752 mm"):
+            registry.get_version(session, "beam", "latest")
 
 
 def test_an_alias_moves(database: Database) -> None:

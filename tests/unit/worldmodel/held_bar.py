@@ -11,6 +11,7 @@ DT_S = 1.0 / 30.0
 SPACING_M = 0.02
 COLUMNS, ROWS = 9, 2
 SUBSTEPS = 60
+GRAVITY_M_S2 = (0.0, 0.0, -1.0)
 SMALL = WorldModelConfig(hidden=16, message_passing_steps=3, history=2, vertices=30, neighbours=5, modes=6)
 
 
@@ -25,7 +26,9 @@ def grip(rest: np.ndarray) -> np.ndarray:
     return np.nonzero(rest[:, 0] < 0.5 * SPACING_M)[0]
 
 
-def graph(config: WorldModelConfig = SMALL, ground_height_m: float | None = None) -> GraphSpec:
+def graph(
+    config: WorldModelConfig = SMALL, ground_height_m: float | None = None, *, framed: bool = False
+) -> GraphSpec:
     """The bar's graph; its controllers are the held particles, one rigid group."""
     rest = lattice()
     controllers = rest[grip(rest)]
@@ -37,6 +40,7 @@ def graph(config: WorldModelConfig = SMALL, ground_height_m: float | None = None
         config=config,
         control_groups=(np.arange(len(controllers)),),
         ground_height_m=ground_height_m,
+        gravity_m_s2=np.array(GRAVITY_M_S2) if framed else None,
     )
 
 
@@ -61,7 +65,7 @@ def episode(seed: int, frames: int = 40) -> dict[str, np.ndarray]:
         force = np.zeros_like(x)
         np.add.at(force, i, pull)
         np.add.at(force, j, -pull)
-        v = v + step * (force + np.array([0.0, 0.0, -1.0]))
+        v = v + step * (force + np.array(GRAVITY_M_S2))
         x = x + step * v
         x[held] = rest[held] + swing * (np.sin(rate * tick * step + phase) - np.sin(phase))
         v[held] = swing * rate * np.cos(rate * tick * step + phase)

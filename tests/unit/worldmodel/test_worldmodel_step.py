@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from physworld_client.network import Network
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from benchmarks.peers.plain_network import PlainNetwork
@@ -20,6 +21,7 @@ from physworld.worldmodel.dataset import read_track
 from physworld.worldmodel.export import INPUTS, StepProgram, edge_list
 from physworld.worldmodel.model.config import WorldModelConfig
 from physworld.worldmodel.model.features import Normalisation
+from physworld.worldmodel.model.frame import enter, leave
 from physworld.worldmodel.model.graph import GraphSpec
 from physworld.worldmodel.model.inertia import InertialPrior
 from physworld.worldmodel.model.model import WorldModel
@@ -45,13 +47,32 @@ class Inputs:
     phi: Tensor
 
 
-def bar(config: WorldModelConfig, ground: float | None, *, alone: bool = False) -> tuple[WorldModel, Inputs]:
-    spec = held_bar.graph(config, ground)
+def bar(
+    config: WorldModelConfig,
+    ground: float | None,
+    *,
+    alone: bool = False,
+    framed: bool = False,
+    line: bool = False,
+) -> tuple[WorldModel, Inputs]:
+    spec = held_bar.graph(config, ground, framed=framed)
+    if line:  # as for a grip whose points lie on a line
+        assert spec.frame is not None
+        along = np.outer(np.arange(spec.control_count) - 1.5, [0.0, 0.0, held_bar.SPACING_M])
+        spec = dataclasses.replace(
+            spec, frame=dataclasses.replace(spec.frame, shape=along, line=np.array([0.0, 0.0, 1.0]))
+        )
     tracks = [read_track(spec, held_bar.episode(seed), config.history) for seed in range(4)]
     paths, phis = [t.positions.numpy() for t in tracks], [t.phi.numpy() for t in tracks]
-    modal = fit_prior(paths, phis, spec.object_count, config.history, config.modes)
+    modal = fit_prior(paths, phis, spec.object_count, config.history, config.modes, spec.frame)
     prior = InertialPrior(spec.object_count) if alone else modal
-    return moving(config, spec, prior), inputs(spec, config, paths[1], 20)
+    given = inputs(spec, config, paths[1], 20)
+    if framed:  # a turn that no episode shows
+        turn = torch.as_tensor(Rotation.from_rotvec([0.6, -0.9, 0.4]).as_matrix().astype(np.float32))
+        given = dataclasses.replace(
+            given, window=given.window @ turn.T, control_next=given.control_next @ turn.T
+        )
+    return moving(config, spec, prior), given
 
 
 def rope(markers: int) -> tuple[WorldModel, Inputs]:
@@ -133,11 +154,16 @@ def client(model: WorldModel, given: Inputs) -> np.ndarray:
 
 def plain_peer(model: WorldModel, given: Inputs) -> np.ndarray:
     """The oracle: nothing taken apart."""
-    n, window, control, phi = model.spec.object_count, *(part for part in vars(given).values())
-    window, control, phi = window[:, :, None], control[:, None], phi[:, None]
+    n, frame = model.spec.object_count, model.spec.frame
+    window, control, phi = given.window[:, :, None], given.control_next[:, None], given.phi[:, None]
+    turn = None
+    if frame is not None:
+        turn, window, control = enter(frame, window, control, n)
     with torch.no_grad():
         ahead = torch.cat([model.prior(window, control, phi), control])
         ahead[:n] += model.norm.change * PlainNetwork(model)(window, ahead, phi)
+    if frame is not None and turn is not None:
+        ahead = torch.cat([leave(frame, turn, ahead[:n]), given.control_next[:, None]])
     return ahead[:, 0].numpy()
 
 
@@ -148,6 +174,9 @@ BODIES: dict[str, Callable[[], tuple[WorldModel, Inputs]]] = {
     "modal prior": lambda: bar(held_bar.SMALL, None),
     "modal prior over a ground": lambda: bar(held_bar.SMALL, -0.1),
     "edges of the current shape": lambda: bar(CURRENT, None),
+    "modal prior in the grip's frame": lambda: bar(held_bar.SMALL, None, framed=True),
+    "no prior in the grip's frame": lambda: bar(held_bar.SMALL, None, alone=True, framed=True),
+    "grip's frame of points on a line": lambda: bar(held_bar.SMALL, None, framed=True, line=True),
     "no prior": lambda: bar(held_bar.SMALL, None, alone=True),
     "chain prior, grips of two markers": lambda: rope(2),
     "chain prior, grips of three markers": lambda: rope(3),
@@ -161,7 +190,9 @@ def test_every_copy_of_the_step_is_the_same_function(body: str) -> None:
     moved = {one.__name__: one(model, given) for one in COPIES}
     expected = moved["torch_double"]
     with torch.no_grad():
-        ahead = model.prior(given.window[:, :, None], given.control_next[:, None], given.phi[:, None])[:, 0]
+        ahead = model.prior_ahead(given.window[:, :, None], given.control_next[:, None], given.phi[:, None])[
+            :, 0
+        ]
     correction = float(np.abs(expected[:n] - ahead.numpy()).max())
     assert correction > LEAST_CORRECTION_M, "a network that adds nothing shows nothing"
     for name, places in moved.items():

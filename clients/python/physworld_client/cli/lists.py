@@ -113,12 +113,19 @@ def _episode(episode: Episode) -> Sequence[object]:
 
 def _model(model: Model) -> Sequence[object]:
     aliases = ", ".join(f"{alias} → {number}" for alias, number in sorted(model.aliases.items()))
-    return (model.name, model.latest_version or "none", aliases, ago(model.created_at))
+    return (
+        model.name,
+        model.latest_version or "none",
+        model.latest or "none",
+        aliases,
+        ago(model.created_at),
+    )
 
 
 def _version(version: ModelVersion) -> Sequence[object]:
     digest = (version.sha256 or "")[:12]
-    return (version.version, version.state, ", ".join(version.aliases), digest, ago(version.created_at))
+    marks = (version.version, version.state, version.quality.verdict, ", ".join(version.aliases))
+    return (*marks, digest, ago(version.created_at))
 
 
 def _job(job: Job) -> Sequence[object]:
@@ -160,11 +167,11 @@ EPISODES = Listing(
     _episode,
     of="dataset_id",
 )
-MODELS = Listing("list", "Registered names.", ("name", "latest", "aliases", "age"), _model)
+MODELS = Listing("list", "Registered names.", ("name", "newest", "latest", "aliases", "age"), _model)
 VERSIONS = Listing(
     "versions",
     "Versions of a name, newest first.",
-    ("version", "state", "aliases", "sha256", "age"),
+    ("version", "state", "quality", "aliases", "sha256", "age"),
     _version,
     of="name",
 )

@@ -68,7 +68,7 @@ def build_report(
         seconds=seconds,
         episodes=episodes,
         parameters={name: value.model_dump(mode="json") for name, value in fit.parameters.items()},
-        notes=[str(note) for note in metrics.get("notes", [])],
+        notes=[str(note) for note in metrics.get("notes", [])] + _failures(version),
         closed_loop=metrics.get("closed_loop"),
     )
 
@@ -151,6 +151,11 @@ def _table(metrics: Mapping[str, Any], key: str, version: ModelVersion) -> Mappi
             f"{_label(version)} carries no figures {key!r} (it has: {', '.join(metrics) or 'none'})"
         )
     return table
+
+
+def _failures(version: ModelVersion) -> list[str]:
+    """Why the version is not ``latest``, where it failed the quality gate."""
+    return [f"{_label(version)} failed the quality gate: {reason}" for reason in version.quality.reasons]
 
 
 def _label(version: ModelVersion) -> str:

@@ -30,16 +30,16 @@ STRENGTHS = {"air_drag_linear.rate_per_s": {"calibrated": 1.9, "ci95": [1.6, 2.2
 
 @pytest.fixture
 def client(tmp_path: Path) -> Iterator[httpx.Client]:
-    """A browser on a dashboard with two ready versions of ``beam`` and one of ``lonely``."""
+    """A browser on a dashboard with two ready versions of ``beam``, one of ``lonely``, and ``lost``, which diverged."""
     settings = Settings(data_dir=tmp_path)
     database = open_database(settings)
     database.upgrade()
     stores = Stores(settings)
     with database.session() as session:
-        for name, error_m in (("beam", 0.004), ("beam", 0.0031), ("lonely", 0.001)):
+        for name, error_m in (("beam", 0.004), ("beam", 0.0031), ("lonely", 0.001), ("lost", 0.752)):
             curves = {name: [error_m, error_m, None] for name in ("twin", "world_model_finetuned", "static")}
             table = {
-                "track_m": dict.fromkeys(curves, error_m),
+                "track_m": dict.fromkeys(curves, error_m) | {"static": 0.1},
                 "frames": [10, 13],
                 "per_frame": {"times_s": [0.3, 0.4, 0.5], "track_m": curves},
             }
@@ -80,6 +80,19 @@ def test_without_a_choice_the_two_newest_are_taken(client: httpx.Client) -> None
     assert '<option value="1" selected>' in page and '<option value="2" selected>' in page
     assert client.get("/dashboard/models/lonely/compare").status_code == 200
     assert client.get("/dashboard/models/beam/compare?a=1&b=nobody").status_code == 404
+
+
+def test_a_version_that_failed_the_quality_gate_has_a_red_mark_everywhere(client: httpx.Client) -> None:
+    red = '<span class="badge failed" title="it errs 752 mm'
+    for path in ("", "/lost", "/lost/1"):
+        page = client.get(f"/dashboard/models{path}").text
+        assert red in page and page.count("badge failed") == 1
+    assert (
+        "does not become <code>latest</code>: it errs 752 mm" in client.get("/dashboard/models/lost/1").text
+    )
+    assert '<span class="badge tag">latest</span>' not in client.get("/dashboard/models/lost").text
+    good = client.get("/dashboard/models/beam").text
+    assert "badge failed" not in good and good.count('<span class="badge tag">latest</span>') == 1
 
 
 def test_a_page_of_a_version_answers_to_its_alias(client: httpx.Client) -> None:

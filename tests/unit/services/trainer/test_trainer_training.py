@@ -29,6 +29,7 @@ from physworld_schemas.dataset import DatasetConfig
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.job import Job
 from physworld_schemas.model import ModelVersion, TrainingConfig, TrainingCreate
+from physworld_schemas.quality import quality_of
 from physworld_schemas.signing import ManifestSignature
 from physworld_services.trainer import training
 from physworld_services.trainer.measuring import json_safe
@@ -225,6 +226,10 @@ def test_the_metrics_have_every_row_of_the_table(runtime: Runtime, dataset_id: s
     assert low < version.metrics["held_out"]["track_m"]["twin"] < high
     assert version.metrics["episodes"] == 4
     assert version.metrics["validation"]["curve"][-1][0] == SMALL.steps
+    assert len(version.metrics["energy"]["still_quarters_m2_s2"]) == 4
+    assert version.quality.verdict in {"passed", "failed"}
+    card = json.loads(_files(runtime, version)["card.json"])
+    assert card["quality"] == version.quality.model_dump(mode="json")
 
 
 def test_the_same_inputs_give_the_same_weights(runtime: Runtime, dataset_id: str) -> None:
@@ -294,6 +299,8 @@ def test_a_rollout_that_left_the_numbers_is_published_as_absent(monkeypatch: pyt
     measured = training.measure(view, view.published(model, phi, phi))
     assert measured.table["track_m"]["world_model"] is None
     assert measured.table["track_m"]["twin"] is not None
+    metrics = json_safe({"held_out": measured.table, "energy": measured.energy})
+    assert len(quality_of(metrics).reasons) == 2  # on the held-out frames, and while the grips stand still
 
 
 def test_a_training_begins_while_its_dataset_is_being_written(runtime: Runtime) -> None:

@@ -1,0 +1,126 @@
+"""What the study compares: ways to a world model, each given the same episodes and the same processor time.
+
+A variant turns episodes into a predictor within a budget of processor seconds (fits of priors, scales and validations
+counted). It is judged elsewhere (``benchmarks.worldmodel.study``), on episodes that it never sees.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+
+from benchmarks.worldmodel.bodies import SUBTICKS, Episodes
+from physworld.worldmodel.dataset import Track
+from physworld.worldmodel.model.config import TrainingConfig, WorldModelConfig
+from physworld.worldmodel.model.graph import GraphSpec
+from physworld.worldmodel.rollout import rollout_tracks
+from physworld.worldmodel.training import train
+
+MODEL = WorldModelConfig(vertices=80)
+TRAINING = TrainingConfig(checkpoint_every=10**9)
+TIMED_STEPS = 4
+MOST_STEPS = 200_000
+
+Predict = Callable[[list[Track]], list[torch.Tensor]]
+"""Positions (T, V, 3) of episodes from their first frames, in the episodes' own ticks."""
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A predictor, the subticks between its ticks, how many frames it is given, and what its training said."""
+
+    predict: Predict
+    every: int
+    given: int
+    notes: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A way to a world model.
+
+    Attributes:
+        label: for people.
+        settings: of the training, what differs from the default.
+        architecture: of the network, what differs from the default.
+        every: subticks between the model's ticks.
+        trains: false for a prior alone, which takes what it takes.
+    """
+
+    label: str
+    settings: dict[str, Any]
+    architecture: dict[str, Any]
+    every: int = SUBTICKS
+    trains: bool = True
+
+    def learn(self, episodes: Episodes, budget_s: float, seed: int) -> Trained:
+        """Train within ``budget_s`` processor seconds."""
+        torch.set_num_threads(1)
+        config = replace(MODEL, **self.architecture)
+        spec = replace(episodes.spec, dt_s=episodes.spec.dt_s * self.every / SUBTICKS)
+        tracks = episodes.tracks("taught", self.every)
+        training = replace(TRAINING, seed=seed, **self.settings)
+        if self.trains:
+            steps = _affordable(tracks, spec, config, training, budget_s)
+            training = replace(training, steps=steps, validation_every=max(1, steps // 10))
+        else:
+            training = replace(training, steps=0)
+        begun = time.process_time()
+        result = train(tracks, spec, config, training)
+        notes = {
+            "processor_s": time.process_time() - begun,
+            "steps": result.steps,
+            "best_step": result.best_step,
+            "prior": result.prior,
+            "validation_m": result.best_error_m,
+            "validation_prior_m": result.prior_error_m,
+            "curve": result.validation,
+        }
+        return Trained(
+            lambda judged: rollout_tracks(result.model, judged), self.every, config.history + 1, notes
+        )
+
+
+def _affordable(
+    tracks: list[Track],
+    spec: GraphSpec,
+    config: WorldModelConfig,
+    training: TrainingConfig,
+    budget_s: float,
+) -> int:
+    """Optimiser steps for the budget, from what a few of them and the start take."""
+    seconds = []
+    for steps in (0, TIMED_STEPS):
+        begun = time.process_time()
+        train(tracks, spec, config, replace(training, steps=steps, validation_every=MOST_STEPS))
+        seconds.append(time.process_time() - begun)
+    a_step = (seconds[1] - seconds[0]) / TIMED_STEPS
+    return int(max(10, min(MOST_STEPS, 0.9 * (budget_s - seconds[0]) / max(a_step, 1e-4))))
+
+
+VARIANTS = {
+    "prior": Variant("prior alone, world axes", {"frame": "world"}, {}, trains=False),
+    "today": Variant("prior and network, world axes (the default so far)", {"frame": "world"}, {}),
+    "network": Variant(
+        "network alone, world axes", {"prior": "none", "frame": "world", "learning_rate": 3e-3}, {}
+    ),
+    "grip_prior": Variant("prior alone, grip's frame where it is chosen", {}, {}, trains=False),
+    "grip": Variant("prior and network, grip's frame where it is chosen", {}, {}),
+    "grip_network": Variant("network alone, grip's frame", {"prior": "none", "learning_rate": 3e-3}, {}),
+    "fine_network": Variant(
+        "network alone, grip's frame, 1/120 s, one-step training with noise",
+        {
+            "prior": "none",
+            "look_ahead": 1,
+            "batch_size": 32,
+            "noise_history": 0.3,
+            "learning_rate": 3e-3,
+        },
+        {"message_passing_steps": 5},
+        every=2,
+    ),
+}
