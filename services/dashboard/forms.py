@@ -140,7 +140,12 @@ def _input(
     """The input of a field that is no model of its own; None for one that a form does not show."""
     own, optional = _without_null(schema)
     help_, unit = str(schema.get("description", "")), str(schema.get("unit", own.get("unit", "")))
-    known: dict[str, Any] = {"name": place, "label": label_of(key), "help": help_, "unit": "" if unit == "1" else unit}
+    known: dict[str, Any] = {
+        "name": place,
+        "label": label_of(key),
+        "help": help_,
+        "unit": "" if unit == "1" else unit,
+    }
     known |= {"value": value, "required": required and not optional}
     empty = [("", "usual" if value is None else "–")] if optional or not required else []
     if options is not None and own.get("type") == "array":

@@ -31,12 +31,16 @@ def router(site: Site) -> APIRouter:
     routes = APIRouter(prefix="/keys", dependencies=[Depends(require_admin)])
 
     def page(
-        request: Request, cursor: str | None = None, token: str = "", fault: str = "", status: int = 200
+        request: Request,
+        cursor: str | None = None,
+        made: str | None = None,
+        fault: str = "",
+        status: int = 200,
     ) -> HTMLResponse:
         with site.database.reading() as session:
             found = api_keys.list_keys(session, limit=PAGE_SIZE, cursor=cursor)
         context: dict[str, Any] = {"keys": found.data, "cursor": cursor, "next_cursor": found.next_cursor}
-        context |= {"roles": ROLES, "token": token, "fault": fault}
+        context |= {"roles": ROLES, "token": made, "fault": fault}
         return site.page(request, "keys.html", status=status, **context)
 
     @routes.get("")
@@ -61,14 +65,14 @@ def router(site: Site) -> APIRouter:
             _, token = api_keys.create_key(
                 session, asked.name, asked.role, lifetime_days=asked.expires_in_days, by=actor_of(request)
             )
-        return page(request, token=token, status=201)
+        return page(request, made=token, status=201)
 
     @routes.post("/{key_id}/rotate", dependencies=[Depends(require_same_origin)])
     def rotate(request: Request, key_id: str) -> HTMLResponse:
         grace = timedelta(minutes=DEFAULT_GRACE_MINUTES)
         with site.database.session() as session:
             _, token, _ = api_keys.rotate_key(session, key_id, grace, by=actor_of(request))
-        return page(request, token=token)
+        return page(request, made=token)
 
     @routes.post("/{key_id}/revoke", dependencies=[Depends(require_same_origin)])
     def revoke(request: Request, key_id: str) -> Response:

@@ -43,21 +43,36 @@ def router(site: Site) -> APIRouter:
         with site.database.reading() as session:
             page = resources.list_fits(session, limit=PAGE_SIZE, cursor=cursor)
             names = overview.scene_names(session, {fit.scene_id for fit in page.data})
-        context: dict[str, Any] = {"fits": page.data, "names": names, "cursor": cursor, "next_cursor": page.next_cursor}
+        context: dict[str, Any] = {
+            "fits": page.data,
+            "names": names,
+            "cursor": cursor,
+            "next_cursor": page.next_cursor,
+        }
         return site.page(request, "fits.html", **context)
 
     @routes.get("/rollouts")
     def rollouts(request: Request, cursor: Cursor = None, model: ModelName = None) -> HTMLResponse:
         with site.database.reading() as session:
             page = runs.list_rollouts(session, limit=PAGE_SIZE, cursor=cursor, model=model)
-        context: dict[str, Any] = {"runs": page.data, "cursor": cursor, "next_cursor": page.next_cursor, "model": model}
+        context: dict[str, Any] = {
+            "runs": page.data,
+            "cursor": cursor,
+            "next_cursor": page.next_cursor,
+            "model": model,
+        }
         return site.page(request, "rollouts.html", **context)
 
     @routes.get("/plans")
     def plans(request: Request, cursor: Cursor = None, model: ModelName = None) -> HTMLResponse:
         with site.database.reading() as session:
             page = runs.list_plans(session, limit=PAGE_SIZE, cursor=cursor, model=model)
-        context: dict[str, Any] = {"runs": page.data, "cursor": cursor, "next_cursor": page.next_cursor, "model": model}
+        context: dict[str, Any] = {
+            "runs": page.data,
+            "cursor": cursor,
+            "next_cursor": page.next_cursor,
+            "model": model,
+        }
         return site.page(request, "plans.html", **context)
 
     @routes.get("/rollouts/{run_id}")

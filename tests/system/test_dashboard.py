@@ -117,7 +117,8 @@ def test_a_scene_without_a_twin_says_what_to_do_or_where_one_is_being_made(
     with world.database.reading() as session:
         scenes = {scene.name: scene.id for scene in resources.list_scenes(session).data}
     visit.open(f"/scenes/{scenes['chain_failed']}")
-    expect(visit.page.locator("main")).to_contain_text("physworld run chain_failed")
+    calibrate = visit.page.locator(".empty").get_by_role("link", name="Calibrate")
+    expect(calibrate).to_have_attribute("href", f"/dashboard/start/fit?scene_id={scenes['chain_failed']}")
     visit.points_shown()
     visit.open(f"/scenes/{scenes['chain_running']}")
     visit.points_shown()

@@ -30,10 +30,10 @@ def where(url: str | None, token: str | None) -> Place:
     Raises:
         PhysWorldError: no address is known.
     """
-    url = url or os.environ.get("PHYSWORLD_URL")
     token = token or os.environ.get("PHYSWORLD_TOKEN")
-    if url:
-        return Place(url, token)
+    known = url if url is not None else os.environ.get("PHYSWORLD_URL") or None
+    if known is not None:
+        return Place(known, token)
     folder = Path(os.environ.get("PHYSWORLD_DATA_DIR") or USUAL_FOLDER).expanduser().absolute()
     try:
         state = json.loads((folder / "run" / "state.json").read_bytes())

@@ -30,7 +30,9 @@ def embedded(folder: Path) -> None:
 
 
 def test_without_any_service_the_client_says_what_to_do() -> None:
-    with pytest.raises(PhysWorldError, match=r"set PHYSWORLD_URL, or start one on .*data with `physworld up`"):
+    with pytest.raises(
+        PhysWorldError, match=r"set PHYSWORLD_URL, or start one on .*data with `physworld up`"
+    ):
         Client()
 
 
