@@ -8,6 +8,7 @@ from setuptools import find_packages, setup
 
 IMPORT_NAMES = {
     "physworld": "physworld",
+    "physworld_sample": "sample",
     "physworld_schemas": "schemas",
     "physworld_scenes": "scenes",
     "physworld_services": "services",
@@ -17,6 +18,7 @@ IMPORT_NAMES = {
 
 setup(
     package_dir=IMPORT_NAMES,
+    package_data={"physworld_sample": ["soft_beam/*.json", "soft_beam/*.npz"]},
     packages=[
         package
         for name, folder in IMPORT_NAMES.items()

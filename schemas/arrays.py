@@ -30,9 +30,9 @@ class EncodedArray(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    shape: list[Side] = Field(max_length=6)
-    dtype: Literal["<f4"] = "<f4"
-    data: str
+    shape: list[Side] = Field(max_length=6, description="Sizes of the axes.", examples=[[2, 3]])
+    dtype: Literal["<f4"] = Field(default="<f4", description="Type of the values: little-endian float32.")
+    data: str = Field(description="Values in C order, base64.")
 
     @classmethod
     def of(cls, values: np.ndarray) -> EncodedArray:

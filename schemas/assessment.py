@@ -19,18 +19,24 @@ class AssessmentCreate(Request):
     ``open_trace`` says whether a recording that the model predicts worse than expected is traced, with ``trace``.
     """
 
-    scene_id: str
-    open_trace: bool = True
-    trace: TraceConfig = Field(default_factory=TraceConfig)
+    scene_id: str = Field(description="New recording of the model's object.")
+    open_trace: bool = Field(
+        default=True, description="Trace the recording where the model errs more than its card promises."
+    )
+    trace: TraceConfig = Field(default_factory=TraceConfig, description="Settings of that trace.")
 
 
 class ErrorFigure(Resource):
     """A mean track error [m] with its 95 % interval, what noise alone would show, and the frames it is over."""
 
-    error_m: float
-    ci95_m: tuple[float, float]
-    noise_floor_m: float | None = None
-    frames: int
+    error_m: float = Field(description="Mean track error.", json_schema_extra={"unit": "m"})
+    ci95_m: tuple[float, float] = Field(description="Its 95 % interval.", json_schema_extra={"unit": "m"})
+    noise_floor_m: float | None = Field(
+        default=None,
+        description="Mean error that noise alone would show; null: not known.",
+        json_schema_extra={"unit": "m"},
+    )
+    frames: int = Field(description="Frames that the mean is over.")
 
 
 class Assessment(Resource):
@@ -41,23 +47,41 @@ class Assessment(Resource):
     model errs more than noise and its card allow.
     """
 
-    id: str
-    name: str
-    version: int
-    scene_id: str
-    state: Literal["pending", "ready", "failed"]
-    created_at: datetime
-    job_id: str
-    config: dict[str, Any] = Field(default_factory=dict)
-    outcome: Outcome | None = None
-    reason: str = ""
-    measured: ErrorFigure | None = None
-    expected: ErrorFigure | None = None
-    excess_m: float | None = None
-    excess_ci95_m: tuple[float, float] | None = None
-    baselines_m: dict[str, float | None] = Field(default_factory=dict)
-    twin_m: float | None = None
-    start_mismatch_m: float | None = None
-    trace_id: str | None = None
-    links: dict[str, str] = Field(default_factory=dict)
-    lineage: Lineage = Field(default_factory=Lineage)
+    id: str = Field(description="Identifier: a prefix of its kind and 26 characters that sort by time.")
+    name: str = Field(description="Name of the model.")
+    version: int = Field(description="Version of the model.")
+    scene_id: str = Field(description="Scene that it is about.", examples=["scn_01JZ8Q5V3M7X2K9T4B6N8R0C1D"])
+    state: Literal["pending", "ready", "failed"] = Field(description="Whether the answer is there.")
+    created_at: datetime = Field(description="When it was made, UTC.")
+    job_id: str = Field(description="Job that makes it.", examples=["job_01JZ8Q5V3M7X2K9T4B6N8R0C1D"])
+    config: dict[str, Any] = Field(default_factory=dict, description="Settings.")
+    outcome: Outcome | None = Field(
+        default=None, description="How the recording compares with the card; null until ready."
+    )
+    reason: str = Field(default="", description="The outcome in a sentence.")
+    measured: ErrorFigure | None = Field(default=None, description="Error on the new recording.")
+    expected: ErrorFigure | None = Field(default=None, description="Error that the card promises.")
+    excess_m: float | None = Field(
+        default=None,
+        description="Error beyond the promised one, noise taken off.",
+        json_schema_extra={"unit": "m"},
+    )
+    excess_ci95_m: tuple[float, float] | None = Field(
+        default=None, description="Its 95 % interval.", json_schema_extra={"unit": "m"}
+    )
+    baselines_m: dict[str, float | None] = Field(
+        default_factory=dict, description="Errors of the baselines.", json_schema_extra={"unit": "m"}
+    )
+    twin_m: float | None = Field(
+        default=None, description="Error of the twin.", json_schema_extra={"unit": "m"}
+    )
+    start_mismatch_m: float | None = Field(
+        default=None,
+        description="Distance of the recording's start from the model's.",
+        json_schema_extra={"unit": "m"},
+    )
+    trace_id: str | None = Field(default=None, description="Trace that was opened; null: none.")
+    links: dict[str, str] = Field(default_factory=dict, description="Addresses of what belongs to it.")
+    lineage: Lineage = Field(
+        default_factory=Lineage, description="What it was made from, by which code, with which seeds."
+    )

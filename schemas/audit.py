@@ -20,10 +20,13 @@ class AuditEntry(Resource):
         subject: to what: an id or a name.
     """
 
-    seq: int
-    at: datetime
-    actor: str | None = None
-    address: str | None = None
-    action: str
-    subject: str | None = None
-    detail: dict[str, Any] = Field(default_factory=dict)
+    seq: int = Field(description="Number of the entry; grows, never used twice.")
+    at: datetime = Field(description="When, UTC.")
+    actor: str | None = Field(
+        default=None,
+        description="API key that did it; null: a process of the service's machine, or a stranger.",
+    )
+    address: str | None = Field(default=None, description="Where the request came from.")
+    action: str = Field(description="What was done.", examples=["key.revoked"])
+    subject: str | None = Field(default=None, description="To what: an id or a name.")
+    detail: dict[str, Any] = Field(default_factory=dict, description="What else is known of it.")

@@ -37,29 +37,29 @@ class Resource(BaseModel):
 class Reference(Resource):
     """One input of an object: what it was made from, and the digest it had then."""
 
-    kind: ObjectKind
-    id: str
-    digest: str | None = None
+    kind: ObjectKind = Field(description="What is referred to.")
+    id: str = Field(description="Its identifier; of a model `name:version`.")
+    digest: str | None = Field(default=None, description="Its SHA-256 at that time; null: it had none.")
 
 
 class Lineage(Resource):
     """What made an object; the same inputs, code and configuration make it again."""
 
-    inputs: list[Reference] = Field(default_factory=list)
-    code_version: str = ""
-    config_digest: str = ""
-    seeds: dict[str, int] = Field(default_factory=dict)
-    device: str = ""
-    job_id: str | None = None
+    inputs: list[Reference] = Field(default_factory=list, description="What it was made from.")
+    code_version: str = Field(default="", description="Version of PhysWorld.")
+    config_digest: str = Field(default="", description="SHA-256 of the settings.")
+    seeds: dict[str, int] = Field(default_factory=dict, description="Seeds by stage.")
+    device: str = Field(default="", description="Device that computed it.", examples=["cpu"])
+    job_id: str | None = Field(default=None, description="Job that made it.")
 
 
 class Artifact(Resource):
     """A content-addressed file: its name in the object that owns it, digest, size [bytes] and type."""
 
-    name: str
-    sha256: str
-    size: int
-    media_type: str = "application/octet-stream"
+    name: str = Field(description="File name within its object.", examples=["report.json"])
+    sha256: str = Field(description="SHA-256 of the bytes: the address of the file.")
+    size: int = Field(description="Size.", json_schema_extra={"unit": "B"})
+    media_type: str = Field(default="application/octet-stream", description="Media type.")
 
 
 Item = TypeVar("Item")
@@ -68,29 +68,33 @@ Item = TypeVar("Item")
 class Page(Resource, Generic[Item]):
     """A page of a list, newest first; pass ``next_cursor`` as ``?cursor=`` for the next one."""
 
-    data: list[Item]
-    has_more: bool = False
-    next_cursor: str | None = None
+    data: list[Item] = Field(description="Items of this page.")
+    has_more: bool = Field(default=False, description="Whether another page follows.")
+    next_cursor: str | None = Field(
+        default=None, description="Opaque: pass it on as `cursor` for the next page; null on the last."
+    )
 
 
 class FieldError(Resource):
     """One fault of the input: where (a path of keys) and what, with its numbers."""
 
-    loc: list[str | int]
-    msg: str
+    loc: list[str | int] = Field(
+        description="Path of keys to the fault.", examples=[["body", "config", "episodes"]]
+    )
+    msg: str = Field(description="What is wrong, with its numbers.")
 
 
 class Problem(Resource):
     """RFC 9457 problem details; ``code`` is stable, ``detail`` carries the numbers that broke."""
 
-    type: str = "about:blank"
-    title: str
-    status: int
-    code: str
-    detail: str = ""
-    request_id: str | None = None
-    errors: list[FieldError] = Field(default_factory=list)
-    hint: str | None = None
+    type: str = Field(default="about:blank", description="URN of the kind of problem.")
+    title: str = Field(description="Kind of problem, for people.")
+    status: int = Field(description="HTTP status.", examples=[422])
+    code: str = Field(description="Stable code to branch on.", examples=["invalid_request"])
+    detail: str = Field(default="", description="What went wrong, with its numbers.")
+    request_id: str | None = Field(default=None, description="Finds the request in the service's log.")
+    errors: list[FieldError] = Field(default_factory=list, description="Each fault with its place.")
+    hint: str | None = Field(default=None, description="What to do about it; null: nothing is known.")
 
 
 def holds_unstorable_characters(text: str) -> bool:
@@ -116,5 +120,5 @@ def _holds_unstorable(value: Any) -> bool:
 class Figures(Resource):
     """A free table of JSON figures (metrics, parameters) with the time at which it was made."""
 
-    made_at: datetime | None = None
-    values: dict[str, Any] = Field(default_factory=dict)
+    made_at: datetime | None = Field(default=None, description="When they were made.")
+    values: dict[str, Any] = Field(default_factory=dict, description="The figures.")

@@ -26,21 +26,86 @@ class DatasetConfig(Request):
     found are drawn within their intervals. An episode that is rejected is drawn anew, at most ``tries`` times.
     """
 
-    episodes: int = Field(default=100, ge=1, le=20_000)
-    frames: int | None = Field(default=None, ge=2, le=5000)
-    motion: Literal["vmp", "linear"] = "vmp"
-    patterns: dict[Pattern, Annotated[float, Field(ge=0.0, le=1e6)]] | None = None
-    replay_share: float = Field(default=0.2, ge=0.0, le=1.0)
-    curvature_limit: float = Field(default=6.0, gt=0.0, le=100.0)
-    perturbation: Literal["p3", "uniform", "random", "none"] = "p3"
-    properties: list[Property] = Field(default=["stiffness", "density"], max_length=3)
-    property_sigma: float = Field(default=0.2, ge=0.0, le=2.0)
-    length_scale: float = Field(default=1.0, gt=0.0, le=100.0)
-    space_scale: float | None = Field(default=None, gt=0.0, le=100.0)
-    features: Literal["auto", "supplied", "geometric"] = "auto"
-    effects: Literal["perturbed", "as_found"] = "perturbed"
-    tries: int = Field(default=8, ge=1, le=100)
-    seed: Seed = 0
+    episodes: int = Field(
+        default=100, ge=1, le=20_000, description="How many episodes the twin demonstrates.", examples=[100]
+    )
+    frames: int | None = Field(
+        default=None,
+        ge=2,
+        le=5000,
+        description="Frames of an episode; empty: as many as the recording has.",
+        examples=[100],
+    )
+    motion: Literal["vmp", "linear"] = Field(
+        default="vmp",
+        description="How grips move: curved paths at three-phase speed (vmp), or straight at constant speed.",
+    )
+    patterns: dict[Pattern, Annotated[float, Field(ge=0.0, le=1e6)]] | None = Field(
+        default=None,
+        description="Weights of the patterns of motion; empty: any direction alike.",
+        examples=[{"lift": 1.0}],
+    )
+    replay_share: float = Field(
+        default=0.2,
+        ge=0.0,
+        le=1.0,
+        description="Share of episodes that replay the recording's own training motion.",
+        json_schema_extra={"unit": "1"},
+        examples=[0.2],
+    )
+    curvature_limit: float = Field(
+        default=6.0,
+        gt=0.0,
+        le=100.0,
+        description="Largest bend of a path, relative to its length.",
+        json_schema_extra={"unit": "1"},
+    )
+    perturbation: Literal["p3", "uniform", "random", "none"] = Field(
+        default="p3",
+        description="How twins differ: fields over part features (p3), one factor, per particle, or not.",
+    )
+    properties: list[Property] = Field(
+        default=["stiffness", "density"],
+        max_length=3,
+        description="Which properties differ between episodes.",
+    )
+    property_sigma: float = Field(
+        default=0.2,
+        ge=0.0,
+        le=2.0,
+        description="Standard deviation of the log of a property.",
+        json_schema_extra={"unit": "1"},
+        examples=[0.2],
+    )
+    length_scale: float = Field(
+        default=1.0,
+        gt=0.0,
+        le=100.0,
+        description="Length of the field's kernel over part features.",
+        json_schema_extra={"unit": "1"},
+    )
+    space_scale: float | None = Field(
+        default=None,
+        gt=0.0,
+        le=100.0,
+        description="Length of the field's kernel in space; empty: features alone.",
+        json_schema_extra={"unit": "object sizes"},
+    )
+    features: Literal["auto", "supplied", "geometric"] = Field(
+        default="auto", description="Part features: from the recording, from the geometry, or what there is."
+    )
+    effects: Literal["perturbed", "as_found"] = Field(
+        default="perturbed",
+        description="Draw traced strengths within their intervals, or keep them as found.",
+    )
+    tries: int = Field(
+        default=8, ge=1, le=100, description="Most tries of an episode before the dataset fails."
+    )
+    seed: Seed = Field(
+        default=0,
+        description="Seed of every random choice; the same seed gives the same result.",
+        examples=[0],
+    )
 
     @field_validator("patterns")
     @classmethod
@@ -63,37 +128,49 @@ class DatasetCreate(Request):
     ``trace_id`` names a ready trace of the fit's scene: where it named an effect, its twin demonstrates.
     """
 
-    fit_id: str
-    trace_id: str | None = None
-    config: DatasetConfig = Field(default_factory=DatasetConfig)
+    fit_id: str = Field(
+        description="Ready fit whose twin demonstrates.", examples=["fit_01JZ8Q5V3M7X2K9T4B6N8R0C1D"]
+    )
+    trace_id: str | None = Field(
+        default=None, description="Ready trace of the fit's scene, whose effect the twin then carries."
+    )
+    config: DatasetConfig = Field(default_factory=DatasetConfig, description="Settings.")
 
 
 class Episode(Resource):
     """One committed episode: its place in the store, digest of its arrays, seed and shape."""
 
-    index: int
-    path: str
-    digest: str
-    seed: int
-    frames: int
-    particles: int
-    attempt: int = 1
-    motion: str = ""
+    index: int = Field(description="Number of the episode, from 0.")
+    path: str = Field(description="Place in the store.")
+    digest: str = Field(description="SHA-256 of its arrays.")
+    seed: int = Field(
+        description="Seed of every random choice; the same seed gives the same result.", examples=[0]
+    )
+    frames: int = Field(description="Frames.")
+    particles: int = Field(description="Particles.")
+    attempt: int = Field(default=1, description="Attempt that was committed.")
+    motion: str = Field(default="", description="Pattern of its motion.")
 
 
 class Dataset(Resource):
     """Episodes under a manifest; immutable once ``sealed`` (``digest`` is the manifest's)."""
 
-    id: str
-    fit_id: str
-    trace_id: str | None = None
-    scene_id: str
-    state: Literal["pending", "writing", "sealed", "failed"]
-    created_at: datetime
-    job_id: str
-    config: DatasetConfig
-    episodes_done: int = 0
-    digest: str | None = None
-    statistics: dict[str, Any] = Field(default_factory=dict)
-    lineage: Lineage = Field(default_factory=Lineage)
-    artifacts: list[Artifact] = Field(default_factory=list)
+    id: str = Field(description="Identifier: a prefix of its kind and 26 characters that sort by time.")
+    fit_id: str = Field(description="Fit whose twin is used.", examples=["fit_01JZ8Q5V3M7X2K9T4B6N8R0C1D"])
+    trace_id: str | None = Field(default=None, description="Trace whose effect the twin carries; null: none.")
+    scene_id: str = Field(description="Scene that it is about.", examples=["scn_01JZ8Q5V3M7X2K9T4B6N8R0C1D"])
+    state: Literal["pending", "writing", "sealed", "failed"] = Field(
+        description="`sealed` is ready and never changes again."
+    )
+    created_at: datetime = Field(description="When it was made, UTC.")
+    job_id: str = Field(description="Job that makes it.", examples=["job_01JZ8Q5V3M7X2K9T4B6N8R0C1D"])
+    config: DatasetConfig = Field(description="Settings.")
+    episodes_done: int = Field(default=0, description="Episodes that are written.")
+    digest: str | None = Field(default=None, description="SHA-256 of the manifest; null until sealed.")
+    statistics: dict[str, Any] = Field(default_factory=dict, description="Counts and times of the episodes.")
+    lineage: Lineage = Field(
+        default_factory=Lineage, description="What it was made from, by which code, with which seeds."
+    )
+    artifacts: list[Artifact] = Field(
+        default_factory=list, description="Files, by name and SHA-256; download them from /v1/artifacts."
+    )

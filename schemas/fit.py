@@ -29,16 +29,53 @@ class FitConfig(Request):
     ``numerics``: measure the engine's own damping on the scene, and the numbers with cells of no size.
     """
 
-    particle_budget: int = Field(default=2000, ge=50, le=MOST_PARTICLES)
-    max_simulations: int = Field(default=400, ge=1, le=5000)
-    damping: Literal["auto", "none"] = "auto"
-    law: Annotated[str, NamesOf("law")] | None = None
-    plasticity: Annotated[str, NamesOf("flow law")] | None = None
-    formulation: Literal["auto", "total_lagrangian", "updated_lagrangian", "discrete_rod"] = "auto"
-    transfer: Literal["apic", "asflip"] = "apic"
-    mesh: str | None = Field(default=None, pattern=r"^[1-9]\d{0,2}x[1-9]\d{0,2}(odd)?$")
-    stages: Literal["global", "global+local"] = "global"
-    numerics: bool = True
+    particle_budget: int = Field(
+        default=2000,
+        ge=50,
+        le=MOST_PARTICLES,
+        description="Particles of the simulated body: more are finer and slower.",
+        json_schema_extra={"unit": "particles"},
+        examples=[2000],
+    )
+    max_simulations: int = Field(
+        default=400,
+        ge=1,
+        le=5000,
+        description="Simulations that the search may spend.",
+        json_schema_extra={"unit": "simulations"},
+        examples=[400],
+    )
+    damping: Literal["auto", "none"] = Field(
+        default="auto",
+        description="Add air drag and internal friction where the data ask (auto), or keep the declared physics.",
+    )
+    law: Annotated[str, NamesOf("law")] | None = Field(
+        default=None,
+        description="Constitutive law; empty: the usual one of the body's shape; auto: choose by validation.",
+    )
+    plasticity: Annotated[str, NamesOf("flow law")] | None = Field(
+        default=None, description="Flow law, whose yield stress is calibrated too; empty: elastic."
+    )
+    formulation: Literal["auto", "total_lagrangian", "updated_lagrangian", "discrete_rod"] = Field(
+        default="auto", description="How the body is integrated; auto takes what its laws and scene need."
+    )
+    transfer: Literal["apic", "asflip"] = Field(
+        default="apic",
+        description="How particles and grid exchange velocities (updated Lagrangian form); asflip damps less.",
+    )
+    mesh: str | None = Field(
+        default=None,
+        pattern=r"^[1-9]\d{0,2}x[1-9]\d{0,2}(odd)?$",
+        description="Cells along both sides of a sheet of triangles; `odd`: diagonals the other way round.",
+        examples=["16x15"],
+    )
+    stages: Literal["global", "global+local"] = Field(
+        default="global",
+        description="One homogeneous material, or then a field of stiffness, kept only if validation improves.",
+    )
+    numerics: bool = Field(
+        default=True, description="Measure the engine's own damping and the error of its cells."
+    )
 
     @model_validator(mode="after")
     def _small_enough(self) -> Self:
@@ -75,8 +112,10 @@ class FitConfig(Request):
 class FitCreate(Request):
     """Body of POST /v1/fits."""
 
-    scene_id: str
-    config: FitConfig = Field(default_factory=FitConfig)
+    scene_id: str = Field(
+        description="Scene to calibrate a twin of.", examples=["scn_01JZ8Q5V3M7X2K9T4B6N8R0C1D"]
+    )
+    config: FitConfig = Field(default_factory=FitConfig, description="Settings.")
 
 
 class Parameter(Resource):
@@ -86,11 +125,16 @@ class Parameter(Resource):
     search did not end by itself.
     """
 
-    value: float
-    unit: str
-    ci95: tuple[float, float] | None = None
-    identified: bool = True
-    note: str = ""
+    value: float = Field(description="Calibrated value.")
+    unit: str = Field(description="Unit of the value; `1` has none.", examples=["Pa"])
+    ci95: tuple[float, float] | None = Field(
+        default=None, description="95 % interval, in the same unit; null where none can be given."
+    )
+    identified: bool = Field(
+        default=True,
+        description="Whether the data fix it; false: it was held at its prior or the search did not end.",
+    )
+    note: str = Field(default="", description="Why it is not identified, or what else to know.")
 
 
 class Numerics(Resource):
@@ -101,18 +145,31 @@ class Numerics(Resource):
     change of the predicted tracks with half the time step, and with cells ``refinement`` times smaller [m].
     """
 
-    equivalent_drag_per_s: float
-    damping_ratio: float | None = None
-    dominant_mode_hz: float | None = None
-    lost_share: float
-    time_step_s: float
-    half_step_m: float
-    finer_cells_m: float
-    refinement: float
-    particles: int
-    finer_particles: int
-    simulations: int
-    seconds: float
+    equivalent_drag_per_s: float = Field(
+        description="Linear drag that loses as much energy as the engine itself.",
+        json_schema_extra={"unit": "1/s"},
+    )
+    damping_ratio: float | None = Field(
+        default=None, description="The same, as a share of critical damping.", json_schema_extra={"unit": "1"}
+    )
+    dominant_mode_hz: float | None = Field(
+        default=None, description="Mode that the ratio is of.", json_schema_extra={"unit": "Hz"}
+    )
+    lost_share: float = Field(description="Share of the energy lost.", json_schema_extra={"unit": "1"})
+    time_step_s: float = Field(description="Time step.", json_schema_extra={"unit": "s"})
+    half_step_m: float = Field(
+        description="RMS change of the tracks with half the step.", json_schema_extra={"unit": "m"}
+    )
+    finer_cells_m: float = Field(
+        description="RMS change of the tracks with finer cells.", json_schema_extra={"unit": "m"}
+    )
+    refinement: float = Field(
+        description="How many times finer those cells were.", json_schema_extra={"unit": "1"}
+    )
+    particles: int = Field(description="Particles of the twin.")
+    finer_particles: int = Field(description="Particles of the finer run.")
+    simulations: int = Field(description="Simulations that were run.")
+    seconds: float = Field(description="Wall time that it took.", json_schema_extra={"unit": "s"})
 
 
 class SearchState(Resource):
@@ -122,8 +179,8 @@ class SearchState(Resource):
     leaves the best found so far, without intervals.
     """
 
-    converged: bool
-    open: dict[str, str] = Field(default_factory=dict)
+    converged: bool = Field(description="Whether every search ended by itself.")
+    open: dict[str, str] = Field(default_factory=dict, description="Why not, by parameter.")
 
 
 class LocalStage(Resource):
@@ -133,15 +190,27 @@ class LocalStage(Resource):
     field's prior. ``log_factors``: mean and ends of each field that was searched. ``held``: why others were not.
     """
 
-    kept: bool
-    reason: str
-    held: dict[str, str] = Field(default_factory=dict)
-    strength: float | None = None
-    validation: dict[str, float | None] = Field(default_factory=dict)
-    log_factors: dict[str, dict[str, float]] = Field(default_factory=dict)
-    runs: int = 0
-    simulations: int = 0
-    seconds: float | None = None
+    kept: bool = Field(description="Whether the field was kept.")
+    reason: str = Field(description="Why.")
+    held: dict[str, str] = Field(default_factory=dict, description="Fields that were not searched, and why.")
+    strength: float | None = Field(
+        default=None, description="Strength of the prior that was chosen.", json_schema_extra={"unit": "1"}
+    )
+    validation: dict[str, float | None] = Field(
+        default_factory=dict,
+        description="Validation error over the homogeneous twin's, by strength of the prior.",
+        json_schema_extra={"unit": "1"},
+    )
+    log_factors: dict[str, dict[str, float]] = Field(
+        default_factory=dict,
+        description="Mean and ends of each field's log factor.",
+        json_schema_extra={"unit": "1"},
+    )
+    runs: int = Field(default=0, description="Searches.")
+    simulations: int = Field(default=0, description="Simulations that were run.")
+    seconds: float | None = Field(
+        default=None, description="Wall time that it took.", json_schema_extra={"unit": "s"}
+    )
 
 
 class Fit(Resource):
@@ -152,19 +221,33 @@ class Fit(Resource):
     the body was built.
     """
 
-    id: str
-    scene_id: str
-    state: Literal["pending", "ready", "failed"]
-    created_at: datetime
-    job_id: str
-    config: FitConfig
-    parameters: dict[str, Parameter] = Field(default_factory=dict)
-    metrics: dict[str, Any] = Field(default_factory=dict)
-    numerics: Numerics | None = None
-    converged: dict[str, Parameter] | None = None
-    not_measured: str = ""
-    search: SearchState | None = None
-    local: LocalStage | None = None
-    notes: list[str] = Field(default_factory=list)
-    lineage: Lineage = Field(default_factory=Lineage)
-    artifacts: list[Artifact] = Field(default_factory=list)
+    id: str = Field(description="Identifier: a prefix of its kind and 26 characters that sort by time.")
+    scene_id: str = Field(description="Scene that it is about.", examples=["scn_01JZ8Q5V3M7X2K9T4B6N8R0C1D"])
+    state: Literal["pending", "ready", "failed"] = Field(description="Whether the twin is there.")
+    created_at: datetime = Field(description="When it was made, UTC.")
+    job_id: str = Field(description="Job that makes it.", examples=["job_01JZ8Q5V3M7X2K9T4B6N8R0C1D"])
+    config: FitConfig = Field(description="Settings.")
+    parameters: dict[str, Parameter] = Field(
+        default_factory=dict, description="Calibrated quantities by name."
+    )
+    metrics: dict[str, Any] = Field(
+        default_factory=dict, description="Errors on the held-out frames and more."
+    )
+    numerics: Numerics | None = Field(
+        default=None, description="What the engine adds by itself; null: not measured."
+    )
+    converged: dict[str, Parameter] | None = Field(
+        default=None, description="Parameters extrapolated to cells of no size; null: not measured."
+    )
+    not_measured: str = Field(default="", description="Why numerics are missing.")
+    search: SearchState | None = Field(default=None, description="Whether the search converged.")
+    local: LocalStage | None = Field(
+        default=None, description="What the local stage found; null: not asked for."
+    )
+    notes: list[str] = Field(default_factory=list, description="How the body was built.")
+    lineage: Lineage = Field(
+        default_factory=Lineage, description="What it was made from, by which code, with which seeds."
+    )
+    artifacts: list[Artifact] = Field(
+        default_factory=list, description="Files, by name and SHA-256; download them from /v1/artifacts."
+    )

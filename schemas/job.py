@@ -17,38 +17,38 @@ TERMINAL_STATES: frozenset[str] = frozenset({"succeeded", "failed", "cancelled"}
 class Progress(Resource):
     """How far a job is: ``done`` of ``total`` ``unit`` (frames, simulations, episodes, steps)."""
 
-    done: float = 0
-    total: float = 0
-    unit: str = ""
-    message: str = ""
+    done: float = Field(default=0, description="How much is done.")
+    total: float = Field(default=0, description="Of how much; 0: not known yet.")
+    unit: str = Field(default="", description="What is counted.", examples=["simulations"])
+    message: str = Field(default="", description="What is being done.")
 
 
 class Job(Resource):
     """A piece of work. A pipeline job owns child jobs (fit, trace, dataset, training)."""
 
-    id: str
-    kind: JobKind
-    state: JobState
-    progress: Progress = Field(default_factory=Progress)
-    attempt: int = 0
-    parent_id: str | None = None
-    children: list[str] = Field(default_factory=list)
-    created_at: datetime
-    started_at: datetime | None = None
-    finished_at: datetime | None = None
-    heartbeat_at: datetime | None = None
-    inputs: list[Reference] = Field(default_factory=list)
-    outputs: list[Reference] = Field(default_factory=list)
-    config: dict[str, Any] = Field(default_factory=dict)
-    error: Problem | None = None
-    links: dict[str, str] = Field(default_factory=dict)
+    id: str = Field(description="Identifier: a prefix of its kind and 26 characters that sort by time.")
+    kind: JobKind = Field(description="What it does.")
+    state: JobState = Field(description="Where it is.")
+    progress: Progress = Field(default_factory=Progress, description="How far it is.")
+    attempt: int = Field(default=0, description="Attempts so far.")
+    parent_id: str | None = Field(default=None, description="Pipeline that it belongs to; null: none.")
+    children: list[str] = Field(default_factory=list, description="Jobs of a pipeline, in order.")
+    created_at: datetime = Field(description="When it was made, UTC.")
+    started_at: datetime | None = Field(default=None, description="When a worker first took it.")
+    finished_at: datetime | None = Field(default=None, description="When it ended.")
+    heartbeat_at: datetime | None = Field(default=None, description="When a worker last reported.")
+    inputs: list[Reference] = Field(default_factory=list, description="What it works on.")
+    outputs: list[Reference] = Field(default_factory=list, description="What it makes.")
+    config: dict[str, Any] = Field(default_factory=dict, description="Settings.")
+    error: Problem | None = Field(default=None, description="Why it failed; null: it did not.")
+    links: dict[str, str] = Field(default_factory=dict, description="Addresses of what belongs to it.")
 
 
 class Event(Resource):
     """One entry of a job's event log; ``seq`` is the SSE id and grows over all jobs."""
 
-    seq: int
-    job_id: str
-    type: Literal["state", "progress", "log"]
-    at: datetime
-    data: dict[str, Any] = Field(default_factory=dict)
+    seq: int = Field(description="Number of the event over all jobs; the SSE id.")
+    job_id: str = Field(description="Job that it is of.")
+    type: Literal["state", "progress", "log"] = Field(description="Kind of event.")
+    at: datetime = Field(description="When, UTC.")
+    data: dict[str, Any] = Field(default_factory=dict, description="What happened.")

@@ -36,73 +36,79 @@ class Quantity(Resource):
     zero switches it off.
     """
 
-    unit: str
-    help: str = ""
-    default: float | None = None
-    bounds: dict[BodyShape, tuple[float | None, float | None]] = Field(default_factory=dict)
-    gate: bool = False
+    unit: str = Field(description="Unit of the value; `1` has none.", examples=["Pa"])
+    help: str = Field(default="", description="What it means, in a sentence.")
+    default: float | None = Field(
+        default=None, description="Value without a choice; null: it must be given, or the body decides."
+    )
+    bounds: dict[BodyShape, tuple[float | None, float | None]] = Field(
+        default_factory=dict, description="Least and greatest value by the body's shape; null: none."
+    )
+    gate: bool = Field(default=False, description="Zero switches the effect off.")
 
 
 class Material(Resource):
     """A constitutive law: an elastic one with its stored energy, or a flow law with its yield condition."""
 
-    name: str
-    kind: Literal["elastic", "flow"] = "elastic"
-    body: BodyShape = "solid"
-    title: str
-    equation: str
-    use: str = ""
-    parameters: dict[str, Quantity] = Field(default_factory=dict)
+    name: str = Field(description="Name in requests.")
+    kind: Literal["elastic", "flow"] = Field(default="elastic", description="Elastic law or flow law.")
+    body: BodyShape = Field(default="solid", description="Shape of body that it is of.")
+    title: str = Field(description="Name for people.")
+    equation: str = Field(description="Equation, in plain text.")
+    use: str = Field(default="", description="What it is for.")
+    parameters: dict[str, Quantity] = Field(default_factory=dict, description="Its constants.")
 
 
 class Effect(Resource):
     """A physical effect: what it adds to the equations, and why a body's shape refuses it where it does."""
 
-    name: str
-    title: str
-    kind: str = ""
-    equation: str
-    parameters: dict[str, Quantity] = Field(default_factory=dict)
-    refused: dict[BodyShape, str] = Field(default_factory=dict)
+    name: str = Field(description="Name in requests.")
+    title: str = Field(description="Name for people.")
+    kind: str = Field(default="", description="Force, stress, boundary or measurement.")
+    equation: str = Field(description="Equation, in plain text.")
+    parameters: dict[str, Quantity] = Field(default_factory=dict, description="Its strengths.")
+    refused: dict[BodyShape, str] = Field(
+        default_factory=dict, description="Shapes of body that refuse it, and why."
+    )
 
 
 class Metric(Resource):
     """How predictions are scored; ``listed`` false: in the tables of means only."""
 
-    name: str
-    title: str
-    unit: str
-    help: str = ""
-    lower_is_better: bool = True
-    listed: bool = True
+    name: str = Field(description="Name in results.")
+    title: str = Field(description="Name for people.")
+    unit: str = Field(description="Unit of the value; `1` has none.", examples=["Pa"])
+    help: str = Field(default="", description="What it means, in a sentence.")
+    lower_is_better: bool = Field(default=True, description="Which way is better.")
+    listed: bool = Field(default=True, description="Whether tables show it.")
 
 
 class Importer(Resource):
     """A form of recording: ``POST /v1/scenes`` reads those with suffixes, and the content decides; ``physworld
     import`` all."""
 
-    name: str
-    title: str
-    suffixes: list[str] = Field(default_factory=list)
-    help: str = ""
+    name: str = Field(description="Name.")
+    title: str = Field(description="Name for people.")
+    suffixes: list[str] = Field(default_factory=list, description="Usual endings of its files.")
+    help: str = Field(default="", description="What it means, in a sentence.")
 
 
 class ExportFormat(Resource):
     """A form in which the SDK writes the episodes of a dataset."""
 
-    name: str
-    title: str
-    help: str = ""
+    name: str = Field(description="Name in `format`.")
+    title: str = Field(description="Name for people.")
+    help: str = Field(default="", description="What it means, in a sentence.")
 
 
 class Catalogue(Resource):
     """Everything that this version knows by name."""
 
-    materials: list[Material] = Field(default_factory=list)
-    effects: list[Effect] = Field(default_factory=list)
-    metrics: list[Metric] = Field(default_factory=list)
-    importers: list[Importer] = Field(default_factory=list)
-    exports: list[ExportFormat] = Field(default_factory=list)
+    materials: list[Material] = Field(default_factory=list, description="Constitutive laws.")
+    effects: list[Effect] = Field(default_factory=list, description="Effects.")
+    metrics: list[Metric] = Field(default_factory=list, description="Metrics.")
+    importers: list[Importer] = Field(default_factory=list, description="Forms of recordings.")
+    exports: list[ExportFormat] = Field(default_factory=list, description="Forms of export.")
 
     def listed_metrics(self) -> list[Metric]:
         """The metrics that comparisons, reports and pages show, in their order."""

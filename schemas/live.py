@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from datetime import datetime
 
+from pydantic import Field
+
 from physworld_schemas.base import Request, Resource
 from physworld_schemas.rollout import ModelName, Version
 
@@ -13,18 +15,18 @@ MOST_REASON_BYTES = 123  # RFC 6455, section 5.5: a control frame has 125, two o
 class LiveTicketCreate(Request):
     """Body of POST /v1/live/tickets."""
 
-    model: ModelName
-    version: Version = "latest"
+    model: ModelName = Field(description="Name of the model.", examples=["soft_beam"])
+    version: Version = Field(default="latest", description="Number, alias or `latest`.")
 
 
 class LiveTicket(Resource):
     """A ticket for one connection; ``path`` is the WebSocket's address on this host, the ticket in it."""
 
-    ticket: str
-    model: str
-    version: int
-    expires_at: datetime
-    path: str
+    ticket: str = Field(description="Secret for one connection.")
+    model: str = Field(description="Name of the model.", examples=["soft_beam"])
+    version: int = Field(description="Version of the model.")
+    expires_at: datetime = Field(description="When it ends.")
+    path: str = Field(description="Address of the WebSocket on this host, ticket included.")
 
 
 def close_reason(code: str, detail: str) -> str:

@@ -26,32 +26,114 @@ class TrainingConfig(Request):
     ``current`` finds the neighbours anew at every step, so that parts of the object that meet see each other.
     """
 
-    hidden: int = Field(default=64, ge=8, le=1024)
-    message_passing_steps: int = Field(default=7, ge=1, le=20)
-    history: int = Field(default=3, ge=1, le=10)
-    look_ahead: int = Field(default=24, ge=1, le=200)
-    vertices: int = Field(default=100, ge=4, le=1000)
-    steps: int = Field(default=240, ge=1, le=1_000_000)
-    batch_size: int = Field(default=6, ge=1, le=256)
-    learning_rate: float = Field(default=1e-3, gt=0, le=1)
-    prior: Literal["auto", "modal", "chain", "none"] = "auto"
-    frame: Literal["auto", "world", "grip"] = "auto"
-    near_edges: Literal["material", "current"] = "material"
-    patience: int = Field(default=8, ge=0, le=1000)
-    start_share: float = Field(default=1.0, gt=0, le=1)
-    fine_tune_steps: int = Field(default=60, ge=0, le=10_000)
-    formats: list[Format] = Field(default_factory=lambda: [*FORMATS], max_length=2)
-    seed: Seed = 0
+    hidden: int = Field(
+        default=64,
+        ge=8,
+        le=1024,
+        description="Width of the network's layers.",
+        json_schema_extra={"unit": "units"},
+        examples=[64],
+    )
+    message_passing_steps: int = Field(
+        default=7, ge=1, le=20, description="Rounds of messages along the graph's edges.", examples=[7]
+    )
+    history: int = Field(
+        default=3,
+        ge=1,
+        le=10,
+        description="Frames of motion that the network sees.",
+        json_schema_extra={"unit": "frames"},
+        examples=[3],
+    )
+    look_ahead: int = Field(
+        default=24,
+        ge=1,
+        le=200,
+        description="Frames that a training rollout lasts.",
+        json_schema_extra={"unit": "frames"},
+        examples=[24],
+    )
+    vertices: int = Field(default=100, ge=4, le=1000, description="Vertices of the graph.", examples=[100])
+    steps: int = Field(
+        default=240,
+        ge=1,
+        le=1_000_000,
+        description="Most training steps.",
+        json_schema_extra={"unit": "steps"},
+        examples=[240],
+    )
+    batch_size: int = Field(default=6, ge=1, le=256, description="Rollouts of a training step.", examples=[6])
+    learning_rate: float = Field(
+        default=1e-3,
+        gt=0,
+        le=1,
+        description="Step length of the optimiser (Adam).",
+        json_schema_extra={"unit": "1"},
+        examples=[0.001],
+    )
+    prior: Literal["auto", "modal", "chain", "none"] = Field(
+        default="auto", description="What the network corrects; none: it stands alone."
+    )
+    frame: Literal["auto", "world", "grip"] = Field(
+        default="auto",
+        description="Axes of a step: the world's, the grip's, or what errs less on episodes that are not learned from.",
+        examples=["auto"],
+    )
+    near_edges: Literal["material", "current"] = Field(
+        default="material",
+        description="Neighbours fixed in the material, or found anew at every step (parts that meet).",
+    )
+    patience: int = Field(
+        default=8,
+        ge=0,
+        le=1000,
+        description="Validations without a better one that end the training; 0: never.",
+        examples=[8],
+    )
+    start_share: float = Field(
+        default=1.0,
+        gt=0,
+        le=1,
+        description="Share of the episodes that must be there before the training begins.",
+        json_schema_extra={"unit": "1"},
+        examples=[1.0],
+    )
+    fine_tune_steps: int = Field(
+        default=60,
+        ge=0,
+        le=10_000,
+        description="Steps of fine-tuning on the recording's training frames; 0: none.",
+        json_schema_extra={"unit": "steps"},
+        examples=[60],
+    )
+    formats: list[Format] = Field(
+        default_factory=lambda: [*FORMATS],
+        max_length=2,
+        description="Programs of one step to publish beside the weights.",
+    )
+    seed: Seed = Field(
+        default=0,
+        description="Seed of every random choice; the same seed gives the same result.",
+        examples=[0],
+    )
 
 
 class TrainingCreate(Request):
     """Body of POST /v1/models: trains on a sealed dataset and publishes the next version of ``name``."""
 
-    name: str = Field(pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$")
-    dataset_id: str
-    config: TrainingConfig = Field(default_factory=TrainingConfig)
-    description: str = Field(default="", max_length=10_000)
-    tags: list[Tag] = Field(default_factory=list, max_length=50)
+    name: str = Field(
+        pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$",
+        description="Model whose next version is trained: lower case, digits, . _ -",
+        examples=["soft_beam"],
+    )
+    dataset_id: str = Field(
+        description="Sealed dataset to learn from.", examples=["dst_01JZ8Q5V3M7X2K9T4B6N8R0C1D"]
+    )
+    config: TrainingConfig = Field(default_factory=TrainingConfig, description="Settings.")
+    description: str = Field(
+        default="", max_length=10_000, description="Description of the version, for people."
+    )
+    tags: list[Tag] = Field(default_factory=list, max_length=50, description="Tags of the version.")
 
 
 class ModelVersion(Resource):
@@ -60,24 +142,36 @@ class ModelVersion(Resource):
     ``quality``: the verdict of the gate; a version that failed it stays ready and is never ``latest``.
     """
 
-    name: str
-    version: int
-    state: Literal["pending", "ready", "failed"]
-    message: str = ""
-    created_at: datetime
-    job_id: str | None = None
-    scene_id: str | None = None
-    fit_id: str | None = None
-    trace_id: str | None = None
-    dataset_id: str | None = None
-    description: str = ""
-    tags: list[str] = Field(default_factory=list)
-    aliases: list[str] = Field(default_factory=list)
-    config: TrainingConfig = Field(default_factory=TrainingConfig)
-    metrics: dict[str, Any] = Field(default_factory=dict)
-    sha256: str | None = None
-    lineage: Lineage = Field(default_factory=Lineage)
-    artifacts: list[Artifact] = Field(default_factory=list)
+    name: str = Field(description="Name of the model.")
+    version: int = Field(description="Number; it only grows.")
+    state: Literal["pending", "ready", "failed"] = Field(description="`ready` never changes again.")
+    message: str = Field(default="", description="Why it failed, or what to know.")
+    created_at: datetime = Field(description="When it was made, UTC.")
+    job_id: str | None = Field(
+        default=None, description="Job that makes it.", examples=["job_01JZ8Q5V3M7X2K9T4B6N8R0C1D"]
+    )
+    scene_id: str | None = Field(
+        default=None, description="Scene that it is about.", examples=["scn_01JZ8Q5V3M7X2K9T4B6N8R0C1D"]
+    )
+    fit_id: str | None = Field(
+        default=None, description="Fit whose twin is used.", examples=["fit_01JZ8Q5V3M7X2K9T4B6N8R0C1D"]
+    )
+    trace_id: str | None = Field(default=None, description="Trace whose effect the twin carries; null: none.")
+    dataset_id: str | None = Field(default=None, description="Dataset that it was trained on.")
+    description: str = Field(default="", description="Description for people.")
+    tags: list[str] = Field(default_factory=list, description="Tags.")
+    aliases: list[str] = Field(default_factory=list, description="Aliases that point here.")
+    config: TrainingConfig = Field(default_factory=TrainingConfig, description="Settings.")
+    metrics: dict[str, Any] = Field(
+        default_factory=dict, description="Errors on the held-out frames, speeds, times."
+    )
+    sha256: str | None = Field(default=None, description="SHA-256 of the manifest; null until ready.")
+    lineage: Lineage = Field(
+        default_factory=Lineage, description="What it was made from, by which code, with which seeds."
+    )
+    artifacts: list[Artifact] = Field(
+        default_factory=list, description="Files, by name and SHA-256; download them from /v1/artifacts."
+    )
 
     @computed_field  # type: ignore[prop-decorator]  # pydantic's own advice
     @property
@@ -93,31 +187,37 @@ class Model(Resource):
     version that is ready and did not fail the quality gate.
     """
 
-    name: str
-    created_at: datetime
-    latest_version: int | None = None
-    latest: int | None = None
-    aliases: dict[str, int] = Field(default_factory=dict)
+    name: str = Field(description="Registered name.")
+    created_at: datetime = Field(description="When it was made, UTC.")
+    latest_version: int | None = Field(default=None, description="Newest number; null: none yet.")
+    latest: int | None = Field(
+        default=None, description="Newest number that did not fail the quality gate; null: none."
+    )
+    aliases: dict[str, int] = Field(default_factory=dict, description="Versions by alias.")
 
 
 class AliasSet(Request):
     """Body of PUT /v1/models/{name}/aliases/{alias}."""
 
-    version: int = Field(ge=1, lt=2**31)
+    version: int = Field(ge=1, lt=2**31, description="Ready version to point at.", examples=[2])
 
 
 class VersionPatch(Request):
     """Body of PATCH /v1/models/{name}/versions/{version}: the two fields that are not part of what was published."""
 
-    description: str | None = Field(default=None, max_length=10_000)
-    tags: list[Tag] | None = Field(default=None, max_length=50)
+    description: str | None = Field(
+        default=None, max_length=10_000, description="New description; null: as it is."
+    )
+    tags: list[Tag] | None = Field(default=None, max_length=50, description="New tags; null: as they are.")
 
 
 class MeasuredError(Resource):
     """A mean error, in its metric's unit, and its 95 % interval by blocks of frames; None where it is not known."""
 
-    value: float
-    ci95: tuple[float, float] | None = None
+    value: float = Field(description="Mean error, in its metric's unit.")
+    ci95: tuple[float, float] | None = Field(
+        default=None, description="95 % interval, in the same unit; null where none can be given."
+    )
 
 
 class ComparedError(Resource):
@@ -128,37 +228,49 @@ class ComparedError(Resource):
     versions were not scored on the same frames of the same recording.
     """
 
-    metric: str
-    predictor: str
-    a: MeasuredError | None = None
-    b: MeasuredError | None = None
-    gain: MeasuredError | None = None
+    metric: str = Field(description="Name of the metric.")
+    predictor: str = Field(description="What predicted.")
+    a: MeasuredError | None = Field(default=None, description="Error of the first version.")
+    b: MeasuredError | None = Field(default=None, description="Error of the second.")
+    gain: MeasuredError | None = Field(
+        default=None, description="Paired gain of the second over the first; null: other frames."
+    )
 
 
 class Difference(Resource):
     """A fact in which two versions differ: its place (``config.steps``) and both values, None where one lacks it."""
 
-    field: str
-    a: Any = None
-    b: Any = None
+    field: str = Field(description="Place of the fact.", examples=["config.steps"])
+    a: Any = Field(default=None, description="Of the first version.")
+    b: Any = Field(default=None, description="Of the second.")
 
 
 class ErrorCurves(Resource):
     """Track error [m] of every predictor against the time in the recording [s], None where nothing was seen."""
 
-    times_s: list[float] = Field(default_factory=list)
-    track_m: dict[str, list[float | None]] = Field(default_factory=dict)
+    times_s: list[float] = Field(
+        default_factory=list, description="Times in the recording.", json_schema_extra={"unit": "s"}
+    )
+    track_m: dict[str, list[float | None]] = Field(
+        default_factory=dict,
+        description="Track error by predictor; null where nothing was seen.",
+        json_schema_extra={"unit": "m"},
+    )
 
 
 class ModelComparison(Resource):
     """Two versions of a name side by side."""
 
-    name: str
-    a: int
-    b: int
-    same_recording: bool
-    errors: list[ComparedError] = Field(default_factory=list)
-    figures: list[Difference] = Field(default_factory=list)
-    curves_a: ErrorCurves = Field(default_factory=ErrorCurves)
-    curves_b: ErrorCurves = Field(default_factory=ErrorCurves)
-    differences: list[Difference] = Field(default_factory=list)
+    name: str = Field(description="Name of the model.")
+    a: int = Field(description="Number of the first version.")
+    b: int = Field(description="Number of the second.")
+    same_recording: bool = Field(description="Whether both were scored on the same frames.")
+    errors: list[ComparedError] = Field(
+        default_factory=list, description="Errors with intervals, by metric and predictor."
+    )
+    figures: list[Difference] = Field(default_factory=list, description="Speeds and times that differ.")
+    curves_a: ErrorCurves = Field(default_factory=ErrorCurves, description="Curves of the first.")
+    curves_b: ErrorCurves = Field(default_factory=ErrorCurves, description="Curves of the second.")
+    differences: list[Difference] = Field(
+        default_factory=list, description="What differs in how they were made."
+    )

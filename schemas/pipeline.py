@@ -21,14 +21,26 @@ class PipelineCreate(Request):
     and settings is there, so that the card can say what the effect brought.
     """
 
-    scene_id: str
-    model_name: str | None = Field(default=None, pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$")
-    fit: FitConfig = Field(default_factory=FitConfig)
-    close_the_loop: bool = False
-    compare: bool = True
-    trace: TraceConfig = Field(default_factory=TraceConfig)
-    dataset: DatasetConfig = Field(default_factory=DatasetConfig)
-    training: TrainingConfig = Field(default_factory=TrainingConfig)
+    scene_id: str = Field(
+        description="Recording to make a world model of.", examples=["scn_01JZ8Q5V3M7X2K9T4B6N8R0C1D"]
+    )
+    model_name: str | None = Field(
+        default=None,
+        pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$",
+        description="Name of the model; empty: the scene's.",
+        examples=["soft_beam"],
+    )
+    fit: FitConfig = Field(default_factory=FitConfig, description="Calibration of the twin.")
+    close_the_loop: bool = Field(
+        default=False,
+        description="Trace what the twin leaves unexplained; a named effect goes into the demonstrations.",
+    )
+    compare: bool = Field(
+        default=True, description="Then also train without the effect, so that the card says what it brought."
+    )
+    trace: TraceConfig = Field(default_factory=TraceConfig, description="Settings of the trace.")
+    dataset: DatasetConfig = Field(default_factory=DatasetConfig, description="Demonstrations.")
+    training: TrainingConfig = Field(default_factory=TrainingConfig, description="World model.")
 
     @model_validator(mode="after")
     def _traceable(self) -> Self:
@@ -40,9 +52,9 @@ class PipelineCreate(Request):
 class ModelReference(Resource):
     """Which model a report speaks of."""
 
-    name: str
-    version: int
-    sha256: str
+    name: str = Field(description="Name.")
+    version: int = Field(description="Number.")
+    sha256: str = Field(description="SHA-256, hexadecimal.")
 
 
 class RunReport(Resource):
@@ -54,14 +66,22 @@ class RunReport(Resource):
     errors before and after; null where no trace was asked for.
     """
 
-    schema_version: int = 1
-    scene: str
-    held_out: dict[str, dict[str, float | None]]
-    noise_floor_m: float | None = None
-    steps_per_second: dict[str, float]
-    model: ModelReference
-    seconds: dict[str, float]
-    episodes: int
-    parameters: dict[str, Any] = Field(default_factory=dict)
-    notes: list[str] = Field(default_factory=list)
-    closed_loop: dict[str, Any] | None = None
+    schema_version: int = Field(default=1, description="Version of this form.")
+    scene: str = Field(description="Name of the scene.")
+    held_out: dict[str, dict[str, float | None]] = Field(description="Errors by metric and predictor.")
+    noise_floor_m: float | None = Field(
+        default=None,
+        description="Mean error that noise alone would show; null: not known.",
+        json_schema_extra={"unit": "m"},
+    )
+    steps_per_second: dict[str, float] = Field(
+        description="Speeds by predictor.", json_schema_extra={"unit": "1/s"}
+    )
+    model: ModelReference = Field(description="Model that was published.")
+    seconds: dict[str, float] = Field(description="Times by stage.", json_schema_extra={"unit": "s"})
+    episodes: int = Field(description="Episodes.")
+    parameters: dict[str, Any] = Field(default_factory=dict, description="Calibrated quantities.")
+    notes: list[str] = Field(default_factory=list, description="What else to know.")
+    closed_loop: dict[str, Any] | None = Field(
+        default=None, description="Errors without and with the traced effect; null: no trace."
+    )

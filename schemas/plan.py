@@ -20,9 +20,17 @@ Place = tuple[Coordinate, Coordinate, Coordinate]
 class PointGoal(Request):
     """Measured points ``index`` of the scene, (M,), to be at ``places`` [m], (M, 3)."""
 
-    kind: Literal["points"] = "points"
-    index: list[Annotated[int, Field(ge=0)]] = Field(min_length=1, max_length=10_000)
-    places: list[Place] = Field(min_length=1, max_length=10_000)
+    kind: Literal["points"] = Field(default="points", description="Goal by points.")
+    index: list[Annotated[int, Field(ge=0)]] = Field(
+        min_length=1, max_length=10_000, description="Measured points of the scene.", examples=[[0]]
+    )
+    places: list[Place] = Field(
+        min_length=1,
+        max_length=10_000,
+        description="Where they shall be.",
+        json_schema_extra={"unit": "m"},
+        examples=[[[0.1, 0.0, 0.2]]],
+    )
 
     @model_validator(mode="after")
     def _as_many(self) -> PointGoal:
@@ -36,8 +44,10 @@ class PointGoal(Request):
 class ShapeGoal(Request):
     """The whole body to take a shape, a cloud of points [m], (M, 3): two-way Chamfer distance to it."""
 
-    kind: Literal["shape"] = "shape"
-    shape: ArrayInput
+    kind: Literal["shape"] = Field(default="shape", description="Goal by shape.")
+    shape: ArrayInput = Field(
+        description="Points of the wanted shape, (M, 3).", json_schema_extra={"unit": "m"}
+    )
 
 
 class PlanLimits(Request):
@@ -46,10 +56,28 @@ class PlanLimits(Request):
     ``workspace_min_m``, ``workspace_max_m``: box of a grip's displacement from where the plan starts, which it holds.
     """
 
-    speed_m_s: float | None = Field(default=None, gt=0, le=10)
-    acceleration_m_s2: float | None = Field(default=None, gt=0, le=200)
-    workspace_min_m: Place | None = None
-    workspace_max_m: Place | None = None
+    speed_m_s: float | None = Field(
+        default=None,
+        gt=0,
+        le=10,
+        description="Greatest speed of a grip; empty: the recording's.",
+        json_schema_extra={"unit": "m/s"},
+        examples=[0.3],
+    )
+    acceleration_m_s2: float | None = Field(
+        default=None,
+        gt=0,
+        le=200,
+        description="Greatest acceleration of a grip; empty: the recording's.",
+        json_schema_extra={"unit": "m/s²"},
+        examples=[2.0],
+    )
+    workspace_min_m: Place | None = Field(
+        default=None, description="Lower corner of a grip's displacement.", json_schema_extra={"unit": "m"}
+    )
+    workspace_max_m: Place | None = Field(
+        default=None, description="Upper corner of a grip's displacement.", json_schema_extra={"unit": "m"}
+    )
 
     @model_validator(mode="after")
     def _holds_the_start(self) -> PlanLimits:
@@ -62,11 +90,33 @@ class PlanLimits(Request):
 class PlanConfig(Request):
     """Settings of the search (MPPI); ``horizon`` ticks of the model's clock after its start."""
 
-    horizon: int = Field(default=60, ge=2, le=MAX_HORIZON)
-    samples: int = Field(default=512, ge=8, le=MAX_SAMPLES)
-    iterations: int = Field(default=10, ge=1, le=MAX_ITERATIONS)
-    settle: float = Field(default=0.2, ge=0, le=0.9)
-    seed: Seed = 0
+    horizon: int = Field(
+        default=60,
+        ge=2,
+        le=MAX_HORIZON,
+        description="Ticks of the model's clock that the plan lasts.",
+        json_schema_extra={"unit": "ticks"},
+        examples=[60],
+    )
+    samples: int = Field(
+        default=512, ge=8, le=MAX_SAMPLES, description="Motions tried in an iteration.", examples=[512]
+    )
+    iterations: int = Field(
+        default=10, ge=1, le=MAX_ITERATIONS, description="Iterations of the search.", examples=[10]
+    )
+    settle: float = Field(
+        default=0.2,
+        ge=0,
+        le=0.9,
+        description="Share of the plan at its end over which the goal counts.",
+        json_schema_extra={"unit": "1"},
+        examples=[0.2],
+    )
+    seed: Seed = Field(
+        default=0,
+        description="Seed of every random choice; the same seed gives the same result.",
+        examples=[0],
+    )
 
     @model_validator(mode="after")
     def _not_too_many(self) -> PlanConfig:
@@ -82,11 +132,13 @@ class PlanConfig(Request):
 class PlanCreate(Request):
     """Body of POST /v1/plans."""
 
-    model: ModelName
-    version: Version = "latest"
-    goal: Annotated[PointGoal | ShapeGoal, Field(discriminator="kind")]
-    limits: PlanLimits = Field(default_factory=PlanLimits)
-    config: PlanConfig = Field(default_factory=PlanConfig)
+    model: ModelName = Field(description="Name of the model.", examples=["soft_beam"])
+    version: Version = Field(default="latest", description="Number, alias or `latest`.")
+    goal: Annotated[PointGoal | ShapeGoal, Field(discriminator="kind")] = Field(
+        description="Where the object shall be."
+    )
+    limits: PlanLimits = Field(default_factory=PlanLimits, description="Limits of the grips.")
+    config: PlanConfig = Field(default_factory=PlanConfig, description="Settings of the search.")
 
 
 class Plan(Resource):
@@ -96,25 +148,53 @@ class Plan(Resource):
     the twin when the grips do not move. ``model_against_twin_m`` is the mean distance of the two paths.
     """
 
-    id: str
-    state: RunState
-    model: str
-    version: int
-    created_at: datetime
-    job_id: str
-    config: dict[str, Any] = Field(default_factory=dict)
-    dt_s: float | None = None
-    history: int | None = None
-    goal: str | None = None
-    predicted_error_m: float | None = None
-    executed_error_m: float | None = None
-    motionless_error_m: float | None = None
-    model_against_twin_m: float | None = None
-    model_against_twin_end_m: float | None = None
-    cost_history: list[float] = Field(default_factory=list)
-    limits: dict[str, Any] = Field(default_factory=dict)
-    peak_speed_m_s: float | None = None
-    samples: int | None = None
-    seconds: float | None = None
-    lineage: Lineage = Field(default_factory=Lineage)
-    artifacts: list[Artifact] = Field(default_factory=list)
+    id: str = Field(description="Identifier: a prefix of its kind and 26 characters that sort by time.")
+    state: RunState = Field(description="Whether the plan is there.")
+    model: str = Field(description="Name of the model.", examples=["soft_beam"])
+    version: int = Field(description="Version of the model.")
+    created_at: datetime = Field(description="When it was made, UTC.")
+    job_id: str = Field(description="Job that makes it.", examples=["job_01JZ8Q5V3M7X2K9T4B6N8R0C1D"])
+    config: dict[str, Any] = Field(default_factory=dict, description="Settings.")
+    dt_s: float | None = Field(
+        default=None, description="Tick of the model's clock.", json_schema_extra={"unit": "s"}
+    )
+    history: int | None = Field(
+        default=None,
+        description="Ticks of history that the motion begins with.",
+        json_schema_extra={"unit": "ticks"},
+    )
+    goal: str | None = Field(default=None, description="Kind of goal.")
+    predicted_error_m: float | None = Field(
+        default=None,
+        description="Distance from the goal as the model predicts.",
+        json_schema_extra={"unit": "m"},
+    )
+    executed_error_m: float | None = Field(
+        default=None, description="Distance from the goal in the twin.", json_schema_extra={"unit": "m"}
+    )
+    motionless_error_m: float | None = Field(
+        default=None,
+        description="Distance from the goal without any motion, in the twin.",
+        json_schema_extra={"unit": "m"},
+    )
+    model_against_twin_m: float | None = Field(
+        default=None, description="Mean distance of the two paths.", json_schema_extra={"unit": "m"}
+    )
+    model_against_twin_end_m: float | None = Field(
+        default=None, description="The same at the end.", json_schema_extra={"unit": "m"}
+    )
+    cost_history: list[float] = Field(default_factory=list, description="Best cost of every iteration.")
+    limits: dict[str, Any] = Field(default_factory=dict, description="Limits that held.")
+    peak_speed_m_s: float | None = Field(
+        default=None, description="Greatest speed of a grip.", json_schema_extra={"unit": "m/s"}
+    )
+    samples: int | None = Field(default=None, description="Motions that were tried.")
+    seconds: float | None = Field(
+        default=None, description="Wall time that it took.", json_schema_extra={"unit": "s"}
+    )
+    lineage: Lineage = Field(
+        default_factory=Lineage, description="What it was made from, by which code, with which seeds."
+    )
+    artifacts: list[Artifact] = Field(
+        default_factory=list, description="Files, by name and SHA-256; download them from /v1/artifacts."
+    )

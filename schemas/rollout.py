@@ -37,18 +37,63 @@ class RolloutCreate(Request):
     density to the calibrated ones, (n, 2) or (B, n, 2), the fine-tuned ones without it; the factors come on top.
     """
 
-    model: ModelName
-    version: Version = "latest"
-    controllers: ArrayInput
-    times: list[float] | None = Field(default=None, max_length=MAX_LISTED_VALUES)
-    dt_s: float | None = Field(default=None, gt=0, lt=10)
-    start: Start = "recording"
-    phi: ArrayInput | None = None
-    stiffness_factor: float = Field(default=1.0, ge=0.01, le=100)
-    density_factor: float = Field(default=1.0, ge=0.01, le=100)
-    returns: list[Part] = Field(default=["points"], min_length=1, max_length=2)
-    every: int = Field(default=1, ge=1, le=MAX_TICKS)
-    mode: Literal["auto", "job"] = "auto"
+    model: ModelName = Field(description="Name of the model.", examples=["soft_beam"])
+    version: Version = Field(default="latest", description="Number, alias or `latest`.")
+    controllers: ArrayInput = Field(
+        description="Control paths, (B, T, K, 3) or (T, K, 3).", json_schema_extra={"unit": "m"}
+    )
+    times: list[float] | None = Field(
+        default=None,
+        max_length=MAX_LISTED_VALUES,
+        description="Times of the paths, from 0; empty: ticks of the model's clock.",
+        json_schema_extra={"unit": "s"},
+    )
+    dt_s: float | None = Field(
+        default=None,
+        gt=0,
+        lt=10,
+        description="Tick; where given it must be the model's.",
+        json_schema_extra={"unit": "s"},
+    )
+    start: Start = Field(default="recording", description="Begin as the recording did, or at rest.")
+    phi: ArrayInput | None = Field(
+        default=None,
+        description="Log ratios of stiffness and density, (n, 2) or (B, n, 2).",
+        json_schema_extra={"unit": "1"},
+    )
+    stiffness_factor: float = Field(
+        default=1.0,
+        ge=0.01,
+        le=100,
+        description="Stiffness relative to the calibrated one.",
+        json_schema_extra={"unit": "1"},
+        examples=[1.0],
+    )
+    density_factor: float = Field(
+        default=1.0,
+        ge=0.01,
+        le=100,
+        description="Density relative to the calibrated one.",
+        json_schema_extra={"unit": "1"},
+        examples=[1.0],
+    )
+    returns: list[Part] = Field(
+        default=["points"],
+        min_length=1,
+        max_length=2,
+        description="Measured points, vertices of the graph, or both.",
+    )
+    every: int = Field(
+        default=1,
+        ge=1,
+        le=MAX_TICKS,
+        description="Return every n-th tick.",
+        json_schema_extra={"unit": "ticks"},
+        examples=[1],
+    )
+    mode: Literal["auto", "job"] = Field(
+        default="auto", description="Answer at once where it is small, or always as a job."
+    )
 
 
 class Rollout(Resource):
@@ -59,22 +104,42 @@ class Rollout(Resource):
     ``speed_m_s`` is the largest of any controller.
     """
 
-    id: str | None = None
-    state: RunState = "ready"
-    model: str
-    version: int
-    created_at: datetime | None = None
-    job_id: str | None = None
-    config: dict[str, Any] = Field(default_factory=dict)
-    dt_s: float | None = None
-    history: int | None = None
-    candidates: int | None = None
-    ticks: int | None = None
-    times: list[float] = Field(default_factory=list)
-    points: EncodedArray | None = None
-    vertices: EncodedArray | None = None
-    speed_m_s: float | None = None
-    seconds: float | None = None
-    sha256: str | None = None
-    lineage: Lineage = Field(default_factory=Lineage)
-    artifacts: list[Artifact] = Field(default_factory=list)
+    id: str | None = Field(default=None, description="Identifier; null where it was answered at once.")
+    state: RunState = Field(default="ready", description="Whether the answer is there.")
+    model: str = Field(description="Name of the model.", examples=["soft_beam"])
+    version: int = Field(description="Version of the model.")
+    created_at: datetime | None = Field(default=None, description="When it was made, UTC.")
+    job_id: str | None = Field(
+        default=None, description="Job that makes it.", examples=["job_01JZ8Q5V3M7X2K9T4B6N8R0C1D"]
+    )
+    config: dict[str, Any] = Field(default_factory=dict, description="Settings.")
+    dt_s: float | None = Field(
+        default=None, description="Tick of the model's clock.", json_schema_extra={"unit": "s"}
+    )
+    history: int | None = Field(
+        default=None, description="Ticks of history.", json_schema_extra={"unit": "ticks"}
+    )
+    candidates: int | None = Field(default=None, description="Control paths, B.")
+    ticks: int | None = Field(default=None, description="Ticks of each, T.")
+    times: list[float] = Field(
+        default_factory=list, description="Times of the answer.", json_schema_extra={"unit": "s"}
+    )
+    points: EncodedArray | None = Field(
+        default=None, description="Measured points, (B, S, N, 3).", json_schema_extra={"unit": "m"}
+    )
+    vertices: EncodedArray | None = Field(
+        default=None, description="Vertices of the graph, (B, S, n, 3).", json_schema_extra={"unit": "m"}
+    )
+    speed_m_s: float | None = Field(
+        default=None, description="Greatest speed of a controller.", json_schema_extra={"unit": "m/s"}
+    )
+    seconds: float | None = Field(
+        default=None, description="Wall time that it took.", json_schema_extra={"unit": "s"}
+    )
+    sha256: str | None = Field(default=None, description="SHA-256 of the model's manifest.")
+    lineage: Lineage = Field(
+        default_factory=Lineage, description="What it was made from, by which code, with which seeds."
+    )
+    artifacts: list[Artifact] = Field(
+        default_factory=list, description="Files, by name and SHA-256; download them from /v1/artifacts."
+    )

@@ -20,14 +20,49 @@ class SceneImport(Request):
     take ``name`` only.
     """
 
-    name: str | None = Field(default=None, min_length=1, max_length=128, pattern=r"^[^/\\\x00-\x1f]+$")
-    kind: str | None = Field(default=None, max_length=32, pattern=r"^[a-z_]+$")
-    fps: float | None = Field(default=None, gt=0, le=1e5, allow_inf_nan=False)
-    noise_sigma_m: float | None = Field(default=None, ge=0, le=1, allow_inf_nan=False)
-    gravity_m_s2: tuple[float, float, float] | None = None
-    body: dict[str, Any] = Field(default_factory=dict)
-    controllers: tuple[str, ...] | None = None
-    up: Axis = "z"
+    name: str | None = Field(
+        default=None,
+        min_length=1,
+        max_length=128,
+        pattern=r"^[^/\\\x00-\x1f]+$",
+        description="Name of the scene; empty: the file's.",
+        examples=["my_beam"],
+    )
+    kind: str | None = Field(
+        default=None,
+        max_length=32,
+        pattern=r"^[a-z_]+$",
+        description="Kind of object.",
+        examples=["soft_body"],
+    )
+    fps: float | None = Field(
+        default=None,
+        gt=0,
+        le=1e5,
+        allow_inf_nan=False,
+        description="Frames per second.",
+        json_schema_extra={"unit": "Hz"},
+        examples=[30.0],
+    )
+    noise_sigma_m: float | None = Field(
+        default=None,
+        ge=0,
+        le=1,
+        allow_inf_nan=False,
+        description="Standard deviation of the tracking noise per axis; null: not known.",
+        json_schema_extra={"unit": "m"},
+        examples=[0.001],
+    )
+    gravity_m_s2: tuple[float, float, float] | None = Field(
+        default=None, description="Gravity.", json_schema_extra={"unit": "m/s²"}, examples=[[0.0, 0.0, -9.81]]
+    )
+    body: dict[str, Any] = Field(
+        default_factory=dict, description="Keys of `scene.json`'s body.", examples=[{"density_kg_m3": 1000.0}]
+    )
+    controllers: tuple[str, ...] | None = Field(
+        default=None, description="Labels of the driven or clamped markers (C3D)."
+    )
+    up: Axis = Field(default="z", description="Axis of the recording that points up.")
 
 
 class Scene(Resource):
@@ -36,21 +71,28 @@ class Scene(Resource):
     ``declared`` is its ``scene.json``; a list leaves it out (null), since it may be long.
     """
 
-    id: str
-    name: str
-    kind: str
-    description: str = ""
-    created_at: datetime
-    digest: str
-    frames: int
-    points: int
-    controllers: int
-    fps: float
-    duration_s: float
-    noise_sigma_m: float | None = None
-    train: tuple[int, int]
-    test: tuple[int, int]
-    declared: dict[str, Any] | None = None
-    warnings: list[str] = Field(default_factory=list)
-    artifacts: list[Artifact] = Field(default_factory=list)
-    tags: list[str] = Field(default_factory=list)
+    id: str = Field(description="Identifier: a prefix of its kind and 26 characters that sort by time.")
+    name: str = Field(description="Name.")
+    kind: str = Field(description="Kind of object.")
+    description: str = Field(default="", description="Description for people.")
+    created_at: datetime = Field(description="When it was made, UTC.")
+    digest: str = Field(description="SHA-256 of the canonical archive: the same content is the same scene.")
+    frames: int = Field(description="Frames.")
+    points: int = Field(description="Measured points.")
+    controllers: int = Field(description="Driven or clamped points.")
+    fps: float = Field(description="Frames per second.", json_schema_extra={"unit": "Hz"})
+    duration_s: float = Field(description="Length.", json_schema_extra={"unit": "s"})
+    noise_sigma_m: float | None = Field(
+        default=None,
+        description="Standard deviation of the tracking noise per axis; null: not known.",
+        json_schema_extra={"unit": "m"},
+        examples=[0.001],
+    )
+    train: tuple[int, int] = Field(description="Frames for training: first and one past the last.")
+    test: tuple[int, int] = Field(description="Held-out frames: first and one past the last.")
+    declared: dict[str, Any] | None = Field(default=None, description="Its `scene.json`; null in lists.")
+    warnings: list[str] = Field(default_factory=list, description="What the validator remarks.")
+    artifacts: list[Artifact] = Field(
+        default_factory=list, description="Files, by name and SHA-256; download them from /v1/artifacts."
+    )
+    tags: list[str] = Field(default_factory=list, description="Tags.")

@@ -18,15 +18,17 @@ class SigningKey(Resource):
     ``public_key``: base64 of its 32 bytes (RFC 8032); ``key_id``: the first 16 hexadecimal digits of their SHA-256.
     """
 
-    key_id: str = Field(pattern=r"^[0-9a-f]{16}$")
-    algorithm: Literal["ed25519"] = "ed25519"
-    public_key: str
-    created_at: datetime | None = None
+    key_id: str = Field(
+        pattern=r"^[0-9a-f]{16}$", description="First 16 hexadecimal digits of the key's SHA-256."
+    )
+    algorithm: Literal["ed25519"] = Field(default="ed25519", description="Algorithm.")
+    public_key: str = Field(description="Public key, base64.")
+    created_at: datetime | None = Field(default=None, description="When it was made, UTC.")
 
 
 class ManifestSignature(Resource):
     """The content of ``manifest.sig.json``; ``signature``: base64 of 64 bytes over ``manifest.json`` as it is."""
 
-    algorithm: Literal["ed25519"] = "ed25519"
-    key_id: str = Field(pattern=r"^[0-9a-f]{16}$")
-    signature: str
+    algorithm: Literal["ed25519"] = Field(default="ed25519", description="Algorithm.")
+    key_id: str = Field(pattern=r"^[0-9a-f]{16}$", description="Key that signed.")
+    signature: str = Field(description="64 bytes over manifest.json, base64.")

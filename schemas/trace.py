@@ -27,14 +27,46 @@ class TraceConfig(Request):
     that sees more finely than the experiment repeats; none: what scenes declare.
     """
 
-    candidates: list[Annotated[str, NamesOf("effect")]] = Field(default_factory=list, max_length=64)
-    effects_at_most: int = Field(default=2, ge=1, le=4)
-    confirmed: int = Field(default=8, ge=1, le=32)
-    iterations: int = Field(default=5, ge=1, le=50)
-    resamples: int = Field(default=2000, ge=100, le=100_000)
-    time_limit_s: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
-    noise_m: float | None = Field(default=None, gt=0.0, le=1.0, allow_inf_nan=False)
-    seed: Seed = 0
+    candidates: list[Annotated[str, NamesOf("effect")]] = Field(
+        default_factory=list, max_length=64, description="Effects that may be named; empty: all."
+    )
+    effects_at_most: int = Field(
+        default=2, ge=1, le=4, description="Most effects of an answer.", examples=[2]
+    )
+    confirmed: int = Field(
+        default=8,
+        ge=1,
+        le=32,
+        description="Candidates that are refitted with the full simulator.",
+        examples=[8],
+    )
+    iterations: int = Field(
+        default=5, ge=1, le=50, description="Gauss-Newton steps of a refit.", examples=[5]
+    )
+    resamples: int = Field(
+        default=2000, ge=100, le=100_000, description="Bootstrap resamples of an interval.", examples=[2000]
+    )
+    time_limit_s: float | None = Field(
+        default=None,
+        gt=0.0,
+        allow_inf_nan=False,
+        description="Time after which the answer is made of what there is; empty: none.",
+        json_schema_extra={"unit": "s"},
+        examples=[600.0],
+    )
+    noise_m: float | None = Field(
+        default=None,
+        gt=0.0,
+        le=1.0,
+        allow_inf_nan=False,
+        description="Noise per axis of every recording; empty: what scenes declare.",
+        json_schema_extra={"unit": "m"},
+    )
+    seed: Seed = Field(
+        default=0,
+        description="Seed of every random choice; the same seed gives the same result.",
+        examples=[0],
+    )
 
 
 MOST_RECORDINGS = 8
@@ -58,12 +90,25 @@ class TraceCreate(Request):
     ``held_out_scene_ids`` are recordings that only the report sees.
     """
 
-    scene_id: str
-    scene_ids: list[str] = Field(default_factory=list, max_length=MOST_RECORDINGS)
-    held_out_scene_ids: list[str] = Field(default_factory=list, max_length=MOST_RECORDINGS)
-    fit_id: str | None = None
-    fit: FitConfig = Field(default_factory=lambda: FitConfig(damping="none", particle_budget=TRACE_PARTICLES))
-    config: TraceConfig = Field(default_factory=TraceConfig)
+    scene_id: str = Field(
+        description="Recording whose residual is traced.", examples=["scn_01JZ8Q5V3M7X2K9T4B6N8R0C1D"]
+    )
+    scene_ids: list[str] = Field(
+        default_factory=list,
+        max_length=MOST_RECORDINGS,
+        description="Further recordings of the same object, fitted together.",
+    )
+    held_out_scene_ids: list[str] = Field(
+        default_factory=list, max_length=MOST_RECORDINGS, description="Recordings that only the report sees."
+    )
+    fit_id: str | None = Field(
+        default=None, description="Ready fit to start from, where its physics is the declared one."
+    )
+    fit: FitConfig = Field(
+        default_factory=lambda: FitConfig(damping="none", particle_budget=TRACE_PARTICLES),
+        description="Budgets of the trace's own calibration.",
+    )
+    config: TraceConfig = Field(default_factory=TraceConfig, description="Settings.")
 
     @model_validator(mode="after")
     def _usual_physics(self) -> Self:
@@ -87,9 +132,11 @@ class Figure(Resource):
 
     model_config = ConfigDict(extra="allow")
 
-    value: float | None
-    unit: str
-    ci95: tuple[float | None, float | None] | None = None
+    value: float | None = Field(description="Value; null: not known.")
+    unit: str = Field(description="Unit of the value; `1` has none.", examples=["Pa"])
+    ci95: tuple[float | None, float | None] | None = Field(
+        default=None, description="95 % interval, in the same unit; null where none can be given."
+    )
 
 
 class FoundEffect(Resource):
@@ -97,8 +144,8 @@ class FoundEffect(Resource):
 
     model_config = ConfigDict(extra="allow")
 
-    name: str
-    parameters: dict[str, Figure] = Field(default_factory=dict)
+    name: str = Field(description="Name of the effect.")
+    parameters: dict[str, Figure] = Field(default_factory=dict, description="Its strengths.")
 
 
 class Trace(Resource):
@@ -111,29 +158,43 @@ class Trace(Resource):
 
     model_config = ConfigDict(extra="allow")
 
-    id: str
-    scene_id: str
-    scene_ids: list[str] = Field(default_factory=list)
-    held_out_scene_ids: list[str] = Field(default_factory=list)
-    fit_id: str | None = None
-    state: TraceState
-    created_at: datetime
-    job_id: str
-    config: TraceConfig
-    fit: FitConfig
-    schema_version: int = 1
-    scene: str = ""
-    verdict: Verdict | None = None
-    reason: str = ""
-    effects: list[FoundEffect] = Field(default_factory=list)
-    equivalent: list[FoundEffect] = Field(default_factory=list)
-    candidates: list[dict[str, Any]] = Field(default_factory=list)
-    held_out: dict[str, Any] | None = None
-    recordings: list[dict[str, Any]] = Field(default_factory=list)
-    calibrated: dict[str, Figure] = Field(default_factory=dict)
-    unexplained: dict[str, Any] | None = None
-    suggested_experiment: dict[str, Any] | None = None
-    seconds: float | None = None
-    simulations: int | None = None
-    lineage: Lineage = Field(default_factory=Lineage)
-    artifacts: list[Artifact] = Field(default_factory=list)
+    id: str = Field(description="Identifier: a prefix of its kind and 26 characters that sort by time.")
+    scene_id: str = Field(description="Scene that it is about.", examples=["scn_01JZ8Q5V3M7X2K9T4B6N8R0C1D"])
+    scene_ids: list[str] = Field(default_factory=list, description="Further recordings.")
+    held_out_scene_ids: list[str] = Field(default_factory=list, description="Held-out recordings.")
+    fit_id: str | None = Field(
+        default=None, description="Fit whose twin is used.", examples=["fit_01JZ8Q5V3M7X2K9T4B6N8R0C1D"]
+    )
+    state: TraceState = Field(description="Whether the answer is there.")
+    created_at: datetime = Field(description="When it was made, UTC.")
+    job_id: str = Field(description="Job that makes it.", examples=["job_01JZ8Q5V3M7X2K9T4B6N8R0C1D"])
+    config: TraceConfig = Field(description="Settings.")
+    fit: FitConfig = Field(description="Budgets of its calibration.")
+    schema_version: int = Field(default=1, description="Version of the report's form.")
+    scene: str = Field(default="", description="Name of the scene.")
+    verdict: Verdict | None = Field(default=None, description="The answer; null until ready.")
+    reason: str = Field(default="", description="The answer in a sentence.")
+    effects: list[FoundEffect] = Field(default_factory=list, description="Effects that were added.")
+    equivalent: list[FoundEffect] = Field(default_factory=list, description="Effects that do as well.")
+    candidates: list[dict[str, Any]] = Field(
+        default_factory=list, description="Every candidate with its score."
+    )
+    held_out: dict[str, Any] | None = Field(
+        default=None, description="Errors on frames that no step has seen."
+    )
+    recordings: list[dict[str, Any]] = Field(default_factory=list, description="The same by recording.")
+    calibrated: dict[str, Figure] = Field(default_factory=dict, description="Calibrated quantities.")
+    unexplained: dict[str, Any] | None = Field(default=None, description="What remains.")
+    suggested_experiment: dict[str, Any] | None = Field(
+        default=None, description="Motion that would tell rivals apart."
+    )
+    seconds: float | None = Field(
+        default=None, description="Wall time that it took.", json_schema_extra={"unit": "s"}
+    )
+    simulations: int | None = Field(default=None, description="Simulations that were run.")
+    lineage: Lineage = Field(
+        default_factory=Lineage, description="What it was made from, by which code, with which seeds."
+    )
+    artifacts: list[Artifact] = Field(
+        default_factory=list, description="Files, by name and SHA-256; download them from /v1/artifacts."
+    )

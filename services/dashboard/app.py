@@ -19,16 +19,22 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from physworld_services.api.attempts import Attempts
+from physworld_services.api.parsing import Parsers
 from physworld_services.api.security import Gate
 from physworld_services.dashboard import (
     access,
     pages_datasets,
     pages_files,
     pages_jobs,
+    pages_keys,
     pages_models,
+    pages_objects,
+    pages_runs,
     pages_scenes,
     pages_sessions,
+    pages_start,
     pages_traces,
+    pages_uploads,
 )
 from physworld_services.dashboard.site import BASE, STATIC, Site
 from physworld_services.stores import Stores
@@ -56,6 +62,13 @@ HEADERS = {
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
+HEADINGS = {
+    404: "This page does not exist",
+    403: "This key may not do that",
+    409: "That is not possible now",
+    422: "Something in the form is wrong",
+    503: "The service cannot answer right now",
+}
 FOREVER = "public, max-age=31536000, immutable"
 
 
@@ -64,7 +77,8 @@ def mount(app: FastAPI, settings: Settings, database: Database, stores: Stores) 
     gate = getattr(app.state, "gate", None) or Gate(
         database, Attempts()
     )  # one with the API's, where there is one
-    dashboard = create_dashboard(Site(settings, database, stores), gate)
+    parsers = getattr(app.state, "parsers", None) or Parsers(1)
+    dashboard = create_dashboard(Site(settings, database, stores), gate, parsers)
 
     @app.get(BASE, include_in_schema=False)
     def without_slash() -> RedirectResponse:
@@ -73,7 +87,7 @@ def mount(app: FastAPI, settings: Settings, database: Database, stores: Stores) 
     app.mount(BASE, dashboard, name="dashboard")
 
 
-def create_dashboard(site: Site, gate: Gate) -> FastAPI:
+def create_dashboard(site: Site, gate: Gate, parsers: Parsers) -> FastAPI:
     """The application itself, for paths relative to /dashboard."""
     app = FastAPI(openapi_url=None, docs_url=None, redoc_url=None)
     app.state.site, app.state.gate = site, gate
@@ -86,9 +100,15 @@ def create_dashboard(site: Site, gate: Gate) -> FastAPI:
         pages_models,
         pages_files,
         pages_sessions,
+        pages_runs,
+        pages_start,
+        pages_objects,
+        pages_keys,
     )
+    viewing = [Depends(access.require_viewer)]
     for module in pages:
-        app.include_router(module.router(site), dependencies=[Depends(access.require_viewer)])
+        app.include_router(module.router(site), dependencies=viewing)
+    app.include_router(pages_uploads.router(site, parsers), dependencies=viewing)
     app.mount("/static", GZipMiddleware(StaticFiles(directory=STATIC), minimum_size=1024))
     app.add_middleware(SecurityHeaders)
     _install_errors(app, site)
@@ -126,7 +146,8 @@ def _install_errors(app: FastAPI, site: Site) -> None:
     def answer(request: Request, status: int, detail: str) -> Response:
         if not _wants_page(request):
             return PlainTextResponse(detail, status)
-        heading = "This page does not exist" if status == 404 else HTTPStatus(status).phrase
+        _know_the_viewer(request, site)
+        heading = HEADINGS.get(status, HTTPStatus(status).phrase)
         request_id = request.scope.get("state", {}).get("request_id") if status >= 500 else None
         return site.page(
             request, "error.html", status=status, heading=heading, detail=detail, request_id=request_id
@@ -152,6 +173,9 @@ def _install_errors(app: FastAPI, site: Site) -> None:
 
     @app.exception_handler(RequestValidationError)
     def invalid(request: Request, error: RequestValidationError) -> Response:
+        if request.method != "GET":
+            faults = (f"{fault['loc'][-1]}: {fault['msg']}" for fault in error.errors())
+            return answer(request, 422, f"{'; '.join(faults)}.")
         return answer(request, 404, "The address holds a value that cannot be.")
 
     @app.exception_handler(DatabaseUnavailable)
@@ -174,6 +198,15 @@ def _install_errors(app: FastAPI, site: Site) -> None:
     @app.exception_handler(Exception)
     def unexpected(request: Request, error: Exception) -> Response:
         return answer(request, 500, "Something went wrong on our side.")
+
+
+def _know_the_viewer(request: Request, site: Site) -> None:
+    """Who looks, for the navigation of an error page of an address that no route has."""
+    if getattr(request.state, "viewer", None) is None:
+        try:
+            access.require_viewer(request)
+        except (access.LoginRequired, DatabaseUnavailable):
+            return
 
 
 def _wants_page(request: Request) -> bool:

@@ -15,6 +15,7 @@ from physworld_services.dashboard.pages_scenes import layer_response
 from physworld_services.dashboard.site import BASE, Site
 from physworld_storage import overview, resources
 from physworld_storage.errors import NotFound
+from physworld_storage.jobs.kinds.pipeline import model_name_of
 
 PAGE_SIZE = 50
 COVERAGE = "coverage.svg"
@@ -61,6 +62,7 @@ def router(site: Site) -> APIRouter:
             "dataset.html",
             dataset=dataset,
             scene=scene,
+            model_name=model_name_of(scene.name),
             chosen=chosen,
             episodes=episodes.data,
             files=files,

@@ -14,9 +14,10 @@ from physworld_schemas.base import Reference
 from physworld_schemas.job import TERMINAL_STATES, Event, Job
 from physworld_services.dashboard import live
 from physworld_services.dashboard.access import actor_of, require_same_origin, require_writer
+from physworld_services.dashboard.samples import sample_folder
 from physworld_services.dashboard.site import BASE, Site
 from physworld_services.dashboard.text import figure
-from physworld_storage import overview, runs
+from physworld_storage import overview
 from physworld_storage.access import audit
 from physworld_storage.jobs import jobs
 
@@ -100,6 +101,7 @@ def _list(site: Site, cursor: str | None, state: str | None) -> dict[str, Any]:
         ],
         "entries": [Entry(job, subjects.get(job.id, ""), children.get(job.id, [])) for job in page.data],
         "filters": FILTERS,
+        "has_sample": sample_folder() is not None,
         "state": state,
         "cursor": cursor,
         "next_cursor": page.next_cursor,
@@ -157,10 +159,4 @@ def _link(session: Session, reference: Reference) -> tuple[str, str]:
         name = overview.scene_names(session, [reference.id]).get(reference.id, reference.id)
         return f"/scenes/{reference.id}", f"scene {name}"
     label = f"{reference.kind} …{reference.id[-6:]}"
-    if (
-        reference.kind == "rollout" or reference.kind == "plan"
-    ):  # no page of their own: their arrays, once they are there
-        job = runs.run_row(session, reference.kind, reference.id).job_id
-        name = f"{reference.id}.npz"
-        return (f"/artifacts/{reference.digest}?name={name}" if reference.digest else f"/jobs/{job}"), label
     return f"/{reference.kind}s/{reference.id}", label

@@ -19,6 +19,7 @@ from physworld_services.dashboard.clouds import (
     thinned,
 )
 from physworld_services.dashboard.curves import chart, frame_errors, given_curves, onto
+from physworld_services.dashboard.samples import sample_folder
 from physworld_services.dashboard.site import BASE, Site
 from physworld_storage import resources, traces
 from physworld_storage.errors import NotFound
@@ -43,7 +44,12 @@ def router(site: Site) -> APIRouter:
         with site.database.reading() as session:
             page = resources.list_scenes(session, limit=PAGE_SIZE, cursor=cursor)
         return site.page(
-            request, "scenes.html", scenes=page.data, cursor=cursor, next_cursor=page.next_cursor
+            request,
+            "scenes.html",
+            scenes=page.data,
+            cursor=cursor,
+            next_cursor=page.next_cursor,
+            has_sample=sample_folder() is not None,
         )
 
     @routes.get("/fits/{fit_id}")

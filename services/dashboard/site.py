@@ -43,6 +43,7 @@ class Site:
     def __init__(self, settings: Settings, database: Database, stores: Stores) -> None:
         self.settings = settings
         self.database = database
+        self.stores = stores
         self.artifacts = stores.artifacts
         self.episodes = stores.episodes
         self._templates = _environment()
@@ -56,7 +57,9 @@ class Site:
         """A rendered template, e.g. the part of a page that a live stream sends again."""
         viewer: ApiKey | None = getattr(request.state, "viewer", None)
         may_write = viewer is not None and viewer.allows("write")
-        return self._templates.get_template(template).render(viewer=viewer, may_write=may_write, **context)
+        may_manage = viewer is not None and viewer.allows("admin")
+        known = {"viewer": viewer, "may_write": may_write, "may_manage": may_manage}
+        return self._templates.get_template(template).render(**known, **context)
 
     def recording(self, artifacts: list[Artifact]) -> Scene | None:
         """The recording behind a scene's artifacts: its canonical archive, parsed; None without one."""

@@ -17,18 +17,22 @@ import numpy as np
 from physworld.demonstrate.coverage import Coverage
 from physworld.scene import Body, Scene
 from physworld_scenes.bundle import canonical_archive
+from physworld_schemas.arrays import EncodedArray
 from physworld_schemas.base import Artifact, Problem
 from physworld_schemas.dataset import DatasetConfig
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.job import Job, Progress
 from physworld_schemas.model import TrainingConfig
 from physworld_schemas.pipeline import PipelineCreate
+from physworld_schemas.trace import TraceCreate
 from physworld_services.stores import Stores
 from physworld_storage import resources
 from physworld_storage.access import api_keys
 from physworld_storage.database import Database, open_database
 from physworld_storage.jobs import jobs, leases
+from physworld_storage.runs import RunKind
 from physworld_storage.settings import Settings
+from physworld_storage.traces import TRACKS
 from physworld_workers.tasks.dataset_card import store_card
 
 FRAMES, POINTS, PARTICLES = 90, 24, 300
@@ -47,6 +51,10 @@ class World:
     stores: Stores
     writer_token: str = ""
     reader_token: str = ""
+    admin_token: str = ""
+    rollout_id: str = ""
+    plan_id: str = ""
+    trace_id: str = ""
     scene_id: str = ""
     pipeline_id: str = ""
     dataset_id: str = ""
@@ -67,11 +75,15 @@ def build_world(folder: Path) -> World:
     with database.session() as session:
         _, world.writer_token = api_keys.create_key(session, "writer", "write")
         _, world.reader_token = api_keys.create_key(session, "reader", "read")
+        _, world.admin_token = api_keys.create_key(session, "admin", "admin")
     recording = chain_recording()
     world.scene_id = add_scene(world, recording)
     world.pipeline_id = _finish_pipeline(world, recording)
     world.failed_id = _fail_fit(world, add_scene(world, replace(recording, name="chain_failed")))
     _start_fit(world, add_scene(world, replace(recording, name="chain_running")))
+    _trace(world, recording)
+    world.rollout_id = _run(world, recording, "rollout")
+    world.plan_id = _run(world, recording, "plan")
     return world
 
 
@@ -286,6 +298,53 @@ def held_out(recording: Scene, predictors: tuple[str, ...]) -> dict[str, Any]:
             "track_m": {name: (error * growth).tolist() for name, error in errors.items()},
         },
     }
+
+
+def _trace(world: World, recording: Scene) -> None:
+    """A trace that named an effect, with its tracks and candidates."""
+    with world.database.session() as session:
+        job = jobs.create_trace(session, TraceCreate(scene_id=world.scene_id))
+    world.trace_id = job.outputs[0].id
+    tracks = {"times": recording.times, "before": recording.points + 0.01, "after": recording.points + 0.002}
+    stored = world.stores.artifacts.put_bytes(packed(tracks), TRACKS)
+    effect = {"name": "drag", "parameters": {"rate": {"value": 0.8, "unit": "1/s", "ci95": [0.7, 0.9]}}}
+    report = {
+        "scene": recording.name,
+        "reason": "Drag accounts for what the twin leaves",
+        "effects": [effect],
+        "candidates": [{"name": "drag", "score": 0.6, "threshold": 0.05, "selected": True}],
+        "held_out": {"before": 0.01, "after": 0.002, "after_ci95": [0.001, 0.003], "noise_floor": 3.2e-4},
+        "path": [{"base": [], "kept": ["drag"], "tried": [{"effects": ["drag"], "misfit": 1.02}]}],
+    }
+    complete(
+        world,
+        claim(world, job.id),
+        {"verdict": "named", "report": report, "artifacts": [stored.model_dump()]},
+    )
+
+
+def _run(world: World, recording: Scene, kind: RunKind) -> str:
+    """A rollout or a plan that is ready, with its arrays."""
+    put = world.stores.artifacts.put_bytes
+    asked = {"controllers": EncodedArray.of(recording.controllers[:60]).model_dump()}
+    request = put(json.dumps(asked).encode(), "request.json", "application/json")
+    with world.database.session() as session:
+        job = jobs.create_run(session, kind, "chain_swing", 1, {}, request, 10)
+    points = recording.points[:60].astype(np.float32)
+    arrays: dict[str, np.ndarray] = {"times": recording.times[:60], "points": points[None]}
+    if kind == "plan":
+        arrays = {"times": recording.times[:60], "controllers": recording.controllers[:64]}
+        arrays |= {"predicted": points, "executed": points + 0.003, "goal_places": points[-1]}
+    result = put(packed(arrays), f"{kind}.npz")
+    figures = {
+        "seconds": 1.5,
+        "ticks": 60,
+        "candidates": 1,
+        "predicted_error_m": 0.002,
+        "executed_error_m": 0.004,
+    }
+    complete(world, claim(world, job.id), {"figures": figures, "artifacts": [result.model_dump()]})
+    return str(job.outputs[0].id)
 
 
 def _fail_fit(world: World, scene_id: str) -> str:

@@ -8,122 +8,19 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
-from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
-from dashboard_world import EPISODES, FRAMES, World, build_world, claim, complete, report
-from fastapi import FastAPI
-from playwright.sync_api import Browser, Page, expect, sync_playwright
-from serving import serve
+from dashboard_browser import READY_MS, Visit
+from dashboard_world import EPISODES, FRAMES, World, claim, complete, report
+from playwright.sync_api import Page, expect
 
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.pipeline import PipelineCreate
-from physworld_services.dashboard import mount
 from physworld_storage import resources
 from physworld_storage.jobs import jobs
 
 pytestmark = pytest.mark.browser
-
-CHROMIUM = next(
-    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
-)
-FLAGS = (
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--no-sandbox",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-)
-READY_MS = 60_000  # software WebGL on a busy machine
-expect.set_options(timeout=READY_MS)
-WATCH_POLICY = """
-window.violations = [];
-document.addEventListener("securitypolicyviolation", (event) =>
-  window.violations.push(`${event.violatedDirective} ${event.blockedURI}`));
-"""
-
-
-@dataclass
-class Visit:
-    """A browser tab, and what went wrong in it."""
-
-    page: Page
-    base: str
-    errors: list[str] = field(default_factory=list)
-    requests: list[str] = field(default_factory=list)
-
-    def open(self, path: str) -> None:
-        """Go to a page of the dashboard."""
-        self.page.goto(self.base + path)
-
-    def login(self, token: str) -> None:
-        """Log in through the form that the present page shows."""
-        self.page.fill("#key", token)
-        self.page.click("button[type=submit]")
-        self.page.wait_for_selector(".top nav")
-
-    def points_shown(self) -> None:
-        """Wait until the 3D view has its points."""
-        self.page.wait_for_selector("[data-cloud][data-ready]", timeout=READY_MS)
-
-
-@pytest.fixture(scope="module")
-def world(tmp_path_factory: pytest.TempPathFactory) -> World:
-    """The installation that all tests look at."""
-    return build_world(tmp_path_factory.mktemp("dashboard"))
-
-
-@pytest.fixture(scope="module")
-def base(world: World) -> Iterator[str]:
-    """Address of a real server with the dashboard and nothing else."""
-    app = FastAPI()
-    mount(app, world.settings, world.database, world.stores)
-    with serve(app) as origin:
-        yield f"{origin}/dashboard"
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    """Headless Chromium with software WebGL."""
-    if CHROMIUM is None:
-        pytest.skip("no Chromium on this machine")
-    with sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
-        yield chromium
-        chromium.close()
-
-
-@pytest.fixture
-def stranger(browser: Browser, base: str) -> Iterator[Visit]:
-    """A tab without a session; clean at the end."""
-    context = browser.new_context(viewport={"width": 1280, "height": 900}, accept_downloads=True)
-    context.add_init_script(WATCH_POLICY)
-    page = context.new_page()
-    visit = Visit(page, base)
-    page.on("console", lambda message: visit.errors.append(message.text) if message.type == "error" else None)
-    page.on("pageerror", lambda error: visit.errors.append(str(error)))
-    page.on("request", lambda request: visit.requests.append(request.url))
-    yield visit
-    assert page.evaluate("window.violations") == []
-    context.close()
-    assert visit.errors == []
-    origin = base.removesuffix("/dashboard")
-    assert [url for url in visit.requests if not url.startswith((origin + "/", "blob:", "data:"))] == []
-
-
-@pytest.fixture
-def visit(stranger: Visit, world: World) -> Visit:
-    """A tab of somebody who may write, on the overview."""
-    stranger.open("/")
-    stranger.login(world.writer_token)
-    return stranger
 
 
 def test_a_stranger_is_led_to_the_login_and_back(stranger: Visit, world: World) -> None:
@@ -220,7 +117,8 @@ def test_a_scene_without_a_twin_says_what_to_do_or_where_one_is_being_made(
     with world.database.reading() as session:
         scenes = {scene.name: scene.id for scene in resources.list_scenes(session).data}
     visit.open(f"/scenes/{scenes['chain_failed']}")
-    expect(visit.page.locator("main")).to_contain_text("physworld run chain_failed")
+    calibrate = visit.page.locator(".empty").get_by_role("link", name="Calibrate")
+    expect(calibrate).to_have_attribute("href", f"/dashboard/start/fit?scene_id={scenes['chain_failed']}")
     visit.points_shown()
     visit.open(f"/scenes/{scenes['chain_running']}")
     visit.points_shown()

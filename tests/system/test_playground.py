@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from dashboard_browser import FLAGS, WATCH_POLICY
 from inference_serving import Served, serve_inference
 from playwright.sync_api import Page, expect, sync_playwright
-from test_dashboard import FLAGS, WATCH_POLICY
 
 pytestmark = pytest.mark.browser
 

@@ -15,6 +15,7 @@ from physworld_client.artifacts import Artifacts
 from physworld_client.calls import Call
 from physworld_client.known_keys import KnownKeys
 from physworld_client.live import Live
+from physworld_client.location import where
 from physworld_client.loop import Assessments, Traces
 from physworld_client.predict import Plans, Rollouts
 from physworld_client.resources import (
@@ -33,8 +34,9 @@ class Client:
     """A connection to one PhysWorld service; usable as a context manager.
 
     Args:
-        base_url: address of the service, e.g. ``http://127.0.0.1:8000``.
-        token: API key.
+        base_url: address of the service; without it ``PHYSWORLD_URL``, else the embedded service that runs on
+            ``PHYSWORLD_DATA_DIR`` or the usual data folder.
+        token: API key; without it ``PHYSWORLD_TOKEN``, or the embedded service's own.
         timeout: seconds for one answer (a long poll adds its own wait).
         max_retries: further attempts after the first, see ``physworld_client.transport``.
         transport: a transport of httpx, for tests or a Unix socket.
@@ -48,7 +50,7 @@ class Client:
 
     def __init__(
         self,
-        base_url: str,
+        base_url: str | None = None,
         token: str | None = None,
         timeout: float = wire.DEFAULT_TIMEOUT_S,
         max_retries: int = wire.DEFAULT_MAX_RETRIES,
@@ -57,11 +59,12 @@ class Client:
         known_keys: str | Path | None = None,
         known_as: str | None = None,
     ) -> None:
+        found = where(base_url, token)
         self.timeout = timeout
         self.max_retries = max_retries
         self.known_keys = KnownKeys(known_keys)
-        self.http = httpx.Client(transport=transport, **wire.client_options(base_url, token, timeout))
-        self.known_as = known_as or wire.service_name(self.base_url)
+        self.http = httpx.Client(transport=transport, **wire.client_options(found.url, found.token, timeout))
+        self.known_as = known_as or found.known_as or wire.service_name(self.base_url)
         self.scenes = Scenes(self)
         self.fits = Fits(self)
         self.traces = Traces(self)
@@ -74,6 +77,9 @@ class Client:
         self.jobs = Jobs(self)
         self.pipelines = Pipelines(self)
         self.artifacts = Artifacts(self)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.base_url!r})"
 
     @property
     def base_url(self) -> str:

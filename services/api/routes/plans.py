@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Response
+from sqlalchemy.orm import Session
 
 from physworld_schemas.arrays import FARTHEST_M, EncodedArray
 from physworld_schemas.base import Page
@@ -15,7 +17,9 @@ from physworld_services.api.dependencies import DatabaseDep, ObjectId, PageDep, 
 from physworld_services.api.errors import documented
 from physworld_services.api.idempotency import IdempotencyDep, accepted
 from physworld_services.api.routes.rollouts import invalid, read_array, ready_version
+from physworld_services.stores import Stores
 from physworld_storage import registry, resources, runs
+from physworld_storage.database import Database
 from physworld_storage.jobs import jobs
 
 router = APIRouter(prefix="/plans", tags=["plans"], route_class=LongBodyRoute)
@@ -28,20 +32,8 @@ def create_plan(
     body: PlanCreate, idempotency: IdempotencyDep, database: DatabaseDep, stores: StoresDep
 ) -> Response:
     """Search a motion that brings the object to the goal; the plan's id is in the job's `outputs`."""
-    with database.reading() as session:
-        version = ready_version(registry.get_version(session, body.model, body.version))
-        points = resources.get_scene(session, str(version.scene_id)).points
-    asked = _checked(body, points).model_copy(update={"version": version.version})
-    request = stores.artifacts.put_bytes(asked.model_dump_json().encode(), runs.REQUEST, "application/json")
-    config = asked.model_dump(mode="json", exclude={"goal"}) | {"goal": body.goal.kind}
-    return idempotency.run(
-        body,
-        lambda session: accepted(
-            jobs.create_run(
-                session, "plan", body.model, version.version, config, request, body.config.iterations
-            )
-        ),
-    )
+    opening = plan_opening(body, database, stores)
+    return idempotency.run(body, lambda session: accepted(opening(session)))
 
 
 @router.get("", responses=documented(401, 403, 422))
@@ -58,6 +50,19 @@ def get_plan(plan_id: ObjectId, database: DatabaseDep) -> Plan:
     """A plan; control path, predicted and executed paths are the artifact `plan.npz`."""
     with database.reading() as session:
         return runs.get_plan(session, plan_id)
+
+
+def plan_opening(body: PlanCreate, database: Database, stores: Stores) -> Callable[[Session], Job]:
+    """What opens the plan's job, its request checked and stored. Raises ApiProblem, 409 or 422."""
+    with database.reading() as session:
+        version = ready_version(registry.get_version(session, body.model, body.version))
+        points = resources.get_scene(session, str(version.scene_id)).points
+    asked = _checked(body, points).model_copy(update={"version": version.version})
+    request = stores.artifacts.put_bytes(asked.model_dump_json().encode(), runs.REQUEST, "application/json")
+    config = asked.model_dump(mode="json", exclude={"goal"}) | {"goal": body.goal.kind}
+    return lambda session: jobs.create_run(
+        session, "plan", body.model, version.version, config, request, body.config.iterations
+    )
 
 
 def _checked(body: PlanCreate, points: int) -> PlanCreate:

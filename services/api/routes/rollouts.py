@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Annotated, Any
 
 import numpy as np
 from fastapi import APIRouter, Query, Response
+from sqlalchemy.orm import Session
 
 from physworld.arrays import Array
 from physworld_schemas.arrays import FARTHEST_M, ArrayInput, EncodedArray, array_of
 from physworld_schemas.base import FieldError, Page
+from physworld_schemas.job import Job
 from physworld_schemas.model import ModelVersion
 from physworld_schemas.rollout import (
     MAX_CANDIDATES,
@@ -33,7 +36,9 @@ from physworld_services.api.dependencies import (
 from physworld_services.api.errors import ApiProblem, documented
 from physworld_services.api.idempotency import IdempotencyDep, accepted, answer_of
 from physworld_services.api.inference import roll_out
+from physworld_services.stores import Stores
 from physworld_storage import registry, resources, runs
+from physworld_storage.database import Database
 from physworld_storage.jobs import jobs
 
 router = APIRouter(prefix="/rollouts", tags=["rollouts"], route_class=LongBodyRoute)
@@ -61,7 +66,7 @@ def create_rollout(
         scene = resources.get_scene(session, str(version.scene_id))
     shape = _shape(body, scene.controllers)
     asked = _encoded(body).model_copy(update={"version": version.version})
-    ticks = shape[1] if body.times is None else max(1, round(body.times[-1] * NOMINAL_RATE_HZ))
+    ticks = _ticks(body, shape)
     places = sum(
         {"points": scene.points, "vertices": version.config.vertices}[part] for part in set(body.returns)
     )
@@ -69,15 +74,8 @@ def create_rollout(
     if small and body.mode == "auto" and settings.inference_url:
         found = roll_out(settings.inference_url, database, principal.credential, asked)
         return idempotency.run(body, lambda session: answer_of(200, found))
-    request = stores.artifacts.put_bytes(asked.model_dump_json().encode(), runs.REQUEST, "application/json")
-    config = asked.model_dump(mode="json", exclude={"controllers", "phi", "times"}) | {"shape": list(shape)}
-    total = shape[0] * ticks
-    return idempotency.run(
-        body,
-        lambda session: accepted(
-            jobs.create_run(session, "rollout", body.model, version.version, config, request, total)
-        ),
-    )
+    opening = _opening(asked, shape, ticks, version.version, stores)
+    return idempotency.run(body, lambda session: accepted(opening(session)))
 
 
 @router.get("", responses=documented(401, 403, 422))
@@ -94,6 +92,30 @@ def get_rollout(rollout_id: ObjectId, database: DatabaseDep) -> Rollout:
     """A rollout that was a job; its arrays are the artifact `rollout.npz`."""
     with database.reading() as session:
         return runs.get_rollout(session, rollout_id)
+
+
+def rollout_opening(body: RolloutCreate, database: Database, stores: Stores) -> Callable[[Session], Job]:
+    """What opens the rollout's job, its request checked and stored. Raises ApiProblem, 409 or 422."""
+    with database.reading() as session:
+        version = ready_version(registry.get_version(session, body.model, body.version))
+        scene = resources.get_scene(session, str(version.scene_id))
+    shape = _shape(body, scene.controllers)
+    asked = _encoded(body).model_copy(update={"version": version.version})
+    return _opening(asked, shape, _ticks(body, shape), version.version, stores)
+
+
+def _ticks(body: RolloutCreate, shape: tuple[int, int]) -> int:
+    return shape[1] if body.times is None else max(1, round(body.times[-1] * NOMINAL_RATE_HZ))
+
+
+def _opening(
+    asked: RolloutCreate, shape: tuple[int, int], ticks: int, version: int, stores: Stores
+) -> Callable[[Session], Job]:
+    request = stores.artifacts.put_bytes(asked.model_dump_json().encode(), runs.REQUEST, "application/json")
+    config = asked.model_dump(mode="json", exclude={"controllers", "phi", "times"}) | {"shape": list(shape)}
+    return lambda session: jobs.create_run(
+        session, "rollout", asked.model, version, config, request, shape[0] * ticks
+    )
 
 
 def ready_version(version: ModelVersion) -> ModelVersion:

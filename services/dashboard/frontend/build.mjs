@@ -8,6 +8,7 @@ import { copyFileSync, mkdirSync, readFileSync, readdirSync, rmSync, writeFileSy
 
 const OUT = "../static";
 const LICENCES = {
+  "fflate.txt": "node_modules/fflate/LICENSE",
   "htmx.txt": "node_modules/htmx.org/LICENSE",
   "three.txt": "node_modules/three/LICENSE",
   "uplot.txt": "node_modules/uplot/LICENSE",
@@ -17,7 +18,7 @@ rmSync(OUT, { recursive: true, force: true });
 mkdirSync(`${OUT}/licences`, { recursive: true });
 
 await build({
-  entryPoints: ["src/app.js", "src/cloud.js", "src/curve.js", "src/playground.js", "src/style.css"],
+  entryPoints: ["src/app.js", "src/cloud.js", "src/curve.js", "src/playground.js", "src/upload.js", "src/style.css"],
   outdir: OUT,
   bundle: true,
   minify: true,

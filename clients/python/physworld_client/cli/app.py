@@ -11,7 +11,7 @@ import signal
 import sys
 from importlib.metadata import version as installed_version
 from types import FrameType
-from typing import NoReturn
+from typing import Annotated, NoReturn
 
 import typer
 from pydantic import ValidationError
@@ -50,6 +50,21 @@ for name, group in lists.GROUPS.items():
 def version() -> None:
     """Print the version of the client."""
     print(installed_version("physworld-client"))
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        version()
+        raise typer.Exit
+
+
+@app.callback()
+def physworld(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and leave.")
+    ] = False,
+) -> None:
+    """From a recording of a deformable object to a world model."""
 
 
 def main() -> None:

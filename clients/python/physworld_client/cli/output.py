@@ -12,6 +12,7 @@ from typing import Any
 from pydantic import BaseModel
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from physworld_schemas.job import Job
 
@@ -35,9 +36,9 @@ def print_table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """A table of texts; says so when it is empty."""
     table = Table(box=None, pad_edge=False, header_style="bold")
     for heading in headings:
-        table.add_column(heading, no_wrap=True)
+        table.add_column(Text(heading), no_wrap=True)
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(Text, row))  # brackets of units and names are no markup
     if table.row_count:
         stdout.print(table)
     else:
@@ -68,7 +69,7 @@ def print_state(job: Job, as_json: bool) -> None:
     if as_json:
         print_json(job)
     else:
-        stdout.print(f"{job.id} is {job.state}")
+        stdout.print(f"{job.id} is {job.state}", markup=False)
 
 
 def progress_text(job: Job) -> str:

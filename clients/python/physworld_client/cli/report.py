@@ -79,7 +79,7 @@ def print_report(report: RunReport) -> None:
     table.add_column("prediction")
     columns = [catalogue().metric(name) for name in report.held_out]
     for metric in columns:
-        table.add_column(f"{metric.title}{shown_unit(metric)}", justify="right")
+        table.add_column(Text(f"{metric.title}{shown_unit(metric)}"), justify="right")
     first = report.held_out[MAIN_METRIC]
     for row, heading in ROWS.items():
         if row in first:

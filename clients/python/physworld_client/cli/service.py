@@ -59,13 +59,16 @@ def data_folder(given: Path | None) -> Path:
 
 
 def find(url: str | None, token: str | None, data: Path | None) -> Address | None:
-    """The service of ``--url`` or ``PHYSWORLD_URL``, else the one that runs on the data folder, else None."""
-    url = url or os.environ.get("PHYSWORLD_URL")
-    token = token or os.environ.get("PHYSWORLD_TOKEN")
+    """The service of ``--url``, of ``--data``, else of ``PHYSWORLD_URL``, else of the usual data folder; or None.
+
+    What was given on the command line counts before the environment.
+    """
+    if url is None and data is None:
+        url = os.environ.get("PHYSWORLD_URL")
     if url:
         base = url.rstrip("/")
-        return Address(base, token, f"{base}/dashboard")
-    return _running_on(data_folder(data))
+        return Address(base, token or os.environ.get("PHYSWORLD_TOKEN"), f"{base}/dashboard")
+    return running_on(data_folder(data))
 
 
 def require(url: str | None, token: str | None, data: Path | None) -> Address:
@@ -120,7 +123,7 @@ class Embedded:
         """
         end = time.monotonic() + START_TIMEOUT_S
         while time.monotonic() < end:
-            address = _running_on(self.data, pid=self.process.pid)
+            address = running_on(self.data, pid=self.process.pid)
             if address is not None:
                 return address
             code = self.process.poll()
@@ -154,7 +157,7 @@ def embedded_command(data: Path, workers: int, port: int) -> list[str]:
     return [sys.executable, "-m", "physworld_services.embedded", *options]
 
 
-def _running_on(data: Path, pid: int | None = None) -> Address | None:
+def running_on(data: Path, pid: int | None = None) -> Address | None:
     """The service that runs on a data folder and answers; None when there is none (or not as ``pid``)."""
     try:
         state = json.loads((data / "run" / "state.json").read_bytes())

@@ -271,9 +271,11 @@ def test_a_reader_cancels_nothing(client: httpx.Client, database: Database) -> N
 
 
 def test_empty_lists_say_what_to_do_next(client: httpx.Client, database: Database) -> None:
-    login(client, database)
-    for path in ("/dashboard/", "/dashboard/scenes", "/dashboard/datasets", "/dashboard/models"):
-        assert "physworld run SCENE" in client.get(path).text
+    login(client, database, "write")
+    for path in ("/dashboard/", "/dashboard/scenes"):
+        assert 'action="/dashboard/scenes/sample"' in client.get(path).text
+    for path, kind in (("datasets", "dataset"), ("models", "pipeline"), ("fits", "fit"), ("plans", "plan")):
+        assert f'href="/dashboard/start/{kind}"' in client.get(f"/dashboard/{path}").text
 
 
 def test_a_cursor_that_no_list_gave_out_is_refused(client: httpx.Client, database: Database) -> None:

@@ -1,0 +1,83 @@
+"""API keys, for administrators: the list, a new one (its token is shown once), another token, the end of one."""
+
+from __future__ import annotations
+
+from datetime import timedelta
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Form, Query, Request
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
+from pydantic import ValidationError
+from starlette.exceptions import HTTPException
+
+from physworld_schemas.key import DEFAULT_GRACE_MINUTES, KeyCreate, Role
+from physworld_services.dashboard.access import actor_of, require_same_origin
+from physworld_services.dashboard.site import BASE, Site
+from physworld_storage.access import api_keys
+
+PAGE_SIZE = 50
+ROLES: dict[Role, str] = {"read": "look", "write": "look and start work", "admin": "also manage keys"}
+
+
+def require_admin(request: Request) -> None:
+    """Dependency of every page here. Raises 403."""
+    viewer: api_keys.ApiKey = request.state.viewer
+    if not viewer.allows("admin"):
+        raise HTTPException(403, f"Keys are managed with an admin key; this one may {viewer.role}.")
+
+
+def router(site: Site) -> APIRouter:
+    """Pages below ``/keys``."""
+    routes = APIRouter(prefix="/keys", dependencies=[Depends(require_admin)])
+
+    def page(
+        request: Request,
+        cursor: str | None = None,
+        made: str | None = None,
+        fault: str = "",
+        status: int = 200,
+    ) -> HTMLResponse:
+        with site.database.reading() as session:
+            found = api_keys.list_keys(session, limit=PAGE_SIZE, cursor=cursor)
+        context: dict[str, Any] = {"keys": found.data, "cursor": cursor, "next_cursor": found.next_cursor}
+        context |= {"roles": ROLES, "token": made, "fault": fault}
+        return site.page(request, "keys.html", status=status, **context)
+
+    @routes.get("")
+    def index(request: Request, cursor: Annotated[str | None, Query(max_length=512)] = None) -> HTMLResponse:
+        return page(request, cursor)
+
+    @routes.post("", dependencies=[Depends(require_same_origin)])
+    def create(
+        request: Request,
+        name: Annotated[str, Form()] = "",
+        role: Annotated[str, Form()] = "read",
+        days: Annotated[str, Form()] = "",
+    ) -> HTMLResponse:
+        try:
+            asked = KeyCreate.model_validate(
+                {"name": name.strip(), "role": role, "expires_in_days": days or None}
+            )
+        except ValidationError as error:
+            fault = "; ".join(f"{fault['loc'][0]}: {fault['msg']}" for fault in error.errors())
+            return page(request, fault=fault, status=422)
+        with site.database.session() as session:
+            _, token = api_keys.create_key(
+                session, asked.name, asked.role, lifetime_days=asked.expires_in_days, by=actor_of(request)
+            )
+        return page(request, made=token, status=201)
+
+    @routes.post("/{key_id}/rotate", dependencies=[Depends(require_same_origin)])
+    def rotate(request: Request, key_id: str) -> HTMLResponse:
+        grace = timedelta(minutes=DEFAULT_GRACE_MINUTES)
+        with site.database.session() as session:
+            _, token, _ = api_keys.rotate_key(session, key_id, grace, by=actor_of(request))
+        return page(request, made=token)
+
+    @routes.post("/{key_id}/revoke", dependencies=[Depends(require_same_origin)])
+    def revoke(request: Request, key_id: str) -> Response:
+        with site.database.session() as session:
+            api_keys.revoke_key(session, key_id, by=actor_of(request))
+        return RedirectResponse(f"{BASE}/keys", 303)
+
+    return routes

@@ -1,0 +1,76 @@
+"""What people do with an object from its page: delete it, describe a version, move an alias."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Form, Request
+from fastapi.responses import RedirectResponse, Response
+from pydantic import ValidationError
+from starlette.exceptions import HTTPException
+
+from physworld_schemas.model import VersionPatch
+from physworld_services.api.routes.removal import delete_episodes, delete_object
+from physworld_services.dashboard.access import actor_of, require_same_origin, require_writer
+from physworld_services.dashboard.site import BASE, Site
+from physworld_storage import registry, removal
+from physworld_storage.access import audit
+from physworld_storage.errors import NotFound
+
+AFTERWARDS = {"fit": "fits", "scene": "scenes", "trace": "traces", "dataset": "datasets"}
+AFTERWARDS |= {"rollout": "rollouts", "plan": "plans", "assessment": "models"}
+ALIAS = r"^[a-z][a-z0-9_-]{0,31}$"
+
+
+def router(site: Site) -> APIRouter:
+    """Everything here changes something: it is posted, by one of our pages, with a key that may write."""
+    routes = APIRouter(dependencies=[Depends(require_same_origin), Depends(require_writer)])
+
+    @routes.post("/delete/{kind}/{object_id}")
+    def delete(request: Request, kind: str, object_id: str) -> Response:
+        if kind not in AFTERWARDS:
+            raise NotFound("kind of object", kind)
+        actor = actor_of(request)
+        if kind == "dataset":
+            delete_episodes(site.database, actor, site.stores, object_id)
+        else:
+            delete_object(site.database, actor, kind, object_id)
+        return RedirectResponse(f"{BASE}/{AFTERWARDS[kind]}", 303)
+
+    @routes.post("/models/{name}/{number}/delete")
+    def delete_version(request: Request, name: str, number: int) -> Response:
+        with site.database.session() as session:
+            removal.remove_version(session, name, number)
+            audit.record(session, actor_of(request), "model.deleted", f"{name}:{number}")
+        return RedirectResponse(f"{BASE}/models/{name}", 303)
+
+    @routes.post("/models/{name}/{number}/label")
+    def label(
+        name: str, number: int, description: Annotated[str, Form()] = "", tags: Annotated[str, Form()] = ""
+    ) -> Response:
+        listed = [tag.strip() for tag in tags.split(",") if tag.strip()]
+        try:
+            patch = VersionPatch(description=description.strip(), tags=listed)
+        except ValidationError as error:
+            raise HTTPException(422, "; ".join(fault["msg"] for fault in error.errors())) from error
+        with site.database.session() as session:
+            registry.patch_version(session, name, number, patch)
+        return RedirectResponse(f"{BASE}/models/{name}/{number}", 303)
+
+    @routes.post("/models/{name}/{number}/alias")
+    def alias(
+        request: Request, name: str, number: int, alias: Annotated[str, Form(pattern=ALIAS)]
+    ) -> Response:
+        with site.database.session() as session:
+            registry.set_alias(session, name, alias, number)
+            audit.record(session, actor_of(request), "alias.set", f"{name}@{alias}", version=number)
+        return RedirectResponse(f"{BASE}/models/{name}/{number}", 303)
+
+    @routes.post("/models/{name}/{number}/alias/{alias}/remove")
+    def remove_alias(request: Request, name: str, number: int, alias: str) -> Response:
+        with site.database.session() as session:
+            registry.delete_alias(session, name, alias)
+            audit.record(session, actor_of(request), "alias.removed", f"{name}@{alias}")
+        return RedirectResponse(f"{BASE}/models/{name}/{number}", 303)
+
+    return routes

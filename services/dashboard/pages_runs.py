@@ -1,0 +1,155 @@
+"""Fits, rollouts and plans: their lists, and the page of a rollout or a plan with its result and a player."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Any
+
+import numpy as np
+from fastapi import APIRouter, Query, Request
+from fastapi.responses import HTMLResponse, JSONResponse, Response
+
+from physworld.arrays import Array
+from physworld_schemas.arrays import EncodedArray
+from physworld_schemas.plan import Plan
+from physworld_schemas.rollout import Rollout
+from physworld_services.dashboard.clouds import Cloud, Layer, thinned
+from physworld_services.dashboard.pages_scenes import layer_response
+from physworld_services.dashboard.site import BASE, Site
+from physworld_storage import overview, resources, runs
+from physworld_storage.errors import NotFound
+
+PAGE_SIZE = 50
+LAYERS = {
+    "rollout": (("points", "Predicted points", "model"), ("vertices", "Vertices", "particles")),
+    "plan": (
+        ("predicted", "Predicted", "model"),
+        ("executed", "In the twin", "twin"),
+        ("goal_places", "Goal", "measured"),
+        ("goal_shape", "Goal", "measured"),
+    ),
+}
+
+Cursor = Annotated[str | None, Query(max_length=512)]
+ModelName = Annotated[str | None, Query(max_length=64)]
+
+
+def router(site: Site) -> APIRouter:
+    """Pages below ``/fits``, ``/rollouts`` and ``/plans``."""
+    routes = APIRouter()
+
+    @routes.get("/fits")
+    def fits(request: Request, cursor: Cursor = None) -> HTMLResponse:
+        with site.database.reading() as session:
+            page = resources.list_fits(session, limit=PAGE_SIZE, cursor=cursor)
+            names = overview.scene_names(session, {fit.scene_id for fit in page.data})
+        context: dict[str, Any] = {
+            "fits": page.data,
+            "names": names,
+            "cursor": cursor,
+            "next_cursor": page.next_cursor,
+        }
+        return site.page(request, "fits.html", **context)
+
+    @routes.get("/rollouts")
+    def rollouts(request: Request, cursor: Cursor = None, model: ModelName = None) -> HTMLResponse:
+        with site.database.reading() as session:
+            page = runs.list_rollouts(session, limit=PAGE_SIZE, cursor=cursor, model=model)
+        context: dict[str, Any] = {
+            "runs": page.data,
+            "cursor": cursor,
+            "next_cursor": page.next_cursor,
+            "model": model,
+        }
+        return site.page(request, "rollouts.html", **context)
+
+    @routes.get("/plans")
+    def plans(request: Request, cursor: Cursor = None, model: ModelName = None) -> HTMLResponse:
+        with site.database.reading() as session:
+            page = runs.list_plans(session, limit=PAGE_SIZE, cursor=cursor, model=model)
+        context: dict[str, Any] = {
+            "runs": page.data,
+            "cursor": cursor,
+            "next_cursor": page.next_cursor,
+            "model": model,
+        }
+        return site.page(request, "plans.html", **context)
+
+    @routes.get("/rollouts/{run_id}")
+    def rollout_page(request: Request, run_id: str) -> HTMLResponse:
+        return _page(site, request, _rollout(site, run_id), "rollout")
+
+    @routes.get("/plans/{run_id}")
+    def plan_page(request: Request, run_id: str) -> HTMLResponse:
+        return _page(site, request, _plan(site, run_id), "plan")
+
+    @routes.get("/rollouts/{run_id}/cloud")
+    def rollout_cloud(run_id: str) -> Response:
+        cloud = _cloud(site, _rollout(site, run_id), "rollout")
+        return JSONResponse(cloud.describe(f"{BASE}/rollouts/{run_id}/cloud"))
+
+    @routes.get("/rollouts/{run_id}/cloud/{layer}")
+    def rollout_layer(run_id: str, layer: str) -> Response:
+        return layer_response(_cloud(site, _rollout(site, run_id), "rollout"), layer)
+
+    @routes.get("/plans/{run_id}/cloud")
+    def plan_cloud(run_id: str) -> Response:
+        cloud = _cloud(site, _plan(site, run_id), "plan")
+        return JSONResponse(cloud.describe(f"{BASE}/plans/{run_id}/cloud"))
+
+    @routes.get("/plans/{run_id}/cloud/{layer}")
+    def plan_layer(run_id: str, layer: str) -> Response:
+        return layer_response(_cloud(site, _plan(site, run_id), "plan"), layer)
+
+    return routes
+
+
+def _rollout(site: Site, run_id: str) -> Rollout:
+    with site.database.reading() as session:
+        return runs.get_rollout(session, run_id)
+
+
+def _plan(site: Site, run_id: str) -> Plan:
+    with site.database.reading() as session:
+        return runs.get_plan(session, run_id)
+
+
+def _page(site: Site, request: Request, run: Rollout | Plan, kind: runs.RunKind) -> HTMLResponse:
+    has_cloud = site.arrays(run.artifacts, runs.RESULT[kind]) is not None
+    return site.page(request, f"{kind}.html", run=run, has_cloud=has_cloud)
+
+
+def _cloud(site: Site, run: Rollout | Plan, kind: runs.RunKind) -> Cloud:
+    """The result as moving points: of a rollout its first candidate, with the grips that were asked for."""
+    arrays = site.arrays(run.artifacts, runs.RESULT[kind])
+    if arrays is None:
+        raise NotFound(f"result of {kind}", run.id or "")
+    times = np.asarray(arrays["times"], dtype=float)
+    layers = []
+    for name, label, role in LAYERS[kind]:
+        if name in arrays:
+            layers.append(thinned(Layer(name, label, role, _frames(arrays[name], len(times)))))
+    driven = arrays.get("controllers") if kind == "plan" else _asked(site, run)
+    if driven is not None:
+        paths = driven[-len(times) :] if kind == "plan" else _frames(driven, len(times))
+        layers.append(Layer("controllers", "Grips", "controllers", paths.astype(np.float32)))
+    return Cloud(times, layers)
+
+
+def _frames(values: Array, frames: int) -> Array:
+    """One path (frames, n, 3) of points: the first of several candidates; a still cloud stays where it is."""
+    path = np.asarray(values, dtype=np.float32)
+    path = path[0] if path.ndim == 4 else path
+    if path.ndim == 2:
+        return np.repeat(path[None], frames, axis=0)
+    index = np.round(np.linspace(0, len(path) - 1, frames)).astype(int)
+    return path if len(path) == frames else path[index]
+
+
+def _asked(site: Site, run: Rollout | Plan) -> Array | None:
+    """The control paths of a rollout's request, None without them."""
+    found = next((item for item in run.artifacts if item.name == runs.REQUEST), None)
+    if found is None:
+        return None
+    request: dict[str, Any] = json.loads(site.artifacts.read_bytes(found.sha256))
+    return EncodedArray.model_validate(request["controllers"]).numpy()

@@ -1,0 +1,100 @@
+"""Recordings that come in through a page: a file or an archive, and the sample scene in one click.
+
+A folder that is dropped on the page is packed in the browser (``frontend/src/upload.js``); here every upload is one
+file, read as the REST API reads it: by another process, under limits.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from fastapi import APIRouter, Depends, Request
+from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
+from starlette.concurrency import run_in_threadpool
+
+from physworld_scenes.errors import SceneInvalid
+from physworld_schemas.base import FieldError
+from physworld_schemas.scene import Scene
+from physworld_services.api.errors import ApiProblem
+from physworld_services.api.parsing import Found, Parsers
+from physworld_services.api.uploads import Upload, parsed, read_form, upload_of
+from physworld_services.dashboard.access import require_same_origin, require_writer
+from physworld_services.dashboard.samples import PACKED, SAMPLE, sample_folder
+from physworld_services.dashboard.site import BASE, Site
+from physworld_storage import resources
+
+ARCHIVE_NAME = "scene.zip"
+
+
+def router(site: Site, parsers: Parsers) -> APIRouter:
+    """What is posted to ``/scenes``."""
+    routes = APIRouter(dependencies=[Depends(require_same_origin), Depends(require_writer)])
+
+    @routes.post("/scenes")
+    async def upload(request: Request) -> Response:
+        try:
+            form = await read_form(request)
+            try:
+                given = upload_of(form, site.settings.max_upload_bytes)
+                scene = await run_in_threadpool(_uploaded, site, given, parsers)
+            finally:
+                await form.close()
+        except SceneInvalid as error:
+            return _refused(site, request, "This recording cannot be used", error.faults, 422)
+        except ApiProblem as problem:
+            return _refused(site, request, str(problem.detail), problem.errors, problem.status_code)
+        return _done(request, scene)
+
+    @routes.post("/scenes/sample")
+    async def sample(request: Request) -> Response:
+        folder = sample_folder()
+        if folder is None:
+            return _refused(site, request, "This installation has no sample scene", [], 404)
+        return _done(request, await run_in_threadpool(_sample, site, folder, parsers))
+
+    return routes
+
+
+def _uploaded(site: Site, given: Upload, parsers: Parsers) -> Scene:
+    with parsed(given, parsers) as found:
+        return _stored(site, found)
+
+
+def _sample(site: Site, source: Path, parsers: Parsers) -> Scene:
+    with TemporaryDirectory(prefix="physworld-sample-") as name:
+        folder = Path(name)
+        with zipfile.ZipFile(folder / "upload", "w", zipfile.ZIP_DEFLATED) as archive:
+            for packed in PACKED:
+                archive.write(source / packed, packed)
+        return _stored(site, parsers.parse(folder, f"{SAMPLE}.zip", None, {}))
+
+
+def _stored(site: Site, found: Found) -> Scene:
+    artifact = site.artifacts.put_file(found.archive, ARCHIVE_NAME, "application/zip")
+    with site.database.session() as session:
+        known = resources.find_scene(session, artifact.sha256)
+        return known or resources.create_scene(
+            session, digest=artifact.sha256, artifacts=[artifact], **found.facts
+        )
+
+
+def _done(request: Request, scene: Scene) -> Response:
+    place = f"{BASE}/scenes/{scene.id}"
+    return JSONResponse({"place": place}, 201) if _by_script(request) else RedirectResponse(place, 303)
+
+
+def _refused(
+    site: Site, request: Request, told: str, faults: list[FieldError], status: int
+) -> HTMLResponse | JSONResponse:
+    lines = [f"{'.'.join(str(part) for part in fault.loc)}: {fault.msg}" for fault in faults]
+    if _by_script(request):
+        return JSONResponse({"told": told, "faults": lines}, status)
+    return site.page(
+        request, "upload.html", status=status, told=told, faults=lines, has_sample=sample_folder() is not None
+    )
+
+
+def _by_script(request: Request) -> bool:
+    return "application/json" in request.headers.get("accept", "")
