@@ -71,6 +71,7 @@ def test_a_file_that_is_no_recording_is_refused_where_it_was_given(visit: Visit,
     wrong = tmp_path / "notes.txt"
     wrong.write_text("no recording")
     visit.open("/scenes")
+    expect(visit.page.get_by_role("progressbar", name="Upload")).to_be_hidden()
     visit.page.set_input_files("#bundle", wrong)
     visit.page.get_by_role("button", name="Upload").click()
     expect(visit.page.locator("[data-told] li").first).to_contain_text("notes.txt: is neither")
