@@ -17,7 +17,7 @@ import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -33,6 +33,7 @@ from physworld_scenes.bundle import read_bundle
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data" / "real"
 BUDGET = 200
+Method = Literal["selection", "evidence"]
 _MOVED = 0.05  # share of the whole motion that marks the release
 
 
@@ -57,6 +58,7 @@ CASES = (
     Case("noodle, gentle", ("noodle_gentle",), ("noodle_hard",), every=4, seconds=10.0),
     Case("noodle, both", ("noodle_gentle", "noodle_hard"), every=4, seconds=10.0),
     Case("rope, whipped", ("rope_a_whip",), ("rope_a_ring",), every=2),
+    Case("rope, shaken", ("rope_c_shake",)),
     Case("cloth, swung", ("cloth_swing",)),
 )  # fmt: skip
 
@@ -107,14 +109,14 @@ def repeatability(first: Scene, second: Scene) -> float:
     return float(np.sqrt(np.mean((both[0] - both[1]) ** 2) / 2.0))
 
 
-def run(case: Case, folder: Path, memory: Path | None) -> dict[str, Any]:
+def run(case: Case, folder: Path, memory: Path | None, method: Method = "selection") -> dict[str, Any]:
     """The figures of one case."""
     fitted, unseen = ([read(n, case, folder) for n in names] for names in (case.fitted, case.held_out))
     if case.repeats is not None:
         sigma = repeatability(*(read(name, case, folder) for name in case.repeats))
         fitted, unseen = ([replace(s, noise_sigma_m=sigma) for s in many] for many in (fitted, unseen))
     config = TraceConfig(
-        calibration=CalibrationConfig(particle_budget=BUDGET, damping="none"), experiment=None
+        method=method, calibration=CalibrationConfig(particle_budget=BUDGET, damping="none"), experiment=None
     )
     known = (
         Memory(memory / case.name.replace(", ", "-").replace(" ", "_")) if memory is not None else Memory()
@@ -271,6 +273,9 @@ def main() -> int:
     parser.add_argument("--docs", type=Path, default=None, help="Markdown file whose section is replaced")
     parser.add_argument("--only", nargs="*", default=[], help="names of cases; none: all")
     parser.add_argument("--resume", type=Path, default=None, help="folder that remembers simulations")
+    parser.add_argument(
+        "--method", choices=("selection", "evidence"), default="selection", help="how a trace decides"
+    )
     parser.add_argument("--set", type=Path, default=SHARED, help="folder of the recordings")
     given = parser.parse_args()
     if not (given.set / "beam_free_a" / "scene.json").exists():
@@ -284,7 +289,9 @@ def main() -> int:
     for case in CASES:
         if case.name not in done and (not given.only or case.name in given.only):
             try:
-                done[case.name] = json.loads(json.dumps(run(case, given.set, given.resume), default=float))
+                done[case.name] = json.loads(
+                    json.dumps(run(case, given.set, given.resume, given.method), default=float)
+                )
             except PhysworldError as failure:
                 print(f"{case.name}: {type(failure).__name__}: {failure}", file=sys.stderr)
                 continue
