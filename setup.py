@@ -18,7 +18,6 @@ IMPORT_NAMES = {
 
 setup(
     package_dir=IMPORT_NAMES,
-    package_data={"physworld_sample": ["soft_beam/*.json", "soft_beam/*.npz"]},
     packages=[
         package
         for name, folder in IMPORT_NAMES.items()

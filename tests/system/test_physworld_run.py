@@ -52,7 +52,7 @@ def processes_of(data: Path) -> list[str]:
 def one_step(step: onnxruntime.InferenceSession, folder: Path, model: WorldModel) -> np.ndarray:
     """Object vertices one tick after the start [m], the grips standing still, by the ONNX program."""
     tensors = load_file(folder / "model.safetensors")
-    neighbours = tensors["graph.neighbours"]
+    neighbours = tensors["graph.turned_neighbours" if "graph.frame_shape" in tensors else "graph.neighbours"]
     receivers, slots = np.nonzero(neighbours < len(neighbours))
     origin = model.start_history[-1].mean(axis=0)
     if model.ground_height_m is not None:

@@ -17,6 +17,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 FOLDERS = {
     "physworld": "physworld",
     "physworld_client": "clients/python/physworld_client",
+    "physworld_sample": "sample",
     "physworld_scenes": "scenes",
     "physworld_schemas": "schemas",
     "physworld_services": "services",

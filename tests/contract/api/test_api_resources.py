@@ -111,6 +111,7 @@ def test_libraries_name_the_laws_that_a_fit_chooses_from(client: httpx.Client) -
         "bundle",
         "c3d",
         "phystwin",
+        "rgbd",
     ]
     assert [one["name"] for one in client.get("/v1/exports").json()["data"]] == list(FORMATS)
 

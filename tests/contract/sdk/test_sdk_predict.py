@@ -92,8 +92,11 @@ def test_the_dashboard_shows_the_job_and_gives_its_arrays(served: Served, client
     with httpx.Client(base_url=served.url, follow_redirects=True, trust_env=False) as browser:
         origin = {"Origin": served.url}
         browser.post("/dashboard/login", data={"key": served.token, "next": "/dashboard/"}, headers=origin)
-        page = browser.get(f"/dashboard/jobs/{found.rollout.job_id}", headers={"Accept": "text/html"}).text
-        link = re.search(r'href="(/dashboard/artifacts/[^"]+)"', page)
+        job = browser.get(f"/dashboard/jobs/{found.rollout.job_id}", headers={"Accept": "text/html"}).text
+        rollout = re.search(r'href="(/dashboard/rollouts/rol_[^"/]+)"', job)
+        assert rollout is not None
+        page = browser.get(rollout.group(1), headers={"Accept": "text/html"}).text
+        link = re.search(r'href="(/dashboard/artifacts/[^"]+\.npz)"', page)
         assert link is not None
         data = browser.get(html.unescape(link.group(1))).content
         playground = browser.get(f"/dashboard/models/{served.model}/1/playground").text

@@ -1,0 +1,1 @@
+"""Sample scenes, each a folder with scene.json and scene.npz."""
