@@ -15,7 +15,7 @@ from scipy.optimize import lsq_linear
 
 from physworld.arrays import Array
 from physworld.estimation.refit import Refit, prior_rows
-from physworld.estimation.unknowns import bounds_of
+from physworld.estimation.unknowns import Unknown, bounds_of
 
 MEANINGFUL = 2.0  # standard errors by which a model must predict better than a simpler one
 _RIDGE = 1e-9  # of the normal matrix's diagonal
@@ -49,23 +49,29 @@ def cross_validated(fitted: Refit, block_of_row: Array) -> CrossValidation:
     for k, block in enumerate(blocks):
         rows = block_of_row == block
         ridge = _RIDGE * np.diag(np.diag(all_normal) + 1e-30)
-        change = _within_bounds(all_normal - normal[k] + ridge, all_gradient - gradient[k], fitted)
+        change = within_bounds(
+            all_normal - normal[k] + ridge, all_gradient - gradient[k], fitted.unknowns, fitted.theta
+        )
         left = fitted.residual[rows] - fitted.jacobian[rows] @ change
         errors.append(float(np.mean(left**2)))
         sizes.append(int(rows.sum()))
     return CrossValidation(np.array(errors), np.array(sizes))
 
 
-def _within_bounds(normal: Array, gradient: Array, fitted: Refit) -> Array:
+def within_bounds(normal: Array, gradient: Array, unknowns: list[Unknown], theta: Array) -> Array:
     """The step (p,) that minimises d.normal.d / 2 - gradient.d and leaves no unknown outside its bounds.
 
     A step that is clipped afterwards leaves the others where they made up for what was cut off.
+
+    Args:
+        normal, gradient: (p, p) and (p,).
+        unknowns, theta: p of them, and where they are in the scale of the search, (p,).
     """
-    if not len(fitted.unknowns):
+    if not len(unknowns):
         return np.zeros(0)
     scale = 1.0 / np.sqrt(np.diag(normal))
     factor = np.linalg.cholesky(normal * scale * scale[:, None])
-    low, high = (end - fitted.theta for end in bounds_of(fitted.unknowns))
+    low, high = (end - theta for end in bounds_of(unknowns))
     bounds = np.minimum(low, 0.0) / scale, np.maximum(high, 0.0) / scale
     target = solve_triangular(factor, gradient * scale, lower=True)
     step: Array = scale * lsq_linear(factor.T, target, bounds, method="bvls").x

@@ -34,7 +34,6 @@ class ImportOptions:
         body: keys of ``scene.json``'s ``body``.
         controllers: C3D and tables: labels of the driven or clamped markers.
         up: the axis of the recording that points up, one of x, y, z, -x, -y, -z.
-        unit: tables: of lengths, one of m, cm, mm, in; None: as the file says, or guessed by its numbers.
     """
 
     name: str | None = None
@@ -45,7 +44,6 @@ class ImportOptions:
     body: dict[str, Any] = field(default_factory=dict)
     controllers: tuple[str, ...] | None = None
     up: str = "z"
-    unit: str | None = None
 
 
 @dataclass(frozen=True)

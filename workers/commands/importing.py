@@ -44,7 +44,6 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--up", default=None, help="axis of the recording that points up: x, y, z, -x, -y, -z"
     )
-    parser.add_argument("--unit", default=None, help="of a table's lengths: m, cm, mm, in")
     parser.add_argument("--controllers", default=None, help="labels of driven or clamped markers, by commas")
     parser.add_argument(
         "--box", action="append", default=[], help="around the object: [CAMERA:]LEFT,TOP,RIGHT,BOTTOM"
@@ -97,7 +96,6 @@ def _options(given: argparse.Namespace) -> ImportOptions:
         "noise_sigma_m": given.noise,
         "up": given.up,
         "controllers": tuple(given.controllers.split(",")) if given.controllers else None,
-        "unit": given.unit,
     }
     if given.body is not None:
         try:

@@ -85,8 +85,6 @@ class Inference(_Trace):
         with self.clock.until(SELECTION):
             search.run(declared)
         known = search.admitted()
-        if not known or known[0].members:
-            known = [declared, *known]
         weights = search.weights()
         self.notes += remarks(sigma, config.noise_m is not None, numerics)
         verdict = self._decided(known, weights, sigma, white, numerics, search.library)
@@ -214,10 +212,7 @@ class Inference(_Trace):
     def _path(self, search: Search, known: list[Hypothesis]) -> tuple[Step, ...]:
         steps = []
         for base, screened in search.screens:
-            ranked = [
-                Score(s.candidate, s.share, np.zeros(0), np.zeros(0), float(np.exp(-max(s.gain, 0.0))))
-                for s in screened
-            ]
+            ranked = [Score(s.candidate, s.share, np.zeros(0), np.zeros(0), float("nan")) for s in screened]
             tried = tuple(
                 _model(h)
                 for h in known

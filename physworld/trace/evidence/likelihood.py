@@ -19,12 +19,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import solve_triangular
-from scipy.optimize import lsq_linear
 
 from physworld.arrays import Array
 from physworld.estimation.refit import prior_rows
 from physworld.estimation.unknowns import Unknown, bounds_of
+from physworld.trace.comparison import within_bounds
 from physworld.trace.evidence.discrepancy import Discrepancy
 
 _WEAKEST = 1e-9  # of the normal matrix's diagonal: keeps it invertible where data say nothing of an unknown
@@ -142,7 +141,7 @@ def _left_out(linear: Linear, discrepancy: Discrepancy, kappa: float) -> tuple[A
     densities, errors, sizes = [], [], []
     for k, block in enumerate(discrepancy.blocks):
         others = normal - normals[k] + weakest
-        change = _within_bounds(others, gradient - gradients[k], linear)
+        change = within_bounds(others, gradient - gradients[k], linear.unknowns, linear.theta)
         rows = block.rows
         left = residual[rows] - jacobian[rows] @ change
         square, occam = float(left @ left), 0.0
@@ -156,16 +155,3 @@ def _left_out(linear: Linear, discrepancy: Discrepancy, kappa: float) -> tuple[A
         errors.append(float(np.mean(plain**2)))
         sizes.append(len(rows))
     return np.array(densities), np.array(errors), np.array(sizes)
-
-
-def _within_bounds(normal: Array, gradient: Array, linear: Linear) -> Array:
-    """The step (p,) that minimises d.normal.d / 2 - gradient.d and leaves no unknown outside its bounds."""
-    if not len(linear.unknowns):
-        return np.zeros(0)
-    scale = 1.0 / np.sqrt(np.diag(normal))
-    factor = np.linalg.cholesky(normal * scale * scale[:, None])
-    low, high = (end - linear.theta for end in bounds_of(linear.unknowns))
-    bounds = np.minimum(low, 0.0) / scale, np.maximum(high, 1e-12) / scale
-    target = solve_triangular(factor, gradient * scale, lower=True)
-    step: Array = scale * lsq_linear(factor.T, target, bounds, method="bvls").x
-    return step

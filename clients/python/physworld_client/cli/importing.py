@@ -24,7 +24,6 @@ def import_recording(
     noise: Annotated[float | None, typer.Option(help="Tracking noise per axis [m].")] = None,
     body: Annotated[str | None, typer.Option(help="What is known of the body, JSON.")] = None,
     up: Annotated[str | None, typer.Option(help="Axis that points up: x, y, z, -x, -y, -z.")] = None,
-    unit: Annotated[str | None, typer.Option(help="Of a table's lengths: m, cm, mm, in.")] = None,
     controllers: Annotated[str | None, typer.Option(help="Labels of driven markers, by commas.")] = None,
     box: Annotated[
         list[str] | None, typer.Option(help="Around the object: [CAMERA:]LEFT,TOP,RIGHT,BOTTOM.")
@@ -54,7 +53,6 @@ def import_recording(
         "--noise": noise,
         "--body": body,
         "--up": up,
-        "--unit": unit,
         "--controllers": controllers,
         "--marker": marker,
         "--patch": patch,
