@@ -88,6 +88,7 @@ class Parameter(Unknown):
             "optional" ones one by one, if the data ask for them.
         held: value of one that is not freed.
         least_gain: share of the training cost that freeing an optional one must remove.
+        read: its value in a twin, in its unit; None: it is among the twin's ``parameters`` or follows from them.
     """
 
     starts: tuple[float, ...]
@@ -96,6 +97,7 @@ class Parameter(Unknown):
     step: float = _LOG_STEP
     held: float = 0.0
     least_gain: float = _LEAST_GAIN
+    read: Callable[[Twin], float] | None = None
 
 
 def parameters_of(

@@ -17,7 +17,7 @@ from physworld.engine.rods.chain import Chain
 from physworld.estimation.unknowns import LINEAR, LOG
 from physworld.materials.cable import CableLaw
 from physworld.scene import Scene
-from physworld.twin.rods import first_mode, is_pose
+from physworld.twin.rods import first_mode, is_pose, natural_of
 from physworld.twin.twin import Twin
 
 GRAVITY = 9.81
@@ -28,6 +28,7 @@ LOSSES = (
     "creep_s",
 )  # fmt: skip
 """Numbers by which a rod loses energy."""
+_LOSSLESS = {name: 0.0 for name in LOSSES if name not in ("friction_onset_per_m", "creep_s")}
 _GRIP_RAD, _BRANCH_RAD = 0.5, 0.3
 _COIL = 4.0  # curvature of its own times the length, of the smoothest shape: a cable that was coiled
 _STEP_S, _REST_S = 0.1, 0.3  # in which a step that is driven from inside shows, and of the rest before it
@@ -78,6 +79,11 @@ def rod_parameters(scene: Scene, twin: Twin) -> list[Parameter]:
     return found
 
 
+def lossless(twin: Twin) -> Twin:
+    """The twin of a discrete rod without friction, drag and creep."""
+    return twin.with_parameters(**_LOSSLESS)
+
+
 def steps_seen(scene: Scene) -> Array | None:
     """Steps of a body that moves by itself, (J, 6), when they begin and which of them vent; None where there are none.
 
@@ -120,14 +126,15 @@ def _number(name: str, unit: str, mean: float, spread: float, step: float = 0.02
     return Parameter(
         name, unit, low, high, lambda twin, value: twin.with_parameters(**{name: value}),
         transform=LOG, step=step, start=float(np.log(mean)), prior=(float(np.log(mean)), spread), starts=(mean,),
-        stage="optional",
+        stage="optional", read=lambda twin: twin.parameters[name],
     )  # fmt: skip
 
 
 def _natural(twin: Twin, row: int, column: int, name: str, unit: str, spread: float) -> Parameter:
-    """An amplitude of the natural curvature or twist with a Gaussian prior about what the twin has of it."""
-    assert twin.natural is not None
-    mean = float(twin.natural[row, column])
+    """An amplitude of the natural curvature or twist with a Gaussian prior about a rod that is straight at rest."""
+    known = natural_of(twin.body, len(twin.held_nodes))
+    assert known is not None
+    mean = float(known[row, column])
 
     def apply(twin: Twin, value: float) -> Twin:
         assert twin.natural is not None
@@ -137,7 +144,7 @@ def _natural(twin: Twin, row: int, column: int, name: str, unit: str, spread: fl
 
     return Parameter(
         name, unit, mean - 5.0 * spread, mean + 5.0 * spread, apply, transform=LINEAR, step=0.05 * spread,
-        start=mean, prior=(mean, spread), starts=(mean,), stage="optional",
+        start=mean, prior=(mean, spread), starts=(mean,), stage="optional", read=lambda twin: twin.natural[row, column],
     )  # fmt: skip
 
 
@@ -167,6 +174,7 @@ def _driven(twin: Twin, step: int, length: float) -> list[Parameter]:
             Parameter(
                 name, unit, transform.value(ends[0]), transform.value(ends[1]), apply, transform=transform,
                 step=difference, start=start, prior=(start, spread), starts=(mean,), stage="optional",
+                read=lambda twin, column=column: _steps(twin)[step, column],
             )
         )  # fmt: skip
     return found
@@ -204,4 +212,5 @@ def _branch(number: int, particles: Array, column: int, what: str, spread: float
     return Parameter(
         f"branch_{number}_{what}", "1", np.exp(-4 * spread), np.exp(4 * spread), apply, transform=LOG, step=0.05,
         prior=(0.0, spread), starts=(1.0,), stage="optional",
+        read=lambda twin: 1.0 if twin.properties is None else np.exp(twin.properties[particles[0], column]),
     )  # fmt: skip

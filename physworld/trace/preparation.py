@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from physworld.calibrate import FitResult, Journal, calibrate
+from physworld.calibrate import Journal, calibrate
 from physworld.engine.formulations import RODS, TOTAL
 from physworld.estimation.noise import noise_sigma
 from physworld.estimation.simulations import Job, Ledger, Memory, Progress, Runner
@@ -78,32 +78,25 @@ class Beginning:
     cancelled: Callable[[], bool] | None
     ledger: Ledger = field(default_factory=Ledger)
     notes: list[str] = field(default_factory=list)
-    fits: list[FitResult] = field(default_factory=list)
 
     def calibrated(
         self, recordings: Recordings, twin: Twin | None, journal: Journal | None
     ) -> tuple[JointSimulations, Twin, int]:
         """The simulations, the declared physics calibrated on the training frames, and the runs that this took."""
         config, runs, begun = self.config, 0, time.perf_counter()
-        form = config.calibration.formulation
-        by_rules = config.method == "selection" or len(recordings.fitted) > 1
-        if form == "auto" and recordings.lead.scene.kind in ROD_KINDS and by_rules:
-            form = TOTAL.name  # the effects on stress act on the cells of splines
+        form, damping = config.calibration.formulation, config.calibration.damping
+        if recordings.lead.scene.kind in ROD_KINDS:
+            if form == "auto" and config.method == "selection":
+                form = TOTAL.name  # the effects on stress act on the cells of splines
+            # the search for a rod's stiffness ends in a wrong basin without its losses, which come off later
+            damping = "auto" if form in ("auto", RODS.name) else damping
         if twin is None or twin.form.name != (form if form != "auto" else twin.form.name):
             # fibres would go into a free shape of bending
-            declared = replace(config.calibration, bending="declared", formulation=form)
+            declared = replace(config.calibration, bending="declared", formulation=form, damping=damping)
             fitted = calibrate(
                 recordings.lead.scene, declared, self.progress, self.cancelled, journal, runner=self.runner
             )
             twin, runs = fitted.twin, fitted.simulations
-            self.fits.append(fitted)
-            if twin.form is RODS:  # what it is with all its losses is another place to start from
-                lossy = replace(declared, damping="auto")
-                whole = calibrate(
-                    recordings.lead.scene, lossy, self.progress, self.cancelled, runner=self.runner
-                )
-                self.fits.append(whole)
-                runs += whole.simulations
             if fitted.cut_short:
                 most = config.calibration.max_simulations
                 self.notes[:] = [

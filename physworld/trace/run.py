@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.calibrate import FitResult, Journal
+from physworld.calibrate import Journal
 from physworld.calibrate.parameters import BENDING_COUPLING, BENDING_RATIO, TWIST_RATIO, parameters_of
 from physworld.engine.thin.triangles import TriangleLattice
 from physworld.errors import SceneUnsupported
@@ -147,7 +147,6 @@ def trace(
 
         kind = Inference
     work = kind(recordings, config, simulations, twin, faults, clock)
-    work.fits = begin.fits[-2:]
     result = work.run()
     stages = tuple(Stage(name, *cost) for name, cost in begin.ledger.spent.items())
     return replace(
@@ -175,7 +174,6 @@ class _Trace:
         self.scene, self.split = recordings.scene, recordings.split
         self.config, self.simulations = config, simulations
         self.frames, self.twin = self.split.train[1], twin
-        self.fits: list[FitResult] = []
         self.faults = "; ".join(known.words for known in faults if known)
         self.notes = [f"left out as faulty sightings: {self.faults}"] if self.faults else []
 

@@ -27,14 +27,22 @@ _SOFTNESS_STEP = 0.1
 _CLAMP_STEP, _CLAMP_SPREAD = 0.25, 0.5  # cells: difference step, and deviation of what is known beforehand
 
 
-def of_parameter(parameter: Parameter, twin: Twin, spread: float | None) -> Unknown:
-    """A calibrated parameter from where the twin has it; ``spread``: deviation of its prior about that, or None."""
+def of_parameter(parameter: Parameter, twin: Twin, known: float | tuple[float, float] | None) -> Unknown:
+    """A calibrated parameter from where the twin has it.
+
+    Args:
+        parameter: of a calibration.
+        twin: that has it.
+        known: its prior in the scale of the search, (mean, deviation); or the deviation of one about where it is; None.
+    """
     start = parameter.searched(max(_value(twin, parameter), parameter.low))
-    known = (getattr(parameter, own.name) for own in fields(Unknown))
-    return replace(Unknown(*known), start=start, prior=None if spread is None else (start, spread))
+    own = Unknown(*(getattr(parameter, own.name) for own in fields(Unknown))).starting(start)
+    return replace(own, prior=(own.start, known) if isinstance(known, float) else known)
 
 
 def _value(twin: Twin, parameter: Parameter) -> float:
+    if parameter.read is not None:
+        return float(parameter.read(twin))
     known = twin.parameters
     if parameter.name in known:
         return known[parameter.name]

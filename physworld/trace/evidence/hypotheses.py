@@ -61,9 +61,10 @@ class Hypothesis:
         return float(np.average(self.evidence.errors, weights=self.evidence.sizes))
 
     @property
-    def believed(self) -> bool:
-        """Whether every effect's own prior admits its numbers."""
-        return all(e.implausible() is None for e in self.fitted.twin.effects if e.name in self.names)
+    def doubt(self) -> str | None:
+        """Why nobody would believe its numbers, whatever a recording says; None where one may."""
+        own = (e.implausible() for e in self.fitted.twin.effects if e.name in self.names)
+        return next((reason for reason in own if reason is not None), None)
 
     @property
     def linear(self) -> Linear:

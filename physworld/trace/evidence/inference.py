@@ -9,15 +9,17 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 
 from physworld.arrays import Array
+from physworld.calibrate.parameters import BENDING_RATIO, TWIST_RATIO
+from physworld.calibrate.rod_parameters import LOSSES, lossless, rod_parameters
 from physworld.engine.formulations import RODS
 from physworld.estimation.noise import noise_sigma
 from physworld.estimation.simulations import Job, stage_s
-from physworld.estimation.unknowns import Unknown
+from physworld.estimation.unknowns import LOG, Unknown
 from physworld.estimation.whitening import Whitener, whitener
 from physworld.trace.candidates import candidates
 from physworld.trace.comparison import CrossValidation
@@ -32,11 +34,13 @@ from physworld.trace.result import Step, Supported, TraceResult
 from physworld.trace.run import _OTHER_STIFFNESSES, _Trace
 from physworld.trace.score import Score, Scores
 from physworld.trace.sensitivity import numerical_directions
+from physworld.trace.unknowns import of_parameter
 from physworld.trace.verdict import DATA, EQUIVALENT, NAMED, NOTHING, NUMERICAL, UNEXPLAINED, Verdict
 
 NAMES = 0.95  # posterior of a name, or of a set
 MOST_IN_SET = 4
 WITHIN = 1.2  # misfit over the noise up to which nothing is left to explain
+_SHAPES = (TWIST_RATIO, BENDING_RATIO)
 _SLOWEST = 12.0
 _THOROUGH = 2
 _RICHARDSON = {"finer cells": 2.04, "half the time step": 1.33}  # error over difference, of second order
@@ -47,6 +51,8 @@ class Inference(_Trace):
 
     def run(self) -> TraceResult:
         config, simulations = self.config, self.simulations
+        if self.twin.form is RODS:
+            self.twin = lossless(self.twin)  # what a rod loses is an effect here
         simulations.stage = "declared physics"
         simulations.least_step_s = stage_s(self.twin, simulations.drive) / _SLOWEST
         tracks, answers = simulations.first_look(Job(self.twin, self.frames))
@@ -67,15 +73,12 @@ class Inference(_Trace):
             white, self.split, self.scene.times, np.nan_to_num(self.scene.points[0]), owners, tracks
         )
         simulations.stage = "declared physics"
-        unknowns, basins = self._unknowns()
+        unknowns = self._unknowns()
         setting = Setting(
             simulations, white, discrepancy, self.frames, config.iterations, self.twin, unknowns
         )
-        own = {u.name: u.start for u in unknowns}
-        first = unknowns[0].name
-        starts = [{**own, first: own[first] + shift} for shift in _OTHER_STIFFNESSES]
-        starts += [{**own, **basin} for basin in basins]
-        declared = replace(setting, iterations=_THOROUGH * config.iterations).fitted((), own, starts)
+        thorough = replace(setting, iterations=_THOROUGH * config.iterations)
+        declared = thorough.fitted((), {u.name: u.start for u in unknowns}, _other_places(unknowns))
         if declared is None:
             raise RuntimeError("the calibrated twin cannot be simulated again")
         chosen, refused = candidates(declared.fitted.twin, config.candidates)
@@ -135,22 +138,12 @@ class Inference(_Trace):
         total = sum(back.values())
         return {name: whole * part / total if total > 0 else whole / len(back) for name, part in back.items()}
 
-    def _unknowns(self) -> tuple[list[Unknown], list[dict[str, float]]]:
-        """What is calibrated beside effects, and other places to start from, in the scale of the search."""
+    def _unknowns(self) -> list[Unknown]:
+        """What is calibrated beside effects."""
         if self.twin.form is not RODS:
-            return self._calibrated_unknowns(self.twin), []
-        fit, *others = self.fits
-        found = []
-        for parameter in fit.searched:
-            known = {own.name: getattr(parameter, own.name) for own in fields(Unknown)}
-            start = parameter.searched(fit.parameters[parameter.name].value)
-            found.append(Unknown(**known).starting(start))
-        names = {unknown.name for unknown in found}
-        basins = [
-            {p.name: p.searched(other.parameters[p.name].value) for p in other.searched if p.name in names}
-            for other in others
-        ]
-        return found, basins
+            return self._calibrated_unknowns(self.twin)
+        found = rod_parameters(self.lead, self.twin)
+        return [of_parameter(p, self.twin, p.prior) for p in found if p.name not in LOSSES]
 
     def _decided(
         self,
@@ -199,6 +192,11 @@ class Inference(_Trace):
         if total < NAMES:
             reason = f"{what} is the best of {tried} with a posterior of {weights[order[0]]:.2f}; {figures}"
             return Verdict(UNEXPLAINED, null, (), reason)
+        if (
+            best.doubt is not None
+        ):  # something is there that looks like it, and the next name would be a wrong one
+            return Verdict(UNEXPLAINED, null, (), f"{what} predicts best, but {best.doubt}; {figures}")
+        rest = [h for h in rest if h.doubt is None]
         kinds = [all(m.kind == "measurement" for m in h.members) for h in rest]
         models = [_model(h) for h in rest]
         if all(kinds):
@@ -220,6 +218,17 @@ class Inference(_Trace):
             )
             steps.append(Step(_model(base), Scores(ranked, 0.0, []), tried, None))
         return tuple(steps)
+
+
+def _other_places(unknowns: list[Unknown]) -> list[dict[str, float]]:
+    """Where the declared physics is looked for beside where it was calibrated: over its stiffness, for a phase that has
+    slipped by a period is a local minimum; and over that again from the other shapes of its stiffness, one deviation
+    of their priors away, which decide in which of these minima it lies.
+    """
+    own, first = {u.name: u.start for u in unknowns}, unknowns[0].name
+    shapes = [u for u in unknowns[1:] if u.prior is not None and u.transform is LOG and u.name in _SHAPES]
+    bases = [own, *({**own, u.name: own[u.name] + u.prior[1]} for u in shapes if u.prior is not None)]
+    return [{**base, first: own[first] + shift} for base in bases for shift in (*_OTHER_STIFFNESSES, 0.0)]
 
 
 def _model(hypothesis: Hypothesis) -> Model:

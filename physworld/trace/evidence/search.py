@@ -102,7 +102,7 @@ class Search:
             for known in sorted(self._of_size(size + 1), key=self._total, reverse=True)[:1] if size else []:
                 with simulations.time_permitting("fits without one of the effects"):
                     self._take_out(known)
-            best = max(self.admitted(), key=self._total)
+            best = max((h for h in self.admitted() if h.doubt is None), key=self._total)
             if len(best.members) <= size or simulations.ledger.cut:
                 break
             base = best
@@ -111,7 +111,7 @@ class Search:
     def admitted(self) -> list[Hypothesis]:
         """Hypotheses of which every effect removes a half of what is left above the noise without it; ours is no
         true twin, and what smaller shares of its error look like is no evidence."""
-        return [h for h in self.hypotheses.values() if h.believed and self._relevant(h)]
+        return [h for h in self.hypotheses.values() if self._relevant(h)]
 
     def _relevant(self, hypothesis: Hypothesis) -> bool:
         for member in hypothesis.members:
