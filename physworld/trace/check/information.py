@@ -14,6 +14,9 @@ An effect of strengths s (in plausible sizes) raises the logarithm of its poster
 trace has). It is *detected* where these odds reach those of a posterior of 95 %. The strength that is detected in 95 %
 of all recordings follows from the distribution of q, a noncentral chi-square (exact for one gate whose F is large).
 
+A trace also asks that an effect takes half of the squared error above the noise that is there without it. So under an
+assumed discrepancy of the model its doing must be no smaller than that one's, both as the noise alone whitens them.
+
 Of two effects a and b, the part of a's doing that b imitates best is a correlation; what is left of it decides from
 which strength on a recording of a is not one of b any more (the likelihoods differ by more than 19, in 95 %).
 """
@@ -23,10 +26,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import brentq
-from scipy.stats import ncx2, norm
+from scipy.special import chndtrinc
+from scipy.stats import norm
 
 from physworld.arrays import Array
+from physworld.trace.evidence.discrepancy import Discrepancy
 
 POSTERIOR = 0.95  # from which a trace names
 POWER = 0.95  # of all recordings in which that must happen
@@ -38,28 +42,43 @@ _Z = float(norm.ppf(POWER))
 
 @dataclass(frozen=True)
 class Information:
-    """J^T J of columns that are whitened and scaled by their priors; recordings add up.
+    """J^T J of columns that are scaled by their priors; recordings add up.
 
     Attributes:
-        matrix: (q, q).
+        matrix: of columns that noise and discrepancy whiten, (q, q).
+        plain: of columns that noise alone whitens, (q, q).
+        error: squared discrepancy that is expected, whitened by the noise alone.
         library: n, effects that a trace asks.
     """
 
     matrix: Array
+    plain: Array
+    error: float
     library: int
 
     @classmethod
-    def of(cls, columns: Array, library: int) -> Information:
-        """Of sensitivities (M, q), one column a number, each per deviation of its prior."""
-        return cls(columns.T @ columns, library)
+    def of(cls, columns: Array, discrepancy: Discrepancy, kappa: float, library: int) -> Information:
+        """Of one recording.
+
+        Args:
+            columns: sensitivities that noise and places whiten, (M, q), one a number, per deviation of its prior.
+            discrepancy: of the model.
+            kappa: its deviation per axis [m].
+            library: effects that a trace asks.
+        """
+        whitened = discrepancy.whitened(columns, kappa)
+        error = kappa**2 * sum(float(np.sum(block.factors**2)) for block in discrepancy.blocks)
+        return cls(whitened.T @ whitened, columns.T @ columns, error, library)
 
     def __add__(self, other: Information) -> Information:
         """Of both recordings, if they share every number."""
-        return Information(self.matrix + other.matrix, self.library)
+        return Information(
+            self.matrix + other.matrix, self.plain + other.plain, self.error + other.error, self.library
+        )
 
     def deviations(self, numbers: Array) -> Array:
         """Posterior deviations of these columns over those of their priors, (p,), all of them calibrated together."""
-        found: Array = np.sqrt(np.diag(np.linalg.inv(self._with_priors(numbers))))
+        found: Array = np.sqrt(np.diag(np.linalg.inv(_with_priors(self.matrix, numbers))))
         return found
 
     def beyond(self, gates: Array, calibrated: Array) -> Array:
@@ -69,9 +88,7 @@ class Information:
             gates: columns (k,).
             calibrated: columns (p,).
         """
-        cross = self.matrix[np.ix_(calibrated, gates)]
-        taken = cross.T @ np.linalg.solve(self._with_priors(calibrated), cross) if len(calibrated) else 0.0
-        return self.matrix[np.ix_(gates, gates)] - taken
+        return _beyond(self.matrix, gates, calibrated)
 
     def detectable(self, gates: Array, calibrated: Array) -> tuple[float, Array]:
         """The multiple of a plausible effect that is detected, and of every gate alone (k,); infinite for none."""
@@ -84,8 +101,10 @@ class Information:
         reached = noncentrality(needed, max(float(weights.sum()), _LEAST_FREEDOM))
         typical = float(np.sum(weights * values))
         alone = vectors**2 @ (weights * values)
+        doing = np.diag(_beyond(self.plain, gates, calibrated))
         with np.errstate(divide="ignore"):
-            return float(np.sqrt(reached / typical)), np.sqrt(reached / alone)
+            multiple = float(np.sqrt(max(reached / typical, self.error / float(doing.sum()))))
+            return multiple, np.sqrt(np.maximum(reached / alone, self.error / doing))
 
     def apart(self, gates: Array, others: Array, calibrated: Array) -> tuple[float, float]:
         """How alike an effect looks to another one, and the multiple of its plausible size from which it does not.
@@ -107,11 +126,21 @@ class Information:
         distance = _Z + np.sqrt(_Z**2 + 2.0 * _ODDS)
         return float(np.sqrt(imitated)), float(distance / np.sqrt(left)) if left > 0 else np.inf
 
-    def _with_priors(self, numbers: Array) -> Array:
-        return self.matrix[np.ix_(numbers, numbers)] + np.eye(len(numbers))
+
+def _beyond(matrix: Array, gates: Array, calibrated: Array) -> Array:
+    own: Array = matrix[np.ix_(gates, gates)]
+    if not len(calibrated):
+        return own
+    cross = matrix[np.ix_(calibrated, gates)]
+    left: Array = own - cross.T @ np.linalg.solve(_with_priors(matrix, calibrated), cross)
+    return left
+
+
+def _with_priors(matrix: Array, numbers: Array) -> Array:
+    known: Array = matrix[np.ix_(numbers, numbers)] + np.eye(len(numbers))
+    return known
 
 
 def noncentrality(needed: float, freedom: float) -> float:
     """The noncentrality with which a chi-square of this many degrees of freedom exceeds ``needed`` in ``POWER``."""
-    high = needed + 2.0 * _Z * np.sqrt(4.0 * needed + 4.0) + 40.0
-    return float(brentq(lambda size: ncx2.sf(needed, freedom, size) - POWER, 1e-9, high))
+    return float(chndtrinc(needed, freedom, 1.0 - POWER))

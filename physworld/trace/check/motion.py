@@ -1,7 +1,7 @@
 """A further motion that shows what a recording does not: the best of a trace's library of motions.
 
 Every motion is simulated with the declared physics and with a step of every calibrated number and of every effect in
-question. What it says is added to what the recording says, for both are of one object; the motion that makes the most
+question: those that the recording misses least, for what it misses by far no motion shows. What it says is added to what the recording says, for both are of one object; the motion that makes the most
 effects visible, or tells the most pairs apart, is proposed. Motions keep the limits that the recording itself has shown.
 """
 
@@ -25,6 +25,7 @@ from physworld.trace.experiment_search import Library, from_rest, library_of
 from physworld.trace.sensitivity import candidate_responses
 
 STAGE = "motions"
+MOST_GATES = 10  # of effects in question
 
 
 @dataclass(frozen=True)
@@ -103,11 +104,15 @@ class MotionSearch:
         self._simulations, self.scene, self.judge, self.known = simulations, scene, judge, known
         self.view, self.sigma, self.limits = view, sigma, limits
         asked = {one.label: one for one in judge.asked}
-        hidden = [figure.label for figure in view.effects if figure.status != VISIBLE]
-        self.pairs = [(asked[a], asked[b]) for a, b in (pair.labels for pair in view.pairs)]
-        labels = dict.fromkeys([*hidden, *(one.label for pair in self.pairs for one in pair)])
-        self.hidden = [judge.middle(known, asked[label]) for label in hidden]
+        alike = [pair for pair in view.pairs if pair.taken_for_each_other]
+        hidden = sorted((f for f in view.effects if f.status != VISIBLE), key=lambda f: f.multiple)
+        wanted = [label for pair in alike for label in pair.labels] + [figure.label for figure in hidden]
+        gates = np.cumsum([len(asked[label].gates) for label in dict.fromkeys(wanted)])
+        labels = list(dict.fromkeys(wanted))[: max(int(np.sum(gates <= MOST_GATES)), 1)]
         self.targets = [judge.middle(known, asked[label]) for label in labels]
+        own = {one.label: one for one in self.targets}
+        self.hidden = [own[figure.label] for figure in hidden if figure.label in own]
+        self.pairs = [(own[a], own[b]) for a, b in (pair.labels for pair in alike) if a in own and b in own]
 
     def proposal(self) -> Proposal | None:
         """The best motion; None where everything is visible and told apart, or nothing can be moved."""
@@ -164,7 +169,7 @@ class MotionSearch:
             columns[:, one.shapes[0]] = in_sizes(response)
         if any(failed) or any(response.failed for response in responses):
             return None
-        return Information.of(made.discrepancy.whitened(columns, made.kappa), self.known.library)
+        return Information.of(columns, made.discrepancy, made.kappa, self.known.library)
 
     def _changes(self, both: Information) -> tuple[list[Change], list[Change]]:
         before = {figure.label: figure.multiple for figure in self.view.effects}
@@ -172,10 +177,9 @@ class MotionSearch:
         shows = [
             Change((one.label,), before[one.label], self.judge.figure(both, one).multiple) for one in self.hidden
         ]
-        own = {one.label: one for one in self.targets}
         separates = []
         for a, b in self.pairs:
-            pair = self.judge.pair(both, own[a.label], own[b.label])
+            pair = self.judge.pair(both, (a, a), (b, b))
             separates.append(Change(pair.labels, apart[pair.labels], pair.apart_from))
         return shows, separates
 

@@ -145,15 +145,13 @@ def check(
     usable = [response for response in responses if not response.failed]
     columns, asked = scaled(unknowns, slopes, usable)
     judge, library = Judge(physics, asked), len({one.effect for one in asked})
-    views, known = [], Information.of(columns, library)
-    for share, kappa in ((0.0, 0.0), (config.discrepancy_share, made.kappa)):
-        known = Information.of(made.discrepancy.whitened(columns, kappa), library)
-        views.append(judge.view(known, kappa, share))
+    right, known = (Information.of(columns, made.discrepancy, kappa, library) for kappa in (0.0, made.kappa))
+    perfect, usual = judge.view(right, 0.0, 0.0), judge.view(known, made.kappa, config.discrepancy_share)
     proposal = None
     if config.motions:
         limits = Limits(config.motions, config.motion_simulations, config.longest_s, config.seed)
         sigma = made.white.sigma
-        proposal = MotionSearch(simulations, taken, judge, known, views[1], sigma, limits).proposal()
+        proposal = MotionSearch(simulations, taken, judge, known, usual, sigma, limits).proposal()
     counted: dict[str, int] = {}
     for response in usable:
         counted[response.candidate.effect] = counted.get(response.candidate.effect, 0) + 1
@@ -165,8 +163,8 @@ def check(
         noise=source,
         motion_m=made.motion_m,
         frames=made.frames,
-        perfect=views[0],
-        usual=views[1],
+        perfect=perfect,
+        usual=usual,
         proposal=proposal,
         asked=counted,
         refused=refused,

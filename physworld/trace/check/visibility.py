@@ -28,6 +28,7 @@ from physworld.trace.check.physics import Physics
 from physworld.trace.sensitivity import Response
 
 VISIBLE, LARGE, INVISIBLE = "visible", "only_if_large", "invisible"
+ALIKE = 0.95  # correlation from which a pair is told of, as in a trace
 _Z95 = 1.96
 
 
@@ -119,7 +120,7 @@ class EffectFigure:
 
 @dataclass(frozen=True)
 class Pair:
-    """Two effects that would be taken for each other at their plausible sizes.
+    """Two effects that look alike: by their correlation, or because they are taken for each other at plausible sizes.
 
     Attributes:
         labels: of both.
@@ -131,6 +132,11 @@ class Pair:
     correlation: float
     apart_from: float
 
+    @property
+    def taken_for_each_other(self) -> bool:
+        """At plausible sizes."""
+        return self.apart_from > 1.0
+
 
 @dataclass(frozen=True)
 class View:
@@ -140,8 +146,8 @@ class View:
         discrepancy_m: deviation per axis of the model's own error [m].
         share: of the motion's extent.
         parameters, effects: figures, in the order of the calibration and of the registry.
-        pairs: effects that are taken for each other.
-        groups: labels of effects that hang together by pairs.
+        pairs: effects that look alike.
+        groups: labels of effects that are not told apart at their plausible sizes, as they hang together by pairs.
     """
 
     discrepancy_m: float
@@ -225,12 +231,15 @@ class Judge:
     def view(self, information: Information, discrepancy_m: float, share: float) -> View:
         """The whole answer."""
         effects = [self.figure(information, one) for one in self.asked]
-        shown = [one for one, figure in zip(self.asked, effects, strict=True) if figure.status != INVISIBLE]
-        pairs = [self.pair(information, a, b) for a, b in combinations(shown, 2) if a.effect != b.effect]
-        alike = tuple(pair for pair in pairs if pair.apart_from > 1.0)
-        return View(
-            discrepancy_m, share, self._parameters(information), tuple(effects), alike, _groups(alike)
-        )
+        shown = [
+            (one, self.middle(information, one))
+            for one, figure in zip(self.asked, effects, strict=True)
+            if figure.status != INVISIBLE
+        ]
+        pairs = [self.pair(information, a, b) for a, b in combinations(shown, 2) if a[0].effect != b[0].effect]
+        alike = tuple(pair for pair in pairs if pair.correlation >= ALIKE or pair.taken_for_each_other)
+        groups = _groups([pair for pair in alike if pair.taken_for_each_other])
+        return View(discrepancy_m, share, self._parameters(information), tuple(effects), alike, groups)
 
     def _parameters(self, information: Information) -> tuple[ParameterFigure, ...]:
         ratios = information.deviations(self._numbers)
@@ -254,7 +263,9 @@ class Judge:
         )
 
     def middle(self, information: Information, asked: Asked) -> Asked:
-        """The effect in that shape alone."""
+        """The effect in the shape alone by which it is judged."""
+        if len(asked.shapes) == 1:
+            return asked
         calibrated = self.calibrated(asked)
         place = _middle([information.detectable(shape, calibrated)[0] for shape in asked.shapes])
         return replace(asked, variants=(asked.variants[place],), shapes=(asked.shapes[place],))
@@ -292,19 +303,20 @@ class Judge:
                 found[name] = information.apart(shape, np.array([number]), others)[0]
         return found
 
-    def pair(self, information: Information, first: Asked, second: Asked) -> Pair:
-        """How alike two effects look."""
-        calibrated = self.calibrated(first, second)
-        ways = [
-            self._taken_for(information, a, b, calibrated) for a, b in ((first, second), (second, first))
-        ]
-        correlation, apart = (min(way[k] for way in ways) for k in range(2))
-        return Pair((first.label, second.label), correlation, apart)
+    def pair(self, information: Information, first: tuple[Asked, Asked], second: tuple[Asked, Asked]) -> Pair:
+        """How alike two effects look.
 
-    def _taken_for(self, information: Information, acts: Asked, other: Asked, calibrated: Array) -> tuple[float, float]:
-        """Correlation and multiple of an effect with the shape of another one that imitates it best."""
-        own = self.middle(information, acts).shapes[0]
-        return max((information.apart(own, shape, calibrated) for shape in other.shapes), key=lambda way: way[0])
+        Args:
+            information: of the recording.
+            first, second: the effects, in all shapes and in the middle one.
+        """
+        calibrated = self.calibrated(first[0], second[0])
+        ways = []
+        for (_, acts), (other, _) in ((first, second), (second, first)):
+            every = [information.apart(acts.shapes[0], shape, calibrated) for shape in other.shapes]
+            ways.append(max(every, key=lambda way: way[0]))  # the shape that imitates it best
+        correlation, apart = (min(way[k] for way in ways) for k in range(2))
+        return Pair((first[0].label, second[0].label), correlation, apart)
 
 
 def _interval(unknown: Unknown, middle: float, half: float) -> tuple[float, float]:
