@@ -139,7 +139,7 @@ class MotionSearch:
     def _said_by(self, library: Library, number: int) -> Information | None:
         """What a recording of a motion would say; None where its run cannot be trusted."""
         physics = self.judge.physics
-        unknowns, twin = list(physics.unknowns), from_rest(physics.twin)
+        unknowns, twin = list(physics.probed), from_rest(physics.twin)
         points = library.motions[number][1].points
         there = self._simulations.elsewhere(Drive(library.control_times, points, library.frame_times))
         there.stage = STAGE
@@ -175,7 +175,8 @@ class MotionSearch:
         before = {figure.label: figure.multiple for figure in self.view.effects}
         apart = {pair.labels: pair.apart_from for pair in self.view.pairs}
         shows = [
-            Change((one.label,), before[one.label], self.judge.figure(both, one).multiple) for one in self.hidden
+            Change((one.label,), before[one.label], self.judge.figure(both, one).multiple)
+            for one in self.hidden
         ]
         separates = []
         for a, b in self.pairs:

@@ -16,6 +16,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
+from physworld.arrays import Array
 from physworld.calibrate import CalibrationConfig
 from physworld.calibrate.cloths import cloth_parameters, with_priors
 from physworld.calibrate.global_stage import prior_twin, searched_parameters
@@ -24,11 +25,16 @@ from physworld.calibrate.rod_parameters import LOSSES, rod_parameters, steps_see
 from physworld.estimation.unknowns import LOG, Unknown, at, multiple_of, starts_of
 from physworld.geometry.sheet_body import is_hung_sheet
 from physworld.scene import Scene
-from physworld.trace.unknowns import KNOWN_BEFOREHAND, hold_unknowns, of_parameter
+from physworld.trace.unknowns import REACH, KNOWN_BEFOREHAND, hold_unknowns, of_parameter
 from physworld.twin.grips import softly_held
 from physworld.twin.twin import Twin
 
 _OF_EVEN = 12.0**-0.5  # deviation over width of a number that is as likely anywhere between two bounds
+_KINKED = (REACH,)  # a clamp that holds less far changes other nodes than one that holds farther
+_STEPS_BY, _LEAST_STEP = (
+    3.0,
+    1e-3,
+)  # deviations that a step of finite differences spans; over the step of a search
 _GENTLE = 0.3  # step of a damping that is switched on, over the value that its search starts from
 
 
@@ -48,6 +54,30 @@ class Physics:
     unknowns: tuple[Unknown, ...]
     optional: frozenset[str]
     given: frozenset[str]
+
+    @property
+    def probed(self) -> tuple[Unknown, ...]:
+        """The unknowns as they are varied: those with a kink at their start both ways, as if they were two numbers."""
+        kinked = (replace(u, step=-u.step) for u in self.unknowns if u.name in _KINKED)
+        return (*self.unknowns, *kinked)
+
+    def stepped(self, ratios: Array) -> Physics:
+        """With steps of the size of what is left open, for a derivative is wanted where the answer will lie.
+
+        Args:
+            ratios: posterior over prior deviations of the probed numbers, (p,).
+        """
+        known = {}
+        for unknown, ratio in zip(self.probed, ratios, strict=True):
+            assert unknown.prior is not None
+            known[unknown.name] = max(known.get(unknown.name, 0.0), float(ratio) * unknown.prior[1])
+        return replace(
+            self,
+            unknowns=tuple(
+                replace(u, step=float(np.clip(_STEPS_BY * known[u.name], _LEAST_STEP * u.step, u.step)))
+                for u in self.unknowns
+            ),
+        )
 
 
 def declared_physics(scene: Scene, calibration: CalibrationConfig, values: Mapping[str, float]) -> Physics:
@@ -76,14 +106,18 @@ def declared_physics(scene: Scene, calibration: CalibrationConfig, values: Mappi
     else:
         known = searched_parameters(scene, twin, calibration)
         for parameter in (p for p in known if p.stage == "stiffness"):
-            twin = parameter.at(twin, float(np.mean([parameter.searched(start) for start in parameter.starts])))
+            twin = parameter.at(
+                twin, float(np.mean([parameter.searched(start) for start in parameter.starts]))
+            )
         twin = softly_held(twin)
         optional = {p.name for p in known if _only_if_asked(p)}
     for name, value in values.items():
         twin = _with_value(twin, known, name, value)
     unknowns = [_of(p, twin, values.get(p.name), own_prior=twin.natural is not None or hung) for p in known]
     holds = [] if twin.natural is not None or hung else hold_unknowns(twin)
-    return Physics(twin, tuple(_with_prior(u) for u in (*unknowns, *holds)), frozenset(optional), frozenset(values))
+    return Physics(
+        twin, tuple(_with_prior(u) for u in (*unknowns, *holds)), frozenset(optional), frozenset(values)
+    )
 
 
 def _only_if_asked(parameter: Parameter) -> bool:
@@ -95,9 +129,13 @@ def _only_if_asked(parameter: Parameter) -> bool:
 def _with_value(twin: Twin, known: list[Parameter], name: str, value: float) -> Twin:
     parameter = next((p for p in known if p.name == name), None)
     if parameter is None:
-        raise ValueError(f"this scene has no {name!r} to be calibrated; it has {', '.join(p.name for p in known)}")
+        raise ValueError(
+            f"this scene has no {name!r} to be calibrated; it has {', '.join(p.name for p in known)}"
+        )
     if not parameter.low <= value <= parameter.high:
-        raise ValueError(f"{name} of {value:g} {parameter.unit} is not within {parameter.low:g} and {parameter.high:g}")
+        raise ValueError(
+            f"{name} of {value:g} {parameter.unit} is not within {parameter.low:g} and {parameter.high:g}"
+        )
     return parameter.apply(twin, value)
 
 

@@ -39,7 +39,9 @@ class Recorded:
     kappa: float
 
 
-def recorded(simulations: Simulations, scene: Scene, twin: Twin, sigma: float | None, share: float) -> Recorded:
+def recorded(
+    simulations: Simulations, scene: Scene, twin: Twin, sigma: float | None, share: float
+) -> Recorded:
     """What the training frames of a scene would say, if this twin were the truth.
 
     Args:

@@ -16,6 +16,9 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+
+from physworld.arrays import Array
 from physworld.calibrate import CalibrationConfig
 from physworld.errors import SceneUnsupported
 from physworld.estimation.refit import sensitivities
@@ -25,8 +28,8 @@ from physworld.trace.candidates import candidates
 from physworld.trace.check.information import Information
 from physworld.trace.check.motion import Limits, MotionSearch, Proposal
 from physworld.trace.check.physics import Physics, declared_physics
-from physworld.trace.check.recorded import recorded
-from physworld.trace.check.visibility import Judge, View, scaled
+from physworld.trace.check.recorded import Recorded, recorded
+from physworld.trace.check.visibility import Judge, View, deviations, scaled
 from physworld.trace.preparation import taken_with
 from physworld.trace.sensitivity import candidate_responses
 
@@ -126,24 +129,23 @@ def check(
     config = config or CheckConfig()
     begun = time.perf_counter()
     if not 0.0 <= config.discrepancy_share < 1.0:
-        raise ValueError(f"a discrepancy of {config.discrepancy_share:g} of the motion: a share from 0 to 1 is needed")
+        raise ValueError(
+            f"a discrepancy of {config.discrepancy_share:g} of the motion: a share from 0 to 1 is needed"
+        )
     (taken,) = taken_with([scene], config.noise_m)
     physics = declared_physics(taken, config.calibration, config.values)
     chosen, refused = candidates(physics.twin, config.candidates)
-    runs = 1 + len(physics.unknowns) + sum(len(candidate.gates) for candidate in chosen)
+    runs = 1 + 2 * len(physics.probed) + sum(len(candidate.gates) for candidate in chosen)
     told = _counted(progress, runs + (config.motion_simulations if config.motions else 0))
     simulations = Simulations(Drive(*taken.control_track(), taken.times), runner, memory, told, cancelled)
     simulations.stage = "declared physics"
     made = recorded(simulations, taken, physics.twin, None, config.discrepancy_share)
     simulations.stage = "sensitivities"
-    unknowns = list(physics.unknowns)
-    slopes, failed = sensitivities(simulations, made.white, physics.twin, made.tracks, unknowns, made.frames)
-    if all(failed):
-        raise SceneUnsupported(f"none of {len(failed)} numbers of {scene.name} can be varied in a simulation")
+    physics, slopes = _varied(simulations, physics, made)
     responses = candidate_responses(simulations, made.white, physics.twin, made.tracks, chosen, made.frames)
     refused |= {r.candidate.label: "its simulation cannot be trusted" for r in responses if r.failed}
     usable = [response for response in responses if not response.failed]
-    columns, asked = scaled(unknowns, slopes, usable)
+    columns, asked = scaled(physics.probed, slopes, usable)
     judge, library = Judge(physics, asked), len({one.effect for one in asked})
     right, known = (Information.of(columns, made.discrepancy, kappa, library) for kappa in (0.0, made.kappa))
     perfect, usual = judge.view(right, 0.0, 0.0), judge.view(known, made.kappa, config.discrepancy_share)
@@ -171,6 +173,22 @@ def check(
         simulations=simulations.count,
         seconds=time.perf_counter() - begun,
     )
+
+
+def _varied(simulations: Simulations, physics: Physics, made: Recorded) -> tuple[Physics, Array]:
+    """Sensitivities (M, p) to the numbers, with steps of the size that is left open."""
+    slopes = np.empty((0, 0))
+    for again in (True, False):
+        unknowns = list(physics.probed)
+        slopes, failed = sensitivities(
+            simulations, made.white, physics.twin, made.tracks, unknowns, made.frames
+        )
+        if all(failed):
+            raise SceneUnsupported(f"none of {len(failed)} numbers can be varied in a simulation")
+        if again:
+            known = Information.of(slopes * deviations(unknowns), made.discrepancy, 0.0, 1)
+            physics = physics.stepped(known.deviations(np.arange(len(unknowns))))
+    return physics, slopes
 
 
 def _counted(progress: Progress | None, total: int) -> Progress | None:

@@ -174,7 +174,9 @@ def plausible(gate: Strength) -> tuple[float, float]:
     return float(np.sqrt(gate.probe * most)), most
 
 
-def scaled(unknowns: Sequence[Unknown], slopes: Array, responses: Sequence[Response]) -> tuple[Array, list[Asked]]:
+def scaled(
+    unknowns: Sequence[Unknown], slopes: Array, responses: Sequence[Response]
+) -> tuple[Array, list[Asked]]:
     """Columns (M, q) in deviations of their priors, first the numbers' then the effects', and where these lie.
 
     Args:
@@ -218,14 +220,14 @@ class Judge:
 
     def __init__(self, physics: Physics, asked: Sequence[Asked]) -> None:
         self.physics, self.asked = physics, list(asked)
-        names = [unknown.name for unknown in physics.unknowns]
+        names = [unknown.name for unknown in physics.probed]
         self._numbers = np.arange(len(names))
         self._always = np.array([name not in physics.optional for name in names], dtype=bool)
 
     def calibrated(self, *effects: Asked) -> Array:
         """Columns that a trace calibrates beside these effects, (p,)."""
         taken = set[str]().union(*(one.names for one in effects))
-        own = np.array([u.name not in taken for u in self.physics.unknowns], dtype=bool)
+        own = np.array([u.name not in taken for u in self.physics.probed], dtype=bool)
         return self._numbers[self._always & own]
 
     def view(self, information: Information, discrepancy_m: float, share: float) -> View:
@@ -236,17 +238,19 @@ class Judge:
             for one, figure in zip(self.asked, effects, strict=True)
             if figure.status != INVISIBLE
         ]
-        pairs = [self.pair(information, a, b) for a, b in combinations(shown, 2) if a[0].effect != b[0].effect]
+        pairs = [
+            self.pair(information, a, b) for a, b in combinations(shown, 2) if a[0].effect != b[0].effect
+        ]
         alike = tuple(pair for pair in pairs if pair.correlation >= ALIKE or pair.taken_for_each_other)
         groups = _groups([pair for pair in alike if pair.taken_for_each_other])
         return View(discrepancy_m, share, self._parameters(information), tuple(effects), alike, groups)
 
     def _parameters(self, information: Information) -> tuple[ParameterFigure, ...]:
         ratios = information.deviations(self._numbers)
-        return tuple(
-            self._parameter(unknown, float(ratio))
-            for unknown, ratio in zip(self.physics.unknowns, ratios, strict=True)
-        )
+        widest: dict[str, float] = {}  # of a number that is varied both ways
+        for unknown, ratio in zip(self.physics.probed, ratios, strict=True):
+            widest[unknown.name] = max(widest.get(unknown.name, 0.0), float(ratio))
+        return tuple(self._parameter(unknown, widest[unknown.name]) for unknown in self.physics.unknowns)
 
     def _parameter(self, unknown: Unknown, ratio: float) -> ParameterFigure:
         assert unknown.prior is not None
@@ -296,11 +300,11 @@ class Judge:
 
     def _hiding(self, information: Information, shape: Array, calibrated: Array) -> dict[str, float]:
         found = {}
-        for number in calibrated:
-            others = calibrated[calibrated != number]
+        names = np.array([unknown.name for unknown in self.physics.probed])
+        for name in dict.fromkeys(names[calibrated]):
+            own, others = calibrated[names[calibrated] == name], calibrated[names[calibrated] != name]
             if information.detectable(shape, others)[0] <= 1.0:
-                name = self.physics.unknowns[number].name
-                found[name] = information.apart(shape, np.array([number]), others)[0]
+                found[str(name)] = information.apart(shape, own, others)[0]
         return found
 
     def pair(self, information: Information, first: tuple[Asked, Asked], second: tuple[Asked, Asked]) -> Pair:
@@ -336,4 +340,6 @@ def _groups(pairs: Sequence[Pair]) -> tuple[tuple[str, ...], ...]:
     rows, columns = ([labels.index(pair.labels[k]) for pair in pairs] for k in range(2))
     graph = coo_array((np.ones(len(pairs)), (rows, columns)), shape=(len(labels), len(labels)))
     count, group = connected_components(graph, directed=False)
-    return tuple(tuple(label for label, own in zip(labels, group, strict=True) if own == k) for k in range(count))
+    return tuple(
+        tuple(label for label, own in zip(labels, group, strict=True) if own == k) for k in range(count)
+    )
