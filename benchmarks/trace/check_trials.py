@@ -1,30 +1,27 @@
-"""``python -m benchmarks.trace.check_trials --json FILE [--refits N] [--seeds N] [--docs docs/check.md]``: is a check right?
+"""``python -m benchmarks.trace.check_trials [--json FILE] [--refits N] [--seeds N] [--docs FILE]``: is a check right?
 
 A bar that a grip shakes is checked before any fit. Then what the check foretells is done, by other code:
 
 - *Intervals.* Bodies are drawn about the one that was checked, by three foretold deviations in every number, recorded
-  with noise and refitted with the full simulator (:func:`physworld.estimation.refit.refit`). The refits' errors over the
-  foretold deviations have to have the size 1. Farther away a search may end in another basin, which is no matter of
-  information.
-- *Detection.* Recordings with an effect of so many times its detectable strength are refitted with the declared physics,
-  and the effect is screened by the marginal likelihood of a trace (:mod:`physworld.trace.evidence.likelihood`), which
-  integrates a discrepancy out and has the search's bounds for a prior. It has to be found in about 95 % at the
-  detectable strength, always at twice that, never at a tenth.
+  with noise and refitted with the full simulator (:func:`physworld.estimation.refit.refit`). The refits' errors over
+  the foretold deviations have to have the size 1.
+- *Detection.* Recordings with an effect of so many times its detectable strength are refitted with the declared
+  physics, and the effect is screened by the marginal likelihood of a trace
+  (:mod:`physworld.trace.evidence.likelihood`), which integrates a discrepancy out and has the search's bounds for a
+  prior. It has to be found always at twice the detectable strength, never at a tenth.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from benchmarks.harness import describe_machine, write_section
+from benchmarks.harness import Report, write_json, write_section
 from physworld.arrays import Array
 from physworld.calibrate import CalibrationConfig
 from physworld.estimation.refit import Refit, prior_rows, refit
@@ -39,7 +36,8 @@ from physworld.trace.check.recorded import Recorded, recorded
 from physworld.trace.evidence.likelihood import Linear, marginal
 from physworld.trace.sensitivity import candidate_responses
 
-STIFFNESS_PA, SIGMA_M, FRAMES, FPS = 6e4, 5e-4, 30, 30.0
+STIFFNESS_PA, FRAMES, FPS = 6e4, 30, 30.0
+SIGMA_M, FINE_M = 5e-4, 1e-4  # noises
 EFFECTS = ("air_drag_linear", "viscosity_kelvin_voigt", "actuation_lag", "gravity_tilt")
 MULTIPLES = (0.1, 0.5, 1.0, 2.0)
 _ITERATIONS, _AGAIN = 4, 3
@@ -52,8 +50,8 @@ CONFIG = CheckConfig(
 )
 
 
-def bar() -> Scene:
-    """A soft bar of 0.16 m whose grip goes up and down and aside; ten points, 0.5 mm of noise, nothing measured yet.
+def bar(sigma_m: float = SIGMA_M) -> Scene:
+    """A soft bar of 0.16 m whose grip goes up and down and aside; ten points with this noise [m], nothing measured yet.
 
     The grip holds the lower half of its section, softly: a clamp's reach has a kink, which no spread of refits follows.
     """
@@ -70,7 +68,7 @@ def bar() -> Scene:
         controllers=grip + sway[:, None],
         times=times,
         gravity_m_s2=np.array([0.0, 0.0, -9.81]),
-        noise_sigma_m=SIGMA_M,
+        noise_sigma_m=sigma_m,
         train=(0, FRAMES),
         test=(FRAMES, FRAMES),
         fps=FPS,
@@ -131,7 +129,7 @@ def fitted(
         for gate, strength in zip(candidate.unknowns(), strengths, strict=True):
             twin = gate.apply(twin, strength)
     tracks = twin.observe(twin.simulate_nodes(*scene.control_track(), scene.times), scene.times)
-    noisy = replace(scene, points=tracks + rng.normal(scale=SIGMA_M, size=tracks.shape))
+    noisy = replace(scene, points=tracks + rng.normal(scale=scene.noise_sigma_m or 0.0, size=tracks.shape))
     physics = declared_physics(noisy, CONFIG.calibration, CONFIG.values)
     simulations = Simulations(Drive(*noisy.control_track(), noisy.times))
     made = recorded(simulations, noisy, physics.twin, None, CONFIG.discrepancy_share)
@@ -205,7 +203,7 @@ def detection(
         seeds: recordings at each.
     """
     candidate = candidates(told.physics.twin, (effect,))[0][0]
-    figure = next(f for f in told.perfect.effects if f.effect == effect)
+    figure = told.perfect.effect(_label(told, effect))
     rates = {}
     for multiple in multiples:
         strengths = [multiple * figure.gates[0].detectable, *(0.0 for _ in figure.gates[1:])]
@@ -224,56 +222,75 @@ def detection(
 
 def main(arguments: list[str] | None = None) -> None:
     """Run, print, write."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.trace.check_trials", description=__doc__)
-    parser.add_argument("--json", type=Path, required=True)
-    parser.add_argument("--refits", type=int, default=100)
-    parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--docs", type=Path, default=None)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.trace.check_trials")
+    parser.add_argument("--json", type=Path, default=None, help="write all figures there")
+    parser.add_argument("--refits", type=int, default=40, help="at each noise")
+    parser.add_argument("--seeds", type=int, default=10, help="recordings at each strength")
+    parser.add_argument("--docs", type=Path, default=None, help="page whose section is written anew")
     given = parser.parse_args(arguments)
-    scene = bar()
-    told = check(scene, CONFIG)
-    spreads = spread_of(scene, told, given.refits)
-    rates = {name: detection(scene, told, name, MULTIPLES, given.seeds) for name in EFFECTS}
-    detectable = {
-        name: next(f for f in told.perfect.effects if f.effect == name).gates[0] for name in EFFECTS
-    }
-    found: dict[str, Any] = {
-        "refits": given.refits,
-        "seeds": given.seeds,
-        "size": {name: float(np.sqrt(np.mean(z**2))) for name, z in spreads.items()},
-        "sampling_error": float(np.sqrt(0.5 / given.refits)),
-        "covered": {name: float(np.mean(np.abs(z) < 1.96)) for name, z in spreads.items()},
-        "detectable": {name: {"value": g.detectable, "unit": g.unit} for name, g in detectable.items()},
-        "found": {name: {f"{m:g}": rate for m, rate in own.items()} for name, own in rates.items()},
-        "machine": describe_machine(),
-    }
-    given.json.write_text(json.dumps(found, indent=1) + "\n")
-    text = page(found)
-    print(text)
+    spreads = {}
+    for sigma in (FINE_M, SIGMA_M):
+        told = check(bar(sigma), CONFIG)
+        spreads[sigma] = spread_of(bar(sigma), told, given.refits)
+    rates = {name: detection(bar(), told, name, MULTIPLES, given.seeds) for name in EFFECTS}
+    report = summary(told, spreads, rates, given.refits, given.seeds)
+    print(report.markdown())
+    if given.json is not None:
+        write_json(report, given.json)
     if given.docs is not None:
-        write_section(given.docs, "check_trials", text)
+        write_section(report, given.docs)
 
 
-def page(found: dict[str, Any]) -> str:
-    """The figures as Markdown."""
-    lines = [
-        "| number | error of refits over the foretold deviation | within the foretold 95 % interval |",
-        "| --- | --- | --- |",
+def summary(
+    told: CheckResult,
+    spreads: dict[float, dict[str, Array]],
+    rates: dict[str, dict[float, float]],
+    refits: int,
+    seeds: int,
+) -> Report:
+    """The figures and a table.
+
+    Args:
+        told: by the check under the larger noise.
+        spreads: of refits by noise [m].
+        rates: of detection by effect and multiple.
+        refits, seeds: how many.
+    """
+    gates = {
+        name: told.perfect.effect(label).gates[0] for name, label in ((n, _label(told, n)) for n in rates)
+    }
+    sizes = {
+        f"{1e3 * sigma:g} mm": {name: float(np.sqrt(np.mean(z**2))) for name, z in own.items()}
+        for sigma, own in spreads.items()
+    }
+    rows = [
+        (f"{name}, noise {noise}", "error of refits over the foretold deviation", f"{size:.2f}")
+        for noise, own in sizes.items()
+        for name, size in own.items()
     ]
-    lines += [
-        f"| {name} | {size:.2f} | {found['covered'][name]:.0%} |" for name, size in found["size"].items()
-    ]
-    heads = " | ".join(f"{m:g} ×" for m in MULTIPLES)
-    lines += ["", f"| effect | detectable | found at {heads} |", "| --- | --- |" + " --- |" * len(MULTIPLES)]
-    for name, rates in found["found"].items():
-        gate = found["detectable"][name]
-        shares = " | ".join(f"{rate:.0%}" for rate in rates.values())
-        lines.append(f"| {name} | {gate['value']:.3g} {gate['unit']} | {shares} |")
-    lines += [
-        "",
-        f"_`python -m benchmarks.trace.check_trials`: {found['refits']} refits (sampling error {found['sampling_error']:.2f}), {found['seeds']} recordings at each strength; {found['machine']}_",
-    ]
-    return "\n".join(lines)
+    for name, own in rates.items():
+        gate, at_each = gates[name], ", ".join(f"{multiple:g}" for multiple in own)
+        what = f"found at {at_each} of {gate.detectable:.3g} {gate.unit}"
+        rows.append((name, what, ", ".join(f"{rate:.0%}" for rate in own.values())))
+    return Report(
+        name="trace.check_trials",
+        title="Against refits and screenings",
+        figures={
+            "size": sizes,
+            "found": {n: {f"{m:g}": r for m, r in own.items()} for n, own in rates.items()},
+        },
+        header=("number or effect", "what was done", "found"),
+        rows=rows,
+        notes=(
+            f"{refits} refits at each noise: sampling error {np.sqrt(0.5 / refits):.2f}",
+            f"{seeds} recordings at each strength, noise {1e3 * SIGMA_M:g} mm",
+        ),
+    )
+
+
+def _label(told: CheckResult, effect: str) -> str:
+    """Of an effect's first part."""
+    return next(figure.label for figure in told.perfect.effects if figure.effect == effect)
 
 
 if __name__ == "__main__":

@@ -241,7 +241,7 @@ def drawn_probes(limits: MotionLimits, draws: int, generator: np.random.Generato
 
 @dataclass(frozen=True)
 class Library:
-    """Motions that may be proposed: with their families, and the times of frames (T,) and of control points (S,) [s]."""
+    """Motions that may be proposed, with their families; the times of frames (T,) and of control points (S,) [s]."""
 
     motions: tuple[tuple[str, Motion], ...]
     frame_times: Array

@@ -122,7 +122,7 @@ def grip_compliance(twin: Twin) -> Unknown | None:
 
 
 def hold_unknowns(twin: Twin) -> list[Unknown]:
-    """How the twin's grips hold it: a reach within a cell is what softness is, and a mesh's lines lie on their faces."""
+    """How the twin's grips hold it: a reach within a cell is what softness is, a mesh's lines lie on their faces."""
     softness = grip_softness(twin)
     reach = clamp_reach(twin) if softness is None and twin.lattice.smooth else None
     return [unknown for unknown in (reach, softness, grip_compliance(twin)) if unknown is not None]

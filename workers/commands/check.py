@@ -1,8 +1,8 @@
 """``python -m physworld_workers.commands.check SCENE --json check.json``: what a recording can show before any fit.
 
-Prints two tables: of every number that a calibration would search its expected 95 % interval, and of every effect of the
-registry the smallest strength that would be detected, each for a twin that is right and for one that is off by a share
-of the motion; then what looks alike, and a further motion that shows more. ``--json FILE`` keeps all of it
+Prints two tables: of every number that a calibration would search its expected 95 % interval, and of every effect of
+the registry the smallest strength that would be detected, each for a twin that is right and for one that is off by a
+share of the motion; then what looks alike, and a further motion that shows more. ``--json FILE`` keeps all of it
 (:func:`physworld.trace.check.document`). Nothing is fitted.
 """
 
@@ -98,11 +98,11 @@ def _print(report: dict[str, Any]) -> None:
     right, usual = report["views"]
     print(
         f"{report['scene']}: {report['law']} in the {report['formulation']} form; noise of "
-        f"{1e3 * report['noise_m']:.3g} mm per axis ({report['noise_is']}), {report['frames']} frames, points that move "
-        f"by {1e3 * report['motion_m']:.3g} mm. Twin off: by {100 * usual['discrepancy_share']:.3g} % of that, "
+        f"{1e3 * report['noise_m']:.3g} mm per axis ({report['noise_is']}), {report['frames']} frames, points that "
+        f"move by {1e3 * report['motion_m']:.3g} mm. Twin off: by {100 * usual['discrepancy_share']:.3g} % of that, "
         f"{1e3 * usual['discrepancy_m']:.3g} mm."
     )
-    rows = [
+    rows: list[tuple[str, ...]] = [
         ("parameter", "value", "known before", "expected, twin right", "expected, twin off", "narrower by")
     ]
     for best, worse in zip(right["parameters"], usual["parameters"], strict=True):

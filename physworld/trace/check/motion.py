@@ -1,8 +1,9 @@
 """A further motion that shows what a recording does not: the best of a trace's library of motions.
 
 Every motion is simulated with the declared physics and with a step of every calibrated number and of every effect in
-question: those that the recording misses least, for what it misses by far no motion shows. What it says is added to what the recording says, for both are of one object; the motion that makes the most
-effects visible, or tells the most pairs apart, is proposed. Motions keep the limits that the recording itself has shown.
+question: those that the recording misses least, for what it misses by far no motion shows. What it says is added to
+what the recording says, for both are of one object; the motion that makes the most effects visible, or tells the most
+pairs apart, is proposed. Motions keep the limits that the recording itself has shown.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ from physworld.calibrate.rod_parameters import LOSSES, rod_parameters, steps_see
 from physworld.estimation.unknowns import LOG, Unknown, at, multiple_of, starts_of
 from physworld.geometry.sheet_body import is_hung_sheet
 from physworld.scene import Scene
-from physworld.trace.unknowns import REACH, KNOWN_BEFOREHAND, hold_unknowns, of_parameter
+from physworld.trace.unknowns import KNOWN_BEFOREHAND, REACH, hold_unknowns, of_parameter
 from physworld.twin.grips import softly_held
 from physworld.twin.twin import Twin
 
@@ -67,7 +67,7 @@ class Physics:
         Args:
             ratios: posterior over prior deviations of the probed numbers, (p,).
         """
-        known = {}
+        known: dict[str, float] = {}
         for unknown, ratio in zip(self.probed, ratios, strict=True):
             assert unknown.prior is not None
             known[unknown.name] = max(known.get(unknown.name, 0.0), float(ratio) * unknown.prior[1])

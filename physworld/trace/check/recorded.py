@@ -1,4 +1,4 @@
-"""A recording as far as its information goes: the prediction, what whitens its residuals, and the assumed discrepancy."""
+"""A recording as far as its information goes: its prediction, what whitens residuals, and the assumed discrepancy."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def recorded(
     sigma = sigma or noise_sigma(scene, split, tracks)
     if sigma is None:
         raise ValueError(
-            "no noise is declared and none can be estimated from so few sightings; give its deviation per axis in metres"
+            "no noise is declared and none can be estimated from so few sightings; give it in metres per axis"
         )
     white = whitener(scene, split, sigma, responses(twin, nodes))
     turned = simulations.run([Job(start, frames) for start in turned_starts(scene, twin, sigma)])

@@ -228,7 +228,8 @@ class Judge:
         """Columns that a trace calibrates beside these effects, (p,)."""
         taken = set[str]().union(*(one.names for one in effects))
         own = np.array([u.name not in taken for u in self.physics.probed], dtype=bool)
-        return self._numbers[self._always & own]
+        found: Array = self._numbers[self._always & own]
+        return found
 
     def view(self, information: Information, discrepancy_m: float, share: float) -> View:
         """The whole answer."""

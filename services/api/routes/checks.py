@@ -21,7 +21,7 @@ router = APIRouter(prefix="/checks", tags=["checks"])
 
 @router.post("", status_code=202, response_model=Job, responses=documented(401, 403, 404, 409, 413, 422))
 def create_check(body: CheckCreate, idempotency: IdempotencyDep) -> Response:
-    """Check what a scene's motion can show of its parameters and of the effects; the check's id is in the job's `outputs`."""
+    """Check what a scene's motion can show, before any fit; the check's id is in the job's `outputs`."""
     require_known(config=body.config)
     return idempotency.run(body, lambda session: accepted(jobs.create_check(session, body)))
 

@@ -1,0 +1,92 @@
+"""A check in its real handler: what it stores, going on after a kill, and a number that the scene does not have."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from physworld_schemas.check import Check, CheckConfig, CheckCreate
+from physworld_schemas.job import Job
+from physworld_storage import checks
+from physworld_storage.jobs import jobs, leases
+from physworld_workers.execute import Runtime, run_shard
+from physworld_workers.stores import Stores
+from physworld_workers.tasks import check as task
+
+pytestmark = pytest.mark.slow
+
+SMALL = CheckConfig(candidates=["air_drag_linear", "adhesion"], particle_budget=60, motions=1)
+
+
+def _open(stores: Stores, scene_id: str, config: CheckConfig = SMALL) -> Job:
+    with stores.database.session() as session:
+        return jobs.create_check(session, CheckCreate(scene_id=scene_id, config=config))
+
+
+def _run(stores: Stores, runtime: Runtime) -> str:
+    with stores.database.reading() as session:
+        (driver,) = [found.shard_id for found in leases.publishable(session)]
+    return run_shard(runtime, driver)
+
+
+def _found(stores: Stores, job: Job) -> tuple[Job, Check]:
+    with stores.database.reading() as session:
+        return jobs.get_job(session, job.id), checks.get_check(session, job.outputs[0].id)
+
+
+def test_a_check_stores_its_report(
+    runtime_with: Callable[..., Runtime], stores: Stores, scene_id: str
+) -> None:
+    job = _open(stores, scene_id)
+    assert _run(stores, runtime_with()) == "done"
+    ended, check = _found(stores, job)
+    assert ended.state == "succeeded" and check.state == "ready" and check.report is not None
+    assert list(check.report.asked) == ["air_drag_linear"]
+    assert "touches no ground" in check.report.refused["adhesion"]
+    right, usual = check.report.views
+    assert (right.discrepancy_m, usual.discrepancy_share) == (0.0, 0.03)
+    modulus = usual.parameters[0]
+    assert (
+        modulus.name == "youngs_modulus_pa" and modulus.expected95[0] < modulus.value < modulus.expected95[1]
+    )
+    assert check.report.scene == "tiny bar" and check.lineage.inputs[0].id == scene_id
+    assert ended.progress.unit == "simulations"
+
+
+def test_a_check_whose_worker_was_killed_goes_on_where_it_was(
+    runtime_with: Callable[..., Runtime], stores: Stores, scene_id: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = _open(stores, scene_id)
+    runs: list[int] = []
+    plain = task.check
+
+    def dies(*arguments: object, **more: object) -> object:
+        plain(*arguments, **more)  # type: ignore[arg-type]
+        raise OSError("the host went down")
+
+    monkeypatch.setattr(task, "check", dies)
+    assert _run(stores, runtime_with()) == "retried"
+
+    def counted(*arguments: object, **more: object) -> object:
+        runner = more["runner"]
+
+        def watched(asked: list[object], *rest: object) -> object:
+            runs.append(len(asked))
+            return runner(asked, *rest)  # type: ignore[operator]
+
+        return plain(*arguments, **{**more, "runner": watched})  # type: ignore[arg-type]
+
+    monkeypatch.setattr(task, "check", counted)
+    assert _run(stores, runtime_with()) == "done"
+    assert _found(stores, job)[1].state == "ready" and sum(runs) == 0
+
+
+def test_a_number_that_the_scene_does_not_have_fails_the_check(
+    runtime_with: Callable[..., Runtime], stores: Stores, scene_id: str
+) -> None:
+    job = _open(stores, scene_id, SMALL.model_copy(update={"values": {"bending_n_m": 1.0}}))
+    assert _run(stores, runtime_with()) == "failed"
+    ended, check = _found(stores, job)
+    assert check.state == "failed" and check.report is None
+    assert ended.error is not None and "no 'bending_n_m' to be calibrated" in (ended.error.detail or "")
