@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
 
+import numpy as np
 import pytest
 
 from physworld_schemas.check import Check, CheckConfig, CheckCreate
 from physworld_schemas.job import Job
 from physworld_storage import checks
+from physworld_storage.clock import CLOCK
 from physworld_storage.jobs import jobs, leases
 from physworld_workers.execute import Runtime, run_shard
 from physworld_workers.stores import Stores
@@ -24,9 +27,13 @@ def _open(stores: Stores, scene_id: str, config: CheckConfig = SMALL) -> Job:
         return jobs.create_check(session, CheckCreate(scene_id=scene_id, config=config))
 
 
-def _run(stores: Stores, runtime: Runtime) -> str:
+def _waiting(stores: Stores) -> list[str]:
     with stores.database.reading() as session:
-        (driver,) = [found.shard_id for found in leases.publishable(session)]
+        return [found.shard_id for found in leases.publishable(session)]
+
+
+def _run(stores: Stores, runtime: Runtime) -> str:
+    (driver,) = _waiting(stores)
     return run_shard(runtime, driver)
 
 
@@ -54,32 +61,37 @@ def test_a_check_stores_its_report(
     assert ended.progress.unit == "simulations"
 
 
-def test_a_check_whose_worker_was_killed_goes_on_where_it_was(
+def test_a_killed_check_goes_on_without_repeating_simulations(
     runtime_with: Callable[..., Runtime], stores: Stores, scene_id: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job = _open(stores, scene_id)
-    runs: list[int] = []
-    plain = task.check
+    (driver,) = _waiting(stores)
+    keys: list[str] = []
+    put = task.SharedMemory.put
 
-    def dies(*arguments: object, **more: object) -> object:
-        plain(*arguments, **more)  # type: ignore[arg-type]
-        raise OSError("the host went down")
+    class Killed(BaseException):
+        pass
 
-    monkeypatch.setattr(task, "check", dies)
-    assert _run(stores, runtime_with()) == "retried"
+    def dying(self: task.SharedMemory, key: str, tracks: np.ndarray | None) -> None:
+        put(self, key, tracks)
+        keys.append(key)
+        if len(keys) == 3:
+            raise Killed
 
-    def counted(*arguments: object, **more: object) -> object:
-        runner = more["runner"]
-
-        def watched(asked: list[object], *rest: object) -> object:
-            runs.append(len(asked))
-            return runner(asked, *rest)  # type: ignore[operator]
-
-        return plain(*arguments, **{**more, "runner": watched})  # type: ignore[arg-type]
-
-    monkeypatch.setattr(task, "check", counted)
-    assert _run(stores, runtime_with()) == "done"
-    assert _found(stores, job)[1].state == "ready" and sum(runs) == 0
+    monkeypatch.setattr(task.SharedMemory, "put", dying)
+    with pytest.raises(Killed):
+        run_shard(runtime_with(), driver)
+    before = set(keys)
+    keys.clear()
+    monkeypatch.setattr(
+        task.SharedMemory, "put", lambda self, key, tracks: (keys.append(key), put(self, key, tracks))
+    )
+    with stores.database.session() as session:
+        session.info[CLOCK] = lambda: datetime.now(UTC) + timedelta(minutes=5)
+        leases.reap(session)
+    assert run_shard(runtime_with(), driver) == "done"
+    assert len(before) == 3 and not before & set(keys), "a simulation was run again"
+    assert _found(stores, job)[1].state == "ready"
 
 
 def test_a_number_that_the_scene_does_not_have_fails_the_check(
