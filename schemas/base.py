@@ -8,7 +8,9 @@ from typing import Annotated, Any, Generic, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-ObjectKind = Literal["scene", "fit", "trace", "dataset", "model", "assessment", "rollout", "plan", "artifact"]
+ObjectKind = Literal[
+    "scene", "check", "fit", "trace", "dataset", "model", "assessment", "rollout", "plan", "artifact"
+]
 _UNSTORABLE = re.compile("[\0\ud800-\udfff]")
 _PLAIN = frozenset({float, int, bool, type(None)})
 Seed = Annotated[int, Field(ge=0, lt=2**63)]

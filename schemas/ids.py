@@ -8,6 +8,7 @@ PREFIXES = {
     "scene": "scn",
     "fit": "fit",
     "trace": "trc",
+    "check": "chk",
     "dataset": "dst",
     "assessment": "ass",
     "rollout": "rol",

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from physworld_schemas.base import Problem, Reference, Resource
 
-JobKind = Literal["fit", "trace", "dataset", "training", "assessment", "rollout", "plan", "pipeline"]
+JobKind = Literal["check", "fit", "trace", "dataset", "training", "assessment", "rollout", "plan", "pipeline"]
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelling", "cancelled"]
 TERMINAL_STATES: frozenset[str] = frozenset({"succeeded", "failed", "cancelled"})
 

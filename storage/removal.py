@@ -20,6 +20,7 @@ from physworld_storage.tables import (
     AliasRow,
     AssessmentRow,
     Base,
+    CheckRow,
     DatasetRow,
     EpisodeRow,
     FitRow,
@@ -60,6 +61,7 @@ KINDS: dict[str, Removable] = {
     "scene": Removable(
         SceneRow,
         (
+            _by("check", CheckRow.id, CheckRow.scene_id),
             _by("fit", FitRow.id, FitRow.scene_id),
             _by("trace", TraceRow.id, TraceRow.scene_id),
             _by("dataset", DatasetRow.id, DatasetRow.scene_id),
@@ -67,6 +69,7 @@ KINDS: dict[str, Removable] = {
             _by("assessment", AssessmentRow.id, AssessmentRow.scene_id),
         ),
     ),
+    "check": Removable(CheckRow),
     "fit": Removable(
         FitRow,
         (

@@ -239,6 +239,22 @@ class TraceRow(Base):
     artifacts: Mapped[JsonList]
 
 
+class CheckRow(Base):
+    """What a scene's motion can show; ``report`` is the whole answer."""
+
+    __tablename__ = "checks"
+    __table_args__ = (Index(None, "created_at"),)
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    scene_id: Mapped[str] = mapped_column(ForeignKey("scenes.id"), index=True)
+    state: Mapped[str]
+    created_at: Mapped[datetime]
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
+    config: Mapped[Json]
+    report: Mapped[Json | None]
+    lineage: Mapped[Json]
+
+
 class DatasetRow(Base):
     """A set of episodes, immutable once sealed."""
 

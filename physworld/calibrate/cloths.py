@@ -234,7 +234,7 @@ def calibrate_cloth(
     from physworld.calibrate.global_stage import FitResult
 
     begun = time.perf_counter()
-    twin = _with_priors(scene, twin)
+    twin = with_priors(scene, twin)
     unknowns = cloth_parameters(scene, twin, config.damping == "auto")
     search = _Search(scene, twin, unknowns, config.max_simulations, progress, cancelled)
 
@@ -268,7 +268,7 @@ def calibrate_cloth(
 _CAMERA = (MeasurementTurn.name, MeasurementScale.name, ActuationLag.name)
 
 
-def _with_priors(scene: Scene, twin: Twin) -> Twin:
+def with_priors(scene: Scene, twin: Twin) -> Twin:
     """The twin with the mass of a woven cloth where none is declared, and a membrane that hardly sags."""
     if scene.body.mass_kg is None and scene.body.density_kg_m3 is None:
         twin = twin.with_parameters(density_kg_m2=_AREA_DENSITY)

@@ -7,7 +7,7 @@ the best so far are looked at more closely.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import permutations
 
@@ -93,13 +93,9 @@ class Search:
     def best(self) -> Tried | None:
         """The best motion found within the budget; None where no motion could be simulated."""
         config, generator = self.config, np.random.default_rng(self.config.seed)
-        families = list(COORDINATES)
         drawn = []
-        for number in range(config.draws):
-            family = (
-                families[number] if number < len(families) else families[1 + number % (len(families) - 1)]
-            )
-            found = self._try(random_probe(family, self.limits, generator))
+        for probe in drawn_probes(self.limits, config.draws, generator):
+            found = self._try(probe)
             if found is not None:
                 drawn.append(found)
         drawn.sort(key=lambda t: -t.plain)
@@ -231,6 +227,43 @@ def _known(rival: Rival, numerics: int) -> tuple[Array, Array]:
     offset = np.zeros(count + numerics)
     offset[:count] = 0.0 if rival.offset is None else rival.offset
     return known, offset
+
+
+def drawn_probes(limits: MotionLimits, draws: int, generator: np.random.Generator) -> Iterator[Probe]:
+    """Random motions, one of every family first."""
+    families = list(COORDINATES)
+    for number in range(draws):
+        first = number < len(families)
+        yield random_probe(
+            families[number] if first else families[1 + number % (len(families) - 1)], limits, generator
+        )
+
+
+@dataclass(frozen=True)
+class Library:
+    """Motions that may be proposed, with their families; the times of frames (T,) and of control points (S,) [s]."""
+
+    motions: tuple[tuple[str, Motion], ...]
+    frame_times: Array
+    control_times: Array
+
+
+def library_of(scene: Scene, twin: Twin, draws: int, longest_s: float, seed: int) -> Library:
+    """Motions of this scene's grips within its limits, as a search draws them.
+
+    Args:
+        scene, twin: whose grips, reach and speed.
+        draws: motions.
+        longest_s: duration, at most; else as long as the recording.
+        seed: everything random follows from it.
+    """
+    limits = limits_of(scene, twin)
+    frame_times, control_times = clock_of(scene, longest_s)
+    probes = drawn_probes(limits, draws, np.random.default_rng(seed))
+    motions = [
+        (probe.family, motion_of(probe, twin.controllers_start, limits, control_times)) for probe in probes
+    ]
+    return Library(tuple(motions), frame_times, control_times)
 
 
 def from_rest(twin: Twin) -> Twin:

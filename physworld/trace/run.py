@@ -18,7 +18,7 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.calibrate import Journal
-from physworld.calibrate.parameters import BENDING_COUPLING, BENDING_RATIO, TWIST_RATIO, parameters_of
+from physworld.calibrate.parameters import BENDING_COUPLING, TWIST_RATIO, parameters_of
 from physworld.engine.thin.triangles import TriangleLattice
 from physworld.errors import SceneUnsupported
 from physworld.estimation.noise import noise_sigma
@@ -62,7 +62,7 @@ from physworld.trace.sensitivity import (
     numerical_directions,
     refinement_of,
 )
-from physworld.trace.unknowns import clamp_reach, grip_compliance, grip_softness, of_parameter
+from physworld.trace.unknowns import KNOWN_BEFOREHAND, hold_unknowns, of_parameter
 from physworld.trace.verdict import (
     DATA,
     NOTHING,
@@ -75,9 +75,6 @@ from physworld.trace.verdict import (
 )
 from physworld.twin.twin import Twin
 
-_POISSON_SPREAD = 0.08  # of what is known of a soft solid's Poisson's ratio beforehand
-_TWIST_SPREAD = 0.7  # of the logarithm of a sheet's twisting stiffness over an isotropic one's
-_BENDING_SPREAD = 0.5  # of the logarithm of a sheet's bending stiffness over what its thickness says
 _OTHER_STIFFNESSES = tuple(0.12 * k for k in (-6, -5, -4, -3, -2, -1, 1, 2, 3, 4, 5, 6))
 """Logarithms: a phase that has slipped by a period is a local minimum, so others are looked at before a descent."""
 _MESH_STIFFNESSES = tuple(0.01 * k for k in (-4, -3, -2, -1, 1, 2, 3, 4))
@@ -326,17 +323,10 @@ class _Trace:
             damping=False,
             ground_friction=ground is not None and ground.friction is None,
         )
-        spread = {
-            "poissons_ratio": _POISSON_SPREAD,
-            TWIST_RATIO: _TWIST_SPREAD,
-            BENDING_RATIO: _BENDING_SPREAD,
-        }
-        softness = grip_softness(twin)
-        # a reach within a cell is what softness is, and a mesh's lines lie on the faces of its grips
-        reach = clamp_reach(twin) if softness is None and twin.lattice.smooth else None
-        found = [of_parameter(p, twin, spread.get(p.name)) for p in known if p.name != BENDING_COUPLING]
-        own = (reach, softness, grip_compliance(twin))
-        return [*found, *(unknown for unknown in own if unknown is not None)]
+        found = [
+            of_parameter(p, twin, KNOWN_BEFOREHAND.get(p.name)) for p in known if p.name != BENDING_COUPLING
+        ]
+        return [*found, *hold_unknowns(twin)]
 
     def _turns(self, tracks: Array, sigma: float) -> list[Array]:
         """What the uncertain pose of the start does to the prediction, (frames, N, 3) each."""

@@ -6,7 +6,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 
-from physworld.calibrate.parameters import BENDING_RATIO, Parameter, bending_ratio
+from physworld.calibrate.parameters import BENDING_RATIO, TWIST_RATIO, Parameter, bending_ratio
 from physworld.effects.base import Strength
 from physworld.effects.clamp_offset import ClampOffset
 from physworld.effects.grip_slip import GripSlip
@@ -25,6 +25,9 @@ _SLIP_STEP = 0.25  # of a sheared rope's compliance
 _SOFTNESS_SHARES = (0.1, 1.5)  # of ``AS_HELD``: finite elements as large as the grip hold so much harder
 _SOFTNESS_STEP = 0.1
 _CLAMP_STEP, _CLAMP_SPREAD = 0.25, 0.5  # cells: difference step, and deviation of what is known beforehand
+KNOWN_BEFOREHAND = {"poissons_ratio": 0.08, TWIST_RATIO: 0.7, BENDING_RATIO: 0.5}
+"""Deviations of what is known of a parameter before any recording, about the twin's value, in the scale of the search:
+of soft solids, and of a sheet's bending over that of a homogeneous plate of its thickness."""
 
 
 def of_parameter(parameter: Parameter, twin: Twin, known: float | tuple[float, float] | None) -> Unknown:
@@ -124,6 +127,13 @@ def grip_compliance(twin: Twin) -> Unknown | None:
     scale = _SLIP_STEP * sheared
     unknown = of_strength(SLIP, replace(known, high=sheared), scale)
     return replace(unknown, start=1.0, prior=(0.0, 1.0 / _SLIP_STEP))
+
+
+def hold_unknowns(twin: Twin) -> list[Unknown]:
+    """How the twin's grips hold it: a reach within a cell is what softness is, a mesh's lines lie on their faces."""
+    softness = grip_softness(twin)
+    reach = clamp_reach(twin) if softness is None and twin.lattice.smooth else None
+    return [unknown for unknown in (reach, softness, grip_compliance(twin)) if unknown is not None]
 
 
 def already(twin: Twin, gate: Unknown) -> float:

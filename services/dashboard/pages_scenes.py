@@ -21,7 +21,7 @@ from physworld_services.dashboard.clouds import (
 from physworld_services.dashboard.curves import chart, frame_errors, given_curves, onto
 from physworld_services.dashboard.samples import sample_folder
 from physworld_services.dashboard.site import BASE, Site
-from physworld_storage import resources, traces
+from physworld_storage import checks, resources, traces
 from physworld_storage.errors import NotFound
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ FitId = Annotated[str | None, Query(max_length=64)]
 
 
 def router(site: Site) -> APIRouter:
-    """Pages below ``/scenes``, and the address of a fit, which is a view of its scene's page."""
+    """Pages below ``/scenes``, and the addresses of fits and checks, which its scene's page shows."""
     routes = APIRouter()
 
     @routes.get("/scenes")
@@ -58,12 +58,19 @@ def router(site: Site) -> APIRouter:
             fit = resources.get_fit(session, fit_id)
         return RedirectResponse(f"{BASE}/scenes/{fit.scene_id}?fit={fit.id}", 303)
 
+    @routes.get("/checks/{check_id}")
+    def check_page(check_id: str) -> Response:
+        with site.database.reading() as session:
+            check = checks.get_check(session, check_id)
+        return RedirectResponse(f"{BASE}/scenes/{check.scene_id}#check", 303)
+
     @routes.get("/scenes/{scene_id}")
     def page(request: Request, scene_id: str, fit: FitId = None) -> HTMLResponse:
         record, shown = _load(site, scene_id, fit)
         with site.database.reading() as session:
             fits = resources.list_fits(session, scene_id=scene_id, limit=RELATED_SHOWN).data
             datasets = resources.list_datasets(session, scene_id=scene_id, limit=RELATED_SHOWN).data
+            checked = checks.list_checks(session, scene_id=scene_id, limit=RELATED_SHOWN).data
             traced = traces.list_traces(session, scene_id=scene_id, limit=RELATED_SHOWN).data
         return site.page(
             request,
@@ -75,6 +82,8 @@ def router(site: Site) -> APIRouter:
             datasets=datasets,
             traces=traced,
             declared=_declared(record),
+            checks=checked,
+            check=next((item for item in checked if item.report is not None), None),
         )
 
     @routes.get("/scenes/{scene_id}/cloud")

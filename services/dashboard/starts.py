@@ -17,6 +17,7 @@ from sqlalchemy.orm import Session
 from physworld_schemas.arrays import EncodedArray
 from physworld_schemas.assessment import AssessmentCreate
 from physworld_schemas.base import Request as Body
+from physworld_schemas.check import CheckCreate
 from physworld_schemas.dataset import DatasetCreate
 from physworld_schemas.fit import FitCreate
 from physworld_schemas.job import Job
@@ -101,6 +102,11 @@ def _fit(site: Site, body: FitCreate) -> Opening:
     return lambda session: jobs.create_fit(session, body.scene_id, body.config)
 
 
+def _check(site: Site, body: CheckCreate) -> Opening:
+    require_known(config=body.config)
+    return lambda session: jobs.create_check(session, body)
+
+
 def _trace(site: Site, body: TraceCreate) -> Opening:
     require_known(config=body.config)
     return lambda session: jobs.create_trace(session, body)
@@ -161,6 +167,12 @@ STARTS: dict[str, Start] = {
     "fit": Start(
         "Calibrate a twin", "A simulation of one recording, its parameters with intervals.", FitCreate, _fit
     ),
+    "check": Start(
+        "Check a recording",
+        "What can its motion show, before anything is fitted?",
+        CheckCreate,
+        _check,
+    ),
     "trace": Start(
         "Trace what is missing",
         "Which physical effect accounts for what the calibrated twin leaves unexplained?",
@@ -219,7 +231,7 @@ def body_of(job: Job) -> dict[str, Any]:
     for reference in job.inputs:
         given.setdefault(reference.kind, []).append(reference.id)
     first: Mapping[str, str] = {kind: ids[0] for kind, ids in given.items()}
-    if job.kind == "fit":
+    if job.kind in ("check", "fit"):
         return {"scene_id": first.get("scene"), "config": job.config}
     if job.kind == "trace":
         own = {"fit": job.config.get("fit"), "config": job.config.get("trace")}

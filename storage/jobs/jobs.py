@@ -16,6 +16,7 @@ from sqlalchemy.orm import Session
 
 from physworld_schemas.assessment import AssessmentCreate
 from physworld_schemas.base import Artifact, Page
+from physworld_schemas.check import CheckCreate
 from physworld_schemas.dataset import DatasetConfig
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.job import Job
@@ -29,6 +30,7 @@ from physworld_storage.jobs.flow import request_cancel
 from physworld_storage.jobs.helpers import SIMULATION
 from physworld_storage.jobs.kinds import (
     assessment,
+    check,
     dataset,
     fit,
     kind_of,
@@ -52,6 +54,11 @@ def create_fit(session: Session, scene_id: str, config: FitConfig, parent: JobRo
     Args: those of ``fit.KIND.open``.
     """
     return _job(session, fit.KIND.open(session, scene_id, config, parent))
+
+
+def create_check(session: Session, request: CheckCreate) -> Job:
+    """Open a check of a scene. Raises NotFound."""
+    return _job(session, check.KIND.open(session, request))
 
 
 def create_trace(session: Session, request: TraceCreate) -> Job:

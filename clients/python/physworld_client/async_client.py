@@ -12,7 +12,7 @@ import httpx
 from physworld_client import transport as wire
 from physworld_client.async_artifacts import AsyncArtifacts
 from physworld_client.async_live import AsyncLive
-from physworld_client.async_loop import AsyncAssessments, AsyncTraces
+from physworld_client.async_loop import AsyncAssessments, AsyncChecks, AsyncTraces
 from physworld_client.async_predict import AsyncPlans, AsyncRollouts
 from physworld_client.async_resources import (
     AsyncDatasets,
@@ -43,7 +43,7 @@ class AsyncClient:
         known_as: the service's name in that file; its address without it.
 
     Attributes:
-        scenes, fits, traces, datasets, models, assessments, rollouts, plans, live, jobs, pipelines, artifacts:
+        scenes, checks, fits, traces, datasets, models, assessments, rollouts, plans, live, jobs, pipelines, artifacts:
             the resources.
     """
 
@@ -68,6 +68,7 @@ class AsyncClient:
         self.known_as = known_as or found.known_as or wire.service_name(self.base_url)
         self.scenes = AsyncScenes(self)
         self.fits = AsyncFits(self)
+        self.checks = AsyncChecks(self)
         self.traces = AsyncTraces(self)
         self.datasets = AsyncDatasets(self)
         self.models = AsyncModels(self)

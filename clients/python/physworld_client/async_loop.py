@@ -1,4 +1,4 @@
-"""Closing the loop: traces of what a twin leaves, and recordings held against published models."""
+"""Closing the loop: checks of recordings, traces of what a twin leaves, recordings held against published models."""
 
 from __future__ import annotations
 
@@ -10,9 +10,30 @@ from physworld_client.async_resources import LATEST, AsyncResource
 from physworld_client.pages import AsyncListPage
 from physworld_client.types import Array
 from physworld_schemas.assessment import Assessment
+from physworld_schemas.check import Check, CheckConfig
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.job import Job
 from physworld_schemas.trace import Trace, TraceConfig
+
+
+class AsyncChecks(AsyncResource):
+    """What recordings can show before any fit."""
+
+    async def create(self, scene_id: str, config: CheckConfig | None = None) -> Job:
+        """Starts a check; its job's output is the check."""
+        return await self._client.send(calls.check_create(scene_id, config))
+
+    async def get(self, check_id: str) -> Check:
+        """One check: once it is ready, its report."""
+        return await self._client.send(calls.check_get(check_id))
+
+    async def list(
+        self, *, limit: int | None = None, cursor: str | None = None, scene_id: str | None = None
+    ) -> AsyncListPage[Check]:
+        """Checks, newest first."""
+        return await self._page(
+            lambda at: calls.check_list(limit=limit, cursor=at, scene_id=scene_id), cursor
+        )
 
 
 class AsyncTraces(AsyncResource):

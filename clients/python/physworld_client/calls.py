@@ -15,6 +15,7 @@ from pydantic import BaseModel, TypeAdapter
 from physworld_client.bundle import Upload
 from physworld_schemas.assessment import Assessment, AssessmentCreate
 from physworld_schemas.base import Page
+from physworld_schemas.check import Check, CheckConfig, CheckCreate
 from physworld_schemas.dataset import Dataset, DatasetConfig, DatasetCreate, Episode
 from physworld_schemas.fit import Fit, FitConfig, FitCreate
 from physworld_schemas.job import Job
@@ -58,6 +59,7 @@ ListCall = Callable[[str | None], Call[Page[Item]]]
 
 _SCENE = TypeAdapter(Scene)
 _FIT = TypeAdapter(Fit)
+_CHECK = TypeAdapter(Check)
 _TRACE = TypeAdapter(Trace)
 _DATASET = TypeAdapter(Dataset)
 _MODEL = TypeAdapter(Model)
@@ -68,6 +70,7 @@ _ASSESSMENT = TypeAdapter(Assessment)
 _JOB = TypeAdapter(Job)
 _SCENES = TypeAdapter(Page[Scene])
 _FITS = TypeAdapter(Page[Fit])
+_CHECKS = TypeAdapter(Page[Check])
 _TRACES = TypeAdapter(Page[Trace])
 _DATASETS = TypeAdapter(Page[Dataset])
 _EPISODES = TypeAdapter(Page[Episode])
@@ -117,6 +120,23 @@ def fit_get(fit_id: str) -> Call[Fit]:
 def fit_list(*, limit: int | None, cursor: str | None, state: str | None = None) -> Call[Page[Fit]]:
     """GET /v1/fits."""
     return Call("GET", "/v1/fits", _FITS, query=_given(limit=limit, cursor=cursor, state=state))
+
+
+def check_create(scene_id: str, config: CheckConfig | None) -> Call[Job]:
+    """POST /v1/checks."""
+    body = CheckCreate(scene_id=scene_id, config=config or CheckConfig())
+    return Call("POST", "/v1/checks", _JOB, body=body)
+
+
+def check_get(check_id: str) -> Call[Check]:
+    """GET /v1/checks/{id}."""
+    return Call("GET", f"/v1/checks/{_part(check_id)}", _CHECK)
+
+
+def check_list(*, limit: int | None, cursor: str | None, scene_id: str | None = None) -> Call[Page[Check]]:
+    """GET /v1/checks."""
+    query = _given(limit=limit, cursor=cursor, scene_id=scene_id)
+    return Call("GET", "/v1/checks", _CHECKS, query=query)
 
 
 def trace_create(

@@ -16,7 +16,7 @@ from physworld_client.calls import Call
 from physworld_client.known_keys import KnownKeys
 from physworld_client.live import Live
 from physworld_client.location import where
-from physworld_client.loop import Assessments, Traces
+from physworld_client.loop import Assessments, Checks, Traces
 from physworld_client.predict import Plans, Rollouts
 from physworld_client.resources import (
     Datasets,
@@ -44,7 +44,7 @@ class Client:
         known_as: the service's name in that file; its address without it.
 
     Attributes:
-        scenes, fits, traces, datasets, models, assessments, rollouts, plans, live, jobs, pipelines, artifacts:
+        scenes, checks, fits, traces, datasets, models, assessments, rollouts, plans, live, jobs, pipelines, artifacts:
             the resources.
     """
 
@@ -67,6 +67,7 @@ class Client:
         self.known_as = known_as or found.known_as or wire.service_name(self.base_url)
         self.scenes = Scenes(self)
         self.fits = Fits(self)
+        self.checks = Checks(self)
         self.traces = Traces(self)
         self.datasets = Datasets(self)
         self.models = Models(self)

@@ -1,5 +1,5 @@
 # Made of async_loop.py by `make sdk`: change that file.
-"""Closing the loop: traces of what a twin leaves, and recordings held against published models."""
+"""Closing the loop: checks of recordings, traces of what a twin leaves, recordings held against published models."""
 
 from __future__ import annotations
 
@@ -11,9 +11,28 @@ from physworld_client.pages import ListPage
 from physworld_client.resources import LATEST, Resource
 from physworld_client.types import Array
 from physworld_schemas.assessment import Assessment
+from physworld_schemas.check import Check, CheckConfig
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.job import Job
 from physworld_schemas.trace import Trace, TraceConfig
+
+
+class Checks(Resource):
+    """What recordings can show before any fit."""
+
+    def create(self, scene_id: str, config: CheckConfig | None = None) -> Job:
+        """Starts a check; its job's output is the check."""
+        return self._client.send(calls.check_create(scene_id, config))
+
+    def get(self, check_id: str) -> Check:
+        """One check: once it is ready, its report."""
+        return self._client.send(calls.check_get(check_id))
+
+    def list(
+        self, *, limit: int | None = None, cursor: str | None = None, scene_id: str | None = None
+    ) -> ListPage[Check]:
+        """Checks, newest first."""
+        return self._page(lambda at: calls.check_list(limit=limit, cursor=at, scene_id=scene_id), cursor)
 
 
 class Traces(Resource):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from fastapi import APIRouter
 
 from physworld_schemas.base import FieldError, Page
+from physworld_schemas.check import CheckConfig
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.library import (
     Effect,
@@ -58,7 +59,7 @@ def list_exports() -> Page[ExportFormat]:
     return Page(data=catalogue().exports)
 
 
-def require_known(**configs: FitConfig | TraceConfig) -> None:
+def require_known(**configs: FitConfig | TraceConfig | CheckConfig) -> None:
     """Refuse names that the catalogue does not have. Raises ApiProblem, 422, that names each.
 
     Args:
@@ -76,7 +77,7 @@ def require_known(**configs: FitConfig | TraceConfig) -> None:
         )
 
 
-def _named(config: FitConfig | TraceConfig) -> list[Named]:
+def _named(config: FitConfig | TraceConfig | CheckConfig) -> list[Named]:
     """Names in a configuration with their places."""
     if isinstance(config, FitConfig):
         return [(("law",), "law", config.law), (("plasticity",), "flow law", config.plasticity)]

@@ -37,6 +37,12 @@ def delete_scene(scene_id: ObjectId, database: DatabaseDep, actor: ActorDep) -> 
     return delete_object(database, actor, "scene", scene_id)
 
 
+@router.delete("/checks/{check_id}", status_code=204, tags=["checks"], response_class=Response)
+def delete_check(check_id: ObjectId, database: DatabaseDep, actor: ActorDep) -> Response:
+    """Delete a check."""
+    return delete_object(database, actor, "check", check_id)
+
+
 @router.delete("/fits/{fit_id}", status_code=204, tags=["fits"], response_class=Response)
 def delete_fit(fit_id: ObjectId, database: DatabaseDep, actor: ActorDep) -> Response:
     """Delete a fit that no trace, dataset or model uses."""

@@ -12,9 +12,33 @@ from physworld_client.errors import Conflict, NotFound
 from sdk_service import Service, write_scene
 from test_command_line import output_of, physworld, worker
 
+from physworld_schemas.check import CheckConfig
 from physworld_schemas.dataset import DatasetConfig
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.trace import TraceConfig
+
+
+def test_a_check_step_by_step(service: Service, client: Client, tmp_path: Path) -> None:
+    scene = client.scenes.create(write_scene(tmp_path / "checked", "checked"))
+    job = client.checks.create(scene.id, CheckConfig(motions=0, noise_m=1e-4))
+    check_id = job.outputs[0].id
+    assert client.checks.get(check_id).report is None
+    service.work()
+    client.jobs.wait(job, timeout=30)
+    check = client.checks.get(check_id)
+    assert check.report is not None and check.config.noise_m == 1e-4
+    usual = check.report.views[-1]
+    assert usual.effects[0].gates[0].detectable == 4.25 and usual.effects[1].multiple is None
+    assert [item.id for item in client.checks.list(scene_id=scene.id).data] == [check_id]
+    done = physworld(service, tmp_path, "checks", "list", "--scene", scene.id)
+    assert done.returncode == 0 and check_id in done.stdout, done.stderr
+    assert output_of(service, tmp_path, "checks", "show", check_id)["report"]["noise_m"] == 1e-4
+
+    async def asked() -> None:
+        async with AsyncClient(service.url, service.token) as other:
+            assert (await other.checks.get(check_id)).id == check_id
+
+    asyncio.run(asked())
 
 
 def test_a_trace_step_by_step(service: Service, client: Client, tmp_path: Path) -> None:

@@ -19,7 +19,19 @@ from pydantic import ValidationError
 import physworld_client.cli.actions
 import physworld_client.cli.loop
 import physworld_client.cli.registry  # noqa: F401  (adds commands to the groups)
-from physworld_client.cli import catalogue, effects, fit, importing, lists, predict, run, trace, up, video
+from physworld_client.cli import (
+    catalogue,
+    check,
+    effects,
+    fit,
+    importing,
+    lists,
+    predict,
+    run,
+    trace,
+    up,
+    video,
+)
 from physworld_client.cli.options import connected
 from physworld_client.cli.output import stderr
 from physworld_client.errors import PhysWorldError
@@ -34,6 +46,7 @@ app = typer.Typer(
 )
 app.command("up")(up.up)
 app.command("run")(run.run)
+app.command("check")(check.check)
 app.command("fit")(fit.fit)
 app.command("trace", cls=trace.ManyHeldOut)(trace.trace)
 connected(app, "rollout")(predict.rollout)

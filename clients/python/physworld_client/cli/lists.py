@@ -30,6 +30,7 @@ from physworld_client.client import Client
 from physworld_client.manifest import checked_name
 from physworld_client.pages import ListPage
 from physworld_schemas.base import Artifact
+from physworld_schemas.check import Check
 from physworld_schemas.dataset import Dataset, Episode
 from physworld_schemas.fit import Fit
 from physworld_schemas.job import Job
@@ -95,6 +96,15 @@ def _fit(fit: Fit) -> Sequence[object]:
     return (fit.id, fit.scene_id, fit.state, ", ".join(parameters), ago(fit.created_at))
 
 
+def _check(check: Check) -> Sequence[object]:
+    visible = counted = ""
+    if check.report is not None:
+        effects = check.report.views[-1].effects
+        visible = str(sum(effect.status == "visible" for effect in effects))
+        counted = str(len(effects))
+    return (check.id, check.scene_id, check.state, visible, counted, ago(check.created_at))
+
+
 def _trace(trace: Trace) -> Sequence[object]:
     effects = ", ".join(effect.name for effect in trace.effects)
     verdict = (trace.verdict or "", effects, held_out_errors(trace))
@@ -149,6 +159,13 @@ SCENES = Listing(
     _scene,
 )
 FITS = Listing("list", "Fits, newest first.", ("id", "scene", "state", "parameters", "age"), _fit)
+CHECKS = Listing(
+    "list",
+    "Checks, newest first.",
+    ("id", "scene", "state", "visible", "effects", "age"),
+    _check,
+    filters=(("scene", "scene_id", "Only checks of this scene."),),
+)
 TRACES = Listing(
     "list",
     "Traces, newest first.",
@@ -190,6 +207,7 @@ RESOURCES = (
     Resource(
         "fits", "Calibrated twins.", (FITS,), "fit", files="the files of a fit: the twin and its report"
     ),
+    Resource("checks", "What recordings can show before any fit.", (CHECKS,), "check"),
     Resource(
         "traces",
         "Residuals traced to effects.",
