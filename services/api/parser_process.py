@@ -29,7 +29,7 @@ import trimesh  # noqa: F401
 from physworld_scenes.bundle import canonical_archive, checked
 from physworld_scenes.errors import SceneInvalid
 from physworld_scenes.importers import ImportOptions, import_any
-from physworld_scenes.importers.c3d import limit_here
+from physworld_scenes.importers.library import limit_here
 from physworld_schemas.base import FieldError
 
 UPLOAD, ARCHIVE, FOUND = "upload", "scene.zip", "found.json"
