@@ -1,8 +1,10 @@
-"""Made motion of a cloth under a rigid gripper, and writers of it in the layouts that motion capture programs export.
+"""Made motion of a cloth under a rigid gripper, and writers of it in the layouts that motion capture programs
+export.
 
-Each writer takes tracks in the scene's world (metres, z up) and turns and scales them into the file's axes and unit, so that
-an import has to give them back. Gaps are nan. The layouts are those of the programs' own exports: ``motive`` of OptiTrack
-Motive's format versions 1.1 to 1.25, ``vicon`` of Nexus' ASCII export, ``qualisys`` of QTM's TSV, ``trc`` of OpenSim.
+Each writer takes tracks in the scene's world (metres, z up) and turns and scales them into the file's axes and unit,
+so that an import has to give them back. Gaps are nan. The layouts are those of the programs' own exports: ``motive``
+of OptiTrack Motive's format versions 1.1 to 1.25, ``vicon`` of Nexus' ASCII export, ``qualisys`` of QTM's TSV,
+``trc`` of OpenSim.
 """
 
 from __future__ import annotations
@@ -105,11 +107,11 @@ def motive(
     places: Array | None = None,
     digits: int = 6,
 ) -> bytes:
-    """OptiTrack Motive's CSV: the rigid body Gripper (its pose, its solved markers, its measured ones), then the body's markers.
+    """OptiTrack Motive's CSV: the rigid body Gripper (pose, solved markers, measured ones), then the body's markers.
 
     Args:
-        version: from 1.24 on the rows have words in front and there may be time codes, from 1.25 on a row of parents; before 1.2
-            no IDs.
+        version: from 1.24 on the rows have words in front and there may be time codes, from 1.25 on a row of parents;
+            before 1.2 no IDs.
         places: (T, N, 3) [m] instead of the motion's points.
         unlabelled: how many markers without names to add.
     """
@@ -188,7 +190,7 @@ def motive(
 def vicon(
     motion: Motion, *, up: str = "z", places: Array | None = None, others: bool = True, delimiter: str = ","
 ) -> bytes:
-    """Vicon Nexus' CSV in millimetres: a section of devices first, then Trajectories, with subjects before the names."""
+    """Vicon Nexus' CSV in millimetres: a section of devices, then Trajectories, with subjects before the names."""
     labels, tracks = motion.tracks("Hand:grip{}", "Cloth:M{}")
     tracks = tracks if places is None else places
     values = in_file(tracks, up, "mm")

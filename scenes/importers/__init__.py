@@ -61,7 +61,7 @@ def import_any(
 def look_at(
     data: bytes, filename: str = "", options: ImportOptions | None = None
 ) -> tuple[str, list[tuple[str, str, str, str]], list[str]]:
-    """What an import would guess: the form's title, (what, value, how, option) of each guess, and lines of what is left out.
+    """What an import would guess: the form's title, (what, value, how, option) of each guess, what is left out.
 
     Args:
         data, filename, options: as of ``import_any``.

@@ -1,7 +1,7 @@
 """Import of C3D motion capture, parsed by ezc3d in a child process.
 
-Units come from POINT:UNITS, the rate from POINT:RATE, the axis that points up from POINT:X_SCREEN and Y_SCREEN where they tell
-it, else it is taken to be z. A sample whose residual is negative or which is not a number is a gap.
+Units come from POINT:UNITS, the rate from POINT:RATE, the axis that points up from POINT:X_SCREEN and Y_SCREEN where
+they tell it, else it is taken to be z. A sample whose residual is negative or which is not a number is a gap.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ def parsed(form: str, data: bytes, where: str) -> tuple[dict[str, Array], dict[s
     if len(data) > MOST_BYTES:
         raise _invalid(where, f"has {len(data)} bytes, at most {MOST_BYTES} are read")
     with tempfile.TemporaryDirectory(prefix="physworld-import-") as folder:
-        source = Path(folder) / "recording"
+        source = Path(folder) / f"recording.{form}"
         source.write_bytes(data)
         return _here(form, source, where) if _limited_here else _in_child(form, source, where)
 

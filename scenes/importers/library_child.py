@@ -1,8 +1,8 @@
 """Child process of the imports that a library parses: C3D by ezc3d, HDF5 by h5py, MCAP by mcap.
 
-``python -m physworld_scenes.importers.library_child FORM SOURCE TARGET`` writes the arrays that it found to TARGET (npz) and prints what
-else there is to say as JSON. Its memory is limited; it ends with status 1 and one line on stderr when the file
-cannot be read.
+``python -m physworld_scenes.importers.library_child FORM SOURCE TARGET`` writes the arrays that it found to TARGET
+(npz) and prints what else there is to say as JSON. Its memory is limited; it ends with status 1 and one line on
+stderr when the file cannot be read.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Content = tuple[dict[str, Array], dict[str, Any]]
 
 
 def reader_of(form: str) -> Callable[[str], Content]:
-    """What reads a form: from the path of a file to arrays by name and facts; it raises ValueError and the library's."""
+    """What reads a form: from a file's path to arrays by name and facts; it raises ValueError and the library's."""
     if form == "c3d":
         from physworld_scenes.importers.c3d_content import content_of as c3d
 

@@ -29,16 +29,18 @@ class ImportOptions:
     Attributes:
         name, kind: of the scene.
         importer: name of the form that reads the file; None: the content decides.
-        fps: frame rate [Hz]; pictures and PhysTwin (30) take it where the file has none, tables of markers instead of the file's.
+        fps: frame rate [Hz]; pictures and PhysTwin (30) take it where the file has none, tables of markers instead of
+            the file's.
         noise_sigma_m: tracking noise per axis [m]; None estimates it.
         gravity_m_s2: in the scene's frame, z up.
         body: keys of ``scene.json``'s ``body``.
-        controllers: tables of markers: names of the driven or clamped markers, of groups of them, or of rigid bodies; ('none',): there
-            is none; None: guessed.
+        controllers: tables of markers: names of the driven or clamped markers, of groups of them, or of rigid bodies;
+            ('none',): there is none; None: guessed.
         markers: tables of markers: likewise of those on the body, in the order that they shall have; None: all others.
         up: the axis of the recording that points up, one of x, y, z, -x, -y, -z; None: guessed.
         unit: of a table of markers: m, cm, mm, in or ft; None: as the file says, or guessed.
-        assume: whether facts of the body that nobody said stay open; else a table of markers without them is refused.
+        assume: whether facts of the body that nobody said stay open, with a warning; else a table of markers without
+            them is refused.
     """
 
     name: str | None = None
@@ -52,7 +54,7 @@ class ImportOptions:
     markers: tuple[str, ...] | None = None
     up: str | None = None
     unit: str | None = None
-    assume: bool = False
+    assume: bool = True
 
 
 @dataclass(frozen=True)
@@ -66,8 +68,8 @@ class Importer:
         recognises: whether the bytes of a file of that name are of this form; the first importer that says so reads it.
         read: bytes, the scene's name where the file has none, and options, to the scene and its warnings. Raises
             SceneInvalid, with every fault.
-        look: likewise, to what would be guessed: what, value, how, the option that says otherwise; and lines of what is left
-            out. None: of this form nothing is guessed.
+        look: likewise, to what would be guessed: what, value, how, the option that says otherwise; and lines of what is
+            left out. None: of this form nothing is guessed.
     """
 
     name: str

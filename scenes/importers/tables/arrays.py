@@ -1,8 +1,9 @@
 """Import of marker tracks as arrays: an npz, or the datasets of an HDF5 file.
 
 Tracks are an array of three dimensions (frames, markers and 3, in any order), an array (frames, 3) of one marker, or
-(frames, 3 markers) with names. Beside them, by their names: times, the frame rate, the markers' names, what is seen, unit, up. Two arrays of three
-dimensions are two sets, named as the arrays are; one that is called after a controller or a gripper drives.
+(frames, 3 markers) with names. Beside them, by their names: times, the frame rate, the markers' names, what is seen,
+unit, up. Two arrays of three dimensions are two sets, named as the arrays are; one that is called after a controller
+or a gripper drives.
 """
 
 from __future__ import annotations
@@ -171,10 +172,9 @@ def _tracks(where: str, arrays: dict[str, Array], facts: _Facts) -> dict[str, Ar
         )
     length = frames if frames is not None else max(len(track) for track in found.values())
     other = [name for name, track in found.items() if len(track) != length]
-    if frames is None or len(other) == len(found):
-        if other:
-            shapes = ", ".join(f"{shortened(name)} {found[name].shape}" for name in found)
-            raise refused(where, f"the tracks have not all {length} frames: {shapes}")
+    if other and (frames is None or len(other) == len(found)):
+        shapes = ", ".join(f"{shortened(name)} {found[name].shape}" for name in found)
+        raise refused(where, f"the tracks have not all {length} frames: {shapes}")
     for name in other:
         facts.left.append(name)
         del found[name]

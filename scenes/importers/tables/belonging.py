@@ -1,7 +1,7 @@
 """Which markers belong to the body and which to what holds it: as a person says, as the file says, or by rigidity.
 
-Markers that keep their distances while others do not are rigid together. One such group is the gripper; where all markers
-are in such groups and one of them stays where it is, that one is the clamp. Anything else has to be said.
+Markers that keep their distances while others do not are rigid together. One such group is the gripper; where all
+markers are in such groups and one of them stays where it is, that one is the clamp. Anything else has to be said.
 """
 
 from __future__ import annotations
@@ -33,6 +33,8 @@ LEAST_GROUP = 3
 RIGID_SHARE = 1e-3
 """Of the distance of two markers, by which it may change while they are rigid together."""
 RIGID_SIGMAS = 5.0
+LINE_SHARE = 0.05
+"""Second extent of a group over its first, up to which it is a line."""
 DEFORMING_FACTOR = 5.0
 """By which a rigid pair's distance changes less than the usual pair's."""
 
@@ -64,7 +66,8 @@ def belonging(
     Args:
         table: the file's tracks.
         where: the file's name, in errors.
-        gripper: names of markers, groups or rigid bodies that hold the object, with * for any letters; ('none',): nothing does.
+        gripper: names of markers, groups or rigid bodies that hold the object, with * for any letters; ('none',):
+            nothing does.
         body: likewise of those on the object.
 
     Raises:
@@ -77,7 +80,8 @@ def belonging(
         kept = sorted({*kept, *said_body})
     bodies: tuple[RigidBody, ...] = ()
     if gripper is not None and [name.lower() for name in gripper] == ["none"]:
-        held, how = [], "given"
+        held: list[int] = []
+        how = "given"
     elif gripper is not None:
         held, bodies = _chosen(table, where, gripper, "gripper")
         how = "given"
@@ -200,7 +204,7 @@ def _guessed(
     )
     raise refused(
         where,
-        f"names no controller: say which of its markers hold the body (--gripper NAMES, or none): {seen}; {_there(table)}",
+        f"names no controller: say which markers hold the body (--gripper NAMES, or none): {seen}; {_there(table)}",
     )
 
 
@@ -246,7 +250,15 @@ def rigid_groups(places: Array, seen: Array) -> list[list[int]]:
     allowed = np.maximum(RIGID_SIGMAS * noise, RIGID_SHARE * distance)
     usual = float(np.quantile(finite, 0.9))
     rigid = (spread <= allowed) & (DEFORMING_FACTOR * spread <= usual)
-    return _cliques(rigid)
+    return [group for group in _cliques(rigid) if _off_a_line(places[:, group], seen[:, group])]
+
+
+def _off_a_line(places: Array, seen: Array) -> bool:
+    """Whether markers do not lie on a line in the frame that shows most of them; a stretched row keeps its distances."""
+    frame = int(np.argmax(seen.sum(axis=1)))
+    there = places[frame, seen[frame]]
+    extents = np.linalg.svd(there - there.mean(axis=0), compute_uv=False)
+    return bool(len(there) >= LEAST_GROUP and extents[1] > LINE_SHARE * extents[0])
 
 
 def _cliques(rigid: Array) -> list[list[int]]:

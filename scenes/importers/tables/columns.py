@@ -1,4 +1,4 @@
-"""What the head of a column means: whose coordinate, along which axis, in which unit; a time, a count, a marker's name."""
+"""What the head of a column means: whose coordinate, along which axis, in which unit; a time, a count, a name."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ AXIS_FIRST = re.compile(
 )
 AXIS_ALONE = re.compile(r"^(?:t|p|pos|position|coord)?[ _.]?(?P<axis>[xyz])$", re.IGNORECASE)
 NO_PLACE = re.compile(
-    r"(^|[ _.:/])(v|vel|velocity|acc|accel|acceleration|rot|rotation|euler|angles?|force|moment|torque|omega|gyro|q|quat"
-    r"|quaternion|orientation|normal|speed)([ _.:/]|$)",
+    r"(^|[ _.:/])(v|vel|velocity|acc|accel|acceleration|rot|rotation|euler|angles?|force|moment|torque|omega|gyro"
+    r"|q|quat|quaternion|orientation|normal|speed)([ _.:/]|$)",
     re.IGNORECASE,
 )
 """Heads of other vectors than places."""

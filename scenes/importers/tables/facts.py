@@ -46,8 +46,8 @@ def asked_facts(where: str, points: Array, options: ImportOptions) -> tuple[Kind
     boxed = facts.get("box_min_m") is not None and facts.get("box_max_m") is not None
     if options.kind in NEEDS_BOX and not boxed and points.shape[1] < COVERED_BY:
         missing.append(
-            f"the box of the {kind}, which {points.shape[1]} markers do not span (--box-m X,Y,Z,X,Y,Z, its corners in the "
-            f"scene's world [m], z up; the markers of the first frame lie between {_corner(points[0].min(axis=0))} and "
+            f"the box of the {kind}, which {points.shape[1]} markers do not span (--box-m X,Y,Z,X,Y,Z, its corners in "
+            f"the scene's world [m]; the markers of the first frame lie between {_corner(points[0].min(axis=0))} and "
             f"{_corner(points[0].max(axis=0))})"
         )
     if not missing:

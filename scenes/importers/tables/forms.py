@@ -26,7 +26,7 @@ def form(
     """An importer of one form: its ``read_table``, then what all share."""
 
     def read(data: bytes, scene_name: str, options: ImportOptions | None) -> tuple[Scene, list[str]]:
-        given = options or ImportOptions(assume=True)
+        given = options or ImportOptions()
         return scene_of(reading_of(read_table(data, name), name, given), name, scene_name, given)
 
     def look(

@@ -16,7 +16,7 @@ from physworld_scenes.importers.tables.table import METRES_PER_UNIT, MarkerTable
 
 USUAL_EXTENT_M, EXTENT_FACTOR = 0.7, 3.5
 USUAL_ACCELERATION_M_S2, ACCELERATION_FACTOR = 5.0, 4.0
-"""Of what markers span, and of their faster accelerations: the usual value, and the factor of one standard deviation."""
+"""Of what markers span, and of their faster accelerations: the usual value, the factor of one standard deviation."""
 USUAL_UNITS = {"m": 0.45, "mm": 0.45, "cm": 0.1}
 SURE = 0.9
 ACCELERATION_STEP_S = 0.04
@@ -123,7 +123,7 @@ def up(
     if table.up is not None:
         against = None
         if hangs is not None and hangs[-1] != table.up[-1]:
-            against = f"up is {table.up} by {table.up_from}, but the body hangs from its gripper along {hangs}: --up {hangs}?"
+            against = f"up is {table.up}, {table.up_from}; the body hangs from its gripper along {hangs}: --up {hangs}?"
         return table.up, table.up_from, against
     if hangs is not None:
         return hangs, "guessed: the body hangs from its gripper along it", None

@@ -103,5 +103,5 @@ def _body(where: str, name: str, clock: Array, own: Array, places: Array, turns:
     if len(own) != len(clock) or not np.array_equal(own, clock):
         turns = np.stack([np.interp(clock, own, turns[:, column]) for column in range(4)], axis=1)
         turns = turns / np.linalg.norm(turns, axis=1, keepdims=True)
-    seen = np.isfinite(places).all(axis=1)
+    seen: Array = np.asarray(np.isfinite(places).all(axis=1))
     return RigidBody(name, np.where(seen[:, None], places, 0.0), turns, seen)

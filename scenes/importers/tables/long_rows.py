@@ -52,7 +52,7 @@ def read_long(
         again = int(np.flatnonzero(cell == cell[at])[1])
         raise refused(
             where,
-            f"lines {lines[at]} and {lines[again]} are both of marker {shortened(order[markers[at]])} at {clocks[at]:g}",
+            f"lines {lines[at]} and {lines[again]} are both of {shortened(order[markers[at]])} at {clocks[at]:g}",
         )
     places = np.full((len(moments) * len(order), 3), np.nan)
     places[cell] = values

@@ -1,8 +1,8 @@
 """What mcap reads of a log: the topics of poses and point clouds, as JSON or as ROS 2 messages.
 
 A message counts as a pose if it has ``pose.position`` (geometry_msgs/PoseStamped) or ``transform.translation``
-(TransformStamped), as points if it has ``points`` with x, y and z (sensor_msgs/PointCloud, foxglove's arrays of points) or,
-of ROS 2, is a sensor_msgs/PointCloud2. Its time is that of its header, else that at which it was logged.
+(TransformStamped), as points if it has ``points`` with x, y and z (sensor_msgs/PointCloud, foxglove's arrays of
+points) or, of ROS 2, is a sensor_msgs/PointCloud2. Its time is that of its header, else that at which it was logged.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def is_mcap(data: bytes, filename: str) -> bool:
 
 
 def content_of(source: str) -> tuple[dict[str, Array], dict[str, Any]]:
-    """Of every topic: ``N.times`` (M,) [s], ``N.places`` (M, P, 3), of a pose ``N.turns`` (M, 4), scalar first; their names.
+    """Of every topic: ``N.times`` (M,) [s], ``N.places`` (M, P, 3), of a pose ``N.turns`` (M, 4), scalar first.
 
     Raises:
         ValueError: mcap is not there, or there is too much in it.
@@ -61,18 +61,19 @@ def content_of(source: str) -> tuple[dict[str, Array], dict[str, Any]]:
                 left[channel.topic] = schema.name if schema is not None else channel.message_encoding
                 continue
             stamp, place, turn = found
+            topic = channel.topic
             points += len(place)
             if points > MOST_POINTS:
                 raise ValueError(f"holds more than {MOST_POINTS} points")
-            if channel.topic in places and len(place) != len(places[channel.topic][0]):
-                first = len(places[channel.topic][0])
+            if topic in places and len(place) != len(places[topic][0]):
+                first, number = len(places[topic][0]), len(places[topic]) + 1
                 raise ValueError(
-                    f"{channel.topic[:80]} has {first} points in its first message, {len(place)} in number {len(places[channel.topic]) + 1}"
+                    f"{topic[:80]} has {first} points in its first message, {len(place)} in number {number}"
                 )
-            times.setdefault(channel.topic, []).append(message.log_time * 1e-9 if stamp is None else stamp)
-            places.setdefault(channel.topic, []).append(place)
+            times.setdefault(topic, []).append(message.log_time * 1e-9 if stamp is None else stamp)
+            places.setdefault(topic, []).append(place)
             if turn is not None:
-                turns.setdefault(channel.topic, []).append(turn)
+                turns.setdefault(topic, []).append(turn)
     arrays: dict[str, Array] = {}
     names = sorted(places)
     for number, topic in enumerate(names):

@@ -1,10 +1,11 @@
 """Import of OptiTrack Motive's CSV.
 
-The first line is pairs of names and values, from ``Format Version``. Then come rows that say what each column is: type
-(Marker, Rigid Body, Rigid Body Marker, Bone ...), name, ID, in versions from 1.25 the parent, the kind of value
-(Position, Rotation, Mean Marker Error ...), and at last ``Frame, Time (Seconds)`` with X, Y, Z, W. Versions before 1.24
-have no words in front of these rows, later ones do, and may have a column of time codes: rows and columns are found by
-what they hold, not by their number. Motive's world has y up unless it was exported otherwise, which the file does not say.
+The first line is pairs of names and values, from ``Format Version``. Then come rows that say what each column is:
+type (Marker, Rigid Body, Rigid Body Marker, Bone ...), name, ID, in versions from 1.25 the parent, the kind of value
+(Position, Rotation, Mean Marker Error ...), and at last ``Frame, Time (Seconds)`` with X, Y, Z, W. Versions before
+1.24 have no words in front of these rows, later ones do, and may have a column of time codes: rows and columns are
+found by what they hold, not by their number. Motive's world has y up unless it was exported otherwise, which the file
+does not say.
 
 Of a rigid body the solved markers (``Rigid Body Marker``) take the place of the measured ones of the same name.
 """
@@ -205,7 +206,7 @@ def _body(where: str, numbers: Array, thing: _Columns) -> RigidBody:
     """The poses of a rigid body; a frame without one is not seen."""
     places = _triple(numbers, thing.place)
     turns = None
-    seen = np.isfinite(places).all(axis=1)
+    seen: Array = np.asarray(np.isfinite(places).all(axis=1))
     if thing.turn is not None:
         xyzw = numbers[:, thing.turn : thing.turn + 4]
         length = np.linalg.norm(np.where(np.isfinite(xyzw), xyzw, 0.0), axis=1)

@@ -1,8 +1,9 @@
 """Import of plain columns: CSV, TSV or text with a time and x, y, z of every marker, wide or long.
 
-Wide: one row a frame; the three columns of a marker are told by their names (``tip_x``, ``tip.X``, ``X_tip``, ``x1``, ``tip x [mm]``,
-``tip_pos_x`` ...), or by two rows of heads, the marker's name over ``x, y, z``. Long: one row a marker and frame, with a column
-that names the marker. Without heads the columns are x, y, z of one marker after another, after a time if the first one is one.
+Wide: one row a frame; the three columns of a marker are told by their names (``tip_x``, ``tip.X``, ``X_tip``, ``x1``,
+``tip x [mm]``, ``tip_pos_x`` ...), or by two rows of heads, the marker's name over ``x, y, z``. Long: one row a
+marker and frame, with a column that names the marker. Without heads the columns are x, y, z of one marker after
+another, after a time if the first one is one.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Import of Qualisys Track Manager's TSV with 3D data.
 
-Lines of a name and its values (``NO_OF_FRAMES``, ``FREQUENCY``, ``MARKER_NAMES`` ...), then rows of X, Y, Z of every marker in
-millimetres. Options of QTM add a row of column heads, columns of frame and time in front, and the types of the
-trajectories; without them a missing place is empty or zero. QTM's world has z up.
+Lines of a name and its values (``NO_OF_FRAMES``, ``FREQUENCY``, ``MARKER_NAMES`` ...), then rows of X, Y, Z of every
+marker in millimetres. Options of QTM add a row of column heads, columns of frame and time in front, and the types of
+the trajectories; without them a missing place is empty or zero. QTM's world has z up.
 """
 
 from __future__ import annotations

@@ -1,13 +1,14 @@
-"""From the tracks in a file to a scene: who is what, metres, z up, seconds, what is seen; and what was guessed on the way.
+"""From the tracks in a file to a scene: who is what, metres, z up, seconds, what is seen; and what was guessed on
+the way.
 
-``reading_of`` finds all of it and needs nothing that only a person knows; ``scene_of`` asks for the facts of the body and
-makes the scene.
+``reading_of`` finds all of it and needs nothing that only a person knows; ``scene_of`` asks for the facts of the body
+and makes the scene.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -184,7 +185,7 @@ def scene_of(reading: Reading, where: str, name: str, options: ImportOptions) ->
         "grips": None,
         "notes": {
             "source": {"format": reading.form, "unit": reading.unit, "up": reading.up},
-            "guessed": {guess.what: f"{guess.value} ({guess.how})" for guess in guessed},
+            "guessed": [asdict(guess) for guess in guessed],
             "left_out": [shortened(line, 400) for line in reading.lines],
             "point_labels": list(reading.labels[:MOST_NAMED_IN_NOTES]),
             "controller_labels": list(reading.controller_labels[:MOST_NAMED_IN_NOTES]),

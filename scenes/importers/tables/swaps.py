@@ -1,8 +1,8 @@
 """Labels that changed hands: a marker that jumps to where another one was to be expected.
 
-Each marker's next place is expected on a straight line through its last two. Where it turns up at the place that is expected of
-another marker, and far from its own, its label was put on that other one; from there until the next such jump its samples
-are not seen. A marker that is wrong for most of the time is dropped.
+Each marker's next place is expected on a straight line through its last two. Where it turns up at the place that is
+expected of another marker, and far from its own, its label was put on that other one; from there until the next such
+jump its samples are not seen. A marker that is wrong for most of the time is dropped.
 """
 
 from __future__ import annotations

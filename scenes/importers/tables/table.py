@@ -138,7 +138,7 @@ def checked_labels(where: str, labels: list[str]) -> tuple[str, ...]:
         if name in first:
             raise refused(
                 where,
-                f"two markers are called {shortened(name)!r}: numbers {first[name] + 1} and {index + 1} of {len(labels)}",
+                f"two markers are called {shortened(name)!r}: {first[name] + 1} and {index + 1} of {len(labels)}",
             )
         first[name] = index
         found.append(name)
@@ -160,12 +160,12 @@ def checked_places(where: str, labels: tuple[str, ...], places: Array) -> tuple[
         frame, marker = np.argwhere(largest > FARTHEST)[0]
         raise refused(
             where,
-            f"marker {shortened(labels[marker])} is at {largest[frame, marker]:.3g} in frame {frame}, beyond {FARTHEST:g}",
+            f"{shortened(labels[marker])} is at {largest[frame, marker]:.3g} in frame {frame}, beyond {FARTHEST:g}",
         )
     lines = []
     zero = seen & (largest == 0.0)
     if zero.any():
-        seen = seen & ~zero
+        seen = np.asarray(seen & ~zero)
         lines.append(
             f"{int(zero.sum())} samples of {int(zero.any(axis=0).sum())} markers are exactly 0, 0, 0: not seen"
         )

@@ -1,8 +1,8 @@
 """Import of TRC, the tracks that OpenSim, Cortex and Motive exchange.
 
 Five lines of heads: ``PathFileType``, names of the facts, their values (``DataRate``, ``NumFrames``, ``NumMarkers``,
-``Units`` ...), ``Frame#, Time`` with the markers' names over the first of three columns, and X1, Y1, Z1 ...; an empty line
-may follow. An empty cell is a place that is not seen. OpenSim's world has y up.
+``Units`` ...), ``Frame#, Time`` with the markers' names over the first of three columns, and X1, Y1, Z1 ...; an empty
+line may follow. An empty cell is a place that is not seen. OpenSim's world has y up.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Import of Vicon Nexus' CSV: its section ``Trajectories``.
 
-A section is a line with its name, a line with its rate, and three rows of heads: names (``SUBJECT:MARKER`` over the first
-of three columns), ``Frame, Sub Frame, X, Y, Z ...`` and units; rows of numbers follow up to an empty line. Other sections
-(devices, model outputs), velocities (X') and accelerations (X'') are left out. Vicon's world has z up.
+A section is a line with its name, a line with its rate, and three rows of heads: names (``SUBJECT:MARKER`` over the
+first of three columns), ``Frame, Sub Frame, X, Y, Z ...`` and units; rows of numbers follow up to an empty line.
+Other sections (devices, model outputs), velocities (X') and accelerations (X'') are left out. Vicon's world has z up.
 """
 
 from __future__ import annotations

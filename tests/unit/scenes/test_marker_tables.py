@@ -17,7 +17,7 @@ from physworld_scenes.importers.axes import ROTATION_FROM_UP
 pytestmark = pytest.mark.slow
 
 MOTION = files.made()
-FACTS = ImportOptions(kind="sheet", body={"mass_kg": 0.08, "thickness_m": 1e-3, "side_m": 0.4})
+FACTS = ImportOptions(kind="sheet", body={"mass_kg": 0.08, "thickness_m": 1e-3, "side_m": 0.4}, assume=False)
 MICROMETRE = 1e-6
 """Six digits of a metre: half of it, and the float of the arithmetic."""
 
@@ -107,7 +107,7 @@ def test_qualisys(version: str | None, heads: bool, timed: bool) -> None:
 @pytest.mark.parametrize("missing", ["", "0.000", "NULL"])
 def test_qualisys_writes_what_it_does_not_see_in_three_ways(missing: str) -> None:
     motion = with_gaps()
-    labels, tracks = motion.tracks()
+    _, tracks = motion.tracks()
     assert_truth(imported(files.qualisys(motion, missing=missing, places=tracks), "trial.tsv"), motion)
 
 
