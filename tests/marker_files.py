@@ -33,7 +33,7 @@ class Motion:
     Attributes:
         times: (T,) [s].
         points: on the body, (T, N, 3).
-        gripper: markers of the gripper, (T, 4, 3).
+        gripper: markers of the gripper, (T, K, 3).
         origin, turns: the gripper's pose: (T, 3), and quaternions (T, 4), scalar first.
     """
 
@@ -50,8 +50,8 @@ class Motion:
         return round(1.0 / (self.times[1] - self.times[0]), 6)
 
     def tracks(self, gripper: str = "Gripper:Marker {}", body: str = "M{}") -> tuple[list[str], Array]:
-        """All markers, gripper first: labels with numbers from 1, and places (T, 4 + N, 3)."""
-        labels = [gripper.format(i + 1) for i in range(4)] + [
+        """All markers, gripper first: labels with numbers from 1, and places (T, K + N, 3)."""
+        labels = [gripper.format(i + 1) for i in range(self.gripper.shape[1])] + [
             body.format(i + 1) for i in range(self.points.shape[1])
         ]
         return labels, np.concatenate([self.gripper, self.points], axis=1)
@@ -136,7 +136,7 @@ def motive(
         error = "Error Per Marker" if number < (1, 23) else "Mean Marker Error"
         columns.append(("Rigid Body", "Gripper", "1", error, "", np.full(frames, 1e-4)))
     for kind, wanted in (("Rigid Body Marker", solved), ("Marker", measured)):
-        for index in range(4 if wanted else 0):
+        for index in range(motion.gripper.shape[1] if wanted else 0):
             noise = 0.0 if kind != "Marker" else 1e-3
             thing(
                 kind,

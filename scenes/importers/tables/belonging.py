@@ -254,7 +254,7 @@ def rigid_groups(places: Array, seen: Array) -> list[list[int]]:
 
 
 def _off_a_line(places: Array, seen: Array) -> bool:
-    """Whether markers do not lie on a line in the frame that shows most of them; a stretched row keeps its distances."""
+    """Whether markers do not lie on a line, in the frame that shows most: a stretched row keeps its distances, too."""
     frame = int(np.argmax(seen.sum(axis=1)))
     there = places[frame, seen[frame]]
     extents = np.linalg.svd(there - there.mean(axis=0), compute_uv=False)

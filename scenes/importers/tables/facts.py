@@ -20,8 +20,10 @@ NEEDS_THICKNESS = ("sheet",)
 NEEDS_BOX = ("beam", "block", "blob", "toy")
 COVERED_BY = 30
 """Markers that span a volume of their own; fewer need the box of the body."""
-CHAIN_SPREAD = 0.1
-"""Of the distance between neighbours along a rope, by which it may change."""
+CHAIN_SPREAD, CHAIN_SPREAD_MOST = 0.1, 0.3
+"""Of the distance between neighbours along a rope, by which the usual one may change, and any."""
+MOST_DETOUR = 1.3
+"""Of the markers' order over the way from each to the nearest, up to which it is that along the rope."""
 
 
 def asked_facts(where: str, points: Array, options: ImportOptions) -> tuple[Kind, dict[str, Any], list[str]]:
@@ -75,13 +77,34 @@ def chain_facts(
     if not both.any(axis=0).all():
         return facts, None
     low, middle, high = np.nanquantile(apart, [0.05, 0.5, 0.95], axis=0)
-    spread = float(((high - low) / np.maximum(middle, 1e-12)).max())
-    if spread > CHAIN_SPREAD or (middle <= 0.0).any():
-        how = f"not along it: neighbours' distances change by up to {spread:.0%}; name them in their order"
+    spreads = (high - low) / np.maximum(middle, 1e-12)
+    usual, most = float(np.median(spreads)), float(spreads.max())
+    detour = float(middle.sum()) / max(_shortest(points, visible), 1e-12)
+    if usual > CHAIN_SPREAD or most > CHAIN_SPREAD_MOST or detour > MOST_DETOUR:
+        how = (
+            f"not along it: neighbours' distances change by {usual:.0%}, up to {most:.0%}, and sum to {detour:.2g} times the "
+            "way from each marker to the nearest; name them in their order"
+        )
         return facts, Guess("order", "unknown", how, "--body")
     facts = facts | {"segment_rest_lengths_m": [round(float(length), 6) for length in middle]}
-    how = f"neighbours keep their distance within {spread:.1%}: {1e3 * middle.min():.4g} to {1e3 * middle.max():.4g} mm"
+    how = (
+        f"neighbours keep their distance within {usual:.1%}, at most {most:.1%}: "
+        f"{1e3 * middle.min():.4g} to {1e3 * middle.max():.4g} mm"
+    )
     return facts, Guess("order", "along it, as listed", how, "--body")
+
+
+def _shortest(points: Array, visible: Array) -> float:
+    """Length [m] of the way from the first marker to the nearest one, and so on, in the frame that shows most."""
+    frame = int(np.argmax(visible.sum(axis=1)))
+    left = list(points[frame, visible[frame]])
+    here, length = left.pop(0), 0.0
+    while left:
+        away = np.linalg.norm(np.array(left) - here, axis=1)
+        nearest = int(np.argmin(away))
+        length += float(away[nearest])
+        here = left.pop(nearest)
+    return length
 
 
 def _corner(point: Array) -> str:

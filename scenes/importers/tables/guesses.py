@@ -20,6 +20,7 @@ USUAL_ACCELERATION_M_S2, ACCELERATION_FACTOR = 5.0, 4.0
 USUAL_UNITS = {"m": 0.45, "mm": 0.45, "cm": 0.1}
 SURE = 0.9
 ACCELERATION_STEP_S = 0.04
+HANGING = (None, "rope", "branched_rope", "sheet")
 HANGS = 0.85
 """Cosine of the angle to an axis, above which what hangs points along it."""
 REST_FRAMES = 25
@@ -96,7 +97,7 @@ def faster_acceleration(places: Array, seen: Array, step_s: float) -> float:
 
 
 def up(
-    table: MarkerTable, where: str, given: str | None, body: Array, gripper: Array | None
+    table: MarkerTable, where: str, given: str | None, kind: str | None, body: Array, gripper: Array | None
 ) -> tuple[str, str, str | None]:
     """The axis that points up, how it was found, and a warning if the data speak against it.
 
@@ -104,6 +105,7 @@ def up(
         table: the file's tracks.
         where: its name, in errors.
         given: the axis that a person says.
+        kind: of the object; a beam stands out from its clamp where a rope or a cloth hangs.
         body: seen places on the body, (M, 3), in the file's axes.
         gripper: from the body's middle to the gripper's, the mean of all frames, (3,); None: no gripper.
 
@@ -114,7 +116,7 @@ def up(
         if axis is not None and axis not in ROTATION_FROM_UP:
             raise refused(where, f"up is {axis!r}; known are {', '.join(ROTATION_FROM_UP)}")
     hangs = None
-    if gripper is not None and np.linalg.norm(gripper) > 0.0:
+    if gripper is not None and kind in HANGING and np.linalg.norm(gripper) > 0.0:
         direction = gripper / np.linalg.norm(gripper)
         if float(np.abs(direction).max()) > HANGS:
             hangs = axis_along(direction)
@@ -126,13 +128,19 @@ def up(
             against = f"up is {table.up}, {table.up_from}; the body hangs from its gripper along {hangs}: --up {hangs}?"
         return table.up, table.up_from, against
     if hangs is not None:
-        return hangs, "guessed: the body hangs from its gripper along it", None
-    low, high = body.min(axis=0), body.max(axis=0)
-    above = [axis for axis in range(3) if low[axis] >= 0.0 and high[axis] > 0.0]
-    if len(above) == 1:
-        axis = "xyz"[above[0]]
-        return axis, f"guessed: no marker is below 0 along {axis}, and some are along the others", None
-    return "z", "assumed: nothing in the data tells it", "up is assumed to be z; --up says otherwise"
+        return (
+            hangs,
+            "guessed: the body hangs from its gripper along it",
+            f"up is guessed to be {hangs}: --up says it",
+        )
+    low = body.min(axis=0)
+    if low[1] >= 0.0 > low[2]:
+        return (
+            "y",
+            "guessed: no marker is below 0 along y, some are along z",
+            "up is guessed to be y: --up says it",
+        )
+    return "z", "assumed: nothing in the data tells it", "up is assumed to be z: --up says it"
 
 
 def clock(table: MarkerTable, where: str, given: float | None) -> tuple[Array, float, str]:

@@ -124,7 +124,7 @@ def reading_of(table: MarkerTable, where: str, options: ImportOptions) -> Readin
     scale = METRES_PER_UNIT[unit]
     held, held_seen, held_labels = _controllers(table, seen, who, scale)
     axis, up_how, against = guesses.up(
-        table, where, options.up, body, _towards(table, seen, who, held, held_seen)
+        table, where, options.up, options.kind, body, _towards(table, seen, who, held, held_seen)
     )
     warnings += [said for said in (unsure, against) if said]
     turn = scale * ROTATION_FROM_UP[axis]

@@ -1,8 +1,9 @@
 """Labels that changed hands: a marker that jumps to where another one was to be expected.
 
 Each marker's next place is expected on a straight line through its last two. Where it turns up at the place that is
-expected of another marker, and far from its own, its label was put on that other one; from there until the next such
-jump its samples are not seen. A marker that is wrong for most of the time is dropped.
+expected of another marker, far from its own, and that other one is lost or turns up at its place, its label was put on
+the other one; from there until its next jump its samples are not seen. A marker that is wrong for most of the time is
+dropped. A grid whose nodes all move on by one is none of this: the tracker found the object anew.
 """
 
 from __future__ import annotations
@@ -52,8 +53,9 @@ def swapped(places: Array, seen: Array, sigma: Array) -> Array:
         there[i] = np.inf
         j = int(np.argmin(there))
         apart = float(np.linalg.norm(expected[t, j] - expected[t, i])) if np.isfinite(there[j]) else np.inf
-        stays = seen[frame, j] and off[t, j] < JUMP_SHARE * apart
-        if NEARER * there[j] < off[t, i] and off[t, i] > JUMP_SHARE * apart and not stays:
+        back = float(np.linalg.norm(places[frame, j] - expected[t, i]))
+        gone = not seen[frame, j] or NEARER * back < off[t, j]
+        if NEARER * there[j] < off[t, i] and off[t, i] > JUMP_SHARE * apart and gone:
             since[i] = frame
     for i in np.flatnonzero(since >= 0):
         wrong[since[i] :, i] = True

@@ -5,6 +5,7 @@ Limits are of the file, a line and a row, so that a hostile file is refused by i
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import re
@@ -36,6 +37,9 @@ class TextFile:
             raise refused(where, f"has {len(data)} bytes, at most {MOST_BYTES} of text are read")
         if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
             raise refused(where, "is UTF-16 text; save it as UTF-8")
+        head = data[:SNIFFED_BYTES]
+        if b"\r" in head and b"\n" not in head:  # lines end as on a Mac of old
+            data = data.replace(b"\r", b"\n")
         self.where, self.number = where, 0
         self._stream = io.BytesIO(data)
         self._again: str | None = None
@@ -102,7 +106,10 @@ def cells_of(line: str, delimiter: str) -> list[str]:
     if delimiter == " ":
         return WORDS.split(line.strip()) if line.strip() else []
     if '"' in line:
-        return [cell.strip().strip('"').strip() for cell in next(csv.reader([line], delimiter=delimiter), [])]
+        with contextlib.suppress(csv.Error):
+            return [
+                cell.strip().strip('"').strip() for cell in next(csv.reader([line], delimiter=delimiter), [])
+            ]
     return [cell.strip() for cell in line.split(delimiter)]
 
 

@@ -181,7 +181,7 @@ def test_a_convention_that_the_data_speak_against_is_warned_of() -> None:
 def test_without_a_gripper_the_floor_tells_up() -> None:
     apart = MOTION.points - [0.0, 0.1, 0.0]
     found = guessed(named(apart[..., [0, 2, 1]], [f"b{i + 1}" for i in range(16)]), controllers=("none",))
-    assert found["up"] == ("y", "guessed: no marker is below 0 along y, and some are along the others")
+    assert found["up"] == ("y", "guessed: no marker is below 0 along y, some are along z")
 
 
 def test_the_rate_that_is_said_counts_and_frames_that_are_missing_stay_missing() -> None:
