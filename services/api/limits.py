@@ -15,7 +15,7 @@ from physworld_services.api.errors import ApiProblem, answer
 
 JSON_LIMIT_BYTES = 1024 * 1024
 MULTIPART_OVERHEAD_BYTES = 64 * 1024
-UPLOAD_PATHS = frozenset({"/v1/scenes"})
+UPLOAD_PATHS = frozenset({"/v1/scenes", "/v1/scenes/preview"})
 ARRAY_PATHS = frozenset({"/v1/rollouts"})
 
 

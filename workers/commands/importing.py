@@ -34,6 +34,15 @@ FACTS = (
     ("--side", "side_m", "m", "side"),
 )
 """Options that are keys of the body, with unit and words."""
+OPTIONS = {
+    "up": "--up",
+    "unit": "--unit",
+    "fps": "--rate",
+    "controllers": "--gripper",
+    "markers": "--body",
+    "noise_sigma_m": "--noise",
+}
+"""What says otherwise than a guess."""
 WIDEST = 60
 MOST_FILE_BYTES = 1 << 30
 
@@ -187,12 +196,8 @@ def _table(rows: list[tuple[str, str, str, str]]) -> None:
     """Guesses as columns: what, value, how, the option that says otherwise."""
     widths = [min(max(len(row[column]) for row in rows), WIDEST) for column in range(3)] if rows else []
     for row in rows:
-        print(
-            "  "
-            + "  ".join(
-                [*(cell.ljust(width) for cell, width in zip(row, widths, strict=False)), row[3]]
-            ).rstrip()
-        )
+        cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=False)]
+        print("  " + "  ".join([*cells, OPTIONS[row[3]]]))
 
 
 def _write(scene: Scene, out: Path) -> None:

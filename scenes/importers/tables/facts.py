@@ -82,16 +82,16 @@ def chain_facts(
     detour = float(middle.sum()) / max(_shortest(points, visible), 1e-12)
     if usual > CHAIN_SPREAD or most > CHAIN_SPREAD_MOST or detour > MOST_DETOUR:
         how = (
-            f"not along it: neighbours' distances change by {usual:.0%}, up to {most:.0%}, and sum to {detour:.2g} times the "
-            "way from each marker to the nearest; name them in their order"
+            f"not along it: neighbours' distances change by {usual:.0%}, up to {most:.0%}, and sum to {detour:.2g} "
+            "times the way from each marker to the nearest; name them in their order"
         )
-        return facts, Guess("order", "unknown", how, "--body")
+        return facts, Guess("order", "unknown", how, "markers")
     facts = facts | {"segment_rest_lengths_m": [round(float(length), 6) for length in middle]}
     how = (
         f"neighbours keep their distance within {usual:.1%}, at most {most:.1%}: "
         f"{1e3 * middle.min():.4g} to {1e3 * middle.max():.4g} mm"
     )
-    return facts, Guess("order", "along it, as listed", how, "--body")
+    return facts, Guess("order", "along it, as listed", how, "markers")
 
 
 def _shortest(points: Array, visible: Array) -> float:

@@ -33,7 +33,7 @@ GRID_SHARE = 0.02
 
 @dataclass(frozen=True)
 class Guess:
-    """A line for a person: what, the value, how it was found, and the option that says otherwise."""
+    """A line for a person: what, the value, how it was found, and the field of the options that says otherwise."""
 
     what: str
     value: str

@@ -147,12 +147,12 @@ def reading_of(table: MarkerTable, where: str, options: ImportOptions) -> Readin
     )
     labels = tuple(table.labels[i] for i in who.body)
     guessed += [
-        Guess("up", axis, up_how, "--up"),
-        Guess("unit", unit, unit_how, "--unit"),
-        Guess("rate", f"{fps:.6g} Hz", rate_how, "--rate"),
-        Guess("gripper", named(_held_names(table, who)) or "none", who.gripper_how, "--gripper"),
-        Guess("body", f"{len(labels)} markers: {named(labels)}", who.body_how, "--body"),
-        Guess("noise", "unknown" if sigma is None else f"{1e3 * sigma:.3g} mm", noise_how, "--noise"),
+        Guess("up", axis, up_how, "up"),
+        Guess("unit", unit, unit_how, "unit"),
+        Guess("rate", f"{fps:.6g} Hz", rate_how, "fps"),
+        Guess("gripper", named(_held_names(table, who)) or "none", who.gripper_how, "controllers"),
+        Guess("body", f"{len(labels)} markers: {named(labels)}", who.body_how, "markers"),
+        Guess("noise", "unknown" if sigma is None else f"{1e3 * sigma:.3g} mm", noise_how, "noise_sigma_m"),
     ]
     times = times[first:] - times[first]
     return Reading(
