@@ -17,6 +17,7 @@ from serving import log_in
 
 from physworld.materials.library import ELASTIC_LAWS
 from physworld.materials.plastic import PLASTICITIES
+from physworld_scenes import importers
 from physworld_storage import resources
 
 CONTENT = bytes(range(256)) * 40
@@ -39,7 +40,7 @@ def digest(service: Service) -> str:
     return service.stores.artifacts.put_bytes(CONTENT, "numbers.bin").sha256
 
 
-IMPORTERS =["npz", "bundle", "c3d", "motive", "vicon", "qualisys", "trc", "hdf5", "mcap", "phystwin", "columns", "rgbd"]def test_episodes_are_listed_and_downloaded(client: httpx.Client, chain: dict[str, Any]) -> None:
+def test_episodes_are_listed_and_downloaded(client: httpx.Client, chain: dict[str, Any]) -> None:
     address = f"/v1/datasets/{chain['dataset']}/episodes"
     page = client.get(address, params={"limit": 2}).json()
     rest = client.get(address, params={"limit": 2, "cursor": page["next_cursor"]}).json()
@@ -107,7 +108,9 @@ def test_libraries_name_the_laws_that_a_fit_chooses_from(client: httpx.Client) -
     assert rate["bounds"] == {shape: [0.0, 30.0] for shape in ("solid", "sheet", "rod")}
     metrics = {metric["name"]: metric for metric in client.get("/v1/metrics").json()["data"]}
     assert metrics["track_m"]["listed"] and not metrics["track_phystwin_m"]["listed"]
-    assert [one["name"] for one in client.get("/v1/importers").json()["data"]] == IMPORTERS
+    assert [one["name"] for one in client.get("/v1/importers").json()["data"]] == [
+        one.name for one in (*importers.IMPORTERS, *importers.FOLDERS)
+    ]
     assert [one["name"] for one in client.get("/v1/exports").json()["data"]] == list(FORMATS)
 
 

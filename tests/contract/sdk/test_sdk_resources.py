@@ -150,3 +150,16 @@ def test_the_asynchronous_client_does_the_same(service: Service, tmp_path: Path)
                 await client.models.get("nobody")
 
     asyncio.run(chain())
+
+
+def test_a_table_of_markers_is_looked_at_and_made_a_scene_with_options(client: Client, tmp_path: Path) -> None:
+    source = tmp_path / "take.csv"
+    source.write_bytes(marker_files.motive(marker_files.made(frames=40)))
+    found = client.scenes.preview(source, SceneImport(unit="m"))
+    assert found.importer == "OptiTrack Motive CSV"
+    assert {guess.option: guess.value for guess in found.guesses}["up"] == "y"
+    options = SceneImport(kind="sheet", body={"mass_kg": 0.1, "thickness_m": 1e-3}, assume=False, name="cloth")
+    scene = client.scenes.create(source, options)
+    assert (scene.name, scene.kind, scene.points, scene.controllers) == ("cloth", "sheet", 16, 4)
+    with pytest.raises(SceneInvalid, match="its kind"):
+        client.scenes.create(source, SceneImport(assume=False))
