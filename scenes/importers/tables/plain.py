@@ -37,18 +37,21 @@ from physworld_scenes.importers.tables.text import (
 )
 
 FORM = "plain columns"
-SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
-HEAD_ROWS = 8
+SUFFIXES, TEXT_SUFFIXES = (".csv", ".tsv"), (".txt", ".dat")
+HEAD_ROWS, SNIFFED_ROWS = 8, 20
 COMMENT = re.compile(r"^\s*(#|%|//)\s?")
 
 
 def is_plain(data: bytes, filename: str) -> bool:
-    """Whether a file is text that is called like columns, or begins with heads of columns."""
+    """Whether a file is text that is called like columns, holds a row of three numbers, or begins with heads."""
     head = start_of(data)
     if not head.strip():
         return False
     if filename.lower().endswith(SUFFIXES):
         return True
+    if filename.lower().endswith(TEXT_SUFFIXES):
+        rows = (cells_of(line, delimiter_of(line)) for line in head.splitlines()[:SNIFFED_ROWS])
+        return any(sum(map(is_number, cells)) >= 3 for cells in rows)
     first = COMMENT.sub("", head.lstrip().partition("\n")[0])
     letters = {head_of(cell).axis for cell in cells_of(first, delimiter_of(first))}
     return {"x", "y", "z"} <= letters

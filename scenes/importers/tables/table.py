@@ -153,7 +153,7 @@ def checked_places(where: str, labels: tuple[str, ...], places: Array) -> tuple[
     Raises:
         SceneInvalid: a value is too large for a place.
     """
-    seen: Array = np.isfinite(places).all(axis=2)
+    seen: Array = np.asarray(np.isfinite(places).all(axis=2))
     places = np.where(seen[..., None], places, 0.0)
     largest = np.abs(places).max(axis=2, initial=0.0)
     if (largest > FARTHEST).any():
