@@ -104,18 +104,6 @@ def test_a_table_of_markers_is_looked_at_and_stored_when_that_is_confirmed(
         assert (scene.kind, scene.points, scene.controllers) == ("sheet", 16, 4)
 
 
-def test_a_recording_of_more_than_a_mebibyte_comes_in(visit: Visit, world: World, tmp_path: Path) -> None:
-    table = tmp_path / "long.csv"
-    table.write_bytes(marker_files.columns(marker_files.made(frames=2000)))
-    assert table.stat().st_size > 1 << 20
-    visit.open("/scenes")
-    visit.page.set_input_files("#bundle", table)
-    visit.page.get_by_role("button", name="Upload").click()
-    expect(visit.page.locator("[data-told]")).to_contain_text("nothing is stored yet")
-    visit.page.get_by_role("button", name="Store the scene").click()
-    visit.page.wait_for_url(re.compile(r"/scenes/scn_"))
-
-
 def test_a_pipeline_is_started_by_its_form_with_other_settings(visit: Visit, world: World) -> None:
     visit.open(f"/scenes/{world.scene_id}")
     visit.page.get_by_role("link", name="Make a world model").click()
