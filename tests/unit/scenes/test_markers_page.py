@@ -12,6 +12,7 @@ import marker_files as files
 import numpy as np
 import pytest
 
+from physworld.twin.build import build_twin
 from physworld_scenes.bundle import read_bundle
 from physworld_scenes.importers.tables import table, text
 from physworld_scenes.importers.tables.belonging import MOST_COMPARED
@@ -57,6 +58,12 @@ def test_the_commands_of_the_page_do_what_it_says(tmp_path: Path) -> None:
     assert cloth.points.shape[1] == 16 and cloth.controllers.shape[1] == 4 and cloth.body.mass_kg == 0.08
     assert line.points.shape[1] == 7 and line.controllers.shape[1] == 2
     assert line.body.density_kg_m3 == 1100.0 and len(line.body.segment_rest_lengths_m) == 6
+    for scene in (cloth, line):
+        body = build_twin(scene).body
+        assert np.isfinite(body.start).all() and body.thickness_m in (
+            scene.body.thickness_m,
+            scene.body.radius_m,
+        )
 
 
 def test_the_page_has_the_limits_of_the_code_and_no_more_words_than_it_may() -> None:
