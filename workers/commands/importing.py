@@ -43,7 +43,7 @@ OPTIONS = {
     "noise_sigma_m": "--noise",
 }
 """What says otherwise than a guess."""
-WIDEST = 60
+WIDEST = 70
 MOST_FILE_BYTES = 1 << 30
 
 
