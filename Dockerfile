@@ -26,7 +26,7 @@ COPY pyproject.toml requirements.lock scripts/requirements.py scripts/install_to
 FROM base AS api
 ARG PIP_INDEX_URL=
 ARG PIP_EXTRA_INDEX_URL=
-RUN python requirements.py api > requirements.txt \
+RUN python requirements.py api tables > requirements.txt \
     && pip install --no-deps --require-hashes -r requirements.txt
 COPY schemas/ physworld_schemas/
 COPY storage/ physworld_storage/

@@ -41,6 +41,7 @@ TAR_MAGIC = b"ustar"
 
 _SURROGATE = re.compile("[\ud800-\udfff]")
 NUMERIC_KINDS = "biuf"
+TEXT_KINDS = "US"
 NPY_HEADER_LIMIT = 10_000
 MOST_DIMENSIONS = 8
 ZIP_ENTRY_BYTES = 4096
@@ -137,8 +138,10 @@ def read_archive(
         raise ArchiveRefused(f"the archive of {len(data)} bytes is damaged or truncated: {error}") from error
 
 
-def read_arrays(data: bytes, limits: ArchiveLimits = DEFAULT_LIMITS) -> dict[str, Array]:
-    """The numeric arrays of an ``npz``, as stored.
+def read_arrays(
+    data: bytes, limits: ArchiveLimits = DEFAULT_LIMITS, *, text: bool = False
+) -> dict[str, Array]:
+    """The numeric arrays of an ``npz``, as stored; with ``text`` its arrays of strings, too.
 
     Raises:
         ArchiveRefused: damaged, too large, or an array that is not plain numbers.
@@ -151,7 +154,9 @@ def read_arrays(data: bytes, limits: ArchiveLimits = DEFAULT_LIMITS) -> dict[str
         raise
     except DAMAGED as error:
         raise ArchiveRefused(f"the npz of {len(data)} bytes is damaged or truncated: {error}") from error
-    return {name.removesuffix(".npy"): parse_array(name, content) for name, content in files.items()}
+    return {
+        name.removesuffix(".npy"): parse_array(name, content, text=text) for name, content in files.items()
+    }
 
 
 def write_arrays(arrays: dict[str, Array]) -> bytes:
@@ -378,8 +383,8 @@ def _check_total(total: int, packed: int, limits: ArchiveLimits, verb: str) -> N
         )
 
 
-def parse_array(name: str, content: bytes) -> Array:
-    """The array in the content of an ``npy`` file called ``name``.
+def parse_array(name: str, content: bytes, *, text: bool = False) -> Array:
+    """The array in the content of an ``npy`` file called ``name``; of strings only with ``text``.
 
     Raises:
         ArchiveRefused: it holds something else than plain numbers, or not as many as it claims.
@@ -396,7 +401,8 @@ def parse_array(name: str, content: bytes) -> Array:
         shape, fortran_order, dtype = read_header(stream, max_header_size=NPY_HEADER_LIMIT)
     except MALFORMED_HEADER as error:
         raise ArchiveRefused(f"{name} is not an npy file: {error}") from error
-    if dtype.kind not in NUMERIC_KINDS or dtype.hasobject or dtype.subdtype is not None:
+    kinds = NUMERIC_KINDS + (TEXT_KINDS if text else "")
+    if dtype.kind not in kinds or dtype.hasobject or dtype.subdtype is not None:
         raise ArchiveRefused(f"{name} holds {dtype}; only plain numbers are read, never Python objects")
     whole = all(type(length) is int and length >= 0 for length in shape)  # True is an int, and no length
     if not whole or len(shape) > MOST_DIMENSIONS:

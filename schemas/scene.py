@@ -10,14 +10,14 @@ from pydantic import Field
 from physworld_schemas.base import Artifact, Request, Resource
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
+Unit = Literal["m", "cm", "mm", "in", "ft"]
 
 
 class SceneImport(Request):
-    """What a foreign recording (C3D, PhysTwin) does not say of itself: ``options`` of POST /v1/scenes.
+    """What a foreign recording (tables of markers, PhysTwin) does not say of itself: ``options`` of POST /v1/scenes.
 
-    ``body`` holds keys of ``scene.json``'s ``body``; ``controllers`` the labels of C3D's driven or clamped
-    markers; ``up`` the axis of the recording that points up. Bundles say everything themselves: of these they
-    take ``name`` only.
+    What is left out is guessed where that can be done; ``POST /v1/scenes/preview`` says how. Bundles say everything
+    themselves: of these they take ``name`` only.
     """
 
     name: str | None = Field(
@@ -60,9 +60,53 @@ class SceneImport(Request):
         default_factory=dict, description="Keys of `scene.json`'s body.", examples=[{"density_kg_m3": 1000.0}]
     )
     controllers: tuple[str, ...] | None = Field(
-        default=None, description="Labels of the driven or clamped markers (C3D)."
+        default=None,
+        description="Markers, groups of them or rigid bodies that hold the object, * for any letters; `none`: nothing "
+        "does; null: guessed.",
+        examples=[["Gripper"]],
     )
-    up: Axis = Field(default="z", description="Axis of the recording that points up.")
+    markers: tuple[str, ...] | None = Field(
+        default=None,
+        description="Likewise those on the object, in the order that the points shall have; null: all others.",
+        examples=[["M1", "M2"]],
+    )
+    up: Axis | None = Field(
+        default=None, description="Axis of the recording that points up; null: guessed.", examples=["y"]
+    )
+    unit: Unit | None = Field(
+        default=None, description="Unit of a table of markers; null: as it says, or guessed.", examples=["mm"]
+    )
+    importer: str | None = Field(
+        default=None,
+        max_length=32,
+        pattern=r"^[a-z0-9_]+$",
+        description="Form of the file, of `GET /v1/importers`; null: the content decides.",
+        examples=["motive"],
+    )
+    assume: bool = Field(
+        default=True,
+        description="Whether facts of the body that nobody said stay open, with a warning; else such a table of "
+        "markers is refused.",
+    )
+
+
+class ImportGuess(Resource):
+    """What an import found without being told."""
+
+    what: str = Field(description="What it is.", examples=["up"])
+    value: str = Field(description="The value.", examples=["y"])
+    how: str = Field(description="How it was found.", examples=["Motive's convention"])
+    option: str = Field(description="Field of SceneImport that says otherwise.", examples=["up"])
+
+
+class ScenePreview(Resource):
+    """What an import of a file would guess; nothing is stored."""
+
+    importer: str = Field(description="Form of the file, for people.", examples=["OptiTrack Motive CSV"])
+    guesses: list[ImportGuess] = Field(default_factory=list, description="What was found.")
+    lines: list[str] = Field(
+        default_factory=list, description="What is left out, what speaks against a guess."
+    )
 
 
 class Scene(Resource):

@@ -65,7 +65,7 @@ install_chromium() {
     fi
 }
 
-EXTRAS=api,sim,train,video
+EXTRAS=api,sim,train,video,tables
 case "${1:-}" in
     "") ;;
     --dev) EXTRAS=$EXTRAS,dev ;;

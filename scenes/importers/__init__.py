@@ -1,4 +1,4 @@
-"""Imports of scenes: our bundle, PhysTwin's pickle, C3D motion capture, told apart by their content.
+"""Imports of scenes: our bundle, PhysTwin's pickle, tables of markers, told apart by their content.
 
 A new one is a file beside this one and a line here.
 """
@@ -11,11 +11,21 @@ from physworld.scene import Scene
 from physworld_scenes.archives import is_tar, is_zip
 from physworld_scenes.bundle import bundle_from_bytes
 from physworld_scenes.errors import SceneInvalid
-from physworld_scenes.importers import c3d, phystwin, pictures
+from physworld_scenes.importers import phystwin, pictures
 from physworld_scenes.importers.options import FolderImporter, Importer, ImportOptions
+from physworld_scenes.importers.tables.forms import FORMS, NPZ, PLAIN
 from physworld_schemas.base import FieldError
 
-__all__ = ["FOLDERS", "IMPORTERS", "FolderImporter", "ImportOptions", "Importer", "import_any"]
+__all__ = [
+    "FOLDERS",
+    "IMPORTERS",
+    "FolderImporter",
+    "ImportOptions",
+    "Importer",
+    "import_any",
+    "importer_of",
+    "look_at",
+]
 
 BUNDLE = Importer(
     "bundle",
@@ -25,7 +35,8 @@ BUNDLE = Importer(
     lambda data, filename: is_zip(data) or is_tar(data),
     lambda data, name, options: bundle_from_bytes(data),
 )
-IMPORTERS = (BUNDLE, c3d.IMPORTER, phystwin.IMPORTER)
+IMPORTERS = (NPZ, BUNDLE, *FORMS, phystwin.IMPORTER, PLAIN)
+"""The first that recognises a file reads it."""
 FOLDERS = (pictures.IMPORTER,)
 """Forms that are folders: the command ``physworld import`` reads them, the service does not."""
 
@@ -44,10 +55,44 @@ def import_any(
         SceneInvalid: with every fault.
     """
     path = PurePosixPath(filename.replace("\\", "/"))
+    return importer_of(data, path.name, options).read(data, path.stem or "scene", options)
+
+
+def look_at(
+    data: bytes, filename: str = "", options: ImportOptions | None = None
+) -> tuple[str, list[tuple[str, str, str, str]], list[str]]:
+    """What an import would guess: the form's title, (what, value, how, option) of each guess, what is left out.
+
+    Args:
+        data, filename, options: as of ``import_any``.
+
+    Raises:
+        SceneInvalid: with every fault, missing facts of the body excepted.
+    """
+    path = PurePosixPath(filename.replace("\\", "/"))
+    importer = importer_of(data, path.name, options)
+    guesses, lines = ([], []) if importer.look is None else importer.look(data, path.stem or "scene", options)
+    return importer.title, guesses, lines
+
+
+def importer_of(data: bytes, name: str = "", options: ImportOptions | None = None) -> Importer:
+    """The importer that reads a file: the one that the options name, else the first that recognises it.
+
+    Raises:
+        SceneInvalid: there is none.
+    """
+    if options is not None and options.importer is not None:
+        wanted = next((one for one in IMPORTERS if one.name == options.importer), None)
+        if wanted is None:
+            known = ", ".join(importer.name for importer in IMPORTERS)
+            raise SceneInvalid(
+                [FieldError(loc=["importer"], msg=f"is {options.importer!r}; known are {known}")]
+            )
+        return wanted
     for importer in IMPORTERS:
-        if importer.recognises(data, path.name):
-            return importer.read(data, path.stem or "scene", options)
+        if importer.recognises(data, name):
+            return importer
     start = data[:8].hex(" ") or "nothing"
     forms = ", nor ".join(importer.title for importer in IMPORTERS)
     message = f"is neither {forms}: {len(data)} bytes that begin with {start}"
-    raise SceneInvalid([FieldError(loc=[path.name or "file"], msg=message)])
+    raise SceneInvalid([FieldError(loc=[name or "file"], msg=message)])

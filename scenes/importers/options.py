@@ -28,22 +28,33 @@ class ImportOptions:
 
     Attributes:
         name, kind: of the scene.
-        fps: frame rate [Hz], where the file has none (PhysTwin: 30).
-        noise_sigma_m: tracking noise per axis [m]; None estimates it from third differences.
+        importer: name of the form that reads the file; None: the content decides.
+        fps: frame rate [Hz]; pictures and PhysTwin (30) take it where the file has none, tables of markers instead of
+            the file's.
+        noise_sigma_m: tracking noise per axis [m]; None estimates it.
         gravity_m_s2: in the scene's frame, z up.
         body: keys of ``scene.json``'s ``body``.
-        controllers: C3D and tables: labels of the driven or clamped markers.
-        up: the axis of the recording that points up, one of x, y, z, -x, -y, -z.
+        controllers: tables of markers: names of the driven or clamped markers, of groups of them, or of rigid bodies;
+            ('none',): there is none; None: guessed.
+        markers: tables of markers: likewise of those on the body, in the order that they shall have; None: all others.
+        up: the axis of the recording that points up, one of x, y, z, -x, -y, -z; None: guessed.
+        unit: of a table of markers: m, cm, mm, in or ft; None: as the file says, or guessed.
+        assume: whether facts of the body that nobody said stay open, with a warning; else a table of markers without
+            them is refused.
     """
 
     name: str | None = None
     kind: Kind | None = None
+    importer: str | None = None
     fps: float | None = None
     noise_sigma_m: float | None = None
     gravity_m_s2: tuple[float, float, float] = (0.0, 0.0, -9.81)
     body: dict[str, Any] = field(default_factory=dict)
     controllers: tuple[str, ...] | None = None
-    up: str = "z"
+    markers: tuple[str, ...] | None = None
+    up: str | None = None
+    unit: str | None = None
+    assume: bool = True
 
 
 @dataclass(frozen=True)
@@ -57,6 +68,8 @@ class Importer:
         recognises: whether the bytes of a file of that name are of this form; the first importer that says so reads it.
         read: bytes, the scene's name where the file has none, and options, to the scene and its warnings. Raises
             SceneInvalid, with every fault.
+        look: likewise, to what would be guessed: what, value, how, the option that says otherwise; and lines of what is
+            left out. None: of this form nothing is guessed.
     """
 
     name: str
@@ -65,6 +78,9 @@ class Importer:
     help: str
     recognises: Callable[[bytes, str], bool]
     read: Callable[[bytes, str, ImportOptions | None], tuple[Scene, list[str]]]
+    look: (
+        Callable[[bytes, str, ImportOptions | None], tuple[list[tuple[str, str, str, str]], list[str]]] | None
+    ) = None
 
 
 @dataclass(frozen=True)

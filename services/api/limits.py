@@ -15,7 +15,10 @@ from physworld_services.api.errors import ApiProblem, answer
 
 JSON_LIMIT_BYTES = 1024 * 1024
 MULTIPART_OVERHEAD_BYTES = 64 * 1024
-UPLOAD_PATHS = frozenset({"/v1/scenes"})
+UPLOAD_PATHS = frozenset(
+    {"/v1/scenes", "/v1/scenes/preview", "/dashboard/scenes", "/dashboard/scenes/preview"}
+)
+"""Of the API, and of the dashboard, whose forms bring the same files."""
 ARRAY_PATHS = frozenset({"/v1/rollouts"})
 
 

@@ -4,11 +4,12 @@
 It has imported what the importers need and then, for each line on its standard input, forks a child that reads one
 upload under limits which the kernel keeps, waits for it, and answers with a line. The limits, of processor seconds,
 memory, wall clock and output, grow with the upload's size, so that a long recording is read and a small file that
-unfolds is not. Hostile content meets neither the web process nor its secrets: this process has none in its environment.
+unfolds is not. Hostile content meets neither the web process nor its secrets: this process has none in its
+environment.
 
-A request is ``{"folder", "filename", "name", "options"}``: the upload lies in the folder as ``upload``; the child
-leaves ``scene.zip``, the canonical archive, and ``found.json`` beside it. An answer is ``{"outcome", "cpu_s",
-"peak_bytes"}``.
+A request is ``{"folder", "filename", "name", "options", "look"}``: the upload lies in the folder as ``upload``; the
+child leaves ``scene.zip``, the canonical archive, and ``found.json`` beside it; with ``look`` what an import would
+guess alone. An answer is ``{"outcome", "cpu_s", "peak_bytes"}``.
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ import trimesh  # noqa: F401
 
 from physworld_scenes.bundle import canonical_archive, checked
 from physworld_scenes.errors import SceneInvalid
-from physworld_scenes.importers import ImportOptions, import_any
-from physworld_scenes.importers.c3d import limit_here
+from physworld_scenes.importers import ImportOptions, import_any, look_at
+from physworld_scenes.importers.library import limit_here
 from physworld_schemas.base import FieldError
 
 UPLOAD, ARCHIVE, FOUND = "upload", "scene.zip", "found.json"
@@ -108,6 +109,9 @@ def _read(request: dict[str, Any]) -> int:
         data = (folder / UPLOAD).read_bytes()
         options = ImportOptions(**request["options"])
         limit_here()
+        if request.get("look"):
+            (folder / FOUND).write_text(json.dumps(_looked(data, request["filename"], options)))
+            return 0
         scene, warnings = import_any(data, request["filename"], options)
         if request["name"] is not None and request["name"] != scene.name:
             scene, warnings = checked(dataclasses.replace(scene, name=request["name"]))
@@ -133,6 +137,17 @@ def _read(request: dict[str, Any]) -> int:
         return _refuse(folder, error.faults)
     except (MemoryError, OSError):
         return TOO_LARGE
+
+
+def _looked(data: bytes, filename: str, options: ImportOptions) -> dict[str, Any]:
+    """What an import would guess."""
+    title, guesses, lines = look_at(data, filename, options)
+    keys = ("what", "value", "how", "option")
+    return {
+        "importer": title,
+        "guesses": [dict(zip(keys, guess, strict=True)) for guess in guesses],
+        "lines": [line[:FAULT_CHARACTERS] for line in lines[:MOST_FAULTS]],
+    }
 
 
 def _refuse(folder: Path, faults: list[FieldError]) -> int:

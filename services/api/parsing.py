@@ -67,6 +67,22 @@ class Parsers:
             ApiProblem: 503, no parser process could be started.
         """
         request = {"folder": str(folder), "filename": filename, "name": name, "options": options}
+        return Found(self._asked(folder, request), folder / "scene.zip")
+
+    def look(self, folder: Path, filename: str, options: dict[str, Any]) -> dict[str, Any]:
+        """What an import of the file ``upload`` in ``folder`` would guess: a ``ScenePreview``'s fields.
+
+        Raises:
+            SceneInvalid, ApiProblem: as of ``parse``.
+        """
+        return self._asked(
+            folder,
+            {"folder": str(folder), "filename": filename, "name": None, "options": options, "look": True},
+        )
+
+    def _asked(self, folder: Path, request: dict[str, Any]) -> dict[str, Any]:
+        """What the reader found. Raises SceneInvalid."""
+        filename = request["filename"]
         with self._one() as parser:
             answer = parser.ask(request)
         size = (folder / "upload").stat().st_size
@@ -78,10 +94,10 @@ class Parsers:
                 loc=[filename[:200] or "file"], msg=f"{STOPPED[outcome]}: {size} bytes took {used}"
             )
             raise SceneInvalid([fault])
-        found = json.loads((folder / "found.json").read_text())
+        found: dict[str, Any] = json.loads((folder / "found.json").read_text())
         if outcome == "refused":
             raise SceneInvalid([FieldError.model_validate(fault) for fault in found["faults"]])
-        return Found(found, folder / "scene.zip")
+        return found
 
     def close(self) -> None:
         """End the processes that are idle."""

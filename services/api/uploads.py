@@ -21,7 +21,7 @@ from starlette.datastructures import FormData, UploadFile
 
 from physworld_scenes.declaration import KINDS
 from physworld_schemas.base import FieldError
-from physworld_schemas.scene import SceneImport
+from physworld_schemas.scene import SceneImport, ScenePreview
 from physworld_services.api.errors import ApiProblem
 from physworld_services.api.limits import too_large
 from physworld_services.api.parsing import Found, Parsers
@@ -44,7 +44,7 @@ MULTIPART_BODY: dict[str, Any] = {
                             "type": "string",
                             "format": "binary",
                             "description": "zip or tar of scene.json and scene.npz, PhysTwin's "
-                            "final_data.pkl, or C3D",
+                            "final_data.pkl, or a table of markers (GET /v1/importers)",
                         },
                         "name": {"type": "string", "minLength": 1, "maxLength": 128},
                         "options": {"type": "string", "description": "a SceneImport as JSON"},
@@ -99,15 +99,27 @@ def upload_of(form: FormData, limit_bytes: int) -> Upload:
     return Upload(file, options)
 
 
+def looked_at(upload: Upload, parsers: Parsers) -> ScenePreview:
+    """What an import of the upload would guess, found in another process. Raises SceneInvalid."""
+    given = {name: value for name, value in upload.options.model_dump().items() if value is not None}
+    with tempfile.TemporaryDirectory(prefix="physworld-upload-") as folder:
+        _copied(upload, Path(folder))
+        return ScenePreview.model_validate(parsers.look(Path(folder), upload.file.filename or "", given))
+
+
 @contextmanager
 def parsed(upload: Upload, parsers: Parsers) -> Iterator[Found]:
     """What the upload holds, read in another process; its files go with the block. Raises SceneInvalid."""
     given = {name: value for name, value in upload.options.model_dump().items() if value is not None}
     with tempfile.TemporaryDirectory(prefix="physworld-upload-") as folder:
-        upload.file.file.seek(0)
-        with (Path(folder) / "upload").open("wb") as file:
-            shutil.copyfileobj(upload.file.file, file, COPIED_BYTES)
+        _copied(upload, Path(folder))
         yield parsers.parse(Path(folder), upload.file.filename or "", upload.options.name, given)
+
+
+def _copied(upload: Upload, folder: Path) -> None:
+    upload.file.file.seek(0)
+    with (folder / "upload").open("wb") as file:
+        shutil.copyfileobj(upload.file.file, file, COPIED_BYTES)
 
 
 def _options(

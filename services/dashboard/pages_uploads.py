@@ -19,7 +19,7 @@ from physworld_schemas.base import FieldError
 from physworld_schemas.scene import Scene
 from physworld_services.api.errors import ApiProblem
 from physworld_services.api.parsing import Found, Parsers
-from physworld_services.api.uploads import Upload, parsed, read_form, upload_of
+from physworld_services.api.uploads import Upload, looked_at, parsed, read_form, upload_of
 from physworld_services.dashboard.access import require_same_origin, require_writer
 from physworld_services.dashboard.samples import PACKED, SAMPLE, sample_folder
 from physworld_services.dashboard.site import BASE, Site
@@ -46,6 +46,23 @@ def router(site: Site, parsers: Parsers) -> APIRouter:
         except ApiProblem as problem:
             return _refused(site, request, str(problem.detail), problem.errors, problem.status_code)
         return _done(request, scene)
+
+    @routes.post("/scenes/preview")
+    async def preview(request: Request) -> JSONResponse:
+        try:
+            form = await read_form(request)
+            try:
+                given = upload_of(form, site.settings.max_upload_bytes)
+                found = await run_in_threadpool(looked_at, given, parsers)
+            finally:
+                await form.close()
+        except SceneInvalid as error:
+            told = "The recording needs another word from you"
+            return JSONResponse({"told": told, "faults": _lines(error.faults)}, 422)
+        except ApiProblem as problem:
+            lines = _lines(problem.errors)
+            return JSONResponse({"told": str(problem.detail), "faults": lines}, problem.status_code)
+        return JSONResponse(found.model_dump())
 
     @routes.post("/scenes/sample")
     async def sample(request: Request) -> Response:
@@ -88,12 +105,16 @@ def _done(request: Request, scene: Scene) -> Response:
 def _refused(
     site: Site, request: Request, told: str, faults: list[FieldError], status: int
 ) -> HTMLResponse | JSONResponse:
-    lines = [f"{'.'.join(str(part) for part in fault.loc)}: {fault.msg}" for fault in faults]
+    lines = _lines(faults)
     if _by_script(request):
         return JSONResponse({"told": told, "faults": lines}, status)
     return site.page(
         request, "upload.html", status=status, told=told, faults=lines, has_sample=sample_folder() is not None
     )
+
+
+def _lines(faults: list[FieldError]) -> list[str]:
+    return [f"{'.'.join(str(part) for part in fault.loc)}: {fault.msg}" for fault in faults]
 
 
 def _by_script(request: Request) -> bool:

@@ -16,6 +16,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from physworld.arrays import Array
 from physworld_scenes.bundle import bundle_from_bytes
+from physworld_scenes.declaration import KINDS
 from physworld_schemas.base import Artifact
 from physworld_schemas.job import Job
 from physworld_schemas.library import catalogue
@@ -103,6 +104,7 @@ def _environment() -> Environment:
     environment.filters.update(text.FILTERS)
     environment.globals.update(
         base=BASE,
+        kinds=KINDS,
         static=_static_url,
         share=share,
         lasted=text.lasted,

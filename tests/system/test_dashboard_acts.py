@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import marker_files
 import pytest
 from dashboard_browser import Visit
 from dashboard_world import World, add_scene, chain_recording
@@ -76,6 +77,31 @@ def test_a_file_that_is_no_recording_is_refused_where_it_was_given(visit: Visit,
     visit.page.get_by_role("button", name="Upload").click()
     expect(visit.page.locator("[data-told] li").first).to_contain_text("notes.txt: is neither")
     visit.errors.clear()  # Chromium notes the 422 itself
+
+
+def test_a_table_of_markers_is_looked_at_and_stored_when_that_is_confirmed(
+    visit: Visit, world: World, tmp_path: Path
+) -> None:
+    table = tmp_path / "hanging cloth.csv"
+    table.write_bytes(marker_files.columns(marker_files.made(frames=60), up="y", unit="mm"))
+    visit.open("/scenes")
+    visit.page.set_input_files("#bundle", table)
+    visit.page.get_by_role("button", name="Upload").click()
+    told = visit.page.locator("[data-told]")
+    expect(told).to_contain_text("nothing is stored yet")
+    hangs = "the body hangs from its gripper along it"
+    expect(told.get_by_role("row", name=re.compile("^up "))).to_contain_text(hangs)
+    expect(told.locator("li", has_text="up is guessed to be y")).to_be_visible()
+    visit.page.get_by_label("Kind").select_option("sheet")
+    visit.page.get_by_label("Mass [kg]").fill("0.08")
+    visit.page.get_by_label("Up").select_option("y")
+    visit.page.get_by_role("button", name="Look again").click()
+    expect(told.get_by_role("row", name=re.compile("^up "))).to_contain_text("given")
+    visit.page.get_by_role("button", name="Store the scene").click()
+    visit.page.wait_for_url(re.compile(r"/scenes/scn_"))
+    with world.database.session() as session:
+        scene = next(one for one in resources.list_scenes(session).data if one.name == "hanging cloth")
+        assert (scene.kind, scene.points, scene.controllers) == ("sheet", 16, 4)
 
 
 def test_a_pipeline_is_started_by_its_form_with_other_settings(visit: Visit, world: World) -> None:

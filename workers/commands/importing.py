@@ -1,15 +1,18 @@
 """``python -m physworld_workers.commands.importing SOURCE --out SCENE``: a recording of any form to a scene.
 
-SOURCE is a file of motion capture or tracks, an archive, or a folder of pictures with depth, in which the object is
-followed (``--box``). What was found and guessed is printed; what a person knows better is an option. ``--picture``
-draws the first frame with the object's pixels and points, and the last one, for a look before anything is fitted.
+SOURCE is a file of marker tracks, an archive, or a folder of pictures with depth, in which the object is
+followed (``--box``). What was found and guessed is printed; what a person knows better is an option. ``--look`` prints
+it and writes nothing. ``--picture`` draws the first frame with the object's pixels and points, and the last one.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
+import shutil
 import sys
+import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +23,28 @@ if TYPE_CHECKING:
     from physworld.tracking.recording import Followed
     from physworld_scenes.importers import ImportOptions
     from physworld_scenes.importers.rgbd import PictureOptions
+
+
+FACTS = (
+    ("--mass", "mass_kg", "kg", "mass"),
+    ("--density", "density_kg_m3", "kg/m³", "density"),
+    ("--radius", "radius_m", "m", "radius"),
+    ("--thickness", "thickness_m", "m", "thickness"),
+    ("--length", "length_m", "m", "length"),
+    ("--side", "side_m", "m", "side"),
+)
+"""Options that are keys of the body, with unit and words."""
+OPTIONS = {
+    "up": "--up",
+    "unit": "--unit",
+    "fps": "--rate",
+    "controllers": "--gripper",
+    "markers": "--body",
+    "noise_sigma_m": "--noise",
+}
+"""What says otherwise than a guess."""
+WIDEST = 70
+MOST_FILE_BYTES = 1 << 30
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -33,18 +58,38 @@ def main(arguments: list[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="physworld import", description="A recording to a scene.")
     parser.add_argument("source", type=Path, help="file, or folder of pictures")
-    parser.add_argument("--out", type=Path, required=True, help="folder for the scene")
+    parser.add_argument("--out", type=Path, default=None, help="folder for the scene")
+    parser.add_argument("--look", action="store_true", help="say what would be guessed, write nothing")
+    parser.add_argument("--importer", default=None, help="form of the file, instead of by its content")
     parser.add_argument("--name", default=None, help="of the scene")
     parser.add_argument("--kind", default=None, help="of the object: beam, block, rope, sheet, toy ...")
-    parser.add_argument(
-        "--fps", type=float, default=None, help="frames per second, where the source has none"
-    )
+    parser.add_argument("--fps", "--rate", type=float, default=None, help="frames per second")
     parser.add_argument("--noise", type=float, default=None, help="tracking noise per axis [m]")
-    parser.add_argument("--body", default=None, help="what is known of the body: keys of scene.json, as JSON")
+    parser.add_argument(
+        "--body",
+        action="append",
+        default=[],
+        help="markers on the body, by commas; or what is known of it, as JSON: keys of scene.json's body",
+    )
+    for option, _, unit, what in FACTS:
+        parser.add_argument(option, type=float, default=None, help=f"{what} of the body [{unit}]")
+    parser.add_argument(
+        "--box-m", default=None, help="box of the body at rest, in the scene's world [m]: X,Y,Z,X,Y,Z"
+    )
+    parser.add_argument(
+        "--assume", action="store_true", help="leave facts of the body open that are not said"
+    )
+    parser.add_argument("--unit", default=None, help="of a table of markers: m, cm, mm, in, ft")
     parser.add_argument(
         "--up", default=None, help="axis of the recording that points up: x, y, z, -x, -y, -z"
     )
-    parser.add_argument("--controllers", default=None, help="labels of driven or clamped markers, by commas")
+    parser.add_argument(
+        "--gripper",
+        "--controllers",
+        dest="controllers",
+        default=None,
+        help="markers, groups or rigid bodies that hold the object, by commas; none: nothing does",
+    )
     parser.add_argument(
         "--box", action="append", default=[], help="around the object: [CAMERA:]LEFT,TOP,RIGHT,BOTTOM"
     )
@@ -69,18 +114,23 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _import(given: argparse.Namespace) -> None:
-    from physworld_scenes.bundle import read_bundle, write_bundle
+    from physworld_scenes.bundle import read_bundle
     from physworld_scenes.importers import FOLDERS, import_any
 
+    if given.out is None and not given.look:
+        raise ValueError("--out is missing: the folder for the scene; or --look")
     options = _options(given)
+    if given.look:
+        _look(given, options)
+        return
     followed = None
     if given.source.is_dir() and any(form.recognises(given.source) for form in FOLDERS):
         scene, warnings, followed = _pictures(given, options)
     elif given.source.is_dir():
         scene, warnings = read_bundle(given.source), []
     else:
-        scene, warnings = import_any(given.source.read_bytes(), given.source.name, options)
-    write_bundle(scene, given.out)
+        scene, warnings = import_any(_content(given.source), given.source.name, options)
+    _write(scene, given.out)
     _say(scene, warnings, given.out)
     if given.picture is not None and followed is not None:
         _draw(given, followed)
@@ -95,16 +145,82 @@ def _options(given: argparse.Namespace) -> ImportOptions:
         "fps": given.fps,
         "noise_sigma_m": given.noise,
         "up": given.up,
-        "controllers": tuple(given.controllers.split(",")) if given.controllers else None,
+        "controllers": _names(given.controllers),
+        "unit": given.unit,
+        "importer": given.importer,
+        "assume": given.assume,
     }
-    if given.body is not None:
-        try:
-            known["body"] = json.loads(given.body)
-        except json.JSONDecodeError as error:
-            raise ValueError(f"--body is no JSON: {error}") from error
-        if not isinstance(known["body"], dict):
-            raise ValueError(f"--body must be an object, got {given.body[:80]}")
+    facts: dict[str, Any] = {}
+    names: list[str] = []
+    for text in given.body:
+        if text.lstrip().startswith("{"):
+            try:
+                facts |= json.loads(text)
+            except json.JSONDecodeError as error:
+                raise ValueError(f"--body is no JSON: {error}") from error
+        else:
+            names += _names(text) or ()
+    for _, key, _, _ in FACTS:
+        if getattr(given, key.partition("_")[0]) is not None:
+            facts[key] = getattr(given, key.partition("_")[0])
+    if given.box_m is not None:
+        corners = _numbers("--box-m", given.box_m, 6)
+        facts |= {"box_min_m": corners[:3], "box_max_m": corners[3:]}
+    known |= {"body": facts or None, "markers": tuple(names) or None}
     return ImportOptions(**{name: value for name, value in known.items() if value is not None})
+
+
+def _names(text: str | None) -> tuple[str, ...] | None:
+    return None if text is None else tuple(name.strip() for name in text.split(",") if name.strip()) or None
+
+
+def _look(given: argparse.Namespace, options: ImportOptions) -> None:
+    """Print what an import would guess."""
+    from physworld_scenes.importers import look_at
+
+    title, guesses, lines = look_at(_content(given.source), given.source.name, options)
+    print(f"{given.source}: {title}; nothing was written")
+    _table(guesses)
+    for line in lines:
+        print(f"  {line}")
+
+
+def _content(source: Path) -> bytes:
+    size = source.stat().st_size
+    if size > MOST_FILE_BYTES:
+        raise ValueError(f"{source.name} has {size} bytes, at most {MOST_FILE_BYTES} are read")
+    return source.read_bytes()
+
+
+def _table(rows: list[tuple[str, str, str, str]]) -> None:
+    """Guesses as columns: what, value, how, the option that says otherwise."""
+    widths = [min(max(len(row[column]) for row in rows), WIDEST) for column in range(3)] if rows else []
+    for row in rows:
+        cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=False)]
+        print("  " + "  ".join([*cells, OPTIONS[row[3]]]))
+
+
+def _write(scene: Scene, out: Path) -> None:
+    """Write the bundle; where that fails, nothing of it stays, and what was there before does."""
+    from physworld_scenes.bundle import write_bundle
+
+    made = [folder for folder in (out, *out.parents) if not folder.exists()]
+    out.mkdir(parents=True, exist_ok=True)
+    part = Path(tempfile.mkdtemp(prefix=".import-", dir=out))
+    try:
+        write_bundle(scene, part)
+        for file in sorted(part.rglob("*")):
+            if file.is_file():
+                target = out / file.relative_to(part)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                file.replace(target)
+    except BaseException:
+        shutil.rmtree(part, ignore_errors=True)
+        for folder in made:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+        raise
+    shutil.rmtree(part)
 
 
 def _pictures(given: argparse.Namespace, options: ImportOptions) -> tuple[Scene, list[str], Followed]:
@@ -186,7 +302,15 @@ def _say(scene: Scene, warnings: list[str], out: Path) -> None:
         f"{out}: {scene.kind}, {frames} frames at {scene.fps:g} Hz, {points} points seen {scene.visible.mean():.0%} "
         f"of the time, {scene.controllers.shape[1]} controllers, noise {noise}"
     )
-    for name, value in scene.declared.get("notes", {}).items():
+    notes = dict(scene.declared.get("notes") or {})
+    guesses = notes.pop("guessed", None)
+    if isinstance(guesses, list):
+        _table([(g["what"], g["value"], g["how"], g["option"]) for g in guesses])
+        for line in notes.pop("left_out", []):
+            print(f"  {line}")
+        for labels in ("point_labels", "controller_labels", "noise"):
+            notes.pop(labels, None)
+    for name, value in notes.items():
         print(f"  {name}: {json.dumps(value)}")
     for warning in warnings:
         print(f"  warning: {warning}")

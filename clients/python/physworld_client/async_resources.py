@@ -27,7 +27,7 @@ from physworld_schemas.fit import Fit, FitConfig
 from physworld_schemas.job import TERMINAL_STATES, Event, Job
 from physworld_schemas.model import Model, ModelComparison, ModelVersion, TrainingConfig
 from physworld_schemas.pipeline import PipelineCreate
-from physworld_schemas.scene import Scene
+from physworld_schemas.scene import Scene, SceneImport, ScenePreview
 from physworld_schemas.signing import SigningKey
 
 if TYPE_CHECKING:
@@ -51,10 +51,20 @@ class AsyncResource:
 class AsyncScenes(AsyncResource):
     """Measured scenes."""
 
-    async def create(self, path: str | Path) -> Scene:
-        """Uploads a scene: a folder (packed to a zip), an archive, a ``final_data.pkl`` or a C3D file."""
+    async def create(self, path: str | Path, options: SceneImport | None = None) -> Scene:
+        """Uploads a scene: a folder (packed to a zip), an archive, a ``final_data.pkl`` or a table of markers.
+
+        Args:
+            path: of the folder or file.
+            options: what a foreign recording does not say of itself.
+        """
         with open_bundle(path) as upload:
-            return await self._client.send(calls.scene_create(upload))
+            return await self._client.send(calls.scene_create(upload, options))
+
+    async def preview(self, path: str | Path, options: SceneImport | None = None) -> ScenePreview:
+        """What an import of a recording would guess: axes, unit, rate, gripper, noise. Nothing is stored."""
+        with open_bundle(path) as upload:
+            return await self._client.send(calls.scene_preview(upload, options))
 
     async def get(self, scene_id: str) -> Scene:
         """One scene."""

@@ -29,7 +29,7 @@ from physworld_schemas.model import (
     VersionPatch,
 )
 from physworld_schemas.pipeline import PipelineCreate
-from physworld_schemas.scene import Scene
+from physworld_schemas.scene import Scene, SceneImport, ScenePreview
 from physworld_schemas.signing import SigningKey
 from physworld_schemas.trace import Trace, TraceConfig, TraceCreate
 
@@ -42,6 +42,7 @@ class Call(Generic[Answer]):
     """One request and how to read its answer.
 
     Attributes:
+        form: text beside an upload.
         read_timeout_s: seconds that the service may hold the answer back on purpose (long poll).
     """
 
@@ -51,6 +52,7 @@ class Call(Generic[Answer]):
     query: Mapping[str, str | int | float] = field(default_factory=dict)
     body: BaseModel | None = None
     upload: Upload | None = None
+    form: Mapping[str, str] = field(default_factory=dict)
     read_timeout_s: float = 0.0
 
 
@@ -58,6 +60,7 @@ ListCall = Callable[[str | None], Call[Page[Item]]]
 """A list from a cursor on."""
 
 _SCENE = TypeAdapter(Scene)
+_PREVIEW = TypeAdapter(ScenePreview)
 _FIT = TypeAdapter(Fit)
 _CHECK = TypeAdapter(Check)
 _TRACE = TypeAdapter(Trace)
@@ -92,9 +95,18 @@ def _part(text: str | int) -> str:
     return quote(str(text), safe="")
 
 
-def scene_create(upload: Upload) -> Call[Scene]:
-    """POST /v1/scenes, multipart field ``bundle``."""
-    return Call("POST", "/v1/scenes", _SCENE, upload=upload)
+def scene_create(upload: Upload, options: SceneImport | None) -> Call[Scene]:
+    """POST /v1/scenes, multipart fields ``bundle`` and ``options``."""
+    return Call("POST", "/v1/scenes", _SCENE, upload=upload, form=_options(options))
+
+
+def scene_preview(upload: Upload, options: SceneImport | None) -> Call[ScenePreview]:
+    """POST /v1/scenes/preview, multipart fields ``bundle`` and ``options``."""
+    return Call("POST", "/v1/scenes/preview", _PREVIEW, upload=upload, form=_options(options))
+
+
+def _options(options: SceneImport | None) -> Mapping[str, str]:
+    return {} if options is None else {"options": options.model_dump_json(exclude_unset=True)}
 
 
 def scene_get(scene_id: str) -> Call[Scene]:

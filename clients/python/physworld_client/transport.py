@@ -129,6 +129,7 @@ def build_request(
         call.upload.stream.seek(0)
         headers["Content-Type"] = f"multipart/form-data; boundary={key}"
         options["files"] = {"bundle": (call.upload.filename, call.upload.stream, call.upload.media_type)}
+        options["data"] = dict(call.form)
     if call.read_timeout_s:
         read = max(timeout, call.read_timeout_s + LONG_POLL_MARGIN_S)
         options["timeout"] = httpx.Timeout(timeout, read=read, connect=min(timeout, 10.0))

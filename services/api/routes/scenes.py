@@ -9,12 +9,12 @@ from fastapi import APIRouter, Query, Request, Response
 from sqlalchemy.orm import Session
 
 from physworld_schemas.base import Page
-from physworld_schemas.scene import Scene
+from physworld_schemas.scene import Scene, ScenePreview
 from physworld_services.api.dependencies import DatabaseDep, ObjectId, PageDep, SettingsDep, StoresDep
 from physworld_services.api.errors import documented
 from physworld_services.api.idempotency import Idempotency, IdempotencyDep, answer_of
 from physworld_services.api.parsing import Parsers
-from physworld_services.api.uploads import MULTIPART_BODY, Upload, parsed, read_form, upload_of
+from physworld_services.api.uploads import MULTIPART_BODY, Upload, looked_at, parsed, read_form, upload_of
 from physworld_services.stores import Stores
 from physworld_storage import resources
 from physworld_storage.idempotency import Answer
@@ -44,6 +44,24 @@ async def create_scene(
         upload = upload_of(form, settings.max_upload_bytes)
         parsers = cast(Parsers, request.app.state.parsers)
         return await anyio.to_thread.run_sync(_register, upload, parsers, stores, idempotency, limiter=slots)
+    finally:
+        await form.close()
+
+
+@router.post(
+    "/preview",
+    response_model=ScenePreview,
+    responses=documented(400, 401, 403, 413, 415, 422, 503, 507),
+    openapi_extra=MULTIPART_BODY,
+)
+async def preview_scene(request: Request, settings: SettingsDep) -> ScenePreview:
+    """What an import of a recording would guess (axes, unit, rate, gripper, noise); nothing is stored."""
+    slots = cast(anyio.CapacityLimiter, request.app.state.upload_slots)
+    form = await read_form(request)
+    try:
+        upload = upload_of(form, settings.max_upload_bytes)
+        parsers = cast(Parsers, request.app.state.parsers)
+        return await anyio.to_thread.run_sync(looked_at, upload, parsers, limiter=slots)
     finally:
         await form.close()
 

@@ -17,6 +17,7 @@ from serving import log_in
 
 from physworld.materials.library import ELASTIC_LAWS
 from physworld.materials.plastic import PLASTICITIES
+from physworld_scenes import importers
 from physworld_storage import resources
 
 CONTENT = bytes(range(256)) * 40
@@ -108,10 +109,7 @@ def test_libraries_name_the_laws_that_a_fit_chooses_from(client: httpx.Client) -
     metrics = {metric["name"]: metric for metric in client.get("/v1/metrics").json()["data"]}
     assert metrics["track_m"]["listed"] and not metrics["track_phystwin_m"]["listed"]
     assert [one["name"] for one in client.get("/v1/importers").json()["data"]] == [
-        "bundle",
-        "c3d",
-        "phystwin",
-        "rgbd",
+        one.name for one in (*importers.IMPORTERS, *importers.FOLDERS)
     ]
     assert [one["name"] for one in client.get("/v1/exports").json()["data"]] == list(FORMATS)
 

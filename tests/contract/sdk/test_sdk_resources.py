@@ -6,6 +6,7 @@ import asyncio
 import hashlib
 from pathlib import Path
 
+import marker_files
 import pytest
 from physworld_client import AsyncClient, Client
 from physworld_client.errors import (
@@ -22,6 +23,7 @@ from sdk_service import Service, write_scene
 from physworld_schemas.dataset import DatasetConfig
 from physworld_schemas.model import TrainingConfig
 from physworld_schemas.pipeline import PipelineCreate
+from physworld_schemas.scene import SceneImport
 
 
 def test_the_whole_chain_step_by_step(service: Service, client: Client, tmp_path: Path) -> None:
@@ -150,3 +152,20 @@ def test_the_asynchronous_client_does_the_same(service: Service, tmp_path: Path)
                 await client.models.get("nobody")
 
     asyncio.run(chain())
+
+
+def test_a_table_of_markers_is_looked_at_and_made_a_scene_with_options(
+    client: Client, tmp_path: Path
+) -> None:
+    source = tmp_path / "take.csv"
+    source.write_bytes(marker_files.motive(marker_files.made(frames=40)))
+    found = client.scenes.preview(source, SceneImport(unit="m"))
+    assert found.importer == "OptiTrack Motive CSV"
+    assert {guess.option: guess.value for guess in found.guesses}["up"] == "y"
+    options = SceneImport(
+        kind="sheet", body={"mass_kg": 0.1, "thickness_m": 1e-3}, assume=False, name="cloth"
+    )
+    scene = client.scenes.create(source, options)
+    assert (scene.name, scene.kind, scene.points, scene.controllers) == ("cloth", "sheet", 16, 4)
+    with pytest.raises(SceneInvalid, match="its kind"):
+        client.scenes.create(source, SceneImport(assume=False))

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from physworld_scenes.errors import SceneInvalid
-from physworld_scenes.importers import ImportOptions, c3d, import_any
+from physworld_scenes.importers import ImportOptions, c3d, import_any, library
 from physworld_scenes.importers.axes import ROTATION_FROM_UP
-from physworld_scenes.importers.c3d import fill_gaps
+from physworld_scenes.importers.tables.scene import fill_gaps
 
 FRAMES = 30
 LABELS = ["tip1", "tip2", "tip3", "base1", "base2", "base3"]
@@ -55,7 +55,8 @@ def write(
 
 def test_millimetres_become_metres_and_base_markers_controllers(tmp_path: Path) -> None:
     data = write(tmp_path / "swing.c3d", markers())
-    scene, warnings = import_any(data, "swing.c3d", ImportOptions(kind="beam", body={"length_m": 0.1}))
+    box = {"box_min_m": [0, 0, 1], "box_max_m": [0.1, 0.03, 1.03], "density_kg_m3": 1000.0}
+    scene, warnings = import_any(data, "swing.c3d", ImportOptions(kind="beam", body=box))
     assert (scene.name, scene.kind, scene.fps) == ("swing", "beam", 100.0)
     assert np.allclose(scene.points, markers()[:, :3], atol=FLOAT32)
     assert np.allclose(scene.controllers, markers()[:, 3:], atol=FLOAT32)
@@ -75,16 +76,22 @@ def test_gaps_are_invisible_and_interpolated(tmp_path: Path) -> None:
     assert scene.declared["notes"]["controller_samples_interpolated"] == 1
 
 
-def test_controllers_must_be_told_and_the_labels_are_listed(tmp_path: Path) -> None:
-    data = write(tmp_path / "a.c3d", markers(), labels=["a", "b", "c", "d", "e", "f"])
-    with pytest.raises(SceneInvalid, match="a, b, c, d, e, f"):
+def test_a_group_that_stays_is_the_clamp_and_two_that_move_must_be_told(tmp_path: Path) -> None:
+    letters = ["a", "b", "c", "d", "e", "f"]
+    data = write(tmp_path / "a.c3d", markers(), labels=letters)
+    scene, _ = import_any(data, "a.c3d")
+    assert scene.declared["notes"]["controller_labels"] == ["d", "e", "f"]
+    moving = markers()
+    moving[:, 3:, 1] += 0.02 * np.cos(9 * np.arange(FRAMES)[:, None] / 100.0)
+    data = write(tmp_path / "b.c3d", moving, labels=letters)
+    with pytest.raises(SceneInvalid, match=r"2 groups keep their distances.*a, b, c, d, e, f"):
         import_any(data, "a.c3d")
     scene, _ = import_any(data, "a.c3d", ImportOptions(controllers=("d", "e", "f")))
-    assert np.allclose(scene.controllers, markers()[:, 3:], atol=FLOAT32)
+    assert np.allclose(scene.controllers, moving[:, 3:], atol=FLOAT32)
     with pytest.raises(SceneInvalid, match="no marker x"):
         import_any(data, "a.c3d", ImportOptions(controllers=("d", "x")))
-    with pytest.raises(SceneInvalid, match="none is left on the object"):
-        import_any(data, "a.c3d", ImportOptions(controllers=("a", "b", "c", "d", "e", "f")))
+    with pytest.raises(SceneInvalid, match="no marker is left on the body; 6 of 6"):
+        import_any(data, "a.c3d", ImportOptions(controllers=tuple(letters)))
 
 
 @pytest.mark.parametrize("up", ["x", "y", "z", "-x", "-y", "-z"])
@@ -110,6 +117,7 @@ def test_metres_called_millimetres_are_noticed(tmp_path: Path) -> None:
     data = write(tmp_path / "m.c3d", markers(), units="mm", per_metre=1.0)
     with pytest.raises(SceneInvalid, match=r"less than 0\.001 m"):
         import_any(data, "m.c3d")
+    assert np.allclose(import_any(data, "m.c3d", ImportOptions(unit="m"))[0].points, markers()[:, :3])
 
 
 @pytest.mark.parametrize("keep", [100, 512, 1024, 2500])
@@ -146,7 +154,7 @@ def test_a_parameter_that_does_not_end_within_the_file_is_refused_before_the_lib
     else:
         across, along = data[at + 4 : at + 6]
         data[at + 6 + across * along] = 255
-    monkeypatch.setattr(c3d, "_parsed_in_child", lambda source: pytest.fail("the library was asked"))
+    monkeypatch.setattr(library, "_in_child", lambda *_: pytest.fail("the library was asked"))
     with pytest.raises(
         SceneInvalid, match=r"cut short: \d+ bytes, a parameter at byte \d+ does not end within them"
     ):

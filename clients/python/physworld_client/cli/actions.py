@@ -7,15 +7,25 @@ from typing import Annotated
 
 import numpy as np
 import typer
+from pydantic import ValidationError
 from rich.progress import Progress
 
 from physworld_client.cli.lists import GROUPS, PAGE, download
 from physworld_client.cli.options import Json, Out, connected
-from physworld_client.cli.output import print_json, print_state, progress_text, show, stderr, stdout
+from physworld_client.cli.output import (
+    print_json,
+    print_state,
+    print_table,
+    progress_text,
+    show,
+    stderr,
+    stdout,
+)
 from physworld_client.client import Client
 from physworld_client.export import FORMATS
 from physworld_schemas.job import Job
 from physworld_schemas.library import catalogue
+from physworld_schemas.scene import SceneImport
 
 FORMS = "; ".join(f"{name}: {form.title}" for name, form in FORMATS.items()) + "."
 RECORDING = f"A folder with scene.json, or a file: {', '.join(one.title for one in catalogue().importers)}."
@@ -31,10 +41,33 @@ def _known(format: str) -> str:
 def scenes_add(
     client: Client,
     path: Annotated[Path, typer.Argument(help=RECORDING)],
+    options: Annotated[
+        str | None, typer.Option(help="What the recording does not say: a SceneImport, as JSON.")
+    ] = None,
+    preview: Annotated[
+        bool, typer.Option("--preview", help="Say what would be guessed, store nothing.")
+    ] = False,
     json: Json = False,
 ) -> None:
     """Upload a scene."""
-    show(client.scenes.create(path), json)
+    try:
+        given = None if options is None else SceneImport.model_validate_json(options)
+    except ValidationError as error:
+        raise typer.BadParameter(
+            f"--options: {error.errors()[0]['loc']}: {error.errors()[0]['msg']}"
+        ) from error
+    if not preview:
+        show(client.scenes.create(path, given), json)
+        return
+    found = client.scenes.preview(path, given)
+    if json:
+        print_json(found)
+        return
+    print_table(
+        ("what", "value", "how", "option"), [(g.what, g.value, g.how, g.option) for g in found.guesses]
+    )
+    for line in found.lines:
+        stdout.print(line, markup=False, soft_wrap=True)
 
 
 @connected(GROUPS["datasets"], "download")

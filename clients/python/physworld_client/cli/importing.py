@@ -17,14 +17,32 @@ def import_recording(
     source: Annotated[
         Path, typer.Argument(help="File of tracks or markers, archive, or folder of pictures.")
     ],
-    out: Annotated[Path, typer.Option(help="Folder for the scene.")],
+    out: Annotated[Path | None, typer.Option(help="Folder for the scene.")] = None,
+    look: Annotated[bool, typer.Option("--look", help="Say what would be guessed, write nothing.")] = False,
+    importer: Annotated[str | None, typer.Option(help="Form of the file, instead of by its content.")] = None,
     name: Annotated[str | None, typer.Option(help="Of the scene.")] = None,
     kind: Annotated[str | None, typer.Option(help="Of the object: beam, rope, sheet, toy ...")] = None,
-    fps: Annotated[float | None, typer.Option(help="Frames per second, where the source has none.")] = None,
+    fps: Annotated[float | None, typer.Option("--fps", "--rate", help="Frames per second.")] = None,
     noise: Annotated[float | None, typer.Option(help="Tracking noise per axis [m].")] = None,
-    body: Annotated[str | None, typer.Option(help="What is known of the body, JSON.")] = None,
+    body: Annotated[
+        list[str] | None, typer.Option(help="Markers on the body, by commas; or what is known of it, JSON.")
+    ] = None,
+    mass: Annotated[float | None, typer.Option(help="Of the body [kg].")] = None,
+    density: Annotated[float | None, typer.Option(help="Of the body [kg/m³].")] = None,
+    radius: Annotated[float | None, typer.Option(help="Of a rope or rod [m].")] = None,
+    thickness: Annotated[float | None, typer.Option(help="Of a sheet [m].")] = None,
+    length: Annotated[float | None, typer.Option(help="Of a rope, rod or arm [m].")] = None,
+    side: Annotated[float | None, typer.Option(help="Of a square sheet [m].")] = None,
+    box_m: Annotated[str | None, typer.Option(help="Box of the body, in the world [m]: X,Y,Z,X,Y,Z.")] = None,
+    assume: Annotated[
+        bool, typer.Option("--assume", help="Leave open what is not said of the body.")
+    ] = False,
+    unit: Annotated[str | None, typer.Option(help="Of a table of markers: m, cm, mm, in, ft.")] = None,
     up: Annotated[str | None, typer.Option(help="Axis that points up: x, y, z, -x, -y, -z.")] = None,
-    controllers: Annotated[str | None, typer.Option(help="Labels of driven markers, by commas.")] = None,
+    gripper: Annotated[
+        str | None,
+        typer.Option("--gripper", "--controllers", help="Markers or groups that hold the object, by commas."),
+    ] = None,
     box: Annotated[
         list[str] | None, typer.Option(help="Around the object: [CAMERA:]LEFT,TOP,RIGHT,BOTTOM.")
     ] = None,
@@ -51,9 +69,17 @@ def import_recording(
         "--kind": kind,
         "--fps": fps,
         "--noise": noise,
-        "--body": body,
+        "--importer": importer,
+        "--mass": mass,
+        "--density": density,
+        "--radius": radius,
+        "--thickness": thickness,
+        "--length": length,
+        "--side": side,
+        "--box-m": box_m,
+        "--unit": unit,
         "--up": up,
-        "--controllers": controllers,
+        "--gripper": gripper,
         "--marker": marker,
         "--patch": patch,
         "--colour": colour,
@@ -68,4 +94,6 @@ def import_recording(
     }
     options = [f"{option}={value}" for option, value in given.items() if value is not None]
     options += [f"--box={value}" for value in box or []] + [f"--mask={value}" for value in mask or []]
-    become(MODULE, [*options, *(["--undeformed"] if undeformed else []), "--", str(source)])
+    options += [f"--body={value}" for value in body or []]
+    flags = {"--undeformed": undeformed, "--look": look, "--assume": assume}
+    become(MODULE, [*options, *(flag for flag, given in flags.items() if given), "--", str(source)])

@@ -30,7 +30,7 @@ CANCEL_WAIT_S = 30.0
 
 
 def run(
-    scene: Annotated[Path, typer.Argument(help="Folder, archive, final_data.pkl or C3D file.")],
+    scene: Annotated[Path, typer.Argument(help="Folder, archive, final_data.pkl or table of markers.")],
     episodes: Annotated[int | None, typer.Option(min=1, help="Demonstration episodes.")] = None,
     hidden: Annotated[int | None, typer.Option(min=8, help="Width of the graph network.")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Training steps.")] = None,

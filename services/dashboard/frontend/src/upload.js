@@ -1,8 +1,10 @@
 // Uploads: a file, or a folder that is packed here, with a bar; the server's faults are shown where the file was dropped.
+// A table of markers is looked at first: what would be guessed is shown, and stored when it is confirmed.
 // Without this script the form posts the file as any form does.
 
 import { zip } from "fflate";
 
+const TABLE = /\.(csv|tsv|txt|dat|trc|c3d|npz|h5|hdf5|mcap)$/i;
 const PACKED = /\.(json|npz|obj|off|ply|stl)$/i;
 
 /** Every file below a dropped entry as [path within the folder, File]. */
@@ -45,6 +47,58 @@ function tell(form, told, faults = []) {
   place.append(list);
 }
 
+/** What a person said beside the file: the fields of a SceneImport that are filled. */
+function optionsOf(form) {
+  const options = {};
+  const body = {};
+  for (const input of form.querySelectorAll("[data-option], [data-fact], [data-names]")) {
+    const value = input.type === "number" ? input.valueAsNumber : input.value.trim();
+    if (value === "" || Number.isNaN(value)) continue;
+    if (input.dataset.fact) body[input.dataset.fact] = value;
+    else if (input.dataset.option) options[input.dataset.option] = value;
+    else options[input.dataset.names] = value.split(",").map((name) => name.trim());
+  }
+  return Object.keys(body).length ? { ...options, body } : options;
+}
+
+/** The guesses as a table, what is left out below it. */
+function show(form, found) {
+  tell(form, `${found.importer}: this was found, nothing is stored yet`);
+  const table = document.createElement("table");
+  const cells = (row, kind, texts) =>
+    row.append(...texts.map((text) => Object.assign(document.createElement(kind), { textContent: text })));
+  cells(table.createTHead().insertRow(), "th", ["what", "value", "how"]);
+  const rows = table.createTBody();
+  for (const guess of found.guesses) cells(rows.insertRow(), "td", [guess.what, guess.value, guess.how]);
+  const lines = document.createElement("ul");
+  for (const line of found.lines) lines.append(Object.assign(document.createElement("li"), { textContent: line }));
+  form.querySelector("[data-told]").append(table, lines);
+}
+
+/** Ask what an import would guess; the options are there for what it could not, or guessed wrongly. */
+async function look(form, file) {
+  const options = form.querySelector("[data-options]");
+  form.looked = file;
+  tell(form, `Looking at ${file.name} …`);
+  const body = new FormData();
+  body.append("bundle", file, file.name);
+  body.append("options", JSON.stringify(optionsOf(form)));
+  try {
+    const answer = await fetch(`${form.action}/preview`, { method: "POST", body, headers: { Accept: "application/json" } });
+    const found = await answer.json();
+    options.hidden = false;
+    if (answer.ok) show(form, found);
+    else tell(form, found.told ?? `The service answered ${answer.status}.`, found.faults);
+  } catch {
+    tell(form, "The service does not answer; nothing was stored.");
+  }
+}
+
+function bring(form, file) {
+  if (TABLE.test(file.name) && form.querySelector("[data-options]")) look(form, file);
+  else send(form, file);
+}
+
 function send(form, file) {
   const bar = form.querySelector("progress");
   const request = new XMLHttpRequest();
@@ -74,6 +128,7 @@ function send(form, file) {
   tell(form, `Uploading ${file.name} …`);
   const body = new FormData();
   body.append("bundle", file, file.name);
+  if (form.looked === file) body.append("options", JSON.stringify(optionsOf(form)));
   request.send(body);
 }
 
@@ -82,8 +137,10 @@ for (const form of document.querySelectorAll("[data-upload]")) {
     const file = form.querySelector('input[type="file"]').files[0];
     if (!file) return;
     event.preventDefault();
-    send(form, file);
+    bring(form, file);
   });
+  form.querySelector("[data-look]")?.addEventListener("click", () => look(form, form.looked));
+  form.querySelector("[data-store]")?.addEventListener("click", () => send(form, form.looked));
   form.addEventListener("dragover", (event) => {
     event.preventDefault();
     form.classList.add("over");
@@ -97,7 +154,7 @@ for (const form of document.querySelectorAll("[data-upload]")) {
     const file = event.dataTransfer.files[0];
     try {
       if (entry?.isDirectory) send(form, await packed(entry));
-      else if (file) send(form, file);
+      else if (file) bring(form, file);
     } catch (error) {
       tell(form, error.message);
     }

@@ -1,0 +1,1 @@
+"""Tables of markers: what motion capture programs export, and plain columns and arrays, to scenes."""
