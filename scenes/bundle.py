@@ -43,6 +43,7 @@ from physworld_scenes.errors import SceneInvalid
 from physworld_scenes.measured import hold
 from physworld_scenes.validation import check_scene
 from physworld_schemas.base import FieldError
+from physworld_schemas.wording import pictures_among
 
 JSON_NAME = "scene.json"
 ARRAYS_NAME = "scene.npz"
@@ -80,7 +81,10 @@ def read_bundle(path: Path | str, limits: ArchiveLimits = DEFAULT_LIMITS) -> Sce
         return bundle_from_bytes(path.read_bytes(), limits)[0]
     missing = [name for name in (JSON_NAME, ARRAYS_NAME) if not (path / name).is_file()]
     if missing:
-        raise SceneInvalid([FieldError(loc=[name], msg=f"is not in the folder {path}") for name in missing])
+        pictures = pictures_among((file.name for file in path.rglob("*")), str(path))
+        more = f"; {pictures}" if pictures else ""
+        faults = [FieldError(loc=[name], msg=f"is not in the folder {path}") for name in missing]
+        raise SceneInvalid([*faults[:-1], FieldError(loc=faults[-1].loc, msg=faults[-1].msg + more)])
     for name in (JSON_NAME, ARRAYS_NAME):
         size = (path / name).stat().st_size
         if size > limits.total_bytes:

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from datetime import datetime
-from typing import Annotated, Any, Generic, Literal, TypeVar
+from typing import Annotated, Any, Generic, Literal, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
+from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
+
+from physworld_schemas.wording import meant
 
 ObjectKind = Literal["scene", "fit", "trace", "dataset", "model", "assessment", "rollout", "plan", "artifact"]
 _UNSTORABLE = re.compile("[\0\ud800-\udfff]")
+_LITERAL = "{said}"
 _PLAIN = frozenset({float, int, bool, type(None)})
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 
@@ -26,6 +31,16 @@ class Request(BaseModel):
         if _holds_unstorable(value):
             raise ValueError("holds a NUL character or half of a surrogate pair")
         return value
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _nearest_key(cls, value: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        """Say of an unknown key which one was probably meant."""
+        try:
+            return handler(value)
+        except ValidationError as error:
+            faults = [_told(fault, cls.model_fields) for fault in error.errors(include_url=False)]
+            raise ValidationError.from_exception_data(error.title, faults) from None
 
 
 class Resource(BaseModel):
@@ -94,7 +109,7 @@ class Problem(Resource):
     detail: str = Field(default="", description="What went wrong, with its numbers.")
     request_id: str | None = Field(default=None, description="Finds the request in the service's log.")
     errors: list[FieldError] = Field(default_factory=list, description="Each fault with its place.")
-    hint: str | None = Field(default=None, description="What to do about it; null: nothing is known.")
+    hint: str | None = Field(default=None, description="What to do about it; absent: nothing is known.")
 
 
 def holds_unstorable_characters(text: str) -> bool:
@@ -115,6 +130,14 @@ def _holds_unstorable(value: Any) -> bool:
         elif isinstance(part, list):
             waiting += [item for item in part if type(item) not in _PLAIN]
     return False
+
+
+def _told(fault: ErrorDetails, known: Iterable[str]) -> InitErrorDetails:
+    """A fault as it was, an unknown key of this very model with the nearest known one."""
+    place, kind = fault["loc"], fault["type"]
+    said = meant(str(place[0]), known) if kind == "extra_forbidden" and len(place) == 1 else fault["msg"]
+    text = PydanticCustomError(kind, _LITERAL, {"said": said})  # type: ignore[arg-type]  # a type known only now
+    return InitErrorDetails(type=text, loc=place, input=fault["input"])
 
 
 class Figures(Resource):

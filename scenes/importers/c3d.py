@@ -33,6 +33,7 @@ from physworld_scenes.importers.axes import ROTATION_FROM_UP
 from physworld_scenes.importers.c3d_child import content_of
 from physworld_scenes.importers.options import Importer, ImportOptions, estimate_noise, split_of
 from physworld_schemas.base import FieldError
+from physworld_schemas.wording import reason
 
 DEFAULT_KIND = "blob"
 CONTROLLER_LABEL = re.compile(r"^(.*:)?(base|clamp|ctrl|control|grip|robot)", re.IGNORECASE)
@@ -170,7 +171,7 @@ def _parsed_here(source: Path) -> tuple[Array, Array, dict[str, Any]]:
     try:
         return content_of(str(source))
     except (MemoryError, KeyError, IndexError, TypeError, ValueError, OSError, RuntimeError) as error:
-        raise _invalid([f"cannot be read: {str(error)[:200] or type(error).__name__}"]) from error
+        raise _invalid([f"cannot be read: {reason(error)[:200]}"]) from error
 
 
 def _parsed_in_child(source: Path) -> tuple[Array, Array, dict[str, Any]]:

@@ -7,6 +7,8 @@ from datetime import UTC, datetime
 
 from markupsafe import Markup
 
+from physworld_schemas.wording import roughly
+
 _AGES = ((60, 1, "s"), (3600, 60, "min"), (86_400, 3600, "h"), (30 * 86_400, 86_400, "d"))
 DASH = "–"
 
@@ -150,6 +152,7 @@ FILTERS = {
     "measured": measured,
     "millimetres": millimetres,
     "shown_unit": shown_unit,
+    "roughly": roughly,
     "size": size,
     "words": words,
     "identifier": identifier,

@@ -137,7 +137,7 @@ def renew(
     if job.state == "cancelling":
         return "cancel"
     if progress is not None and SHARDS[lease.kind].progress is Tells.ITS_OWN:
-        report_progress(session, job, progress)
+        report_progress(session, job, progress, SHARDS[lease.kind].span, now)
     return "held"
 
 

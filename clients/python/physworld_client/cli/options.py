@@ -22,6 +22,26 @@ Limit = Annotated[int, typer.Option("--limit", "-n", min=1, help="At most so man
 Out = Annotated[Path | None, typer.Option("--out", "-o", help="Folder for the files [./ID].")]
 VersionName = Annotated[str, typer.Option("--version", help="A number, an alias, or latest.")]
 
+
+def written_as(*suffixes: str) -> Callable[[Path | None], Path | None]:
+    """The callback of an option that names a file to be written: its ending is one of these, or it is refused.
+
+    What is there already and is no plain file (a pipe, ``/dev/stdout``) takes anything.
+    """
+
+    def checked(path: Path | None) -> Path | None:
+        if path is None or path.suffix.lower() in suffixes or (path.exists() and not path.is_file()):
+            return path
+        ending = f"ends in {path.suffix!r}" if path.suffix else "has no ending"
+        raise typer.BadParameter(f"{path} {ending}; it is written as {' or '.join(suffixes)}")
+
+    return checked
+
+
+JSON_FILE, NPZ_FILE, MP4_FILE, PNG_FILE, HTML_FILE = map(
+    written_as, (".json", ".npz", ".mp4", ".png", ".html")
+)
+
 CONNECTION = {"url": Url, "token": Token, "data": Data}
 """The options that say which service a command talks to, by the parameters of ``service.connect``."""
 

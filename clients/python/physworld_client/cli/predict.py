@@ -11,7 +11,7 @@ import numpy as np
 import typer
 
 from physworld_client.arrays import arrays_of
-from physworld_client.cli.options import Json
+from physworld_client.cli.options import NPZ_FILE, Json
 from physworld_client.cli.output import print_json, stderr, stdout
 from physworld_client.client import Client
 from physworld_client.errors import PhysWorldError
@@ -19,6 +19,7 @@ from physworld_client.resources import LATEST
 from physworld_client.types import Array
 from physworld_schemas.plan import Plan, PlanConfig, PlanLimits
 from physworld_schemas.rollout import Part
+from physworld_schemas.wording import reason
 
 Version = Annotated[str, typer.Option(help="Number, alias or latest.")]
 
@@ -30,7 +31,10 @@ def rollout(
         Path,
         typer.Option(help="npz with controllers, (B, T, K, 3) or (T, K, 3) [m], and perhaps times (T,) [s]."),
     ],
-    out: Annotated[Path, typer.Option(help="Write times, points and what else is asked for to this npz.")],
+    out: Annotated[
+        Path,
+        typer.Option(callback=NPZ_FILE, help="Write times, points and what else is asked for to this npz."),
+    ],
     version: Version = LATEST,
     rest: Annotated[bool, typer.Option(help="Begin at rest, not as the recording did.")] = False,
     vertices: Annotated[bool, typer.Option(help="Also the vertices of the graph.")] = False,
@@ -74,7 +78,10 @@ def plan(
         Path,
         typer.Option(help="npz: index (M,) and places (M, 3) [m] of measured points, or shape (M, 3) [m]."),
     ],
-    out: Annotated[Path, typer.Option(help="Write the control path and the predicted paths to this npz.")],
+    out: Annotated[
+        Path,
+        typer.Option(callback=NPZ_FILE, help="Write the control path and the predicted paths to this npz."),
+    ],
     version: Version = LATEST,
     horizon: Annotated[int, typer.Option(min=2, help="Ticks of the motion.")] = 60,
     samples: Annotated[int, typer.Option(min=8, help="Motions tried in an iteration.")] = 512,
@@ -134,7 +141,7 @@ def _controllers(path: Path) -> dict[str, Array]:
                 "times": np.array(experiment["times_s"], dtype=float),
             }
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise PhysWorldError(f"{path} is no report of a trace: {error!r}") from error
+            raise PhysWorldError(f"{path} is no report of a trace: {reason(error)}") from error
     arrays = _npz(path)
     if "controllers" not in arrays:
         raise PhysWorldError(f"{path} holds {sorted(arrays)}, no controllers")
@@ -164,9 +171,10 @@ def _goal(path: Path) -> tuple[dict[int, Sequence[float]] | None, Array | None]:
 
 def _npz(path: Path) -> dict[str, Array]:
     try:
-        return arrays_of(path.read_bytes())
+        data = path.read_bytes()
     except OSError as error:
-        raise PhysWorldError(f"{path} cannot be read: {error}") from error
+        raise PhysWorldError(f"{path} cannot be read: {error.strerror}") from error
+    return arrays_of(data, str(path))
 
 
 def _write(path: Path, arrays: dict[str, Array]) -> None:

@@ -12,7 +12,7 @@ import typer
 
 from physworld_client.cli import service
 from physworld_client.cli.follow import follow
-from physworld_client.cli.options import Data, Token, Url
+from physworld_client.cli.options import JSON_FILE, Data, Token, Url
 from physworld_client.cli.output import stderr, stdout
 from physworld_client.cli.report import CLOSED_LOOP, STAGES, build_report, print_report, write_report
 from physworld_client.cli.up import require_service_code
@@ -62,7 +62,9 @@ def run(
     compare: Annotated[
         bool, typer.Option(help="Train a model without the effect too, so that the card can compare.")
     ] = True,
-    json: Annotated[Path | None, typer.Option(help="Write the figures to this file.")] = None,
+    json: Annotated[
+        Path | None, typer.Option(callback=JSON_FILE, help="Write the figures to this file.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the model [DATA/models/NAME-VERSION].")] = None,
     workers: Annotated[int, typer.Option(min=1, help="Workers, if the service must be started.")] = 2,
     keep_up: Annotated[bool, typer.Option("--keep-up", help="Leave a started service running.")] = False,
