@@ -33,14 +33,14 @@ from physworld_schemas.rollout import RolloutCreate
 from physworld_schemas.trace import TraceConfig
 
 WITHIN_S = 5.0
-MOMENTS = 6
+MOMENTS, FEW_MOMENTS = 6, 3
 CANDIDATES, TICKS = 64, 400
 LOOK_S = 0.05
 JOB_S, CANCEL_S = 1800.0, 300.0
 MODEL = "cancelled"
-FIT = FitConfig(max_simulations=24, particle_budget=1500)
-DATASET = DatasetConfig(episodes=12, frames=100)
-TRAINING = TrainingConfig(steps=40)
+FIT = FitConfig(max_simulations=12, particle_budget=1000)
+DATASET = DatasetConfig(episodes=8, frames=60)
+TRAINING = TrainingConfig(steps=16, fine_tune_steps=10, hidden=32)
 TRACE = TraceConfig(candidates=["air_drag_linear", "viscosity_kelvin_voigt"], confirmed=2, iterations=2)
 TRACED = FitConfig(max_simulations=12, particle_budget=600, damping="none")
 
