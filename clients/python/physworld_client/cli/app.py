@@ -18,8 +18,21 @@ from pydantic import ValidationError
 
 import physworld_client.cli.actions
 import physworld_client.cli.loop
-import physworld_client.cli.registry  # noqa: F401  (adds commands to the groups)
-from physworld_client.cli import catalogue, effects, fit, importing, lists, predict, run, trace, up, video
+import physworld_client.cli.registry
+import physworld_client.cli.starts  # noqa: F401  (adds commands to the groups)
+from physworld_client.cli import (
+    catalogue,
+    effects,
+    fit,
+    importing,
+    lists,
+    predict,
+    run,
+    running,
+    trace,
+    up,
+    video,
+)
 from physworld_client.cli.options import connected
 from physworld_client.cli.output import stderr
 from physworld_client.errors import PhysWorldError
@@ -28,12 +41,14 @@ app = typer.Typer(
     name="physworld",
     help="From a recording of a deformable object to a world model.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
 app.command("up")(up.up)
 app.command("run")(run.run)
+app.command("status")(running.status)
+app.command("logs")(running.logs)
+app.command("down")(running.down)
 app.command("fit")(fit.fit)
 app.command("trace", cls=trace.ManyHeldOut)(trace.trace)
 connected(app, "rollout")(predict.rollout)

@@ -11,6 +11,8 @@ import numpy as np
 import typer
 
 from physworld_client.arrays import arrays_of
+from physworld_client.cli.names import found as known_as
+from physworld_client.cli.names import help_of
 from physworld_client.cli.options import NPZ_FILE, Json
 from physworld_client.cli.output import print_json, stderr, stdout
 from physworld_client.client import Client
@@ -26,7 +28,7 @@ Version = Annotated[str, typer.Option(help="Number, alias or latest.")]
 
 def rollout(
     client: Client,
-    model: Annotated[str, typer.Argument(help="Name of a published model.")],
+    model: Annotated[str, typer.Argument(help=help_of("models"))],
     controllers: Annotated[
         Path,
         typer.Option(help="npz with controllers, (B, T, K, 3) or (T, K, 3) [m], and perhaps times (T,) [s]."),
@@ -46,6 +48,7 @@ def rollout(
     """Predict what the object does under given motions of its control points."""
     arrays = _controllers(controllers)
     returns: list[Part] = ["points", "vertices"] if vertices else ["points"]
+    model = known_as(client, "models", model)
     found = client.rollouts.create(
         model,
         arrays["controllers"],
@@ -73,7 +76,7 @@ def rollout(
 
 def plan(
     client: Client,
-    model: Annotated[str, typer.Argument(help="Name of a published model.")],
+    model: Annotated[str, typer.Argument(help=help_of("models"))],
     goal: Annotated[
         Path,
         typer.Option(help="npz: index (M,) and places (M, 3) [m] of measured points, or shape (M, 3) [m]."),
@@ -96,6 +99,7 @@ def plan(
     """Find a motion of the grips that brings the object to a goal, and check it in the twin."""
     points, shape = _goal(goal)
     config = PlanConfig(horizon=horizon, samples=samples, iterations=iterations, seed=seed)
+    model = known_as(client, "models", model)
     job = client.plans.create(
         model,
         _version(version),
