@@ -3,7 +3,7 @@
 A handler is ``run(context: TaskContext, stores: Stores) -> HandlerResult``, named by its kind of shard
 (``physworld_storage.jobs.kind.ShardKind``).
 
-The thread renews the lease about every two seconds (sooner when there is new progress) and reads from the
+The thread renews the lease about every second (sooner when there is new progress) and reads from the
 same transaction whether the job was cancelled or the lease lost. A handler calls ``progress`` and ``check``
 as often as it likes: both only touch memory.
 
@@ -42,7 +42,7 @@ logger = logging.getLogger(__name__)
 OPEN: set[TaskContext] = set()
 """The leases that this process holds: a shard that decides takes its own helpers."""
 
-RENEW_INTERVAL_S = 2.0
+RENEW_INTERVAL_S = 1.0
 PROGRESS_INTERVAL_S = 0.5
 GRACE_S = 1.5
 """From the moment that a process knows of a cancellation to the one when it no longer waits for its handler."""

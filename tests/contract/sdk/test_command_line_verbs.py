@@ -159,7 +159,8 @@ def test_a_local_file_is_never_called_an_answer_of_the_service(service: Service,
 
 def test_every_resource_of_the_table_has_its_list(service: Service, tmp_path: Path) -> None:
     for resource in RESOURCES:
-        assert isinstance(output_of(service, tmp_path, resource.name, "list"), list), resource.name
+        whose = ("byname",) if resource.lists[0].of else ()
+        assert isinstance(output_of(service, tmp_path, resource.name, "list", *whose), list), resource.name
 
 
 def test_the_shell_is_told_how_to_complete(tmp_path: Path) -> None:

@@ -89,6 +89,11 @@ class Resource:
     shown: bool = True
     files: str | None = None
 
+    @property
+    def argument(self) -> Any:
+        """The type of the argument that names one: by its id alone where there is no list of all of them."""
+        return one_of(self.name) if self.lists[0].of is None else str
+
 
 def _scene(scene: Scene) -> Sequence[object]:
     counts = (scene.frames, scene.points, scene.controllers)
@@ -237,9 +242,10 @@ PLANS = Listing(
 )
 ASSESSMENTS = Listing(
     "list",
-    "Recordings held against a model, newest first.",
+    "Recordings held against a model.",
     ("id", "model", "scene", "state", "outcome", "age"),
     _assessment,
+    of=("name", "models"),
 )
 KEYS = Listing("list", "Keys, newest first, ended ones too.", ("id", "name", "role", "until", "age"), _key)
 RESOURCES = (
@@ -306,7 +312,7 @@ def _add_show(group: typer.Typer, resource: Resource) -> None:
         show(getattr(client, resource.name).get(given[name]), given["json"])
 
     shown.__doc__ = f"One {resource.one}."
-    connected(group, "show", {name: (one_of(resource.name), inspect.Parameter.empty), "json": (Json, False)})(
+    connected(group, "show", {name: (resource.argument, inspect.Parameter.empty), "json": (Json, False)})(
         shown
     )
 
@@ -319,7 +325,7 @@ def _add_download(group: typer.Typer, resource: Resource) -> None:
         download(client, found.artifacts, given["out"] or Path(given[name]))
 
     downloaded.__doc__ = f"Download {resource.files}."
-    which = (one_of(resource.name), inspect.Parameter.empty)
+    which = (resource.argument, inspect.Parameter.empty)
     connected(group, "download", {name: which, "out": (Out, None)})(downloaded)
 
 

@@ -28,7 +28,6 @@ SINGULAR = {
     "models": "model",
     "rollouts": "rollout",
     "plans": "plan",
-    "assessments": "assessment",
     "jobs": "job",
     "keys": "key",
 }
