@@ -136,7 +136,7 @@ def _told(fault: ErrorDetails, known: Iterable[str]) -> InitErrorDetails:
     """A fault as it was, an unknown key of this very model with the nearest known one."""
     place, kind = fault["loc"], fault["type"]
     said = meant(str(place[0]), known) if kind == "extra_forbidden" and len(place) == 1 else fault["msg"]
-    text = PydanticCustomError(kind, _LITERAL, {"said": said})  # type: ignore[arg-type]  # a type known only now
+    text = PydanticCustomError(kind, _LITERAL, {"said": said})
     return InitErrorDetails(type=text, loc=place, input=fault["input"])
 
 

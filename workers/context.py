@@ -7,7 +7,7 @@ The thread renews the lease about every second (sooner when there is new progres
 same transaction whether the job was cancelled or the lease lost. A handler calls ``progress`` and ``check``
 as often as it likes: both only touch memory.
 
-A cancelled handler has ``GRACE_S`` to notice. One that is inside code that cannot be asked (a compiler, an export) is
+A handler that is cancelled or has lost its lease has ``GRACE_S`` to notice. One that is inside code that cannot be asked (a compiler, an export) is
 then left behind: the thread ends the shard as cancelled, so that whatever the handler still makes belongs to nobody,
 and calls ``abandon``, by which a worker's process ends itself (ADR 47).
 
@@ -68,7 +68,8 @@ class TaskContext:
         lease: of the shard.
         database: where it is renewed.
         settings: of the worker.
-        abandon: ends the process, once a cancelled handler has not returned within ``GRACE_S``; None: it is waited for.
+        abandon: ends the process, once a handler that should stop has not returned within ``GRACE_S``; None: it is
+            waited for.
     """
 
     def __init__(
@@ -172,18 +173,20 @@ class TaskContext:
                 self._renew(progress)
             except DatabaseUnavailable as error:
                 logger.warning("lease %s not renewed: %s", self.lease.shard_id, error)
-            if self._lost:
-                return
-            if self._cancelled and self._abandon is not None:
+            if (self._cancelled or self._lost) and self._abandon is not None:
                 if not self._stop.wait(GRACE_S):
                     self._leave_behind(self._abandon)
+                return
+            if self._lost:
                 return
             self._stop.wait(min(PROGRESS_INTERVAL_S, self._interval_s))
 
     def _leave_behind(self, abandon: Callable[[], None]) -> None:
         """End every shard that this process holds, and then the process."""
         for context in (*OPEN,):
-            logger.warning("shard %s: cancelled, and its handler does not stop", context.lease.shard_id)
+            logger.warning(
+                "shard %s: no longer wanted, and its handler does not stop", context.lease.shard_id
+            )
             try:
                 with self.database.session() as session:
                     leases.mark_cancelled(session, context.lease)

@@ -88,7 +88,7 @@ def versions_chart(versions: Sequence[ModelVersion], floor_m: float | None) -> H
     for name in ("twin", "world_model", "world_model_finetuned"):
         one = PREDICTORS[name]
         for version in versions:
-            table = held_out_of(version.metrics) or {}
+            table: Mapping[str, Any] = held_out_of(version.metrics) or {}
             value = table.get(METRIC, {}).get(name)
             if value is None:
                 continue

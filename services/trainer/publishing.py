@@ -103,7 +103,7 @@ def store_version(
         "vertices": measured.vertices.astype(np.float32),
     }
     facts = {"format": "physworld-world-model", "name": payload["name"], "version": str(payload["version"])}
-    programs = []
+    programs: list[Artifact] = []
     formats = list(dict.fromkeys(card["training"]["formats"]))
     for name in formats:
         poll(len(programs), len(formats))

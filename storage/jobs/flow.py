@@ -9,7 +9,7 @@ workers that finish the last two episodes at the same moment start the next stag
 
 from __future__ import annotations
 
-from datetime import datetime
+from datetime import datetime, timedelta
 from typing import Any
 
 from sqlalchemy import exists, select, update
@@ -17,6 +17,7 @@ from sqlalchemy.orm import Session
 
 from physworld_schemas.base import Problem, Reference
 from physworld_schemas.job import TERMINAL_STATES, Progress
+from physworld_storage.clock import database_now
 from physworld_storage.errors import Conflict
 from physworld_storage.jobs.events import append_event
 from physworld_storage.jobs.kind import ShardResult, Tells
@@ -24,6 +25,9 @@ from physworld_storage.jobs.kinds import SHARDS, kind_of
 from physworld_storage.jobs.progress import of_the_job
 from physworld_storage.jobs.shards import CANCELLED, QUEUED, RUNNING, put_up, put_up_more
 from physworld_storage.tables import JobRow, ShardRow
+
+CANCEL_WITHIN_S = 3.0
+"""From a cancellation to the end of the leases of what runs: what a worker has to stop by itself."""
 
 
 def shard_started(session: Session, job: JobRow, attempt: int, now: datetime) -> None:
@@ -121,6 +125,9 @@ def fail_job(session: Session, job: JobRow, problem: Problem, now: datetime) -> 
 def request_cancel(session: Session, job: JobRow, now: datetime) -> None:
     """Cancel the job, its children and its parent. Running shards see it at their next ``renew``.
 
+    Whatever their workers do, their leases end after ``CANCEL_WITHIN_S`` and are not prolonged: the job is then cancelled
+    without them.
+
     Raises Conflict when the job has succeeded or failed; a second cancel changes nothing.
     """
     if job.state in {"succeeded", "failed"}:
@@ -130,6 +137,7 @@ def request_cancel(session: Session, job: JobRow, now: datetime) -> None:
         if row.state in TERMINAL_STATES or row.state == "cancelling":
             continue
         _stop_shards(session, row, (QUEUED,), now)
+        _shorten_leases(session, row)
         _set_state(session, row, "cancelling")
     for row in (*_children(session, root), root):
         settle_cancel(session, row, now)
@@ -228,6 +236,12 @@ def _stop_shards(session: Session, job: JobRow, states: tuple[str, ...], now: da
         .where(ShardRow.job_id == job.id, ShardRow.state.in_(states))
         .values(state=CANCELLED, lease_owner=None, lease_until=None, finished_at=now)
     )
+
+
+def _shorten_leases(session: Session, job: JobRow) -> None:
+    end = database_now(session) + timedelta(seconds=CANCEL_WITHIN_S)
+    held = (ShardRow.job_id == job.id, ShardRow.state == RUNNING, ShardRow.lease_until > end)
+    session.execute(update(ShardRow).where(*held).values(lease_until=end))
 
 
 def _has_running(session: Session, job: JobRow) -> bool:

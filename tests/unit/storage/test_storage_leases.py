@@ -19,6 +19,7 @@ from physworld_storage.clock import CLOCK
 from physworld_storage.database import Database
 from physworld_storage.errors import ResultInvalid
 from physworld_storage.jobs import events, jobs, leases
+from physworld_storage.jobs.flow import CANCEL_WITHIN_S
 from physworld_storage.tables import ShardRow, utc_now
 
 if TYPE_CHECKING:
@@ -342,3 +343,18 @@ def test_a_problem_survives_the_database_unchanged(work: Work) -> None:
     with work.database.session() as session:
         leases.fail(session, lease, problem, retry=False)
     assert work.job(job).error == problem
+
+
+def test_a_cancelled_job_does_not_wait_for_a_worker_that_is_gone(work: Work) -> None:
+    job = work.fit()
+    lease = work.claim()
+    work.cancel(job)
+    with work.database.session() as session:
+        assert leases.renew(session, lease, LEASE_SECONDS) == "cancel"  # and the lease is no longer for it
+        assert leases.reap(session) == []
+    with work.database.session() as session:
+        put_forward(session, CANCEL_WITHIN_S + 0.1)
+        assert leases.reap(session) == [lease.shard_id]
+    assert work.job(job).state == "cancelled"
+    with work.database.session() as session:
+        assert leases.renew(session, lease, LEASE_SECONDS) == "lost"

@@ -139,7 +139,8 @@ def _version(version: ModelVersion) -> Sequence[object]:
 
 
 def _rollout(run: Rollout) -> Sequence[object]:
-    return (run.id, f"{run.model}:{run.version}", run.state, run.candidates, run.ticks, ago(run.created_at))
+    age = "" if run.created_at is None else ago(run.created_at)
+    return (run.id, f"{run.model}:{run.version}", run.state, run.candidates, run.ticks, age)
 
 
 def _plan(run: Plan) -> Sequence[object]:

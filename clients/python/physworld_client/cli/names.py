@@ -67,7 +67,7 @@ def found(client: Client, resource: str, given: str) -> str:
     if re.fullmatch(prefix + _ULID, given) if prefix else not re.fullmatch(_MODEL, given):
         return given  # an id; or what can be no model's name, which the request itself will say
     listed = islice(getattr(client, resource).list(limit=PAGE).auto_paging_iter(), MOST)
-    known = [
+    known: list[tuple[str, str]] = [
         (item.name, item.name)
         if resource == "models"
         else (item.id, item.name if resource in WITH_NAMES else "")

@@ -98,9 +98,9 @@ def logs(
             if size > places[process]:
                 with path.open("rb") as file:
                     file.seek(places[process])
-                    text = file.read()
-                places[process] += len(text)
-                _print(text.decode(errors="replace").splitlines(), "" if name else process)
+                    more = file.read()
+                places[process] += len(more)
+                _print(more.decode(errors="replace").splitlines(), "" if name else process)
 
 
 def down(data: Data = None) -> None:
