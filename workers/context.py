@@ -7,9 +7,9 @@ The thread renews the lease about every second (sooner when there is new progres
 same transaction whether the job was cancelled or the lease lost. A handler calls ``progress`` and ``check``
 as often as it likes: both only touch memory.
 
-A handler that is cancelled or has lost its lease has ``GRACE_S`` to notice. One that is inside code that cannot be asked (a compiler, an export) is
-then left behind: the thread ends the shard as cancelled, so that whatever the handler still makes belongs to nobody,
-and calls ``abandon``, by which a worker's process ends itself (ADR 47).
+A handler that is cancelled or has lost its lease has ``GRACE_S`` to notice. One that is inside code that cannot be
+asked (a compiler, an export) is then left behind: the thread ends the shard as cancelled, so that whatever the handler
+still makes belongs to nobody, and calls ``abandon``, by which a worker's process ends itself (ADR 47).
 
 A database that does not answer costs the lease once ``lease_seconds`` have passed since the last renewal, by this
 process's own monotonic clock, so a paused process stops by itself.

@@ -125,8 +125,8 @@ def fail_job(session: Session, job: JobRow, problem: Problem, now: datetime) -> 
 def request_cancel(session: Session, job: JobRow, now: datetime) -> None:
     """Cancel the job, its children and its parent. Running shards see it at their next ``renew``.
 
-    Whatever their workers do, their leases end after ``CANCEL_WITHIN_S`` and are not prolonged: the job is then cancelled
-    without them.
+    Whatever their workers do, their leases end after ``CANCEL_WITHIN_S`` and are not prolonged: the job is then
+    cancelled without them.
 
     Raises Conflict when the job has succeeded or failed; a second cancel changes nothing.
     """
