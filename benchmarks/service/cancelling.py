@@ -39,7 +39,7 @@ LOOK_S = 0.05
 JOB_S, CANCEL_S = 1800.0, 300.0
 MODEL = "cancelled"
 BEFORE_S = {"fit, no kernel compiled yet": 12.1, "fit": 2.8, "trace": 2.5, "dataset": 3.1, "training": 79.4}
-"""The longest of each before decision 47, by this script on the same machine at the same load (a training of 16 steps)."""
+"""The longest of each before decision 47, by this script on the same machine (a training of 16 steps)."""
 FIT = FitConfig(max_simulations=10, particle_budget=800)
 DATASET = DatasetConfig(episodes=8, frames=60)
 TRAINING = TrainingConfig(steps=8, fine_tune_steps=5, hidden=32, vertices=60)

@@ -80,7 +80,7 @@ def store_version(
     view: SceneView,
     measured: Measured,
     card: dict[str, Any],
-    poll: Callable[[int, int], None] = lambda done, of: None,
+    begin: Callable[[str], None] = lambda name: None,
 ) -> list[Artifact]:
     """The version's files, the manifest and its signature last.
 
@@ -91,7 +91,7 @@ def store_version(
         view: the recording at its vertices.
         measured: its predictions.
         card: what it says of itself.
-        poll: called before each program with (done, of); it raises to end the export.
+        begin: called before each program with its format; it raises to end the export.
     """
     put = stores.artifacts.put_bytes
     prediction = {
@@ -104,9 +104,8 @@ def store_version(
     }
     facts = {"format": "physworld-world-model", "name": payload["name"], "version": str(payload["version"])}
     programs: list[Artifact] = []
-    formats = list(dict.fromkeys(card["training"]["formats"]))
-    for name in formats:
-        poll(len(programs), len(formats))
+    for name in dict.fromkeys(card["training"]["formats"]):
+        begin(name)
         programs.append(
             put(PROGRAMS[name][1](published.model), PROGRAMS[name][0], "application/octet-stream")
         )

@@ -22,7 +22,7 @@ from physworld_workers.tasks.inputs import scene_of, scene_reference
 from physworld_workers.tasks.shared_runs import SharedRunner, stored_journal
 
 SEARCH, NUMERICS = "calibrating", "measuring the numerics"
-NUMERICS_SIMULATIONS = 60.0
+NUMERICS_SIMULATIONS = 35.0
 """Simulations of the search that those on finer cells and steps take as long as, about."""
 WORTH_SHARING_S = 0.3  # to hand a simulation to another worker takes some hundredths of a second
 
