@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from datetime import datetime
+from html import escape
 from typing import Annotated, Any, Generic, Literal, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
@@ -14,6 +15,8 @@ from physworld_schemas.wording import meant
 
 ObjectKind = Literal["scene", "fit", "trace", "dataset", "model", "assessment", "rollout", "plan", "artifact"]
 _UNSTORABLE = re.compile("[\0\ud800-\udfff]")
+LINE, LONGEST_TEXT = 120, 40
+"""Characters of the line that an object is shown in, and of a text in it."""
 _LITERAL = "{said}"
 _PLAIN = frozenset({float, int, bool, type(None)})
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
@@ -47,6 +50,31 @@ class Resource(BaseModel):
     """An object that the service returns: a newer service may add fields."""
 
     model_config = ConfigDict(extra="ignore")
+
+    def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
+        """What a line has room for: plain fields that are set, long texts cut, the rest as an ellipsis."""
+        left = LINE
+        for name, value in self._plain_fields():
+            shown = value if len(str(value)) <= LONGEST_TEXT else f"{str(value)[: LONGEST_TEXT - 1]}…"
+            left -= len(f"{name}={shown!r}, ")
+            if left < 0:
+                yield None, ...
+                return
+            yield name, shown
+
+    def _repr_html_(self) -> str:
+        """The plain fields as a table, for notebooks."""
+        rows = "".join(
+            f"<tr><th style='text-align:left'>{escape(name)}</th><td>{escape(str(value))}</td></tr>"
+            for name, value in self._plain_fields()
+        )
+        return f"<table><caption>{escape(type(self).__name__)}</caption><tbody>{rows}</tbody></table>"
+
+    def _plain_fields(self) -> Iterator[tuple[str, Any]]:
+        for name in type(self).model_fields:
+            value = getattr(self, name)
+            if value not in (None, "") and isinstance(value, str | int | float | bool | datetime):
+                yield name, value
 
 
 class Reference(Resource):
