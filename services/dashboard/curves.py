@@ -104,6 +104,7 @@ def versions_chart(versions: Sequence[ModelVersion], floor_m: float | None) -> H
         x_label="mean track error on the held-out frames [mm], 95 % interval",
         floor=None if floor_m is None else MM * floor_m,
         log_x=bool(values) and max(values) > DWARFS * min(values),
+        width=980,
     )
 
 
@@ -115,8 +116,8 @@ def training_charts(points: Sequence[tuple[float, Mapping[str, float]]]) -> list
     """
     charts = []
     for name, label, role, scale, unit in (
-        ("loss", "training loss, share of the prior's error", "calibrated", 1.0, ""),
-        ("validation_m", "open-loop error of the validation [mm]", "model", MM, "mm"),
+        ("loss", "training loss / prior's", "calibrated", 1.0, ""),
+        ("validation_m", "validation error [mm]", "model", MM, "mm"),
     ):
         told = {step: scale * figures[name] for step, figures in points if name in figures}
         if len(told) < FEWEST:
