@@ -30,6 +30,7 @@ BENCHMARKS = (
     "service.factory",
     "service.idle_and_start",
     "service.api_load",
+    "service.cancelling",
     "speed.video",
 )
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")

@@ -43,6 +43,7 @@ from physworld_scenes.errors import SceneInvalid
 from physworld_scenes.measured import hold
 from physworld_scenes.validation import check_scene
 from physworld_schemas.base import FieldError
+from physworld_schemas.wording import pictures_among
 
 JSON_NAME = "scene.json"
 ARRAYS_NAME = "scene.npz"
@@ -69,7 +70,12 @@ NUMBER_FACTS = ("length_m", "side_m", "thickness_m", "radius_m", "density_kg_m3"
 
 
 def read_bundle(path: Path | str, limits: ArchiveLimits = DEFAULT_LIMITS) -> Scene:
-    """The scene in a folder or an archive.
+    """The scene in a folder or an archive; see ``read_with_warnings``."""
+    return read_with_warnings(path, limits)[0]
+
+
+def read_with_warnings(path: Path | str, limits: ArchiveLimits = DEFAULT_LIMITS) -> tuple[Scene, list[str]]:
+    """The scene in a folder or an archive, and the warnings that it travels with.
 
     Raises:
         SceneInvalid: with every fault that the reading found.
@@ -77,10 +83,13 @@ def read_bundle(path: Path | str, limits: ArchiveLimits = DEFAULT_LIMITS) -> Sce
     """
     path = Path(path)
     if not path.is_dir():
-        return bundle_from_bytes(path.read_bytes(), limits)[0]
+        return bundle_from_bytes(path.read_bytes(), limits)
     missing = [name for name in (JSON_NAME, ARRAYS_NAME) if not (path / name).is_file()]
     if missing:
-        raise SceneInvalid([FieldError(loc=[name], msg=f"is not in the folder {path}") for name in missing])
+        pictures = pictures_among((file.name for file in path.rglob("*")), str(path))
+        more = f"; {pictures}" if pictures else ""
+        faults = [FieldError(loc=[name], msg=f"is not in the folder {path}") for name in missing]
+        raise SceneInvalid([*faults[:-1], FieldError(loc=faults[-1].loc, msg=faults[-1].msg + more)])
     for name in (JSON_NAME, ARRAYS_NAME):
         size = (path / name).stat().st_size
         if size > limits.total_bytes:
@@ -92,7 +101,7 @@ def read_bundle(path: Path | str, limits: ArchiveLimits = DEFAULT_LIMITS) -> Sce
         return file.read_bytes() if inside and file.stat().st_size <= MAX_MESH_BYTES else None
 
     json_text, npz = (path / JSON_NAME).read_bytes(), (path / ARRAYS_NAME).read_bytes()
-    return scene_from_files(json_text, npz, limits, fetch)[0]
+    return scene_from_files(json_text, npz, limits, fetch)
 
 
 def bundle_from_bytes(data: bytes, limits: ArchiveLimits = DEFAULT_LIMITS) -> tuple[Scene, list[str]]:

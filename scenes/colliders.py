@@ -19,6 +19,7 @@ from physworld.shapes.surface_mesh import SurfaceMesh, merged
 from physworld_scenes.declaration import ColliderForm, Declaration
 from physworld_scenes.measured import Findings, Measured
 from physworld_schemas.base import FieldError
+from physworld_schemas.wording import reason
 
 LARGEST_SIZES, SMALLEST_SIZES = 100.0, 0.01
 """Longest side of a collider over the object's size: a floor or a table at most, the tip of a needle at least."""
@@ -167,9 +168,7 @@ def read_mesh(path: str, content: bytes) -> SurfaceMesh:
             np.asarray(loaded.faces, dtype=np.int64),
         )
     except Exception as error:
-        raise MeshRefused(
-            f"{path} cannot be read as {suffix}: {type(error).__name__}: {str(error)[:200]}"
-        ) from error
+        raise MeshRefused(f"{path} cannot be read as {suffix}: {reason(error)[:200]}") from error
     if faces.ndim != 2 or not len(faces) or not len(vertices):
         raise MeshRefused(f"{path} holds no triangles ({len(vertices)} vertices)")
     if len(faces) > MAX_FACES:

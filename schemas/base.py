@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable, Iterator
 from datetime import datetime
-from typing import Annotated, Any, Generic, Literal, TypeVar
+from html import escape
+from typing import Annotated, Any, Generic, Literal, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
+from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
+
+from physworld_schemas.wording import meant
 
 ObjectKind = Literal[
     "scene", "check", "fit", "trace", "dataset", "model", "assessment", "rollout", "plan", "artifact"
 ]
 _UNSTORABLE = re.compile("[\0\ud800-\udfff]")
+LINE, LONGEST_TEXT = 120, 40
+"""Characters of the line that an object is shown in, and of a text in it."""
+_LITERAL = "{said}"
 _PLAIN = frozenset({float, int, bool, type(None)})
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 
@@ -29,11 +37,46 @@ class Request(BaseModel):
             raise ValueError("holds a NUL character or half of a surrogate pair")
         return value
 
+    @model_validator(mode="wrap")
+    @classmethod
+    def _nearest_key(cls, value: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        """Say of an unknown key which one was probably meant."""
+        try:
+            return handler(value)
+        except ValidationError as error:
+            faults = [_told(fault, cls.model_fields) for fault in error.errors(include_url=False)]
+            raise ValidationError.from_exception_data(error.title, faults) from None
+
 
 class Resource(BaseModel):
     """An object that the service returns: a newer service may add fields."""
 
     model_config = ConfigDict(extra="ignore")
+
+    def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
+        """What a line has room for: plain fields that are set, long texts cut, the rest as an ellipsis."""
+        left = LINE
+        for name, value in self._plain_fields():
+            shown = value if len(str(value)) <= LONGEST_TEXT else f"{str(value)[: LONGEST_TEXT - 1]}…"
+            left -= len(f"{name}={shown!r}, ")
+            if left < 0:
+                yield None, ...
+                return
+            yield name, shown
+
+    def _repr_html_(self) -> str:
+        """The plain fields as a table, for notebooks."""
+        rows = "".join(
+            f"<tr><th style='text-align:left'>{escape(name)}</th><td>{escape(str(value))}</td></tr>"
+            for name, value in self._plain_fields()
+        )
+        return f"<table><caption>{escape(type(self).__name__)}</caption><tbody>{rows}</tbody></table>"
+
+    def _plain_fields(self) -> Iterator[tuple[str, Any]]:
+        for name in type(self).model_fields:
+            value = getattr(self, name)
+            if value not in (None, "") and isinstance(value, str | int | float | bool | datetime):
+                yield name, value
 
 
 class Reference(Resource):
@@ -96,7 +139,7 @@ class Problem(Resource):
     detail: str = Field(default="", description="What went wrong, with its numbers.")
     request_id: str | None = Field(default=None, description="Finds the request in the service's log.")
     errors: list[FieldError] = Field(default_factory=list, description="Each fault with its place.")
-    hint: str | None = Field(default=None, description="What to do about it; null: nothing is known.")
+    hint: str | None = Field(default=None, description="What to do about it; absent: nothing is known.")
 
 
 def holds_unstorable_characters(text: str) -> bool:
@@ -117,6 +160,14 @@ def _holds_unstorable(value: Any) -> bool:
         elif isinstance(part, list):
             waiting += [item for item in part if type(item) not in _PLAIN]
     return False
+
+
+def _told(fault: ErrorDetails, known: Iterable[str]) -> InitErrorDetails:
+    """A fault as it was, an unknown key of this very model with the nearest known one."""
+    place, kind = fault["loc"], fault["type"]
+    said = meant(str(place[0]), known) if kind == "extra_forbidden" and len(place) == 1 else fault["msg"]
+    text = PydanticCustomError(kind, _LITERAL, {"said": said})
+    return InitErrorDetails(type=text, loc=place, input=fault["input"])
 
 
 class Figures(Resource):

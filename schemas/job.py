@@ -15,12 +15,39 @@ TERMINAL_STATES: frozenset[str] = frozenset({"succeeded", "failed", "cancelled"}
 
 
 class Progress(Resource):
-    """How far a job is: ``done`` of ``total`` ``unit`` (frames, simulations, episodes, steps)."""
+    """How far a job is: ``done`` of ``total`` ``unit`` of what it does now, and how much of the whole job that is.
+
+    Units are frames, simulations, episodes, steps.
+    """
 
     done: float = Field(default=0, description="How much is done.")
     total: float = Field(default=0, description="Of how much; 0: not known yet.")
     unit: str = Field(default="", description="What is counted.", examples=["simulations"])
     message: str = Field(default="", description="What is being done.")
+    fraction: float | None = Field(
+        default=None,
+        ge=0,
+        le=1,
+        description="Share of the whole job that is done, all its stages together; it never falls. null: not known.",
+    )
+    eta_s: float | None = Field(
+        default=None,
+        ge=0,
+        description="Until the job ends, at its pace so far; null: too early to tell, or it has ended.",
+        json_schema_extra={"unit": "s"},
+    )
+
+    figures: dict[str, float] = Field(
+        default_factory=dict,
+        description="Newest figures of the work; of a training `loss` (share of the prior's error) and `validation_m`.",
+    )
+
+    @property
+    def share(self) -> float:
+        """How much is done, 0 to 1: ``fraction`` where it is known, else what is counted."""
+        if self.fraction is not None:
+            return self.fraction
+        return min(1.0, max(0.0, self.done / self.total)) if self.total > 0 else 0.0
 
 
 class Job(Resource):
@@ -42,6 +69,11 @@ class Job(Resource):
     config: dict[str, Any] = Field(default_factory=dict, description="Settings.")
     error: Problem | None = Field(default=None, description="Why it failed; null: it did not.")
     links: dict[str, str] = Field(default_factory=dict, description="Addresses of what belongs to it.")
+
+    @property
+    def share(self) -> float:
+        """How much of it is done, 0 to 1."""
+        return 1.0 if self.state == "succeeded" else self.progress.share
 
 
 class Event(Resource):

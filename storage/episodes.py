@@ -35,6 +35,7 @@ from pydantic import ValidationError
 
 from physworld_schemas.base import Artifact, Resource
 from physworld_schemas.dataset import Episode
+from physworld_schemas.wording import reason
 from physworld_storage.artifacts import ArtifactStore
 from physworld_storage.errors import EpisodeCorrupt, NotFound
 from physworld_storage.patience import WORKING, Patience
@@ -317,4 +318,4 @@ def _decoding(path: str) -> Iterator[None]:
     except (
         ValueError, RuntimeError, LookupError, TypeError, AttributeError, ArithmeticError, EOFError, BadZipFile
     ) as error:  # fmt: skip
-        raise EpisodeCorrupt(f"{path} cannot be decoded: {type(error).__name__}: {error}") from error
+        raise EpisodeCorrupt(f"{path} cannot be decoded: {reason(error)}") from error

@@ -45,6 +45,19 @@ def list_plans(
     return _page(session, "plan", Plan, limit, cursor, model)
 
 
+def get_run(session: Session, kind: RunKind, run_id: str) -> Rollout | Plan:
+    """The rollout or plan, or NotFound."""
+    return get_rollout(session, run_id) if kind == "rollout" else get_plan(session, run_id)
+
+
+def list_runs(
+    session: Session, kind: RunKind, *, limit: int = 50, cursor: str | None = None, model: str | None = None
+) -> Page[Rollout] | Page[Plan]:
+    """Rollouts or plans, newest first."""
+    listed = list_rollouts if kind == "rollout" else list_plans
+    return listed(session, limit=limit, cursor=cursor, model=model)
+
+
 def mark_run_ready(
     session: Session,
     kind: RunKind,

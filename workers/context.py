@@ -3,19 +3,25 @@
 A handler is ``run(context: TaskContext, stores: Stores) -> HandlerResult``, named by its kind of shard
 (``physworld_storage.jobs.kind.ShardKind``).
 
-The thread renews the lease about every two seconds (sooner when there is new progress) and reads from the
+The thread renews the lease about every second (sooner when there is new progress) and reads from the
 same transaction whether the job was cancelled or the lease lost. A handler calls ``progress`` and ``check``
-as often as it likes: both only touch memory. A database that does not answer costs the lease once
-``lease_seconds`` have passed since the last renewal, by this process's own monotonic clock, so a paused
-process stops by itself.
+as often as it likes: both only touch memory.
+
+A handler that is cancelled or has lost its lease has ``GRACE_S`` to notice. One that is inside code that cannot be
+asked (a compiler, an export) is then left behind: the thread ends the shard as cancelled, so that whatever the handler
+still makes belongs to nobody, and calls ``abandon``, by which a worker's process ends itself (ADR 47).
+
+A database that does not answer costs the lease once ``lease_seconds`` have passed since the last renewal, by this
+process's own monotonic clock, so a paused process stops by itself.
 """
 
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -26,14 +32,20 @@ from physworld_storage.errors import DatabaseUnavailable
 from physworld_storage.jobs import leases
 from physworld_storage.settings import Settings
 from physworld_workers.errors import Cancelled, LeaseLost
+from physworld_workers.pace import Pace
 
 if TYPE_CHECKING:
     from physworld_workers.stores import Stores
 
 logger = logging.getLogger(__name__)
 
-RENEW_INTERVAL_S = 2.0
+OPEN: set[TaskContext] = set()
+"""The leases that this process holds: a shard that decides takes its own helpers."""
+
+RENEW_INTERVAL_S = 1.0
 PROGRESS_INTERVAL_S = 0.5
+GRACE_S = 1.5
+"""From the moment that a process knows of a cancellation to the one when it no longer waits for its handler."""
 JOIN_S = 5.0
 """That the end of a task waits for a renewal under way, which may wait for a silent database."""
 
@@ -50,14 +62,30 @@ Handler = Callable[["TaskContext", "Stores"], HandlerResult]
 
 
 class TaskContext:
-    """A lease under renewal; use as a context manager around the handler."""
+    """A lease under renewal; use as a context manager around the handler.
 
-    def __init__(self, lease: leases.Lease, database: Database, settings: Settings) -> None:
+    Args:
+        lease: of the shard.
+        database: where it is renewed.
+        settings: of the worker.
+        abandon: ends the process, once a handler that should stop has not returned within ``GRACE_S``; None: it is
+            waited for.
+    """
+
+    def __init__(
+        self,
+        lease: leases.Lease,
+        database: Database,
+        settings: Settings,
+        abandon: Callable[[], None] | None = None,
+    ) -> None:
         self.lease = lease
+        self._abandon = abandon
         self.database = database
         self.settings = settings
         self._interval_s = min(RENEW_INTERVAL_S, settings.lease_seconds / 4)
         self._progress: Progress | None = None
+        self._pace = Pace()
         self._lock = threading.Lock()
         self._fresh = threading.Event()
         self._stop = threading.Event()
@@ -67,20 +95,50 @@ class TaskContext:
         self._thread = threading.Thread(target=self._beat, name=f"lease-{lease.shard_id}", daemon=True)
 
     def __enter__(self) -> TaskContext:
+        OPEN.add(self)
         self._thread.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        OPEN.discard(self)
         self._stop.set()
         self._fresh.set()
         self._thread.join(JOIN_S)  # a renewal that hangs writes nothing that the epoch does not allow
 
-    def progress(self, done: float, total: float, unit: str = "", message: str = "") -> None:
-        """Report how far the shard is; written to the database at most twice a second."""
+    def plan(self, weights: Mapping[str, float]) -> None:
+        """Say which stages the shard goes through, in their order, and about how long each takes (in one unit)."""
+        self._pace.plan(weights)
+
+    def begin(self, stage: str, unit: str = "", total: float = 1.0) -> None:
+        """A stage of the plan begins, of which ``progress`` tells from now on. Raises Cancelled, LeaseLost."""
+        self.check()
+        self._pace.begin(stage)
+        self.progress(0, total, unit, stage)
+
+    def progress(
+        self,
+        done: float,
+        total: float,
+        unit: str = "",
+        message: str = "",
+        figures: Mapping[str, float] | None = None,
+    ) -> None:
+        """Report how far the stage is, and so the shard; written to the database at most twice a second.
+
+        Args:
+            done: how much of the stage is done.
+            total: of how much.
+            unit: what is counted.
+            message: what is being done.
+            figures: the newest figures of the work, finite ones.
+        """
+        share, left_s = self._pace.reach(done, total)
+        told = Progress(done=done, total=total, unit=unit, message=message, fraction=share, eta_s=left_s)
+        told.figures = {name: value for name, value in (figures or {}).items() if math.isfinite(value)}
         with self._lock:
-            self._progress = Progress(done=done, total=total, unit=unit, message=message)
+            self._progress = told
         self._fresh.set()
 
     def cancelled(self) -> bool:
@@ -115,9 +173,26 @@ class TaskContext:
                 self._renew(progress)
             except DatabaseUnavailable as error:
                 logger.warning("lease %s not renewed: %s", self.lease.shard_id, error)
+            if (self._cancelled or self._lost) and self._abandon is not None:
+                if not self._stop.wait(GRACE_S):
+                    self._leave_behind(self._abandon)
+                return
             if self._lost:
                 return
             self._stop.wait(min(PROGRESS_INTERVAL_S, self._interval_s))
+
+    def _leave_behind(self, abandon: Callable[[], None]) -> None:
+        """End every shard that this process holds, and then the process."""
+        for context in (*OPEN,):
+            logger.warning(
+                "shard %s: no longer wanted, and its handler does not stop", context.lease.shard_id
+            )
+            try:
+                with self.database.session() as session:
+                    leases.mark_cancelled(session, context.lease)
+            except DatabaseUnavailable as error:  # the dispatcher finds the owner dead
+                logger.warning("shard %s: not ended: %s", context.lease.shard_id, error)
+        abandon()
 
     def _renew(self, progress: Progress | None) -> None:
         started = time.monotonic()

@@ -11,7 +11,8 @@ from __future__ import annotations
 import functools
 import importlib
 import logging
-import re
+import os
+import signal
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,7 +24,9 @@ from physworld.errors import Cancelled as LibraryCancelled
 from physworld.errors import PhysworldError
 from physworld.worldmodel.errors import WorldModelError
 from physworld_schemas.base import Problem
+from physworld_schemas.hints import hint_of
 from physworld_schemas.job import TERMINAL_STATES
+from physworld_schemas.wording import reason, words
 from physworld_storage.database import Database, open_database
 from physworld_storage.errors import DatabaseUnavailable, StorageError, StoreReadFailed, StoreWriteFailed
 from physworld_storage.jobs import leases
@@ -72,13 +75,14 @@ def handler_of(kind: str) -> Handler:
 
 @dataclass(frozen=True)
 class Runtime:
-    """What every shard of this process shares."""
+    """What every shard of this process shares; ``abandon`` ends the process where a handler cannot be stopped."""
 
     settings: Settings
     database: Database
     stores: Stores
     owner: str
     handler_of: Callable[[str], Handler] = handler_of
+    abandon: Callable[[], None] | None = None
 
 
 @functools.cache
@@ -86,7 +90,12 @@ def process_runtime() -> Runtime:
     """The runtime of this process, opened at its first shard (never before a fork)."""
     settings = get_settings()
     database = open_database(settings)
-    return Runtime(settings, database, Stores(settings, database), process_owner())
+    return Runtime(settings, database, Stores(settings, database), process_owner(), abandon=end_process)
+
+
+def end_process() -> None:
+    """End this pool process at once, whatever code it is in; the worker puts up another one."""
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 def run_shard(runtime: Runtime, shard_id: str) -> Outcome:
@@ -107,7 +116,7 @@ def run_shard(runtime: Runtime, shard_id: str) -> Outcome:
 
 def _run_claimed(runtime: Runtime, lease: leases.Lease) -> Outcome:
     try:
-        with TaskContext(lease, runtime.database, runtime.settings) as context:
+        with TaskContext(lease, runtime.database, runtime.settings, runtime.abandon) as context:
             made = runtime.handler_of(lease.kind)(context, runtime.stores)
         return _commit(runtime, context, made)
     except LeaseLost as error:
@@ -166,21 +175,16 @@ def _record_failure(runtime: Runtime, lease: leases.Lease, error: BaseException,
 
 def problem_of(error: BaseException) -> Problem:
     """The problem document of an exception: its own code if it has one, else its type in snake case."""
-    name = type(error).__name__
     return Problem(
         type=f"urn:physworld:problem:{_code(error)}",
-        title=_words(name),
+        title=words(type(error).__name__),
         status=500 if isinstance(error, WORTH_A_RETRY) or not isinstance(error, SAID_BY_THE_WORK) else 422,
         code=_code(error),
-        detail=f"{name}: {error}" if str(error) else name,
+        detail=reason(error),
         errors=list(getattr(error, "faults", [])),
-        hint=getattr(error, "hint", None),
+        hint=getattr(error, "hint", None) or hint_of(_code(error)),
     )
 
 
 def _code(error: BaseException) -> str:
-    return str(getattr(error, "code", None) or _words(type(error).__name__).replace(" ", "_"))
-
-
-def _words(name: str) -> str:
-    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", name).lower()
+    return str(getattr(error, "code", None) or words(type(error).__name__).replace(" ", "_"))

@@ -19,6 +19,7 @@ from typing import Any
 import httpx
 
 from physworld.errors import LawAnswerUnavailable
+from physworld_schemas.wording import reason
 
 VARIABLES = ("PHYSWORLD_LAW_URL", "PHYSWORLD_LAW_MODEL", "PHYSWORLD_LAW_KEY", "PHYSWORLD_LAW_TIMEOUT_S")
 TIMEOUT_S = 60.0
@@ -60,7 +61,7 @@ class LawEndpoint:
         try:
             raw = self._exchange(body, headers)
         except (httpx.HTTPError, httpx.InvalidURL) as error:
-            raise LawAnswerUnavailable(f"{self.base_url}: {type(error).__name__}: {error}") from error
+            raise LawAnswerUnavailable(f"{self.base_url}: {reason(error)}") from error
         return _text_of(raw, self.base_url)
 
     def _exchange(self, body: dict[str, Any], headers: dict[str, str]) -> bytes:

@@ -14,13 +14,14 @@ is left of the wall time is the queue's: publishing, claiming, committing, waiti
 from __future__ import annotations
 
 import json
+import os
 import signal
 import sqlite3
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -197,8 +198,13 @@ def _fit(client: Client, bundle: Path, particles: int) -> str:
 
 
 @contextmanager
-def service(data: Path, workers: int) -> Iterator[Client]:
-    """The embedded service on ``data`` with so many workers and no trainer; stopped at the end."""
+def service(
+    data: Path, workers: int, *, trainer: bool = False, environment: Mapping[str, str] | None = None
+) -> Iterator[Client]:
+    """The embedded service on ``data`` with so many workers, without a trainer unless asked for; stopped at the end.
+
+    ``environment`` is added to this process's own.
+    """
     command = [
         sys.executable,
         "-m",
@@ -209,7 +215,12 @@ def service(data: Path, workers: int) -> Iterator[Client]:
         str(workers),
     ]
     with (data / "service.log").open("a") as log:
-        process = subprocess.Popen([*command, "--no-trainer"], stdout=log, stderr=subprocess.STDOUT)
+        process = subprocess.Popen(
+            [*command, *([] if trainer else ["--no-trainer"])],
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            env={**os.environ, **(environment or {})},
+        )
         try:
             state = _ready_state(data, process)
             key = Path(state["api_key_file"]).read_text().strip()

@@ -21,6 +21,7 @@ from physworld.report.view import script, view
 from physworld.scene import Scene
 
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+STYLES = ("palette.css", "style.css")
 _CLAIMED = ("named", "equivalent_set", "data_issue", "numerical_issue")
 
 
@@ -72,7 +73,7 @@ def render(report: dict[str, Any], scene: Scene, before: Array, after: Array) ->
         tag("meta", http_equiv="Content-Security-Policy", content=_POLICY),
         tag("meta", name="viewport", content="width=device-width, initial-scale=1"),
         tag("title", f"Trace of {report.get('scene', scene.name)}"),
-        tag("style", Html(files(__package__).joinpath("style.css").read_text())),
+        tag("style", Html("\n".join(files(__package__).joinpath(f).read_text() for f in STYLES))),
     )
     body = tag("body", tag("main", *sections), tag("script", Html(script())))
     return "<!doctype html>\n" + tag("html", head, body, lang="en") + "\n"

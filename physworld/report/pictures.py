@@ -13,6 +13,7 @@ import numpy as np
 from physworld.arrays import Array
 from physworld.report.curves import Residuals, carpet, mean_component, per_frame
 from physworld.report.markup import Child, Html, tag
+from physworld.report.predictors import PREDICTORS
 from physworld.report.svg import Axes, Series, legend_of, line_chart, picture, short
 from physworld.report.words import number, title
 
@@ -21,19 +22,14 @@ MOST_FRAMES = 600
 LEAST_SHARE = 0.005  # of the residual: candidates below it share a line
 _HEAT = (224, 72, 47)  # on white and on black; its opacity is the value
 _UNSEEN = (128, 128, 128, 46)
-_BASELINE_ROLES = {
-    "static": ("stay as in frame 0", "static", "2 4"),
-    "rigid_follow": ("follow the grips rigidly", "rigid", "7 3"),
-    "constant_velocity": ("keep the first velocity", "velocity", "7 3 2 3"),
-}
 
 
 def horizon(found: Residuals, sigma: float | None) -> Html:
     """Error of the open-loop predictions against the horizon, with baselines and the noise floor."""
     picked = _picked(found)
     series = [
-        Series(label, role, _mm(found.baselines[name][picked]), 1.4, dash)
-        for name, (label, role, dash) in _BASELINE_ROLES.items()
+        Series(one.label, one.role, _mm(found.baselines[name][picked]), 1.4, one.dash)
+        for name, one in PREDICTORS.items()
         if name in found.baselines
     ]
     if sigma:

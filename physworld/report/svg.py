@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from physworld.report.markup import Child, Html, tag
+from physworld.report.predictors import NOISE
 from physworld.report.words import number
 
 TICKS = 5
+ROW = 26.0
+"""Height of a row of an interval chart [px]."""
+DWARFS = 10.0
+"""Ratio of the largest line of a chart to the smallest from which on the axis is logarithmic."""
 
 
 @dataclass(frozen=True)
@@ -133,8 +139,11 @@ def line_chart(
     width: float = 720.0,
     symmetric: bool = False,
     named: bool = True,
+    unit: str = "",
 ) -> Html:
     """Lines over x, with a legend if ``named``; what lies after ``split`` is shaded as held out.
+
+    The figure carries its numbers as JSON (``data-x``, ``data-series``), for a page to tell those under a pointer.
 
     Args:
         x: places along the horizontal axis, (n,).
@@ -145,6 +154,7 @@ def line_chart(
         height, width: [px].
         symmetric: zero in the middle of the vertical axis.
         named: curves are named.
+        unit: of the values.
     """
     values = [v for s in series for v in s.values if v is not None and math.isfinite(v)]
     x_range = (float(x[0]), float(x[-1])) if len(x) > 1 else (0.0, 1.0)
@@ -165,7 +175,88 @@ def line_chart(
         axes.width, axes.height, title, *parts, data_time=f"{x_range[0]:.6g} {x_range[1]:.6g}",
         data_span=f"{axes.left:g} {axes.width - axes.right:g}",
     )  # fmt: skip
-    return tag("figure", tag("div", drawn, class_="scroll"), legend_of(series) if named else None)
+    numbers = [{"label": s.label, "role": s.role, "values": [_plain(v) for v in s.values]} for s in series]
+    return tag(
+        "figure", tag("div", drawn, class_="scroll"), legend_of(series) if named else None, class_="plot",
+        data_x=json.dumps([_plain(v) for v in x]), data_series=json.dumps(numbers), data_unit=unit,
+    )  # fmt: skip
+
+
+def dwarfed(series: Sequence[Series]) -> bool:
+    """Whether some lines are so small beside the others that only a logarithmic axis shows both."""
+    highest = [max((v for v in s.values if v is not None and math.isfinite(v)), default=0.0) for s in series]
+    positive = [value for value in highest if value > 0]
+    return len(positive) > 1 and max(positive) > DWARFS * min(positive)
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A row of an interval chart: its label, its role, the value, and the ends of its interval where there is one."""
+
+    label: str
+    role: str
+    value: float
+    ends: tuple[float, float] | None = None
+
+
+def interval_chart(
+    rows: Sequence[Interval],
+    *,
+    title: str,
+    x_label: str,
+    floor: float | None = None,
+    log_x: bool = False,
+    width: float = 720.0,
+) -> Html:
+    """Values with their intervals, one a row, smallest at the left; ``floor`` is a line that no row can be left of.
+
+    Args:
+        rows: what is compared, from the top.
+        title, x_label: texts.
+        floor: noise floor, say, in the unit of the values; None: no line.
+        log_x: logarithmic axis.
+        width: [px].
+    """
+    held = [v for row in rows for v in (row.value, *(row.ends or ())) if math.isfinite(v)]
+    low, high = _range(held + ([] if floor is None else [floor]), log_x, False)
+    axes = Axes(width, ROW * len(rows) + 62.0, (low, high), (0.0, 1.0), left=230.0, top=8.0, bottom=44.0)
+
+    def across(value: float) -> float:
+        if not log_x:
+            return axes.x(value)
+        share = (math.log10(max(value, low)) - math.log10(low)) / (math.log10(high) - math.log10(low))
+        return axes.left + share * (axes.width - axes.left - axes.right)
+
+    foot = axes.height - axes.bottom
+    parts: list[Child] = []
+    for tick in decades(low, high) if log_x else round_ticks(low, high):
+        x = across(tick)
+        parts.append(tag("line", class_="grid", x1=x, x2=x, y1=axes.top, y2=foot))
+        parts.append(tag("text", short(tick), class_="tick", x=x, y=foot + 16, text_anchor="middle"))
+    if floor is not None:
+        x = across(floor)
+        ends = {"x1": x, "x2": x, "y1": axes.top, "y2": foot}
+        parts.append(tag("line", class_=f"line {NOISE}", stroke_width=1.6, stroke_dasharray="3 3", **ends))
+    for place, row in enumerate(rows):
+        y = axes.top + ROW * (place + 0.5)
+        parts.append(tag("text", row.label, x=axes.left - 12, y=y + 4, text_anchor="end"))
+        if row.ends is not None and all(map(math.isfinite, row.ends)):
+            left, right = map(across, row.ends)
+            parts.append(
+                tag("line", class_=f"line {row.role}", x1=left, x2=right, y1=y, y2=y, stroke_width=2.5)
+            )
+        if math.isfinite(row.value):
+            parts.append(tag("circle", class_=f"dot {row.role}", cx=across(row.value), cy=y, r=4.5))
+    middle = 0.5 * (axes.left + axes.width - axes.right)
+    parts.append(tag("text", x_label, class_="label", x=middle, y=axes.height - 6, text_anchor="middle"))
+    return tag(
+        "figure", tag("div", picture(axes.width, axes.height, title, *parts), class_="scroll"), class_="plot"
+    )
+
+
+def _plain(value: float | None) -> float | None:
+    """A number as JSON has it, no more exact than a picture needs."""
+    return None if value is None or not math.isfinite(value) else float(f"{value:.5g}")
 
 
 def round_ticks(low: float, high: float, count: int = TICKS) -> list[float]:

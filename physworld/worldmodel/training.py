@@ -123,6 +123,7 @@ def train(
     checkpoint: bytes | None = None,
     save_checkpoint: Callable[[bytes], None] | None = None,
     progress: Callable[[int, int, float], None] | None = None,
+    validated: Callable[[int, float], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> TrainingResult:
     """Train on ``tracks``; see the module's docstring.
@@ -138,6 +139,7 @@ def train(
         checkpoint: bytes that an earlier, interrupted run gave to ``save_checkpoint``.
         save_checkpoint: called every ``checkpoint_every`` steps.
         progress: called after each step with (step, steps, loss).
+        validated: called after each validation with (step, open-loop error [m]).
         cancelled: asked before each step; true raises TrainingCancelled.
     """
     if not tracks:
@@ -167,7 +169,7 @@ def train(
     if checkpoint is not None:
         _restore(run, checkpoint, identity)
     if run.step == 0:
-        _validate(run, held_out)
+        _validate(run, held_out, validated)
     joined = first
     sampler = WindowSampler(fitting)
     while run.step < training.steps and not _out_of_patience(run, training):
@@ -182,7 +184,7 @@ def train(
         run.step += 1
         if run.step % training.validation_every == 0 or run.step == training.steps:
             run.losses.append((run.step, run.loss))
-            _validate(run, held_out)
+            _validate(run, held_out, validated)
         if save_checkpoint is not None and run.step % training.checkpoint_every == 0:
             save_checkpoint(_checkpoint(run, identity))
         if progress is not None:
@@ -305,9 +307,11 @@ def _with_noise(window: Tensor, n: int, scale: Tensor, generator: torch.Generato
     return noisy
 
 
-def _validate(run: _Run, held_out: list[Track]) -> None:
+def _validate(run: _Run, held_out: list[Track], validated: Callable[[int, float], None] | None) -> None:
     error = open_loop_error(run.average, held_out)
     run.validation.append((run.step, error))
+    if validated is not None:
+        validated(run.step, error)
     if error < run.best_error_m or not run.best_weights:
         run.best_error_m, run.best_step = error, run.step
         run.best_weights = {name: value.clone() for name, value in run.average.state_dict().items()}

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from physworld.arrays import Array
+from physworld_schemas.wording import reason
 
 NUMBER_CODE = re.compile(r"^([<>|=]?)([biuf])(1|2|4|8)$")
 """Type codes of numpy that are plain numbers."""
@@ -55,9 +56,8 @@ def load_arrays(data: bytes) -> Any:
     except PickleRefused:
         raise
     except MALFORMED as error:
-        text = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
         raise PickleRefused(
-            f"the pickle of {len(data)} bytes is damaged or truncated ({text[:200]})"
+            f"the pickle of {len(data)} bytes is damaged or truncated ({reason(error)[:200]})"
         ) from error
 
 

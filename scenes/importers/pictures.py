@@ -30,6 +30,7 @@ from physworld_scenes.errors import SceneInvalid
 from physworld_scenes.importers.array_pickle import PickleRefused, load_arrays
 from physworld_scenes.importers.options import FolderImporter
 from physworld_schemas.base import FieldError
+from physworld_schemas.wording import reason
 
 COLOUR_FOLDERS, DEPTH_FOLDERS = ("color", "colour", "rgb", "image"), ("depth",)
 PICTURES, FILMS, ARRAYS = (".png", ".jpg", ".jpeg"), (".mp4", ".mkv", ".avi"), (".npy",)
@@ -335,7 +336,7 @@ def _expect(name: str, read: Callable[[], Any]) -> Any:
     try:
         return read()
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, np.linalg.LinAlgError) as error:
-        raise refused(name, f"is not of its form: {type(error).__name__} {str(error)[:160]}") from error
+        raise refused(name, f"is not of its form: {reason(error)[:160]}") from error
 
 
 def _json(path: Path) -> Any:

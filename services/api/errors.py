@@ -20,6 +20,7 @@ from starlette.exceptions import HTTPException
 
 from physworld_scenes.errors import SceneInvalid
 from physworld_schemas.base import FieldError, Problem
+from physworld_schemas.hints import hint_of
 from physworld_storage.errors import (
     ArtifactCorrupt,
     Conflict,
@@ -108,10 +109,10 @@ def problem_response(
         detail=_printable(detail),
         request_id=request_id,
         errors=[_printable_fault(fault) for fault in errors],
-        hint=hint,
+        hint=hint or hint_of(code),
     )
     return JSONResponse(
-        {**problem.model_dump(mode="json"), **more},
+        {**problem.model_dump(mode="json", exclude={"hint"} if problem.hint is None else None), **more},
         status,
         headers=dict(headers or {}),
         media_type=PROBLEM_MEDIA_TYPE,
@@ -234,8 +235,7 @@ async def _unexpected(request: Request, error: Exception) -> JSONResponse:
     return problem_response(
         500,
         "internal_error",
-        f"{type(error).__name__} while answering {request.method} {request.url.path}",
+        f"an unexpected fault while answering {request.method} {request.url.path}",
         request_id=request_id,
-        hint="The service's log holds the traceback under this request id.",
         headers={"X-Request-Id": request_id} if request_id else None,
     )

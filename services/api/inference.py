@@ -6,6 +6,7 @@ import httpx
 
 from physworld_schemas.base import FieldError
 from physworld_schemas.rollout import Rollout, RolloutCreate
+from physworld_schemas.wording import reason
 from physworld_services.api.errors import ApiProblem
 from physworld_storage.access import tickets
 from physworld_storage.database import Database
@@ -30,7 +31,7 @@ def roll_out(url: str, database: Database, credential: str, request: RolloutCrea
             trust_env=False,
         )
     except httpx.TransportError as error:
-        raise unavailable(f"the inference service does not answer: {type(error).__name__}") from error
+        raise unavailable(f"the inference service does not answer: {reason(error)}") from error
     if answer.status_code == 200:
         return Rollout.model_validate_json(answer.content)
     if answer.headers.get("Content-Type", "").startswith("application/problem+json"):

@@ -1,4 +1,5 @@
-"""Curves over time for the charts: a prediction's error per frame, curves that a result brought along."""
+"""What the plots of the pages show: a prediction's error per frame, curves that a result brought along, versions side
+by side, a training under way. All are drawn by ``physworld.report.svg``."""
 
 from __future__ import annotations
 
@@ -9,25 +10,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from physworld.arrays import Array
-from physworld_schemas.model import ModelComparison
+from physworld.report.markup import Html
+from physworld.report.predictors import NOISE, PREDICTORS
+from physworld.report.svg import DWARFS, Interval, Series, dwarfed, interval_chart, line_chart
+from physworld_schemas.model import ModelVersion
+from physworld_services.dashboard.tables import held_out_of
 
 if TYPE_CHECKING:
     from physworld.scene import Scene
 
-MOST_TIMES = 1500
-LABELS = {
-    "static": ("Static", "static"),
-    "rigid_follow": ("Rigid follow", "rigid"),
-    "constant_velocity": ("Constant velocity", "velocity"),
-    "before": ("Before", "other"),
-    "after": ("After", "predicted"),
-    "twin_homogeneous": ("Twin without its field", "other"),
-    "twin": ("Twin", "predicted"),
-    "world_model": ("World model", "other"),
-    "world_model_finetuned": ("World model, fine-tuned", "model"),
-}
-PREDICTORS = ("after", "twin_homogeneous", "twin", "world_model", "world_model_finetuned")
+MOST_TIMES = 600
 TIMES_KEY = "times_s"
+MM = 1e3
+VERSION_DASHES = (None, "7 3", "2 3", "9 3 2 3", "1 4", "12 4")
+"""One colour is one predictor's; versions that are compared differ in their dash."""
+METRIC = "track_m"
+FEWEST = 2
+"""Points that make a line."""
 
 
 def frame_errors(scene: Scene, tracks: Array) -> Array:
@@ -43,46 +42,103 @@ def frame_errors(scene: Scene, tracks: Array) -> Array:
 
 
 def chart(
-    times: Array, errors: Mapping[str, Array], *, split: float | None, x_label: str = "time [s]"
-) -> dict[str, object]:
-    """The JSON that ``frontend/src/curve.js`` draws: error curves [m] in millimetres over ``times`` [s]."""
-    stride = max(1, -(-len(times) // MOST_TIMES))
-    return {
-        "x": {"label": x_label},
-        "y": {"label": "mean error [mm]", "unit": "mm"},
-        "times": _rounded(times[::stride]),
-        "split": split,
-        "series": [
-            {
-                "label": LABELS.get(name, (name.replace("_", " "), "other"))[0],
-                "role": LABELS.get(name, (name, "other"))[1],
-                "bold": name in PREDICTORS,
-                "values": _rounded(np.asarray(values)[::stride] * 1000),
-            }
-            for name, values in errors.items()
-        ],
-    }
+    times: Array, errors: Mapping[str, Array], *, split: float | None = None, floor_m: float | None = None
+) -> Html:
+    """Error curves [m] in millimetres over ``times`` [s], with the noise floor; logarithmic where baselines dwarf them.
+
+    Args:
+        times: (T,) [s].
+        errors: (T,) [m] by predictor.
+        split: where the held-out frames begin [s].
+        floor_m: mean error of a perfect prediction under the declared noise [m]; None: not known.
+    """
+    picked = slice(None, None, max(1, -(-len(times) // MOST_TIMES)))
+    series = [
+        Series(one.label, one.role, _mm(errors[name][picked]), 1.4 if one.baseline else 2.2, one.dash)
+        for name, one in PREDICTORS.items()
+        if name in errors
+    ]
+    return _drawn(times[picked], series, split, floor_m)
 
 
-def comparison_chart(found: ModelComparison) -> dict[str, object]:
-    """Curves of two versions over the times of the first; what only the scene decides (baselines) is drawn once."""
-    times = np.array(found.curves_a.times_s, dtype=float)
-    errors: dict[str, Array] = {}
-    drawn = chart(times, errors, split=None)
-    series = []
-    for number, curves, roles in (
-        (found.a, found.curves_a, {"twin": "rigid", "world_model_finetuned": "other"}),
-        (found.b, found.curves_b, {"twin": "predicted", "world_model_finetuned": "model"}),
-    ):
-        for name, values in curves.track_m.items():
-            if name not in roles or len(values) != len(curves.times_s) or len(values) < 2:
+def comparison_chart(versions: Sequence[ModelVersion], floor_m: float | None) -> Html | None:
+    """Curves of versions over the times of the first, each predictor in its colour, each version with its dash.
+
+    None where none of them has curves.
+    """
+    series: list[Series] = []
+    times = np.empty(0)
+    for version, dash in zip(versions, VERSION_DASHES, strict=False):
+        given = given_curves(version.metrics)
+        if given is None:
+            continue
+        times = times if len(times) else given[0]
+        for name in ("twin", "world_model_finetuned"):
+            if name in given[1]:
+                one = PREDICTORS[name]
+                label = f"{one.label}, version {version.version}"
+                values = onto(given[0], given[1][name], times)
+                series.append(Series(label, one.role, _mm(values), 2.2, dash))
+    return _drawn(times, series, None, floor_m) if series else None
+
+
+def versions_chart(versions: Sequence[ModelVersion], floor_m: float | None) -> Html | None:
+    """Mean held-out track errors of versions with their intervals, a row each and predictor; None without any."""
+    rows = []
+    for name in ("twin", "world_model", "world_model_finetuned"):
+        one = PREDICTORS[name]
+        for version in versions:
+            table: Mapping[str, Any] = held_out_of(version.metrics) or {}
+            value = table.get(METRIC, {}).get(name)
+            if value is None:
                 continue
-            given = np.array([math.nan if value is None else value for value in values], dtype=float)
-            label = f"{LABELS[name][0]}, version {number}"
-            placed = onto(np.array(curves.times_s, dtype=float), given, times)
-            one = chart(times, {name: placed}, split=None)["series"]
-            series += [{**item, "label": label, "role": roles[name]} for item in one]  # type: ignore[attr-defined]
-    return {**drawn, "series": series}
+            ends = table.get("ci95", {}).get(METRIC, {}).get(name)
+            scaled = None if ends is None else (MM * ends[0], MM * ends[1])
+            rows.append(Interval(f"{one.label}, version {version.version}", one.role, MM * value, scaled))
+    if not rows:
+        return None
+    values = [row.value for row in rows if row.value > 0]
+    return interval_chart(
+        rows,
+        title="Mean track errors of the versions with 95 % intervals",
+        x_label="mean track error on the held-out frames [mm], 95 % interval",
+        floor=None if floor_m is None else MM * floor_m,
+        log_x=bool(values) and max(values) > DWARFS * min(values),
+        width=980,
+    )
+
+
+def training_charts(points: Sequence[tuple[float, Mapping[str, float]]]) -> list[Html]:
+    """Loss and validation of a training over its steps, as far as it has come; empty before there are two of one.
+
+    Args:
+        points: (step, figures) as the job told them: ``loss``, ``validation_m``.
+    """
+    charts = []
+    for name, label, role, scale, unit in (
+        ("loss", "training loss / prior's", "calibrated", 1.0, ""),
+        ("validation_m", "validation error [mm]", "model", MM, "mm"),
+    ):
+        told = {step: scale * figures[name] for step, figures in points if name in figures}
+        if len(told) < FEWEST:
+            continue
+        steps = sorted(told)[:: max(1, len(told) // MOST_TIMES)]
+        line = Series(label, role, [told[step] for step in steps])
+        values = [value for value in told.values() if value > 0]
+        charts.append(
+            line_chart(
+                steps,
+                [line],
+                title=label,
+                x_label="step",
+                y_label=label,
+                log_y=bool(values) and max(values) > DWARFS * min(values),
+                height=220,
+                width=520,
+                unit=unit,
+            )
+        )
+    return charts
 
 
 def given_curves(metrics: Mapping[str, Any]) -> tuple[Array, dict[str, Array]] | None:
@@ -101,7 +157,7 @@ def given_curves(metrics: Mapping[str, Any]) -> tuple[Array, dict[str, Array]] |
         errors = {
             str(name): np.array(values, dtype=float)
             for name, values in by_name.items()
-            if name in LABELS and isinstance(values, Sequence) and len(values) == len(times)
+            if name in PREDICTORS and isinstance(values, Sequence) and len(values) == len(times)
         }
         if len(times) > 1 and errors:
             return times, errors
@@ -113,5 +169,22 @@ def onto(times: Array, values: Array, target: Array) -> Array:
     return np.interp(target, times, values, left=math.nan, right=math.nan)
 
 
-def _rounded(values: Array) -> list[float | None]:
-    return [float(f"{value:.5g}") if math.isfinite(value) else None for value in values]
+def _drawn(times: Array, series: list[Series], split: float | None, floor_m: float | None) -> Html:
+    if floor_m is not None:
+        series = [*series, Series("noise floor", NOISE, [MM * floor_m] * len(times), 1.6, "3 3")]
+    return line_chart(
+        times.tolist(),
+        series,
+        title="Mean error against time",
+        x_label="time [s]",
+        y_label="mean error [mm]",
+        split=split,
+        log_y=dwarfed(series),
+        height=300,
+        width=980,
+        unit="mm",
+    )
+
+
+def _mm(values: Array) -> list[float]:
+    return [float(value) for value in MM * np.asarray(values, dtype=float)]

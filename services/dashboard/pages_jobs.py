@@ -14,12 +14,13 @@ from physworld_schemas.base import Reference
 from physworld_schemas.job import TERMINAL_STATES, Event, Job
 from physworld_services.dashboard import live
 from physworld_services.dashboard.access import actor_of, require_same_origin, require_writer
+from physworld_services.dashboard.curves import training_charts
 from physworld_services.dashboard.samples import sample_folder
 from physworld_services.dashboard.site import BASE, Site
 from physworld_services.dashboard.text import figure
 from physworld_storage import overview
 from physworld_storage.access import audit
-from physworld_storage.jobs import jobs
+from physworld_storage.jobs import events, jobs
 
 PAGE_SIZE = 20
 EVENTS_SHOWN = 100
@@ -113,9 +114,10 @@ def _job(site: Site, job_id: str) -> dict[str, Any]:
         job = jobs.get_job(session, job_id)
         children = overview.children_of(session, [job]).get(job_id, [])
         family = {item.id: item for item in (job, *children)}
-        events = overview.latest_events(session, list(family), EVENTS_SHOWN)
+        latest = overview.latest_events(session, list(family), EVENTS_SHOWN)
         subject = overview.subjects_of(session, [job]).get(job_id, "")
         inputs = [_link(session, reference) for reference in job.inputs]
+        told = [events.figures_of(session, item.id) for item in family.values() if item.kind == "training"]
         links = {
             item.id: [_link(session, reference) for reference in item.outputs] for item in family.values()
         }
@@ -130,7 +132,8 @@ def _job(site: Site, job_id: str) -> dict[str, Any]:
         "subject": subject,
         "inputs": inputs,
         "links": links,
-        "events": events,
+        "events": latest,
+        "plots": [plot for points in told for plot in training_charts(points)],
         "event_words": event_words,
     }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 from urllib.parse import urlencode
@@ -13,10 +14,10 @@ from fastapi.responses import HTMLResponse, JSONResponse, Response
 from physworld_schemas.model import Model, ModelComparison, ModelVersion
 from physworld_services.dashboard.access import require_same_origin, require_writer
 from physworld_services.dashboard.clouds import Cloud, Layer, measured_layers, resampled, scene_cloud, thinned
-from physworld_services.dashboard.curves import chart, comparison_chart, given_curves
+from physworld_services.dashboard.curves import chart, comparison_chart, given_curves, versions_chart
 from physworld_services.dashboard.pages_scenes import PREDICTION, layer_response, recording_of
 from physworld_services.dashboard.site import BASE, Site
-from physworld_services.dashboard.tables import held_out_of
+from physworld_services.dashboard.tables import held_out_of, noise_floor_of
 from physworld_storage import registry, resources
 from physworld_storage.access import tickets
 from physworld_storage.access.api_keys import ApiKey
@@ -27,9 +28,12 @@ from physworld_storage.jobs.kinds.rollout import ready_version
 PAGE_SIZE = 50
 
 CHOICES = 200
+MOST_COMPARED = 4
+"""Versions beside the two of a comparison that its plots show."""
 CARD = "card.json"
 
 Cursor = Annotated[str | None, Query(max_length=512)]
+Others = Annotated[Sequence[str], Query(max_length=MOST_COMPARED)]
 Chosen = Annotated[str | None, Query(max_length=64)]
 
 
@@ -71,7 +75,9 @@ def router(site: Site) -> APIRouter:
         )
 
     @routes.get("/models/{name}/compare")
-    def compare_page(request: Request, name: str, a: Chosen = None, b: Chosen = None) -> HTMLResponse:
+    def compare_page(
+        request: Request, name: str, a: Chosen = None, b: Chosen = None, also: Others = ()
+    ) -> HTMLResponse:
         with site.database.reading() as session:
             model = registry.get_model(session, name)
             ready = registry.list_versions(session, name, limit=CHOICES, state="ready").data
@@ -80,6 +86,8 @@ def router(site: Site) -> APIRouter:
         first = a or (numbers[1] if len(numbers) > 1 else next(iter(numbers), None))
         second = b or next(iter(numbers), None)
         found = None if first is None or second is None else _compared(site, name, first, second)
+        shown = [] if found is None else _distinct(site, name, (str(found.a), str(found.b), *also))
+        floor = next((floor for one in shown if (floor := noise_floor_of(one.metrics)) is not None), None)
         return site.page(
             request,
             "compare.html",
@@ -87,13 +95,11 @@ def router(site: Site) -> APIRouter:
             choices=choices,
             a=first,
             b=second,
+            also=[one.version for one in shown[2:]],
+            numbers=numbers,
             found=found,
-            has_curve=found is not None and len(found.curves_a.times_s) > 1,
+            plots=[chart for draw in (versions_chart, comparison_chart) if (chart := draw(shown, floor))],
         )
-
-    @routes.get("/models/{name}/compare/curve")
-    def compare_curve(name: str, a: str, b: str) -> Response:
-        return JSONResponse(comparison_chart(_compared(site, name, a, b)))
 
     @routes.get("/models/{name}/{number}")
     def version_page(request: Request, name: str, number: str) -> HTMLResponse:
@@ -124,10 +130,11 @@ def router(site: Site) -> APIRouter:
 
     @routes.get("/models/{name}/{number}/curve")
     def curve(name: str, number: str) -> Response:
-        given = given_curves(_version(site, name, number).metrics)
+        version = _version(site, name, number)
+        given = given_curves(version.metrics)
         if given is None:
             raise NotFound("curve of model version", f"{name}:{number}")
-        return JSONResponse(chart(*given, split=None))
+        return HTMLResponse(chart(*given, floor_m=noise_floor_of(version.metrics)))
 
     @routes.get("/models/{name}/{number}/cloud")
     def cloud(name: str, number: str) -> Response:
@@ -145,6 +152,13 @@ def _compared(site: Site, name: str, a: str, b: str) -> ModelComparison:
     with site.database.reading() as session:
         pair = registry.get_version(session, name, a), registry.get_version(session, name, b)
     return compare_versions(*pair)
+
+
+def _distinct(site: Site, name: str, chosen: Sequence[str]) -> list[ModelVersion]:
+    """The ready versions that are chosen, each once, in the order of the choice."""
+    with site.database.reading() as session:
+        found = [registry.get_version(session, name, one) for one in chosen]
+    return list({one.version: one for one in found if one.state == "ready"}.values())
 
 
 def _session(name: str, number: int, ticket: str) -> dict[str, str | int]:
@@ -179,8 +193,8 @@ def _cloud(site: Site, version: ModelVersion) -> Cloud:
     recording = recording_of(site, record)
     layers = measured_layers(recording)
     for key, label, role, opacity in (
-        ("tracks", "World model", "predicted", 1.0),
-        ("vertices", "Vertices", "model", 0.75),
+        ("tracks", "World model", "model", 1.0),
+        ("vertices", "Vertices", "particles", 0.75),
     ):
         if key in arrays:
             own = "tick_times" if key == "vertices" and "tick_times" in arrays else "times"  # its own clock's

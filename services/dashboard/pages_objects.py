@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from starlette.exceptions import HTTPException
 
 from physworld_schemas.model import VersionPatch
-from physworld_services.api.routes.removal import delete_episodes, delete_object
+from physworld_services.api.routes.removal import delete_object
 from physworld_services.dashboard.access import actor_of, require_same_origin, require_writer
 from physworld_services.dashboard.site import BASE, Site
 from physworld_storage import registry, removal
@@ -30,11 +30,7 @@ def router(site: Site) -> APIRouter:
     def delete(request: Request, kind: str, object_id: str) -> Response:
         if kind not in AFTERWARDS:
             raise NotFound("kind of object", kind)
-        actor = actor_of(request)
-        if kind == "dataset":
-            delete_episodes(site.database, actor, site.stores, object_id)
-        else:
-            delete_object(site.database, actor, kind, object_id)
+        delete_object(site.database, site.stores, actor_of(request), kind, object_id)
         return RedirectResponse(f"{BASE}/{AFTERWARDS[kind]}", 303)
 
     @routes.post("/models/{name}/{number}/delete")

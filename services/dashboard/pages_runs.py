@@ -20,7 +20,7 @@ from physworld_storage import overview, resources, runs
 from physworld_storage.errors import NotFound
 
 PAGE_SIZE = 50
-LAYERS = {
+LAYERS: dict[runs.RunKind, tuple[tuple[str, str, str], ...]] = {
     "rollout": (("points", "Predicted points", "model"), ("vertices", "Vertices", "particles")),
     "plan": (
         ("predicted", "Predicted", "model"),
@@ -51,72 +51,45 @@ def router(site: Site) -> APIRouter:
         }
         return site.page(request, "fits.html", **context)
 
-    @routes.get("/rollouts")
-    def rollouts(request: Request, cursor: Cursor = None, model: ModelName = None) -> HTMLResponse:
-        with site.database.reading() as session:
-            page = runs.list_rollouts(session, limit=PAGE_SIZE, cursor=cursor, model=model)
-        context: dict[str, Any] = {
-            "runs": page.data,
-            "cursor": cursor,
-            "next_cursor": page.next_cursor,
-            "model": model,
-        }
-        return site.page(request, "rollouts.html", **context)
-
-    @routes.get("/plans")
-    def plans(request: Request, cursor: Cursor = None, model: ModelName = None) -> HTMLResponse:
-        with site.database.reading() as session:
-            page = runs.list_plans(session, limit=PAGE_SIZE, cursor=cursor, model=model)
-        context: dict[str, Any] = {
-            "runs": page.data,
-            "cursor": cursor,
-            "next_cursor": page.next_cursor,
-            "model": model,
-        }
-        return site.page(request, "plans.html", **context)
-
-    @routes.get("/rollouts/{run_id}")
-    def rollout_page(request: Request, run_id: str) -> HTMLResponse:
-        return _page(site, request, _rollout(site, run_id), "rollout")
-
-    @routes.get("/plans/{run_id}")
-    def plan_page(request: Request, run_id: str) -> HTMLResponse:
-        return _page(site, request, _plan(site, run_id), "plan")
-
-    @routes.get("/rollouts/{run_id}/cloud")
-    def rollout_cloud(run_id: str) -> Response:
-        cloud = _cloud(site, _rollout(site, run_id), "rollout")
-        return JSONResponse(cloud.describe(f"{BASE}/rollouts/{run_id}/cloud"))
-
-    @routes.get("/rollouts/{run_id}/cloud/{layer}")
-    def rollout_layer(run_id: str, layer: str) -> Response:
-        return layer_response(_cloud(site, _rollout(site, run_id), "rollout"), layer)
-
-    @routes.get("/plans/{run_id}/cloud")
-    def plan_cloud(run_id: str) -> Response:
-        cloud = _cloud(site, _plan(site, run_id), "plan")
-        return JSONResponse(cloud.describe(f"{BASE}/plans/{run_id}/cloud"))
-
-    @routes.get("/plans/{run_id}/cloud/{layer}")
-    def plan_layer(run_id: str, layer: str) -> Response:
-        return layer_response(_cloud(site, _plan(site, run_id), "plan"), layer)
-
+    for kind in LAYERS:
+        _add(routes, site, kind)
     return routes
 
 
-def _rollout(site: Site, run_id: str) -> Rollout:
+def _add(routes: APIRouter, site: Site, kind: runs.RunKind) -> None:
+    """The pages of one kind of run: its list, a run, and the run's result as moving points."""
+
+    @routes.get(f"/{kind}s")
+    def index(request: Request, cursor: Cursor = None, model: ModelName = None) -> HTMLResponse:
+        with site.database.reading() as session:
+            page = runs.list_runs(session, kind, limit=PAGE_SIZE, cursor=cursor, model=model)
+        context: dict[str, Any] = {
+            "runs": page.data,
+            "cursor": cursor,
+            "next_cursor": page.next_cursor,
+            "model": model,
+        }
+        return site.page(request, f"{kind}s.html", **context)
+
+    @routes.get(f"/{kind}s/{{run_id}}")
+    def one(request: Request, run_id: str) -> HTMLResponse:
+        run = _run(site, kind, run_id)
+        has_cloud = site.arrays(run.artifacts, runs.RESULT[kind]) is not None
+        return site.page(request, f"{kind}.html", run=run, has_cloud=has_cloud)
+
+    @routes.get(f"/{kind}s/{{run_id}}/cloud")
+    def cloud(run_id: str) -> Response:
+        described = _cloud(site, _run(site, kind, run_id), kind).describe(f"{BASE}/{kind}s/{run_id}/cloud")
+        return JSONResponse(described)
+
+    @routes.get(f"/{kind}s/{{run_id}}/cloud/{{layer}}")
+    def cloud_layer(run_id: str, layer: str) -> Response:
+        return layer_response(_cloud(site, _run(site, kind, run_id), kind), layer)
+
+
+def _run(site: Site, kind: runs.RunKind, run_id: str) -> Rollout | Plan:
     with site.database.reading() as session:
-        return runs.get_rollout(session, run_id)
-
-
-def _plan(site: Site, run_id: str) -> Plan:
-    with site.database.reading() as session:
-        return runs.get_plan(session, run_id)
-
-
-def _page(site: Site, request: Request, run: Rollout | Plan, kind: runs.RunKind) -> HTMLResponse:
-    has_cloud = site.arrays(run.artifacts, runs.RESULT[kind]) is not None
-    return site.page(request, f"{kind}.html", run=run, has_cloud=has_cloud)
+        return runs.get_run(session, kind, run_id)
 
 
 def _cloud(site: Site, run: Rollout | Plan, kind: runs.RunKind) -> Cloud:

@@ -21,6 +21,7 @@ from physworld_services.dashboard.clouds import (
 from physworld_services.dashboard.curves import chart, frame_errors, given_curves, onto
 from physworld_services.dashboard.samples import sample_folder
 from physworld_services.dashboard.site import BASE, Site
+from physworld_services.dashboard.tables import noise_floor_of
 from physworld_storage import checks, resources, traces
 from physworld_storage.errors import NotFound
 
@@ -111,7 +112,8 @@ def router(site: Site) -> APIRouter:
         if arrays is not None:
             tracks = resampled(arrays["tracks"], arrays["times"], recording.times)
             errors["twin"] = frame_errors(recording, tracks)
-        return JSONResponse(chart(recording.times, errors, split=split_time(recording)))
+        floor = noise_floor_of(shown.metrics) if shown else None
+        return HTMLResponse(chart(recording.times, errors, split=split_time(recording), floor_m=floor))
 
     return routes
 
@@ -157,7 +159,7 @@ def _cloud(site: Site, record: SceneRecord, fit: Fit | None) -> Cloud:
     arrays = site.arrays(fit.artifacts, PREDICTION) if fit else None
     if arrays is not None:
         tracks = resampled(arrays["tracks"], arrays["times"], recording.times)
-        layers.append(thinned(Layer("predicted", "Twin", "predicted", tracks, pairs="measured")))
+        layers.append(thinned(Layer("predicted", "Twin", "twin", tracks, pairs="measured")))
         if "particles" in arrays:
             body = resampled(arrays["particles"], arrays["times"], recording.times)
             layers.append(thinned(Layer("particles", "Particles", "particles", body, opacity=0.4)))

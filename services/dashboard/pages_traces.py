@@ -71,7 +71,8 @@ def router(site: Site) -> APIRouter:
             name: frame_errors(recording, resampled(tracks[name], tracks["times"], recording.times))
             for name in ("before", "after")
         }
-        return JSONResponse(chart(recording.times, errors, split=split_time(recording)))
+        floor = (trace.held_out or {}).get("noise_floor")
+        return HTMLResponse(chart(recording.times, errors, split=split_time(recording), floor_m=floor))
 
     @routes.get("/traces/{trace_id}/cloud")
     def cloud(trace_id: str) -> Response:
@@ -112,7 +113,7 @@ def _cloud(site: Site, trace: Trace, record: SceneRecord) -> Cloud:
     recording = recording_of(site, record)
     tracks = _tracks(site, trace)
     layers = measured_layers(recording)
-    for name, label, role in (("after", "After", "predicted"), ("before", "Before", "other")):
+    for name, label, role in (("after", "After", "after"), ("before", "Before", "before")):
         points = resampled(tracks[name], tracks["times"], recording.times)
         layers.append(thinned(Layer(name, label, role, points, shown=name == "after", pairs="measured")))
     return scene_cloud(recording, layers)

@@ -18,7 +18,6 @@ from physworld.arrays import Array
 from physworld_scenes.bundle import bundle_from_bytes
 from physworld_scenes.declaration import KINDS
 from physworld_schemas.base import Artifact
-from physworld_schemas.job import Job
 from physworld_schemas.library import catalogue
 from physworld_services.dashboard import text
 from physworld_services.dashboard.byte_cache import ByteCache
@@ -85,14 +84,6 @@ class Site:
             return {name: archive[name] for name in archive.files}
 
 
-def share(job: Job) -> float:
-    """How far a job is, 0 to 1."""
-    if job.state == "succeeded":
-        return 1.0
-    total = job.progress.total
-    return max(0.0, min(1.0, job.progress.done / total)) if total > 0 else 0.0
-
-
 def _environment() -> Environment:
     environment = Environment(
         loader=FileSystemLoader(HERE / "templates"),
@@ -106,7 +97,6 @@ def _environment() -> Environment:
         base=BASE,
         kinds=KINDS,
         static=_static_url,
-        share=share,
         lasted=text.lasted,
         held_out_of=held_out_of,
         metric_called=catalogue().metric,

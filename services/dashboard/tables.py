@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from physworld.report.predictors import PREDICTORS
 from physworld_schemas.library import Metric, catalogue
-from physworld_services.dashboard.curves import LABELS, PREDICTORS
 
 HeldOut = Mapping[str, Mapping[str, float | None]]
 
@@ -54,12 +54,12 @@ def held_out_rows(table: HeldOut) -> list[Row]:
     """One row for each predictor that any metric has, baselines first."""
     columns = held_out_columns(table)
     present = {name for metric in columns for name in table[metric.name]}
-    names = [name for name in LABELS if name in present] + sorted(present - set(LABELS))
+    names = [name for name in PREDICTORS if name in present] + sorted(present - set(PREDICTORS))
     best = {metric.name: _best(metric, table[metric.name]) for metric in columns}
     return [
         Row(
-            LABELS.get(name, (name.replace("_", " "), ""))[0],
-            name not in PREDICTORS,
+            label_of(name),
+            name not in PREDICTORS or PREDICTORS[name].baseline,
             [
                 Cell(value, value is not None and value == best[metric.name])
                 for metric in columns
@@ -68,6 +68,12 @@ def held_out_rows(table: HeldOut) -> list[Row]:
         )
         for name in names
     ]
+
+
+def label_of(name: str) -> str:
+    """What a predictor is called at the beginning of a row."""
+    label = PREDICTORS[name].label if name in PREDICTORS else name.replace("_", " ")
+    return label[:1].upper() + label[1:]
 
 
 def _best(metric: Metric, values: Mapping[str, float | None]) -> float | None:

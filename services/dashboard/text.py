@@ -7,6 +7,9 @@ from datetime import UTC, datetime
 
 from markupsafe import Markup
 
+from physworld.report.markup import Html
+from physworld_schemas.wording import roughly
+
 _AGES = ((60, 1, "s"), (3600, 60, "min"), (86_400, 3600, "h"), (30 * 86_400, 86_400, "d"))
 DASH = "–"
 
@@ -143,13 +146,20 @@ def plain(value: object) -> str:
     return figure(value)
 
 
+def markup(drawn: Html) -> Markup:
+    """A picture of ``physworld.report``, whose every text is escaped already."""
+    return Markup(drawn)  # nosec B704
+
+
 FILTERS = {
+    "markup": markup,
     "moment": moment,
     "duration": duration,
     "figure": figure,
     "measured": measured,
     "millimetres": millimetres,
     "shown_unit": shown_unit,
+    "roughly": roughly,
     "size": size,
     "words": words,
     "identifier": identifier,

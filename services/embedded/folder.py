@@ -75,6 +75,19 @@ class DataFolder:
         """What runs, for people and for the command line."""
         return self.run / "state.json"
 
+    @property
+    def port(self) -> Path:
+        """The port of the last run, which the next one takes again."""
+        return self.root / "run" / "port"
+
+    def last_port(self) -> int:
+        """The port of the last run; 0 where there was none or the file holds none."""
+        try:
+            port = int(self.port.read_text())
+        except (FileNotFoundError, ValueError):
+            return 0
+        return port if 0 < port < 65536 else 0
+
     def read_state(self) -> dict[str, Any]:
         """The last state written; empty if there is none."""
         try:

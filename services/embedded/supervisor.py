@@ -208,8 +208,7 @@ class Supervisor:
 
     def _listen(self) -> socket.socket:
         """The web process's socket: on the asked port, or on the last one, or on any that is free."""
-        last = str(self._folder.read_state().get("api_url", "")).rpartition(":")[2]
-        candidates = [self._options.port] if self._options.port else [int(last or 0), 0]
+        candidates = [self._options.port] if self._options.port else [self._folder.last_port(), 0]
         for port in candidates:
             listening = socket.socket()
             listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -221,6 +220,7 @@ class Supervisor:
                     raise StartFailed(f"port {port} on 127.0.0.1 cannot be had: {error}") from error
                 continue
             listening.listen(128)
+            write_private(self._folder.port, f"{listening.getsockname()[1]}\n")
             return listening
         raise StartFailed("no port to listen on")
 

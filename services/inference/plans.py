@@ -28,6 +28,10 @@ from physworld_workers.context import TaskContext
 from physworld_workers.stores import Stores
 from physworld_workers.tasks.inputs import scene_of, twin_of
 
+SEARCHING, EXECUTING = "searching a motion", "executing the plan in the twin"
+EXECUTED_ITERATIONS = 3.0
+"""Iterations of the search that the plan's runs in the twin take as long as, about."""
+
 
 def make(
     context: TaskContext, stores: Stores, request: PlanCreate, model: PublishedModel
@@ -43,6 +47,9 @@ def make(
         horizon=asked.horizon, samples=asked.samples, iterations=asked.iterations, settle=asked.settle
     )
 
+    context.plan({SEARCHING: float(config.iterations), EXECUTING: EXECUTED_ITERATIONS})
+    context.begin(SEARCHING, "iterations", config.iterations)
+
     def progress(done: int, total: int, cost: float) -> None:
         context.progress(done, total, "iterations", f"cost {1e3 * cost:.3g} mm")
 
@@ -56,9 +63,10 @@ def make(
         progress=progress,
         cancelled=context.cancelled,
     )
-    context.progress(config.iterations, config.iterations, "iterations", "executing the plan in the twin")
+    context.begin(EXECUTING, "runs", 2)
     executed = task.execute(found.displacements)
     context.check()
+    context.progress(1, 2, "runs", EXECUTING)
     motionless = task.execute(np.zeros_like(found.displacements))
     arrays = {
         "times": task.dt_s * (np.arange(config.horizon) + len(model.start_history)),

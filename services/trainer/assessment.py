@@ -32,6 +32,9 @@ from physworld_workers.lineage import lineage_of
 from physworld_workers.stores import Stores
 from physworld_workers.tasks.inputs import named, scene_of, scene_reference, twin_of
 
+PLACING, ROLLING, COMPARING = (
+    "placing the twin", "rolling the model out over the recording", "comparing with noise and card",
+)  # fmt: skip
 BASELINES = ("static", "rigid_follow", "constant_velocity")
 
 
@@ -43,11 +46,12 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
         fit = resources.get_fit(session, payload["fit_id"])
     recording, home = scene_of(stores, payload["scene_id"]), scene_of(stores, payload["model_scene_id"])
     twin = twin_of(stores, payload["fit_id"], payload.get("trace_id"))
-    context.progress(0, 1, "rollouts", "rolling the model out over the recording")
+    context.plan({PLACING: 1.0, ROLLING: 1.0, COMPARING: 1.0})
+    context.begin(PLACING)
     placed = twin_on(recording, home, twin, fit.config.particle_budget)
-    context.check()
+    context.begin(ROLLING, "rollouts")
     predicted = predict(_model(stores, version), recording, placed)
-    context.check()
+    context.begin(COMPARING)
     found = assess(recording, predicted, version)
     inputs = [
         Reference(

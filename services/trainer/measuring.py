@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +20,8 @@ from physworld.worldmodel.published import PublishedModel
 from physworld.worldmodel.scene_view import SceneView
 
 SPEED_REPEATS = 3
+RUNS = SPEED_REPEATS + 3
+"""Parts of a measurement: timed rollouts, the calibrated one, the table, the energy."""
 
 
 @dataclass(frozen=True)
@@ -35,21 +38,37 @@ class Measured:
     energy: dict[str, Any]
 
 
-def measure(view: SceneView, published: PublishedModel, before: PublishedModel | None = None) -> Measured:
-    """Open-loop predictions over the whole recording, and what they cost; ``before``: without fine-tuned strengths."""
+def measure(
+    view: SceneView,
+    published: PublishedModel,
+    before: PublishedModel | None = None,
+    poll: Callable[[int, int], None] = lambda done, of: None,
+) -> Measured:
+    """Open-loop predictions over the whole recording, and what they cost.
+
+    Args:
+        view: the recording at the model's vertices.
+        published: the version.
+        before: it without fine-tuned strengths; None: there are none.
+        poll: called between rollouts with (done, of); it raises to end the measurement.
+    """
     controllers = view.controllers[view.first :]
     seconds = []
-    for _ in range(SPEED_REPEATS):
+    for run in range(SPEED_REPEATS):
+        poll(run, RUNS)
         started = time.perf_counter()
         rolled = published.rollout(controllers)
         seconds.append(time.perf_counter() - started)
+    poll(SPEED_REPEATS, RUNS)
     calibrated = (before or published).rollout(controllers, phi=published.phi_calibrated)
     frame_times = view.scene.times - view.scene.times[0]
     tracks, tracks_calibrated = view.tracks_of(rolled), view.tracks_of(calibrated)
     twin_tracks = resample_smooth(view.twin_tracks, view.times, frame_times)
     predictions = {"twin": twin_tracks, "world_model": tracks_calibrated, "world_model_finetuned": tracks}
     finite = {name: path for name, path in predictions.items() if np.isfinite(path).all()}
+    poll(SPEED_REPEATS + 1, RUNS)
     table = _with_intervals(held_out_table(view.scene, finite))
+    poll(SPEED_REPEATS + 2, RUNS)
     return Measured(
         tracks=tracks,
         tracks_calibrated=tracks_calibrated,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
 
@@ -79,8 +80,19 @@ def store_version(
     view: SceneView,
     measured: Measured,
     card: dict[str, Any],
+    begin: Callable[[str], None] = lambda name: None,
 ) -> list[Artifact]:
-    """The version's files, the manifest and its signature last."""
+    """The version's files, the manifest and its signature last.
+
+    Args:
+        stores: where they are put.
+        payload: of the shard: the version's name and number.
+        published: the model.
+        view: the recording at its vertices.
+        measured: its predictions.
+        card: what it says of itself.
+        begin: called before each program with its format; it raises to end the export.
+    """
     put = stores.artifacts.put_bytes
     prediction = {
         "times": view.scene.times,
@@ -91,10 +103,12 @@ def store_version(
         "vertices": measured.vertices.astype(np.float32),
     }
     facts = {"format": "physworld-world-model", "name": payload["name"], "version": str(payload["version"])}
-    programs = [
-        put(PROGRAMS[name][1](published.model), PROGRAMS[name][0], "application/octet-stream")
-        for name in dict.fromkeys(card["training"]["formats"])
-    ]
+    programs: list[Artifact] = []
+    for name in dict.fromkeys(card["training"]["formats"]):
+        begin(name)
+        programs.append(
+            put(PROGRAMS[name][1](published.model), PROGRAMS[name][0], "application/octet-stream")
+        )
     artifacts = [
         put(save_tensors(published.to_tensors(), facts), "model.safetensors", "application/octet-stream"),
         *programs,

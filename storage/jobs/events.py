@@ -40,6 +40,13 @@ def events_after(
     return [_event(row) for row in session.scalars(statement.order_by(EventRow.seq).limit(limit))]
 
 
+def figures_of(session: Session, job_id: str) -> list[tuple[float, dict[str, float]]]:
+    """What the job told of its work: (done, figures) of each progress that carried any, oldest first."""
+    of = (EventRow.job_id == job_id, EventRow.type == "progress")
+    rows = session.scalars(select(EventRow.data).where(*of).order_by(EventRow.seq))
+    return [(float(data["done"]), data["figures"]) for data in rows if data.get("figures")]
+
+
 def newest(session: Session, job_id: str, before: int = 0) -> int:
     """The ``seq`` of the job's newest event, or of the one that ``before`` newer ones follow; 0 where there is none."""
     statement = select(EventRow.seq).where(EventRow.job_id == job_id)

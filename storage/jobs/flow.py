@@ -9,7 +9,7 @@ workers that finish the last two episodes at the same moment start the next stag
 
 from __future__ import annotations
 
-from datetime import datetime
+from datetime import datetime, timedelta
 from typing import Any
 
 from sqlalchemy import exists, select, update
@@ -17,12 +17,17 @@ from sqlalchemy.orm import Session
 
 from physworld_schemas.base import Problem, Reference
 from physworld_schemas.job import TERMINAL_STATES, Progress
+from physworld_storage.clock import database_now
 from physworld_storage.errors import Conflict
 from physworld_storage.jobs.events import append_event
 from physworld_storage.jobs.kind import ShardResult, Tells
 from physworld_storage.jobs.kinds import SHARDS, kind_of
+from physworld_storage.jobs.progress import of_the_job
 from physworld_storage.jobs.shards import CANCELLED, QUEUED, RUNNING, put_up, put_up_more
 from physworld_storage.tables import JobRow, ShardRow
+
+CANCEL_WITHIN_S = 3.0
+"""From a cancellation to the end of the leases of what runs: what a worker has to stop by itself."""
 
 
 def shard_started(session: Session, job: JobRow, attempt: int, now: datetime) -> None:
@@ -66,23 +71,33 @@ def shard_succeeded(
         result.lineage.inputs = [Reference.model_validate(item) for item in job.inputs]
     kind.apply(session, job, shard, result)
     if kind.progress is Tells.SHARDS_DONE:
-        _report_shards_done(session, job)
+        _report_shards_done(session, job, kind.span, now)
     if job.stage_done < job.stage_total:
         put_up_more(session, job, shard)
     elif kind.next is not None:
-        _start_stage(session, job, shard, result)
+        _start_stage(session, job, shard, result, now)
     else:
         job.finished_at = now
         _set_state(session, job, "succeeded")
         _child_succeeded(session, job, now)
 
 
-def report_progress(session: Session, job: JobRow, progress: Progress) -> None:
-    """Store and log the job's progress, and what it means for its parent."""
-    _set_progress(session, job, progress)
+def report_progress(
+    session: Session, job: JobRow, progress: Progress, span: tuple[float, float], now: datetime
+) -> None:
+    """Store and log the job's progress, and what it means for its parent.
+
+    Args:
+        session: the transaction that it belongs to.
+        job: locked.
+        progress: of the shard that tells, or of the shards that are done.
+        span: the part of the job that such shards cover.
+        now: by the database's clock.
+    """
+    _set_progress(session, job, of_the_job(progress, _progress(job), span, _elapsed_s(job, now)))
     parent = _parent(session, job)
     if parent is not None and parent.state not in TERMINAL_STATES:
-        _set_progress(session, parent, _parent_progress(session, parent, job))
+        _set_progress(session, parent, _parent_progress(session, parent, job, now))
 
 
 def fail_job(session: Session, job: JobRow, problem: Problem, now: datetime) -> None:
@@ -110,6 +125,9 @@ def fail_job(session: Session, job: JobRow, problem: Problem, now: datetime) -> 
 def request_cancel(session: Session, job: JobRow, now: datetime) -> None:
     """Cancel the job, its children and its parent. Running shards see it at their next ``renew``.
 
+    Whatever their workers do, their leases end after ``CANCEL_WITHIN_S`` and are not prolonged: the job is then
+    cancelled without them.
+
     Raises Conflict when the job has succeeded or failed; a second cancel changes nothing.
     """
     if job.state in {"succeeded", "failed"}:
@@ -119,6 +137,7 @@ def request_cancel(session: Session, job: JobRow, now: datetime) -> None:
         if row.state in TERMINAL_STATES or row.state == "cancelling":
             continue
         _stop_shards(session, row, (QUEUED,), now)
+        _shorten_leases(session, row)
         _set_state(session, row, "cancelling")
     for row in (*_children(session, root), root):
         settle_cancel(session, row, now)
@@ -141,7 +160,7 @@ def settle_cancel(session: Session, job: JobRow, now: datetime) -> None:
         settle_cancel(session, parent, now)
 
 
-def _start_stage(session: Session, job: JobRow, shard: ShardRow, result: ShardResult) -> None:
+def _start_stage(session: Session, job: JobRow, shard: ShardRow, result: ShardResult, now: datetime) -> None:
     """Put up what follows the stage that ended with this shard."""
     follows = SHARDS[shard.kind].next
     assert follows is not None
@@ -149,15 +168,15 @@ def _start_stage(session: Session, job: JobRow, shard: ShardRow, result: ShardRe
     job.stage += 1
     put_up(session, job, stage)
     if SHARDS[stage.shard].progress is Tells.SHARDS_DONE:
-        _report_shards_done(session, job)
+        _report_shards_done(session, job, SHARDS[stage.shard].span, now)
     parent = _parent(session, job)
     if parent is not None:
         kind_of(parent).stage_opened(session, parent, job)
 
 
-def _report_shards_done(session: Session, job: JobRow) -> None:
+def _report_shards_done(session: Session, job: JobRow, span: tuple[float, float], now: datetime) -> None:
     done = Progress(done=job.stage_done, total=job.stage_total, unit=kind_of(job).unit)
-    report_progress(session, job, done)
+    report_progress(session, job, done, span, now)
 
 
 def _child_succeeded(session: Session, child: JobRow, now: datetime) -> None:
@@ -169,18 +188,29 @@ def _child_succeeded(session: Session, child: JobRow, now: datetime) -> None:
     parent.outputs = [*parent.outputs, *child.outputs]
     message = f"{child.kind} done"
     append_event(session, parent.id, "log", {"message": message, "child": child.id, "kind": child.kind})
-    progress = _parent_progress(session, parent, child)
+    progress = _parent_progress(session, parent, child, now)
     _set_progress(session, parent, progress.model_copy(update={"message": message}))
     if not kind_of(parent).open_next(session, parent, child, _children(session, parent)):
         parent.finished_at = now
         _set_state(session, parent, "succeeded")
 
 
-def _parent_progress(session: Session, parent: JobRow, active: JobRow) -> Progress:
+def _parent_progress(session: Session, parent: JobRow, active: JobRow, now: datetime) -> Progress:
     share = kind_of(parent).share_done(parent, _children(session, parent))
-    own = Progress.model_validate(active.progress)
+    own = _progress(active)
     message = f"{active.kind}: {own.done:g} of {own.total:g} {own.unit}"
-    return Progress(done=round(100 * share, 2), total=100, unit="percent", message=message)
+    before = _progress(parent)
+    told = Progress(done=100 * max(share, before.fraction or 0.0), total=100, unit="percent", message=message)
+    found = of_the_job(told, before, (0.0, 1.0), _elapsed_s(parent, now))
+    return found.model_copy(update={"done": round(found.done, 2)})
+
+
+def _progress(job: JobRow) -> Progress:
+    return Progress.model_validate(job.progress)
+
+
+def _elapsed_s(job: JobRow, now: datetime) -> float | None:
+    return None if job.started_at is None else (now - job.started_at).total_seconds()
 
 
 def _set_progress(session: Session, job: JobRow, progress: Progress) -> None:
@@ -190,6 +220,9 @@ def _set_progress(session: Session, job: JobRow, progress: Progress) -> None:
 
 def _set_state(session: Session, job: JobRow, state: str) -> None:
     job.state = state
+    if state in TERMINAL_STATES:
+        whole = {"fraction": 1.0} if state == "succeeded" else {}
+        job.progress = {**job.progress, **whole, "eta_s": None}
     data: dict[str, Any] = {"state": state}
     if job.error is not None:
         data["error"] = job.error
@@ -203,6 +236,12 @@ def _stop_shards(session: Session, job: JobRow, states: tuple[str, ...], now: da
         .where(ShardRow.job_id == job.id, ShardRow.state.in_(states))
         .values(state=CANCELLED, lease_owner=None, lease_until=None, finished_at=now)
     )
+
+
+def _shorten_leases(session: Session, job: JobRow) -> None:
+    end = database_now(session) + timedelta(seconds=CANCEL_WITHIN_S)
+    held = (ShardRow.job_id == job.id, ShardRow.state == RUNNING, ShardRow.lease_until > end)
+    session.execute(update(ShardRow).where(*held).values(lease_until=end))
 
 
 def _has_running(session: Session, job: JobRow) -> bool:

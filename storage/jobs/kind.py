@@ -63,6 +63,7 @@ class ShardKind(Generic[Result]):
         progress: what the shard's progress means for its job.
         keeps_scratch: whether its job keeps files in the scratch store.
         is_helper: put up by another shard, which waits for it: it neither counts for its stage nor ends it.
+        span: the part of the job's time that its stage covers, about: where it begins and ends, 0 to 1.
     """
 
     name: str
@@ -74,6 +75,7 @@ class ShardKind(Generic[Result]):
     progress: Tells = Tells.ITS_OWN
     keeps_scratch: bool = False
     is_helper: bool = False
+    span: tuple[float, float] = (0.0, 1.0)
 
 
 class JobKind:

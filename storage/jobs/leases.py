@@ -129,15 +129,15 @@ def renew(
     """
     job = lock_job(session, lease.job_id)
     now = database_now(session)
-    until = now + timedelta(seconds=lease_seconds)
+    prolonged = {} if job.state == "cancelling" else {"lease_until": now + timedelta(seconds=lease_seconds)}
     reached = {} if progress is None else {"progress": progress.model_dump(mode="json")}
-    if not _compare_and_set(session, lease, lease_until=until, renewed_at=now, **reached):
+    if not _compare_and_set(session, lease, renewed_at=now, **prolonged, **reached):
         return "lost"
     job.heartbeat_at = now
     if job.state == "cancelling":
         return "cancel"
     if progress is not None and SHARDS[lease.kind].progress is Tells.ITS_OWN:
-        report_progress(session, job, progress)
+        report_progress(session, job, progress, SHARDS[lease.kind].span, now)
     return "held"
 
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from physworld_schemas.job import Progress
 from physworld_storage.tables import ShardRow
 
 ALIKE = 8
@@ -33,13 +34,12 @@ def with_this_one(shard: ShardRow) -> list[Loss]:
     ran_s = 0.0
     if shard.claimed_at is not None and shard.renewed_at is not None:
         ran_s = max(0.0, (shard.renewed_at - shard.claimed_at).total_seconds())
-    progress = shard.progress or {}
-    total = float(progress.get("total") or 0.0)
+    progress = Progress.model_validate(shard.progress or {})
     loss = {
         "owner": shard.lease_owner,
         "ran_s": round(ran_s, 2),
-        "unit": progress.get("unit", ""),
-        "reached": float(progress.get("done", 0.0)) / total if total > 0 else 0.0,
+        "unit": progress.unit,
+        "reached": progress.share,
     }
     before = shard.losses or []
     if any(_got_on(earlier, loss) for earlier in before):

@@ -64,7 +64,7 @@ def violations(visit: Visit) -> list[Any]:
 def settle(visit: Visit) -> None:
     """Wait until curves are drawn: their legends are text."""
     for curve in visit.page.locator("[data-curve]").all():
-        curve.locator(".u-legend").wait_for()
+        curve.locator(".legend").wait_for()
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

@@ -77,6 +77,10 @@ def test_start_look_start_again_and_ctrl_c(tmp_path: Path) -> None:
         assert alive == []
         assert service.state() == {}
 
+        service.start()
+        assert service.state()["api_url"] == state["api_url"]  # after a clean stop too
+        assert service.interrupt() == 0
+
 
 def test_a_service_whose_own_key_was_ended_says_so_and_makes_another(tmp_path: Path) -> None:
     with ServiceProcess(tmp_path / "data", "--workers", "0", "--no-trainer", "--no-inference") as service:

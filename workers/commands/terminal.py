@@ -19,6 +19,7 @@ from physworld.errors import Cancelled, PhysworldError
 from physworld.scene import Scene
 from physworld_scenes.bundle import read_bundle
 from physworld_scenes.importers import import_any
+from physworld_schemas.wording import reason
 from physworld_storage.errors import StorageError
 
 FAILED, INTERRUPTED = 2, 130
@@ -75,16 +76,9 @@ def guarded(command: Callable[[], None], left: Callable[[], str] = lambda: NOTHI
         _say(f"cancelled; {left()}")
         return INTERRUPTED
     except (PhysworldError, StorageError, OSError, ValueError) as error:
-        _say(f"error: {_words(error)}")
+        _say(f"error: {reason(error)}")
         return FAILED
     return 0
-
-
-def _words(error: Exception) -> str:
-    """A typed error with its type, by which programs know it; one of the system's with the path that it is about."""
-    if isinstance(error, OSError) and error.filename is not None and error.strerror:
-        return f"{error.filename}: {error.strerror}"
-    return f"{type(error).__name__}: {error}"
 
 
 def _say(text: str) -> None:

@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from physworld.arrays import Array
+from physworld_schemas.wording import reason
 
 _MOTIONS = ("vertices", "particles", "tracks", "points", "after")
 _SHOWN = 3000  # points of a motion that are drawn where there is no splat
@@ -148,7 +149,7 @@ def _camera(given: argparse.Namespace, moved: Array) -> Any:
                 world_to_camera=np.asarray(facts["world_to_camera"], dtype=np.float64),
             )
         except (KeyError, TypeError, json.JSONDecodeError) as error:
-            raise ValueError(f"{given.camera} is no camera: {error!r}") from error
+            raise ValueError(f"{given.camera} is no camera: {reason(error)}") from error
     width, times, height = given.size.partition("x")
     if not (times and width.isdecimal() and height.isdecimal() and min(int(width), int(height)) > 0):
         raise ValueError(f"--size must be WIDTHxHEIGHT in pixels, got {given.size!r}")

@@ -21,6 +21,9 @@ from physworld_workers.tasks.fit_report import MEDIA_TYPES, fit_files, fit_repor
 from physworld_workers.tasks.inputs import scene_of, scene_reference
 from physworld_workers.tasks.shared_runs import SharedRunner, stored_journal
 
+SEARCH, NUMERICS = "calibrating", "measuring the numerics"
+NUMERICS_SIMULATIONS = 35.0
+"""Simulations of the search that those on finer cells and steps take as long as, about."""
 WORTH_SHARING_S = 0.3  # to hand a simulation to another worker takes some hundredths of a second
 
 
@@ -31,6 +34,9 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     payload = context.lease.payload
     config = FitConfig.model_validate(payload["config"])
     scene = scene_of(stores, payload["scene_id"])
+
+    context.plan({SEARCH: config.max_simulations, NUMERICS: NUMERICS_SIMULATIONS if config.numerics else 0.0})
+    context.begin(SEARCH, "simulations", config.max_simulations)
 
     def progress(done: int, total: int, message: str) -> None:
         context.progress(done, total, "simulations", message)
@@ -57,12 +63,9 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     if config.numerics:
 
         def measuring(done: int, total: int, message: str) -> None:
-            most = max(config.max_simulations, spent + total)
-            context.progress(spent + done, most, "simulations", f"numerics: {message}")
+            context.progress(done, total, "runs", f"{NUMERICS}: {message}")
 
-        local = fitted.local
-        spent = fitted.simulations + (0 if local is None else local.runs + local.simulations)
-
+        context.begin(NUMERICS, "runs")
         accuracy = fit_accuracy(
             scene, fitted, config.particle_budget, measuring, context.cancelled, journal, runner
         )

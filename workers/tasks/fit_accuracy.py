@@ -17,6 +17,7 @@ from physworld.errors import Cancelled, SceneUnsupported, SimulationError
 from physworld.estimation.simulations import Runner, in_turn
 from physworld.evaluate.numerics import measure_numerics, refined_tracks_of
 from physworld.scene import Scene
+from physworld_schemas.wording import reason
 from physworld_workers.tasks.fit_report import json_safe, parameter_json
 
 MEASURED_RUNS = 4
@@ -88,7 +89,7 @@ def _measured(
             scene, fitted, budget, poll=poll, runner=runner, finer_tracks=finer.finer_cells
         )
     except (SimulationError, SceneUnsupported) as error:  # finer cells may not hold what these do
-        return not_measured(f"{type(error).__name__}: {error}")
+        return not_measured(reason(error))
     return {
         "numerics": json_safe(asdict(numerics)),
         "converged": {name: parameter_json(estimate) for name, estimate in converged.items()},

@@ -1,4 +1,4 @@
-"""Arrays that the service answers with: npz without pickles."""
+"""Arrays in npz without pickles: those that the service answers with, and those of local files."""
 
 from __future__ import annotations
 
@@ -11,8 +11,12 @@ from physworld_client.errors import PhysWorldError
 from physworld_client.types import Array
 
 
-def arrays_of(data: bytes) -> dict[str, Array]:
+def arrays_of(data: bytes, source: str = "the service's answer") -> dict[str, Array]:
     """The arrays of an npz by name.
+
+    Args:
+        data: the npz.
+        source: what an error calls it.
 
     Raises:
         PhysWorldError: the bytes are no npz, or one that would have to be unpickled.
@@ -20,5 +24,5 @@ def arrays_of(data: bytes) -> dict[str, Array]:
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
-    except (ValueError, OSError, zipfile.BadZipFile, AttributeError) as error:
-        raise PhysWorldError(f"the service answered {len(data)} bytes that are no npz: {error}") from error
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile, AttributeError) as error:
+        raise PhysWorldError(f"{source}, {len(data)} bytes, is no npz of plain arrays: {error}") from error

@@ -24,6 +24,7 @@ from physworld_client.errors import ConnectionFailed
 from physworld_client.live_frames import LiveFrame, LiveStart
 from physworld_client.transport import is_loopback
 from physworld_schemas.rollout import Part
+from physworld_schemas.wording import reason
 
 
 class AsyncLiveSession:
@@ -112,7 +113,7 @@ class AsyncLive(AsyncResource):
                 socket = await stack.enter_async_context(line)
             except (OSError, InvalidHandshake, TimeoutError) as error:
                 raise ConnectionFailed(
-                    f"no live session at {self._client.base_url}: {str(error) or type(error).__name__}"
+                    f"no live session at {self._client.base_url}: {reason(error)}"
                 ) from error
             start = live_frames.read_start(await live_frames.received_async(socket, self._client.timeout))
             yield AsyncLiveSession(socket, start, self._client.timeout)

@@ -15,6 +15,7 @@ from types import TracebackType
 from typing import IO
 
 from physworld_client.errors import BundleUnreadable
+from physworld_schemas.wording import pictures_among
 
 BUNDLE_FILES = ("scene.json", "scene.npz")
 MESH_SUFFIXES = (".obj", ".off", ".ply", ".stl")
@@ -65,9 +66,10 @@ def _pack_folder(folder: Path) -> Upload:
     if missing:
         present = sorted(entry.name for entry in folder.iterdir())
         shown = ", ".join(present[:8]) + (f" and {len(present) - 8} more" if len(present) > 8 else "")
+        pictures = pictures_among((path.name for path in folder.rglob("*")), str(folder))
         raise BundleUnreadable(
             f"{folder} lacks {' and '.join(missing)} (it holds {shown or 'nothing'}); "
-            "a recording of another program is given by its file"
+            f"{pictures or 'a recording of another program is given by its file'}"
         )
     stream = tempfile.SpooledTemporaryFile(max_size=SPOOL_LIMIT_BYTES)  # noqa: SIM115 (the upload closes it)
     try:

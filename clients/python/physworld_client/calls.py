@@ -19,6 +19,7 @@ from physworld_schemas.check import Check, CheckConfig, CheckCreate
 from physworld_schemas.dataset import Dataset, DatasetConfig, DatasetCreate, Episode
 from physworld_schemas.fit import Fit, FitConfig, FitCreate
 from physworld_schemas.job import Job
+from physworld_schemas.key import ApiKey, KeyCreate, KeyRotate, Role
 from physworld_schemas.model import (
     AliasSet,
     Model,
@@ -61,6 +62,8 @@ ListCall = Callable[[str | None], Call[Page[Item]]]
 
 _SCENE = TypeAdapter(Scene)
 _PREVIEW = TypeAdapter(ScenePreview)
+_KEY = TypeAdapter(ApiKey)
+_KEYS = TypeAdapter(Page[ApiKey])
 _FIT = TypeAdapter(Fit)
 _CHECK = TypeAdapter(Check)
 _TRACE = TypeAdapter(Trace)
@@ -301,6 +304,28 @@ def versions_compare(name: str, a: int | str, b: int | str) -> Call[ModelCompari
 def signing_keys() -> Call[Page[SigningKey]]:
     """GET /v1/signing-keys."""
     return Call("GET", "/v1/signing-keys", _SIGNING_KEYS, query={"limit": 200})
+
+
+def key_create(name: str, role: Role, expires_in_days: int | None) -> Call[ApiKey]:
+    """POST /v1/keys."""
+    body = KeyCreate(name=name, role=role, expires_in_days=expires_in_days)
+    return Call("POST", "/v1/keys", _KEY, body=body)
+
+
+def key_list(*, limit: int | None, cursor: str | None) -> Call[Page[ApiKey]]:
+    """GET /v1/keys."""
+    return Call("GET", "/v1/keys", _KEYS, query=_given(limit=limit, cursor=cursor))
+
+
+def key_rotate(key_id: str, grace_minutes: int | None) -> Call[ApiKey]:
+    """POST /v1/keys/{id}/rotate."""
+    body = KeyRotate() if grace_minutes is None else KeyRotate(grace_minutes=grace_minutes)
+    return Call("POST", f"/v1/keys/{_part(key_id)}/rotate", _KEY, body=body)
+
+
+def key_revoke(key_id: str) -> Call[ApiKey]:
+    """DELETE /v1/keys/{id}."""
+    return Call("DELETE", f"/v1/keys/{_part(key_id)}", _KEY)
 
 
 def pipeline_create(body: PipelineCreate) -> Call[Job]:

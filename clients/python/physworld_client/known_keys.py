@@ -26,6 +26,7 @@ from physworld_client.errors import ModelUnreadable, SignatureInvalid
 from physworld_client.locks import locked
 from physworld_client.signatures import TrustedKeys, fingerprint_of, given_key, keys_by_id, listed_keys
 from physworld_schemas.signing import SigningKey
+from physworld_schemas.wording import reason
 
 FORMAT = 2
 FINGERPRINT = re.compile(r"[0-9a-f]{64}")
@@ -114,7 +115,7 @@ class KnownKeys:
                     if fingerprint_of(entry["public_key"]) != mark:
                         raise ValueError(f"{mark} is not the fingerprint of its key")
         except (ValueError, KeyError, TypeError, AttributeError, ModelUnreadable) as error:
-            raise ModelUnreadable(f"{self.path} is not a file of known keys: {error!r}") from error
+            raise ModelUnreadable(f"{self.path} is not a file of known keys: {reason(error)}") from error
         return dict(services)
 
     @contextmanager

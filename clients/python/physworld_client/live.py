@@ -25,6 +25,7 @@ from physworld_client.live_frames import LiveFrame, LiveStart
 from physworld_client.resources import LATEST, Resource
 from physworld_client.transport import is_loopback
 from physworld_schemas.rollout import Part
+from physworld_schemas.wording import reason
 
 
 class LiveSession:
@@ -111,7 +112,7 @@ class Live(Resource):
                 socket = stack.enter_context(line)
             except (OSError, InvalidHandshake, TimeoutError) as error:
                 raise ConnectionFailed(
-                    f"no live session at {self._client.base_url}: {str(error) or type(error).__name__}"
+                    f"no live session at {self._client.base_url}: {reason(error)}"
                 ) from error
             start = live_frames.read_start(live_frames.received(socket, self._client.timeout))
             yield LiveSession(socket, start, self._client.timeout)

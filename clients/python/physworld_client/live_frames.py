@@ -20,6 +20,7 @@ from physworld_client.errors import LiveSessionEnded, PhysWorldError, RequestTim
 from physworld_client.types import Array
 from physworld_schemas.live import LiveTicket, LiveTicketCreate
 from physworld_schemas.rollout import Part
+from physworld_schemas.wording import reason
 
 MOST_BYTES = 64 * 2**20
 """Of one message; the first one lists the body's points as text."""
@@ -97,7 +98,7 @@ def read_start(message: bytes | str) -> LiveStart:
             reach_m=float(ready["reach_m"]),
         )
     except (ValueError, KeyError, TypeError) as error:
-        raise PhysWorldError(f"a live session began with {message[:120]!r}: {error!r}") from error
+        raise PhysWorldError(f"a live session began with {message[:120]!r}: {reason(error)}") from error
 
 
 def read_frame(message: bytes | str, start: LiveStart) -> LiveFrame:

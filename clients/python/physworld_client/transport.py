@@ -26,6 +26,7 @@ from physworld_client.errors import (
     RequestTimedOut,
     error_from_response,
 )
+from physworld_schemas.wording import reason
 
 RETRIED_STATUSES = frozenset({408, 425, 429, 500, 502, 503, 504})  # not 507: a store that is full stays so
 RETRY_BASE_S = 0.25
@@ -174,9 +175,8 @@ def connection_error(
     base_url = str(http.base_url).rstrip("/")
     tries = f"{attempts} attempt{'s' if attempts != 1 else ''}"
     if isinstance(error, httpx.TimeoutException):
-        return RequestTimedOut(f"{base_url} did not answer in time ({type(error).__name__}, {tries})")
-    reason = str(error) or type(error).__name__
-    return ConnectionFailed(f"no connection to {base_url}: {reason} ({tries})")
+        return RequestTimedOut(f"{base_url} did not answer in time ({tries})")
+    return ConnectionFailed(f"no connection to {base_url}: {reason(error)} ({tries})")
 
 
 def stream_ended(

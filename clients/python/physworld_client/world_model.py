@@ -26,6 +26,7 @@ from physworld_client.manifest import CARD_NAME, WEIGHTS_NAME, verify_folder
 from physworld_client.network import PROPERTY_COUNT, Network
 from physworld_client.types import Array
 from physworld_schemas.arrays import FARTHEST_M
+from physworld_schemas.wording import reason
 
 CARD_SCHEMA = 1
 PHI_NAMES = ("stiffness", "density")
@@ -103,7 +104,9 @@ class WorldModel:
             known, facts = card["schema_version"] == CARD_SCHEMA, card["architecture"]
             dt_s, ground = float(facts["dt_s"]), facts["ground_height_m"]
         except (SafetensorError, ValueError, KeyError, TypeError) as error:
-            raise ModelUnreadable(f"{place} is not a world model of a known layout: {error!r}") from error
+            raise ModelUnreadable(
+                f"{place} is not a world model of a known layout: {reason(error)}"
+            ) from error
         if not known:
             raise ModelUnreadable(
                 f"{place} is not a world model of a known layout: its card has schema_version "

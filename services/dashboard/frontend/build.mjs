@@ -11,7 +11,6 @@ const LICENCES = {
   "fflate.txt": "node_modules/fflate/LICENSE",
   "htmx.txt": "node_modules/htmx.org/LICENSE",
   "three.txt": "node_modules/three/LICENSE",
-  "uplot.txt": "node_modules/uplot/LICENSE",
 };
 
 rmSync(OUT, { recursive: true, force: true });
@@ -31,7 +30,8 @@ await build({
 for (const [name, source] of Object.entries(LICENCES)) copyFileSync(source, `${OUT}/licences/${name}`);
 copyFileSync("src/favicon.svg", `${OUT}/favicon.svg`);
 
-const sources = ["build.mjs", "package.json", "package-lock.json", ...readdirSync("src").map((f) => `src/${f}`)];
+const PALETTE = "../../../physworld/report/palette.css";
+const sources = ["build.mjs", "package.json", "package-lock.json", PALETTE, ...readdirSync("src").map((f) => `src/${f}`)];
 const digests = Object.fromEntries(
   sources.sort().map((path) => [path, createHash("sha256").update(readFileSync(path)).digest("hex")]),
 );

@@ -105,6 +105,7 @@ class DatasetJobs(JobKind):
             _planned,
             _episodes,
             Tells.NOTHING,
+            span=(0.0, 0.02),
         ),
         ShardKind(
             "episode",
@@ -114,6 +115,7 @@ class DatasetJobs(JobKind):
             _written,
             _seal,
             Tells.SHARDS_DONE,
+            span=(0.02, 0.95),
         ),
         ShardKind(
             "dataset_seal",
@@ -121,7 +123,7 @@ class DatasetJobs(JobKind):
             "physworld_workers.tasks.dataset:seal",
             SealResult,
             _sealed,
-            progress=Tells.NOTHING,
+            span=(0.95, 1.0),
         ),
     )
 

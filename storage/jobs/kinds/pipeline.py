@@ -150,7 +150,4 @@ def _is_comparison(session: Session, children: Sequence[JobRow]) -> bool:
 
 
 def _fraction(job: JobRow) -> float:
-    if job.state == "succeeded":
-        return 1.0
-    progress = Progress.model_validate(job.progress)
-    return min(1.0, max(0.0, progress.done / progress.total)) if progress.total > 0 else 0.0
+    return 1.0 if job.state == "succeeded" else Progress.model_validate(job.progress).share

@@ -60,3 +60,11 @@ def test_nothing_to_send_is_refused(tmp_path: Path, name: str) -> None:
     (tmp_path / "empty.zip").touch()
     with pytest.raises(BundleUnreadable, match=name):
         open_bundle(tmp_path / name)
+
+
+def test_a_folder_of_pictures_is_told_from_a_scene_and_names_its_importer(tmp_path: Path) -> None:
+    (tmp_path / "color").mkdir()
+    for number in range(3):
+        (tmp_path / "color" / f"{number}.png").write_bytes(b"x")
+    with pytest.raises(BundleUnreadable, match=r"3 pictures were seen .*`physworld import .* --out SCENE`"):
+        open_bundle(tmp_path)

@@ -32,7 +32,7 @@ def test_the_table_of_lists_names_what_the_client_has(resource: Resource) -> Non
         held = getattr(client, resource.name)
     for listing in resource.lists:
         parameters = inspect.signature(getattr(held, listing.name)).parameters
-        wanted = {keyword for _, keyword, _ in listing.filters} | ({listing.of} - {None})
+        wanted = {keyword for _, keyword, _ in listing.filters} | ({listing.of[0]} if listing.of else set())
         assert wanted <= parameters.keys(), listing
         help_text = CliRunner().invoke(app, [resource.name, listing.name, "--help"]).output
         for option in (

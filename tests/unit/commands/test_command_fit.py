@@ -129,7 +129,7 @@ def test_a_given_law_is_used_and_an_unknown_one_refused(
 
 
 @pytest.mark.parametrize(
-    ("content", "word"), [(None, "{path}: No such file"), (b"nothing that we read", "SceneInvalid")]
+    ("content", "word"), [(None, "{path}: No such file"), (b"nothing that we read", "scene.zip: is neither ")]
 )
 def test_what_cannot_be_read_is_one_line_and_exit_code_2(
     tmp_path: Path, content: bytes | None, word: str, capsys: pytest.CaptureFixture[str]
@@ -149,7 +149,8 @@ def test_a_scene_that_no_law_covers_is_one_line_and_exit_code_2(
     folder = tmp_path / "few"
     write_bundle(replace(made_scene(np.eye(3), "blob"), name="few"), folder)
     assert fit.main([str(folder)]) == 2
-    assert capsys.readouterr().err.startswith("error: SceneUnsupported: ")
+    said = capsys.readouterr().err
+    assert said.startswith("error: ") and "SceneUnsupported" not in said
 
 
 def test_an_interrupt_cancels_and_says_so(bundle: Path, tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from physworld_storage.clock import CLOCK
 from physworld_storage.database import Database
 from physworld_storage.errors import ResultInvalid
 from physworld_storage.jobs import events, jobs, leases
+from physworld_storage.jobs.flow import CANCEL_WITHIN_S
 from physworld_storage.tables import ShardRow, utc_now
 
 if TYPE_CHECKING:
@@ -120,7 +121,8 @@ def test_progress_of_a_long_shard_is_the_jobs(work: Work) -> None:
     progress = Progress(done=12, total=80, unit="simulations", message="loss 3e-4")
     with work.database.session() as session:
         leases.renew(session, lease, LEASE_SECONDS, progress)
-    assert work.job(job).progress == progress
+    told = progress.model_copy(update={"fraction": 12 / 80})
+    assert work.job(job).progress == told
     with work.database.reading() as session:
         last = events.events_after(session, job.id, 0)[-1]
     assert (last.type, last.data["done"]) == ("progress", 12)
@@ -341,3 +343,18 @@ def test_a_problem_survives_the_database_unchanged(work: Work) -> None:
     with work.database.session() as session:
         leases.fail(session, lease, problem, retry=False)
     assert work.job(job).error == problem
+
+
+def test_a_cancelled_job_does_not_wait_for_a_worker_that_is_gone(work: Work) -> None:
+    job = work.fit()
+    lease = work.claim()
+    work.cancel(job)
+    with work.database.session() as session:
+        assert leases.renew(session, lease, LEASE_SECONDS) == "cancel"  # and the lease is no longer for it
+        assert leases.reap(session) == []
+    with work.database.session() as session:
+        put_forward(session, CANCEL_WITHIN_S + 0.1)
+        assert leases.reap(session) == [lease.shard_id]
+    assert work.job(job).state == "cancelled"
+    with work.database.session() as session:
+        assert leases.renew(session, lease, LEASE_SECONDS) == "lost"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 
@@ -13,12 +14,13 @@ from physworld_storage.jobs import events as log
 from physworld_storage.jobs import jobs, leases
 from physworld_storage.settings import Settings
 from physworld_storage.tables import ShardRow
-from physworld_workers.context import TaskContext
+from physworld_workers.context import GRACE_S, TaskContext
 from physworld_workers.errors import Cancelled, LeaseLost
 from physworld_workers.stores import Stores
 
 WITHIN_S = 10.0
 LEASE_S = 2.0
+ANSWER_S = 5.0
 
 
 def _until(condition: Callable[[], bool]) -> None:
@@ -105,3 +107,30 @@ def test_a_process_that_could_not_renew_in_time_stops_by_its_own_clock(
     time.sleep(1.1 * LEASE_S)
     with pytest.raises(LeaseLost, match=r"2\.\d s after its last renewal \(lease 2\.0 s\)"):
         context.check()
+
+
+def test_a_cancelled_handler_that_cannot_be_asked_is_left_behind(
+    stores: Stores, lease: leases.Lease, settings: Settings, job: Job
+) -> None:
+    left = threading.Event()
+    with TaskContext(lease, stores.database, settings, left.set):
+        with stores.database.session() as session:
+            assert jobs.cancel_job(session, job.id).state == "cancelling"
+        asked = time.monotonic()
+        assert left.wait(WITHIN_S)  # the handler is in a compiler: it neither reports nor checks
+        assert time.monotonic() - asked < ANSWER_S
+        with stores.database.session() as session:
+            assert jobs.get_job(session, job.id).state == "cancelled"
+            assert not leases.complete(session, lease, {"parameters": {}, "metrics": {}, "artifacts": []})
+
+
+def test_a_cancelled_handler_that_stops_in_time_is_not_left_behind(
+    stores: Stores, lease: leases.Lease, settings: Settings, job: Job
+) -> None:
+    left = threading.Event()
+    with TaskContext(lease, stores.database, settings, left.set) as context:
+        with stores.database.session() as session:
+            jobs.cancel_job(session, job.id)
+        _until(context.cancelled)
+    time.sleep(GRACE_S + 0.5)
+    assert not left.is_set()

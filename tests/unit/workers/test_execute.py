@@ -67,7 +67,8 @@ def test_physics_fails_at_once_and_keeps_its_numbers(runtime_with, stores: Store
     failed = _job(stores, job)
     assert failed.state == "failed" and failed.error is not None
     assert (failed.error.code, failed.error.status) == ("unstable_simulation", 422)
-    assert failed.error.detail == "UnstableSimulation: 12 of 400 nodes are not finite after step 31"
+    assert failed.error.detail == "12 of 400 nodes are not finite after step 31"
+    assert failed.error.hint is not None  # filled by its code
 
 
 def test_infrastructure_is_tried_again_until_the_attempts_are_spent(

@@ -1,4 +1,4 @@
-"""What the command line does with scenes, datasets and jobs beside listing them."""
+"""What the command line does with scenes, datasets, jobs and keys beside listing them."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import typer
 from pydantic import ValidationError
 from rich.progress import Progress
 
-from physworld_client.cli.lists import GROUPS, PAGE, download
-from physworld_client.cli.options import Json, Out, connected
+from physworld_client.cli.fit import become
+from physworld_client.cli.lists import GROUPS, PAGE, download, ending
+from physworld_client.cli.options import DatasetName, JobName, Json, KeyName, Out, connected
 from physworld_client.cli.output import (
     print_json,
     print_state,
@@ -24,6 +25,7 @@ from physworld_client.cli.output import (
 from physworld_client.client import Client
 from physworld_client.export import FORMATS
 from physworld_schemas.job import Job
+from physworld_schemas.key import DEFAULT_LIFETIME_DAYS, KeyCreate
 from physworld_schemas.library import catalogue
 from physworld_schemas.scene import SceneImport
 
@@ -73,7 +75,7 @@ def scenes_add(
 @connected(GROUPS["datasets"], "download")
 def datasets_download(
     client: Client,
-    dataset_id: str,
+    dataset_id: DatasetName,
     out: Out = None,
     episodes: Annotated[bool, typer.Option("--episodes", help="Every episode too, as npz.")] = False,
 ) -> None:
@@ -94,7 +96,7 @@ def datasets_download(
 @connected(GROUPS["datasets"], "export")
 def datasets_export(
     client: Client,
-    dataset_id: str,
+    dataset_id: DatasetName,
     format: Annotated[
         str,
         typer.Option("--format", "-f", metavar="|".join(FORMATS), callback=_known, help=FORMS),
@@ -121,10 +123,44 @@ def datasets_export(
     stdout.print(f"{folder.absolute()}", soft_wrap=True)
 
 
+@GROUPS["scenes"].command("check")
+def scenes_check(
+    paths: Annotated[list[Path], typer.Argument(metavar="SCENE...", help=RECORDING)],
+    json: Json = False,
+) -> None:
+    """Name every fault and warning of a scene in this process; needs no service. Exit code 2 where one is refused."""
+    become("physworld_workers.commands.scene_check", [*(["--json"] if json else []), "--", *map(str, paths)])
+
+
+@connected(GROUPS["keys"], "create")
+def keys_create(
+    client: Client,
+    name: Annotated[str, typer.Argument(help="Who or what uses the key.")],
+    role: Annotated[str, typer.Option(help="read, write, or admin, which may manage keys too.")] = "read",
+    days: Annotated[int, typer.Option(min=0, help="Until it ends; 0: never.")] = DEFAULT_LIFETIME_DAYS,
+    json: Json = False,
+) -> None:
+    """Make a key; its token is printed once and kept nowhere."""
+    asked = KeyCreate.model_validate({"name": name, "role": role})
+    made = client.keys.create(name, asked.role, expires_in_days=days or None)
+    if json:
+        print_json(made)
+    else:
+        stdout.print(f"{made.id}  {made.name}, {made.role}, until {ending(made)}", markup=False)
+        print(made.token)
+
+
+@connected(GROUPS["keys"], "revoke")
+def keys_revoke(client: Client, key_id: KeyName) -> None:
+    """End a key, and what it opened, at once."""
+    ended = client.keys.revoke(key_id)
+    stdout.print(f"{ended.id}  {ended.name} is revoked", markup=False)
+
+
 @connected(GROUPS["jobs"], "wait")
 def jobs_wait(
     client: Client,
-    job_id: str,
+    job_id: JobName,
     timeout: Annotated[float | None, typer.Option(min=0, help="Seconds; default for ever.")] = None,
     json: Json = False,
 ) -> None:
@@ -140,12 +176,12 @@ def jobs_wait(
 
 
 @connected(GROUPS["jobs"], "retry")
-def jobs_retry(client: Client, job_id: str, json: Json = False) -> None:
+def jobs_retry(client: Client, job_id: JobName, json: Json = False) -> None:
     """Take a failed job up again; what it stored is kept."""
     print_state(client.jobs.retry(job_id), json)
 
 
 @connected(GROUPS["jobs"], "cancel")
-def jobs_cancel(client: Client, job_id: str, json: Json = False) -> None:
+def jobs_cancel(client: Client, job_id: JobName, json: Json = False) -> None:
     """Cancel a job and everything it started."""
     print_state(client.jobs.cancel(job_id), json)

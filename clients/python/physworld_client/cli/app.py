@@ -18,7 +18,8 @@ from pydantic import ValidationError
 
 import physworld_client.cli.actions
 import physworld_client.cli.loop
-import physworld_client.cli.registry  # noqa: F401  (adds commands to the groups)
+import physworld_client.cli.registry
+import physworld_client.cli.starts  # noqa: F401  (adds commands to the groups)
 from physworld_client.cli import (
     catalogue,
     check,
@@ -28,6 +29,7 @@ from physworld_client.cli import (
     lists,
     predict,
     run,
+    running,
     trace,
     up,
     video,
@@ -40,13 +42,15 @@ app = typer.Typer(
     name="physworld",
     help="From a recording of a deformable object to a world model.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
 app.command("up")(up.up)
 app.command("run")(run.run)
 app.command("check")(check.check)
+app.command("status")(running.status)
+app.command("logs")(running.logs)
+app.command("down")(running.down)
 app.command("fit")(fit.fit)
 app.command("trace", cls=trace.ManyHeldOut)(trace.trace)
 connected(app, "rollout")(predict.rollout)

@@ -14,6 +14,7 @@ from typing import Annotated
 
 import typer
 
+from physworld_client.cli.options import JSON_FILE
 from physworld_client.errors import PhysWorldError
 
 MODULE = "physworld_workers.commands.fit"
@@ -21,7 +22,9 @@ MODULE = "physworld_workers.commands.fit"
 
 def fit(
     scene: Annotated[Path, typer.Argument(help="Folder, archive, final_data.pkl or C3D file.")],
-    json: Annotated[Path | None, typer.Option(help="Write the figures to this file.")] = None,
+    json: Annotated[
+        Path | None, typer.Option(callback=JSON_FILE, help="Write the figures to this file.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the twin and its prediction.")] = None,
     particles: Annotated[int | None, typer.Option(min=50, help="Particles of the twin, about.")] = None,
     simulations: Annotated[int | None, typer.Option(min=1, help="Most simulations of the search.")] = None,

@@ -103,14 +103,11 @@ class Bars:
     def show(self, stages: dict[str, Job]) -> None:
         """Moves the bars."""
         for kind, job in stages.items():
-            total = job.progress.total or 1.0
-            done = total if job.state == "succeeded" else min(job.progress.done, total)
             if kind not in self._tasks:
                 self._tasks[kind] = self._add(kind)
             self._progress.update(
                 self._tasks[kind],
-                total=total,
-                completed=done,
+                completed=job.share,
                 state=job.state,
                 seconds=f"{duration_s(job):.0f} s" if job.started_at else "",
                 text=progress_text(job),

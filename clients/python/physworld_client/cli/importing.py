@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from physworld_client.cli.fit import become
+from physworld_client.cli.options import PNG_FILE
 
 MODULE = "physworld_workers.commands.importing"
 
@@ -60,7 +61,7 @@ def import_recording(
     undeformed: Annotated[
         bool, typer.Option("--undeformed", help="The first frame is undeformed and at rest.")
     ] = False,
-    picture: Annotated[Path | None, typer.Option(help="PNG of what was followed.")] = None,
+    picture: Annotated[Path | None, typer.Option(callback=PNG_FILE, help="PNG of what was followed.")] = None,
 ) -> None:
     """Make a scene of a recording; needs no service."""
     given = {

@@ -1,7 +1,7 @@
 """What the command line lists, shows and downloads: one table of resources, and the commands that are made of it.
 
 Every command goes through the SDK; ``--json`` prints the wire models as they are. What else can be done with a
-resource stands in ``actions``, ``registry`` and ``traces``.
+resource stands in ``actions``, ``starts``, ``registry`` and ``loop``.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import Annotated, Any
 import typer
 from pydantic import BaseModel
 
+from physworld_client.cli.names import one_of
 from physworld_client.cli.options import Json, Limit, Out, connected
 from physworld_client.cli.output import (
     ago,
@@ -29,12 +30,16 @@ from physworld_client.cli.output import (
 from physworld_client.client import Client
 from physworld_client.manifest import checked_name
 from physworld_client.pages import ListPage
+from physworld_schemas.assessment import Assessment
 from physworld_schemas.base import Artifact
 from physworld_schemas.check import Check
 from physworld_schemas.dataset import Dataset, Episode
 from physworld_schemas.fit import Fit
 from physworld_schemas.job import Job
+from physworld_schemas.key import ApiKey
 from physworld_schemas.model import Model, ModelVersion
+from physworld_schemas.plan import Plan
+from physworld_schemas.rollout import Rollout
 from physworld_schemas.scene import Scene
 from physworld_schemas.trace import Trace
 
@@ -53,7 +58,7 @@ class Listing:
         help: its line of help.
         headings: of the columns.
         row: the cells of an item.
-        of: the argument that names whose list it is; none: all of the service.
+        of: the argument that names whose list it is, and of which resource that is; None: all of the service.
         filters: options that narrow it: (option, the method's keyword, help).
     """
 
@@ -61,7 +66,7 @@ class Listing:
     help: str
     headings: tuple[str, ...]
     row: Row
-    of: str | None = None
+    of: tuple[str, str] | None = None
     filters: tuple[tuple[str, str, str], ...] = ()
 
 
@@ -84,6 +89,11 @@ class Resource:
     one: str
     shown: bool = True
     files: str | None = None
+
+    @property
+    def argument(self) -> Any:
+        """The type of the argument that names one: by its id alone where there is no list of all of them."""
+        return one_of(self.name) if self.lists[0].of is None else str
 
 
 def _scene(scene: Scene) -> Sequence[object]:
@@ -138,6 +148,38 @@ def _version(version: ModelVersion) -> Sequence[object]:
     return (*marks, digest, ago(version.created_at))
 
 
+def _rollout(run: Rollout) -> Sequence[object]:
+    age = "" if run.created_at is None else ago(run.created_at)
+    return (run.id, f"{run.model}:{run.version}", run.state, run.candidates, run.ticks, age)
+
+
+def _plan(run: Plan) -> Sequence[object]:
+    errors = (millimetres(run.executed_error_m), millimetres(run.motionless_error_m))
+    return (run.id, f"{run.model}:{run.version}", run.state, *errors, ago(run.created_at))
+
+
+def _assessment(one: Assessment) -> Sequence[object]:
+    return (
+        one.id,
+        f"{one.name}:{one.version}",
+        one.scene_id,
+        one.state,
+        one.outcome or "",
+        ago(one.created_at),
+    )
+
+
+def _key(key: ApiKey) -> Sequence[object]:
+    return (key.id, key.name, key.role, ending(key), ago(key.created_at))
+
+
+def ending(key: ApiKey) -> str:
+    """When a key ends: a day, ``revoked``, or ``never``."""
+    if key.revoked_at is not None:
+        return "revoked"
+    return "never" if key.expires_at is None else f"{key.expires_at:%Y-%m-%d}"
+
+
 def _job(job: Job) -> Sequence[object]:
     return (job.id, job.kind, job.state, progress_text(job), ago(job.created_at))
 
@@ -182,7 +224,7 @@ EPISODES = Listing(
     "The committed episodes of a dataset.",
     ("index", "motion", "seed", "frames", "particles", "attempt", "digest"),
     _episode,
-    of="dataset_id",
+    of=("dataset_id", "datasets"),
 )
 MODELS = Listing("list", "Registered names.", ("name", "newest", "latest", "aliases", "age"), _model)
 VERSIONS = Listing(
@@ -190,7 +232,7 @@ VERSIONS = Listing(
     "Versions of a name, newest first.",
     ("version", "state", "quality", "aliases", "sha256", "age"),
     _version,
-    of="name",
+    of=("name", "models"),
 )
 JOBS = Listing(
     "list",
@@ -202,6 +244,28 @@ JOBS = Listing(
         ("kind", "kind", "Only jobs of this kind."),
     ),
 )
+ROLLOUTS = Listing(
+    "list",
+    "Rollouts that were jobs, newest first.",
+    ("id", "model", "state", "candidates", "ticks", "age"),
+    _rollout,
+    filters=(("model", "model", "Only rollouts of this model."),),
+)
+PLANS = Listing(
+    "list",
+    "Plans, newest first.",
+    ("id", "model", "state", "in the twin [mm]", "without motion [mm]", "age"),
+    _plan,
+    filters=(("model", "model", "Only plans with this model."),),
+)
+ASSESSMENTS = Listing(
+    "list",
+    "Recordings held against a model.",
+    ("id", "model", "scene", "state", "outcome", "age"),
+    _assessment,
+    of=("name", "models"),
+)
+KEYS = Listing("list", "Keys, newest first, ended ones too.", ("id", "name", "role", "until", "age"), _key)
 RESOURCES = (
     Resource("scenes", "Measured scenes.", (SCENES,), "scene", files="the files of a scene"),
     Resource(
@@ -219,6 +283,12 @@ RESOURCES = (
     Resource("datasets", "Datasets of demonstration episodes.", (DATASETS, EPISODES), "dataset"),
     Resource("models", "Published world models.", (MODELS, VERSIONS), "model", shown=False),
     Resource("jobs", "Jobs.", (JOBS,), "job"),
+    Resource(
+        "rollouts", "Predictions that were jobs.", (ROLLOUTS,), "rollout", files="the arrays of a rollout"
+    ),
+    Resource("plans", "Motions that reach a goal.", (PLANS,), "plan", files="the arrays of a plan"),
+    Resource("assessments", "New recordings held against models.", (ASSESSMENTS,), "assessment"),
+    Resource("keys", "API keys of the service.", (KEYS,), "key", shown=False),
 )
 
 
@@ -237,7 +307,7 @@ def group_of(resource: Resource) -> typer.Typer:
 def _add_list(group: typer.Typer, resource: Resource, listing: Listing) -> None:
     options: dict[str, tuple[Any, Any]] = {}
     if listing.of is not None:
-        options[listing.of] = (str, inspect.Parameter.empty)
+        options[listing.of[0]] = (one_of(listing.of[1]), inspect.Parameter.empty)
     options["limit"] = (Limit, DEFAULT_LIMIT)
     for option, _, text in listing.filters:
         options[option] = (Annotated[str | None, typer.Option(help=text)], None)
@@ -245,7 +315,7 @@ def _add_list(group: typer.Typer, resource: Resource, listing: Listing) -> None:
 
     def listed(client: Client, **given: Any) -> None:
         method: Callable[..., ListPage[Any]] = getattr(getattr(client, resource.name), listing.name)
-        whose = () if listing.of is None else (given[listing.of],)
+        whose = () if listing.of is None else (given[listing.of[0]],)
         chosen = {keyword: given[option] for option, keyword, _ in listing.filters}
         pages = method(*whose, limit=min(given["limit"], PAGE), **chosen).auto_paging_iter()
         show_list(pages, given["limit"], given["json"], listing.headings, listing.row)
@@ -261,7 +331,9 @@ def _add_show(group: typer.Typer, resource: Resource) -> None:
         show(getattr(client, resource.name).get(given[name]), given["json"])
 
     shown.__doc__ = f"One {resource.one}."
-    connected(group, "show", {name: (str, inspect.Parameter.empty), "json": (Json, False)})(shown)
+    connected(group, "show", {name: (resource.argument, inspect.Parameter.empty), "json": (Json, False)})(
+        shown
+    )
 
 
 def _add_download(group: typer.Typer, resource: Resource) -> None:
@@ -272,7 +344,8 @@ def _add_download(group: typer.Typer, resource: Resource) -> None:
         download(client, found.artifacts, given["out"] or Path(given[name]))
 
     downloaded.__doc__ = f"Download {resource.files}."
-    connected(group, "download", {name: (str, inspect.Parameter.empty), "out": (Out, None)})(downloaded)
+    which = (resource.argument, inspect.Parameter.empty)
+    connected(group, "download", {name: which, "out": (Out, None)})(downloaded)
 
 
 def show_list(

@@ -11,7 +11,8 @@ from typing import Annotated
 import typer
 
 from physworld_client.cli.lists import GROUPS, held_out_errors
-from physworld_client.cli.options import Json, VersionName, connected
+from physworld_client.cli.names import found
+from physworld_client.cli.options import Json, ModelName, SceneName, TraceName, VersionName, connected
 from physworld_client.cli.output import millimetres, print_json, print_state, show, stdout
 from physworld_client.client import Client
 from physworld_client.resources import LATEST
@@ -23,7 +24,7 @@ from physworld_schemas.trace import FoundEffect, TraceConfig
 @connected(GROUPS["traces"], "add")
 def traces_add(
     client: Client,
-    scene_id: Annotated[str, typer.Argument(help="A scene of the service.")],
+    scene_id: SceneName,
     fit: Annotated[str | None, typer.Option(help="A ready fit whose twin to begin with.")] = None,
     particles: Annotated[int | None, typer.Option(min=50, help="Particles of the twin, about.")] = None,
     candidate: Annotated[list[str] | None, typer.Option(help="Try this effect only; repeatable.")] = None,
@@ -43,9 +44,9 @@ def traces_add(
         scene_id,
         config,
         fit=settings,
-        fit_id=fit,
-        scene_ids=also or (),
-        held_out_scene_ids=held_out or (),
+        fit_id=None if fit is None else found(client, "fits", fit),
+        scene_ids=[found(client, "scenes", one) for one in also or ()],
+        held_out_scene_ids=[found(client, "scenes", one) for one in held_out or ()],
     )
     if json:
         print_json(job)
@@ -54,7 +55,7 @@ def traces_add(
 
 
 @connected(GROUPS["traces"], "show")
-def traces_show(client: Client, trace_id: str, json: Json = False) -> None:
+def traces_show(client: Client, trace_id: TraceName, json: Json = False) -> None:
     """One trace: the verdict, the strengths, the errors before and after."""
     trace = client.traces.get(trace_id)
     if json or trace.verdict is None:
@@ -73,7 +74,7 @@ def traces_show(client: Client, trace_id: str, json: Json = False) -> None:
 
 
 @connected(GROUPS["traces"], "cancel")
-def traces_cancel(client: Client, trace_id: str, json: Json = False) -> None:
+def traces_cancel(client: Client, trace_id: TraceName, json: Json = False) -> None:
     """Cancel a trace that runs."""
     print_state(client.traces.cancel(trace_id), json)
 
@@ -81,22 +82,22 @@ def traces_cancel(client: Client, trace_id: str, json: Json = False) -> None:
 @connected(GROUPS["models"], "assess")
 def models_assess(
     client: Client,
-    name: str,
-    scene: Annotated[str, typer.Argument(help="A recording's file or folder, or the id of a scene.")],
+    name: ModelName,
+    scene: Annotated[str, typer.Argument(help="A recording's file or folder, or a scene of the service.")],
     version: VersionName = LATEST,
     trace: Annotated[bool, typer.Option(help="Open a trace where the model has become worse.")] = True,
     timeout: Annotated[float | None, typer.Option(min=0, help="Seconds to wait; default for ever.")] = None,
     json: Json = False,
 ) -> None:
     """Hold a new recording of the object against a published model."""
-    scene_id = client.scenes.create(scene).id if Path(scene).exists() else scene
+    scene_id = client.scenes.create(scene).id if Path(scene).exists() else found(client, "scenes", scene)
     job = client.assessments.create(name, scene_id, version, open_trace=trace)
     client.jobs.wait(job, timeout)
-    found = client.assessments.get(job.outputs[0].id)
+    answer = client.assessments.get(job.outputs[0].id)
     if json:
-        print_json(found)
+        print_json(answer)
     else:
-        _print_assessment(found)
+        _print_assessment(answer)
 
 
 def effect_text(effect: FoundEffect) -> str:

@@ -11,6 +11,7 @@ from typing import Annotated, Any, get_type_hints
 import typer
 
 from physworld_client.cli import service
+from physworld_client.cli.names import Named, found, help_of
 
 Url = Annotated[str | None, typer.Option("--url", help="Address of a running service [PHYSWORLD_URL].")]
 Token = Annotated[str | None, typer.Option("--token", help="API key for --url [PHYSWORLD_TOKEN].")]
@@ -20,7 +21,35 @@ Data = Annotated[
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
 Limit = Annotated[int, typer.Option("--limit", "-n", min=1, help="At most so many, newest first.")]
 Out = Annotated[Path | None, typer.Option("--out", "-o", help="Folder for the files [./ID].")]
+SceneName = Annotated[str, typer.Argument(help=help_of("scenes")), Named("scenes")]
+FitName = Annotated[str, typer.Argument(help=help_of("fits")), Named("fits")]
+TraceName = Annotated[str, typer.Argument(help=help_of("traces")), Named("traces")]
+DatasetName = Annotated[str, typer.Argument(help=help_of("datasets")), Named("datasets")]
+ModelName = Annotated[str, typer.Argument(help=help_of("models")), Named("models")]
+JobName = Annotated[str, typer.Argument(help=help_of("jobs")), Named("jobs")]
+KeyName = Annotated[str, typer.Argument(help=help_of("keys")), Named("keys")]
+"""Arguments that name one object: by id, the beginning of one, or a name."""
 VersionName = Annotated[str, typer.Option("--version", help="A number, an alias, or latest.")]
+
+
+def written_as(*suffixes: str) -> Callable[[Path | None], Path | None]:
+    """The callback of an option that names a file to be written: its ending is one of these, or it is refused.
+
+    What is there already and is no plain file (a pipe, ``/dev/stdout``) takes anything.
+    """
+
+    def checked(path: Path | None) -> Path | None:
+        if path is None or path.suffix.lower() in suffixes or (path.exists() and not path.is_file()):
+            return path
+        ending = f"ends in {path.suffix!r}" if path.suffix else "has no ending"
+        raise typer.BadParameter(f"{path} {ending}; it is written as {' or '.join(suffixes)}")
+
+    return checked
+
+
+JSON_FILE, NPZ_FILE, MP4_FILE, PNG_FILE, HTML_FILE = map(
+    written_as, (".json", ".npz", ".mp4", ".png", ".html")
+)
 
 CONNECTION = {"url": Url, "token": Token, "data": Data}
 """The options that say which service a command talks to, by the parameters of ``service.connect``."""
@@ -31,7 +60,8 @@ def connected(
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Makes a command of a function whose first parameter is the client.
 
-    On the command line the client's place is taken by ``--url``, ``--token`` and ``--data``, which stand last.
+    On the command line the client's place is taken by ``--url``, ``--token`` and ``--data``, which stand last. An
+    argument that is marked as ``Named`` may be an id, the beginning of one, or a name; the function is given the id.
 
     Args:
         group: where the command is added.
@@ -57,8 +87,17 @@ def connected(
         def command(**given: Any) -> None:
             where = {option: given.pop(option) for option in CONNECTION}
             with service.connect(**where) as client:
+                for name, resource in named.items():
+                    if given[name] is not None:
+                        given[name] = found(client, resource, given[name])
                 function(client, **given)
 
+        named = {
+            parameter.name: mark.resource
+            for parameter in own
+            for mark in getattr(parameter.annotation, "__metadata__", ())
+            if isinstance(mark, Named)
+        }
         parameters = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in own]
         command.__dict__["__signature__"] = inspect.Signature(parameters)
         command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}

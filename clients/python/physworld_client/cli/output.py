@@ -15,6 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from physworld_schemas.job import Job
+from physworld_schemas.wording import roughly
 
 NARROWEST = 110
 LONGEST_LIST = 8
@@ -73,9 +74,13 @@ def print_state(job: Job, as_json: bool) -> None:
 
 
 def progress_text(job: Job) -> str:
-    """``12 of 40 episodes, message``."""
+    """``63 %, about 4 min left, 12 of 40 episodes, message``."""
     progress = job.progress
     parts = []
+    if job.state == "running":
+        parts.append(f"{100 * job.share:.0f} %")
+        if progress.eta_s is not None:
+            parts.append(f"about {roughly(progress.eta_s)} left")
     if progress.total:
         parts.append(f"{progress.done:g} of {progress.total:g} {progress.unit}".strip())
     if progress.message:

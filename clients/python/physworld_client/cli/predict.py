@@ -11,7 +11,9 @@ import numpy as np
 import typer
 
 from physworld_client.arrays import arrays_of
-from physworld_client.cli.options import Json
+from physworld_client.cli.names import found as known_as
+from physworld_client.cli.names import help_of
+from physworld_client.cli.options import NPZ_FILE, Json
 from physworld_client.cli.output import print_json, stderr, stdout
 from physworld_client.client import Client
 from physworld_client.errors import PhysWorldError
@@ -19,18 +21,22 @@ from physworld_client.resources import LATEST
 from physworld_client.types import Array
 from physworld_schemas.plan import Plan, PlanConfig, PlanLimits
 from physworld_schemas.rollout import Part
+from physworld_schemas.wording import reason
 
 Version = Annotated[str, typer.Option(help="Number, alias or latest.")]
 
 
 def rollout(
     client: Client,
-    model: Annotated[str, typer.Argument(help="Name of a published model.")],
+    model: Annotated[str, typer.Argument(help=help_of("models"))],
     controllers: Annotated[
         Path,
         typer.Option(help="npz with controllers, (B, T, K, 3) or (T, K, 3) [m], and perhaps times (T,) [s]."),
     ],
-    out: Annotated[Path, typer.Option(help="Write times, points and what else is asked for to this npz.")],
+    out: Annotated[
+        Path,
+        typer.Option(callback=NPZ_FILE, help="Write times, points and what else is asked for to this npz."),
+    ],
     version: Version = LATEST,
     rest: Annotated[bool, typer.Option(help="Begin at rest, not as the recording did.")] = False,
     vertices: Annotated[bool, typer.Option(help="Also the vertices of the graph.")] = False,
@@ -42,6 +48,7 @@ def rollout(
     """Predict what the object does under given motions of its control points."""
     arrays = _controllers(controllers)
     returns: list[Part] = ["points", "vertices"] if vertices else ["points"]
+    model = known_as(client, "models", model)
     found = client.rollouts.create(
         model,
         arrays["controllers"],
@@ -69,12 +76,15 @@ def rollout(
 
 def plan(
     client: Client,
-    model: Annotated[str, typer.Argument(help="Name of a published model.")],
+    model: Annotated[str, typer.Argument(help=help_of("models"))],
     goal: Annotated[
         Path,
         typer.Option(help="npz: index (M,) and places (M, 3) [m] of measured points, or shape (M, 3) [m]."),
     ],
-    out: Annotated[Path, typer.Option(help="Write the control path and the predicted paths to this npz.")],
+    out: Annotated[
+        Path,
+        typer.Option(callback=NPZ_FILE, help="Write the control path and the predicted paths to this npz."),
+    ],
     version: Version = LATEST,
     horizon: Annotated[int, typer.Option(min=2, help="Ticks of the motion.")] = 60,
     samples: Annotated[int, typer.Option(min=8, help="Motions tried in an iteration.")] = 512,
@@ -89,6 +99,7 @@ def plan(
     """Find a motion of the grips that brings the object to a goal, and check it in the twin."""
     points, shape = _goal(goal)
     config = PlanConfig(horizon=horizon, samples=samples, iterations=iterations, seed=seed)
+    model = known_as(client, "models", model)
     job = client.plans.create(
         model,
         _version(version),
@@ -134,7 +145,7 @@ def _controllers(path: Path) -> dict[str, Array]:
                 "times": np.array(experiment["times_s"], dtype=float),
             }
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise PhysWorldError(f"{path} is no report of a trace: {error!r}") from error
+            raise PhysWorldError(f"{path} is no report of a trace: {reason(error)}") from error
     arrays = _npz(path)
     if "controllers" not in arrays:
         raise PhysWorldError(f"{path} holds {sorted(arrays)}, no controllers")
@@ -164,9 +175,10 @@ def _goal(path: Path) -> tuple[dict[int, Sequence[float]] | None, Array | None]:
 
 def _npz(path: Path) -> dict[str, Array]:
     try:
-        return arrays_of(path.read_bytes())
+        data = path.read_bytes()
     except OSError as error:
-        raise PhysWorldError(f"{path} cannot be read: {error}") from error
+        raise PhysWorldError(f"{path} cannot be read: {error.strerror}") from error
+    return arrays_of(data, str(path))
 
 
 def _write(path: Path, arrays: dict[str, Array]) -> None:

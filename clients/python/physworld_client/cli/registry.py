@@ -9,7 +9,8 @@ import typer
 
 from physworld_client.cli import service
 from physworld_client.cli.lists import GROUPS, show_list
-from physworld_client.cli.options import Data, Json, Out, Token, Url, VersionName, connected
+from physworld_client.cli.names import found
+from physworld_client.cli.options import Data, Json, ModelName, Out, Token, Url, VersionName, connected
 from physworld_client.cli.output import print_json, print_table, show, stdout
 from physworld_client.cli.report import shown_unit
 from physworld_client.client import Client
@@ -31,27 +32,27 @@ Key = Annotated[str, typer.Argument(help="A fingerprint (`models keys`), a key i
 @connected(MODELS, "compare")
 def models_compare(
     client: Client,
-    name: str,
+    name: ModelName,
     a: Annotated[str, typer.Argument(help="A number, an alias, or latest.")],
     b: Annotated[str, typer.Argument(help="A number, an alias, or latest.")] = LATEST,
     json: Json = False,
 ) -> None:
     """Two versions side by side: errors with intervals, gains, and what differs in how they were made."""
-    found = client.models.compare(name, a, b)
+    compared = client.models.compare(name, a, b)
     if json:
-        print_json(found)
+        print_json(compared)
     else:
-        _print_comparison(found)
+        _print_comparison(compared)
 
 
 @connected(MODELS, "show")
-def models_show(client: Client, name: str, version: VersionName = LATEST, json: Json = False) -> None:
+def models_show(client: Client, name: ModelName, version: VersionName = LATEST, json: Json = False) -> None:
     """One version of a model."""
     show(client.models.version(name, version), json)
 
 
 @connected(MODELS, "alias")
-def models_alias(client: Client, name: str, alias: str, version: int) -> None:
+def models_alias(client: Client, name: ModelName, alias: str, version: int) -> None:
     """Point an alias at a version."""
     client.models.set_alias(name, alias, version)
     stdout.print(f"{name}@{alias} is version {version}")
@@ -60,7 +61,7 @@ def models_alias(client: Client, name: str, alias: str, version: int) -> None:
 @connected(MODELS, "describe")
 def models_describe(
     client: Client,
-    name: str,
+    name: ModelName,
     version: VersionName = LATEST,
     description: Annotated[str | None, typer.Option(help="New description.")] = None,
     tag: Annotated[list[str] | None, typer.Option(help="Tags from now on; repeatable.")] = None,
@@ -72,7 +73,7 @@ def models_describe(
 
 
 @connected(MODELS, "unalias")
-def models_unalias(client: Client, name: str, alias: str) -> None:
+def models_unalias(client: Client, name: ModelName, alias: str) -> None:
     """Remove an alias; the version stays."""
     client.models.delete_alias(name, alias)
     stdout.print(f"{name}@{alias} is no more")
@@ -80,7 +81,7 @@ def models_unalias(client: Client, name: str, alias: str) -> None:
 
 @MODELS.command("download")
 def models_download(
-    name: str,
+    name: ModelName,
     version: VersionName = LATEST,
     out: Out = None,
     trust: Annotated[
@@ -97,11 +98,12 @@ def models_download(
     own = address.signing_key if only is None else None
     key = own if trust is None else _key(trust)
     with address.client() as client:
+        name = found(client, "models", name)
         number = client.models.version(name, version).version
         folder = out or Path(f"{name}-{number}")
-        found = client.models.download(name, folder, number, trust=key, public_key=only)
+        got = client.models.download(name, folder, number, trust=key, public_key=only)
     stdout.print(
-        f"{name} version {number}, sha256 {found.sha256}: verified in {folder.absolute()}", soft_wrap=True
+        f"{name} version {number}, sha256 {got.sha256}: verified in {folder.absolute()}", soft_wrap=True
     )
 
 

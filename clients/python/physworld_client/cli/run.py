@@ -12,7 +12,8 @@ import typer
 
 from physworld_client.cli import service
 from physworld_client.cli.follow import follow
-from physworld_client.cli.options import Data, Token, Url
+from physworld_client.cli.names import found
+from physworld_client.cli.options import JSON_FILE, Data, Token, Url
 from physworld_client.cli.output import stderr, stdout
 from physworld_client.cli.report import CLOSED_LOOP, STAGES, build_report, print_report, write_report
 from physworld_client.cli.up import require_service_code
@@ -25,12 +26,18 @@ from physworld_schemas.fit import FitConfig
 from physworld_schemas.job import TERMINAL_STATES, Job
 from physworld_schemas.model import TrainingConfig
 from physworld_schemas.pipeline import PipelineCreate, RunReport
+from physworld_schemas.scene import Scene
 
 CANCEL_WAIT_S = 30.0
 
 
 def run(
-    scene: Annotated[Path, typer.Argument(help="Folder, archive, final_data.pkl or table of markers.")],
+    scene: Annotated[
+        str,
+        typer.Argument(
+            help="Folder, archive, final_data.pkl or table of markers, or a scene of the service."
+        ),
+    ],
     episodes: Annotated[int | None, typer.Option(min=1, help="Demonstration episodes.")] = None,
     hidden: Annotated[int | None, typer.Option(min=8, help="Width of the graph network.")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Training steps.")] = None,
@@ -62,7 +69,9 @@ def run(
     compare: Annotated[
         bool, typer.Option(help="Train a model without the effect too, so that the card can compare.")
     ] = True,
-    json: Annotated[Path | None, typer.Option(help="Write the figures to this file.")] = None,
+    json: Annotated[
+        Path | None, typer.Option(callback=JSON_FILE, help="Write the figures to this file.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the model [DATA/models/NAME-VERSION].")] = None,
     workers: Annotated[int, typer.Option(min=1, help="Workers, if the service must be started.")] = 2,
     keep_up: Annotated[bool, typer.Option("--keep-up", help="Leave a started service running.")] = False,
@@ -86,6 +95,10 @@ def run(
         "mesh": mesh,
         "stages": stages,
     }
+    if not Path(scene).expanduser().exists() and service.find(url, token, data) is None:
+        raise PhysWorldError(
+            f"no scene at {scene}: neither a folder nor a file, and no service runs that may know it"
+        )
     with _service(url, token, data, workers, keep_up) as (address, alive):
         with address.client(DEFAULT_MAX_RETRIES) as client:
             loop = {"close_the_loop": True, "compare": compare} if close_the_loop else {}
@@ -108,10 +121,10 @@ def _service(
     url: str | None, token: str | None, data: Path | None, workers: int, keep_up: bool
 ) -> Iterator[tuple[service.Address, Callable[[], bool]]]:
     """A running service, or one started for this run and stopped at its end; and whether it (still) runs."""
-    found = service.find(url, token, data)
-    if found is not None:
-        stdout.print(f"service: {found.url} (running), dashboard {found.dashboard_url}", soft_wrap=True)
-        yield found, lambda: True
+    running = service.find(url, token, data)
+    if running is not None:
+        stdout.print(f"service: {running.url} (running), dashboard {running.dashboard_url}", soft_wrap=True)
+        yield running, lambda: True
         return
     require_service_code()
     folder = service.data_folder(data)
@@ -131,7 +144,7 @@ def _service(
 
 def _run(
     client: Client,
-    scene: Path,
+    scene: str,
     name: str | None,
     settings: dict[str, object],
     loop: dict[str, bool],
@@ -140,7 +153,7 @@ def _run(
     alive: Callable[[], bool],
 ) -> tuple[RunReport, Path]:
     """The main job on a running service: its report, and the folder with the verified model."""
-    uploaded = client.scenes.create(scene)
+    uploaded = _scene(client, scene)
     stdout.print(
         f"scene: {uploaded.name} ({uploaded.id}), {uploaded.frames} frames at {uploaded.fps:g} Hz, "
         f"{uploaded.points} points, {uploaded.controllers} controllers, held out: frames "
@@ -167,6 +180,20 @@ def _run(
     dataset = client.datasets.get(outputs["dataset"])
     fit = client.fits.get(outputs["fit"])
     return build_report(uploaded.name, pipeline, stages, fit, version, dataset.episodes_done), folder
+
+
+def _scene(client: Client, given: str) -> Scene:
+    """The scene at a path, uploaded; else the one of the service that is called so.
+
+    Raises:
+        PhysWorldError: there is nothing at the path, and no scene has such an id or name.
+    """
+    if Path(given).expanduser().exists():
+        return client.scenes.create(given)
+    try:
+        return client.scenes.get(found(client, "scenes", given))
+    except PhysWorldError as error:
+        raise PhysWorldError(f"no scene at {given}: neither a folder nor a file, and {error}") from error
 
 
 def _pipeline(

@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import httpx
 
@@ -157,13 +158,19 @@ def embedded_command(data: Path, workers: int, port: int) -> list[str]:
     return [sys.executable, "-m", "physworld_services.embedded", *options]
 
 
+def state_of(data: Path) -> dict[str, Any]:
+    """What the embedded service on a data folder wrote of itself; empty where none runs."""
+    try:
+        state: dict[str, Any] = json.loads((data / "run" / "state.json").read_bytes())
+    except (FileNotFoundError, json.JSONDecodeError):
+        return {}
+    return state
+
+
 def running_on(data: Path, pid: int | None = None) -> Address | None:
     """The service that runs on a data folder and answers; None when there is none (or not as ``pid``)."""
-    try:
-        state = json.loads((data / "run" / "state.json").read_bytes())
-    except (FileNotFoundError, json.JSONDecodeError):
-        return None
-    if not state.get("ready", True) or (pid is not None and state.get("pid") != pid):
+    state = state_of(data)
+    if not state or not state.get("ready", True) or (pid is not None and state.get("pid") != pid):
         return None
     url = str(state["api_url"]).rstrip("/")
     try:

@@ -12,6 +12,7 @@ import typer
 from typer.core import TyperCommand
 
 from physworld_client.cli.fit import become
+from physworld_client.cli.options import HTML_FILE, NPZ_FILE, written_as
 
 MODULE = "physworld_workers.commands.trace"
 HELD_OUT = "--held-out"
@@ -45,11 +46,19 @@ def trace(
     held_out: Annotated[
         list[Path] | None, typer.Option(metavar="SCENE...", help="Recordings that only the report sees.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Write the report to this file.")] = None,
-    predictions: Annotated[
-        Path | None, typer.Option(help="Write the tracks before and after to this npz.")
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            callback=written_as(".json", ".html"),
+            help="Write the report to this file: .json, or .html for a page.",
+        ),
     ] = None,
-    html: Annotated[Path | None, typer.Option(help="Write the report as a page to this file.")] = None,
+    predictions: Annotated[
+        Path | None, typer.Option(callback=NPZ_FILE, help="Write the tracks before and after to this npz.")
+    ] = None,
+    html: Annotated[
+        Path | None, typer.Option(callback=HTML_FILE, help="Write the report as a page to this file.")
+    ] = None,
     particles: Annotated[int | None, typer.Option(min=50, help="Particles of the twin, about.")] = None,
     mesh: Annotated[
         str | None,
@@ -82,6 +91,10 @@ def trace(
     ] = None,
 ) -> None:
     """Name the effect that a twin lacks, add it, and report the held-out error before and after."""
+    if out is not None and out.suffix.lower() == ".html":
+        if html is not None:
+            raise typer.BadParameter(f"--out {out} and --html {html} are both the page")
+        out, html = None, out
     given = {
         "--out": out,
         "--predictions": predictions,

@@ -8,13 +8,14 @@ from typing import Annotated
 import typer
 
 from physworld_client.cli.fit import become
+from physworld_client.cli.options import JSON_FILE, MP4_FILE
 
 MODULE = "physworld_workers.commands.video"
 
 
 def video(
     motion: Annotated[Path, typer.Argument(help="npz with vertices, particles or tracks, and times.")],
-    out: Annotated[Path, typer.Option(help="The film, MP4.")],
+    out: Annotated[Path, typer.Option(callback=MP4_FILE, help="The film, MP4.")],
     number: Annotated[int | None, typer.Option(help="Which motion of a batch [0].")] = None,
     gaussians: Annotated[Path | None, typer.Option(help="Splat of the object at rest, PLY.")] = None,
     camera: Annotated[Path | None, typer.Option(help="Camera, JSON.")] = None,
@@ -24,7 +25,9 @@ def video(
     frames: Annotated[Path | None, typer.Option(help="Folder for the frames as PNG.")] = None,
     against: Annotated[Path | None, typer.Option(help="Frames to compare with: folder or npz.")] = None,
     lpips: Annotated[Path | None, typer.Option(help="torch.export program of LPIPS.")] = None,
-    json: Annotated[Path | None, typer.Option(help="Write the scores to this file.")] = None,
+    json: Annotated[
+        Path | None, typer.Option(callback=JSON_FILE, help="Write the scores to this file.")
+    ] = None,
     device: Annotated[str | None, typer.Option(help="cpu or cuda.")] = None,
 ) -> None:
     """Draw a motion with the Gaussians that it carries; needs no service."""

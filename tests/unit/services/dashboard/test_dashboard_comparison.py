@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import html
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -36,10 +38,17 @@ def client(tmp_path: Path) -> Iterator[httpx.Client]:
     database.upgrade()
     stores = Stores(settings)
     with database.session() as session:
-        for name, error_m in (("beam", 0.004), ("beam", 0.0031), ("lonely", 0.001), ("lost", 0.752)):
+        for name, error_m in (
+            ("beam", 0.004),
+            ("beam", 0.0031),
+            ("beam", 0.0035),
+            ("lonely", 0.001),
+            ("lost", 0.752),
+        ):
             curves = {name: [error_m, error_m, None] for name in ("twin", "world_model_finetuned", "static")}
             table = {
                 "track_m": dict.fromkeys(curves, error_m) | {"static": 0.1},
+                "ci95": {"track_m": {name: [0.9 * error_m, 1.1 * error_m] for name in curves}},
                 "frames": [10, 13],
                 "per_frame": {"times_s": [0.3, 0.4, 0.5], "track_m": curves},
             }
@@ -68,16 +77,27 @@ def test_two_versions_are_held_side_by_side(client: httpx.Client) -> None:
     assert page.status_code == 200
     for text in ("Version 1", "Version 2", "4.00", "3.10", "0.900", "config.seed", "400", "310"):
         assert text in page.text, text
-    curve = client.get("/dashboard/models/beam/compare/curve?a=1&b=2").json()
-    lines = {line["label"]: line["values"] for line in curve["series"]}
-    assert lines["World model, fine-tuned, version 1"] == [4.0, 4.0, None]
-    assert lines["World model, fine-tuned, version 2"] == [3.1, 3.1, None]
-    assert len({line["role"] for line in curve["series"]}) == len(lines) == 4
+    [told] = re.findall(r'data-series="([^"]*)"', page.text)
+    lines = {line["label"]: line for line in json.loads(html.unescape(told))}
+    assert lines["world model, fine-tuned, version 1"]["values"] == [4.0, 4.0, None]
+    assert lines["world model, fine-tuned, version 2"]["values"] == [3.1, 3.1, None]
+    assert {line["role"] for label, line in lines.items() if label.startswith("world")} == {"model"}
+    assert len(lines) == 4
+
+
+def test_any_number_of_versions_is_plotted_with_intervals(client: httpx.Client) -> None:
+    page = client.get("/dashboard/models/beam/compare?a=1&b=2&also=3").text
+    [forest] = re.findall(r"<title>Mean track errors of the versions.*?</svg>", page, re.DOTALL)
+    for version in (1, 2, 3):
+        assert f"world model, fine-tuned, version {version}<" in forest
+    assert forest.count("<circle") == 6  # twin and world model of each
+    assert forest.count('class="line model"') == 3  # an interval each
+    assert 'name="also" value="3" checked' in page
 
 
 def test_without_a_choice_the_two_newest_are_taken(client: httpx.Client) -> None:
     page = client.get("/dashboard/models/beam/compare").text
-    assert '<option value="1" selected>' in page and '<option value="2" selected>' in page
+    assert '<option value="2" selected>' in page and '<option value="3" selected>' in page
     assert client.get("/dashboard/models/lonely/compare").status_code == 200
     assert client.get("/dashboard/models/beam/compare?a=1&b=nobody").status_code == 404
 

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import hashlib
+import html
 import json
+import re
 from datetime import UTC, datetime, timedelta
+from importlib.resources import files
+from typing import Any
 
 import numpy as np
 import pytest
 
+from physworld.report.predictors import PREDICTORS
 from physworld.scene import Scene
 from physworld_services.dashboard import clouds, curves, tables, text
 from physworld_services.dashboard.site import HERE, STATIC
@@ -72,9 +77,47 @@ def test_the_error_of_a_frame_is_the_mean_over_what_was_visible() -> None:
     assert errors[0] == pytest.approx(0.015)
     assert errors[2] == pytest.approx(0.05 / 3)
     assert np.isnan(errors[3])
-    drawn = curves.chart(scene.times, {"twin": errors}, split=0.4)
-    assert drawn["series"][0]["values"][3] is None  # type: ignore[index]
-    json.dumps(drawn, allow_nan=False)
+    [twin] = lines_of(curves.chart(scene.times, {"twin": errors}, split=0.4))
+    assert twin["label"] == "twin" and twin["values"][3] is None
+    assert twin["values"][0] == pytest.approx(15.0)
+
+
+def lines_of(plot: str) -> list[dict[str, Any]]:
+    """The lines of a plot as its numbers have them."""
+    [found] = re.findall(r'data-series="([^"]*)"', plot)
+    lines: list[dict[str, Any]] = json.loads(html.unescape(found))
+    return lines
+
+
+def test_an_axis_is_logarithmic_only_where_a_baseline_dwarfs_the_result() -> None:
+    times = np.linspace(0.0, 1.0, 5)
+    near = {"twin": np.full(5, 0.0018), "rigid_follow": np.full(5, 0.013)}
+    far = near | {"constant_velocity": np.full(5, 0.53)}
+    linear, logarithmic = (curves.chart(times, errors, floor_m=0.0016) for errors in (near, far))
+    zero = ">0</text>"
+    assert linear.count(zero) == 2 and logarithmic.count(zero) == 1  # the time axis begins at 0 in both
+    assert ">100</text>" in logarithmic
+    heights = {one["label"]: one["values"][0] for one in lines_of(logarithmic)}
+    assert heights == {"rigid follow": 13.0, "constant velocity": 530.0, "twin": 1.8, "noise floor": 1.6}
+
+
+def test_a_predictor_has_one_colour_in_every_plot_and_every_colour_is_in_the_palette() -> None:
+    times = np.linspace(0.0, 1.0, 3)
+    plot = curves.chart(times, {name: np.ones(3) for name in PREDICTORS}, floor_m=0.5)
+    roles = {one["label"]: one["role"] for one in lines_of(plot)}
+    assert len(roles) == len(PREDICTORS) + 1
+    palette = files("physworld.report").joinpath("palette.css").read_text()
+    for role in roles.values():
+        assert palette.count(f"--{role}: #") == 2, f"{role} in light and in dark"
+        assert f".line.{role} {{ stroke: var(--{role}); }}" in palette
+
+
+def test_the_curves_of_a_training_need_two_points_and_follow_it() -> None:
+    told = [(1.0, {"loss": 1.0, "validation_m": 0.004}), (2.0, {"loss": 0.5, "validation_m": 0.004})]
+    assert curves.training_charts(told[:1]) == []
+    loss, validation = curves.training_charts(told)
+    assert [one["values"] for one in lines_of(loss)] == [[1.0, 0.5]]
+    assert [one["values"] for one in lines_of(validation)] == [[4.0, 4.0]]
 
 
 def test_curves_are_found_where_the_results_table_of_the_library_puts_them() -> None:

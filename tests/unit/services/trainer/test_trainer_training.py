@@ -36,6 +36,7 @@ from physworld_services.trainer.measuring import json_safe
 from physworld_services.trainer.settings import translate
 from physworld_storage import registry, resources, signing
 from physworld_storage.database import open_database
+from physworld_storage.jobs import events as log
 from physworld_storage.jobs import jobs, leases
 from physworld_storage.settings import Settings
 from physworld_storage.tables import ShardRow
@@ -147,6 +148,19 @@ def test_a_training_publishes_a_version_that_rolls_out(runtime: Runtime, dataset
     assert card["intended_use"] and card["limits"]
     assert set(card["metrics"]["held_out"]["per_frame"]["track_m"]) >= {"twin", "world_model", "static"}
     assert not runtime.stores.scratch.has(job.id, training.CHECKPOINT)
+
+
+def test_progress_covers_what_follows_the_steps_and_never_falls(runtime: Runtime, dataset_id: str) -> None:
+    job, _ = _train(runtime, dataset_id)
+    with runtime.database.reading() as session:
+        told = [event.data for event in log.events_after(session, job.id, 0) if event.type == "progress"]
+        figures = log.figures_of(session, job.id)
+    fractions = [data["fraction"] for data in told]
+    assert len(fractions) > 2 and fractions == sorted(fractions)
+    training = [data["fraction"] for data in told if data["message"].startswith("loss")]
+    assert max(training, default=0.0) < 0.9  # fine-tuning, measuring and exporting are still to come
+    assert job.share == 1.0 and job.progress.eta_s is None
+    assert {name for _, one in figures for name in one} <= {"loss", "validation_m"} and figures
 
 
 def test_a_field_of_friction_is_stored_learned_and_tuned_as_one_number(runtime: Runtime) -> None:

@@ -1,0 +1,36 @@
+"""API keys of a service, for those whose own key may manage them."""
+
+from __future__ import annotations
+
+from physworld_client import calls
+from physworld_client.async_resources import AsyncResource
+from physworld_client.pages import AsyncListPage
+from physworld_schemas.key import DEFAULT_LIFETIME_DAYS, ApiKey, Role
+
+
+class AsyncKeys(AsyncResource):
+    """API keys: made, listed, given another token, revoked."""
+
+    async def create(
+        self, name: str, role: Role = "read", *, expires_in_days: int | None = DEFAULT_LIFETIME_DAYS
+    ) -> ApiKey:
+        """Makes a key; its ``token`` is in this answer and in no other.
+
+        Args:
+            name: who or what uses the key.
+            role: "read", "write", or "admin", which may manage keys too.
+            expires_in_days: its term; None: it never ends.
+        """
+        return await self._client.send(calls.key_create(name, role, expires_in_days))
+
+    async def list(self, *, limit: int | None = None, cursor: str | None = None) -> AsyncListPage[ApiKey]:
+        """Keys, newest first, the revoked and expired ones too."""
+        return await self._page(lambda at: calls.key_list(limit=limit, cursor=at), cursor)
+
+    async def rotate(self, key_id: str, *, grace_minutes: int | None = None) -> ApiKey:
+        """Gives a key another token and its whole term again; the old token stays good for the grace."""
+        return await self._client.send(calls.key_rotate(key_id, grace_minutes))
+
+    async def revoke(self, key_id: str) -> ApiKey:
+        """Ends a key, and what it opened, at once."""
+        return await self._client.send(calls.key_revoke(key_id))

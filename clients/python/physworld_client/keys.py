@@ -1,0 +1,37 @@
+# Made of async_keys.py by `make sdk`: change that file.
+"""API keys of a service, for those whose own key may manage them."""
+
+from __future__ import annotations
+
+from physworld_client import calls
+from physworld_client.pages import ListPage
+from physworld_client.resources import Resource
+from physworld_schemas.key import DEFAULT_LIFETIME_DAYS, ApiKey, Role
+
+
+class Keys(Resource):
+    """API keys: made, listed, given another token, revoked."""
+
+    def create(
+        self, name: str, role: Role = "read", *, expires_in_days: int | None = DEFAULT_LIFETIME_DAYS
+    ) -> ApiKey:
+        """Makes a key; its ``token`` is in this answer and in no other.
+
+        Args:
+            name: who or what uses the key.
+            role: "read", "write", or "admin", which may manage keys too.
+            expires_in_days: its term; None: it never ends.
+        """
+        return self._client.send(calls.key_create(name, role, expires_in_days))
+
+    def list(self, *, limit: int | None = None, cursor: str | None = None) -> ListPage[ApiKey]:
+        """Keys, newest first, the revoked and expired ones too."""
+        return self._page(lambda at: calls.key_list(limit=limit, cursor=at), cursor)
+
+    def rotate(self, key_id: str, *, grace_minutes: int | None = None) -> ApiKey:
+        """Gives a key another token and its whole term again; the old token stays good for the grace."""
+        return self._client.send(calls.key_rotate(key_id, grace_minutes))
+
+    def revoke(self, key_id: str) -> ApiKey:
+        """Ends a key, and what it opened, at once."""
+        return self._client.send(calls.key_revoke(key_id))
