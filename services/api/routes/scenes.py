@@ -54,14 +54,14 @@ async def create_scene(
     responses=documented(400, 401, 403, 413, 415, 422, 503, 507),
     openapi_extra=MULTIPART_BODY,
 )
-async def preview_scene(request: Request, settings: SettingsDep) -> ScenePreview:
+async def preview_scene(request: Request, settings: SettingsDep, idempotency: IdempotencyDep) -> Response:
     """What an import of a recording would guess (axes, unit, rate, gripper, noise); nothing is stored."""
     slots = cast(anyio.CapacityLimiter, request.app.state.upload_slots)
     form = await read_form(request)
     try:
         upload = upload_of(form, settings.max_upload_bytes)
         parsers = cast(Parsers, request.app.state.parsers)
-        return await anyio.to_thread.run_sync(looked_at, upload, parsers, limiter=slots)
+        return await anyio.to_thread.run_sync(_preview, upload, parsers, idempotency, limiter=slots)
     finally:
         await form.close()
 
@@ -82,6 +82,11 @@ def get_scene(scene_id: ObjectId, database: DatabaseDep) -> Scene:
     """A scene: what is declared of it, and the archive with the arrays among its artifacts."""
     with database.reading() as session:
         return resources.get_scene(session, scene_id)
+
+
+def _preview(upload: Upload, parsers: Parsers, idempotency: Idempotency) -> Response:
+    found = looked_at(upload, parsers)
+    return idempotency.run(f"preview {upload.fingerprint()}", lambda session: answer_of(200, found))
 
 
 def _register(upload: Upload, parsers: Parsers, stores: Stores, idempotency: Idempotency) -> Response:
