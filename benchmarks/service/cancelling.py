@@ -110,6 +110,8 @@ def measure(repeats: int, seed: int) -> Report:
         notes=[
             f"From POST cancel to `cancelled`, sample scene, two workers and the trainer; longest of all {worst:.1f} s "
             f"(target: {WITHIN_S:g} s).",
+            "Before: the longest of each kind at the commit before decision 47, on the same machine; "
+            "`-`: not measured.",
             "The last column counts from the POST of the following job of that kind: what a worker that was left "
             "behind costs is in it.",
         ],
