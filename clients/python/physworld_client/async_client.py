@@ -11,6 +11,7 @@ import httpx
 
 from physworld_client import transport as wire
 from physworld_client.async_artifacts import AsyncArtifacts
+from physworld_client.async_keys import AsyncKeys
 from physworld_client.async_live import AsyncLive
 from physworld_client.async_loop import AsyncAssessments, AsyncChecks, AsyncTraces
 from physworld_client.async_predict import AsyncPlans, AsyncRollouts
@@ -43,7 +44,8 @@ class AsyncClient:
         known_as: the service's name in that file; its address without it.
 
     Attributes:
-        scenes, checks, fits, traces, datasets, models, assessments, rollouts, plans, live, jobs, pipelines, artifacts:
+        scenes, checks, fits, traces, datasets, models, assessments, rollouts, plans, live, jobs, keys, pipelines,
+        artifacts:
             the resources.
     """
 
@@ -77,6 +79,7 @@ class AsyncClient:
         self.plans = AsyncPlans(self)
         self.live = AsyncLive(self)
         self.jobs = AsyncJobs(self)
+        self.keys = AsyncKeys(self)
         self.pipelines = AsyncPipelines(self)
         self.artifacts = AsyncArtifacts(self)
 

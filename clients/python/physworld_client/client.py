@@ -13,6 +13,7 @@ import httpx
 from physworld_client import transport as wire
 from physworld_client.artifacts import Artifacts
 from physworld_client.calls import Call
+from physworld_client.keys import Keys
 from physworld_client.known_keys import KnownKeys
 from physworld_client.live import Live
 from physworld_client.location import where
@@ -44,7 +45,8 @@ class Client:
         known_as: the service's name in that file; its address without it.
 
     Attributes:
-        scenes, checks, fits, traces, datasets, models, assessments, rollouts, plans, live, jobs, pipelines, artifacts:
+        scenes, checks, fits, traces, datasets, models, assessments, rollouts, plans, live, jobs, keys, pipelines,
+        artifacts:
             the resources.
     """
 
@@ -76,6 +78,7 @@ class Client:
         self.plans = Plans(self)
         self.live = Live(self)
         self.jobs = Jobs(self)
+        self.keys = Keys(self)
         self.pipelines = Pipelines(self)
         self.artifacts = Artifacts(self)
 

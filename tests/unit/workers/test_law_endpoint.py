@@ -78,13 +78,13 @@ def test_what_is_no_answer_is_unavailable_with_its_reason(
 def test_a_model_that_sleeps_is_not_waited_for(server: Any) -> None:
     server.delay_s = 30.0
     begun = time.monotonic()
-    with pytest.raises(LawAnswerUnavailable, match="ReadTimeout"):
+    with pytest.raises(LawAnswerUnavailable, match="timed out"):
         endpoint(server, timeout_s=0.3)("?", [])
     assert time.monotonic() - begun < 10.0
 
 
 def test_nobody_there_is_unavailable() -> None:
-    with pytest.raises(LawAnswerUnavailable, match="ConnectError"):
+    with pytest.raises(LawAnswerUnavailable, match="127.0.0.1:9"):
         LawEndpoint("http://127.0.0.1:9/v1", "eye-1", timeout_s=2.0)("?", [])
     with pytest.raises(LawAnswerUnavailable, match="UnsupportedProtocol"):
         LawEndpoint("nowhere", "eye-1")("?", [])
