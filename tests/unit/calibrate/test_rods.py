@@ -11,7 +11,7 @@ import pytest
 from made_scene import made_scene, recorded_by
 
 from physworld.calibrate.global_stage import CalibrationConfig, FitResult, prior_twin
-from physworld.calibrate.rod_parameters import rod_parameters
+from physworld.calibrate.rod_parameters import LOSSES, lossless, rod_parameters
 from physworld.calibrate.rods import calibrate_rod
 from physworld.errors import Cancelled
 from physworld.estimation.journal import Journal
@@ -107,3 +107,33 @@ def test_a_rope_without_damping_frees_none() -> None:
     twin = prior_twin(scene, replace(CONFIG, damping="none"))
     for name in losses & set(twin.parameters):
         assert result.twin.parameters[name] == twin.parameters[name]
+
+
+def test_every_number_of_a_rod_is_read_where_it_was_written() -> None:
+    scene = recorded()
+    twin = prior_twin(scene, CONFIG)
+    unknowns = rod_parameters(scene, twin)
+    for number, unknown in enumerate(unknowns):
+        twin = unknown.at(twin, unknown.start + 0.1 * (1 + number % 3) * unknown.step)
+    for number, unknown in enumerate(unknowns):
+        assert unknown.read is not None
+        there = unknown.searched(float(unknown.read(twin)))
+        assert there == pytest.approx(unknown.start + 0.1 * (1 + number % 3) * unknown.step), unknown.name
+        if unknown.name not in ("stretching_n", "torsion_ratio"):  # of these a twin's own law is the prior
+            assert unknown.prior == rod_parameters(scene, twin)[number].prior
+
+
+def test_a_rod_without_losses_rings_on() -> None:
+    scene = recorded()
+    lossy = truth(scene)
+    still = lossless(lossy)
+    assert {name for name in LOSSES if still.parameters[name] != lossy.parameters[name]} == {
+        "relaxation_s",
+        "air_drag_per_s",
+    }
+    paths = [
+        twin.observe(twin.simulate_nodes(*scene.control_track(), scene.times), scene.times)
+        for twin in (lossy, still)
+    ]
+    speeds = [float(np.linalg.norm(np.diff(path, axis=0)[-12:], axis=2).mean()) for path in paths]
+    assert speeds[1] > 1.02 * speeds[0]

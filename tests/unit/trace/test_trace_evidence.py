@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -152,3 +153,33 @@ def test_a_trace_by_evidence_names_nothing_where_nothing_acts() -> None:
 
     found = trace(recorded(beam(0.015), sigma=2 * SIGMA), replace(CONFIG, method="evidence", experiment=None))
     assert found.verdict.name == "nothing_to_explain" and not found.effects
+
+
+@pytest.mark.parametrize(
+    ("weights", "name", "others"),
+    [
+        ([0.0, 0.01, 0.99], "unexplained", 0),
+        ([0.0, 0.94, 0.06], "named", 0),
+        ([0.06, 0.94, 0.0], "unexplained", 0),
+    ],
+)
+def test_no_other_name_is_given_where_something_unbelievable_predicts_best(
+    weights: list[float], name: str, others: int
+) -> None:
+    from types import SimpleNamespace
+
+    from physworld.trace.evidence.inference import Inference
+
+    def known(effect: str | None, misfit: float, doubt: str | None = None) -> Any:
+        members = () if effect is None else (SimpleNamespace(effect=effect, kind="force"),)
+        seen = SimpleNamespace(kappa=0.0, errors=np.ones(2), sizes=np.ones(2))
+        names = tuple(member.effect for member in members)
+        fitted = SimpleNamespace(misfit=misfit)
+        return SimpleNamespace(members=members, names=names, fitted=fitted, evidence=seen, doubt=doubt)
+
+    gale = known("wind", 1.0, "a wind of 60 m/s is not believed")
+    hypotheses = [known(None, 4.0), known("air_drag_linear", 1.1), gale]
+    white: Any = SimpleNamespace(sigma=1e-3)
+    found = Inference._decided(SimpleNamespace(), hypotheses, np.array(weights), 1e-3, white, {}, 20)  # type: ignore[arg-type]
+    assert (found.name, len(found.equivalent)) == (name, others)
+    assert ("not believed" in found.reason) == (weights[2] > 0.9)
