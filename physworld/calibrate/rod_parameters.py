@@ -142,9 +142,13 @@ def _natural(twin: Twin, row: int, column: int, name: str, unit: str, spread: fl
         natural[row, column] = value
         return replace(twin, natural=natural)
 
+    def read(twin: Twin) -> float:
+        assert twin.natural is not None
+        return float(twin.natural[row, column])
+
     return Parameter(
         name, unit, mean - 5.0 * spread, mean + 5.0 * spread, apply, transform=LINEAR, step=0.05 * spread,
-        start=mean, prior=(mean, spread), starts=(mean,), stage="optional", read=lambda twin: twin.natural[row, column],
+        start=mean, prior=(mean, spread), starts=(mean,), stage="optional", read=read,
     )  # fmt: skip
 
 
@@ -168,13 +172,16 @@ def _driven(twin: Twin, step: int, length: float) -> list[Parameter]:
                 drive[row, 2:5] = -drive[:row, 2:5].sum(axis=0)
             return replace(changed, drive=drive)
 
+        def read(changed: Twin, column: int = column) -> float:
+            return float(_steps(changed)[step, column])
+
         start = transform.searched(mean)
         ends = start - 5.0 * spread, start + 5.0 * spread
         found.append(
             Parameter(
                 name, unit, transform.value(ends[0]), transform.value(ends[1]), apply, transform=transform,
                 step=difference, start=start, prior=(start, spread), starts=(mean,), stage="optional",
-                read=lambda twin, column=column: _steps(twin)[step, column],
+                read=read,
             )
         )  # fmt: skip
     return found
