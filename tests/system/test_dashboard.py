@@ -145,7 +145,8 @@ def test_the_scene_plays(visit: Visit, world: World) -> None:
     visit.points_shown()
     visit.page.select_option("[data-speed]", "2")
     visit.page.get_by_role("button", name="Play").click()
-    expect(visit.page.locator("figure")).to_have_attribute("data-frame", str(FRAMES - 1), timeout=READY_MS)
+    viewer = visit.page.locator("figure.viewer")
+    expect(viewer).to_have_attribute("data-frame", str(FRAMES - 1), timeout=READY_MS)
     expect(visit.page.get_by_role("button", name="Play")).to_be_visible()
 
 

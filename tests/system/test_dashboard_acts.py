@@ -94,7 +94,7 @@ def test_a_table_of_markers_is_looked_at_and_stored_when_that_is_confirmed(
     expect(told.locator("li", has_text="up is guessed to be y")).to_be_visible()
     visit.page.get_by_label("Kind").select_option("sheet")
     visit.page.get_by_label("Mass [kg]").fill("0.08")
-    visit.page.get_by_label("Up").select_option("y")
+    visit.page.locator("select[data-option=up]").select_option("y")
     visit.page.get_by_role("button", name="Look again").click()
     expect(told.get_by_role("row", name=re.compile("^up "))).to_contain_text("given")
     visit.page.get_by_role("button", name="Store the scene").click()

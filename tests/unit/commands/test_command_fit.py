@@ -242,7 +242,7 @@ def test_a_grip_that_a_finer_lattice_cannot_hold_leaves_the_fit(bundle: Path) ->
     scene = replace(scene, controllers=beside, grips=(Grip((0, 1, 2, 3), radius_m=1e-4),))
     fitted = calibrate(scene, CalibrationConfig(particle_budget=BUDGET, max_simulations=12))
     found = fit_accuracy(scene, fitted, BUDGET)
-    assert found["numerics"] is None and "SceneUnsupported" in found["not_measured"]
+    assert found["numerics"] is None and "a grip holds material within" in found["not_measured"]
 
 
 def test_shared_runs_measure_the_same_accuracy(bundle: Path) -> None:
