@@ -38,8 +38,6 @@ CANDIDATES, TICKS = 64, 300
 LOOK_S = 0.05
 JOB_S, CANCEL_S = 1800.0, 300.0
 MODEL = "cancelled"
-BEFORE_S = {"fit, no kernel compiled yet": 12.1, "fit": 2.8, "trace": 2.5, "dataset": 3.1, "training": 79.4}
-"""The longest of each before decision 47, by this script on the same machine (a training of 16 steps)."""
 FIT = FitConfig(max_simulations=8, particle_budget=800)
 DATASET = DatasetConfig(episodes=6, frames=60)
 TRAINING = TrainingConfig(steps=6, fine_tune_steps=3, hidden=16, vertices=50, formats=["torch_export"])
@@ -87,7 +85,6 @@ def measure(repeats: int, seed: int) -> Report:
             str(len(one.seconds)),
             f"{summarise(one.seconds).median:.1f}",
             f"{max(one.seconds):.1f}",
-            f"{BEFORE_S[name]:.1f}" if name in BEFORE_S else "-",
             one.doing[one.seconds.index(max(one.seconds))][:60] or "-",
             f"{max(one.next_s):.1f}",
         ]
@@ -102,7 +99,6 @@ def measure(repeats: int, seed: int) -> Report:
             "cancelled",
             "median [s]",
             "longest [s]",
-            "before [s]",
             "what it did then",
             "next one begins within [s]",
         ],
@@ -110,8 +106,6 @@ def measure(repeats: int, seed: int) -> Report:
         notes=[
             f"From POST cancel to `cancelled`, sample scene, two workers and the trainer; longest of all {worst:.1f} s "
             f"(target: {WITHIN_S:g} s).",
-            "Before: the longest of each kind at the commit before decision 47, on the same machine; "
-            "`-`: not measured.",
             "The last column counts from the POST of the following job of that kind: what a worker that was left "
             "behind costs is in it.",
         ],

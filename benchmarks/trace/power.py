@@ -19,9 +19,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from benchmarks.harness import describe_machine, write_section
 from benchmarks.trace.power_effects import LEVELS, inject, refusal
@@ -35,6 +35,7 @@ from physworld.trace import Memory, TraceResult, document, trace
 from physworld.twin.build import build_twin
 
 NULLS = 120
+Method = Literal["selection", "evidence"]
 METHOD = tuple(
     f"physworld/{room}"
     for room in ("trace", "calibrate", "estimation", "effects", "engine", "geometry", "evaluate", "twin")
@@ -58,14 +59,14 @@ class Task:
         return f"{self.object}/{self.effect or 'none'}/{self.level:g}/{self.seed}"
 
 
-def tasks(nulls: int) -> list[Task]:
-    """All of them in their order."""
+def tasks(nulls: int, seed: int = 0) -> list[Task]:
+    """All of them in their order: ``nulls`` recordings without an effect, motions and noise drawn from ``seed`` on."""
     bodies = [name for name in OBJECTS if name not in (GROUND_ONLY, NULLS_ONLY)]
     sources = [*bodies, *bodies, NULLS_ONLY]  # of recordings without an effect
-    without = [Task(sources[k % len(sources)], None, 0.0, 1 + k) for k in range(nulls)]
+    without = [Task(sources[k % len(sources)], None, 0.0, seed + 1 + k) for k in range(nulls)]
     low, middle, high = LEVELS
     injected = [
-        Task(body, name, level, 0)
+        Task(body, name, level, seed)
         for level in (middle, high, low)
         for body in (*_cheapest_first(bodies), GROUND_ONLY)
         for name in EFFECTS
@@ -82,14 +83,14 @@ def _needs_ground(name: str) -> bool:
     return name in ("ground_friction", "adhesion")
 
 
-def run(task: Task, memory: Path | None = None) -> dict[str, Any]:
+def run(task: Task, memory: Path | None = None, method: Method = "selection") -> dict[str, Any]:
     """One line: what was injected, and what the trace said; ``memory`` keeps its simulations."""
     known = OBJECTS[task.object](task.seed)
     kept = Memory(memory / task.key.replace("/", "_")) if memory is not None else Memory()
     line: dict[str, Any] = asdict(task)
     without = observed(known.truth, known.scene)
     if task.effect is None:
-        return line | traced(known, recorded(known.scene, without, task.seed), kept)
+        return line | traced(known, recorded(known.scene, without, task.seed), kept, method)
     reason = refusal(task.effect, known)
     if reason is not None:
         return line | {"outcome": "refused", "reason": reason}
@@ -99,17 +100,20 @@ def run(task: Task, memory: Path | None = None) -> dict[str, Any]:
     line |= {"strengths": made.strengths, "size": made.size, "unit": made.unit, "clipped": made.clipped}
     line |= {"displacement": made.displacement}
     noise_seed = 1000 + sorted(EFFECTS).index(task.effect)
-    return line | traced(known, recorded(known.scene, made.tracks, noise_seed), kept)
+    return line | traced(known, recorded(known.scene, made.tracks, noise_seed), kept, method)
 
 
-def traced(known: Object, scene: Scene, memory: Memory | None = None) -> dict[str, Any]:
+def traced(
+    known: Object, scene: Scene, memory: Memory | None = None, method: Method = "selection"
+) -> dict[str, Any]:
     """What a trace says of a recording, and its seconds."""
     start = build_twin(scene, known.budget)
     true = known.truth.parameters
     start = start.with_parameters(**{n: _OFF * true[n] for n in _STIFFNESS if n in true})
     begun, cpu = time.perf_counter(), time.process_time()
     try:
-        found = trace(scene, known.config(), calibrated_twin=start, memory=memory)
+        config = replace(known.config(), method=method)
+        found = trace(scene, config, calibrated_twin=start, memory=memory)
     except (PhysworldError, RuntimeError) as failure:
         return {"outcome": "failed", "reason": f"{type(failure).__name__}: {failure}"}
     return _answer(found) | {
@@ -190,16 +194,22 @@ def main() -> int:
     parser.add_argument(
         "--at-most", type=int, default=None, help="traces to run now; 0: only write the report"
     )
+    parser.add_argument(
+        "--method", choices=("selection", "evidence"), default="selection", help="how a trace decides"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, help="of motions, stiffnesses and noise: another is fresh"
+    )
     given = parser.parse_args()
-    every = tasks(given.nulls)
+    every = tasks(given.nulls, given.seed)
     lines = stored(given.resume)
     missing = [task for task in _wanted(every, given.only) if task.key not in lines]
-    method = commit()
+    version = commit()
     import warp as wp
 
     wp.config.quiet = True
     for task in missing[: given.at_most]:
-        line = {"key": task.key, **run(task, given.memory), **method}
+        line = {"key": task.key, **run(task, given.memory, given.method), "method": given.method, **version}
         line = json.loads(json.dumps(line, default=float))
         lines[task.key] = line
         if given.resume is not None:

@@ -90,7 +90,7 @@ class Inference(_Trace):
         known = search.admitted()
         weights = search.weights()
         self.notes += remarks(sigma, config.noise_m is not None, numerics)
-        verdict = self._decided(known, weights, sigma, white, numerics, search.library)
+        verdict = decided(known, weights, sigma, white, numerics, search.library)
         block_of_row = self.split.block_of(white.frame_of_row)
         path = self._path(search, list(search.hypotheses.values()))
         models = {h.names: _model(h) for h in known}
@@ -145,68 +145,6 @@ class Inference(_Trace):
         found = rod_parameters(self.lead, self.twin)
         return [of_parameter(p, self.twin, p.prior) for p in found if p.name not in LOSSES]
 
-    def _decided(
-        self,
-        known: list[Hypothesis],
-        weights: Array,
-        sigma: float | None,
-        white: Whitener,
-        numerics: dict[str, float],
-        tried: int,
-    ) -> Verdict:
-        """The answer that a posterior gives.
-
-        Args:
-            known: hypotheses, the declared physics first.
-            weights: their posterior, (H,).
-            sigma: noise [m]; None where it is not known.
-            white: whitener of the training frames.
-            numerics: what other cells and steps change, over the noise.
-            tried: effects that were asked.
-        """
-        order = np.argsort(-weights)
-        declared = known[0]
-        null = _model(declared)
-        before = declared.fitted.misfit
-        best = known[int(order[0])]
-        figures = f"misfit {before:.2f} to {best.fitted.misfit:.2f} of the noise"
-        if sigma is None:
-            return Verdict(UNEXPLAINED, null, (), "no noise estimate, no claim")
-        chosen, total = [], 0.0
-        for k in order:
-            chosen.append(known[int(k)])
-            total += float(weights[k])
-            if total >= NAMES or len(chosen) == MOST_IN_SET:
-                break
-        rest = [h for h in chosen if h.members]
-        if declared in chosen or not rest:
-            if before <= WITHIN:
-                reason = f"misfit {before:.2f} of the noise; {tried} effects tried"
-                return Verdict(NOTHING, null, (), reason)
-            if declared.evidence.kappa <= white.sigma and numerics.get("finer cells", 0.0) > before:
-                reason = f"misfit {before:.2f} of the noise; finer cells change as much"
-                return Verdict(NUMERICAL, null, (), reason)
-            reason = f"misfit {before:.2f} of the noise; no effect is supported"
-            return Verdict(UNEXPLAINED, null, (), reason)
-        what = " and ".join(best.names)
-        if total < NAMES:
-            reason = f"{what} is the best of {tried} with a posterior of {weights[order[0]]:.2f}; {figures}"
-            return Verdict(UNEXPLAINED, null, (), reason)
-        if (
-            best.doubt is not None
-        ):  # something is there that looks like it, and the next name would be a wrong one
-            return Verdict(UNEXPLAINED, null, (), f"{what} predicts best, but {best.doubt}; {figures}")
-        rest = [h for h in rest if h.doubt is None]
-        kinds = [all(m.kind == "measurement" for m in h.members) for h in rest]
-        models = [_model(h) for h in rest]
-        if all(kinds):
-            return Verdict(DATA, models[0], tuple(models[1:]), f"{what}, a fault of the data; {figures}")
-        if len(rest) > 1:
-            others = ", ".join(" and ".join(h.names) for h in rest[1:])
-            return Verdict(EQUIVALENT, models[0], tuple(models[1:]), f"{what} or {others}; {figures}")
-        reason = f"{what}: posterior {weights[order[0]]:.3f} among {tried} effects; {figures}"
-        return Verdict(NAMED, models[0], (), reason)
-
     def _path(self, search: Search, known: list[Hypothesis]) -> tuple[Step, ...]:
         steps = []
         for base, screened in search.screens:
@@ -218,6 +156,66 @@ class Inference(_Trace):
             )
             steps.append(Step(_model(base), Scores(ranked, 0.0, []), tried, None))
         return tuple(steps)
+
+
+def decided(
+    known: list[Hypothesis],
+    weights: Array,
+    sigma: float | None,
+    white: Whitener,
+    numerics: dict[str, float],
+    tried: int,
+) -> Verdict:
+    """The answer that a posterior gives.
+
+    Args:
+        known: hypotheses, the declared physics first.
+        weights: their posterior, (H,).
+        sigma: noise [m]; None where it is not known.
+        white: whitener of the training frames.
+        numerics: what other cells and steps change, over the noise.
+        tried: effects that were asked.
+    """
+    order = np.argsort(-weights)
+    declared = known[0]
+    null = _model(declared)
+    before = declared.fitted.misfit
+    best = known[int(order[0])]
+    figures = f"misfit {before:.2f} to {best.fitted.misfit:.2f} of the noise"
+    if sigma is None:
+        return Verdict(UNEXPLAINED, null, (), "no noise estimate, no claim")
+    chosen, total = [], 0.0
+    for k in order:
+        chosen.append(known[int(k)])
+        total += float(weights[k])
+        if total >= NAMES or len(chosen) == MOST_IN_SET:
+            break
+    rest = [h for h in chosen if h.members]
+    if declared in chosen or not rest:
+        if before <= WITHIN:
+            reason = f"misfit {before:.2f} of the noise; {tried} effects tried"
+            return Verdict(NOTHING, null, (), reason)
+        if declared.evidence.kappa <= white.sigma and numerics.get("finer cells", 0.0) > before:
+            reason = f"misfit {before:.2f} of the noise; finer cells change as much"
+            return Verdict(NUMERICAL, null, (), reason)
+        reason = f"misfit {before:.2f} of the noise; no effect is supported"
+        return Verdict(UNEXPLAINED, null, (), reason)
+    what = " and ".join(best.names)
+    if total < NAMES:
+        reason = f"{what} is the best of {tried} with a posterior of {weights[order[0]]:.2f}; {figures}"
+        return Verdict(UNEXPLAINED, null, (), reason)
+    if best.doubt is not None:  # something is there that looks like it: the next name would be a wrong one
+        return Verdict(UNEXPLAINED, null, (), f"{what} predicts best, but {best.doubt}; {figures}")
+    rest = [h for h in rest if h.doubt is None]
+    kinds = [all(m.kind == "measurement" for m in h.members) for h in rest]
+    models = [_model(h) for h in rest]
+    if all(kinds):
+        return Verdict(DATA, models[0], tuple(models[1:]), f"{what}, a fault of the data; {figures}")
+    if len(rest) > 1:
+        others = ", ".join(" and ".join(h.names) for h in rest[1:])
+        return Verdict(EQUIVALENT, models[0], tuple(models[1:]), f"{what} or {others}; {figures}")
+    reason = f"{what}: posterior {weights[order[0]]:.3f} among {tried} effects; {figures}"
+    return Verdict(NAMED, models[0], (), reason)
 
 
 def _other_places(unknowns: list[Unknown]) -> list[dict[str, float]]:
