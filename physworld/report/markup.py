@@ -34,6 +34,11 @@ def tag(name: str, /, *children: Child, **attributes: str | float | bool | None)
     return Html(f"<{opening}>{join(children)}</{name}>")
 
 
+def scrolled(label: str, *children: Child) -> Html:
+    """A part that scrolls by itself where it is wider than the page, with the keyboard too, and has a name to read."""
+    return tag("div", *children, class_="scroll", tabindex=0, role="group", aria_label=label)
+
+
 def join(children: Child) -> Html:
     """Children one after the other, escaped where they are text."""
     if children is None:

@@ -16,7 +16,7 @@ from typing import Any
 from physworld.arrays import Array
 from physworld.report import pictures, words
 from physworld.report.curves import Residuals, residuals
-from physworld.report.markup import Child, Html, tag
+from physworld.report.markup import Child, Html, scrolled, tag
 from physworld.report.view import script, view
 from physworld.scene import Scene
 
@@ -211,7 +211,7 @@ def _figure(figure: dict[str, Any]) -> list[Html]:
 
 def _table(head: tuple[str, ...], rows: list[Any]) -> Html:
     table = tag("table", tag("thead", tag("tr", [tag("th", h) for h in head])), tag("tbody", *rows))
-    return tag("div", table, class_="scroll")
+    return scrolled("Table", table)
 
 
 def _chosen(report: dict[str, Any]) -> Html:

@@ -12,7 +12,7 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.report.curves import Residuals, carpet, mean_component, per_frame
-from physworld.report.markup import Child, Html, tag
+from physworld.report.markup import Child, Html, scrolled, tag
 from physworld.report.predictors import PREDICTORS
 from physworld.report.svg import Axes, Series, legend_of, line_chart, picture, short
 from physworld.report.words import number, title
@@ -116,7 +116,7 @@ def candidates(report: dict[str, Any]) -> Html:
         rest = tag(
             "details", tag("summary", few), tag("p", ", ".join(title(row) for row in quiet), class_="quiet")
         )
-    return tag("div", tag("div", table, class_="scroll"), tag("p", note, class_="quiet small"), rest)
+    return tag("div", scrolled("Table", table), tag("p", note, class_="quiet small"), rest)
 
 
 def strength(figure: dict[str, Any]) -> Html | str:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from physworld.report.markup import Child, Html, tag
+from physworld.report.markup import Child, Html, scrolled, tag
 from physworld.report.predictors import NOISE
 from physworld.report.words import number
 
@@ -177,7 +177,7 @@ def line_chart(
     )  # fmt: skip
     numbers = [{"label": s.label, "role": s.role, "values": [_plain(v) for v in s.values]} for s in series]
     return tag(
-        "figure", tag("div", drawn, class_="scroll"), legend_of(series) if named else None, class_="plot",
+        "figure", scrolled(title, drawn), legend_of(series) if named else None, class_="plot",
         data_x=json.dumps([_plain(v) for v in x]), data_series=json.dumps(numbers), data_unit=unit,
     )  # fmt: skip
 
@@ -249,9 +249,7 @@ def interval_chart(
             parts.append(tag("circle", class_=f"dot {row.role}", cx=across(row.value), cy=y, r=4.5))
     middle = 0.5 * (axes.left + axes.width - axes.right)
     parts.append(tag("text", x_label, class_="label", x=middle, y=axes.height - 6, text_anchor="middle"))
-    return tag(
-        "figure", tag("div", picture(axes.width, axes.height, title, *parts), class_="scroll"), class_="plot"
-    )
+    return tag("figure", scrolled(title, picture(axes.width, axes.height, title, *parts)), class_="plot")
 
 
 def _plain(value: float | None) -> float | None:

@@ -50,7 +50,7 @@ class Parsers:
     """Up to ``count`` parser processes, each started when it is first needed and again when it has died."""
 
     def __init__(self, count: int) -> None:
-        self._idle: queue.SimpleQueue[_Parser] = queue.SimpleQueue()
+        self._idle: queue.LifoQueue[_Parser] = queue.LifoQueue()  # the one that has read last is warm
         for _ in range(count):
             self._idle.put(_Parser())
 

@@ -7,6 +7,7 @@ import inspect
 import pytest
 from physworld_client.cli.app import app
 from physworld_client.cli.lists import RESOURCES, Resource
+from physworld_client.cli.names import SINGULAR
 from physworld_client.cli.output import print_fields
 from physworld_client.client import Client
 from pydantic import BaseModel
@@ -30,6 +31,7 @@ def test_long_curves_are_told_by_their_length(capsys: pytest.CaptureFixture[str]
 def test_the_table_of_lists_names_what_the_client_has(resource: Resource) -> None:
     with Client("http://127.0.0.1:1") as client:
         held = getattr(client, resource.name)
+    assert resource.name in SINGULAR or not resource.shown, "its names and prefixes are looked up"
     for listing in resource.lists:
         parameters = inspect.signature(getattr(held, listing.name)).parameters
         wanted = {keyword for _, keyword, _ in listing.filters} | ({listing.of[0]} if listing.of else set())

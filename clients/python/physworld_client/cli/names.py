@@ -22,6 +22,7 @@ PAGE = 200
 SHOWN = 4
 SINGULAR = {
     "scenes": "scene",
+    "checks": "check",
     "fits": "fit",
     "traces": "trace",
     "datasets": "dataset",
