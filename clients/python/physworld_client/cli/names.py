@@ -27,6 +27,7 @@ SINGULAR = {
     "traces": "trace",
     "datasets": "dataset",
     "models": "model",
+    "assessments": "assessment",
     "rollouts": "rollout",
     "plans": "plan",
     "jobs": "job",
