@@ -31,7 +31,7 @@ class TraceConfig(Request):
         default_factory=list, max_length=64, description="Effects that may be named; empty: all."
     )
     effects_at_most: int = Field(
-        default=2, ge=1, le=4, description="Most effects of an answer.", examples=[2]
+        default=3, ge=1, le=4, description="Most effects of an answer.", examples=[3]
     )
     confirmed: int = Field(
         default=8,
@@ -44,7 +44,7 @@ class TraceConfig(Request):
         default=5, ge=1, le=50, description="Gauss-Newton steps of a refit.", examples=[5]
     )
     resamples: int = Field(
-        default=2000, ge=100, le=100_000, description="Bootstrap resamples of an interval.", examples=[2000]
+        default=1000, ge=100, le=100_000, description="Bootstrap resamples of an interval.", examples=[1000]
     )
     time_limit_s: float | None = Field(
         default=None,
@@ -71,7 +71,7 @@ class TraceConfig(Request):
 
 MOST_RECORDINGS = 8
 TRACE_PARTICLES = 1000
-"""Coarser than a fit's: a trace runs a thousand simulations, and asks finer cells in the end."""
+"""Coarser than a fit's: a trace runs a thousand simulations."""
 
 NO_OTHER_PHYSICS = (
     "a trace calibrates the usual elastic law, the same all over the body: fit.law, fit.plasticity, fit.formulation "

@@ -1,4 +1,4 @@
-"""Models of the sagging bar with an effect, at places where a search may have left them."""
+"""Fits of the sagging bar with an effect, at places where a search may have left them."""
 
 from __future__ import annotations
 
@@ -14,9 +14,7 @@ from physworld.estimation.refit import Refit, sensitivities
 from physworld.estimation.simulations import Job
 from physworld.estimation.unknowns import Unknown
 from physworld.estimation.whitening import whitener
-from physworld.trace.candidates import Candidate, candidates
-from physworld.trace.comparison import cross_validated
-from physworld.trace.confirm import Confirmation, Model
+from physworld.trace.candidates import candidates
 from physworld.trace.recordings import JointSimulations, Recordings
 from physworld.trace.unknowns import of_parameter
 from physworld.twin.build import build_twin
@@ -24,7 +22,7 @@ from physworld.twin.twin import Twin
 
 
 class Bar:
-    """A bar with an effect, and models of it at places where a search may have left them."""
+    """A bar with an effect, and fits of it at places where a search may have left them."""
 
     def __init__(self, acts: Effect) -> None:
         scene = sagging(acts)
@@ -34,14 +32,11 @@ class Bar:
         self.simulations = JointSimulations(recordings, self.plain, BUDGET, 1.25)
         _, answers = self.simulations.first_look(Job(self.plain, self.frames))
         self.white = whitener(recordings.scene, recordings.split, SIGMA, answers)
-        rows = len(self.white.residual(self.simulations.run([Job(self.plain, self.frames)])[0]))
-        self.blocks = np.arange(rows) * 4 // rows
-        self.confirmation = Confirmation(self.simulations, self.white, self.blocks, self.frames, 8)
 
     def model(
         self, name: str, youngs_modulus_pa: float, shape: dict[str, float] | None = None, **strength: float
-    ) -> Model:
-        """A model with one effect, not searched any further; with a shape, of which a search is free to change some."""
+    ) -> Refit:
+        """With one effect, not searched any further; with a shape, of which a search is free to change some."""
         twin = self.plain.with_parameters(youngs_modulus_pa=youngs_modulus_pa).with_effect(
             effect(name, **strength, **(shape or {}))
         )
@@ -52,17 +47,12 @@ class Bar:
             g.starting(value / g.value(1.0))
             for g, value in zip(member.unknowns(), strength.values(), strict=True)
         ]
-        return self._at(twin, gates + (member.shape_unknowns() if shape is not None else []), (member,))
+        return self._at(twin, gates + (member.shape_unknowns() if shape is not None else []))
 
-    def declared(self, youngs_modulus_pa: float) -> Model:
-        """The declared physics, not searched any further."""
-        return self._at(self.plain.with_parameters(youngs_modulus_pa=youngs_modulus_pa), [], ())
-
-    def _at(self, twin: Twin, own: list[Unknown], members: tuple[Candidate, ...]) -> Model:
+    def _at(self, twin: Twin, own: list[Unknown]) -> Refit:
         known = parameters_of(twin, separate_bending=False, damping=False)
         unknowns = [of_parameter(p, twin, None) for p in known if p.name == "youngs_modulus_pa"] + own
         tracks = self.simulations.run([Job(twin, self.frames)])[0]
         slope, _ = sensitivities(self.simulations, self.white, twin, tracks, unknowns, self.frames)
         place = np.array([u.start for u in unknowns])
-        fitted = Refit(unknowns, twin, place, tracks, self.white.residual(tracks), slope)
-        return Model(members, fitted, cross_validated(fitted, self.blocks))
+        return Refit(unknowns, twin, place, tracks, self.white.residual(tracks), slope)

@@ -7,7 +7,7 @@ A bar that a grip shakes is checked before any fit. Then what the check foretell
   the foretold deviations have to have the size 1.
 - *Detection.* Recordings with an effect of so many times its detectable strength are refitted with the declared
   physics, and the effect is screened by the marginal likelihood of a trace
-  (:mod:`physworld.trace.evidence.likelihood`), which integrates a discrepancy out and has the search's bounds for a
+  (:mod:`physworld.trace.likelihood`), which integrates a discrepancy out and has the search's bounds for a
   prior. It has to be found always at twice the detectable strength, never at a tenth.
 """
 
@@ -33,7 +33,7 @@ from physworld.trace.check import CheckConfig, CheckResult, check
 from physworld.trace.check.information import POSTERIOR
 from physworld.trace.check.physics import Physics, declared_physics
 from physworld.trace.check.recorded import Recorded, recorded
-from physworld.trace.evidence.likelihood import Linear, marginal
+from physworld.trace.likelihood import Linear, marginal
 from physworld.trace.sensitivity import candidate_responses
 
 STIFFNESS_PA, FRAMES, FPS = 6e4, 30, 30.0

@@ -19,9 +19,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from benchmarks.harness import describe_machine, write_section
 from benchmarks.trace.power_effects import LEVELS, inject, refusal
@@ -35,7 +35,6 @@ from physworld.trace import Memory, TraceResult, document, trace
 from physworld.twin.build import build_twin
 
 NULLS = 120
-Method = Literal["selection", "evidence"]
 METHOD = tuple(
     f"physworld/{room}"
     for room in ("trace", "calibrate", "estimation", "effects", "engine", "geometry", "evaluate", "twin")
@@ -83,14 +82,14 @@ def _needs_ground(name: str) -> bool:
     return name in ("ground_friction", "adhesion")
 
 
-def run(task: Task, memory: Path | None = None, method: Method = "selection") -> dict[str, Any]:
+def run(task: Task, memory: Path | None = None) -> dict[str, Any]:
     """One line: what was injected, and what the trace said; ``memory`` keeps its simulations."""
     known = OBJECTS[task.object](task.seed)
     kept = Memory(memory / task.key.replace("/", "_")) if memory is not None else Memory()
     line: dict[str, Any] = asdict(task)
     without = observed(known.truth, known.scene)
     if task.effect is None:
-        return line | traced(known, recorded(known.scene, without, task.seed), kept, method)
+        return line | traced(known, recorded(known.scene, without, task.seed), kept)
     reason = refusal(task.effect, known)
     if reason is not None:
         return line | {"outcome": "refused", "reason": reason}
@@ -100,20 +99,17 @@ def run(task: Task, memory: Path | None = None, method: Method = "selection") ->
     line |= {"strengths": made.strengths, "size": made.size, "unit": made.unit, "clipped": made.clipped}
     line |= {"displacement": made.displacement}
     noise_seed = 1000 + sorted(EFFECTS).index(task.effect)
-    return line | traced(known, recorded(known.scene, made.tracks, noise_seed), kept, method)
+    return line | traced(known, recorded(known.scene, made.tracks, noise_seed), kept)
 
 
-def traced(
-    known: Object, scene: Scene, memory: Memory | None = None, method: Method = "selection"
-) -> dict[str, Any]:
+def traced(known: Object, scene: Scene, memory: Memory | None = None) -> dict[str, Any]:
     """What a trace says of a recording, and its seconds."""
     start = build_twin(scene, known.budget)
     true = known.truth.parameters
     start = start.with_parameters(**{n: _OFF * true[n] for n in _STIFFNESS if n in true})
     begun, cpu = time.perf_counter(), time.process_time()
     try:
-        config = replace(known.config(), method=method)
-        found = trace(scene, config, calibrated_twin=start, memory=memory)
+        found = trace(scene, known.config(), calibrated_twin=start, memory=memory)
     except (PhysworldError, RuntimeError) as failure:
         return {"outcome": "failed", "reason": f"{type(failure).__name__}: {failure}"}
     return _answer(found) | {
@@ -138,6 +134,7 @@ def _answer(found: TraceResult) -> dict[str, Any]:
         "held_out_before_m": report["held_out"]["before"],
         "held_out_after_m": report["held_out"]["after"],
         "explained_fraction": report["held_out"]["explained_fraction"],
+        "posterior": [[h["effects"], h["posterior"]] for h in report["hypotheses"][:4]],
         "simulations": report["simulations"],
     }
 
@@ -195,9 +192,6 @@ def main() -> int:
         "--at-most", type=int, default=None, help="traces to run now; 0: only write the report"
     )
     parser.add_argument(
-        "--method", choices=("selection", "evidence"), default="selection", help="how a trace decides"
-    )
-    parser.add_argument(
         "--seed", type=int, default=0, help="of motions, stiffnesses and noise: another is fresh"
     )
     given = parser.parse_args()
@@ -209,7 +203,7 @@ def main() -> int:
 
     wp.config.quiet = True
     for task in missing[: given.at_most]:
-        line = {"key": task.key, **run(task, given.memory, given.method), "method": given.method, **version}
+        line = {"key": task.key, **run(task, given.memory), **version}
         line = json.loads(json.dumps(line, default=float))
         lines[task.key] = line
         if given.resume is not None:

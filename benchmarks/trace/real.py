@@ -17,7 +17,7 @@ import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -26,14 +26,13 @@ from physworld.calibrate import CalibrationConfig, Journal
 from physworld.errors import PhysworldError
 from physworld.scene import Scene
 from physworld.trace import Memory, TraceConfig, TraceResult, document, trace
-from physworld.trace.confirm import Model
 from physworld.trace.held_out import measure
+from physworld.trace.hypotheses import Hypothesis
 from physworld.trace.recordings import HELD_OUT, JointSimulations, Recordings
 from physworld_scenes.bundle import read_bundle
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data" / "real"
 BUDGET = 200
-Method = Literal["selection", "evidence"]
 _MOVED = 0.05  # share of the whole motion that marks the release
 
 
@@ -109,14 +108,14 @@ def repeatability(first: Scene, second: Scene) -> float:
     return float(np.sqrt(np.mean((both[0] - both[1]) ** 2) / 2.0))
 
 
-def run(case: Case, folder: Path, memory: Path | None, method: Method = "selection") -> dict[str, Any]:
+def run(case: Case, folder: Path, memory: Path | None) -> dict[str, Any]:
     """The figures of one case."""
     fitted, unseen = ([read(n, case, folder) for n in names] for names in (case.fitted, case.held_out))
     if case.repeats is not None:
         sigma = repeatability(*(read(name, case, folder) for name in case.repeats))
         fitted, unseen = ([replace(s, noise_sigma_m=sigma) for s in many] for many in (fitted, unseen))
     config = TraceConfig(
-        method=method, calibration=CalibrationConfig(particle_budget=BUDGET, damping="none"), experiment=None
+        calibration=CalibrationConfig(particle_budget=BUDGET, damping="none"), experiment=None
     )
     known = (
         Memory(memory / case.name.replace(", ", "-").replace(" ", "_")) if memory is not None else Memory()
@@ -164,17 +163,17 @@ def run(case: Case, folder: Path, memory: Path | None, method: Method = "selecti
     }
 
 
-def best_supported(result: TraceResult) -> Model | None:
+def best_supported(result: TraceResult) -> Hypothesis | None:
     """The model that the verdict takes; where it takes none, the one that predicts left-out training blocks best."""
     if result.effects:
         return result.verdict.model
     tried = [model for step in result.path for model in step.tried]
-    better = [model for model in tried if model.validated.mean < result.declared.validated.mean]
-    return min(better, key=lambda model: model.validated.mean) if better else None
+    better = [model for model in tried if model.left < result.declared.left]
+    return min(better, key=lambda model: model.left) if better else None
 
 
 def _errors_of(
-    model: Model,
+    model: Hypothesis,
     result: TraceResult,
     fitted: list[Scene],
     unseen: list[Scene],
@@ -273,9 +272,6 @@ def main() -> int:
     parser.add_argument("--docs", type=Path, default=None, help="Markdown file whose section is replaced")
     parser.add_argument("--only", nargs="*", default=[], help="names of cases; none: all")
     parser.add_argument("--resume", type=Path, default=None, help="folder that remembers simulations")
-    parser.add_argument(
-        "--method", choices=("selection", "evidence"), default="selection", help="how a trace decides"
-    )
     parser.add_argument("--set", type=Path, default=SHARED, help="folder of the recordings")
     given = parser.parse_args()
     if not (given.set / "beam_free_a" / "scene.json").exists():
@@ -289,9 +285,7 @@ def main() -> int:
     for case in CASES:
         if case.name not in done and (not given.only or case.name in given.only):
             try:
-                done[case.name] = json.loads(
-                    json.dumps(run(case, given.set, given.resume, given.method), default=float)
-                )
+                done[case.name] = json.loads(json.dumps(run(case, given.set, given.resume), default=float))
             except PhysworldError as failure:
                 print(f"{case.name}: {type(failure).__name__}: {failure}", file=sys.stderr)
                 continue

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from physworld.effects.base import DISSIPATIVE, Effect, Strength
+from physworld.effects.base import Effect, Strength
 from physworld.engine.problem import Problem
 from physworld.materials.cable import CableLaw
 
@@ -27,7 +27,7 @@ class AirDragAcross(Effect):
     equation = "a = -b |v_n| v_n"
     kind = "force"
     gates = ("coefficient_per_m",)
-    basins = DISSIPATIVE
+    scanned = True
 
     coefficient_per_m: float = 0.0
 

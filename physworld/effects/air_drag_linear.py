@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from physworld.effects.base import DISSIPATIVE, Effect, Strength
+from physworld.effects.base import Effect, Strength
 from physworld.engine.problem import Problem
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ class AirDragLinear(Effect):
     equation = "a = -c v"
     kind = "force"
     gates = ("rate_per_s",)
-    basins = DISSIPATIVE
+    scanned = True
 
     rate_per_s: float = 0.0
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from physworld.effects.base import DISSIPATIVE, Effect, Strength
+from physworld.effects.base import Effect, Strength
 from physworld.engine.problem import Problem
 from physworld.engine.terms.term import BoundTerm
 from physworld.engine.updated.terms import ParticleBody
@@ -77,7 +77,7 @@ class AirDragQuadratic(Effect):
     equation = "a = -k |v| v"
     kind = "force"
     gates = ("coefficient_per_m",)
-    basins = DISSIPATIVE
+    scanned = True
 
     coefficient_per_m: float = 0.0
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.effects.base import BasinScan, Effect, Strength, Variant
+from physworld.effects.base import Effect, Strength, Variant
 from physworld.engine.problem import Problem
 from physworld.engine.total.stress import StressTerm
 from physworld.engine.total.stress_kernels import sheet_model, solid_model
@@ -55,9 +55,7 @@ class Anisotropy(Effect):
     kind = "stress"
     gates = ("ratio",)
     strains = True
-    basins = BasinScan(
-        (-0.4, -0.2, 0.0), (0.025, 0.1, 0.4)
-    )  # fibres so stiff that nothing about them is small
+    scanned = True  # fibres so stiff that nothing about them is small
 
     ratio: float = 0.0
     azimuth_rad: float = 0.0

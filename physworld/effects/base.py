@@ -12,7 +12,7 @@ effects take their turn in the order of the registry. A hook leaves what it does
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, ClassVar, Literal
 
@@ -70,23 +70,6 @@ class Variant:
 
 
 @dataclass(frozen=True)
-class BasinScan:
-    """Where a trace looks for other basins of an effect with one gate, by simulation.
-
-    Attributes:
-        stiffness_shifts: natural logarithms of the stiffness over that of the declared physics' optimum.
-        shares: strengths of the gate over its upper bound.
-    """
-
-    stiffness_shifts: tuple[float, ...]
-    shares: tuple[float, ...]
-
-
-DISSIPATIVE = BasinScan((-0.9, -0.6, -0.4, -0.2, 0.0, 0.25, 0.5), (0.01, 0.1, 0.5))
-"""Of effects that take energy: without them a body that rings down is fitted by one so stiff that it hardly rings."""
-
-
-@dataclass(frozen=True)
 class Effect:
     """Base of the effects; see the module's text.
 
@@ -97,9 +80,8 @@ class Effect:
         kind: where it enters.
         gates: fields whose zero switches the effect off.
         strains: acts on the strains of a body's cells, which a mesh of triangles does not have.
-        basins: where a trace looks for other basins of the effect; None: nowhere.
-        parts: effects whose sum this one is, each with the gates that make it up; a recording of one place tells the
-            sum from its parts hardly, so a trace asks both.
+        scanned: a score to first order may miss the effect, since it may be large, or since without it a stiffness far
+            from the truth fits (a body that rings down, and takes energy): a trace looks over its whole range.
         instead: a measurement that settles whether the effect is there without a motion of the grips, for people.
     """
 
@@ -109,8 +91,7 @@ class Effect:
     kind: ClassVar[Kind]
     gates: ClassVar[tuple[str, ...]]
     strains: ClassVar[bool] = False
-    basins: ClassVar[BasinScan | None] = None
-    parts: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    scanned: ClassVar[bool] = False
     instead: ClassVar[str | None] = None
 
     @property
@@ -145,10 +126,6 @@ class Effect:
     def implausible(self) -> str | None:
         """Why nobody would believe these strengths, whatever a recording says; None where one may."""
         return None
-
-    def in_parts(self, twin: Twin) -> list[float]:
-        """Strengths of the gates of ``parts``, in their order, that do to first order what this effect does."""
-        raise NotImplementedError(f"{type(self).__name__} is no sum of other effects")
 
     @classmethod
     def refuses(cls, twin: Twin) -> str | None:

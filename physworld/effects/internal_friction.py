@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from physworld.effects.base import DISSIPATIVE, Effect, Strength
+from physworld.effects.base import Effect, Strength
 from physworld.effects.places import body_size
 from physworld.engine.problem import Problem
 from physworld.materials.cable import CableLaw
@@ -30,7 +30,7 @@ class InternalFriction(Effect):
     equation = "M += B k_f z, k_o z' = k' - |k'| z"
     kind = "stress"
     gates = ("moment_per_m",)
-    basins = DISSIPATIVE
+    scanned = True
 
     moment_per_m: float = 0.0
     onset_per_m: float = 1.0

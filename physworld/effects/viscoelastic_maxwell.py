@@ -17,7 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from physworld.effects.base import DISSIPATIVE, Effect, Strength, Variant
+from physworld.effects.base import Effect, Strength, Variant
 from physworld.effects.places import body_size, gravity_size
 from physworld.engine.problem import Problem
 from physworld.engine.total.stress import StressTerm
@@ -91,7 +91,7 @@ class ViscoelasticMaxwell(Effect):
     kind = "stress"
     gates = ("shear_modulus_pa", "share")
     strains = True
-    basins = DISSIPATIVE
+    scanned = True
 
     shear_modulus_pa: float = 0.0
     share: float = 0.0

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from physworld.effects.base import DISSIPATIVE, Effect, Strength
+from physworld.effects.base import Effect, Strength
 from physworld.effects.places import body_size, gravity_size
 from physworld.engine.problem import Problem
 from physworld.materials.sheet import SheetLaw
@@ -34,7 +34,7 @@ class ViscosityKelvinVoigt(Effect):
     equation = "sigma += 2 eta d"
     kind = "stress"
     gates = ("viscosity_pa_s", "relaxation_s")
-    basins = DISSIPATIVE
+    scanned = True
 
     viscosity_pa_s: float = 0.0
     relaxation_s: float = 0.0

@@ -10,12 +10,11 @@ alone is the same as other gravity (``gravity_tilt``); the drag alone is ``air_d
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from physworld.effects.base import Effect, Strength
-from physworld.effects.gravity_tilt import horizontal_axes
 from physworld.effects.places import gravity_size
 from physworld.engine.problem import Problem
 
@@ -35,7 +34,6 @@ class Wind(Effect):
     equation = "a = c (w - v) = p - c v"
     kind = "force"
     gates = ("push_x_m_s2", "push_y_m_s2", "push_z_m_s2", "rate_per_s")
-    parts: ClassVar = {"air_drag_linear": ("rate_per_s",), "gravity_tilt": ("tilt_x_rad", "tilt_y_rad")}
     instead = "repeat the recording in a closed box"
 
     push_x_m_s2: float = 0.0
@@ -67,16 +65,6 @@ class Wind(Effect):
         push = float(np.linalg.norm([self.push_x_m_s2, self.push_y_m_s2, self.push_z_m_s2]))
         speed = push / max(self.rate_per_s, 1e-9)
         return f"a wind of {speed:.3g} m/s is not believed" if speed > _FASTEST_M_S else None
-
-    def in_parts(self, twin: Twin) -> list[float]:
-        """The drag in still air, and the tilt of gravity that pushes as much across it."""
-        gravity = np.asarray(twin.gravity_m_s2, dtype=float)
-        push = np.array([self.push_x_m_s2, self.push_y_m_s2, self.push_z_m_s2])
-        angles = [
-            float(push @ np.cross(axis, gravity)) / float(gravity @ gravity)
-            for axis in horizontal_axes(gravity)
-        ]
-        return [self.rate_per_s, *angles]
 
     def problem(self, problem: Problem, twin: Twin) -> Problem:
         """Adds to gravity and to the drag rate: no kernel."""

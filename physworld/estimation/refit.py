@@ -19,6 +19,9 @@ from physworld.estimation.whitening import Whitening
 from physworld.twin.twin import Twin
 
 _SCALES = (1.0, 0.3)  # of a Gauss-Newton step, tried together
+_PAYS = (
+    0.3  # relative fall of the cost from which a step is followed by another with the sensitivities corrected
+)
 _TOLERANCE = 2e-3  # relative fall of the cost that ends the search
 _BOUND = 1e-6
 _PATIENCE = 2  # iterations before a search is judged hopeless
@@ -72,7 +75,6 @@ def refit(
     iterations: int,
     starts: list[Array] | None = None,
     hopeless: float = np.inf,
-    brief: bool = False,
     jacobian: Array | None = None,
 ) -> Refit | None:
     """Minimise the whitened misfit and the priors over the unknowns, from the best of the starts.
@@ -81,9 +83,10 @@ def refit(
         starts: places (p,) to try first, beside the unknowns' own.
         hopeless: squared residual (sum) above which the search is left after two iterations: what it is compared with
             does far better.
-        brief: leave the Jacobian one step behind the optimum.
-        jacobian: sensitivities to begin with, (M, p), such as another resolution's, which hardly differ. None are
-            simulated then; the steps themselves tell how they change (Broyden, Math. Comp. 19, 1965, 577-593).
+        jacobian: sensitivities where the search begins, (M, p), if they are known; with ``starts`` they are not.
+
+    Steps tell how sensitivities change (Broyden, Math. Comp. 19, 1965, 577-593), so new ones are only simulated where
+    a step with the old ones did not pay.
 
     Returns:
         The optimum; None where no start gave a usable run.
@@ -95,39 +98,40 @@ def refit(
     if best is None:
         return None
     theta, tracks, residual, cost = best
-    slope, known, damping = jacobian, jacobian, 1e-3
+    last, slope, damping = jacobian, jacobian, 1e-3
+    exact = slope is not None
     for number in range(iterations):
         if number >= _PATIENCE and cost > hopeless:
             break
         if slope is None:
             here = starting_at(unknowns, theta)
             slope, _ = sensitivities(simulations, whitener, twin, tracks, here, frames)
-            known = slope
+            last, exact = slope, True
         step = _step(unknowns, theta, residual, slope, damping, low, high)
         trials = [np.clip(theta + scale * step, low, high) for scale in _SCALES]
         looked = _looked(simulations, whitener, twin, unknowns, trials, frames)
-        if jacobian is not None:
-            slope = _secant(slope, theta, residual, looked)
         found = min(looked, key=_cost, default=None)
         if found is None or not found[3] < cost:
-            if damping > 1.0:
+            if not exact:
+                slope = None
+            elif damping > 1.0:
                 break
-            damping *= 100.0
+            else:
+                damping *= 100.0
             continue
-        gain = 1.0 - found[3] / cost
+        gain, before, was = 1.0 - found[3] / cost, theta, residual
         theta, tracks, residual, cost = found
         damping = max(damping / 10.0, 1e-6)
-        if gain < _TOLERANCE:
+        if gain < _TOLERANCE and exact:
             break
-        if jacobian is None:
-            slope = None
-    if slope is None and known is not None and (brief or cost > hopeless):
-        slope = known
-    if slope is None:
+        last = _secant(slope, before, was, looked)
+        slope, exact = (last, False) if gain >= _PAYS else (None, False)
+    if not exact and (last is None or cost <= hopeless):
         here = starting_at(unknowns, theta)
-        slope, _ = sensitivities(simulations, whitener, twin, tracks, here, frames)
+        last, _ = sensitivities(simulations, whitener, twin, tracks, here, frames)
+    assert last is not None
     final = starting_at(unknowns, theta)
-    return Refit(final, at(twin, unknowns, theta), theta, tracks, residual, slope)
+    return Refit(final, at(twin, unknowns, theta), theta, tracks, residual, last)
 
 
 def sensitivities(

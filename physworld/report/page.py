@@ -238,11 +238,29 @@ def _chosen(report: dict[str, Any]) -> Html:
     )  # fmt: skip
     return _section(
         "How it was chosen",
-        "A candidate's score is the share of the training residual that it explains and that re-tuning the calibrated "
-        "parameters cannot. The best are refitted with the full simulator and compared on blocks of frames that they "
-        "were not fitted to; of those that do as well, the simplest is kept.",
-        pictures.candidates(report), *steps, listed,
+        "A candidate's score is the share of the training residual that it explains together with the calibrated "
+        "parameters. The best are fitted with the full simulator and compared on blocks of frames that they were not "
+        "fitted to, under noise and a smooth discrepancy of the twin; the posterior is how sure that comparison is.",
+        pictures.candidates(report), _hypotheses(report), *steps, listed,
     )  # fmt: skip
+
+
+def _hypotheses(report: dict[str, Any]) -> Html | None:
+    """Every set of effects of which each removes a half of what is left without it, with its posterior."""
+    known = report.get("hypotheses") or []
+    if not known:
+        return None
+    rows = [
+        tag("tr",
+            tag("td", " and ".join(words.title(name) for name in one.get("effects", [])) or "the declared physics"),
+            tag("td", f"{float(one.get('posterior') or 0.0):.3f}", class_="right"),
+            tag("td", words.number(one.get("misfit"))), tag("td", words.number(one.get("left_out"))),
+            tag("td", words.millimetres(one.get("discrepancy_m"))))
+        for one in known
+    ]  # fmt: skip
+    return _table(
+        ("set of effects", "posterior", "misfit / noise", "left-out error / noise", "discrepancy"), rows
+    )
 
 
 def _tried(model: dict[str, Any], kept: list[str] | None) -> Html:
@@ -273,11 +291,6 @@ def _remainder(report: dict[str, Any]) -> Html:
         shown = "; ".join(f"{name} {words.number(value, 2)}" for name, value in numerics.items())
         parts.append(
             tag("p", f"What the solver's own choices change, over the noise: {shown}.", class_="quiet lead")
-        )
-    for names, values in (training.get("second_resolution") or {}).items():
-        shown = ", ".join(f"{words.label(k.split('.')[-1])} {words.number(v)}" for k, v in values.items())
-        parts.append(
-            tag("p", f"Refitted on finer cells with {words.title(names)}: {shown}.", class_="quiet lead")
         )
     parts += [tag("p", _sentence(str(note)), class_="lead") for note in report.get("notes", [])]
     return _section("What remains", None, *parts)

@@ -14,7 +14,7 @@ from physworld.arrays import Array
 from physworld.report.curves import Residuals, carpet, mean_component, per_frame
 from physworld.report.markup import Child, Html, scrolled, tag
 from physworld.report.predictors import PREDICTORS
-from physworld.report.svg import Axes, Series, legend_of, line_chart, picture, short
+from physworld.report.svg import Axes, Series, legend_of, line_chart, picture
 from physworld.report.words import number, title
 
 MM = 1e3
@@ -84,32 +84,26 @@ _CARPET_TITLES = {"before": "Before: declared physics, calibrated", "after": "Af
 
 
 def candidates(report: dict[str, Any]) -> Html:
-    """Scores of all candidates with the threshold and the decoys."""
+    """Scores of all candidates, and the posterior of those that were fitted."""
     rows = report.get("candidates", [])
     if not rows:
         return tag("p", "No candidate was scored.", class_="quiet")
     threshold = float(rows[0].get("threshold") or 0.0)
-    absorbed = any(row.get("absorbed") is not None for row in rows)
+    posterior: dict[str, float] = {}
+    for known in report.get("hypotheses", []):
+        for name in known.get("effects", []):
+            posterior[name] = posterior.get(name, 0.0) + float(known.get("posterior") or 0.0)
     also = {effect.get("name") for effect in report.get("equivalent", [])}
-    head = ["candidate", "share of the residual it explains beyond re-tuning", "p"]
-    if absorbed:
-        head.append("re-tuning could absorb")
+    head = ["candidate", "share of the residual it explains, to first order", "posterior"]
     shown = [row for row in rows if _telling(row, also)]
     quiet = [row for row in rows if not _telling(row, also)]
-    body = [_candidate(row, threshold, also, absorbed) for row in shown]
-    decoys = [float(d) for d in report.get("decoys", []) if d is not None]
-    if decoys:
-        dots = [tag("i", class_="decoy", style=f"left:{_percent(d)}") for d in decoys]
-        bar = tag("div", _mark(threshold), dots, class_="bar", title=f"best decoy {max(decoys):.3f}")
-        cells = [
-            tag("td", f"{len(decoys)} decoys, which must not score"),
-            tag("td", bar, class_="bars"),
-            tag("td"),
-        ]
-        body.append(tag("tr", cells, tag("td") if absorbed else None, class_="quiet"))
-    cells = [tag("th", h, class_="right" if h == "p" else None) for h in head]
+    body = [_candidate(row, threshold, also, posterior.get(row.get("name", ""))) for row in shown]
+    cells = [tag("th", h, class_="right" if h == "posterior" else None) for h in head]
     table = tag("table", tag("thead", tag("tr", cells)), tag("tbody", body), class_="scores")
-    note = f"The line at {threshold:.2f}: what the best of all candidates would reach by chance in one case of twenty."
+    note = (
+        f"The line at {threshold:.2f}: from there on an effect is fitted with the full simulator, the best first; "
+        "effects that may be large are fitted in any case. A dash: it was not fitted, or removes less than a half."
+    )
     rest = None
     if quiet:
         few = f"{len(quiet)} more explain less than {LEAST_SHARE:.1%}"
@@ -213,29 +207,16 @@ def _telling(row: dict[str, Any], also: set[Any]) -> bool:
     )
 
 
-def _candidate(row: dict[str, Any], threshold: float, also: set[Any], absorbed: bool) -> Html:
+def _candidate(row: dict[str, Any], threshold: float, also: set[Any], posterior: float | None) -> Html:
     role = "chosen" if row.get("selected") else "also" if row.get("name") in also else "other"
     score = max(float(row.get("score") or 0.0), 0.0)
     variant = tag("span", f" {row['variant']}", class_="quiet") if row.get("variant") else None
     bar = tag("div", tag("i", class_=role, style=f"width:{_percent(score)}"), _mark(threshold), class_="bar")
-    p_value = row.get("p_value")
     cells = [
         tag("td", title(row), variant),
         tag("td", bar, tag("span", f"{score:.3f}", class_="value"), class_="bars"),
-        tag("td", "–" if p_value is None else short(round(p_value, 4)), class_="right"),
+        tag("td", "–" if posterior is None else f"{posterior:.2f}", class_="right"),
     ]
-    if absorbed:
-        share = row.get("absorbed")
-        inner = None if share is None else tag("i", class_="other", style=f"width:{_percent(float(share))}")
-        shown = "–" if share is None else f"{float(share):.0%}"
-        cells.append(
-            tag(
-                "td",
-                tag("div", inner, class_="bar narrow"),
-                tag("span", shown, class_="value"),
-                class_="bars",
-            )
-        )
     return tag("tr", cells, class_=role)
 
 

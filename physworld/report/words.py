@@ -95,7 +95,7 @@ def headline(report: dict[str, Any]) -> str:
         also = f" (or as well {others})" if others else ""
         return f"Best supported {among}: a fault of the measurement, not of the physics: {effects}{also}."
     if kind == "numerical_issue":
-        return "No effect is claimed: the strength that fits best moves with the solver's resolution."
+        return "No effect is claimed: finer cells change the twin by as much as is left."
     if kind == "unexplained":
         return f"Something is there that none {_of(tried)} accounts for; it is described below, not forced into a name."
     if kind == "nothing_to_explain":

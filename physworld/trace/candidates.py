@@ -48,7 +48,7 @@ class Candidate:
     @property
     def scanned(self) -> bool:
         """Whether a score to first order may miss the effect, so that it is looked for over its whole range."""
-        return EFFECTS[self.effect].basins is not None
+        return EFFECTS[self.effect].scanned
 
     def unknowns(self) -> list[Unknown]:
         """The gates, in units of their probes; with what is known of them beforehand."""

@@ -17,7 +17,7 @@ from physworld.evaluate.baselines import constant_velocity, rigid_follow, static
 from physworld.evaluate.metrics import chamfer_l2
 from physworld.scene import Scene
 from physworld.trace.config import TraceConfig
-from physworld.trace.confirm import Model
+from physworld.trace.hypotheses import Hypothesis
 from physworld.trace.recordings import HELD_OUT, JointSimulations, Recording, Recordings, side_by_side
 
 METRIC = "track_rmse_m"
@@ -174,7 +174,9 @@ class Outcomes:
         """All that are fitted, side by side."""
         return self.recordings.scene
 
-    def of(self, declared: Model, model: Model, white: Whitener, sigma: float | None) -> list[Outcome]:
+    def of(
+        self, declared: Hypothesis, model: Hypothesis, white: Whitener, sigma: float | None
+    ) -> list[Outcome]:
         """Open-loop predictions of every recording before and after, and their errors on frames that were not used.
 
         Args:
@@ -209,7 +211,7 @@ class Outcomes:
     def _recordings_of(self, outcomes: list[Outcome]) -> tuple[Recording, ...]:
         return self.recordings.held_out if outcomes[0].role == HELD_OUT else self.recordings.fitted
 
-    def _predictions(self, model: Model, white: Whitener, recordings: list[Recording]) -> list[Array]:
+    def _predictions(self, model: Hypothesis, white: Whitener, recordings: list[Recording]) -> list[Array]:
         """Open loop over all frames, [(T, N, 3)], with the points' own places from the training frames."""
         places = white.place_errors(model.fitted.tracks)
         found = []

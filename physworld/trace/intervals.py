@@ -9,8 +9,9 @@ import numpy as np
 from physworld.arrays import Array
 from physworld.effects.registry import EFFECTS
 from physworld.estimation.refit import Refit, prior_rows
-from physworld.estimation.unknowns import Unknown, at
-from physworld.trace.confirm import Model
+from physworld.estimation.unknowns import at
+from physworld.trace.discrepancy import Discrepancy
+from physworld.trace.hypotheses import Hypothesis
 from physworld.trace.result import Named, Number
 from physworld.twin.twin import Twin
 
@@ -25,21 +26,18 @@ class Spread:
     Attributes:
         fitted: the optimum.
         drawn: unknowns under resampled blocks of frames, (resamples, p).
-        covariance: what sensitivities and noise (the misfit, where that is larger) leave, (p, p).
-        finer: values at the second resolution, by name.
+        covariance: what sensitivities, noise and discrepancy leave, (p, p).
     """
 
     fitted: Refit
     drawn: Array
     covariance: Array
-    finer: dict[str, float]
 
     def numbers(self) -> dict[str, Number]:
         """Every unknown's value and interval.
 
         The interval is that of the linear refit under resampled blocks of frames, but no narrower than the
-        sensitivities and the noise leave it: few blocks, or a single one, resample to much the same. It is widened to
-        hold the value that was found at the second resolution.
+        sensitivities and the noise leave it: few blocks, or a single one, resample to much the same.
         """
         fitted, found = self.fitted, {}
         least = _TWO_SIDED * np.sqrt(np.diag(self.covariance))
@@ -48,8 +46,7 @@ class Spread:
             below, above = np.quantile(self.drawn[:, k], [0.025, 0.975])
             ends = min(below, fitted.theta[k] - least[k]), max(above, fitted.theta[k] + least[k])
             low, high = sorted(unknown.value(float(np.clip(end, *unknown.bounds))) for end in ends)
-            other = self.finer.get(unknown.name, value)
-            found[unknown.name] = Number(value, unknown.unit, (min(low, other), max(high, other)))
+            found[unknown.name] = Number(value, unknown.unit, (low, high))
         return found
 
     def derived(self, name: str) -> dict[str, Number]:
@@ -63,57 +60,47 @@ class Spread:
             there = _implied(at(fitted.twin, unknowns, fitted.theta + step), name)
             for key, (value, _) in implied.items():
                 slopes[key][k] = (there.get(key, (value, ""))[0] - value) / step[k]
-        moved = np.array([self._to_finer(u, float(t)) for u, t in zip(unknowns, fitted.theta, strict=True)])
         found = {}
         for key, (value, unit) in implied.items():
             slope = slopes[key]
             resampled = (self.drawn - fitted.theta) @ slope
             reach = _TWO_SIDED * float(np.sqrt(slope @ self.covariance @ slope))
             below, above = np.quantile(resampled, [0.025, 0.975])
-            other = float(slope @ moved)
-            ends = (min(below, -reach, other), max(above, reach, other))
+            ends = (min(below, -reach), max(above, reach))
             found[key] = Number(value, unit, (value + float(ends[0]), value + float(ends[1])))
         return found
 
-    def _to_finer(self, unknown: Unknown, theta: float) -> float:
-        """How far the second resolution is away, in the scale of the search and to first order."""
-        if unknown.name not in self.finer:
-            return 0.0
-        value = unknown.value(theta)
-        slope = (unknown.value(theta + _STEP * unknown.step) - value) / (_STEP * unknown.step)
-        return (self.finer[unknown.name] - value) / slope
 
-
-def spread_of(
-    fitted: Refit, block_of_row: Array, finer: dict[str, float], resamples: int, seed: int
-) -> Spread:
-    """How well an optimum is known, by resampling blocks of training frames, and by noise and sensitivities.
+def spread_of(model: Hypothesis, discrepancy: Discrepancy, resamples: int, seed: int) -> Spread:
+    """How well an optimum is known under noise and its own discrepancy, by resampling blocks of training frames.
 
     Args:
-        finer: values at the second resolution, by name.
+        model: with its estimate of the discrepancy.
+        discrepancy: of the recording.
+        resamples: of the blocks.
+        seed: of these.
     """
-    blocks = int(block_of_row.max()) + 1
-    normal = np.zeros((blocks, len(fitted.theta), len(fitted.theta)))
-    gradient = np.zeros((blocks, len(fitted.theta)))
-    for block in range(blocks):
-        rows = block_of_row == block
-        normal[block] = fitted.jacobian[rows].T @ fitted.jacobian[rows]
-        gradient[block] = fitted.jacobian[rows].T @ fitted.residual[rows]
+    fitted, kappa = model.fitted, model.evidence.kappa
+    residual, jacobian = (discrepancy.whitened(v, kappa) for v in (fitted.residual, fitted.jacobian))
+    rows = [block.rows for block in discrepancy.blocks]
+    normal = np.stack([jacobian[own].T @ jacobian[own] for own in rows])
+    gradient = np.stack([jacobian[own].T @ residual[own] for own in rows])
+    misfit = float(np.sqrt(np.mean(residual**2)))
     prior_residual, prior_slope = prior_rows(fitted.unknowns, fitted.theta)
     rng = np.random.default_rng(seed)
-    counts = rng.multinomial(blocks, np.full(blocks, 1.0 / blocks), size=resamples)
+    counts = rng.multinomial(len(rows), np.full(len(rows), 1.0 / len(rows)), size=resamples)
     ridge = 1e-9 * np.diag(np.diag(normal.sum(axis=0)) + 1e-30)
     information = normal.sum(axis=0) + prior_slope.T @ prior_slope + ridge
-    covariance = max(1.0, fitted.misfit) ** 2 * np.linalg.inv(information)
+    covariance = max(1.0, misfit) ** 2 * np.linalg.inv(information)
     total = np.tensordot(counts, normal, 1) + prior_slope.T @ prior_slope + ridge
     push = np.tensordot(counts, gradient, 1) + prior_slope.T @ prior_residual
     drawn = fitted.theta + np.linalg.solve(total, push[..., None])[..., 0]
     # with few blocks the resampled optimum may miss the slope that the tolerance of the search left: centre it
     drawn += fitted.theta - np.median(drawn, axis=0)
-    return Spread(fitted, drawn, covariance, finer)
+    return Spread(fitted, drawn, covariance)
 
 
-def named(model: Model, spread: Spread) -> tuple[Named, ...]:
+def named(model: Hypothesis, spread: Spread) -> tuple[Named, ...]:
     """The effects of a model with their numbers: what was estimated, and what that implies."""
     found, estimated, twin = [], spread.numbers(), model.fitted.twin
     effects = {known.name: known for known in twin.effects}

@@ -1,9 +1,9 @@
 """What a trace begins with: the noise that is asked for, the calibrated physics, faulty sightings, and its time.
 
-Searches are left when their part of the time is up, and the answer says so. Calibration, noise and first-order scores
-are never cut short, for without them there is no answer. What is left of the limit then, and a quarter of it at least,
-goes to the selection, the second resolution and the proposed experiment in turn; what one of them does not need the
-next one has. A run that is remembered takes no time, so a trace that resumes goes on where its searches were left.
+Searches are left when their part of the time is up, and the answer says so. Calibration, noise and the fit of the
+declared physics are never cut short, for without them there is no answer. What is left of the limit then, and a quarter
+of it at least, goes to the search and the proposed experiment in turn; what the one does not need the other has. A run
+that is remembered takes no time, so a trace that resumes goes on where its searches were left.
 """
 
 from __future__ import annotations
@@ -16,16 +16,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from physworld.calibrate import Journal, calibrate
-from physworld.engine.formulations import RODS, TOTAL
+from physworld.engine.formulations import RODS
 from physworld.estimation.noise import noise_sigma
 from physworld.estimation.simulations import Job, Ledger, Memory, Progress, Runner
 from physworld.geometry.reference import ROD_KINDS
 from physworld.scene import Scene
+from physworld.trace.answer import Verdict
 from physworld.trace.config import TraceConfig
-from physworld.trace.confirm import Model
 from physworld.trace.faults import Faults, find_faults
 from physworld.trace.recordings import JointSimulations, Recordings
-from physworld.trace.verdict import DATA, EQUIVALENT, NAMED, UNEXPLAINED, Verdict
 from physworld.twin.grips import softly_held
 from physworld.twin.twin import Twin
 
@@ -86,8 +85,6 @@ class Beginning:
         config, runs, begun = self.config, 0, time.perf_counter()
         form, damping = config.calibration.formulation, config.calibration.damping
         if recordings.lead.scene.kind in ROD_KINDS:
-            if form == "auto" and config.method == "selection":
-                form = TOTAL.name  # the effects on stress act on the cells of splines
             # the search for a rod's stiffness ends in a wrong basin without its losses, which come off later
             damping = "auto" if form in ("auto", RODS.name) else damping
         if twin is None or twin.form.name != (form if form != "auto" else twin.form.name):
@@ -128,8 +125,8 @@ class Beginning:
         )  # fmt: skip
 
 
-SELECTION, CONFIRMATION, EXPERIMENT = 0.7, 0.95, 1.0
-"""By which share of the time that is left after the scores a part ends."""
+SEARCH, EXPERIMENT = 0.85, 1.0
+"""By which share of the time that is left when the searches begin a part ends."""
 _AT_LEAST = 0.25  # share of the limit that the searches have, however long what comes before them took
 _SHOWN = 6  # searches that a reason lists
 
@@ -163,20 +160,11 @@ class Clock:
         finally:
             self.ledger.ends_at = float("inf")
 
-    def told(self, verdict: Verdict, declared: Model, agreement: dict[tuple[str, ...], bool]) -> Verdict:
-        """The verdict as far as it goes: nothing is named that finer cells were not asked about.
-
-        Args:
-            verdict: made of what there is.
-            declared: the declared physics.
-            agreement: of the models that were asked about, by their names.
-        """
+    def told(self, verdict: Verdict) -> Verdict:
+        """The verdict, with what was left for want of time."""
         cut = list(dict.fromkeys(self.ledger.cut))
         if not cut:
             return verdict
         more = f" and {len(cut) - _SHOWN} more" if len(cut) > _SHOWN else ""
         left = f"after {self.limit_s:g} s these searches were left: {', '.join(cut[:_SHOWN])}{more}"
-        if verdict.name in (NAMED, EQUIVALENT, DATA) and verdict.model.names not in agreement:
-            reason = f"time was up before finer cells were asked ({verdict.reason}); {left}"
-            return Verdict(UNEXPLAINED, declared, (), reason)
         return replace(verdict, reason=f"{verdict.reason}; {left}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,9 @@ from physworld.arrays import Array
 from physworld.effects.registry import EFFECTS
 from physworld.scene import Scene
 from physworld.trace.held_out import METRIC, HeldOut
+from physworld.trace.hypotheses import Hypothesis
 from physworld.trace.result import Named, Number, TraceResult
+from physworld.trace.search import WORTH
 
 SCHEMA_VERSION = 1
 _SHOWN = 10  # best scores of a step
@@ -19,21 +22,18 @@ _SHOWN = 10  # best scores of a step
 
 def document(result: TraceResult) -> dict[str, Any]:
     """The answer under stable keys; JSON types only, numbers that are not finite as null."""
-    ranked = result.path[0].scores if result.path else None
     selected = set(result.verdict.model.names) if result.effects else set()
     best: dict[str, dict[str, Any]] = {}
-    for score in ranked.ranked if ranked else ():
-        name = score.candidate.effect
+    for one in result.path[0].screened if result.path else ():
+        name = one.candidate.effect
         best.setdefault(
             name,
             {
                 "name": name,
                 "title": EFFECTS[name].title,
-                "variant": score.candidate.variant or None,
-                "score": score.share,
-                "threshold": max(ranked.threshold, 0.0) if ranked else 0.0,
-                "p_value": score.p_value,
-                "absorbed": score.absorbed,
+                "variant": one.candidate.variant or None,
+                "score": one.share,
+                "threshold": WORTH,
                 "selected": name in selected,
             },
         )
@@ -46,26 +46,25 @@ def document(result: TraceResult) -> dict[str, Any]:
         "equivalent": [_effect(effect) for model in result.equivalent for effect in model],
         "candidates": list(best.values()),
         "refused": result.refused,
-        "decoys": ranked.decoys if ranked else [],
         "path": [
             {
                 "base": list(step.base.names),
-                "threshold": step.scores.threshold,
+                "threshold": WORTH,
                 "scores": [
                     {"name": s.candidate.effect, "variant": s.candidate.variant or None, "score": s.share}
-                    for s in step.scores.ranked[:_SHOWN]
+                    for s in step.screened[:_SHOWN]
                 ],
                 "tried": [
                     {
                         "effects": list(model.names),
                         "variants": [member.variant for member in model.members],
                         "misfit": model.fitted.misfit,
-                        "left_out_error": model.validated.mean,
+                        "left_out_error": model.left,
                         "values": {u.name: model.fitted.value(u.name) for u in model.fitted.unknowns},
                     }
                     for model in step.tried
                 ],
-                "kept": list(step.kept.names) if step.kept else None,
+                "kept": _kept(step.tried, result.verdict.model.names),
             }
             for step in result.path
         ],
@@ -74,7 +73,6 @@ def document(result: TraceResult) -> dict[str, Any]:
             "misfit_before": result.declared.fitted.misfit,
             "misfit_after": result.verdict.model.fitted.misfit,
             "numerics": result.numerics,
-            "second_resolution": {" + ".join(names): values for names, values in result.finer.items()},
         },
         "held_out": _errors(result.held_out),
         "recordings": [
@@ -104,6 +102,12 @@ def document(result: TraceResult) -> dict[str, Any]:
     }
     answer: dict[str, Any] = _finite(found)
     return answer
+
+
+def _kept(tried: Sequence[Hypothesis], answer: Sequence[str]) -> list[str] | None:
+    """What of a step is in the answer, or on the way to it."""
+    found = [h for h in tried if set(h.names) <= set(answer)]
+    return list(max(found, key=lambda h: h.score).names) if found else None
 
 
 def _support(result: TraceResult, name: str) -> dict[str, float | None]:

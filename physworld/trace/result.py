@@ -6,12 +6,12 @@ from dataclasses import dataclass, field
 
 from physworld.arrays import Array
 from physworld.estimation.noise import Split
+from physworld.trace.answer import Verdict
 from physworld.trace.candidates import Candidate
-from physworld.trace.confirm import Model
 from physworld.trace.experiment import Experiment
 from physworld.trace.held_out import HeldOut, Outcome
-from physworld.trace.score import Scores
-from physworld.trace.verdict import Verdict
+from physworld.trace.hypotheses import Hypothesis
+from physworld.trace.search import Step
 from physworld.twin.twin import Twin
 
 
@@ -30,16 +30,6 @@ class Named:
 
     name: str
     parameters: dict[str, Number]
-
-
-@dataclass(frozen=True)
-class Step:
-    """One step of the forward selection: the scores against what was left, and the model that was kept, or None."""
-
-    base: Model
-    scores: Scores
-    tried: tuple[Model, ...]
-    kept: Model | None
 
 
 @dataclass(frozen=True)
@@ -81,10 +71,9 @@ class TraceResult:
         calibrated: the calibrated parameters of the model with the effects.
         declared: the declared physics, refitted.
         split, sigma: frozen split of the first recording; noise [m], or None where it is unknown.
-        path: steps of the selection.
+        path: steps of the search.
         candidates, refused: what was tried, and why the rest was not.
         numerics: root mean squared change of the training prediction by each numerical direction, over the noise.
-        finer: values at the second resolution by the unknowns' names, for each model that was refitted there.
         before, after: open-loop tracks of the first recording, (T, N, 3) [m].
         held_out: errors on the recordings that are held out, if there are any; else on the held-out frames.
         remainder_m, remainder: what is left on the training frames beyond the noise, and in words.
@@ -92,8 +81,8 @@ class TraceResult:
         simulations, seconds: cost.
         notes: what a reader has to know.
         recordings: every recording of its own, those that are held out last.
-        supported: by evidence, every set of effects with its posterior, the best first.
-        shares: by evidence, the share of the held-out error that each named effect takes away.
+        supported: every set of effects with its posterior, the best first.
+        shares: the share of the held-out error that each named effect takes away.
         stages: what each has cost, in the order in which they began.
     """
 
@@ -102,14 +91,13 @@ class TraceResult:
     effects: tuple[Named, ...]
     equivalent: tuple[tuple[Named, ...], ...]
     calibrated: dict[str, Number]
-    declared: Model
+    declared: Hypothesis
     split: Split
     sigma: float | None
     path: tuple[Step, ...]
     candidates: list[Candidate]
     refused: dict[str, str]
     numerics: dict[str, float]
-    finer: dict[tuple[str, ...], dict[str, float]]
     before: Array
     after: Array
     held_out: HeldOut

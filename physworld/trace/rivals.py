@@ -16,7 +16,7 @@ from physworld.arrays import Array
 from physworld.effects.registry import EFFECTS
 from physworld.estimation.refit import prior_rows
 from physworld.estimation.unknowns import Unknown, at, bounds_of
-from physworld.trace.confirm import Model
+from physworld.trace.hypotheses import Hypothesis
 from physworld.twin.twin import Twin
 
 _RIDGE = 1e-9
@@ -70,8 +70,8 @@ class Rival:
         )
 
 
-def rival_of(model: Model) -> Rival:
-    """A refitted model as a rival."""
+def rival_of(model: Hypothesis) -> Rival:
+    """A fitted hypothesis as a rival."""
     fitted = model.fitted
     _, slope = prior_rows(fitted.unknowns, fitted.theta)
     information = fitted.jacobian.T @ fitted.jacobian + slope.T @ slope

@@ -1,88 +1,58 @@
 """A trace from beginning to end: calibrate, find the residual, name the effect, add it, and measure what it brought.
 
-1. Freeze the split. Calibrate the declared physics on the training frames, with several starts and no damping.
-2. Noise; whitening by noise and by the points' own places; what other cells and time steps change.
-3. Sensitivities of the calibrated parameters and of every candidate; scores, decoys, and what chance would reach.
-4. Refit the best candidates with everything; where the best single leaves too much, pairs.
-5. Refit the winner and its rivals on finer cells: the strength has to agree.
-6. The verdict; intervals; then, once, the held-out frames.
+1. Freeze the split. Calibrate the declared physics on the training frames; leave out faulty sightings.
+2. Noise; whitening by noise, by the points' own places and by what finer cells and a smaller step change (their
+   estimated error as one standard deviation, Richardson's for second order).
+3. The declared physics under noise and model discrepancy; the search over sets of effects; their posterior.
+4. The answer: the sets that hold 0.95 of the posterior, four at most. What remains is told beside it and forbids no
+   name. Intervals; then, once, the held-out frames.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from physworld.arrays import Array
 from physworld.calibrate import Journal
-from physworld.calibrate.parameters import BENDING_COUPLING, TWIST_RATIO, parameters_of
+from physworld.calibrate.parameters import BENDING_COUPLING, BENDING_RATIO, TWIST_RATIO, parameters_of
+from physworld.calibrate.rod_parameters import LOSSES, lossless, rod_parameters
+from physworld.engine.formulations import RODS
 from physworld.engine.thin.triangles import TriangleLattice
 from physworld.errors import SceneUnsupported
 from physworld.estimation.noise import noise_sigma
-from physworld.estimation.refit import refit
 from physworld.estimation.simulations import Job, Memory, Progress, Runner, in_turn, stage_s
-from physworld.estimation.unknowns import Unknown
+from physworld.estimation.unknowns import LOG, Unknown
 from physworld.estimation.whitening import Whitener, turned_starts, whitener
 from physworld.scene import Scene
-from physworld.trace.candidates import Candidate, candidates
-from physworld.trace.comparison import cross_validated
+from physworld.trace.answer import DATA as FAULTY
+from physworld.trace.answer import NOTHING, UNEXPLAINED, Verdict, decided
+from physworld.trace.candidates import candidates
 from physworld.trace.config import TraceConfig
-from physworld.trace.confirm import Model, held_otherwise
+from physworld.trace.discrepancy import Discrepancy, discrepancy_of
 from physworld.trace.experiment import Experiment, propose, rival_of
 from physworld.trace.faults import Faults, without_faults
-from physworld.trace.held_out import Outcomes
+from physworld.trace.held_out import HeldOut, Outcomes
+from physworld.trace.hypotheses import Hypothesis, Setting
 from physworld.trace.intervals import calibrated, named, spread_of
-from physworld.trace.mixtures import Mixtures
-from physworld.trace.preparation import (
-    CONFIRMATION,
-    EXPERIMENT,
-    SELECTION,
-    Beginning,
-    Clock,
-    remarks,
-    taken_with,
-)
-from physworld.trace.recordings import (
-    FITTED,
-    HELD_OUT,
-    JointSimulations,
-    Recordings,
-    side_by_side,
-)
+from physworld.trace.preparation import EXPERIMENT, SEARCH, Beginning, Clock, remarks, taken_with
+from physworld.trace.recordings import FITTED, HELD_OUT, JointSimulations, Recordings, side_by_side
 from physworld.trace.report import describe
-from physworld.trace.result import Stage, Step, TraceResult
-from physworld.trace.score import orthonormal, project
-from physworld.trace.second_resolution import SecondResolution
-from physworld.trace.selection import Selection, by_chance
-from physworld.trace.sensitivity import (
-    candidate_responses,
-    numerical_directions,
-    refinement_of,
-)
+from physworld.trace.result import Stage, Supported, TraceResult
+from physworld.trace.search import Search, early_part
+from physworld.trace.sensitivity import numerical_directions
 from physworld.trace.unknowns import KNOWN_BEFOREHAND, hold_unknowns, of_parameter
-from physworld.trace.verdict import (
-    DATA,
-    NOTHING,
-    UNEXPLAINED,
-    Verdict,
-    claimable,
-    decide,
-    implausible,
-    simplest_first,
-)
 from physworld.twin.twin import Twin
 
 _OTHER_STIFFNESSES = tuple(0.12 * k for k in (-6, -5, -4, -3, -2, -1, 1, 2, 3, 4, 5, 6))
 """Logarithms: a phase that has slipped by a period is a local minimum, so others are looked at before a descent."""
-_MESH_STIFFNESSES = tuple(0.01 * k for k in (-4, -3, -2, -1, 1, 2, 3, 4))
-"""Of a mesh of triangles also these: its wrinkles make basins that are a few percent of its stiffness wide."""
-_OTHER_TWIST = float(np.log(2.0))
-_NEAR = (-0.12, 0.12)  # on finer cells, where the coarser ones have looked farther
-_THOROUGH = 2  # times the iterations of other refits: everything is compared with the declared physics
+_SHAPES = (TWIST_RATIO, BENDING_RATIO)
+_THOROUGH = 2  # times the iterations of other fits: everything is compared with the declared physics
 _SLOWEST = 12.0  # times the cost of the declared physics that a run may take: strong friction is dear
+_RICHARDSON = {"finer cells": 2.04, "half the time step": 1.33}  # error over difference, of second order
 
 
 def trace(
@@ -138,13 +108,7 @@ def trace(
         simulations, twin, runs = begin.calibrated(recordings, None, None)
         runs += looked
     clock = Clock(begun, config.time_limit_s, begin.ledger)
-    kind: type[_Trace] = _Trace
-    if config.method == "evidence":
-        from physworld.trace.evidence.inference import Inference  # it goes on from the class below
-
-        kind = Inference
-    work = kind(recordings, config, simulations, twin, faults, clock)
-    result = work.run()
+    result = _Trace(recordings, config, simulations, twin, faults, clock).run()
     stages = tuple(Stage(name, *cost) for name, cost in begin.ledger.spent.items())
     return replace(
         result,
@@ -153,6 +117,18 @@ def trace(
         stages=stages,
         notes=(*begin.notes, *result.notes),
     )
+
+
+@dataclass(frozen=True)
+class _Ground:
+    """What is known before hypotheses: whiteners without and with the solver's doubt, noise [m], numerics."""
+
+    bare: Whitener
+    white: Whitener
+    discrepancy: Discrepancy
+    sigma: float | None
+    numerics: dict[str, float]
+    finer: Twin
 
 
 class _Trace:
@@ -170,117 +146,173 @@ class _Trace:
         self.recordings, self.lead, self.clock = recordings, recordings.lead.scene, clock
         self.scene, self.split = recordings.scene, recordings.split
         self.config, self.simulations = config, simulations
-        self.frames, self.twin = self.split.train[1], twin
+        # what a rod loses is an effect here
+        self.frames, self.twin = self.split.train[1], lossless(twin) if twin.form is RODS else twin
         self.faults = "; ".join(known.words for known in faults if known)
         self.notes = [f"left out as faulty sightings: {self.faults}"] if self.faults else []
 
     def run(self) -> TraceResult:
         config, simulations = self.config, self.simulations
-        level = 1.0
-        while True:
-            simulations.stage = "declared physics"
-            simulations.least_step_s = stage_s(self.twin, simulations.drive) / _SLOWEST
-            tracks, answers = simulations.first_look(Job(self.twin, self.frames))
-            sigma = noise_sigma(self.scene, self.split, tracks)
-            scale = sigma or self._rms(tracks) or 1e-3
-            white = whitener(self.scene, self.split, scale, answers)
-            white = white.knowing(self._turns(tracks, scale))
-            simulations.stage = "numerics"
-            budget = config.calibration.particle_budget
-            directions, finer = numerical_directions(
-                simulations, self.lead, self.twin, tracks, budget, config.refinement, level
-            )
-            block_of_row = self.split.block_of(white.frame_of_row)
-            others = _OTHER_STIFFNESSES if level == 1.0 else _NEAR
-            declared = self._declared(
-                white, block_of_row, others if self.twin.lattice.smooth else (*others, *_MESH_STIFFNESSES)
-            )
-            basis = orthonormal(declared.fitted.free_jacobian)
-            shifts = [project(basis, white.change(direction)) for direction in directions.values()]
-            numerics = {
-                n: float(np.sqrt(np.mean(shift**2))) for n, shift in zip(directions, shifts, strict=True)
-            }
-            if not self._too_coarse(numerics, finer):
-                break
-            level *= config.refinement
-            self.twin = refinement_of(declared.fitted.twin, finer)
-        if isinstance(self.twin.lattice, TriangleLattice):
-            self.notes.append(f"taken as a mesh that another engine recorded, {self.twin.lattice.mesh}")
-        self.notes += remarks(sigma, config.noise_m is not None, numerics)
-        if level > 1.0:
-            self.notes.append(f"cells {level:.3g} times smaller than asked for: coarser ones change too much")
-        solver = orthonormal(np.stack(shifts, axis=1)) if shifts else basis[:, :0]
-        resolved = float(np.sqrt(np.mean(project(solver, project(basis, declared.fitted.residual)) ** 2)))
+        ground = self._ground()
+        declared = self._declared(ground)
         chosen, refused = candidates(declared.fitted.twin, config.candidates)
-        simulations.stage = "sensitivities"
-        responses = candidate_responses(
-            simulations, white, declared.fitted.twin, declared.fitted.tracks, chosen, self.frames
+        setting = self._setting(ground, declared.fitted.twin, declared.fitted.unknowns)
+        early = early_part(ground.bare, self.split)
+        search = Search(
+            setting, chosen, early, config.confirmed, config.additions, config.effects_at_most, config.seed
         )
-        usable = [response for response in responses if not response.failed]
-        refused |= {r.candidate.label: "its simulation cannot be trusted" for r in responses if r.failed}
-        setting = (simulations, white, block_of_row, self.frames, config)
-        selection = Selection(*setting)
         self.clock.start()
-        with self.clock.until(SELECTION):
-            path = selection.path(declared, usable)
-        models = [model for step in path for model in step.tried]
-        facts = (solver, block_of_row, lambda model: by_chance(model, path[0].scores))
-        real = claimable(declared, models, config, *facts)
-        second = SecondResolution(*setting, finer, numerics.get("finer cells", 0.0))
-        mixed = None
-        with self.clock.until(CONFIRMATION):
-            finer_values, agreement = second.check(declared, real)
-            single = self._complete(declared, real, agreement)
-            with simulations.time_permitting("refit of mixtures"):
-                mixed = single and Mixtures(selection, second).beside(single, usable, finer_values, agreement)
-        if mixed and mixed.kept:  # of the others only what may not be named still counts
-            path = (*path, mixed)
-            models = [mixed.kept, *(model for model in models if implausible(model) is not None)]
-        tried = len({c.effect for c in chosen})
-        verdict = decide(declared, models, basis, agreement, resolved, config, tried, *facts)
-        if sigma is None:
-            verdict = Verdict(UNEXPLAINED, declared, (), "no noise estimate, no claim: " + verdict.reason)
+        with self.clock.until(SEARCH):
+            search.run(declared)
+        known, weights = search.admitted(), search.weights()
+        verdict = decided(known, weights, ground.sigma, ground.numerics, search.library)
         if self.faults and verdict.name == NOTHING:
             reason = f"faulty sightings ({self.faults}); of the others {verdict.reason}"
-            verdict = Verdict(DATA, declared, (), reason)
-        verdict = self.clock.told(verdict, declared, agreement)
-        found = self._result(
-            verdict, declared, white, block_of_row, sigma, path, chosen, refused, numerics, finer_values
-        )
-        experiment, notes = None, found.notes
+            verdict = Verdict(FAULTY, declared, (), reason)
+        verdict = self.clock.told(verdict)
+        if isinstance(self.twin.lattice, TriangleLattice):
+            self.notes.append(f"taken as a mesh that another engine recorded, {self.twin.lattice.mesh}")
+        self.notes += remarks(ground.sigma, config.noise_m is not None, ground.numerics)
+        simulations.stage = "held-out frames"
+        measured = Outcomes(self.recordings, simulations, config)
+        outcomes = measured.of(declared, verdict.model, ground.white, ground.sigma)
+        unseen = [o for o in outcomes if o.role == HELD_OUT] or [o for o in outcomes if o.role == FITTED]
+        held_out = measured.together(unseen, ground.sigma)
+        shares = self._shares(verdict, declared, held_out, measured, ground)
+        spreads = [
+            spread_of(m, ground.discrepancy, config.bootstraps, config.seed)
+            for m in (verdict.model, *verdict.equivalent)
+        ]
+        claimed = verdict.name not in (NOTHING, UNEXPLAINED)
+        after = side_by_side([o.after for o in outcomes if o.role == FITTED], self.scene.frame_count)
+        remainder_m, remainder = describe(self.scene, after, self.split.train, ground.white.sigma)
+        experiment = None
         with self.clock.until(EXPERIMENT), simulations.time_permitting("experiment"):
-            experiment = self._experiment(verdict, white, finer)
+            experiment = self._experiment(verdict, ground)
         if simulations.ledger.cut[-1:] == ["experiment"]:
-            notes = (*notes, "time was up before an experiment was found that would tell these apart")
-        return replace(found, experiment=experiment, notes=notes)
+            self.notes.append("time was up before an experiment was found that would tell these apart")
+        return TraceResult(
+            scene=self.lead.name,
+            verdict=verdict,
+            effects=named(verdict.model, spreads[0]) if claimed else (),
+            equivalent=tuple(named(m, s) for m, s in zip(verdict.equivalent, spreads[1:], strict=True)),
+            calibrated=calibrated(spreads[0].numbers()),
+            declared=declared,
+            split=self.recordings.lead.split,
+            sigma=ground.sigma,
+            path=search.steps,
+            candidates=chosen,
+            refused=refused,
+            numerics=ground.numerics,
+            before=outcomes[0].before,
+            after=outcomes[0].after,
+            held_out=held_out,
+            remainder_m=remainder_m,
+            remainder=remainder,
+            simulations=0,
+            seconds=0.0,
+            experiment=experiment,
+            notes=(*self.notes, *measured.notes),
+            recordings=tuple(outcomes),
+            supported=_supported(known, weights),
+            shares=shares,
+        )
 
-    def _complete(
-        self, declared: Model, real: list[Model], agreement: dict[tuple[str, ...], bool]
-    ) -> Model | None:
-        """What would be named, where it leaves so little that a second effect is not looked for."""
-        ordered = simplest_first(real, declared)
-        best = next((model for model in ordered if agreement.get(model.names)), None)
-        finer = self.twin.lattice.smooth  # a mesh of triangles has no finer cells to ask
-        return best if best and finer and best.fitted.misfit <= self.config.near_floor else None
+    def _ground(self) -> _Ground:
+        """Noise, what the solver does not know of itself, and the discrepancy that every hypothesis has."""
+        simulations = self.simulations
+        simulations.stage = "declared physics"
+        simulations.least_step_s = stage_s(self.twin, simulations.drive) / _SLOWEST
+        tracks, answers = simulations.first_look(Job(self.twin, self.frames))
+        sigma = noise_sigma(self.scene, self.split, tracks)
+        scale = sigma or self._rms(tracks) or 1e-3
+        bare = whitener(self.scene, self.split, scale, answers)
+        simulations.stage = "numerics"
+        budget = self.config.calibration.particle_budget
+        directions, finer = numerical_directions(
+            simulations, self.lead, self.twin, tracks, budget, self.config.refinement
+        )
+        numerics = {n: float(np.sqrt(np.mean(bare.change(d) ** 2))) for n, d in directions.items()}
+        doubt = [_RICHARDSON[n] * d for n, d in directions.items() if n in _RICHARDSON]
+        white = bare.knowing([*self._turns(tracks, scale), *doubt])
+        counts = [r.points.stop - r.points.start for r in self.recordings.fitted]
+        owners = np.repeat(np.arange(len(counts)), counts)
+        places = np.nan_to_num(self.scene.points[0])
+        discrepancy = discrepancy_of(white, self.split, self.scene.times, places, owners, tracks)
+        return _Ground(bare, white, discrepancy, sigma, numerics, finer)
 
-    def _rms(self, tracks: Array) -> float:
-        """Root mean squared residual of the sightings per axis [m]."""
-        seen = self.scene.visible[: self.frames]
-        return float(np.sqrt(np.mean((tracks - self.scene.points[: self.frames])[seen] ** 2)))
+    def _declared(self, ground: _Ground) -> Hypothesis:
+        """The declared physics under noise and discrepancy."""
+        self.simulations.stage = "declared physics"
+        unknowns = self._unknowns()
+        thorough = replace(
+            self._setting(ground, self.twin, unknowns), iterations=_THOROUGH * self.config.iterations
+        )
+        declared = thorough.fitted((), {u.name: u.start for u in unknowns}, _other_places(unknowns))
+        if declared is None:
+            raise RuntimeError("the calibrated twin cannot be simulated again")
+        return declared
 
-    def _experiment(self, verdict: Verdict, white: Whitener, finer: Twin) -> Experiment | None:
-        """What would tell the models of an equivalent set apart."""
+    def _setting(self, ground: _Ground, twin: Twin, unknowns: Sequence[Unknown]) -> Setting:
+        known = (self.simulations, ground.white, ground.discrepancy, self.frames, self.config.iterations)
+        return Setting(*known, twin, unknowns)
+
+    def _unknowns(self) -> list[Unknown]:
+        """What is calibrated beside effects."""
+        if self.twin.form is RODS:
+            rod = rod_parameters(self.lead, self.twin)
+            return [of_parameter(p, self.twin, p.prior) for p in rod if p.name not in LOSSES]
+        body, ground = self.lead.body, self.lead.ground
+        known = parameters_of(
+            self.twin,
+            separate_bending=body.thickness_m is None and body.size_m is None,
+            damping=False,
+            ground_friction=ground is not None and ground.friction is None,
+        )
+        found = [
+            of_parameter(p, self.twin, KNOWN_BEFOREHAND.get(p.name))
+            for p in known
+            if p.name != BENDING_COUPLING
+        ]
+        return [*found, *hold_unknowns(self.twin)]
+
+    def _shares(
+        self, verdict: Verdict, declared: Hypothesis, held_out: HeldOut, measured: Outcomes, ground: _Ground
+    ) -> dict[str, float]:
+        """Share of the held-out error that each effect of the answer takes away, by name; together what all take.
+
+        What an effect takes is the error that comes back when it alone is closed, the other numbers as they are.
+        """
+        model = verdict.model
+        if verdict.name in (NOTHING, UNEXPLAINED) or not model.members:
+            return {}
+        whole = (held_out.before - held_out.after) / held_out.before
+        if len(model.members) == 1:
+            return {model.names[0]: whole}
+        back = {}
+        for name in model.names:
+            twin = model.fitted.twin
+            kept = tuple(e for e in twin.effects if e.name != name)
+            without = replace(model, fitted=replace(model.fitted, twin=replace(twin, effects=kept)))
+            outcomes = measured.of(declared, without, ground.white, ground.sigma)
+            unseen = [o for o in outcomes if o.role == HELD_OUT] or [o for o in outcomes if o.role == FITTED]
+            back[name] = max(measured.together(unseen, ground.sigma).after - held_out.after, 0.0)
+        total = sum(back.values())
+        return {name: whole * part / total if total > 0 else whole / len(back) for name, part in back.items()}
+
+    def _experiment(self, verdict: Verdict, ground: _Ground) -> Experiment | None:
+        """What would tell the hypotheses of an equivalent set apart."""
         if not verdict.equivalent or self.config.experiment is None:
             return None
-        models = (verdict.model, *verdict.equivalent)
-        left = max(model.fitted.misfit for model in models)
+        rivals = (verdict.model, *verdict.equivalent)
+        left = max(rival.fitted.misfit for rival in rivals)
         return propose(
             self.lead,
-            [rival_of(model) for model in models],
-            white.sigma,
+            [rival_of(rival) for rival in rivals],
+            ground.white.sigma,
             discrepancy=float(np.sqrt(max(left**2 - 1.0, 0.0))),
-            finer=finer,
-            cost=lambda twin: self._cost(twin, white),
+            finer=ground.finer,
+            cost=lambda twin: self._cost(twin, ground.white),
             config=self.config.experiment,
             simulations=self.simulations,
         )
@@ -290,43 +322,10 @@ class _Trace:
         tracks = self.simulations.run([Job(twin, self.frames)])[0]
         return float("inf") if tracks is None else float(np.sum(white.residual(tracks) ** 2))
 
-    def _too_coarse(self, numerics: dict[str, float], finer: Twin) -> bool:
-        """Whether finer cells change what counts, and can be afforded."""
-        if len(self.recordings.fitted) > 1 or self.recordings.held_out:
-            return False  # their other twins stay on the cells that were asked for
-        drive = self.simulations.drive
-        steps = float(drive.times[self.frames - 1] - drive.times[0]) / stage_s(finer, drive)
-        cost = finer.lattice.fill.size * steps
-        return numerics.get("finer cells", 0.0) > self.config.resolved and cost <= self.config.affordable
-
-    def _declared(self, white: Whitener, block_of_row: Array, shifts: tuple[float, ...]) -> Model:
-        """The declared physics under the trace's own misfit."""
-        self.simulations.stage = "declared physics"
-        unknowns = self._calibrated_unknowns(self.twin)
-        own = np.array([u.start for u in unknowns])
-        axes = dict(zip([u.name for u in unknowns], np.eye(len(own)), strict=True))
-        starts = [own + shift * axes[unknowns[0].name] for shift in shifts]
-        if TWIST_RATIO in axes:  # how stiff a sheet is in twist decides in which basin its stiffness lies
-            starts += [start + _OTHER_TWIST * axes[TWIST_RATIO] for start in [own, *starts]]
-        iterations = _THOROUGH * self.config.iterations
-        fitted = refit(self.simulations, white, self.twin, unknowns, self.frames, iterations, starts)
-        if fitted is None:
-            raise RuntimeError("the calibrated twin cannot be simulated again")
-        fitted = held_otherwise(fitted, self.simulations, white, self.frames, self.config.iterations)
-        return Model((), fitted, cross_validated(fitted, block_of_row))
-
-    def _calibrated_unknowns(self, twin: Twin) -> list[Unknown]:
-        body, ground = self.lead.body, self.lead.ground
-        known = parameters_of(
-            twin,
-            separate_bending=body.thickness_m is None and body.size_m is None,
-            damping=False,
-            ground_friction=ground is not None and ground.friction is None,
-        )
-        found = [
-            of_parameter(p, twin, KNOWN_BEFOREHAND.get(p.name)) for p in known if p.name != BENDING_COUPLING
-        ]
-        return [*found, *hold_unknowns(twin)]
+    def _rms(self, tracks: Array) -> float:
+        """Root mean squared residual of the sightings per axis [m]."""
+        seen = self.scene.visible[: self.frames]
+        return float(np.sqrt(np.mean((tracks - self.scene.points[: self.frames])[seen] ** 2)))
 
     def _turns(self, tracks: Array, sigma: float) -> list[Array]:
         """What the uncertain pose of the start does to the prediction, (frames, N, 3) each."""
@@ -335,53 +334,21 @@ class _Trace:
         jobs = [Job(turned, self.frames) for turned in turned_starts(self.lead, self.twin, sigma)]
         return [found - tracks for found in self.simulations.run(jobs) if found is not None]
 
-    def _result(
-        self,
-        verdict: Verdict,
-        declared: Model,
-        white: Whitener,
-        block_of_row: Array,
-        sigma: float | None,
-        path: tuple[Step, ...],
-        chosen: list[Candidate],
-        refused: dict[str, str],
-        numerics: dict[str, float],
-        finer: dict[tuple[str, ...], dict[str, float]],
-    ) -> TraceResult:
-        config, simulations = self.config, self.simulations
-        simulations.stage = "held-out frames"
-        measured = Outcomes(self.recordings, simulations, config)
-        outcomes = measured.of(declared, verdict.model, white, sigma)
-        spreads = [
-            spread_of(m.fitted, block_of_row, finer.get(m.names, {}), config.bootstraps, config.seed)
-            for m in (verdict.model, *verdict.equivalent)
-        ]
-        claimed = verdict.name not in (NOTHING, UNEXPLAINED)
-        unseen = [o for o in outcomes if o.role == HELD_OUT]
-        held_out = measured.together(unseen or [o for o in outcomes if o.role == FITTED], sigma)
-        after = side_by_side([o.after for o in outcomes if o.role == FITTED], self.scene.frame_count)
-        remainder_m, remainder = describe(self.scene, after, self.split.train, white.sigma)
-        return TraceResult(
-            scene=self.lead.name,
-            verdict=verdict,
-            effects=named(verdict.model, spreads[0]) if claimed else (),
-            equivalent=tuple(named(m, s) for m, s in zip(verdict.equivalent, spreads[1:], strict=True)),
-            calibrated=calibrated(spreads[0].numbers()),
-            declared=declared,
-            split=self.recordings.lead.split,
-            sigma=sigma,
-            path=path,
-            candidates=chosen,
-            refused=refused,
-            numerics=numerics,
-            finer=finer,
-            before=outcomes[0].before,
-            after=outcomes[0].after,
-            held_out=held_out,
-            remainder_m=remainder_m,
-            remainder=remainder,
-            simulations=0,
-            seconds=0.0,
-            notes=(*self.notes, *measured.notes),
-            recordings=tuple(outcomes),
-        )
+
+def _supported(known: list[Hypothesis], weights: Array) -> tuple[Supported, ...]:
+    ordered = sorted(zip(weights, known, strict=True), key=lambda pair: -pair[0])
+    return tuple(
+        Supported(h.names, float(w), h.fitted.misfit, float(np.sqrt(h.left)), h.evidence.kappa)
+        for w, h in ordered
+    )
+
+
+def _other_places(unknowns: list[Unknown]) -> list[dict[str, float]]:
+    """Where the declared physics is looked for beside where it was calibrated: over its stiffness, for a phase that has
+    slipped by a period is a local minimum; and over that again from the other shapes of its stiffness, one deviation
+    of their priors away, which decide in which of these minima it lies.
+    """
+    own, first = {u.name: u.start for u in unknowns}, unknowns[0].name
+    shapes = [u for u in unknowns[1:] if u.prior is not None and u.transform is LOG and u.name in _SHAPES]
+    bases = [own, *({**own, u.name: own[u.name] + u.prior[1]} for u in shapes if u.prior is not None)]
+    return [{**base, first: own[first] + shift} for base in bases for shift in (*_OTHER_STIFFNESSES, 0.0)]

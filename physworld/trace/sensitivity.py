@@ -1,4 +1,4 @@
-"""What every unknown does to the prediction, one simulation each; what the numerics do; what decoys would do."""
+"""What every unknown does to the prediction, one simulation each; what the numerics do."""
 
 from __future__ import annotations
 
@@ -74,56 +74,21 @@ def numerical_directions(
     base: Array,
     budget: int,
     refinement: float,
-    level: float = 1.0,
 ) -> tuple[dict[str, Array], Twin]:
     """Changes of the prediction (frames, N, 3) that are the solver's own, by name; and the twin on finer cells.
 
     Of a mesh of triangles the cells are what is supposed of the recording: it has no finer ones, and is its own.
 
-    Args:
-        level: cells of ``twin`` are this many times smaller than the budget says.
     """
     frames = len(base)
     finer = twin
     variants = {"half the time step": Job(twin, frames, 0.5)}
     if twin.lattice.smooth:
-        finer = refined(scene, twin, budget, level * refinement)
-        coarser = refined(scene, twin, budget, level / refinement)
+        finer = refined(scene, twin, budget, refinement)
+        coarser = refined(scene, twin, budget, 1.0 / refinement)
         variants = {"finer cells": Job(finer, frames), "coarser cells": Job(coarser, frames), **variants}
     found = zip(variants, simulations.run(list(variants.values())), strict=True)
     return {name: tracks - base for name, tracks in found if tracks is not None}, finer
-
-
-def decoys(
-    responses: list[Response], whitener: Whitener, tracks_shape: tuple[int, int], count: int, seed: int
-) -> list[Array]:
-    """Sensitivities that are none, (M, 1): smooth in time and over the points, with the spectra of real ones.
-
-    Phases of a real sensitivity's time courses are drawn anew for every point pattern, which leaves the size, the
-    slowness and the shapes, and takes away every relation to what was measured.
-
-    Args:
-        responses: of real candidates.
-        whitener: of the residuals (M,).
-        tracks_shape: training frames and points.
-        count: decoys.
-        seed: of their phases.
-    """
-    rng = np.random.default_rng(seed)
-    frames, points = tracks_shape
-    usable = [r.columns[:, 0] for r in responses if not r.failed and np.any(r.columns[:, 0])]
-    made = []
-    for number in range(count if usable else 0):
-        source = usable[number * len(usable) // count]
-        field = np.zeros((frames, points, 3))
-        field[whitener.visible] = source.reshape(-1, 3)
-        u, s, vt = np.linalg.svd(field.reshape(frames, -1), full_matrices=False)
-        spectrum = np.fft.rfft(u * s, axis=0)
-        turn = np.exp(2j * np.pi * rng.uniform(size=spectrum.shape))
-        turn[0] = rng.choice([-1.0, 1.0], size=turn.shape[1])
-        fresh = np.fft.irfft(spectrum * turn, n=frames, axis=0) @ vt
-        made.append(fresh.reshape(frames, points, 3)[whitener.visible].reshape(-1, 1))
-    return made
 
 
 def refinement_of(twin: Twin, finer: Twin) -> Twin:

@@ -71,12 +71,6 @@ def _parser() -> argparse.ArgumentParser:
         help="after about so long searches are left and the answer is made of what there is; 0: never",
     )
     parser.add_argument(
-        "--method",
-        choices=("selection", "evidence"),
-        default="selection",
-        help="how it decides: effect by effect by rules, or by one likelihood with a posterior for every set",
-    )
-    parser.add_argument(
         "--noise",
         type=_metres,
         default=None,
@@ -124,9 +118,7 @@ def _trace(given: argparse.Namespace) -> None:
     scenes = [read_scene(path) for path in given.scenes]
     held_out = [read_scene(path) for path in given.held_out]
     scene = scenes[0]
-    config = TraceConfig(
-        time_limit_s=60.0 * given.time_limit or None, noise_m=given.noise, method=given.method
-    )
+    config = TraceConfig(time_limit_s=60.0 * given.time_limit or None, noise_m=given.noise)
     if given.particles is not None:
         config = replace(config, calibration=replace(config.calibration, particle_budget=given.particles))
     if given.mesh is not None:
@@ -137,7 +129,7 @@ def _trace(given: argparse.Namespace) -> None:
         journal = journal_in(
             given.resume / "calibration.json",
             scene,
-            f"{config.calibration}{given.noise or ''}{'' if given.method == 'selection' else given.method}",
+            f"{config.calibration}{given.noise or ''}",
         )
     pool = Workers(given.processes) if given.processes > 1 else nullcontext(in_turn)
     with progress_bar(f"trace {scene.name}") as shown, pool as runner:

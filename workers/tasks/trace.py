@@ -38,12 +38,10 @@ if TYPE_CHECKING:
 _PLATE = 1e-6  # relative difference to a homogeneous plate of the declared thickness that is rounding
 _STAGES = (  # of a trace, with the share of its work that is done when one begins
     ("declared physics", 0.35),
-    ("numerics", 0.45),
-    ("sensitivities", 0.5),
-    ("refit", 0.6),
-    ("second resolution", 0.85),
-    ("experiment", 0.9),
-    ("held-out", 0.97),
+    ("numerics", 0.4),
+    ("fit with", 0.55),
+    ("held-out", 0.9),
+    ("experiment", 0.92),
 )
 
 
@@ -109,7 +107,7 @@ def translate(fit: FitConfig, config: WireConfig, device: str) -> TraceConfig:
         effects_at_most=config.effects_at_most,
         confirmed=config.confirmed,
         iterations=config.iterations,
-        resamples=config.resamples,
+        bootstraps=config.resamples,
         time_limit_s=config.time_limit_s,
         noise_m=config.noise_m,
         seed=config.seed,

@@ -42,7 +42,7 @@ REPORT: dict[str, Any] = {
     "suggested_experiment": None,
     "seconds": 1.5,
     "simulations": 40,
-    "decoys": [0.001],
+    "hypotheses": [{"effects": ["air_drag_linear"], "posterior": 0.97}],
 }
 TRACKS = {
     "times": np.arange(3) / 30.0,

@@ -14,7 +14,7 @@ from physworld.errors import Cancelled
 from physworld.trace.check import INVISIBLE, VISIBLE, check, document
 from physworld.trace.check.information import POSTERIOR, POWER, Information
 from physworld.trace.check.run import CheckResult
-from physworld.trace.evidence.discrepancy import Block, Discrepancy
+from physworld.trace.discrepancy import Block, Discrepancy
 
 pytestmark = pytest.mark.slow
 

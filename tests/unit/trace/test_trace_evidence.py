@@ -1,4 +1,4 @@
-"""The likelihood of a trace by evidence against dense Gaussians, its posterior, and one trace from beginning to end."""
+"""The likelihood of a trace against dense Gaussians, its posterior, and one trace from beginning to end."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
 from physworld.estimation.unknowns import Unknown
-from physworld.trace.evidence.discrepancy import Block, Discrepancy
-from physworld.trace.evidence.inference import decided
-from physworld.trace.evidence.likelihood import Linear, evidence, marginal
-from physworld.trace.evidence.posterior import HALF, posterior, removes
+from physworld.trace.answer import decided
+from physworld.trace.discrepancy import Block, Discrepancy
+from physworld.trace.likelihood import Linear, evidence, marginal
+from physworld.trace.posterior import HALF, posterior, removes
 
 SIGMA = 1e-3
 
@@ -130,13 +130,13 @@ def test_an_effect_removes_a_share_of_what_is_above_the_noise() -> None:
 
 
 @pytest.mark.slow
-def test_a_trace_by_evidence_names_a_drag_and_tells_what_is_left() -> None:
+def test_a_trace_names_a_drag_and_tells_what_is_left() -> None:
     from test_trace_run import CONFIG, beam, recorded
 
     from physworld.effects.registry import effect
     from physworld.trace import document, trace
 
-    config = replace(CONFIG, method="evidence", experiment=None)
+    config = replace(CONFIG, experiment=None)
     found = trace(recorded(beam(0.03), effect("air_drag_linear", rate_per_s=6.0)), config)
     report = document(found)
     assert found.verdict.name == "named" and [e.name for e in found.effects] == ["air_drag_linear"]
@@ -148,12 +148,12 @@ def test_a_trace_by_evidence_names_a_drag_and_tells_what_is_left() -> None:
 
 
 @pytest.mark.slow
-def test_a_trace_by_evidence_names_nothing_where_nothing_acts() -> None:
+def test_a_trace_names_nothing_where_nothing_acts() -> None:
     from test_trace_run import CONFIG, SIGMA, beam, recorded
 
     from physworld.trace import trace
 
-    found = trace(recorded(beam(0.015), sigma=2 * SIGMA), replace(CONFIG, method="evidence", experiment=None))
+    found = trace(recorded(beam(0.015), sigma=2 * SIGMA), replace(CONFIG, experiment=None))
     assert found.verdict.name == "nothing_to_explain" and not found.effects
 
 
@@ -173,7 +173,6 @@ def test_no_other_name_is_given_where_something_unbelievable_predicts_best(
 
     gale = known("wind", 1.0, "a wind of 60 m/s is not believed")
     hypotheses = [known(None, 4.0), known("air_drag_linear", 1.1), gale]
-    white: Any = SimpleNamespace(sigma=1e-3)
-    found = decided(hypotheses, np.array(weights), 1e-3, white, {}, 20)
+    found = decided(hypotheses, np.array(weights), 1e-3, {}, 20)
     assert found.name == name and not found.equivalent
     assert ("not believed" in found.reason) == (weights[2] > 0.9)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from sagging_bar import BUDGET, sagging
@@ -10,7 +13,8 @@ from physworld.effects.registry import effect
 from physworld.estimation.refit import Refit
 from physworld.estimation.unknowns import Unknown
 from physworld.trace.candidates import candidates
-from physworld.trace.intervals import spread_of
+from physworld.trace.discrepancy import Block, Discrepancy
+from physworld.trace.intervals import Spread, spread_of
 from physworld.twin.build import build_twin
 
 ROWS = 60
@@ -29,6 +33,14 @@ def line(noise: float = 1.0) -> Refit:
     return Refit(unknowns, build_twin(sagging(), BUDGET), np.array([0.3, 2.0]), np.empty(0), left, slopes)
 
 
+def spread(fitted: Refit, blocks: int, resamples: int) -> Spread:
+    """Under blocks of equal size, without a discrepancy."""
+    rows = np.array_split(np.arange(len(fitted.residual)), blocks)
+    parts = tuple(Block(own, np.zeros((len(own), 0)), np.zeros(0)) for own in rows)
+    model: Any = SimpleNamespace(fitted=fitted, evidence=SimpleNamespace(kappa=0.0))
+    return spread_of(model, Discrepancy(parts, 1e-3, 0.1), resamples, 0)
+
+
 @pytest.mark.parametrize("blocks", [1, 2, 12])
 @pytest.mark.parametrize("noise", [0.5, 3.0])
 def test_an_interval_is_as_wide_as_the_noise_leaves_it_however_few_the_blocks(
@@ -36,21 +48,20 @@ def test_an_interval_is_as_wide_as_the_noise_leaves_it_however_few_the_blocks(
 ) -> None:
     fitted = line(noise)
     deviation = np.sqrt(np.diag(np.linalg.inv(fitted.jacobian.T @ fitted.jacobian))) * max(1.0, fitted.misfit)
-    found = spread_of(fitted, np.arange(ROWS) * blocks // ROWS, {}, 500, 0).numbers()
-    for name, value, spread in zip(("offset", "slope"), (0.3, 2.0), deviation, strict=True):
+    found = spread(fitted, blocks, 500).numbers()
+    for name, value, own in zip(("offset", "slope"), (0.3, 2.0), deviation, strict=True):
         low, high = found[name].ci95
-        assert low <= value - 1.95 * spread and high >= value + 1.95 * spread
-        assert high - low < 8 * spread
+        assert low <= value - 1.95 * own and high >= value + 1.95 * own
+        assert high - low < 8 * own
 
 
 def test_a_number_that_the_data_do_not_see_may_be_anything_within_its_bounds() -> None:
     fitted = line()
     fitted.jacobian[:, 1] = 0.0
-    assert spread_of(fitted, np.zeros(ROWS, dtype=int), {}, 100, 0).numbers()["slope"].ci95 == (-50.0, 50.0)
+    assert spread(fitted, 1, 100).numbers()["slope"].ci95 == (-50.0, 50.0)
 
 
-@pytest.mark.parametrize("finer", [{}, {"gravity_tilt.tilt_y_rad": 0.06}])
-def test_what_the_numbers_imply_has_an_interval_too(finer: dict[str, float]) -> None:
+def test_what_the_numbers_imply_has_an_interval_too() -> None:
     tilt, deviation = np.array([0.03, 0.04]), np.array([0.002, 0.004])
     twin = build_twin(sagging(), BUDGET).with_effect(
         effect("gravity_tilt", tilt_x_rad=tilt[0], tilt_y_rad=tilt[1])
@@ -62,10 +73,22 @@ def test_what_the_numbers_imply_has_an_interval_too(finer: dict[str, float]) -> 
     left = rng.normal(size=4000)
     left -= slopes @ np.linalg.lstsq(slopes, left, rcond=None)[0]
     fitted = Refit(gates, twin, tilt / probes, np.empty(0), left, slopes)
-    angle = spread_of(fitted, np.arange(4000) // 100, finer, 2000, 0).derived("gravity_tilt")["tilt_deg"]
+    angle = spread(fitted, 40, 2000).derived("gravity_tilt")["tilt_deg"]
     assert angle.value == pytest.approx(np.degrees(0.05)) and angle.unit == "deg"
-    spread = np.degrees(np.linalg.norm(tilt / 0.05 * deviation))
+    own = np.degrees(np.linalg.norm(tilt / 0.05 * deviation))
     low, high = angle.ci95
-    assert low == pytest.approx(angle.value - 1.96 * spread, abs=0.15 * spread)
-    there = angle.value + np.degrees(0.8 * 0.02) if finer else angle.value + 1.96 * spread
-    assert high == pytest.approx(there, abs=0.15 * spread)
+    assert low == pytest.approx(angle.value - 1.96 * own, abs=0.15 * own)
+    assert high == pytest.approx(angle.value + 1.96 * own, abs=0.15 * own)
+
+
+def test_an_interval_under_a_discrepancy_is_that_of_generalised_least_squares() -> None:
+    fitted, kappa = line(), 2e-3
+    basis = np.linalg.qr(np.stack([np.ones(ROWS), TIMES], axis=1))[0]  # looks like an offset and a slope
+    factors = np.array([900.0, 300.0])
+    model: Any = SimpleNamespace(fitted=fitted, evidence=SimpleNamespace(kappa=kappa))
+    block = Block(np.arange(ROWS), basis, factors)
+    found = spread_of(model, Discrepancy((block,), 1e-3, 0.1), 100, 0)
+    dense = np.linalg.inv(np.eye(ROWS) + kappa**2 * basis @ np.diag(factors**2) @ basis.T)
+    expected = np.linalg.inv(fitted.jacobian.T @ dense @ fitted.jacobian)
+    misfit = max(1.0, float(fitted.residual @ dense @ fitted.residual) / ROWS)
+    np.testing.assert_allclose(found.covariance, misfit * expected, rtol=1e-6)

@@ -60,10 +60,9 @@ def test_a_viscosity_that_hides_behind_a_drag_is_found() -> None:
     strengths = {e.name: next(iter(e.parameters.values())).value for e in found.effects}
     assert strengths["air_drag_linear"] == pytest.approx(RATE_PER_S, rel=0.25)
     assert strengths["viscosity_kelvin_voigt"] == pytest.approx(VISCOSITY_PA_S, rel=0.35)
-    assert found.path[0].kept.fitted.misfit < CONFIG.near_floor  # one alone would have been complete
     report = document(found)
     assert [effect["name"] for effect in report["effects"]] == ["air_drag_linear", "viscosity_kelvin_voigt"]
-    assert len(found.path) == 2 and found.path[1].kept is found.verdict.model
+    assert report["path"][1]["kept"] == ["air_drag_linear", "viscosity_kelvin_voigt"]
     assert report["held_out"]["after"] < 1.3 * SIGMA
 
 

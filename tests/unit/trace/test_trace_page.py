@@ -75,19 +75,20 @@ def report(**given: Any) -> dict[str, Any]:
         ],
         "equivalent": [],
         "candidates": [
-            {"name": "air_drag_linear", "variant": None, "score": 0.8, "threshold": 0.3, "p_value": 0.0005,
-             "selected": True, "absorbed": 0.25},
-            {"name": "tether", "variant": "towards +0 +1 +0", "score": 0.0, "threshold": 0.3, "p_value": 1.0,
-             "selected": False, "absorbed": None},
+            {"name": "air_drag_linear", "variant": None, "score": 0.8, "threshold": 0.3,
+             "selected": True},
+            {"name": "tether", "variant": "towards +0 +1 +0", "score": 0.0, "threshold": 0.3,
+             "selected": False},
         ],
         "refused": {"ground_friction": "no ground"},
-        "decoys": [0.01, 0.02],
         "path": [{"base": [], "threshold": 0.3, "scores": [{"name": "air_drag_linear", "score": 0.8}],
                   "tried": [{"effects": ["air_drag_linear"], "variants": [""], "misfit": 1.08, "left_out_error": 1.17,
                              "values": {"youngs_modulus_pa": 4e4, "air_drag_linear.rate_per_s": 1.48}}],
                   "kept": ["air_drag_linear"]}],
-        "training": {"misfit_before": 5.1, "misfit_after": 1.08, "numerics": {"finer cells": 0.1},
-                     "second_resolution": {"air_drag_linear": {"air_drag_linear.rate_per_s": 1.5}}},
+        "training": {"misfit_before": 5.1, "misfit_after": 1.08, "numerics": {"finer cells": 0.1}},
+        "hypotheses": [{"effects": ["air_drag_linear"], "posterior": 0.973, "misfit": 1.08, "left_out": 1.17,
+                        "discrepancy_m": 0.0},
+                       {"effects": [], "posterior": 0.027, "misfit": 5.1, "left_out": 5.3, "discrepancy_m": 0.002}],
         "held_out": {"noise_floor": 0.001, "before": 0.0096, "after": 0.0012, "after_ci95": [0.0011, 0.0013],
                      "explained_fraction": 0.98},
         "calibrated": {"youngs_modulus_pa": {"value": 4e4, "unit": "Pa", "ci95": [3.9e4, 4.1e4]}},
@@ -132,7 +133,7 @@ def test_a_page_says_shows_and_offers_what_the_report_holds() -> None:
     scene, before, after = recording()
     page = Reader(render(report(), scene, before, after))
     for text in ("Best supported among 2 candidates: linear air drag, rate 1.48 1/s (95 %: 1.30 to 1.60 1/s).",
-                 "9.60 mm → 1.20 mm", "98%", "5.10 → 1.08", "40.0 kPa", "39.0 to 41.0 kPa", "2 decoys", "25%",
+                 "9.60 mm → 1.20 mm", "98%", "5.10 → 1.08", "40.0 kPa", "39.0 to 41.0 kPa", "0.97", "0.027", "2.00 mm",
                  "it grows over time".capitalize(), "Shake the grip.", "One note.", "no ground", "1 more explain less",
                  "threshold 0.300", "90 simulations"):  # fmt: skip
         assert text in page.text, text

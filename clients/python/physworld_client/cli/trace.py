@@ -73,12 +73,6 @@ def trace(
             help="After about so long searches are left and the answer is made of what there is (10); 0: never.",
         ),
     ] = None,
-    method: Annotated[
-        str | None,
-        typer.Option(
-            help="How it decides: selection (effect by effect, by rules) or evidence (a posterior for every set)."
-        ),
-    ] = None,
     noise: Annotated[
         float | None,
         typer.Option(
@@ -103,7 +97,6 @@ def trace(
         "--mesh": mesh,
         "--processes": processes,
         "--time-limit": time_limit,
-        "--method": method,
         "--noise": noise,
         "--resume": resume,
     }

@@ -19,12 +19,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.optimize import lsq_linear
 
 from physworld.arrays import Array
 from physworld.estimation.refit import prior_rows
 from physworld.estimation.unknowns import Unknown, bounds_of
-from physworld.trace.comparison import within_bounds
-from physworld.trace.evidence.discrepancy import Discrepancy
+from physworld.trace.discrepancy import Discrepancy
 
 _WEAKEST = 1e-9  # of the normal matrix's diagonal: keeps it invertible where data say nothing of an unknown
 
@@ -155,3 +156,23 @@ def _left_out(linear: Linear, discrepancy: Discrepancy, kappa: float) -> tuple[A
         errors.append(float(np.mean(plain**2)))
         sizes.append(len(rows))
     return np.array(densities), np.array(errors), np.array(sizes)
+
+
+def within_bounds(normal: Array, gradient: Array, unknowns: list[Unknown], theta: Array) -> Array:
+    """The step (p,) that minimises d.normal.d / 2 - gradient.d and leaves no unknown outside its bounds.
+
+    A step that is clipped afterwards leaves the others where they made up for what was cut off.
+
+    Args:
+        normal, gradient: (p, p) and (p,).
+        unknowns, theta: p of them, and where they are in the scale of the search, (p,).
+    """
+    if not len(unknowns):
+        return np.zeros(0)
+    scale = 1.0 / np.sqrt(np.diag(normal))
+    factor = np.linalg.cholesky(normal * scale * scale[:, None])
+    low, high = (end - theta for end in bounds_of(unknowns))
+    bounds = np.minimum(low, 0.0) / scale, np.maximum(high, 0.0) / scale
+    target = solve_triangular(factor, gradient * scale, lower=True)
+    step: Array = scale * lsq_linear(factor.T, target, bounds, method="bvls").x
+    return step

@@ -27,9 +27,9 @@ from physworld.estimation.simulations import Job
 from physworld.estimation.unknowns import Unknown, at, bounds_of
 from physworld.estimation.whitening import Whitener
 from physworld.trace.candidates import Candidate
-from physworld.trace.evidence.hypotheses import Hypothesis, Setting, Values
-from physworld.trace.evidence.likelihood import Linear, marginal
-from physworld.trace.evidence.posterior import HALF, posterior, removes
+from physworld.trace.hypotheses import Hypothesis, Setting, Values
+from physworld.trace.likelihood import Linear, marginal
+from physworld.trace.posterior import HALF, posterior, removes
 from physworld.trace.sensitivity import Response, candidate_responses
 
 _KAPPAS = (1.0, 0.25, 0.06, 0.0)  # of the base's discrepancy: with a candidate there may be less of it
@@ -39,7 +39,7 @@ _DESIGN = 16  # places of the low-discrepancy design
 _STIFFNESS = 0.8  # logarithms of the stiffness that it spans, up and down
 _EARLY = 0.4  # share of the training frames that it looks at
 _LEAST_SHARE = 0.01  # of a strength's bound, where the design begins
-_WORTH = 0.2  # share of what is left above the noise that an effect explains to first order, to be fitted
+WORTH = 0.2  # share of what is left above the noise that an effect explains to first order, to be fitted
 _BASINS = 3  # other hypotheses' optima from which a fit starts
 _WORSE = 3.0  # times the best one's squared error above the noise: a fit that is left
 _APART = 0.05  # logarithm of the stiffness by which two optima are two basins
@@ -60,6 +60,15 @@ class Screened:
     gain: float
     values: Values
     share: float
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of a search: what every candidate scored beside a set of effects, and what was fitted on top of it."""
+
+    base: Hypothesis
+    screened: list[Screened]
+    tried: tuple[Hypothesis, ...]
 
 
 @dataclass
@@ -121,6 +130,15 @@ class Search:
                 return False
         return True
 
+    @property
+    def steps(self) -> tuple[Step, ...]:
+        """What was scored and fitted, set by set."""
+        found = []
+        for base, screened in self.screens:
+            tried = (h for h in self.hypotheses.values() if len(h.members) == len(base.members) + 1)
+            found.append(Step(base, screened, tuple(h for h in tried if set(base.names) <= set(h.names))))
+        return tuple(found)
+
     def weights(self) -> Array:
         """Posterior of the admitted hypotheses, (H,), in their order."""
         known = self.admitted()
@@ -144,7 +162,7 @@ class Search:
             by_effect.setdefault(one.candidate.effect, []).append(one)
         if removes(base.left, 0.0) == 0.0:
             return
-        order = [own for own in by_effect.values() if own[0].gain > price and own[0].share > _WORTH]
+        order = [own for own in by_effect.values() if own[0].gain > price and own[0].share > WORTH]
         restless = base.fitted.misfit > 1.2 and not base.members
         order = order[:count]
         if restless:  # a score to first order says nothing of an effect that is large

@@ -13,11 +13,11 @@ import numpy as np
 
 from physworld.estimation.refit import Refit, refit
 from physworld.estimation.simulations import Simulations
-from physworld.estimation.unknowns import Unknown, at
+from physworld.estimation.unknowns import Unknown
 from physworld.estimation.whitening import Whitener
 from physworld.trace.candidates import Candidate
-from physworld.trace.evidence.discrepancy import Discrepancy, DiscrepancyWhitener
-from physworld.trace.evidence.likelihood import Evidence, Linear, evidence
+from physworld.trace.discrepancy import Discrepancy, DiscrepancyWhitener
+from physworld.trace.likelihood import Evidence, Linear, evidence
 from physworld.twin.twin import Twin
 
 Values = Mapping[str, float]
@@ -136,12 +136,11 @@ class Setting:
         twin, unknowns = self.assembled(members, values, shapes)
         places = [np.array([start.get(u.name, u.start) for u in unknowns]) for start in starts]
         found: Hypothesis | None = None
-        kappa, rounds = 0.0, _ROUNDS
-        while rounds:
-            rounds -= 1
+        kappa, known = 0.0, None
+        for _ in range(_ROUNDS):
             white = self.whitened(kappa)
             done = refit(
-                self.simulations, white, twin, unknowns, self.frames, self.iterations, places, hopeless
+                self.simulations, white, twin, unknowns, self.frames, self.iterations, places, hopeless, known
             )
             if done is None:
                 return found
@@ -158,13 +157,8 @@ class Setting:
             if _alike(kappa, following, self.white.sigma) or float(np.sum(plain.residual**2)) > hopeless:
                 break
             kappa, unknowns, places, hopeless = following, done.unknowns, [], np.inf
+            known = self.discrepancy.whitened(plain.jacobian, kappa)
         return found
-
-
-def fixed(hypothesis: Hypothesis, unknowns: Sequence[Unknown], twin: Twin) -> Twin:
-    """``twin`` with the numbers of a hypothesis."""
-    values = hypothesis.values
-    return at(twin, unknowns, np.array([values.get(u.name, u.start) for u in unknowns]))
 
 
 def _alike(kappa: float, other: float, sigma: float) -> bool:
