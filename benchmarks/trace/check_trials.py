@@ -24,15 +24,15 @@ from scipy.optimize import lsq_linear
 from benchmarks.harness import Report, write_json, write_section
 from physworld.arrays import Array
 from physworld.calibrate import CalibrationConfig
+from physworld.check import CheckConfig, CheckResult, check
+from physworld.check.information import POSTERIOR
+from physworld.check.physics import Physics, declared_physics
+from physworld.check.recorded import Recorded, recorded
 from physworld.estimation.refit import Refit, prior_rows, refit
 from physworld.estimation.simulations import Drive, Simulations
 from physworld.estimation.unknowns import at, bounds_of, starts_of
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Scene
 from physworld.trace.candidates import Candidate, candidates
-from physworld.trace.check import CheckConfig, CheckResult, check
-from physworld.trace.check.information import POSTERIOR
-from physworld.trace.check.physics import Physics, declared_physics
-from physworld.trace.check.recorded import Recorded, recorded
 from physworld.trace.likelihood import Linear, marginal
 from physworld.trace.sensitivity import candidate_responses
 

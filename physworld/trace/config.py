@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from physworld.calibrate import CalibrationConfig
-from physworld.trace.experiment_search import ExperimentConfig
+from physworld.experiments.search import ExperimentConfig
 
 
 def _declared() -> CalibrationConfig:

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 
 from physworld.arrays import Array
 from physworld.estimation.noise import Split
+from physworld.experiments import Experiment
 from physworld.trace.answer import Verdict
 from physworld.trace.candidates import Candidate
-from physworld.trace.experiment import Experiment
 from physworld.trace.held_out import HeldOut, Outcome
 from physworld.trace.hypotheses import Hypothesis
 from physworld.trace.search import Step

@@ -27,13 +27,13 @@ from physworld.estimation.noise import noise_sigma
 from physworld.estimation.simulations import Job, Memory, Progress, Runner, in_turn, stage_s
 from physworld.estimation.unknowns import LOG, Unknown
 from physworld.estimation.whitening import Whitener, turned_starts, whitener
+from physworld.experiments import Experiment, propose, rival_of
 from physworld.scene import Scene
 from physworld.trace.answer import DATA as FAULTY
 from physworld.trace.answer import NOTHING, UNEXPLAINED, Verdict, decided
 from physworld.trace.candidates import candidates
 from physworld.trace.config import TraceConfig
 from physworld.trace.discrepancy import Discrepancy, discrepancy_of
-from physworld.trace.experiment import Experiment, propose, rival_of
 from physworld.trace.faults import Faults, without_faults
 from physworld.trace.held_out import HeldOut, Outcomes
 from physworld.trace.hypotheses import Hypothesis, Setting
@@ -308,7 +308,7 @@ class _Trace:
         left = max(rival.fitted.misfit for rival in rivals)
         return propose(
             self.lead,
-            [rival_of(rival) for rival in rivals],
+            [rival_of(rival.names, rival.fitted) for rival in rivals],
             ground.white.sigma,
             discrepancy=float(np.sqrt(max(left**2 - 1.0, 0.0))),
             finer=ground.finer,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -89,16 +89,3 @@ def numerical_directions(
         variants = {"finer cells": Job(finer, frames), "coarser cells": Job(coarser, frames), **variants}
     found = zip(variants, simulations.run(list(variants.values())), strict=True)
     return {name: tracks - base for name, tracks in found if tracks is not None}, finer
-
-
-def refinement_of(twin: Twin, finer: Twin) -> Twin:
-    """``finer``'s lattice with the parameters and effects of ``twin``."""
-    return replace(
-        finer,
-        body=replace(finer.body, points=twin.body.points, offsets=twin.body.offsets),
-        law=twin.law,
-        air_drag_per_s=twin.air_drag_per_s,
-        grip_softness=twin.grip_softness,
-        ground_friction=twin.ground_friction,
-        effects=twin.effects,
-    )

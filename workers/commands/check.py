@@ -3,7 +3,7 @@
 Prints two tables: of every number that a calibration would search its expected 95 % interval, and of every effect of
 the registry the smallest strength that would be detected, each for a twin that is right and for one that is off by a
 share of the motion; then what looks alike, and a further motion that shows more. ``--json FILE`` keeps all of it
-(:func:`physworld.trace.check.document`). Nothing is fitted.
+(:func:`physworld.check.document`). Nothing is fitted.
 """
 
 from __future__ import annotations
@@ -73,8 +73,8 @@ def _check(given: argparse.Namespace) -> None:
     wp.config.quiet = True  # before the first import that starts it
     from dataclasses import replace
 
+    from physworld.check import CheckConfig, check, document
     from physworld.estimation.simulations import Workers, in_turn
-    from physworld.trace.check import CheckConfig, check, document
     from physworld_workers.commands.terminal import progress_bar, read_scene
 
     scene = read_scene(given.scene)

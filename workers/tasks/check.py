@@ -7,7 +7,7 @@ on where it was.
 from __future__ import annotations
 
 from physworld.calibrate import CalibrationConfig
-from physworld.trace.check import CheckConfig, check, document
+from physworld.check import CheckConfig, check, document
 from physworld_schemas.check import CheckConfig as WireConfig
 from physworld_storage.jobs import helpers
 from physworld_workers.context import HandlerResult, TaskContext

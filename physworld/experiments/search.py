@@ -17,10 +17,9 @@ from physworld.arrays import Array
 from physworld.demonstrate.limits import MotionLimits, limits_of
 from physworld.estimation.simulations import Drive, Job, Simulations
 from physworld.estimation.unknowns import at
+from physworld.experiments.probing import COORDINATES, Motion, Probe, motion_of, nudged, random_probe
+from physworld.experiments.rivals import Rival, reconciled, refit_of
 from physworld.scene import Scene
-from physworld.trace.probing import COORDINATES, Motion, Probe, motion_of, nudged, random_probe
-from physworld.trace.rivals import Rival, reconciled, refit_of
-from physworld.trace.sensitivity import refinement_of
 from physworld.twin.twin import Twin
 
 STAGE = "experiment"
@@ -79,7 +78,7 @@ class Search:
     ) -> None:
         self._simulations, self._before, self.tried = simulations, simulations.count, 0
         self.rivals = [replace(rival, twin=from_rest(rival.twin)) for rival in reconciled(rivals, cost)]
-        self.finer = None if finer is None else from_rest(refinement_of(rivals[0].twin, finer))
+        self.finer = None if finer is None else from_rest(_refinement_of(rivals[0].twin, finer))
         self.sigma, self.config = sigma, config
         self.limits: MotionLimits = limits_of(scene, rivals[0].twin)
         self.pose = rivals[0].twin.controllers_start
@@ -284,3 +283,16 @@ def _better(best: Tried | None, other: Tried | None) -> Tried | None:
     if best is None or other is None:
         return other or best
     return other if (other.refitted or 0.0) > (best.refitted or 0.0) else best
+
+
+def _refinement_of(twin: Twin, finer: Twin) -> Twin:
+    """``finer``'s lattice with the parameters and effects of ``twin``."""
+    return replace(
+        finer,
+        body=replace(finer.body, points=twin.body.points, offsets=twin.body.offsets),
+        law=twin.law,
+        air_drag_per_s=twin.air_drag_per_s,
+        grip_softness=twin.grip_softness,
+        ground_friction=twin.ground_friction,
+        effects=twin.effects,
+    )

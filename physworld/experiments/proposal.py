@@ -26,12 +26,10 @@ import numpy as np
 from physworld.arrays import Array
 from physworld.effects.registry import EFFECTS
 from physworld.estimation.simulations import Drive, Simulations
+from physworld.experiments.rivals import Rival
+from physworld.experiments.search import ExperimentConfig, Search, Tried
 from physworld.scene import Scene
-from physworld.trace.experiment_search import ExperimentConfig, Search, Tried
-from physworld.trace.rivals import Rival, rival_of
 from physworld.twin.twin import Twin
-
-__all__ = ["Experiment", "ExperimentConfig", "Rival", "propose", "rival_of"]
 
 _LEAST_SHARE = 0.25  # of the noise in a coordinate: nobody knows a body, a grip and a camera better than that
 

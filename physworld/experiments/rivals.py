@@ -14,9 +14,8 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.effects.registry import EFFECTS
-from physworld.estimation.refit import prior_rows
+from physworld.estimation.refit import Refit, prior_rows
 from physworld.estimation.unknowns import Unknown, at, bounds_of
-from physworld.trace.hypotheses import Hypothesis
 from physworld.twin.twin import Twin
 
 _RIDGE = 1e-9
@@ -70,12 +69,11 @@ class Rival:
         )
 
 
-def rival_of(model: Hypothesis) -> Rival:
-    """A fitted hypothesis as a rival."""
-    fitted = model.fitted
+def rival_of(names: tuple[str, ...], fitted: Refit) -> Rival:
+    """A fitted set of effects of these names as a rival."""
     _, slope = prior_rows(fitted.unknowns, fitted.theta)
     information = fitted.jacobian.T @ fitted.jacobian + slope.T @ slope
-    return Rival(model.names, fitted.twin, tuple(fitted.unknowns), information, fitted.residual)
+    return Rival(names, fitted.twin, tuple(fitted.unknowns), information, fitted.residual)
 
 
 def reconciled(rivals: list[Rival], cost: Callable[[Twin], float] | None) -> list[Rival]:

@@ -20,16 +20,16 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.calibrate import CalibrationConfig
+from physworld.check.information import Information
+from physworld.check.motion import Limits, MotionSearch, Proposal
+from physworld.check.physics import Physics, declared_physics
+from physworld.check.recorded import Recorded, recorded
+from physworld.check.visibility import Judge, View, deviations, scaled
 from physworld.errors import SceneUnsupported
 from physworld.estimation.refit import sensitivities
 from physworld.estimation.simulations import Drive, Memory, Progress, Runner, Simulations, in_turn
 from physworld.scene import Scene
 from physworld.trace.candidates import candidates
-from physworld.trace.check.information import Information
-from physworld.trace.check.motion import Limits, MotionSearch, Proposal
-from physworld.trace.check.physics import Physics, declared_physics
-from physworld.trace.check.recorded import Recorded, recorded
-from physworld.trace.check.visibility import Judge, View, deviations, scaled
 from physworld.trace.preparation import taken_with
 from physworld.trace.sensitivity import candidate_responses
 

@@ -19,13 +19,13 @@ from physworld.estimation.refit import Refit, refit
 from physworld.estimation.simulations import Drive, Job, Simulations, nodes_of
 from physworld.estimation.unknowns import Unknown
 from physworld.estimation.whitening import responses, whitener
+from physworld.experiments import Experiment, ExperimentConfig, Rival, propose
+from physworld.experiments.probing import COORDINATES, motion_of, nudged, random_probe
+from physworld.experiments.rivals import reconciled, refit_of
+from physworld.experiments.search import clock_of
 from physworld.report import render
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
 from physworld.trace import TraceConfig, document, trace
-from physworld.trace.experiment import Experiment, ExperimentConfig, Rival, propose
-from physworld.trace.experiment_search import clock_of
-from physworld.trace.probing import COORDINATES, motion_of, nudged, random_probe
-from physworld.trace.rivals import reconciled, refit_of
 from physworld.trace.unknowns import of_parameter, of_strength
 from physworld.twin.build import build_twin
 from physworld.twin.twin import Twin

@@ -10,10 +10,10 @@ import pytest
 from scipy.stats import chi2
 
 from benchmarks.trace.check_trials import CONFIG, FINE_M, bar, detection, spread_of
+from physworld.check import INVISIBLE, VISIBLE, check, document
+from physworld.check.information import POSTERIOR, POWER, Information
+from physworld.check.run import CheckResult
 from physworld.errors import Cancelled
-from physworld.trace.check import INVISIBLE, VISIBLE, check, document
-from physworld.trace.check.information import POSTERIOR, POWER, Information
-from physworld.trace.check.run import CheckResult
 from physworld.trace.discrepancy import Block, Discrepancy
 
 pytestmark = pytest.mark.slow

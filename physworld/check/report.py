@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.trace.check.motion import Change, Proposal
-from physworld.trace.check.run import CheckResult
-from physworld.trace.check.visibility import EffectFigure, ParameterFigure, View
+from physworld.check.motion import Change, Proposal
+from physworld.check.run import CheckResult
+from physworld.check.visibility import EffectFigure, ParameterFigure, View
 
 SCHEMA_VERSION = 1
 

@@ -14,15 +14,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from physworld.arrays import Array
+from physworld.check.information import Information
+from physworld.check.recorded import Recorded, recorded
+from physworld.check.visibility import VISIBLE, Asked, Judge, View, deviations, in_sizes
 from physworld.effects.registry import EFFECTS
 from physworld.errors import SimulationError
 from physworld.estimation.refit import sensitivities
 from physworld.estimation.simulations import Drive, Simulations
+from physworld.experiments.search import Library, from_rest, library_of
 from physworld.scene import Scene
-from physworld.trace.check.information import Information
-from physworld.trace.check.recorded import Recorded, recorded
-from physworld.trace.check.visibility import VISIBLE, Asked, Judge, View, deviations, in_sizes
-from physworld.trace.experiment_search import Library, from_rest, library_of
 from physworld.trace.sensitivity import candidate_responses
 
 STAGE = "motions"

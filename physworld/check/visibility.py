@@ -19,12 +19,12 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from physworld.arrays import Array
+from physworld.check.information import Information
+from physworld.check.physics import Physics
 from physworld.effects.base import Strength
 from physworld.effects.registry import EFFECTS
 from physworld.estimation.unknowns import Unknown
 from physworld.trace.candidates import Candidate
-from physworld.trace.check.information import Information
-from physworld.trace.check.physics import Physics
 from physworld.trace.sensitivity import Response
 
 VISIBLE, LARGE, INVISIBLE = "visible", "only_if_large", "invisible"
