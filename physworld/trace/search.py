@@ -40,6 +40,7 @@ _STIFFNESS = 0.8  # logarithms of the stiffness that it spans, up and down
 _EARLY = 0.4  # share of the training frames that it looks at
 _LEAST_SHARE = 0.01  # of a strength's bound, where the design begins
 WORTH = 0.2  # share of what is left above the noise that an effect explains to first order, to be fitted
+_NEARLY_ALL = 0.9  # share of what is left above the noise
 _BASINS = 3  # other hypotheses' optima from which a fit starts
 _WORSE = 3.0  # times the best one's squared error above the noise: a fit that is left
 _APART = 0.05  # logarithm of the stiffness by which two optima are two basins
@@ -153,23 +154,37 @@ class Search:
         return [h for h in self.hypotheses.values() if len(h.members) == size]
 
     def _add(self, base: Hypothesis, count: int) -> None:
-        """Fits with one effect more than ``base``."""
+        """Fits with one effect more than ``base``, if that leaves anything above the noise."""
+        nothing = removes(base.left, 0.0) == 0.0
+        if nothing and base.members:
+            return
         screened = self.screened(base)
         self.screens.append((base, screened))
+        if nothing:
+            return
         price = float(np.log(2.0 * self.library)) if base.members else 0.0
         by_effect: dict[str, list[Screened]] = {}
         for one in screened:
             by_effect.setdefault(one.candidate.effect, []).append(one)
-        if removes(base.left, 0.0) == 0.0:
-            return
         order = [own for own in by_effect.values() if own[0].gain > price and own[0].share > WORTH]
         restless = base.fitted.misfit > 1.2 and not base.members
         order = order[:count]
         if restless:  # a score to first order says nothing of an effect that is large
             order += [own for own in by_effect.values() if own not in order and own[0].candidate.scanned]
         for own in order:
+            if not own[0].candidate.scanned and own[0].share < HALF * self._cleared(base):
+                continue
             self.setting.simulations.stage = f"fit with {own[0].candidate.effect}"
             self._fit(base, own)
+
+    def _cleared(self, base: Hypothesis) -> float:
+        """Share of what ``base`` leaves that one effect more removes, where it is nearly all; else 0.
+
+        A rival that promises less than half of that is no rival.
+        """
+        tried = (h for h in self._of_size(len(base.members) + 1) if set(base.names) <= set(h.names))
+        most = max((removes(base.left, h.left) for h in tried if h.doubt is None), default=0.0)
+        return most if most >= _NEARLY_ALL else 0.0
 
     def _take_out(self, larger: Hypothesis) -> None:
         """Fits without one of the effects of a set, and with another one in its place, from the set's basin."""
