@@ -25,7 +25,7 @@ from physworld.engine.thin.triangles import TriangleLattice
 from physworld.errors import SceneUnsupported
 from physworld.estimation.noise import noise_sigma
 from physworld.estimation.simulations import Job, Memory, Progress, Runner, in_turn, stage_s
-from physworld.estimation.unknowns import LOG, Unknown
+from physworld.estimation.unknowns import Unknown
 from physworld.estimation.whitening import Whitener, turned_starts, whitener
 from physworld.experiments import Experiment, propose, rival_of
 from physworld.scene import Scene
@@ -345,10 +345,15 @@ def _supported(known: list[Hypothesis], weights: Array) -> tuple[Supported, ...]
 
 def _other_places(unknowns: list[Unknown]) -> list[dict[str, float]]:
     """Where the declared physics is looked for beside where it was calibrated: over its stiffness, for a phase that has
-    slipped by a period is a local minimum; and over that again from the other shapes of its stiffness, one deviation
-    of their priors away, which decide in which of these minima it lies.
+    slipped by a period is a local minimum; and over that again from other values of what decides in which of these
+    minima it lies: the shapes of a sheet's stiffness, one deviation of their priors away, and what is not known at all
+    beforehand, a quarter of its range from its lower end.
     """
     own, first = {u.name: u.start for u in unknowns}, unknowns[0].name
-    shapes = [u for u in unknowns[1:] if u.prior is not None and u.transform is LOG and u.name in _SHAPES]
-    bases = [own, *({**own, u.name: own[u.name] + u.prior[1]} for u in shapes if u.prior is not None)]
+    bases = [own]
+    for u in unknowns[1:]:
+        if u.prior is None:
+            bases.append({**own, u.name: u.bounds[0] + 0.25 * (u.bounds[1] - u.bounds[0])})
+        elif u.name in _SHAPES:
+            bases.append({**own, u.name: own[u.name] + u.prior[1]})
     return [{**base, first: own[first] + shift} for base in bases for shift in (*_OTHER_STIFFNESSES, 0.0)]

@@ -36,6 +36,7 @@ _KAPPAS = (1.0, 0.25, 0.06, 0.0)  # of the base's discrepancy: with a candidate 
 _MULTIPLES = (0.3, 3.0, 9.0)  # of a linear estimate
 _VARIANTS = 3  # shapes of an effect that are fitted before its best is freed
 _DESIGN = 16  # places of the low-discrepancy design
+_FOLLOWED = 2  # of them, from which a fit may start
 _STIFFNESS = 0.8  # logarithms of the stiffness that it spans, up and down
 _EARLY = 0.4  # share of the training frames that it looks at
 _LEAST_SHARE = 0.01  # of a strength's bound, where the design begins
@@ -262,22 +263,27 @@ class Search:
         return found[:_BASINS]
 
     def _designed(self, base: Hypothesis, one: Screened) -> list[Values]:
-        """The best place of a low-discrepancy design over stiffness and strengths on the early frames."""
+        """The best places of a low-discrepancy design on the early frames: over strengths, stiffness, and what else is
+        calibrated of which nothing is known beforehand."""
         if self.early is None:
             return []
         white, frames = self.early
-        candidate, first = one.candidate, self.setting.calibrated[0].name
+        candidate, (first, *rest) = one.candidate, self.setting.calibrated
         twin, unknowns = self.setting.assembled(
             (*base.members, candidate), base.values, shapes=bool(base.members)
         )
         names = [u.name for u in unknowns]
         gates = candidate.unknowns()
-        drawn = qmc.Sobol(1 + len(gates), seed=self.seed).random(_DESIGN)
+        open_ = [u for u in rest if u.prior is None and u.name not in [gate.name for gate in gates]]
+        drawn = qmc.Sobol(1 + len(open_) + len(gates), seed=self.seed).random(_DESIGN)
         places = []
         for row in drawn:
             place = {u.name: u.start for u in unknowns}
-            place[first] += _STIFFNESS * (2.0 * row[0] - 1.0)
-            for share, gate in zip(row[1:], gates, strict=True):
+            place[first.name] += _STIFFNESS * (2.0 * row[0] - 1.0)
+            for share, unknown in zip(row[1:], open_, strict=False):
+                low, high = unknown.bounds
+                place[unknown.name] = low + share * (high - low)
+            for share, gate in zip(row[1 + len(open_) :], gates, strict=True):
                 lowest, highest = gate.bounds
                 signed = 2.0 * float(share) - 1.0 if lowest < 0 else float(share)
                 size = _LEAST_SHARE ** (1.0 - abs(signed))
@@ -288,10 +294,8 @@ class Search:
         runs = self.setting.simulations.run([Job(at(twin, unknowns, theta), frames) for theta in thetas])
         costs = [np.inf if tracks is None else float(np.sum(white.residual(tracks) ** 2)) for tracks in runs]
         before = float(np.sum(white.residual(base.fitted.tracks[:frames]) ** 2))
-        best = int(np.argmin(costs))
-        if not costs[best] < before:
-            return []
-        return [dict(zip(names, (float(t) for t in thetas[best]), strict=True))]
+        best = [int(k) for k in np.argsort(costs)[:_FOLLOWED] if costs[k] < before]
+        return [dict(zip(names, (float(t) for t in thetas[k]), strict=True)) for k in best]
 
     def screened(self, base: Hypothesis) -> list[Screened]:
         """First-order scores of all candidates that ``base`` has not, best first."""
