@@ -6,8 +6,8 @@ A bar that a grip shakes is checked before any fit. Then what the check foretell
   with noise and refitted with the full simulator (:func:`physworld.estimation.refit.refit`). The refits' errors over
   the foretold deviations have to have the size 1.
 - *Detection.* Recordings with an effect of so many times its detectable strength are refitted with the declared
-  physics, and the effect is screened by the marginal likelihood of a trace
-  (:mod:`physworld.trace.likelihood`), which integrates a discrepancy out and has the search's bounds for a
+  physics, and the effect is screened by a marginal likelihood
+  (:mod:`benchmarks.trace.marginal`), which integrates a discrepancy out and has the search's bounds for a
   prior. It has to be found always at twice the detectable strength, never at a tenth.
 """
 
@@ -22,6 +22,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from benchmarks.harness import Report, write_json, write_section
+from benchmarks.trace.marginal import marginal
 from physworld.arrays import Array
 from physworld.calibrate import CalibrationConfig
 from physworld.check import CheckConfig, CheckResult, check
@@ -33,7 +34,7 @@ from physworld.estimation.simulations import Drive, Simulations
 from physworld.estimation.unknowns import at, bounds_of, starts_of
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Scene
 from physworld.trace.candidates import Candidate, candidates
-from physworld.trace.likelihood import Linear, marginal
+from physworld.trace.left_out import Linear
 from physworld.trace.sensitivity import candidate_responses
 
 STIFFNESS_PA, FRAMES, FPS = 6e4, 30, 30.0

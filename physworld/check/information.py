@@ -30,7 +30,7 @@ from scipy.special import chndtrinc
 from scipy.stats import norm
 
 from physworld.arrays import Array
-from physworld.trace.discrepancy import Discrepancy
+from physworld.check.discrepancy import Discrepancy
 
 POSTERIOR = 0.95  # from which a trace names
 POWER = 0.95  # of all recordings in which that must happen

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from physworld.arrays import Array
+from physworld.check.discrepancy import Discrepancy, discrepancy_of
 from physworld.errors import SimulationError
 from physworld.estimation.noise import Split, freeze, noise_sigma
 from physworld.estimation.simulations import Job, Simulations, nodes_of
 from physworld.estimation.whitening import Whitener, responses, turned_starts, whitener
 from physworld.scene import Scene
-from physworld.trace.discrepancy import Discrepancy, discrepancy_of
 from physworld.twin.twin import Twin
 
 BLOCKS, SHORTEST_BLOCK = 12, 3  # of frames, as a trace has them: a discrepancy is independent between blocks

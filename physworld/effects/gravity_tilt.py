@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
 _LARGEST_TILT_RAD = 0.2
 _LARGEST_MAGNITUDE = 0.01  # over the Earth gravity's strength differs by half as much
+_MAGNITUDE_DEVIATION = (
+    0.003  # from the equator to the poles and up a mountain, where only 9.81 m/s^2 is declared
+)
 _TILT_DEVIATION_RAD = 0.1
 """Who sets up a camera sees a frame that is far off the vertical before any recording.
 
@@ -57,7 +60,7 @@ class GravityTilt(Effect):
         return (
             Strength("tilt_x_rad", "rad", -0.5, 0.5, 0.01, prior_deviation=_TILT_DEVIATION_RAD),
             Strength("tilt_y_rad", "rad", -0.5, 0.5, 0.01, prior_deviation=_TILT_DEVIATION_RAD),
-            Strength("magnitude", "1", -0.5, 0.5, 0.01),
+            Strength("magnitude", "1", -0.5, 0.5, 0.01, prior_deviation=_MAGNITUDE_DEVIATION),
         )
 
     @classmethod

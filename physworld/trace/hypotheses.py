@@ -1,4 +1,7 @@
-"""A hypothesis: a set of effects beside the calibrated numbers, fitted under noise and discrepancy.
+"""A hypothesis: a set of effects beside the calibrated numbers, fitted and held against left-out blocks of frames.
+
+A fit weighs the residual against the priors by how much a sighting counts (:mod:`physworld.trace.left_out`): where a
+twin errs by a hundred times a camera's noise, ten thousand sightings do not fix a stiffness to a part in a million.
 
 Nothing here knows what an effect is: its numbers, their bounds and priors, its shapes and their mirror images come from
 the effect's own file by way of the candidates.
@@ -11,19 +14,40 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from physworld.estimation.refit import Refit, refit
+from physworld.arrays import Array
+from physworld.estimation.refit import Refit, prior_rows, refit
 from physworld.estimation.simulations import Simulations
 from physworld.estimation.unknowns import Unknown
 from physworld.estimation.whitening import Whitener
 from physworld.trace.candidates import Candidate
-from physworld.trace.discrepancy import Discrepancy, DiscrepancyWhitener
-from physworld.trace.likelihood import Evidence, Linear, evidence
+from physworld.trace.left_out import LeftOut, Linear, left_out
 from physworld.twin.twin import Twin
 
 Values = Mapping[str, float]
 """Places of unknowns in the scale of their search, by name."""
-_ROUNDS = 3  # fits in turn with an estimate of the discrepancy
-_SAME = 1.5  # ratio of two amplitudes of the discrepancy that are one
+_ROUNDS = 3  # fits in turn with an estimate of what a sighting counts
+_SAME = 1.5  # ratio of two such estimates that are one
+
+
+@dataclass(frozen=True)
+class ScaledWhitener:
+    """Whitens by noise, places and solver (``base``), and divides by ``scale``, deviations of a sighting."""
+
+    base: Whitener
+    scale: float
+
+    @property
+    def measured(self) -> Array:
+        """Sightings, (V, 3) [m]."""
+        return self.base.measured
+
+    def residual(self, tracks: Array) -> Array:
+        """Whitened measured minus predicted, (M,), of tracks (frames, N, 3)."""
+        return self.base.residual(tracks) / self.scale
+
+    def change(self, difference: Array) -> Array:
+        """Whitened change of a prediction, (M,), of a difference of tracks (frames, N, 3)."""
+        return self.base.change(difference) / self.scale
 
 
 @dataclass(frozen=True)
@@ -32,13 +56,13 @@ class Hypothesis:
 
     Attributes:
         members: the candidates in it; none: the declared physics.
-        fitted: the optimum; residual and Jacobian are whitened by noise, places and solver only.
-        evidence: what the data say of it.
+        fitted: the optimum; residual and Jacobian are whitened by noise, places and solver.
+        unseen: its errors on left-out blocks.
     """
 
     members: tuple[Candidate, ...]
     fitted: Refit
-    evidence: Evidence
+    unseen: LeftOut
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -51,25 +75,22 @@ class Hypothesis:
         return {u.name: float(t) for u, t in zip(self.fitted.unknowns, self.fitted.theta, strict=True)}
 
     @property
-    def score(self) -> float:
-        """Log density of all blocks, each given the others."""
-        return float(self.evidence.left_out.sum())
-
-    @property
     def left(self) -> float:
         """Mean squared error of left-out blocks over the noise's: 1 for a perfect model."""
-        return float(np.average(self.evidence.errors, weights=self.evidence.sizes))
+        return self.unseen.mean
+
+    @property
+    def log_prior(self) -> float:
+        """Log of the prior density of the effects' strengths, over that at its top."""
+        own = [k for k, u in enumerate(self.fitted.unknowns) if u.name.split(".")[0] in self.names]
+        residual, _ = prior_rows(self.fitted.unknowns, self.fitted.theta)
+        return -0.5 * float(np.sum(residual[own] ** 2))
 
     @property
     def doubt(self) -> str | None:
         """Why nobody would believe its numbers, whatever a recording says; None where one may."""
         own = (e.implausible() for e in self.fitted.twin.effects if e.name in self.names)
         return next((reason for reason in own if reason is not None), None)
-
-    @property
-    def linear(self) -> Linear:
-        """About its optimum."""
-        return Linear(self.fitted.residual, self.fitted.jacobian, self.fitted.unknowns, self.fitted.theta)
 
 
 @dataclass(frozen=True)
@@ -79,7 +100,7 @@ class Setting:
     Attributes:
         simulations: of the recordings.
         white: by noise, places and solver.
-        discrepancy: that every hypothesis has.
+        blocks: rows of every block of frames.
         frames: from the first to before this one.
         iterations: of a fit.
         twin: of the declared physics.
@@ -88,15 +109,11 @@ class Setting:
 
     simulations: Simulations
     white: Whitener
-    discrepancy: Discrepancy
+    blocks: Sequence[Array]
     frames: int
     iterations: int
     twin: Twin
     calibrated: Sequence[Unknown]
-
-    def whitened(self, kappa: float) -> DiscrepancyWhitener:
-        """The whitener with a discrepancy of this amplitude [m]."""
-        return DiscrepancyWhitener(self.white, self.discrepancy, kappa)
 
     def assembled(
         self, members: Sequence[Candidate], values: Values, shapes: bool = True
@@ -123,6 +140,7 @@ class Setting:
         values: Values,
         starts: Sequence[Values] = (),
         shapes: bool = True,
+        scale: float = 1.0,
         hopeless: float = np.inf,
     ) -> Hypothesis | None:
         """A hypothesis from the best of several starts; None where no run was usable.
@@ -131,37 +149,31 @@ class Setting:
             members: its effects.
             values, starts: where unknowns start, by name.
             shapes: whether the numbers that only shape effects are free.
-            hopeless: squared residual above which the search ends after two iterations.
+            scale: deviations of the noise that a sighting counts as, as a first guess.
+            hopeless: squared residual, over the noise, above which the search ends after two iterations.
         """
         twin, unknowns = self.assembled(members, values, shapes)
         places = [np.array([start.get(u.name, u.start) for u in unknowns]) for start in starts]
         found: Hypothesis | None = None
-        kappa, known = 0.0, None
+        known: Array | None = None
         for _ in range(_ROUNDS):
-            white = self.whitened(kappa)
+            white = ScaledWhitener(self.white, scale)
+            limit = hopeless / scale**2
             done = refit(
-                self.simulations, white, twin, unknowns, self.frames, self.iterations, places, hopeless, known
+                self.simulations, white, twin, unknowns, self.frames, self.iterations, places, limit, known
             )
             if done is None:
                 return found
-            plain = replace(
-                done,
-                residual=self.white.residual(done.tracks),
-                jacobian=self.discrepancy.unwhitened(done.jacobian, kappa),
-            )
+            plain = replace(done, residual=scale * done.residual, jacobian=scale * done.jacobian)
             linear = Linear(plain.residual, plain.jacobian, plain.unknowns, plain.theta)
-            new = Hypothesis(tuple(members), plain, evidence(linear, self.discrepancy))
-            if found is None or new.score >= found.score:
+            new = Hypothesis(tuple(members), plain, left_out(linear, self.blocks, scale))
+            if found is None or new.left <= found.left:
                 found = new
-            following = new.evidence.kappa
-            if _alike(kappa, following, self.white.sigma) or float(np.sum(plain.residual**2)) > hopeless:
+            following = new.unseen.scale
+            if max(scale, following) <= _SAME * min(scale, following):
                 break
-            kappa, unknowns, places, hopeless = following, done.unknowns, [], np.inf
-            known = self.discrepancy.whitened(plain.jacobian, kappa)
+            if float(np.sum(plain.residual**2)) > hopeless:
+                break
+            scale, unknowns, places, hopeless = following, done.unknowns, [], np.inf
+            known = plain.jacobian / scale
         return found
-
-
-def _alike(kappa: float, other: float, sigma: float) -> bool:
-    """Whether two amplitudes of the discrepancy are one as far as a fit goes."""
-    low, high = sorted((max(kappa, 0.3 * sigma), max(other, 0.3 * sigma)))
-    return high <= _SAME * low

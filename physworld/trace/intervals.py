@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,6 @@ from physworld.arrays import Array
 from physworld.effects.registry import EFFECTS
 from physworld.estimation.refit import Refit, prior_rows
 from physworld.estimation.unknowns import at
-from physworld.trace.discrepancy import Discrepancy
 from physworld.trace.hypotheses import Hypothesis
 from physworld.trace.result import Named, Number
 from physworld.twin.twin import Twin
@@ -26,7 +26,7 @@ class Spread:
     Attributes:
         fitted: the optimum.
         drawn: unknowns under resampled blocks of frames, (resamples, p).
-        covariance: what sensitivities, noise and discrepancy leave, (p, p).
+        covariance: what sensitivities leave of it, a sighting counting what it counts, (p, p).
     """
 
     fitted: Refit
@@ -71,27 +71,24 @@ class Spread:
         return found
 
 
-def spread_of(model: Hypothesis, discrepancy: Discrepancy, resamples: int, seed: int) -> Spread:
-    """How well an optimum is known under noise and its own discrepancy, by resampling blocks of training frames.
+def spread_of(model: Hypothesis, blocks: Sequence[Array], resamples: int, seed: int) -> Spread:
+    """How well an optimum is known, by resampling blocks of training frames, and by what a sighting counts.
 
     Args:
-        model: with its estimate of the discrepancy.
-        discrepancy: of the recording.
+        model: with its errors on left-out blocks.
+        blocks: rows of every block of frames.
         resamples: of the blocks.
         seed: of these.
     """
-    fitted, kappa = model.fitted, model.evidence.kappa
-    residual, jacobian = (discrepancy.whitened(v, kappa) for v in (fitted.residual, fitted.jacobian))
-    rows = [block.rows for block in discrepancy.blocks]
-    normal = np.stack([jacobian[own].T @ jacobian[own] for own in rows])
-    gradient = np.stack([jacobian[own].T @ residual[own] for own in rows])
-    misfit = float(np.sqrt(np.mean(residual**2)))
+    fitted, scale = model.fitted, model.unseen.scale
+    residual, jacobian = fitted.residual / scale, fitted.jacobian / scale
+    normal = np.stack([jacobian[own].T @ jacobian[own] for own in blocks])
+    gradient = np.stack([jacobian[own].T @ residual[own] for own in blocks])
     prior_residual, prior_slope = prior_rows(fitted.unknowns, fitted.theta)
     rng = np.random.default_rng(seed)
-    counts = rng.multinomial(len(rows), np.full(len(rows), 1.0 / len(rows)), size=resamples)
+    counts = rng.multinomial(len(blocks), np.full(len(blocks), 1.0 / len(blocks)), size=resamples)
     ridge = 1e-9 * np.diag(np.diag(normal.sum(axis=0)) + 1e-30)
-    information = normal.sum(axis=0) + prior_slope.T @ prior_slope + ridge
-    covariance = max(1.0, misfit) ** 2 * np.linalg.inv(information)
+    covariance = np.linalg.inv(normal.sum(axis=0) + prior_slope.T @ prior_slope + ridge)
     total = np.tensordot(counts, normal, 1) + prior_slope.T @ prior_slope + ridge
     push = np.tensordot(counts, gradient, 1) + prior_slope.T @ prior_residual
     drawn = fitted.theta + np.linalg.solve(total, push[..., None])[..., 0]

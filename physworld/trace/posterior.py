@@ -1,11 +1,13 @@
 """Posterior of hypotheses: how often each would predict unseen blocks best, were the blocks drawn again.
 
-Weights are those of pseudo Bayesian model averaging with the Bayesian bootstrap (pseudo-BMA+: Yao, Vehtari, Simpson and
-Gelman 2018): blocks of frames get Dirichlet weights, each hypothesis the weighted sum of its left-out log densities and
-its prior, and the softmax of these is averaged. Blocks, and not sightings, are what is independent: so a hypothesis
-that wins in a few blocks only does not win by much, and the odds mean what they say although no twin is the truth.
+Blocks of frames get Dirichlet weights (the Bayesian bootstrap), each hypothesis its weighted left-out error e, and with
+n independent numbers (:mod:`physworld.trace.left_out`) of a variance that nobody knows the log likelihood -n/2 log e.
+The softmax of that and the log prior is averaged over the draws, as pseudo-BMA+ does it (Yao, Vehtari, Simpson and
+Gelman 2018). So a hypothesis that wins in a few blocks only does not win by much, and the odds mean what they say
+although no twin is the truth.
 
-Prior: an effect acts with odds of one to one, whichever of the library it is; so k effects of n have (2 n)^-k.
+Prior: an effect acts with odds of one to one, whichever of the library it is; so k effects of n have (2 n)^-k. Beside
+it stands the prior density of the strengths, over that at their mean.
 """
 
 from __future__ import annotations
@@ -15,32 +17,30 @@ from collections.abc import Sequence
 import numpy as np
 
 from physworld.arrays import Array
+from physworld.trace.left_out import LeftOut
 
+HALF = 0.5
+_NOISE_KNOWN = 0.05  # share to which the variance of the noise is known
 _DRAWS = 4000
 
 
-def posterior(left_out: Sequence[Array], effects: Sequence[int], library: int, seed: int = 0) -> Array:
+def posterior(known: Sequence[LeftOut], log_priors: Sequence[float], seed: int = 0) -> Array:
     """Weights of hypotheses, (H,), that add up to 1.
 
     Args:
-        left_out: log densities of the blocks given the others, (B,) for each hypothesis.
-        effects: number of effects in each.
-        library: number of effects that were asked.
+        known: left-out errors of each, of the same blocks.
+        log_priors: of each.
         seed: of the bootstrap.
     """
-    densities = np.array(left_out)
-    blocks = densities.shape[1]
-    prior = -np.asarray(effects) * np.log(2.0 * max(library, 1))
-    drawn = np.random.default_rng(seed).dirichlet(np.ones(blocks), size=_DRAWS) * blocks
-    total = drawn @ densities.T + prior
+    sizes = known[0].sizes
+    count = min(known, key=lambda one: one.mean).count
+    drawn = np.random.default_rng(seed).dirichlet(np.ones(len(sizes)), size=_DRAWS) * sizes
+    errors = drawn @ np.array([one.errors for one in known]).T / drawn.sum(axis=1, keepdims=True)
+    total = -0.5 * count * np.log(errors) + np.asarray(log_priors)
     total -= total.max(axis=1, keepdims=True)
     weights = np.exp(total)
     found: Array = (weights / weights.sum(axis=1, keepdims=True)).mean(axis=0)
     return found
-
-
-HALF = 0.5
-_NOISE_KNOWN = 0.05  # share to which the variance of the noise is known
 
 
 def removes(without: float, after: float) -> float:

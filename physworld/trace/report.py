@@ -107,7 +107,7 @@ def document(result: TraceResult) -> dict[str, Any]:
 def _kept(tried: Sequence[Hypothesis], answer: Sequence[str]) -> list[str] | None:
     """What of a step is in the answer, or on the way to it."""
     found = [h for h in tried if set(h.names) <= set(answer)]
-    return list(max(found, key=lambda h: h.score).names) if found else None
+    return list(min(found, key=lambda h: h.left).names) if found else None
 
 
 def _support(result: TraceResult, name: str) -> dict[str, float | None]:

@@ -50,7 +50,7 @@ class Supported:
         posterior: probability among all sets that were fitted.
         misfit: on the training frames, over the noise.
         left_out: error on left-out blocks, over the noise.
-        discrepancy_m: estimated amplitude of what the twin lacks still [m].
+        discrepancy_m: root mean square of that error beyond the noise [m].
     """
 
     effects: tuple[str, ...]

@@ -3,7 +3,7 @@
 1. Freeze the split. Calibrate the declared physics on the training frames; leave out faulty sightings.
 2. Noise; whitening by noise, by the points' own places and by what finer cells and a smaller step change (their
    estimated error as one standard deviation, Richardson's for second order).
-3. The declared physics under noise and model discrepancy; the search over sets of effects; their posterior.
+3. The declared physics; the search over sets of effects; their posterior from left-out blocks.
 4. The answer: the sets that hold 0.95 of the posterior, four at most. What remains is told beside it and forbids no
    name. Intervals; then, once, the held-out frames.
 """
@@ -33,11 +33,11 @@ from physworld.trace.answer import DATA as FAULTY
 from physworld.trace.answer import NOTHING, UNEXPLAINED, Verdict, decided
 from physworld.trace.candidates import candidates
 from physworld.trace.config import TraceConfig
-from physworld.trace.discrepancy import Discrepancy, discrepancy_of
 from physworld.trace.faults import Faults, without_faults
 from physworld.trace.held_out import HeldOut, Outcomes
 from physworld.trace.hypotheses import Hypothesis, Setting
 from physworld.trace.intervals import calibrated, named, spread_of
+from physworld.trace.left_out import independent
 from physworld.trace.preparation import EXPERIMENT, SEARCH, Beginning, Clock, remarks, taken_with
 from physworld.trace.recordings import FITTED, HELD_OUT, JointSimulations, Recordings, side_by_side
 from physworld.trace.report import describe
@@ -121,14 +121,26 @@ def trace(
 
 @dataclass(frozen=True)
 class _Ground:
-    """What is known before hypotheses: whiteners without and with the solver's doubt, noise [m], numerics."""
+    """What is known before hypotheses.
+
+    Attributes:
+        bare, white: whiteners without and with the solver's own error.
+        blocks: rows of every block of frames.
+        sigma: noise [m]; None where it is not known.
+        numerics: root mean squared change by other cells and steps, over the noise, by name.
+        doubt: the solver's error as estimated from these, (frames, N, 3) [m] each.
+        finer: the twin on finer cells.
+        tracks: of the calibrated twin, (frames, N, 3) [m].
+    """
 
     bare: Whitener
     white: Whitener
-    discrepancy: Discrepancy
+    blocks: list[Array]
     sigma: float | None
     numerics: dict[str, float]
+    doubt: list[Array]
     finer: Twin
+    tracks: Array
 
 
 class _Trace:
@@ -158,14 +170,14 @@ class _Trace:
         chosen, refused = candidates(declared.fitted.twin, config.candidates)
         setting = self._setting(ground, declared.fitted.twin, declared.fitted.unknowns)
         early = early_part(ground.bare, self.split)
-        search = Search(
-            setting, chosen, early, config.confirmed, config.additions, config.effects_at_most, config.seed
-        )
+        solver = _solver_error(ground, declared)
+        sizes = (config.confirmed, config.additions, config.effects_at_most)
+        search = Search(setting, chosen, early, *sizes, config.seed)
         self.clock.start()
         with self.clock.until(SEARCH):
             search.run(declared)
         known, weights = search.admitted(), search.weights()
-        verdict = decided(known, weights, ground.sigma, ground.numerics, search.library)
+        verdict = decided(known, weights, ground.sigma, solver, search.library)
         if self.faults and verdict.name == NOTHING:
             reason = f"faulty sightings ({self.faults}); of the others {verdict.reason}"
             verdict = Verdict(FAULTY, declared, (), reason)
@@ -180,7 +192,7 @@ class _Trace:
         held_out = measured.together(unseen, ground.sigma)
         shares = self._shares(verdict, declared, held_out, measured, ground)
         spreads = [
-            spread_of(m, ground.discrepancy, config.bootstraps, config.seed)
+            spread_of(m, ground.blocks, config.bootstraps, config.seed)
             for m in (verdict.model, *verdict.equivalent)
         ]
         claimed = verdict.name not in (NOTHING, UNEXPLAINED)
@@ -214,7 +226,7 @@ class _Trace:
             experiment=experiment,
             notes=(*self.notes, *measured.notes),
             recordings=tuple(outcomes),
-            supported=_supported(known, weights),
+            supported=_supported(known, weights, ground.white.sigma),
             shares=shares,
         )
 
@@ -235,26 +247,29 @@ class _Trace:
         numerics = {n: float(np.sqrt(np.mean(bare.change(d) ** 2))) for n, d in directions.items()}
         doubt = [_RICHARDSON[n] * d for n, d in directions.items() if n in _RICHARDSON]
         white = bare.knowing([*self._turns(tracks, scale), *doubt])
-        counts = [r.points.stop - r.points.start for r in self.recordings.fitted]
-        owners = np.repeat(np.arange(len(counts)), counts)
-        places = np.nan_to_num(self.scene.points[0])
-        discrepancy = discrepancy_of(white, self.split, self.scene.times, places, owners, tracks)
-        return _Ground(bare, white, discrepancy, sigma, numerics, finer)
+        block_of_row = self.split.block_of(white.frame_of_row)
+        blocks = [np.flatnonzero(block_of_row == k) for k in range(self.split.blocks)]
+        blocks = [rows for rows in blocks if len(rows)]
+        return _Ground(bare, white, blocks, sigma, numerics, doubt, finer, tracks)
 
     def _declared(self, ground: _Ground) -> Hypothesis:
-        """The declared physics under noise and discrepancy."""
+        """The declared physics."""
         self.simulations.stage = "declared physics"
         unknowns = self._unknowns()
         thorough = replace(
             self._setting(ground, self.twin, unknowns), iterations=_THOROUGH * self.config.iterations
         )
-        declared = thorough.fitted((), {u.name: u.start for u in unknowns}, _other_places(unknowns))
+        first = float(np.mean(ground.white.residual(ground.tracks) ** 2))
+        rows = sum(len(own) for own in ground.blocks)
+        scale = np.sqrt(max(first, 1.0) * rows / independent(max(first, 1.0), rows, len(ground.blocks)))
+        start = {u.name: u.start for u in unknowns}
+        declared = thorough.fitted((), start, _other_places(unknowns), scale=float(scale))
         if declared is None:
             raise RuntimeError("the calibrated twin cannot be simulated again")
         return declared
 
     def _setting(self, ground: _Ground, twin: Twin, unknowns: Sequence[Unknown]) -> Setting:
-        known = (self.simulations, ground.white, ground.discrepancy, self.frames, self.config.iterations)
+        known = (self.simulations, ground.white, ground.blocks, self.frames, self.config.iterations)
         return Setting(*known, twin, unknowns)
 
     def _unknowns(self) -> list[Unknown]:
@@ -335,12 +350,28 @@ class _Trace:
         return [found - tracks for found in self.simulations.run(jobs) if found is not None]
 
 
-def _supported(known: list[Hypothesis], weights: Array) -> tuple[Supported, ...]:
+def _supported(known: list[Hypothesis], weights: Array, sigma: float) -> tuple[Supported, ...]:
     ordered = sorted(zip(weights, known, strict=True), key=lambda pair: -pair[0])
     return tuple(
-        Supported(h.names, float(w), h.fitted.misfit, float(np.sqrt(h.left)), h.evidence.kappa)
+        Supported(
+            h.names,
+            float(w),
+            h.fitted.misfit,
+            float(np.sqrt(h.left)),
+            sigma * float(np.sqrt(max(h.left - 1.0, 0.0))),
+        )
         for w, h in ordered
     )
+
+
+def _solver_error(ground: _Ground, declared: Hypothesis) -> float:
+    """Mean squared estimate of the solver's own error, over the noise's, beside what calibrated parameters can do."""
+    basis = np.linalg.qr(declared.fitted.free_jacobian)[0]
+    found = 0.0
+    for change in ground.doubt:
+        shift = ground.bare.change(change)
+        found += float(np.mean((shift - basis @ (basis.T @ shift)) ** 2))
+    return found
 
 
 def _other_places(unknowns: list[Unknown]) -> list[dict[str, float]]:

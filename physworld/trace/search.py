@@ -1,10 +1,11 @@
 """One search over sets of effects: forward additions, backward deletions, starts that every hypothesis shares.
 
-Every candidate is scored to first order first: the fall of the log marginal likelihood with its sensitivities, the
-discrepancy estimated anew. The most promising are fitted with the full simulator. A fit starts from its linear
-estimate, from multiples of it (a strength is underestimated where motion has run out of phase), from where other
-hypotheses have come to rest (their *basins*), and from the best of a low-discrepancy design over stiffness and
-strengths on the first part of the recording, where phases have not slipped yet.
+Every candidate is scored to first order first: the share of the squared residual above the noise that goes with its
+sensitivities and those of the calibrated parameters, within bounds and under priors. The most promising are fitted with
+the full simulator. A fit starts from its linear estimate, from multiples of it (a strength is underestimated where
+motion has run out of phase), from where other hypotheses have come to rest (their *basins*), and from the best of a
+low-discrepancy design over strengths, stiffness and whatever else nothing is known of, on the first part of the
+recording, where phases have not slipped yet.
 
 Then another effect is added to the best set as long as the posterior asks for it, at most three; of every larger set
 each effect is taken out again and exchanged, from the larger set's basin, so that a pair whose first half was wrong
@@ -28,11 +29,10 @@ from physworld.estimation.unknowns import Unknown, at, bounds_of
 from physworld.estimation.whitening import Whitener
 from physworld.trace.candidates import Candidate
 from physworld.trace.hypotheses import Hypothesis, Setting, Values
-from physworld.trace.likelihood import Linear, marginal
+from physworld.trace.left_out import independent
 from physworld.trace.posterior import HALF, posterior, removes
 from physworld.trace.sensitivity import Response, candidate_responses
 
-_KAPPAS = (1.0, 0.25, 0.06, 0.0)  # of the base's discrepancy: with a candidate there may be less of it
 _MULTIPLES = (0.3, 3.0, 9.0)  # of a linear estimate
 _VARIANTS = 3  # shapes of an effect that are fitted before its best is freed
 _DESIGN = 16  # places of the low-discrepancy design
@@ -53,15 +53,15 @@ class Screened:
 
     Attributes:
         candidate: which.
-        gain: rise of the log marginal likelihood.
         values: linear estimates of all unknowns, by name, in the scale of the search.
         share: of the squared residual above the noise that goes, to first order.
+        error: mean squared residual over the noise's that stays.
     """
 
     candidate: Candidate
-    gain: float
     values: Values
     share: float
+    error: float
 
 
 @dataclass(frozen=True)
@@ -128,9 +128,13 @@ class Search:
         for member in hypothesis.members:
             rest = self.hypotheses.get(_names([m for m in hypothesis.members if m is not member]))
             without = self.hypotheses[()] if rest is None else rest
-            if removes(without.left, hypothesis.left) < HALF:
+            if self._removes(without, hypothesis) < HALF:
                 return False
         return True
+
+    def _removes(self, without: Hypothesis, after: Hypothesis | None = None) -> float:
+        """Share of what ``without`` leaves that is gone after; all of it for None."""
+        return removes(without.left, 0.0 if after is None else after.left)
 
     @property
     def steps(self) -> tuple[Step, ...]:
@@ -144,30 +148,32 @@ class Search:
     def weights(self) -> Array:
         """Posterior of the admitted hypotheses, (H,), in their order."""
         known = self.admitted()
-        return posterior(
-            [h.evidence.left_out for h in known], [len(h.members) for h in known], self.library, self.seed
-        )
+        return posterior([h.unseen for h in known], [self._log_prior(h) for h in known], self.seed)
+
+    def _log_prior(self, hypothesis: Hypothesis) -> float:
+        return hypothesis.log_prior - len(hypothesis.members) * float(np.log(2.0 * self.library))
 
     def _total(self, hypothesis: Hypothesis) -> float:
-        return hypothesis.score - len(hypothesis.members) * float(np.log(2.0 * self.library))
+        """Log posterior up to a constant, all blocks alike."""
+        count = min(self.hypotheses.values(), key=lambda h: h.left).unseen.count
+        return self._log_prior(hypothesis) - 0.5 * count * float(np.log(hypothesis.left))
 
     def _of_size(self, size: int) -> list[Hypothesis]:
         return [h for h in self.hypotheses.values() if len(h.members) == size]
 
     def _add(self, base: Hypothesis, count: int) -> None:
         """Fits with one effect more than ``base``, if that leaves anything above the noise."""
-        nothing = removes(base.left, 0.0) == 0.0
+        nothing = self._removes(base) == 0.0
         if nothing and base.members:
             return
         screened = self.screened(base)
         self.screens.append((base, screened))
         if nothing:
             return
-        price = float(np.log(2.0 * self.library)) if base.members else 0.0
         by_effect: dict[str, list[Screened]] = {}
         for one in screened:
             by_effect.setdefault(one.candidate.effect, []).append(one)
-        order = [own for own in by_effect.values() if own[0].gain > price and own[0].share > WORTH]
+        order = [own for own in by_effect.values() if own[0].share > WORTH]
         restless = base.fitted.misfit > 1.2 and not base.members
         order = order[:count]
         if restless:  # a score to first order says nothing of an effect that is large
@@ -184,7 +190,7 @@ class Search:
         A rival that promises less than half of that is no rival.
         """
         tried = (h for h in self._of_size(len(base.members) + 1) if set(base.names) <= set(h.names))
-        most = max((removes(base.left, h.left) for h in tried if h.doubt is None), default=0.0)
+        most = max((self._removes(base, h) for h in tried if h.doubt is None), default=0.0)
         return most if most >= _NEARLY_ALL else 0.0
 
     def _take_out(self, larger: Hypothesis) -> None:
@@ -193,8 +199,10 @@ class Search:
             rest = tuple(m for m in larger.members if m is not member)
             known = self.hypotheses.get(_names(rest))
             values = larger.values
-            again = self.setting.fitted(rest, values, [known.values] if known else [])
-            if again is not None and (known is None or again.score > known.score):
+            again = self.setting.fitted(
+                rest, values, [known.values] if known else [], scale=larger.unseen.scale
+            )
+            if again is not None and (known is None or again.left < known.left):
                 self.hypotheses[_names(rest)] = known = again
             if known is not None and known.members and self._total(known) < self._total(larger):
                 self._add(known, self.additions)
@@ -211,8 +219,9 @@ class Search:
             own = (*base.members, one.candidate)
             starts = self._starts(base, one)
             linear = {**base.values, **one.values}
-            found = self.setting.fitted(own, linear, starts, hopeless=hopeless, shapes=not shaped)
-            if found is not None and (best is None or found.score > best.score):
+            scale = self._scale(base, one.error)
+            found = self.setting.fitted(own, linear, starts, not shaped, scale, hopeless)
+            if found is not None and (best is None or found.left < best.left):
                 best = found
         if best is not None and shaped:
             places = [best.values]
@@ -220,12 +229,17 @@ class Search:
             if mirror is not None:
                 places.append({**best.values, **_mirrored(best, best.members[-1])})
             for place in places:
-                found = self.setting.fitted(best.members, place)
-                if found is not None and found.score > best.score:
+                found = self.setting.fitted(best.members, place, scale=best.unseen.scale)
+                if found is not None and found.left < best.left:
                     best = found
         known = self.hypotheses.get(names)
-        if best is not None and (known is None or best.score > known.score):
+        if best is not None and (known is None or best.left < known.left):
             self.hypotheses[names] = best
+
+    def _scale(self, base: Hypothesis, error: float) -> float:
+        """Deviations of the noise that a sighting counts as at a mean squared residual of ``error``."""
+        rows, blocks = len(base.fitted.residual), len(self.setting.blocks)
+        return float(np.sqrt(max(error, 1.0) * rows / independent(max(error, 1.0), rows, blocks)))
 
     def _hopeless(self, base: Hypothesis) -> float:
         """Squared residual above which a fit is left: it is far from removing a half of what ``base`` leaves, and the
@@ -305,7 +319,7 @@ class Search:
             setting.simulations, setting.white, base.fitted.twin, base.fitted.tracks, chosen, setting.frames
         )
         found = [self._screen(base, response) for response in responses if not response.failed]
-        return sorted((one for one in found if one is not None), key=lambda one: -one.gain)
+        return sorted((one for one in found if one is not None), key=lambda one: -one.share)
 
     def _screen(self, base: Hypothesis, response: Response) -> Screened | None:
         candidate, columns = response.candidate, response.columns
@@ -318,30 +332,16 @@ class Search:
         start = np.concatenate([base.fitted.theta[kept], [base.values.get(g.name, 0.0) for g in gates]])
         unknowns = [u.starting(t) for u, t in zip([*known, *gates], start, strict=True)]
         jacobian = np.concatenate([base.fitted.jacobian[:, kept], columns], axis=1)
-        before = base.evidence.marginal
-        best: Screened | None = None
-        square = max(base.fitted.misfit**2 - 1.0, 1e-12)
-        for kappa in dict.fromkeys(f * base.evidence.kappa for f in _KAPPAS):
-            change = self._bounded(base, jacobian, unknowns, start, kappa)
-            theta = start + change
-            residual = base.fitted.residual - jacobian @ change
-            there = [u.starting(t) for u, t in zip(unknowns, theta, strict=True)]
-            after, _ = marginal(Linear(residual, jacobian, there, theta), self.setting.discrepancy)
-            if best is None or after - before > best.gain:
-                share = (base.fitted.misfit**2 - float(np.mean(residual**2))) / square
-                values = {u.name: float(t) for u, t in zip(unknowns, theta, strict=True)}
-                best = Screened(candidate, after - before, values, share)
-        return best
+        change = self._bounded(base, jacobian, unknowns, start)
+        error = float(np.mean((base.fitted.residual - jacobian @ change) ** 2))
+        before = base.fitted.misfit**2
+        share = (before - error) / max(before - 1.0, 1e-12)
+        values = {u.name: float(t) for u, t in zip(unknowns, start + change, strict=True)}
+        return Screened(candidate, values, share, error)
 
-    def _bounded(
-        self, base: Hypothesis, jacobian: Array, unknowns: list[Unknown], start: Array, kappa: float
-    ) -> Array:
-        """Linear change of all unknowns (p,) within their bounds, under a discrepancy of ``kappa`` [m]."""
-        discrepancy = self.setting.discrepancy
-        slope, residual = (
-            discrepancy.whitened(jacobian, kappa),
-            discrepancy.whitened(base.fitted.residual, kappa),
-        )
+    def _bounded(self, base: Hypothesis, jacobian: Array, unknowns: list[Unknown], start: Array) -> Array:
+        """Linear change of all unknowns (p,) within their bounds, by what a sighting counts beside ``base``."""
+        slope, residual = jacobian / base.unseen.scale, base.fitted.residual / base.unseen.scale
         prior_residual, prior_slope = prior_rows(unknowns, start)
         normal = slope.T @ slope + prior_slope.T @ prior_slope
         gradient = slope.T @ residual + prior_slope.T @ prior_residual

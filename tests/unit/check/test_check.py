@@ -11,10 +11,10 @@ from scipy.stats import chi2
 
 from benchmarks.trace.check_trials import CONFIG, FINE_M, bar, detection, spread_of
 from physworld.check import INVISIBLE, VISIBLE, check, document
+from physworld.check.discrepancy import Block, Discrepancy
 from physworld.check.information import POSTERIOR, POWER, Information
 from physworld.check.run import CheckResult
 from physworld.errors import Cancelled
-from physworld.trace.discrepancy import Block, Discrepancy
 
 pytestmark = pytest.mark.slow
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from sagging_bar import BUDGET, sagging
 
+from physworld.check.discrepancy import Block, Discrepancy
 from physworld.effects.registry import effect
 from physworld.estimation.refit import Refit
 from physworld.estimation.unknowns import Unknown
 from physworld.trace.candidates import candidates
-from physworld.trace.discrepancy import Block, Discrepancy
 from physworld.trace.intervals import Spread, spread_of
 from physworld.twin.build import build_twin
 

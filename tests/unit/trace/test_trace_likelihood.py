@@ -11,9 +11,9 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
+from physworld.check.discrepancy import Block, Discrepancy
 from physworld.estimation.unknowns import Unknown
 from physworld.trace.answer import decided
-from physworld.trace.discrepancy import Block, Discrepancy
 from physworld.trace.likelihood import Linear, evidence, marginal
 from physworld.trace.posterior import HALF, posterior, removes
 
