@@ -16,7 +16,20 @@ from physworld.estimation.refit import prior_rows
 from physworld.estimation.unknowns import bounds_of
 from physworld.trace.left_out import Linear
 
+_LEVELS = 28  # amplitudes that are tried, beside none
+_LEAST, _MOST = 0.05, 3e4  # of the noise
 _WEAKEST = 1e-9  # of the normal matrix's diagonal: keeps it invertible where data say nothing of an unknown
+
+
+def amplitudes(discrepancy: Discrepancy) -> Array:
+    """Kappa [m] that are tried, (L,): none, and from a twentieth of the noise upwards."""
+    return np.concatenate([[0.0], discrepancy.sigma * np.geomspace(_LEAST, _MOST, _LEVELS)])
+
+
+def log_prior(discrepancy: Discrepancy, kappa: Array) -> Array:
+    """Logarithm of the density of kappa over the noise, up to a constant: half a Cauchy, which prefers zero."""
+    density: Array = -np.log1p((np.asarray(kappa) / discrepancy.sigma) ** 2)
+    return density
 
 
 def marginal(linear: Linear, discrepancy: Discrepancy) -> tuple[float, float]:
@@ -32,7 +45,7 @@ def marginal(linear: Linear, discrepancy: Discrepancy) -> tuple[float, float]:
     normal, gradient = jacobian.T @ jacobian, jacobian.T @ residual
     square = float(residual @ residual)
     spread = np.log([max(u.bounds[1] - u.bounds[0], 1e-300) for u in linear.unknowns])
-    kappas = discrepancy.amplitudes()
+    kappas = amplitudes(discrepancy)
     found = np.zeros(len(kappas))
     for k, kappa in enumerate(kappas):
         n, g, s, half = normal + precision, gradient + prior_slope.T @ prior_residual, square, 0.0
@@ -50,13 +63,13 @@ def marginal(linear: Linear, discrepancy: Discrepancy) -> tuple[float, float]:
         )
         # an unknown without a prior is as likely anywhere within its bounds
         known = np.diag(prior_slope)[free]
-        log_prior = np.where(
+        log_known = np.where(
             known > 0, np.log(np.maximum(known, 1e-300)), -spread[free] + 0.5 * np.log(2 * np.pi)
         )
-        occam = 0.5 * np.linalg.slogdet(n)[1] - float(np.sum(log_prior)) if len(g) else 0.0
+        occam = 0.5 * np.linalg.slogdet(n)[1] - float(np.sum(log_known)) if len(g) else 0.0
         found[k] = -0.5 * fitted - occam - half
-    found = found + discrepancy.log_prior(kappas)
-    weights = np.concatenate([[discrepancy.amplitudes()[1]], np.gradient(kappas[1:])])
+    found = found + log_prior(discrepancy, kappas)
+    weights = np.concatenate([[amplitudes(discrepancy)[1]], np.gradient(kappas[1:])])
     total = found + np.log(weights / weights.sum())
     best = int(np.argmax(found))
     top = float(total.max())

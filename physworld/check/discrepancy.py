@@ -5,9 +5,8 @@
 No twin of a real object is right to the last micrometre of a camera. What it leaves is smooth: in time on the scale
 of the motion, along the body on the scale of its length (Kennedy and O'Hagan 2001; Brynjarsdottir and O'Hagan 2014).
 K is the product of a Matern kernel of order 3/2 over time and a squared exponential over the points' places at rest,
-alike in x, y and z and independent from one block of frames to the next; its amplitude kappa [m] is estimated together
-with everything else by marginal likelihood under a prior that prefers zero (half a Cauchy of the noise's width). A
-recording that a twin meets has kappa near 0, and then r is white.
+alike in x, y and z and independent from one block of frames to the next; its amplitude kappa [m] is what is
+assumed of a twin. Without any, r is white.
 
 Within a block K has few directions that matter (U, with factors s), so that every kappa costs a few products.
 """
@@ -25,8 +24,6 @@ from physworld.estimation.whitening import Whitener
 _BODY_SHARE = 0.5  # length scale along the body over its size
 _KEPT = 0.99  # of each kernel's variance
 _MOST_SHAPES, _MOST_TIMES = 6, 12
-_LEVELS = 28  # amplitudes that are tried, beside none
-_LEAST, _MOST = 0.05, 3e4  # of the noise
 
 
 @dataclass(frozen=True)
@@ -55,15 +52,6 @@ class Discrepancy:
     sigma: float
     time_s: float
 
-    def amplitudes(self) -> Array:
-        """Kappa [m] that are tried, (L,): none, and from a twentieth of the noise upwards."""
-        return np.concatenate([[0.0], self.sigma * np.geomspace(_LEAST, _MOST, _LEVELS)])
-
-    def log_prior(self, kappa: Array) -> Array:
-        """Logarithm of the density of kappa over the noise, up to a constant: half a Cauchy."""
-        density: Array = -np.log1p((np.asarray(kappa) / self.sigma) ** 2)
-        return density
-
     def shrink(self, block: Block, kappa: float) -> Array:
         """What whitening takes from every direction of a block, (r,)."""
         taken: Array = 1.0 - 1.0 / np.sqrt(1.0 + (kappa * block.factors) ** 2)
@@ -76,41 +64,6 @@ class Discrepancy:
             inner = block.basis.T @ values[block.rows]
             out[block.rows] -= block.basis @ (_down(self.shrink(block, kappa), inner) * inner)
         return out
-
-    def unwhitened(self, values: Array, kappa: float) -> Array:
-        """The inverse of :meth:`whitened`."""
-        out = values.copy()
-        for block in self.blocks if kappa > 0 else ():
-            inner = block.basis.T @ values[block.rows]
-            grow = np.sqrt(1.0 + (kappa * block.factors) ** 2) - 1.0
-            out[block.rows] += block.basis @ (_down(grow, inner) * inner)
-        return out
-
-    def log_determinants(self, kappa: float) -> Array:
-        """Half the logarithm of the covariance's determinant, of every block (B,)."""
-        return np.array([0.5 * np.sum(np.log1p((kappa * block.factors) ** 2)) for block in self.blocks])
-
-
-@dataclass(frozen=True)
-class DiscrepancyWhitener:
-    """Whitens by noise, places and solver (``base``), then by a discrepancy of ``kappa`` [m]."""
-
-    base: Whitener
-    discrepancy: Discrepancy
-    kappa: float
-
-    @property
-    def measured(self) -> Array:
-        """Sightings, (V, 3) [m]."""
-        return self.base.measured
-
-    def residual(self, tracks: Array) -> Array:
-        """Whitened measured minus predicted, (M,), of tracks (frames, N, 3)."""
-        return self.discrepancy.whitened(self.base.residual(tracks), self.kappa)
-
-    def change(self, difference: Array) -> Array:
-        """Whitened change of a prediction, (M,), of a difference of tracks (frames, N, 3)."""
-        return self.discrepancy.whitened(self.base.change(difference), self.kappa)
 
 
 def discrepancy_of(

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from sagging_bar import BUDGET, sagging
 
-from physworld.check.discrepancy import Block, Discrepancy
 from physworld.effects.registry import effect
 from physworld.estimation.refit import Refit
 from physworld.estimation.unknowns import Unknown
 from physworld.trace.candidates import candidates
 from physworld.trace.intervals import Spread, spread_of
+from physworld.trace.left_out import LeftOut
 from physworld.twin.build import build_twin
 
 ROWS = 60
@@ -33,21 +33,21 @@ def line(noise: float = 1.0) -> Refit:
     return Refit(unknowns, build_twin(sagging(), BUDGET), np.array([0.3, 2.0]), np.empty(0), left, slopes)
 
 
-def spread(fitted: Refit, blocks: int, resamples: int) -> Spread:
-    """Under blocks of equal size, without a discrepancy."""
+def spread(fitted: Refit, blocks: int, resamples: int, error: float = 1.0) -> Spread:
+    """Under blocks of equal size, with this left-out error."""
     rows = np.array_split(np.arange(len(fitted.residual)), blocks)
-    parts = tuple(Block(own, np.zeros((len(own), 0)), np.zeros(0)) for own in rows)
-    model: Any = SimpleNamespace(fitted=fitted, evidence=SimpleNamespace(kappa=0.0))
-    return spread_of(model, Discrepancy(parts, 1e-3, 0.1), resamples, 0)
+    unseen = LeftOut(np.full(blocks, error), np.array([len(own) for own in rows]))
+    model: Any = SimpleNamespace(fitted=fitted, unseen=unseen)
+    return spread_of(model, rows, resamples, 0)
 
 
 @pytest.mark.parametrize("blocks", [1, 2, 12])
-@pytest.mark.parametrize("noise", [0.5, 3.0])
+@pytest.mark.parametrize("noise", [0.5, 1.0])
 def test_an_interval_is_as_wide_as_the_noise_leaves_it_however_few_the_blocks(
     blocks: int, noise: float
 ) -> None:
     fitted = line(noise)
-    deviation = np.sqrt(np.diag(np.linalg.inv(fitted.jacobian.T @ fitted.jacobian))) * max(1.0, fitted.misfit)
+    deviation = np.sqrt(np.diag(np.linalg.inv(fitted.jacobian.T @ fitted.jacobian)))
     found = spread(fitted, blocks, 500).numbers()
     for name, value, own in zip(("offset", "slope"), (0.3, 2.0), deviation, strict=True):
         low, high = found[name].ci95
@@ -81,14 +81,9 @@ def test_what_the_numbers_imply_has_an_interval_too() -> None:
     assert high == pytest.approx(angle.value + 1.96 * own, abs=0.15 * own)
 
 
-def test_an_interval_under_a_discrepancy_is_that_of_generalised_least_squares() -> None:
-    fitted, kappa = line(), 2e-3
-    basis = np.linalg.qr(np.stack([np.ones(ROWS), TIMES], axis=1))[0]  # looks like an offset and a slope
-    factors = np.array([900.0, 300.0])
-    model: Any = SimpleNamespace(fitted=fitted, evidence=SimpleNamespace(kappa=kappa))
-    block = Block(np.arange(ROWS), basis, factors)
-    found = spread_of(model, Discrepancy((block,), 1e-3, 0.1), 100, 0)
-    dense = np.linalg.inv(np.eye(ROWS) + kappa**2 * basis @ np.diag(factors**2) @ basis.T)
-    expected = np.linalg.inv(fitted.jacobian.T @ dense @ fitted.jacobian)
-    misfit = max(1.0, float(fitted.residual @ dense @ fitted.residual) / ROWS)
-    np.testing.assert_allclose(found.covariance, misfit * expected, rtol=1e-6)
+def test_an_interval_is_wider_where_blocks_share_an_error() -> None:
+    """Three quarters of the squared error are shared by the rows of each of twelve blocks."""
+    fitted = line()
+    alone, shared = (spread(fitted, 12, 100, error).covariance for error in (1.0, 4.0))
+    worth = 1.0 / ((1 / 4) ** 2 / ROWS + (3 / 4) ** 2 / 12)
+    np.testing.assert_allclose(shared, alone * 4.0 * ROWS / worth, rtol=1e-6)

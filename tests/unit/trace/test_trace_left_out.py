@@ -1,0 +1,144 @@
+"""Left-out errors against refits of the rows, what sightings count, the posterior, the answer, and a whole trace."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.optimize import lsq_linear
+
+from physworld.estimation.unknowns import Unknown
+from physworld.trace.answer import decided
+from physworld.trace.left_out import LeftOut, Linear, independent, left_out
+from physworld.trace.posterior import HALF, posterior, removes
+
+BLOCKS, ROWS = 5, 12
+
+
+def linear_fit(
+    jacobian: np.ndarray, observed: np.ndarray, bounds: tuple[float, float], scale: float
+) -> Linear:
+    """The fit of three unknowns with priors (0, 2) within the bounds, where a sighting counts ``scale``."""
+    rows = np.concatenate([jacobian / scale, np.eye(3) / 2.0])
+    wanted = np.concatenate([observed / scale, np.zeros(3)])
+    found = lsq_linear(rows, wanted, bounds, method="trf", tol=1e-14, max_iter=500).x
+    unknowns = [Unknown(f"u{k}", "1", *bounds, lambda twin, v: twin, prior=(0.0, 2.0)) for k in range(3)]
+    return Linear(observed - jacobian @ found, jacobian, unknowns, found)
+
+
+@pytest.mark.parametrize("bounds", [(-50.0, 50.0), (-0.3, 0.3)])
+@pytest.mark.parametrize("scale", [1.0, 8.0])
+def test_a_left_out_block_is_predicted_by_a_fit_to_the_others(
+    bounds: tuple[float, float], scale: float
+) -> None:
+    rng = np.random.default_rng(3)
+    block_of_row = np.repeat(np.arange(BLOCKS), ROWS)
+    jacobian = rng.normal(size=(BLOCKS * ROWS, 3))
+    # the third number is seen in one block only, where the others make up for it
+    jacobian[:, 2] = np.where(block_of_row == 2, jacobian[:, 0] + jacobian[:, 1], 0.01 * jacobian[:, 2])
+    observed = jacobian @ np.array([0.2, -0.1, 0.25]) + rng.normal(size=BLOCKS * ROWS)
+    fitted = linear_fit(jacobian, observed, bounds, scale)
+    found = left_out(fitted, [np.flatnonzero(block_of_row == k) for k in range(BLOCKS)], scale)
+    for block in range(BLOCKS):
+        kept = block_of_row != block
+        alone = linear_fit(jacobian[kept], observed[kept], bounds, scale)
+        left = observed[~kept] - jacobian[~kept] @ alone.theta
+        assert found.errors[block] == pytest.approx(np.mean(left**2), rel=1e-4)
+
+
+@pytest.mark.parametrize("shared", [0.0, 0.3, 3.0])
+def test_sightings_are_worth_what_the_spread_of_their_mean_square_says(shared: float) -> None:
+    """Noise in every number, and an error that all numbers of a block share: the mean square of n independent numbers
+    of deviation 1 spreads by sqrt(2 / n)."""
+    rng = np.random.default_rng(0)
+    rows, blocks, draws = 600, 12, 4000
+    noise = rng.normal(size=(draws, rows))
+    common = np.sqrt(shared) * np.repeat(rng.normal(size=(draws, blocks)), rows // blocks, axis=1)
+    signs = np.where(np.arange(rows) % 2, 1.0, -1.0)  # a pattern within the block
+    parts = np.mean(noise**2, axis=1) + np.mean((signs * common) ** 2, axis=1)
+    worth = 2.0 * np.mean(parts) ** 2 / np.var(parts)
+    assert independent(1.0 + shared, rows, blocks) == pytest.approx(worth, rel=0.1)
+
+
+def unseen(*errors: float, rows: int = 100) -> LeftOut:
+    return LeftOut(np.array(errors), np.full(len(errors), rows))
+
+
+def test_a_posterior_prefers_what_predicts_and_what_is_simple() -> None:
+    plain = unseen(*[6.0] * 12)
+    better = unseen(*[1.0] * 12)
+    price = -np.log(40.0)
+    weights = posterior([plain, better, better], [0.0, price, price])
+    assert weights.sum() == pytest.approx(1.0)
+    np.testing.assert_allclose(weights, [0.0, 0.5, 0.5], atol=1e-6)
+    np.testing.assert_allclose(posterior([plain, plain], [0.0, price]), [40.0 / 41.0, 1.0 / 41.0])
+
+
+def test_where_the_twin_is_right_a_little_is_decisive_and_where_it_is_not_it_is_nothing() -> None:
+    """The same tenth of the error: beside noise alone, and beside a discrepancy of thirty times the noise."""
+    assert posterior([unseen(*[1.1] * 12, rows=1000), unseen(*[1.0] * 12, rows=1000)], [0.0, 0.0])[1] > 0.999
+    far = posterior([unseen(*[990.0] * 12, rows=1000), unseen(*[900.0] * 12, rows=1000)], [0.0, 0.0])
+    assert 0.5 < far[1] < 0.8
+
+
+def test_what_wins_in_one_block_only_does_not_win_for_sure() -> None:
+    even, once = [4.0] * 12, [4.4] * 11 + [0.1]
+    found = posterior([unseen(*even, rows=30), unseen(*once, rows=30)], [0.0, 0.0])
+    assert 0.2 < found[1] < 0.8
+
+
+def test_an_effect_removes_a_share_of_what_is_above_the_noise() -> None:
+    assert removes(3.0, 2.0) == HALF
+    assert removes(3.0, 0.9) == 1.0
+    assert removes(1.04, 1.0) == 0.0, "that much is not known of the noise"
+
+
+@pytest.mark.slow
+def test_a_trace_names_a_drag_and_tells_what_is_left() -> None:
+    from test_trace_run import CONFIG, beam, recorded
+
+    from physworld.effects.registry import effect
+    from physworld.trace import document, trace
+
+    config = replace(CONFIG, experiment=None)
+    found = trace(recorded(beam(0.03), effect("air_drag_linear", rate_per_s=6.0)), config)
+    report = document(found)
+    assert found.verdict.name == "named" and [e.name for e in found.effects] == ["air_drag_linear"]
+    assert found.effects[0].parameters["rate_per_s"].value == pytest.approx(6.0, rel=0.2)
+    assert report["effects"][0]["posterior"] > 0.95
+    assert 0.5 < report["effects"][0]["share_of_held_out_error"] <= 1.0
+    assert report["remainder"]["over_noise"] < 1.3
+    assert sum(h["posterior"] for h in report["hypotheses"]) == pytest.approx(1.0)
+
+
+@pytest.mark.slow
+def test_a_trace_names_nothing_where_nothing_acts() -> None:
+    from test_trace_run import CONFIG, SIGMA, beam, recorded
+
+    from physworld.trace import trace
+
+    found = trace(recorded(beam(0.015), sigma=2 * SIGMA), replace(CONFIG, experiment=None))
+    assert found.verdict.name == "nothing_to_explain" and not found.effects
+
+
+@pytest.mark.parametrize(
+    ("weights", "name"),
+    [([0.0, 0.01, 0.99], "unexplained"), ([0.0, 0.94, 0.06], "named"), ([0.06, 0.94, 0.0], "unexplained")],
+)
+def test_no_other_name_is_given_where_something_unbelievable_predicts_best(
+    weights: list[float], name: str
+) -> None:
+    def known(effect: str | None, misfit: float, doubt: str | None = None) -> Any:
+        members = () if effect is None else (SimpleNamespace(effect=effect, kind="force"),)
+        names = tuple(member.effect for member in members)
+        fitted = SimpleNamespace(misfit=misfit)
+        return SimpleNamespace(members=members, names=names, fitted=fitted, doubt=doubt)
+
+    gale = known("wind", 1.0, "a wind of 60 m/s is not believed")
+    hypotheses = [known(None, 4.0), known("air_drag_linear", 1.1), gale]
+    found = decided(hypotheses, np.array(weights), 1e-3, 0.0, 20)
+    assert found.name == name and not found.equivalent
+    assert ("not believed" in found.reason) == (weights[2] > 0.9)
