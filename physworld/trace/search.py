@@ -208,7 +208,8 @@ class Search:
                 self._add(known, self.additions)
 
     def _fit(self, base: Hypothesis, variants: list[Screened]) -> None:
-        """Fits ``base`` with an effect more, the best variants' shapes first as they are, then free."""
+        """Fits ``base`` with an effect more, the best variants' shapes first as they are, then free where that promises
+        something."""
         candidate = variants[0].candidate
         members = (*base.members, candidate)
         names = _names(members)
@@ -223,7 +224,8 @@ class Search:
             found = self.setting.fitted(own, linear, starts, not shaped, scale, hopeless)
             if found is not None and (best is None or found.left < best.left):
                 best = found
-        if best is not None and shaped:
+        promising = max(WORTH, HALF * self._cleared(base))
+        if best is not None and shaped and self._removes(base, best) >= promising:
             places = [best.values]
             mirror = best.members[-1].mirror
             if mirror is not None:
