@@ -181,7 +181,7 @@ def page(rows: list[dict[str, Any]]) -> Report:
         rows=table,
         notes=[
             "Errors in mm, root mean square per axis, open loop, on recordings or frames that no step has seen. "
-            "After: with what the verdict names. Best baseline: the best of static, rigid follow and constant velocity.",
+            "After: with what is named. Best baseline: the best of static, rigid follow and constant velocity.",
             *notes,
             *_not_run(rows),
         ],
