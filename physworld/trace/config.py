@@ -38,7 +38,7 @@ class TraceConfig:
     blocks: int = 12
     shortest_block: int = 3
     confirmed: int = 8
-    additions: int = 3
+    additions: int = 2
     iterations: int = 5
     effects_at_most: int = 3
     refinement: float = 1.4

@@ -41,6 +41,9 @@ _STIFFNESS = 0.8  # logarithms of the stiffness that it spans, up and down
 _EARLY = 0.4  # share of the training frames that it looks at
 _LEAST_SHARE = 0.01  # of a strength's bound, where the design begins
 WORTH = 0.2  # share of what is left above the noise that an effect explains to first order, to be fitted
+_QUIET = (
+    1.2  # misfit over the noise up to which what is there is small, and a score to first order says enough
+)
 _NEARLY_ALL = 0.9  # share of what is left above the noise
 _BASINS = 3  # other hypotheses' optima from which a fit starts
 _WORSE = 3.0  # times the best one's squared error above the noise: a fit that is left
@@ -110,9 +113,10 @@ class Search:
                 "sensitivities" if not size else "sensitivities of another effect"
             ):
                 self._add(base, self.additions if size else self.singles)
-            for known in sorted(self._of_size(size + 1), key=self._total, reverse=True)[:1] if size else []:
+            larger = max(self._of_size(size + 1), key=self._total, default=base)
+            if size and self._total(larger) > self._total(base):
                 with simulations.time_permitting("fits without one of the effects"):
-                    self._take_out(known)
+                    self._take_out(larger)
             best = max((h for h in self.admitted() if h.doubt is None), key=self._total)
             if len(best.members) <= size or simulations.ledger.cut:
                 break
@@ -174,24 +178,22 @@ class Search:
         for one in screened:
             by_effect.setdefault(one.candidate.effect, []).append(one)
         order = [own for own in by_effect.values() if own[0].share > WORTH]
-        restless = base.fitted.misfit > 1.2 and not base.members
+        restless = base.fitted.misfit > _QUIET and not base.members
         order = order[:count]
         if restless:  # a score to first order says nothing of an effect that is large
             order += [own for own in by_effect.values() if own not in order and own[0].candidate.scanned]
         for own in order:
-            if not own[0].candidate.scanned and own[0].share < HALF * self._cleared(base):
+            if not own[0].candidate.scanned and own[0].share < self._least(base):
                 continue
             self.setting.simulations.stage = f"fit with {own[0].candidate.effect}"
             self._fit(base, own)
 
-    def _cleared(self, base: Hypothesis) -> float:
-        """Share of what ``base`` leaves that one effect more removes, where it is nearly all; else 0.
-
-        A rival that promises less than half of that is no rival.
-        """
+    def _least(self, base: Hypothesis) -> float:
+        """Share of what ``base`` leaves that a rival has to promise: half of what one effect removes, where that is
+        nearly all; else 0."""
         tried = (h for h in self._of_size(len(base.members) + 1) if set(base.names) <= set(h.names))
         most = max((self._removes(base, h) for h in tried if h.doubt is None), default=0.0)
-        return most if most >= _NEARLY_ALL else 0.0
+        return HALF * most if most >= _NEARLY_ALL else 0.0
 
     def _take_out(self, larger: Hypothesis) -> None:
         """Fits without one of the effects of a set, and with another one in its place, from the set's basin."""
@@ -218,14 +220,16 @@ class Search:
         best: Hypothesis | None = None
         for one in variants[: _VARIANTS if shaped else 1]:
             own = (*base.members, one.candidate)
-            starts = self._starts(base, one)
+            designed, promised = self._designed(base, one)
+            if max(one.share, promised) < self._least(base):
+                continue
+            starts = [*self._starts(base, one), *designed]
             linear = {**base.values, **one.values}
             scale = self._scale(base, one.error)
             found = self.setting.fitted(own, linear, starts, not shaped, scale, hopeless)
             if found is not None and (best is None or found.left < best.left):
                 best = found
-        promising = max(WORTH, HALF * self._cleared(base))
-        if best is not None and shaped and self._removes(base, best) >= promising:
+        if best is not None and shaped and self._removes(base, best) >= max(WORTH, self._least(base)):
             places = [best.values]
             mirror = best.members[-1].mirror
             if mirror is not None:
@@ -264,8 +268,6 @@ class Search:
             starts += [
                 {**base.values, **kept, **{n: f * s for n, s in strengths.items()}} for f in (1.0, 0.3, 3.0)
             ]
-        if base.members or base.fitted.misfit > 1.2:
-            starts += self._designed(base, one)
         return starts
 
     def _basins(self, base: Hypothesis) -> list[Hypothesis]:
@@ -278,11 +280,11 @@ class Search:
                 found.append(other)
         return found[:_BASINS]
 
-    def _designed(self, base: Hypothesis, one: Screened) -> list[Values]:
-        """The best places of a low-discrepancy design on the early frames: over strengths, stiffness, and what else is
-        calibrated of which nothing is known beforehand."""
-        if self.early is None:
-            return []
+    def _designed(self, base: Hypothesis, one: Screened) -> tuple[list[Values], float]:
+        """The best places of a low-discrepancy design on the early frames, over strengths, stiffness, and what else is
+        calibrated of which nothing is known beforehand; and the share of what ``base`` leaves there that goes."""
+        if self.early is None or (base.fitted.misfit <= _QUIET and not base.members):
+            return [], 0.0
         white, frames = self.early
         candidate, (first, *rest) = one.candidate, self.setting.calibrated
         twin, unknowns = self.setting.assembled(
@@ -311,7 +313,9 @@ class Search:
         costs = [np.inf if tracks is None else float(np.sum(white.residual(tracks) ** 2)) for tracks in runs]
         before = float(np.sum(white.residual(base.fitted.tracks[:frames]) ** 2))
         best = [int(k) for k in np.argsort(costs)[:_FOLLOWED] if costs[k] < before]
-        return [dict(zip(names, (float(t) for t in thetas[k]), strict=True)) for k in best]
+        rows = len(white.residual(base.fitted.tracks[:frames]))
+        promised = removes(before / rows, min(costs) / rows)
+        return [dict(zip(names, (float(t) for t in thetas[k]), strict=True)) for k in best], promised
 
     def screened(self, base: Hypothesis) -> list[Screened]:
         """First-order scores of all candidates that ``base`` has not, best first."""
