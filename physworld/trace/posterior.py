@@ -44,11 +44,11 @@ def posterior(known: Sequence[LeftOut], log_priors: Sequence[float], seed: int =
 
 
 def removes(without: float, after: float) -> float:
-    """Share of the squared error above the noise that goes; 0 where there is none beyond what is known of the noise.
+    """Share of the root mean square error above the noise that goes; 0 where there is none beyond what is known of it.
 
     Args:
         without, after: mean squared errors of left-out blocks over the noise's, without and with an effect.
     """
     if without - 1.0 <= _NOISE_KNOWN:
         return 0.0
-    return 1.0 - max(after - 1.0, 0.0) / (without - 1.0)
+    return 1.0 - float(np.sqrt(max(after - 1.0, 0.0) / (without - 1.0)))

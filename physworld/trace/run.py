@@ -172,7 +172,7 @@ class _Trace:
         early = early_part(ground.bare, self.split)
         solver = _solver_error(ground, declared)
         sizes = (config.confirmed, config.additions, config.effects_at_most)
-        search = Search(setting, chosen, early, *sizes, config.seed)
+        search = Search(setting, chosen, early, *sizes, solver, config.seed)
         self.clock.start()
         with self.clock.until(SEARCH):
             search.run(declared)

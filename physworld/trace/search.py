@@ -1,6 +1,6 @@
 """One search over sets of effects: forward additions, backward deletions, starts that every hypothesis shares.
 
-Every candidate is scored to first order first: the share of the squared residual above the noise that goes with its
+Every candidate is scored to first order first: the share of the residual above the noise that goes with its
 sensitivities and those of the calibrated parameters, within bounds and under priors. The most promising are fitted with
 the full simulator. A fit starts from its linear estimate, from multiples of it (a strength is underestimated where
 motion has run out of phase), from where other hypotheses have come to rest (their *basins*), and from the best of a
@@ -40,11 +40,11 @@ _FOLLOWED = 2  # of them, from which a fit may start
 _STIFFNESS = 0.8  # logarithms of the stiffness that it spans, up and down
 _EARLY = 0.4  # share of the training frames that it looks at
 _LEAST_SHARE = 0.01  # of a strength's bound, where the design begins
-WORTH = 0.2  # share of what is left above the noise that an effect explains to first order, to be fitted
+WORTH = 0.1  # share of the error above the noise that an effect removes to first order, to be fitted
 _QUIET = (
     1.2  # misfit over the noise up to which what is there is small, and a score to first order says enough
 )
-_NEARLY_ALL = 0.9  # share of what is left above the noise
+_NEARLY_ALL = 0.7  # share of the error above the noise
 _BASINS = 3  # other hypotheses' optima from which a fit starts
 _WORSE = 3.0  # times the best one's squared error above the noise: a fit that is left
 _APART = 0.05  # logarithm of the stiffness by which two optima are two basins
@@ -57,7 +57,7 @@ class Screened:
     Attributes:
         candidate: which.
         values: linear estimates of all unknowns, by name, in the scale of the search.
-        share: of the squared residual above the noise that goes, to first order.
+        share: of the root mean square residual above the noise that goes, to first order.
         error: mean squared residual over the noise's that stays.
     """
 
@@ -85,6 +85,7 @@ class Search:
         chosen: candidates.
         early: whitener of the first part of the training frames, and their end; None: no design.
         singles, additions, most: candidates that are fitted first, and on top of a set; effects at most.
+        solver: the solver's own squared error over the noise's; beside an effect no other one is looked for in less.
         seed: of the designs.
     """
 
@@ -94,6 +95,7 @@ class Search:
     singles: int
     additions: int
     most: int
+    solver: float = 0.0
     seed: int = 0
     hypotheses: dict[tuple[str, ...], Hypothesis] = field(default_factory=dict)
     screens: list[tuple[Hypothesis, list[Screened]]] = field(default_factory=list)
@@ -118,7 +120,7 @@ class Search:
                 with simulations.time_permitting("fits without one of the effects"):
                     self._take_out(larger)
             best = max((h for h in self.admitted() if h.doubt is None), key=self._total)
-            if len(best.members) <= size or simulations.ledger.cut:
+            if len(best.members) <= size or best.left - 1.0 <= self.solver or simulations.ledger.cut:
                 break
             base = best
         return list(self.hypotheses.values())
@@ -340,8 +342,7 @@ class Search:
         jacobian = np.concatenate([base.fitted.jacobian[:, kept], columns], axis=1)
         change = self._bounded(base, jacobian, unknowns, start)
         error = float(np.mean((base.fitted.residual - jacobian @ change) ** 2))
-        before = base.fitted.misfit**2
-        share = (before - error) / max(before - 1.0, 1e-12)
+        share = removes(base.fitted.misfit**2, error)
         values = {u.name: float(t) for u, t in zip(unknowns, start + change, strict=True)}
         return Screened(candidate, values, share, error)
 

@@ -91,7 +91,7 @@ def test_what_wins_in_one_block_only_does_not_win_for_sure() -> None:
 
 
 def test_an_effect_removes_a_share_of_what_is_above_the_noise() -> None:
-    assert removes(3.0, 2.0) == HALF
+    assert removes(3.0, 1.5) == HALF, "of the root mean square"
     assert removes(3.0, 0.9) == 1.0
     assert removes(1.04, 1.0) == 0.0, "that much is not known of the noise"
 
