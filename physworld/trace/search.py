@@ -35,8 +35,8 @@ from physworld.trace.sensitivity import Response, candidate_responses
 
 _MULTIPLES = (0.3, 3.0, 9.0)  # of a linear estimate
 _VARIANTS = 3  # shapes of an effect that are fitted before its best is freed
-_DESIGN = 16  # places of the low-discrepancy design
-_FOLLOWED = 2  # of them, from which a fit may start
+_DESIGN = 32  # places of the low-discrepancy design
+_FOLLOWED = 3  # of all starts, the best on the early frames
 _STIFFNESS = 0.8  # logarithms of the stiffness that it spans, up and down
 _EARLY = 0.4  # share of the training frames that it looks at
 _LEAST_SHARE = 0.01  # of a strength's bound, where the design begins
@@ -85,7 +85,8 @@ class Search:
         chosen: candidates.
         early: whitener of the first part of the training frames, and their end; None: no design.
         singles, additions, most: candidates that are fitted first, and on top of a set; effects at most.
-        solver: the solver's own squared error over the noise's; beside an effect no other one is looked for in less.
+        solver: what the solver's own squared error is known to, over the noise's; beside an effect no other one is
+            looked for in less.
         seed: of the designs.
     """
 
@@ -222,10 +223,9 @@ class Search:
         best: Hypothesis | None = None
         for one in variants[: _VARIANTS if shaped else 1]:
             own = (*base.members, one.candidate)
-            designed, promised = self._designed(base, one)
+            starts, promised = self._best_early(base, one)
             if max(one.share, promised) < self._least(base):
                 continue
-            starts = [*self._starts(base, one), *designed]
             linear = {**base.values, **one.values}
             scale = self._scale(base, one.error)
             found = self.setting.fitted(own, linear, starts, not shaped, scale, hopeless)
@@ -282,18 +282,28 @@ class Search:
                 found.append(other)
         return found[:_BASINS]
 
-    def _designed(self, base: Hypothesis, one: Screened) -> tuple[list[Values], float]:
-        """The best places of a low-discrepancy design on the early frames, over strengths, stiffness, and what else is
-        calibrated of which nothing is known beforehand; and the share of what ``base`` leaves there that goes."""
+    def _best_early(self, base: Hypothesis, one: Screened) -> tuple[list[Values], float]:
+        """The best of all starts on the early frames, and the share of what ``base`` leaves there that goes with it."""
+        starts = self._starts(base, one)
         if self.early is None or (base.fitted.misfit <= _QUIET and not base.members):
-            return [], 0.0
+            return starts, 0.0
         white, frames = self.early
-        candidate, (first, *rest) = one.candidate, self.setting.calibrated
-        twin, unknowns = self.setting.assembled(
-            (*base.members, candidate), base.values, shapes=bool(base.members)
-        )
-        names = [u.name for u in unknowns]
-        gates = candidate.unknowns()
+        members = (*base.members, one.candidate)
+        twin, unknowns = self.setting.assembled(members, base.values, shapes=bool(base.members))
+        starts += self._designed(one, unknowns)
+        low, high = bounds_of(unknowns)
+        thetas = [np.clip([start.get(u.name, u.start) for u in unknowns], low, high) for start in starts]
+        runs = self.setting.simulations.run([Job(at(twin, unknowns, theta), frames) for theta in thetas])
+        errors = [np.inf if t is None else float(np.mean(white.residual(t) ** 2)) for t in runs]
+        before = float(np.mean(white.residual(base.fitted.tracks[:frames]) ** 2))
+        best = [dict(starts[int(k)]) for k in np.argsort(errors)[:_FOLLOWED]]
+        return best, removes(before, min(errors))
+
+    def _designed(self, one: Screened, unknowns: list[Unknown]) -> list[Values]:
+        """A low-discrepancy design over strengths, stiffness, and what else is calibrated of which nothing is known
+        beforehand."""
+        first, *rest = self.setting.calibrated
+        gates = one.candidate.unknowns()
         open_ = [u for u in rest if u.prior is None and u.name not in [gate.name for gate in gates]]
         drawn = qmc.Sobol(1 + len(open_) + len(gates), seed=self.seed).random(_DESIGN)
         places = []
@@ -309,15 +319,7 @@ class Search:
                 size = _LEAST_SHARE ** (1.0 - abs(signed))
                 place[gate.name] = float(np.sign(signed) * size * (highest if signed > 0 else -lowest))
             places.append(place)
-        low, high = bounds_of(unknowns)
-        thetas = [np.clip([place[n] for n in names], low, high) for place in places]
-        runs = self.setting.simulations.run([Job(at(twin, unknowns, theta), frames) for theta in thetas])
-        costs = [np.inf if tracks is None else float(np.sum(white.residual(tracks) ** 2)) for tracks in runs]
-        before = float(np.sum(white.residual(base.fitted.tracks[:frames]) ** 2))
-        best = [int(k) for k in np.argsort(costs)[:_FOLLOWED] if costs[k] < before]
-        rows = len(white.residual(base.fitted.tracks[:frames]))
-        promised = removes(before / rows, min(costs) / rows)
-        return [dict(zip(names, (float(t) for t in thetas[k]), strict=True)) for k in best], promised
+        return places
 
     def screened(self, base: Hypothesis) -> list[Screened]:
         """First-order scores of all candidates that ``base`` has not, best first."""
