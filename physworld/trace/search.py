@@ -37,7 +37,7 @@ _MULTIPLES = (0.3, 3.0, 9.0)  # of a linear estimate
 _VARIANTS = 3  # shapes of an effect that are fitted before its best is freed
 _DESIGN = 32  # places of the low-discrepancy design
 _FOLLOWED = 3  # of all starts, the best on the early frames
-_STIFFNESS = 0.8  # logarithms of the stiffness that it spans, up and down
+_STIFFNESS = 1.1  # logarithms of the stiffness that it spans, up and down
 _EARLY = 0.4  # share of the training frames that it looks at
 _LEAST_SHARE = 0.01  # of a strength's bound, where the design begins
 WORTH = 0.1  # share of the error above the noise that an effect removes to first order, to be fitted
@@ -296,7 +296,7 @@ class Search:
         runs = self.setting.simulations.run([Job(at(twin, unknowns, theta), frames) for theta in thetas])
         errors = [np.inf if t is None else float(np.mean(white.residual(t) ** 2)) for t in runs]
         before = float(np.mean(white.residual(base.fitted.tracks[:frames]) ** 2))
-        best = [dict(starts[int(k)]) for k in np.argsort(errors)[:_FOLLOWED]]
+        best: list[Values] = [dict(starts[int(k)]) for k in np.argsort(errors)[:_FOLLOWED]]
         return best, removes(before, min(errors))
 
     def _designed(self, one: Screened, unknowns: list[Unknown]) -> list[Values]:
@@ -306,7 +306,7 @@ class Search:
         gates = one.candidate.unknowns()
         open_ = [u for u in rest if u.prior is None and u.name not in [gate.name for gate in gates]]
         drawn = qmc.Sobol(1 + len(open_) + len(gates), seed=self.seed).random(_DESIGN)
-        places = []
+        places: list[Values] = []
         for row in drawn:
             place = {u.name: u.start for u in unknowns}
             place[first.name] += _STIFFNESS * (2.0 * row[0] - 1.0)
