@@ -4,12 +4,12 @@ Every candidate is scored to first order first: the share of the residual above 
 sensitivities and those of the calibrated parameters, within bounds and under priors. The most promising are fitted with
 the full simulator. A fit starts from its linear estimate, from multiples of it (a strength is underestimated where
 motion has run out of phase), from where other hypotheses have come to rest (their *basins*), and from the best of a
-low-discrepancy design over strengths, stiffness and whatever else nothing is known of, on the first part of the
-recording, where phases have not slipped yet.
+low-discrepancy design over strengths, stiffness and whatever else nothing is known of. All of them are ranked on the
+first part of the recording, where phases have not slipped yet, and the best are first fitted to that part.
 
-Then another effect is added to the best set as long as the posterior asks for it, at most three; of every larger set
-each effect is taken out again and exchanged, from the larger set's basin, so that a pair whose first half was wrong
-comes apart.
+Then another effect is added to the best set as long as the last one removed what one of two would, at most three; of
+every larger set each effect is taken out again and exchanged, from the larger set's basin, so that a pair whose first
+half was wrong comes apart.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from scipy.stats import qmc
 
 from physworld.arrays import Array
 from physworld.estimation.noise import Split
-from physworld.estimation.refit import prior_rows
+from physworld.estimation.refit import prior_rows, refit
 from physworld.estimation.simulations import Job
-from physworld.estimation.unknowns import Unknown, at, bounds_of
+from physworld.estimation.unknowns import Unknown, at, bounds_of, starting_at
 from physworld.estimation.whitening import Whitener
 from physworld.trace.candidates import Candidate
-from physworld.trace.hypotheses import Hypothesis, Setting, Values
+from physworld.trace.hypotheses import Hypothesis, ScaledWhitener, Setting, Values
 from physworld.trace.left_out import independent
 from physworld.trace.posterior import HALF, posterior, removes
 from physworld.trace.sensitivity import Response, candidate_responses
@@ -37,6 +37,7 @@ _MULTIPLES = (0.3, 3.0, 9.0)  # of a linear estimate
 _VARIANTS = 3  # shapes of an effect that are fitted before its best is freed
 _DESIGN = 32  # places of the low-discrepancy design
 _FOLLOWED = 3  # of all starts, the best on the early frames
+_EARLY_ITERATIONS = 2  # of each of these, on the early frames
 _STIFFNESS = 1.1  # logarithms of the stiffness that it spans, up and down
 _EARLY = 0.4  # share of the training frames that it looks at
 _LEAST_SHARE = 0.01  # of a strength's bound, where the design begins
@@ -45,6 +46,7 @@ _QUIET = (
     1.2  # misfit over the noise up to which what is there is small, and a score to first order says enough
 )
 _NEARLY_ALL = 0.7  # share of the error above the noise
+_FIRST_OF_TWO = 0.29  # share of the root mean square that goes with one of two effects of the same size
 _BASINS = 3  # other hypotheses' optima from which a fit starts
 _WORSE = 3.0  # times the best one's squared error above the noise: a fit that is left
 _APART = 0.05  # logarithm of the stiffness by which two optima are two basins
@@ -120,8 +122,10 @@ class Search:
             if size and self._total(larger) > self._total(base):
                 with simulations.time_permitting("fits without one of the effects"):
                     self._take_out(larger)
-            best = max((h for h in self.admitted() if h.doubt is None), key=self._total)
-            if len(best.members) <= size or best.left - 1.0 <= self.solver or simulations.ledger.cut:
+            known = (h for h in self._of_size(size + 1) if h.doubt is None)
+            best = max(known, key=self._total, default=base)
+            pays = best is not base and self._removes(base, best) >= _FIRST_OF_TWO
+            if not pays or best.left - 1.0 <= self.solver or simulations.ledger.cut:
                 break
             base = best
         return list(self.hypotheses.values())
@@ -186,7 +190,13 @@ class Search:
         if restless:  # a score to first order says nothing of an effect that is large
             order += [own for own in by_effect.values() if own not in order and own[0].candidate.scanned]
         for own in order:
-            if not own[0].candidate.scanned and own[0].share < self._least(base):
+            best, _ = self._nearly_all(base)
+            # against the best one's score, not against what it brought: where phases slip all scores are too low
+            if (
+                best is not None
+                and not own[0].candidate.scanned
+                and own[0].share < HALF * by_effect[best][0].share
+            ):
                 continue
             self.setting.simulations.stage = f"fit with {own[0].candidate.effect}"
             self._fit(base, own)
@@ -194,9 +204,17 @@ class Search:
     def _least(self, base: Hypothesis) -> float:
         """Share of what ``base`` leaves that a rival has to promise: half of what one effect removes, where that is
         nearly all; else 0."""
-        tried = (h for h in self._of_size(len(base.members) + 1) if set(base.names) <= set(h.names))
-        most = max((self._removes(base, h) for h in tried if h.doubt is None), default=0.0)
-        return HALF * most if most >= _NEARLY_ALL else 0.0
+        return HALF * self._nearly_all(base)[1]
+
+    def _nearly_all(self, base: Hypothesis) -> tuple[str | None, float]:
+        """The effect on top of ``base`` that removes nearly all of what that leaves, and its share; None and 0 where
+        there is none."""
+        tried = [h for h in self._of_size(len(base.members) + 1) if set(base.names) <= set(h.names)]
+        best = max((h for h in tried if h.doubt is None), key=lambda h: self._removes(base, h), default=base)
+        share = self._removes(base, best) if best is not base else 0.0
+        if share < _NEARLY_ALL:
+            return None, 0.0
+        return next(name for name in best.names if name not in base.names), share
 
     def _take_out(self, larger: Hypothesis) -> None:
         """Fits without one of the effects of a set, and with another one in its place, from the set's basin."""
@@ -296,7 +314,14 @@ class Search:
         runs = self.setting.simulations.run([Job(at(twin, unknowns, theta), frames) for theta in thetas])
         errors = [np.inf if t is None else float(np.mean(white.residual(t) ** 2)) for t in runs]
         before = float(np.mean(white.residual(base.fitted.tracks[:frames]) ** 2))
-        best: list[Values] = [dict(starts[int(k)]) for k in np.argsort(errors)[:_FOLLOWED]]
+        best: list[Values] = []
+        for k in np.argsort(errors)[:_FOLLOWED]:
+            here = starting_at(unknowns, thetas[int(k)])
+            scaled = ScaledWhitener(white, self._scale(base, max(errors[int(k)], 1.0)))
+            found = refit(self.setting.simulations, scaled, twin, here, frames, _EARLY_ITERATIONS)
+            if found is not None:
+                errors.append((scaled.scale * found.misfit) ** 2)
+                best.append({u.name: float(t) for u, t in zip(found.unknowns, found.theta, strict=True)})
         return best, removes(before, min(errors))
 
     def _designed(self, one: Screened, unknowns: list[Unknown]) -> list[Values]:
