@@ -87,8 +87,6 @@ class Search:
         chosen: candidates.
         early: whitener of the first part of the training frames, and their end; None: no design.
         singles, additions, most: candidates that are fitted first, and on top of a set; effects at most.
-        solver: what the solver's own squared error is known to, over the noise's; beside an effect no other one is
-            looked for in less.
         seed: of the designs.
     """
 
@@ -98,7 +96,6 @@ class Search:
     singles: int
     additions: int
     most: int
-    solver: float = 0.0
     seed: int = 0
     hypotheses: dict[tuple[str, ...], Hypothesis] = field(default_factory=dict)
     screens: list[tuple[Hypothesis, list[Screened]]] = field(default_factory=list)
@@ -125,7 +122,7 @@ class Search:
             known = (h for h in self._of_size(size + 1) if h.doubt is None)
             best = max(known, key=self._total, default=base)
             pays = best is not base and self._removes(base, best) >= _FIRST_OF_TWO
-            if not pays or best.left - 1.0 <= self.solver or simulations.ledger.cut:
+            if not pays or simulations.ledger.cut:
                 break
             base = best
         return list(self.hypotheses.values())

@@ -139,6 +139,6 @@ def test_no_other_name_is_given_where_something_unbelievable_predicts_best(
 
     gale = known("wind", 1.0, "a wind of 60 m/s is not believed")
     hypotheses = [known(None, 4.0), known("air_drag_linear", 1.1), gale]
-    found = decided(hypotheses, np.array(weights), 1e-3, 0.0, 20)
+    found = decided(hypotheses, np.array(weights), 1e-3, 4.0, 20)
     assert found.name == name and not found.equivalent
     assert ("not believed" in found.reason) == (weights[2] > 0.9)
