@@ -15,6 +15,7 @@ from physworld_schemas.base import Page
 from physworld_schemas.job import TERMINAL_STATES, Event, Job
 from physworld_storage.jobs.kinds import KINDS
 from physworld_storage.pages import page_of
+from physworld_storage.search import matching_jobs
 from physworld_storage.tables import (
     DatasetRow,
     EventRow,
@@ -49,10 +50,15 @@ def count_objects(session: Session) -> Counts:
 
 
 def list_top_jobs(
-    session: Session, *, limit: int = 50, cursor: str | None = None, state: str | None = None
+    session: Session,
+    *,
+    limit: int = 50,
+    cursor: str | None = None,
+    state: str | None = None,
+    search: str | None = None,
 ) -> Page[Job]:
     """Jobs that no pipeline owns, newest first. ``children`` is left empty: ``children_of`` gives them."""
-    statement = select(JobRow).where(JobRow.parent_id.is_(None))
+    statement = matching_jobs(select(JobRow).where(JobRow.parent_id.is_(None)), search)
     if state is not None:
         statement = statement.where(JobRow.state == state)
     keys = (JobRow.created_at, JobRow.id)

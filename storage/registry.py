@@ -16,6 +16,7 @@ from physworld_schemas.base import Artifact, Lineage, Page
 from physworld_schemas.model import Model, ModelVersion, TrainingConfig, VersionPatch
 from physworld_storage.errors import Conflict, NotFound
 from physworld_storage.pages import page_of
+from physworld_storage.search import matching
 from physworld_storage.tables import (
     AliasRow,
     DatasetRow,
@@ -125,12 +126,13 @@ def get_model(session: Session, name: str) -> Model:
     return _model(session, _model_row(session, name))
 
 
-def list_models(session: Session, *, limit: int = 50, cursor: str | None = None) -> Page[Model]:
+def list_models(
+    session: Session, *, limit: int = 50, cursor: str | None = None, search: str | None = None
+) -> Page[Model]:
     """Models, newest first."""
+    statement = matching(select(ModelRow), search, ModelRow.name)
     keys = (ModelRow.created_at, ModelRow.name)
-    return page_of(
-        session, select(ModelRow), keys, lambda row: _model(session, row), limit=limit, cursor=cursor
-    )
+    return page_of(session, statement, keys, lambda row: _model(session, row), limit=limit, cursor=cursor)
 
 
 def get_version(session: Session, name: str, version: int | str) -> ModelVersion:
@@ -140,11 +142,24 @@ def get_version(session: Session, name: str, version: int | str) -> ModelVersion
 
 
 def list_versions(
-    session: Session, name: str, *, limit: int = 50, cursor: str | None = None, state: str | None = None
+    session: Session,
+    name: str,
+    *,
+    limit: int = 50,
+    cursor: str | None = None,
+    state: str | None = None,
+    search: str | None = None,
 ) -> Page[ModelVersion]:
-    """Versions of a model, newest first."""
+    """Versions of a model, newest first; a search looks at their descriptions, tags and states."""
     _model_row(session, name)
     statement = select(ModelVersionRow).where(ModelVersionRow.name == name)
+    columns = (
+        ModelVersionRow.description,
+        ModelVersionRow.message,
+        ModelVersionRow.tags,
+        ModelVersionRow.state,
+    )
+    statement = matching(statement, search, *columns)
     if state is not None:
         statement = statement.where(ModelVersionRow.state == state)
     return page_of(

@@ -18,6 +18,7 @@ from physworld_schemas.ids import new_id
 from physworld_schemas.scene import Scene
 from physworld_storage.errors import Conflict, NotFound, ResultInvalid
 from physworld_storage.pages import page_of
+from physworld_storage.search import matching
 from physworld_storage.tables import (
     DatasetRow,
     EpisodeRow,
@@ -97,10 +98,16 @@ def find_scene(session: Session, digest: str) -> Scene | None:
 
 
 def list_scenes(
-    session: Session, *, limit: int = 50, cursor: str | None = None, kind: str | None = None
+    session: Session,
+    *,
+    limit: int = 50,
+    cursor: str | None = None,
+    kind: str | None = None,
+    search: str | None = None,
 ) -> Page[Scene]:
     """Scenes, newest first, without their declared documents, which are not read either."""
     statement = select(SceneRow).options(defer(SceneRow.declared, raiseload=True))
+    statement = matching(statement, search, SceneRow.id, SceneRow.name, SceneRow.kind)
     if kind is not None:
         statement = statement.where(SceneRow.kind == kind)
     keys = (SceneRow.created_at, SceneRow.id)
@@ -119,9 +126,10 @@ def list_fits(
     cursor: str | None = None,
     state: str | None = None,
     scene_id: str | None = None,
+    search: str | None = None,
 ) -> Page[Fit]:
     """Fits, newest first."""
-    statement = select(FitRow)
+    statement = matching(select(FitRow), search, FitRow.id, FitRow.state, scene_id=FitRow.scene_id)
     if state is not None:
         statement = statement.where(FitRow.state == state)
     if scene_id is not None:
@@ -170,9 +178,11 @@ def list_datasets(
     state: str | None = None,
     fit_id: str | None = None,
     scene_id: str | None = None,
+    search: str | None = None,
 ) -> Page[Dataset]:
     """Datasets, newest first."""
-    statement = select(DatasetRow)
+    columns = (DatasetRow.id, DatasetRow.state)
+    statement = matching(select(DatasetRow), search, *columns, scene_id=DatasetRow.scene_id)
     for column, wanted in (
         (DatasetRow.state, state),
         (DatasetRow.fit_id, fit_id),

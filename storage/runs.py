@@ -13,6 +13,7 @@ from physworld_schemas.plan import Plan
 from physworld_schemas.rollout import Rollout
 from physworld_storage.errors import Conflict, NotFound
 from physworld_storage.pages import page_of
+from physworld_storage.search import matching
 from physworld_storage.tables import RunRow, columns_of
 
 RunKind = Literal["rollout", "plan"]
@@ -51,11 +52,18 @@ def get_run(session: Session, kind: RunKind, run_id: str) -> Rollout | Plan:
 
 
 def list_runs(
-    session: Session, kind: RunKind, *, limit: int = 50, cursor: str | None = None, model: str | None = None
+    session: Session,
+    kind: RunKind,
+    *,
+    limit: int = 50,
+    cursor: str | None = None,
+    model: str | None = None,
+    search: str | None = None,
 ) -> Page[Rollout] | Page[Plan]:
     """Rollouts or plans, newest first."""
-    listed = list_rollouts if kind == "rollout" else list_plans
-    return listed(session, limit=limit, cursor=cursor, model=model)
+    if kind == "rollout":
+        return _page(session, kind, Rollout, limit, cursor, model, search)
+    return _page(session, kind, Plan, limit, cursor, model, search)
 
 
 def mark_run_ready(
@@ -98,9 +106,16 @@ def run_row(session: Session, kind: RunKind, run_id: str) -> RunRow:
 
 
 def _page(
-    session: Session, kind: RunKind, wire: type[Wire], limit: int, cursor: str | None, model: str | None
+    session: Session,
+    kind: RunKind,
+    wire: type[Wire],
+    limit: int,
+    cursor: str | None,
+    model: str | None,
+    search: str | None = None,
 ) -> Page[Wire]:
     statement = select(RunRow).where(RunRow.kind == kind)
+    statement = matching(statement, search, RunRow.id, RunRow.model, RunRow.state)
     if model is not None:
         statement = statement.where(RunRow.model == model)
     keys = (RunRow.created_at, RunRow.id)

@@ -12,6 +12,7 @@ from physworld_schemas.base import Artifact, Lineage, Page
 from physworld_schemas.trace import Trace
 from physworld_storage.errors import Conflict, NotFound
 from physworld_storage.pages import page_of
+from physworld_storage.search import matching
 from physworld_storage.tables import AssessmentRow, FitRow, TraceRow, columns_of
 
 TWIN = "twin.npz"
@@ -34,9 +35,11 @@ def list_traces(
     state: str | None = None,
     scene_id: str | None = None,
     verdict: str | None = None,
+    search: str | None = None,
 ) -> Page[Trace]:
     """Traces, newest first."""
-    statement = select(TraceRow)
+    columns = (TraceRow.id, TraceRow.state, TraceRow.verdict)
+    statement = matching(select(TraceRow), search, *columns, scene_id=TraceRow.scene_id)
     for column, wanted in (
         (TraceRow.state, state),
         (TraceRow.scene_id, scene_id),

@@ -11,6 +11,8 @@ from fastapi.responses import HTMLResponse, JSONResponse, Response
 
 from physworld_services.dashboard import live
 from physworld_services.dashboard.clouds import Cloud, Layer, thinned
+from physworld_services.dashboard.lineage import lineage_graph
+from physworld_services.dashboard.lists import Asked
 from physworld_services.dashboard.pages_scenes import layer_response
 from physworld_services.dashboard.site import BASE, Site
 from physworld_storage import overview, resources
@@ -32,18 +34,14 @@ def router(site: Site) -> APIRouter:
     routes = APIRouter()
 
     @routes.get("/datasets")
-    def index(request: Request, cursor: Cursor = None) -> HTMLResponse:
+    def index(request: Request, asked: Asked) -> HTMLResponse:
         with site.database.reading() as session:
-            page = resources.list_datasets(session, limit=PAGE_SIZE, cursor=cursor)
+            page = resources.list_datasets(
+                session, limit=PAGE_SIZE, cursor=asked.cursor, state=asked.state, search=asked.q
+            )
             names = overview.scene_names(session, (item.scene_id for item in page.data))
-        return site.page(
-            request,
-            "datasets.html",
-            datasets=page.data,
-            names=names,
-            cursor=cursor,
-            next_cursor=page.next_cursor,
-        )
+        context = asked.context(page.next_cursor)
+        return site.page(request, "datasets.html", datasets=page.data, names=names, **context)
 
     @routes.get("/datasets/{dataset_id}")
     def page(
@@ -62,6 +60,7 @@ def router(site: Site) -> APIRouter:
             "dataset.html",
             dataset=dataset,
             scene=scene,
+            graph=lineage_graph(site, dataset.scene_id, dataset_id),
             model_name=model_name_of(scene.name),
             chosen=chosen,
             episodes=episodes.data,

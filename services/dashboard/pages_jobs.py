@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, Any
-from urllib.parse import urlencode
+from typing import Any
 
-from fastapi import APIRouter, Depends, Query, Request
+from fastapi import APIRouter, Depends, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from sqlalchemy.orm import Session
 
@@ -15,6 +14,7 @@ from physworld_schemas.job import TERMINAL_STATES, Event, Job
 from physworld_services.dashboard import live
 from physworld_services.dashboard.access import actor_of, require_same_origin, require_writer
 from physworld_services.dashboard.curves import training_charts
+from physworld_services.dashboard.lists import Asked, Looked
 from physworld_services.dashboard.samples import sample_folder
 from physworld_services.dashboard.site import BASE, Site
 from physworld_services.dashboard.text import figure
@@ -25,9 +25,6 @@ from physworld_storage.jobs import events, jobs
 PAGE_SIZE = 20
 EVENTS_SHOWN = 100
 FILTERS = ("all", "running", "queued", "succeeded", "failed", "cancelled")
-
-Cursor = Annotated[str | None, Query(max_length=512)]
-State = Annotated[str | None, Query(pattern=r"^[a-z]{1,20}$")]
 
 
 @dataclass(frozen=True)
@@ -44,15 +41,14 @@ def router(site: Site) -> APIRouter:
     routes = APIRouter()
 
     @routes.get("/")
-    def index(request: Request, cursor: Cursor = None, state: State = None) -> HTMLResponse:
-        query = {name: value for name, value in (("cursor", cursor), ("state", state)) if value}
-        live_url = f"{BASE}/live/jobs?{urlencode(query)}"
-        return site.page(request, "jobs.html", live_url=live_url, **_list(site, cursor, state))
+    def index(request: Request, asked: Asked) -> HTMLResponse:
+        live_url = f"{BASE}/live/jobs?{asked.address}"
+        return site.page(request, "jobs.html", live_url=live_url, **_list(site, asked))
 
     @routes.get("/live/jobs")
-    async def live_list(request: Request, cursor: Cursor = None, state: State = None) -> Response:
+    async def live_list(request: Request, asked: Asked) -> Response:
         def render() -> tuple[str, bool]:
-            return site.fragment(request, "_jobs.html", **_list(site, cursor, state)), False
+            return site.fragment(request, "_jobs.html", **_list(site, asked)), False
 
         return await live.stream(render)
 
@@ -87,10 +83,12 @@ def router(site: Site) -> APIRouter:
     return routes
 
 
-def _list(site: Site, cursor: str | None, state: str | None) -> dict[str, Any]:
+def _list(site: Site, asked: Looked) -> dict[str, Any]:
     with site.database.reading() as session:
         counts = overview.count_objects(session)
-        page = overview.list_top_jobs(session, limit=PAGE_SIZE, cursor=cursor, state=state)
+        page = overview.list_top_jobs(
+            session, limit=PAGE_SIZE, cursor=asked.cursor, state=asked.state, search=asked.q
+        )
         children = overview.children_of(session, page.data)
         subjects = overview.subjects_of(session, page.data)
     return {
@@ -103,9 +101,7 @@ def _list(site: Site, cursor: str | None, state: str | None) -> dict[str, Any]:
         "entries": [Entry(job, subjects.get(job.id, ""), children.get(job.id, [])) for job in page.data],
         "filters": FILTERS,
         "has_sample": sample_folder() is not None,
-        "state": state,
-        "cursor": cursor,
-        "next_cursor": page.next_cursor,
+        **asked.context(page.next_cursor),
     }
 
 

@@ -5,17 +5,19 @@ from __future__ import annotations
 from datetime import timedelta
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Form, Query, Request
+from fastapi import APIRouter, Depends, Form, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from pydantic import ValidationError
 from starlette.exceptions import HTTPException
 
 from physworld_schemas.key import DEFAULT_GRACE_MINUTES, KeyCreate, Role
 from physworld_services.dashboard.access import actor_of, require_same_origin
+from physworld_services.dashboard.lists import Asked, Looked
 from physworld_services.dashboard.site import BASE, Site
 from physworld_storage.access import api_keys
 
 PAGE_SIZE = 50
+EVERYTHING = Looked()
 ROLES: dict[Role, str] = {"read": "look", "write": "look and start work", "admin": "also manage keys"}
 
 
@@ -32,20 +34,20 @@ def router(site: Site) -> APIRouter:
 
     def page(
         request: Request,
-        cursor: str | None = None,
+        asked: Looked = EVERYTHING,
         made: str | None = None,
         fault: str = "",
         status: int = 200,
     ) -> HTMLResponse:
         with site.database.reading() as session:
-            found = api_keys.list_keys(session, limit=PAGE_SIZE, cursor=cursor)
-        context: dict[str, Any] = {"keys": found.data, "cursor": cursor, "next_cursor": found.next_cursor}
+            found = api_keys.list_keys(session, limit=PAGE_SIZE, cursor=asked.cursor, search=asked.q)
+        context: dict[str, Any] = {"keys": found.data, **asked.context(found.next_cursor)}
         context |= {"roles": ROLES, "token": made, "fault": fault}
         return site.page(request, "keys.html", status=status, **context)
 
     @routes.get("")
-    def index(request: Request, cursor: Annotated[str | None, Query(max_length=512)] = None) -> HTMLResponse:
-        return page(request, cursor)
+    def index(request: Request, asked: Asked) -> HTMLResponse:
+        return page(request, asked)
 
     @routes.post("", dependencies=[Depends(require_same_origin)])
     def create(

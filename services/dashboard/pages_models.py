@@ -15,6 +15,8 @@ from physworld_schemas.model import Model, ModelComparison, ModelVersion
 from physworld_services.dashboard.access import require_same_origin, require_writer
 from physworld_services.dashboard.clouds import Cloud, Layer, measured_layers, resampled, scene_cloud, thinned
 from physworld_services.dashboard.curves import chart, comparison_chart, given_curves, versions_chart
+from physworld_services.dashboard.lineage import lineage_graph
+from physworld_services.dashboard.lists import Asked
 from physworld_services.dashboard.pages_scenes import PREDICTION, layer_response, recording_of
 from physworld_services.dashboard.site import BASE, Site
 from physworld_services.dashboard.tables import held_out_of, noise_floor_of
@@ -32,7 +34,6 @@ MOST_COMPARED = 4
 """Versions beside the two of a comparison that its plots show."""
 CARD = "card.json"
 
-Cursor = Annotated[str | None, Query(max_length=512)]
 Others = Annotated[Sequence[str], Query(max_length=MOST_COMPARED)]
 Chosen = Annotated[str | None, Query(max_length=64)]
 
@@ -51,28 +52,24 @@ def router(site: Site) -> APIRouter:
     routes = APIRouter()
 
     @routes.get("/models")
-    def index(request: Request, cursor: Cursor = None) -> HTMLResponse:
+    def index(request: Request, asked: Asked) -> HTMLResponse:
         with site.database.reading() as session:
-            page = registry.list_models(session, limit=PAGE_SIZE, cursor=cursor)
+            page = registry.list_models(session, limit=PAGE_SIZE, cursor=asked.cursor, search=asked.q)
             newest = {
                 model.name: registry.list_versions(session, model.name, limit=1).data for model in page.data
             }
         entries = [_entry(model, newest[model.name]) for model in page.data]
-        return site.page(request, "models.html", entries=entries, cursor=cursor, next_cursor=page.next_cursor)
+        return site.page(request, "models.html", entries=entries, **asked.context(page.next_cursor))
 
     @routes.get("/models/{name}")
-    def model_page(request: Request, name: str, cursor: Cursor = None) -> HTMLResponse:
+    def model_page(request: Request, name: str, asked: Asked) -> HTMLResponse:
         with site.database.reading() as session:
             model = registry.get_model(session, name)
-            page = registry.list_versions(session, name, limit=PAGE_SIZE, cursor=cursor)
-        return site.page(
-            request,
-            "model.html",
-            model=model,
-            versions=page.data,
-            cursor=cursor,
-            next_cursor=page.next_cursor,
-        )
+            page = registry.list_versions(
+                session, name, limit=PAGE_SIZE, cursor=asked.cursor, state=asked.state, search=asked.q
+            )
+        context = asked.context(page.next_cursor)
+        return site.page(request, "model.html", model=model, versions=page.data, **context)
 
     @routes.get("/models/{name}/compare")
     def compare_page(
@@ -109,6 +106,7 @@ def router(site: Site) -> APIRouter:
             "version.html",
             version=version,
             card=_card(site, version),
+            graph=lineage_graph(site, version.scene_id, f"{version.name}:{version.version}"),
             has_curve=given_curves(version.metrics) is not None,
             has_cloud=version.scene_id is not None and site.arrays(version.artifacts, PREDICTION) is not None,
         )

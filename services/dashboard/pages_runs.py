@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse, JSONResponse, Response
 
 from physworld.arrays import Array
@@ -14,9 +14,11 @@ from physworld_schemas.arrays import EncodedArray
 from physworld_schemas.plan import Plan
 from physworld_schemas.rollout import Rollout
 from physworld_services.dashboard.clouds import Cloud, Layer, thinned
+from physworld_services.dashboard.lineage import lineage_graph
+from physworld_services.dashboard.lists import Asked
 from physworld_services.dashboard.pages_scenes import layer_response
 from physworld_services.dashboard.site import BASE, Site
-from physworld_storage import overview, resources, runs
+from physworld_storage import overview, registry, resources, runs
 from physworld_storage.errors import NotFound
 
 PAGE_SIZE = 50
@@ -30,26 +32,20 @@ LAYERS: dict[runs.RunKind, tuple[tuple[str, str, str], ...]] = {
     ),
 }
 
-Cursor = Annotated[str | None, Query(max_length=512)]
-ModelName = Annotated[str | None, Query(max_length=64)]
-
 
 def router(site: Site) -> APIRouter:
     """Pages below ``/fits``, ``/rollouts`` and ``/plans``."""
     routes = APIRouter()
 
     @routes.get("/fits")
-    def fits(request: Request, cursor: Cursor = None) -> HTMLResponse:
+    def fits(request: Request, asked: Asked) -> HTMLResponse:
         with site.database.reading() as session:
-            page = resources.list_fits(session, limit=PAGE_SIZE, cursor=cursor)
+            page = resources.list_fits(
+                session, limit=PAGE_SIZE, cursor=asked.cursor, state=asked.state, search=asked.q
+            )
             names = overview.scene_names(session, {fit.scene_id for fit in page.data})
-        context: dict[str, Any] = {
-            "fits": page.data,
-            "names": names,
-            "cursor": cursor,
-            "next_cursor": page.next_cursor,
-        }
-        return site.page(request, "fits.html", **context)
+        context = asked.context(page.next_cursor)
+        return site.page(request, "fits.html", fits=page.data, names=names, **context)
 
     for kind in LAYERS:
         _add(routes, site, kind)
@@ -60,22 +56,21 @@ def _add(routes: APIRouter, site: Site, kind: runs.RunKind) -> None:
     """The pages of one kind of run: its list, a run, and the run's result as moving points."""
 
     @routes.get(f"/{kind}s")
-    def index(request: Request, cursor: Cursor = None, model: ModelName = None) -> HTMLResponse:
+    def index(request: Request, asked: Asked) -> HTMLResponse:
         with site.database.reading() as session:
-            page = runs.list_runs(session, kind, limit=PAGE_SIZE, cursor=cursor, model=model)
-        context: dict[str, Any] = {
-            "runs": page.data,
-            "cursor": cursor,
-            "next_cursor": page.next_cursor,
-            "model": model,
-        }
-        return site.page(request, f"{kind}s.html", **context)
+            page = runs.list_runs(
+                session, kind, limit=PAGE_SIZE, cursor=asked.cursor, model=asked.model, search=asked.q
+            )
+        return site.page(request, f"{kind}s.html", runs=page.data, **asked.context(page.next_cursor))
 
     @routes.get(f"/{kind}s/{{run_id}}")
     def one(request: Request, run_id: str) -> HTMLResponse:
         run = _run(site, kind, run_id)
         has_cloud = site.arrays(run.artifacts, runs.RESULT[kind]) is not None
-        return site.page(request, f"{kind}.html", run=run, has_cloud=has_cloud)
+        with site.database.reading() as session:
+            version = registry.get_version(session, run.model, run.version)
+        graph = lineage_graph(site, version.scene_id, run_id)
+        return site.page(request, f"{kind}.html", run=run, has_cloud=has_cloud, graph=graph)
 
     @routes.get(f"/{kind}s/{{run_id}}/cloud")
     def cloud(run_id: str) -> Response:

@@ -19,6 +19,8 @@ from physworld_services.dashboard.clouds import (
     thinned,
 )
 from physworld_services.dashboard.curves import chart, frame_errors, given_curves, onto
+from physworld_services.dashboard.lineage import lineage_graph
+from physworld_services.dashboard.lists import Asked
 from physworld_services.dashboard.samples import sample_folder
 from physworld_services.dashboard.site import BASE, Site
 from physworld_services.dashboard.tables import noise_floor_of
@@ -41,16 +43,15 @@ def router(site: Site) -> APIRouter:
     routes = APIRouter()
 
     @routes.get("/scenes")
-    def index(request: Request, cursor: Annotated[str | None, Query(max_length=512)] = None) -> HTMLResponse:
+    def index(request: Request, asked: Asked) -> HTMLResponse:
         with site.database.reading() as session:
-            page = resources.list_scenes(session, limit=PAGE_SIZE, cursor=cursor)
+            page = resources.list_scenes(session, limit=PAGE_SIZE, cursor=asked.cursor, search=asked.q)
         return site.page(
             request,
             "scenes.html",
             scenes=page.data,
-            cursor=cursor,
-            next_cursor=page.next_cursor,
             has_sample=sample_folder() is not None,
+            **asked.context(page.next_cursor),
         )
 
     @routes.get("/fits/{fit_id}")
@@ -84,6 +85,7 @@ def router(site: Site) -> APIRouter:
             traces=traced,
             declared=_declared(record),
             checks=checked,
+            graph=lineage_graph(site, scene_id, fit or scene_id),
             check=next((item for item in checked if item.report is not None), None),
         )
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Any
 
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse, JSONResponse, Response
 
 from physworld_schemas.scene import Scene as SceneRecord
 from physworld_schemas.trace import Trace
 from physworld_services.dashboard.clouds import Cloud, Layer, measured_layers, resampled, scene_cloud, thinned
 from physworld_services.dashboard.curves import chart, frame_errors
+from physworld_services.dashboard.lineage import lineage_graph
+from physworld_services.dashboard.lists import Asked
 from physworld_services.dashboard.pages_scenes import layer_response, recording_of, split_time
 from physworld_services.dashboard.site import BASE, Site
 from physworld_storage import overview, resources, traces
@@ -23,21 +25,20 @@ PAGE_POLICY = (
     "style-src 'unsafe-inline'; img-src data:"
 )
 
-Cursor = Annotated[str | None, Query(max_length=512)]
-
 
 def router(site: Site) -> APIRouter:
     """Pages below ``/traces`` and ``/assessments``."""
     routes = APIRouter()
 
     @routes.get("/traces")
-    def index(request: Request, cursor: Cursor = None) -> HTMLResponse:
+    def index(request: Request, asked: Asked) -> HTMLResponse:
         with site.database.reading() as session:
-            page = traces.list_traces(session, limit=PAGE_SIZE, cursor=cursor)
+            page = traces.list_traces(
+                session, limit=PAGE_SIZE, cursor=asked.cursor, state=asked.state, search=asked.q
+            )
             names = overview.scene_names(session, {trace.scene_id for trace in page.data})
-        return site.page(
-            request, "traces.html", traces=page.data, names=names, cursor=cursor, next_cursor=page.next_cursor
-        )
+        context = asked.context(page.next_cursor)
+        return site.page(request, "traces.html", traces=page.data, names=names, **context)
 
     @routes.get("/traces/{trace_id}")
     def trace_page(request: Request, trace_id: str) -> HTMLResponse:
@@ -49,6 +50,7 @@ def router(site: Site) -> APIRouter:
             scene=record,
             extra=trace.model_extra or {},
             candidates=_best(trace),
+            graph=lineage_graph(site, trace.scene_id, trace_id),
             has_tracks=_artifact(trace, traces.TRACKS) is not None,
             has_page=_artifact(trace, traces.PAGE) is not None,
         )

@@ -26,6 +26,7 @@ from physworld_storage.access import audit
 from physworld_storage.access.audit import LOCAL, Actor
 from physworld_storage.errors import Conflict, KeyEnded, NotFound
 from physworld_storage.pages import page_of
+from physworld_storage.search import matching
 from physworld_storage.tables import ApiKeyRow, RetiredTokenRow, SessionRow, insert_if_absent, utc_now
 
 Role = Literal["read", "write", "admin"]
@@ -187,10 +188,13 @@ def revoke_key(session: Session, key_id: str, *, by: Actor = LOCAL) -> ApiKey:
     return key_of_row(row)
 
 
-def list_keys(session: Session, *, limit: int = 50, cursor: str | None = None) -> Page[ApiKey]:
+def list_keys(
+    session: Session, *, limit: int = 50, cursor: str | None = None, search: str | None = None
+) -> Page[ApiKey]:
     """Keys, newest first."""
+    statement = matching(select(ApiKeyRow), search, ApiKeyRow.id, ApiKeyRow.name, ApiKeyRow.role)
     keys = (ApiKeyRow.created_at, ApiKeyRow.id)
-    return page_of(session, select(ApiKeyRow), keys, key_of_row, limit=limit, cursor=cursor)
+    return page_of(session, statement, keys, key_of_row, limit=limit, cursor=cursor)
 
 
 def count_active_admins(session: Session) -> int:

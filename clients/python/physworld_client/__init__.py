@@ -23,12 +23,14 @@ from physworld_client.errors import (
     ConnectionFailed,
     DigestMismatch,
     ExportRefused,
+    ExtraMissing,
     InvalidRequest,
     JobCancelled,
     JobFailed,
     LiveSessionEnded,
     ModelUnreadable,
     NotFound,
+    NothingToPlot,
     PayloadTooLarge,
     PermissionDenied,
     PhysWorldError,
@@ -40,6 +42,7 @@ from physworld_client.errors import (
     SigningKeyUntrusted,
     WaitTimedOut,
 )
+from physworld_client.tables import to_pandas
 
 __version__ = "0.1.0"
 
@@ -54,12 +57,14 @@ __all__ = [
     "ConnectionFailed",
     "DigestMismatch",
     "ExportRefused",
+    "ExtraMissing",
     "InvalidRequest",
     "JobCancelled",
     "JobFailed",
     "LiveSessionEnded",
     "ModelUnreadable",
     "NotFound",
+    "NothingToPlot",
     "PayloadTooLarge",
     "PermissionDenied",
     "PhysWorldError",
@@ -71,4 +76,5 @@ __all__ = [
     "SigningKeyUntrusted",
     "WaitTimedOut",
     "__version__",
+    "to_pandas",
 ]

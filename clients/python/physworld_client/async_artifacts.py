@@ -10,6 +10,7 @@ import httpx
 
 from physworld_client import calls, transport
 from physworld_client.partial import PartialFile
+from physworld_client.progress import Bar
 from physworld_schemas.base import Artifact
 
 if TYPE_CHECKING:
@@ -22,6 +23,9 @@ class AsyncArtifacts:
     def __init__(self, client: AsyncClient) -> None:
         self._client = client
 
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} of {self._client.base_url}>"
+
     async def download(self, artifact: Artifact | str, path: str | Path) -> Path:
         """Downloads an artifact to ``path``: resumes a part found there, checks the digest, then renames.
 
@@ -33,17 +37,17 @@ class AsyncArtifacts:
         partial = PartialFile(Path(path), artifact.sha256 if isinstance(artifact, Artifact) else artifact)
         if partial.present():
             return partial.target
-        with partial:
-            await self._fill(partial)
+        with partial, self._client.bars.receiving(partial.target.name) as bar:
+            await self._fill(partial, bar)
             return partial.finish()
 
-    async def _fill(self, partial: PartialFile) -> None:
+    async def _fill(self, partial: PartialFile, bar: Bar) -> None:
         """Requests with retries until the part holds every byte."""
         retry = transport.Retry(self._client.max_retries)
         while not partial.complete():
             offset = partial.offset
             try:
-                response = await self._fetch(partial)
+                response = await self._fetch(partial, bar)
             except httpx.TransportError as error:
                 if partial.offset > offset:
                     retry.attempt = 0
@@ -59,14 +63,16 @@ class AsyncArtifacts:
                 transport.raise_for_problem(response)
             await asyncio.sleep(retry.delay_s(response))
 
-    async def _fetch(self, partial: PartialFile) -> httpx.Response:
+    async def _fetch(self, partial: PartialFile, bar: Bar) -> httpx.Response:
         """One request for what is missing; the body of a success is in the part when this returns."""
         path = calls.artifact_path(partial.sha256)
         async with self._client.http.stream("GET", path, headers=partial.headers()) as response:
             if response.is_success:
                 partial.accept(response)
+                bar.begins(partial.offset, response.headers.get("content-length"))
                 async for chunk in response.aiter_bytes():
                     partial.write(chunk)
+                    bar.moves(len(chunk))
             else:
                 await response.aread()
         return response

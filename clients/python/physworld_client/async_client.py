@@ -26,6 +26,7 @@ from physworld_client.async_resources import (
 from physworld_client.calls import Call
 from physworld_client.known_keys import KnownKeys
 from physworld_client.location import where
+from physworld_client.progress import Bars
 
 Answer = TypeVar("Answer")
 
@@ -42,6 +43,8 @@ class AsyncClient:
         transport: a transport of httpx, for tests or a Unix socket.
         known_keys: the file of keys that may sign models; by default that of this machine.
         known_as: the service's name in that file; its address without it.
+        progress: whether uploads and downloads show a bar on the standard error stream; by default where that is a
+            terminal.
 
     Attributes:
         scenes, checks, fits, traces, datasets, models, assessments, rollouts, plans, live, jobs, keys, pipelines,
@@ -59,10 +62,12 @@ class AsyncClient:
         transport: httpx.AsyncBaseTransport | None = None,
         known_keys: str | Path | None = None,
         known_as: str | None = None,
+        progress: bool | None = None,
     ) -> None:
         found = where(base_url, token)
         self.timeout = timeout
         self.max_retries = max_retries
+        self.bars = Bars(progress)
         self.known_keys = KnownKeys(known_keys)
         self.http = httpx.AsyncClient(
             transport=transport, **wire.client_options(found.url, found.token, timeout)

@@ -5,7 +5,8 @@ from __future__ import annotations
 from physworld_client import calls
 from physworld_client.async_resources import AsyncResource
 from physworld_client.pages import AsyncListPage
-from physworld_schemas.key import DEFAULT_LIFETIME_DAYS, ApiKey, Role
+from physworld_client.types import ApiKey
+from physworld_schemas.key import DEFAULT_LIFETIME_DAYS, Role
 
 
 class AsyncKeys(AsyncResource):

@@ -8,12 +8,10 @@ from physworld_client import calls
 from physworld_client.arrays import arrays_of
 from physworld_client.async_resources import LATEST, AsyncResource
 from physworld_client.pages import AsyncListPage
-from physworld_client.types import Array
-from physworld_schemas.assessment import Assessment
-from physworld_schemas.check import Check, CheckConfig
+from physworld_client.types import Array, Assessment, Check, Job, Trace
+from physworld_schemas.check import CheckConfig
 from physworld_schemas.fit import FitConfig
-from physworld_schemas.job import Job
-from physworld_schemas.trace import Trace, TraceConfig
+from physworld_schemas.trace import TraceConfig
 
 
 class AsyncChecks(AsyncResource):

@@ -8,10 +8,9 @@ from physworld_client import predictions
 from physworld_client.async_resources import LATEST, AsyncResource
 from physworld_client.pages import AsyncListPage
 from physworld_client.predictions import Planned, Predicted
-from physworld_client.types import Array
-from physworld_schemas.job import Job
-from physworld_schemas.plan import Plan, PlanConfig, PlanLimits
-from physworld_schemas.rollout import Part, Rollout, Start
+from physworld_client.types import Array, Job, Plan, Rollout
+from physworld_schemas.plan import PlanConfig, PlanLimits
+from physworld_schemas.rollout import Part, Start
 
 
 class AsyncRollouts(AsyncResource):

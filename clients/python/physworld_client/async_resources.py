@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import httpx
+from pydantic import BaseModel
 
 from physworld_client import calls, transport
 from physworld_client.arrays import arrays_of
@@ -20,20 +21,32 @@ from physworld_client.manifest import artifacts_of, verify_folder
 from physworld_client.pages import AsyncListPage
 from physworld_client.signatures import given_key
 from physworld_client.stream import HEARTBEAT_S, IDLE_LIMIT_S, EventDecoder, ends_job
-from physworld_client.types import Array
+from physworld_client.types import (
+    Array,
+    Dataset,
+    Episode,
+    Event,
+    Fit,
+    Job,
+    Model,
+    ModelComparison,
+    ModelVersion,
+    Scene,
+    ScenePreview,
+    SigningKey,
+)
 from physworld_client.waiting import Patience, job_id_of, require_success
-from physworld_schemas.dataset import Dataset, DatasetConfig, Episode
-from physworld_schemas.fit import Fit, FitConfig
-from physworld_schemas.job import TERMINAL_STATES, Event, Job
-from physworld_schemas.model import Model, ModelComparison, ModelVersion, TrainingConfig
+from physworld_schemas.dataset import DatasetConfig
+from physworld_schemas.fit import FitConfig
+from physworld_schemas.job import TERMINAL_STATES
+from physworld_schemas.model import TrainingConfig
 from physworld_schemas.pipeline import PipelineCreate
-from physworld_schemas.scene import Scene, SceneImport, ScenePreview
-from physworld_schemas.signing import SigningKey
+from physworld_schemas.scene import SceneImport
 
 if TYPE_CHECKING:
     from physworld_client.async_client import AsyncClient
 
-Item = TypeVar("Item")
+Item = TypeVar("Item", bound=BaseModel)
 LATEST = "latest"
 
 
@@ -42,6 +55,9 @@ class AsyncResource:
 
     def __init__(self, client: AsyncClient) -> None:
         self._client = client
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} of {self._client.base_url}>"
 
     async def _page(self, call_at: calls.ListCall[Item], cursor: str | None) -> AsyncListPage[Item]:
         page = await self._client.send(call_at(cursor))
@@ -58,13 +74,13 @@ class AsyncScenes(AsyncResource):
             path: of the folder or file.
             options: what a foreign recording does not say of itself.
         """
-        with open_bundle(path) as upload:
-            return await self._client.send(calls.scene_create(upload, options))
+        with open_bundle(path) as upload, self._client.bars.sending(upload) as sent:
+            return await self._client.send(calls.scene_create(sent, options))
 
     async def preview(self, path: str | Path, options: SceneImport | None = None) -> ScenePreview:
         """What an import of a recording would guess: axes, unit, rate, gripper, noise. Nothing is stored."""
-        with open_bundle(path) as upload:
-            return await self._client.send(calls.scene_preview(upload, options))
+        with open_bundle(path) as upload, self._client.bars.sending(upload) as sent:
+            return await self._client.send(calls.scene_preview(sent, options))
 
     async def get(self, scene_id: str) -> Scene:
         """One scene."""

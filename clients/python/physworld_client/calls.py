@@ -13,26 +13,32 @@ from urllib.parse import quote
 from pydantic import BaseModel, TypeAdapter
 
 from physworld_client.bundle import Upload
-from physworld_schemas.assessment import Assessment, AssessmentCreate
-from physworld_schemas.base import Page
-from physworld_schemas.check import Check, CheckConfig, CheckCreate
-from physworld_schemas.dataset import Dataset, DatasetConfig, DatasetCreate, Episode
-from physworld_schemas.fit import Fit, FitConfig, FitCreate
-from physworld_schemas.job import Job
-from physworld_schemas.key import ApiKey, KeyCreate, KeyRotate, Role
-from physworld_schemas.model import (
-    AliasSet,
+from physworld_client.types import (
+    ApiKey,
+    Assessment,
+    Check,
+    Dataset,
+    Episode,
+    Fit,
+    Job,
     Model,
     ModelComparison,
     ModelVersion,
-    TrainingConfig,
-    TrainingCreate,
-    VersionPatch,
+    Scene,
+    ScenePreview,
+    SigningKey,
+    Trace,
 )
+from physworld_schemas.assessment import AssessmentCreate
+from physworld_schemas.base import Page
+from physworld_schemas.check import CheckConfig, CheckCreate
+from physworld_schemas.dataset import DatasetConfig, DatasetCreate
+from physworld_schemas.fit import FitConfig, FitCreate
+from physworld_schemas.key import KeyCreate, KeyRotate, Role
+from physworld_schemas.model import AliasSet, TrainingConfig, TrainingCreate, VersionPatch
 from physworld_schemas.pipeline import PipelineCreate
-from physworld_schemas.scene import Scene, SceneImport, ScenePreview
-from physworld_schemas.signing import SigningKey
-from physworld_schemas.trace import Trace, TraceConfig, TraceCreate
+from physworld_schemas.scene import SceneImport
+from physworld_schemas.trace import TraceConfig, TraceCreate
 
 Answer = TypeVar("Answer")
 Item = TypeVar("Item")

@@ -19,6 +19,7 @@ from physworld_client.live import Live
 from physworld_client.location import where
 from physworld_client.loop import Assessments, Checks, Traces
 from physworld_client.predict import Plans, Rollouts
+from physworld_client.progress import Bars
 from physworld_client.resources import (
     Datasets,
     Fits,
@@ -43,6 +44,8 @@ class Client:
         transport: a transport of httpx, for tests or a Unix socket.
         known_keys: the file of keys that may sign models; by default that of this machine.
         known_as: the service's name in that file; its address without it.
+        progress: whether uploads and downloads show a bar on the standard error stream; by default where that is a
+            terminal.
 
     Attributes:
         scenes, checks, fits, traces, datasets, models, assessments, rollouts, plans, live, jobs, keys, pipelines,
@@ -60,10 +63,12 @@ class Client:
         transport: httpx.BaseTransport | None = None,
         known_keys: str | Path | None = None,
         known_as: str | None = None,
+        progress: bool | None = None,
     ) -> None:
         found = where(base_url, token)
         self.timeout = timeout
         self.max_retries = max_retries
+        self.bars = Bars(progress)
         self.known_keys = KnownKeys(known_keys)
         self.http = httpx.Client(transport=transport, **wire.client_options(found.url, found.token, timeout))
         self.known_as = known_as or found.known_as or wire.service_name(self.base_url)

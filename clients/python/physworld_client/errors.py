@@ -20,6 +20,8 @@
     ├── WaitTimedOut                the job goes on, the caller's patience ended; ``.job``
     ├── DigestMismatch              bytes are not those that their SHA-256 promises; nothing was kept
     ├── ExportRefused               episodes cannot be written in that form or to that place: what, and why
+    ├── NothingToPlot               an answer holds nothing that a plot could show, mostly since its job has not ended
+    ├── ExtraMissing                a package is missing that an extra of this distribution brings; an ImportError too
     ├── BundleUnreadable            a local scene cannot be packed: the path, and what is wrong with it
     └── ModelUnreadable             a local model artifact is incomplete or of an unknown layout
         └── SignatureInvalid        its manifest is not signed, or was changed since; nothing was loaded
@@ -158,6 +160,20 @@ class DigestMismatch(PhysWorldError):
 
 class ExportRefused(PhysWorldError):
     """Episodes cannot be written in that form or to that place."""
+
+
+class NothingToPlot(PhysWorldError):
+    """An answer holds nothing that a plot could show."""
+
+    def __init__(self, what: str) -> None:
+        super().__init__(f"{what} holds nothing to plot yet")
+
+
+class ExtraMissing(PhysWorldError, ImportError):
+    """A package is missing that an extra of this distribution brings."""
+
+    def __init__(self, what: str, extra: str) -> None:
+        super().__init__(f"{what} need an extra of this package: pip install 'physworld-client[{extra}]'")
 
 
 class BundleUnreadable(PhysWorldError):

@@ -6,7 +6,8 @@ from __future__ import annotations
 from physworld_client import calls
 from physworld_client.pages import ListPage
 from physworld_client.resources import Resource
-from physworld_schemas.key import DEFAULT_LIFETIME_DAYS, ApiKey, Role
+from physworld_client.types import ApiKey
+from physworld_schemas.key import DEFAULT_LIFETIME_DAYS, Role
 
 
 class Keys(Resource):

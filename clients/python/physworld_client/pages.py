@@ -4,12 +4,19 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-Item = TypeVar("Item")
+from pydantic import BaseModel
+
+from physworld_client import tables
+
+if TYPE_CHECKING:
+    import pandas
+
+Item = TypeVar("Item", bound=BaseModel)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ListPage(Generic[Item]):
     """One page of a list.
 
@@ -34,8 +41,19 @@ class ListPage(Generic[Item]):
                 return
             page = page.fetch(page.next_cursor)
 
+    def __repr__(self) -> str:
+        return _shown(self.data, self.has_more)
 
-@dataclass(frozen=True)
+    def _repr_html_(self) -> str:
+        """The page as a table, for notebooks."""
+        return tables.html(self.data)
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """The items of this page as rows; of all pages: ``to_pandas`` of ``physworld_client``."""
+        return tables.to_pandas(self.data)
+
+
+@dataclass(frozen=True, repr=False)
 class AsyncListPage(Generic[Item]):
     """One page of a list; the asynchronous twin of ``ListPage``."""
 
@@ -53,3 +71,20 @@ class AsyncListPage(Generic[Item]):
             if not page.has_more or page.next_cursor is None:
                 return
             page = await page.fetch(page.next_cursor)
+
+    def __repr__(self) -> str:
+        return _shown(self.data, self.has_more)
+
+    def _repr_html_(self) -> str:
+        """The page as a table, for notebooks."""
+        return tables.html(self.data)
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """The items of this page as rows; of all pages: ``to_pandas`` of ``physworld_client``."""
+        return tables.to_pandas(self.data)
+
+
+def _shown(data: list[Any], has_more: bool) -> str:
+    """``<3 Fit, older ones follow>``."""
+    kind = type(data[0]).__name__ if data else "items"
+    return f"<{len(data) or 'no'} {kind}{', older ones follow' if has_more else ''}>"

@@ -9,10 +9,9 @@ from physworld_client import predictions
 from physworld_client.pages import ListPage
 from physworld_client.predictions import Planned, Predicted
 from physworld_client.resources import LATEST, Resource
-from physworld_client.types import Array
-from physworld_schemas.job import Job
-from physworld_schemas.plan import Plan, PlanConfig, PlanLimits
-from physworld_schemas.rollout import Part, Rollout, Start
+from physworld_client.types import Array, Job, Plan, Rollout
+from physworld_schemas.plan import PlanConfig, PlanLimits
+from physworld_schemas.rollout import Part, Start
 
 
 class Rollouts(Resource):

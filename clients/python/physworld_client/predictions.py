@@ -13,12 +13,11 @@ from pydantic import TypeAdapter
 from physworld_client.arrays import arrays_of
 from physworld_client.calls import BYTES, Call, _given, _part, artifact_path
 from physworld_client.errors import DigestMismatch, ModelUnreadable
-from physworld_client.types import Array
+from physworld_client.types import Array, Job, Plan, Rollout
 from physworld_schemas.arrays import EncodedArray
 from physworld_schemas.base import Artifact, Page
-from physworld_schemas.job import Job
-from physworld_schemas.plan import Plan, PlanConfig, PlanCreate, PlanLimits, PointGoal, ShapeGoal
-from physworld_schemas.rollout import Part, Rollout, RolloutCreate, Start
+from physworld_schemas.plan import PlanConfig, PlanCreate, PlanLimits, PointGoal, ShapeGoal
+from physworld_schemas.rollout import Part, RolloutCreate, Start
 
 _ROLLOUT = TypeAdapter(Rollout)
 _ROLLOUTS = TypeAdapter(Page[Rollout])
@@ -30,7 +29,7 @@ ANSWER_S = 60.0
 """Seconds that the service may work on a rollout before it answers."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Predicted:
     """A rollout as arrays.
 
@@ -46,8 +45,13 @@ class Predicted:
     points: Array | None = None
     vertices: Array | None = None
 
+    def __repr__(self) -> str:
+        shapes = ((name, getattr(self, name)) for name in ("times", "points", "vertices"))
+        given = ", ".join(f"{name}={array.shape}" for name, array in shapes if array is not None)
+        return f"Predicted({self.rollout.model!r}, version={self.rollout.version}, {given})"
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, repr=False)
 class Planned:
     """A plan with its arrays: ``controllers`` (h+1+T, K, 3) is what a rollout and a robot take.
 
@@ -58,6 +62,9 @@ class Planned:
 
     plan: Plan
     arrays: dict[str, Array] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return f"Planned({self.plan!r}, arrays={', '.join(self.arrays) or 'none'})"
 
     @property
     def controllers(self) -> Array:

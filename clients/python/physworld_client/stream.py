@@ -5,7 +5,8 @@ from __future__ import annotations
 from pydantic import ValidationError
 
 from physworld_client.errors import PhysWorldError
-from physworld_schemas.job import TERMINAL_STATES, Event
+from physworld_client.types import Event
+from physworld_schemas.job import TERMINAL_STATES
 
 HEARTBEAT_S = 15.0
 IDLE_LIMIT_S = 3 * HEARTBEAT_S

@@ -1,11 +1,127 @@
-"""The type of arrays in signatures.
+"""The types of what the SDK takes and answers, and the type of arrays: everything to import from here.
 
-Shapes and units stand in docstrings, since numpy's types know neither; the element type is named where it matters.
+Objects of the service have ``to_pandas()`` and mostly ``plot()`` (``physworld_client.objects``); settings and what
+objects are made of are the wire's models. Shapes and units of arrays stand in docstrings, since numpy's types know
+neither.
 """
 
 from typing import Any, TypeAlias
 
 import numpy.typing as npt
 
+from physworld_client.objects import (
+    ApiKey,
+    Assessment,
+    Check,
+    Dataset,
+    Episode,
+    Event,
+    Fit,
+    Job,
+    Model,
+    ModelComparison,
+    ModelVersion,
+    Plan,
+    Rollout,
+    Scene,
+    ScenePreview,
+    SigningKey,
+    Trace,
+)
+from physworld_schemas.arrays import EncodedArray
+from physworld_schemas.assessment import ErrorFigure
+from physworld_schemas.base import Artifact, FieldError, Lineage, Page, Problem, Reference
+from physworld_schemas.check import (
+    CheckConfig,
+    CheckedEffect,
+    CheckedGate,
+    CheckedPair,
+    CheckedParameter,
+    CheckReport,
+    CheckView,
+    MotionChange,
+    ProposedMotion,
+)
+from physworld_schemas.dataset import DatasetConfig
+from physworld_schemas.fit import FitConfig, LocalStage, Numerics, Parameter, SearchState
+from physworld_schemas.job import TERMINAL_STATES, Progress
+from physworld_schemas.key import Role
+from physworld_schemas.model import (
+    ComparedError,
+    Difference,
+    ErrorCurves,
+    MeasuredError,
+    TrainingConfig,
+)
+from physworld_schemas.pipeline import PipelineCreate
+from physworld_schemas.plan import PlanConfig, PlanLimits, PointGoal, ShapeGoal
+from physworld_schemas.rollout import Part, Start
+from physworld_schemas.scene import ImportGuess, SceneImport
+from physworld_schemas.trace import Figure, FoundEffect, TraceConfig
+
 Array: TypeAlias = npt.NDArray[Any]
 """An array of any element type."""
+
+__all__ = [
+    "TERMINAL_STATES",
+    "ApiKey",
+    "Array",
+    "Artifact",
+    "Assessment",
+    "Check",
+    "CheckConfig",
+    "CheckReport",
+    "CheckView",
+    "CheckedEffect",
+    "CheckedGate",
+    "CheckedPair",
+    "CheckedParameter",
+    "ComparedError",
+    "Dataset",
+    "DatasetConfig",
+    "Difference",
+    "EncodedArray",
+    "Episode",
+    "ErrorCurves",
+    "ErrorFigure",
+    "Event",
+    "FieldError",
+    "Figure",
+    "Fit",
+    "FitConfig",
+    "FoundEffect",
+    "ImportGuess",
+    "Job",
+    "Lineage",
+    "LocalStage",
+    "MeasuredError",
+    "Model",
+    "ModelComparison",
+    "ModelVersion",
+    "MotionChange",
+    "Numerics",
+    "Page",
+    "Parameter",
+    "Part",
+    "PipelineCreate",
+    "Plan",
+    "PlanConfig",
+    "PlanLimits",
+    "PointGoal",
+    "Problem",
+    "Progress",
+    "ProposedMotion",
+    "Reference",
+    "Role",
+    "Rollout",
+    "Scene",
+    "SceneImport",
+    "ScenePreview",
+    "SearchState",
+    "ShapeGoal",
+    "SigningKey",
+    "Start",
+    "Trace",
+    "TraceConfig",
+    "TrainingConfig",
+]

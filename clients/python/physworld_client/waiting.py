@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 
 from physworld_client.errors import JobCancelled, JobFailed
-from physworld_schemas.job import Job
+from physworld_client.types import Job
 
 LOOK_INTERVAL_S = 0.2
 LONG_POLL_S = 30.0

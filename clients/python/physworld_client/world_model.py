@@ -33,7 +33,7 @@ PHI_NAMES = ("stiffness", "density")
 """Columns of Φ, which the weights take in this order."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class WorldModel:
     """A loaded version. Positions in metres, world frame z up; the clock ticks every ``dt_s`` seconds.
 
@@ -67,6 +67,12 @@ class WorldModel:
     ground_height_m: float | None
     _network: Network
     _skin: tuple[Array, Array] | None
+
+    def __repr__(self) -> str:
+        return (
+            f"WorldModel({self.name!r}, version={self.version}, vertices={len(self.rest_vertices)}, "
+            f"controllers={self.controller_count}, history={self.history}, dt_s={self.dt_s:g})"
+        )
 
     @classmethod
     def load(

@@ -24,7 +24,7 @@ from physworld_client.cli.output import (
 )
 from physworld_client.client import Client
 from physworld_client.export import FORMATS
-from physworld_schemas.job import Job
+from physworld_client.types import Job
 from physworld_schemas.key import DEFAULT_LIFETIME_DAYS, KeyCreate
 from physworld_schemas.library import catalogue
 from physworld_schemas.scene import SceneImport

@@ -17,7 +17,8 @@ from physworld_client.cli.output import progress_text, stdout
 from physworld_client.cli.report import STAGES, duration_s
 from physworld_client.client import Client
 from physworld_client.errors import ConnectionFailed
-from physworld_schemas.job import TERMINAL_STATES, Job
+from physworld_client.types import Job
+from physworld_schemas.job import TERMINAL_STATES
 
 LOOK_INTERVAL_S = 1.0
 LINE_INTERVAL_S = 5.0

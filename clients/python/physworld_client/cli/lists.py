@@ -30,18 +30,22 @@ from physworld_client.cli.output import (
 from physworld_client.client import Client
 from physworld_client.manifest import checked_name
 from physworld_client.pages import ListPage
-from physworld_schemas.assessment import Assessment
+from physworld_client.types import (
+    ApiKey,
+    Assessment,
+    Check,
+    Dataset,
+    Episode,
+    Fit,
+    Job,
+    Model,
+    ModelVersion,
+    Plan,
+    Rollout,
+    Scene,
+    Trace,
+)
 from physworld_schemas.base import Artifact
-from physworld_schemas.check import Check
-from physworld_schemas.dataset import Dataset, Episode
-from physworld_schemas.fit import Fit
-from physworld_schemas.job import Job
-from physworld_schemas.key import ApiKey
-from physworld_schemas.model import Model, ModelVersion
-from physworld_schemas.plan import Plan
-from physworld_schemas.rollout import Rollout
-from physworld_schemas.scene import Scene
-from physworld_schemas.trace import Trace
 
 DEFAULT_LIMIT = 20
 PAGE = 100

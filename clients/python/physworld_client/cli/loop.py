@@ -16,7 +16,7 @@ from physworld_client.cli.options import Json, ModelName, SceneName, TraceName, 
 from physworld_client.cli.output import millimetres, print_json, print_state, show, stdout
 from physworld_client.client import Client
 from physworld_client.resources import LATEST
-from physworld_schemas.assessment import Assessment
+from physworld_client.types import Assessment
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.trace import FoundEffect, TraceConfig
 

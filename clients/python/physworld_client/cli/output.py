@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from physworld_schemas.job import Job
+from physworld_client.types import Job
 from physworld_schemas.wording import roughly
 
 NARROWEST = 110

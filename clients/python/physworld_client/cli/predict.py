@@ -18,8 +18,8 @@ from physworld_client.cli.output import print_json, stderr, stdout
 from physworld_client.client import Client
 from physworld_client.errors import PhysWorldError
 from physworld_client.resources import LATEST
-from physworld_client.types import Array
-from physworld_schemas.plan import Plan, PlanConfig, PlanLimits
+from physworld_client.types import Array, Plan
+from physworld_schemas.plan import PlanConfig, PlanLimits
 from physworld_schemas.rollout import Part
 from physworld_schemas.wording import reason
 

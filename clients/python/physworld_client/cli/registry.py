@@ -18,9 +18,9 @@ from physworld_client.known_keys import trusted_keys
 from physworld_client.manifest import verify_folder
 from physworld_client.resources import LATEST
 from physworld_client.signatures import fingerprint_of
+from physworld_client.types import ModelComparison, SigningKey
 from physworld_schemas.library import Metric, catalogue
-from physworld_schemas.model import MeasuredError, ModelComparison
-from physworld_schemas.signing import SigningKey
+from physworld_schemas.model import MeasuredError
 
 MODELS = GROUPS["models"]
 PublicKey = Annotated[

@@ -12,10 +12,8 @@ from rich.text import Text
 
 from physworld_client.cli.output import stdout
 from physworld_client.errors import PhysWorldError
-from physworld_schemas.fit import Fit
-from physworld_schemas.job import Job
+from physworld_client.types import Fit, Job, ModelVersion
 from physworld_schemas.library import Metric, catalogue
-from physworld_schemas.model import ModelVersion
 from physworld_schemas.pipeline import ModelReference, RunReport
 
 MAIN_METRIC = "track_m"

@@ -20,13 +20,13 @@ from physworld_client.cli.up import require_service_code
 from physworld_client.client import Client
 from physworld_client.errors import JobFailed, PhysWorldError
 from physworld_client.transport import DEFAULT_MAX_RETRIES
+from physworld_client.types import Job, Scene
 from physworld_client.waiting import require_success
 from physworld_schemas.dataset import DatasetConfig
 from physworld_schemas.fit import FitConfig
-from physworld_schemas.job import TERMINAL_STATES, Job
+from physworld_schemas.job import TERMINAL_STATES
 from physworld_schemas.model import TrainingConfig
 from physworld_schemas.pipeline import PipelineCreate, RunReport
-from physworld_schemas.scene import Scene
 
 CANCEL_WAIT_S = 30.0
 

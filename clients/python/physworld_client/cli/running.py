@@ -16,7 +16,7 @@ from physworld_client.cli import service
 from physworld_client.cli.options import Data, Json, Token, Url
 from physworld_client.cli.output import ago, progress_text, stdout
 from physworld_client.errors import PhysWorldError
-from physworld_schemas.job import Job
+from physworld_client.types import Job
 
 SHOWN_JOBS = 10
 STOP_WITHIN_S = 30.0

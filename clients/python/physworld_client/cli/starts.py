@@ -24,9 +24,9 @@ from physworld_client.cli.options import Json, connected
 from physworld_client.cli.output import print_json, progress_text, stdout
 from physworld_client.client import Client
 from physworld_client.errors import PhysWorldError
+from physworld_client.types import Job
 from physworld_schemas.dataset import DatasetConfig
 from physworld_schemas.fit import FitConfig
-from physworld_schemas.job import Job
 from physworld_schemas.model import TrainingConfig
 
 PLAIN = (int, float, str, bool)
