@@ -30,7 +30,7 @@ from physworld.estimation.whitening import Whitener
 from physworld.trace.candidates import Candidate
 from physworld.trace.hypotheses import Hypothesis, ScaledWhitener, Setting, Values
 from physworld.trace.left_out import independent
-from physworld.trace.posterior import HALF, posterior, removes
+from physworld.trace.posterior import MOST, posterior, removes
 from physworld.trace.sensitivity import Response, candidate_responses
 
 _MULTIPLES = (0.3, 3.0, 9.0)  # of a linear estimate
@@ -45,6 +45,7 @@ WORTH = 0.1  # share of the error above the noise that an effect removes to firs
 _QUIET = (
     1.2  # misfit over the noise up to which what is there is small, and a score to first order says enough
 )
+_HALF = 0.5  # of what the best effect removes, or promised: what a rival has to promise
 _NEARLY_ALL = 0.7  # share of the error above the noise
 _FIRST_OF_TWO = 0.29  # share of the root mean square that goes with one of two effects of the same size
 _BASINS = 3  # other hypotheses' optima from which a fit starts
@@ -128,15 +129,19 @@ class Search:
         return list(self.hypotheses.values())
 
     def admitted(self) -> list[Hypothesis]:
-        """Hypotheses of which every effect removes a half of what is left above the noise without it; ours is no
-        true twin, and what smaller shares of its error look like is no evidence."""
+        """Hypotheses of which every effect removes most of what is left above the noise without it, and of what an effect
+        that it contains leaves in its place; ours is no true twin, and what smaller shares of its error look like is no
+        evidence."""
         return [h for h in self.hypotheses.values() if self._relevant(h)]
 
     def _relevant(self, hypothesis: Hypothesis) -> bool:
         for member in hypothesis.members:
-            rest = self.hypotheses.get(_names([m for m in hypothesis.members if m is not member]))
-            without = self.hypotheses[()] if rest is None else rest
-            if self._removes(without, hypothesis) < HALF:
+            rest = [other.effect for other in hypothesis.members if other is not member]
+            simpler = [self.hypotheses.get(tuple(sorted(rest)), self.hypotheses[()])]
+            simpler += [
+                h for name in member.contains if (h := self.hypotheses.get(tuple(sorted([*rest, name]))))
+            ]
+            if any(self._removes(one, hypothesis) < MOST for one in simpler):
                 return False
         return True
 
@@ -186,14 +191,12 @@ class Search:
         order = order[:count]
         if restless:  # a score to first order says nothing of an effect that is large
             order += [own for own in by_effect.values() if own not in order and own[0].candidate.scanned]
+        simpler = [name for own in order for name in own[0].candidate.contains]
+        order += [by_effect[name] for name in simpler if name in by_effect and by_effect[name] not in order]
         for own in order:
-            best, _ = self._nearly_all(base)
+            best = by_effect.get(self._nearly_all(base)[0] or "")
             # against the best one's score, not against what it brought: where phases slip all scores are too low
-            if (
-                best is not None
-                and not own[0].candidate.scanned
-                and own[0].share < HALF * by_effect[best][0].share
-            ):
+            if best and not own[0].candidate.scanned and own[0].share < _HALF * best[0].share:
                 continue
             self.setting.simulations.stage = f"fit with {own[0].candidate.effect}"
             self._fit(base, own)
@@ -201,7 +204,7 @@ class Search:
     def _least(self, base: Hypothesis) -> float:
         """Share of what ``base`` leaves that a rival has to promise: half of what one effect removes, where that is
         nearly all; else 0."""
-        return HALF * self._nearly_all(base)[1]
+        return _HALF * self._nearly_all(base)[1]
 
     def _nearly_all(self, base: Hypothesis) -> tuple[str | None, float]:
         """The effect on top of ``base`` that removes nearly all of what that leaves, and its share; None and 0 where
