@@ -14,6 +14,7 @@ import { Surface } from "./surface.js";
 
 const HEAD_BYTES = 16;
 const PICK_PIXELS = { mouse: 28, pen: 32, touch: 48 };
+const SETTLE_S = 0.5; // after the end of the recorded motion, to arrive
 const STILL = 1e-3; // of the body's size: a grip that is so near its target stays where it is
 const GAIN_PER_S = 12; // how fast a grip follows the pointer: it covers the gap in about a tenth of a second
 const KEYS = {
@@ -164,6 +165,10 @@ class Playground {
     this.markers = new Cloud(ready.controllers.length, "controllers", 0.03);
     this.handles = new Cloud(ready.grips.length, "controllers", 0.085);
     this.clouds = [this.body, this.markers, this.handles];
+    for (const cloud of [this.markers, this.handles]) { // a grip may lie inside the body
+      cloud.material.depthTest = false;
+      cloud.points.renderOrder = 2;
+    }
     for (const cloud of this.clouds) this.scene.add(cloud.points);
     this.latest = new Float32Array(ready.start.flat());
     this.place(this.latest);
@@ -307,7 +312,7 @@ class Playground {
       this.ready.grips.forEach((members, grip) => {
         velocities[grip].copy(this.towards(grip, this.ghost.grip(members, time + 1 / GAIN_PER_S, new Vector3()), now));
       });
-      if (time > this.ghost.end) this.replayed = null;
+      if (time > this.ghost.end + SETTLE_S) this.replayed = null;
     }
     for (const key of this.keys) velocities[this.chosen].addScaledVector(new Vector3(...KEYS[key]), 0.25 * this.ready.speed_m_s);
     for (const velocity of velocities) velocity.clampLength(0, this.ready.speed_m_s);

@@ -52,11 +52,13 @@ def test_the_surface_of_a_twin_lies_around_its_vertices_and_hangs_on_the_nearest
     surface = body_surface(twin.to_arrays(), rest)
     assert surface is not None
     assert volume(surface.points, surface.triangles) > 0
-    assert (surface.points.min(axis=0) < rest.min(axis=0) + 1e-3).all()
-    assert (surface.points.max(axis=0) > rest.max(axis=0) - 1e-3).all()
+    part = twin.to_arrays()["lattice_spacing"] / 2  # a vertex may lie in a part that is hardly filled
+    assert (surface.points.min(axis=0) < rest.min(axis=0) + part).all()
+    assert (surface.points.max(axis=0) > rest.max(axis=0) - part).all()
     np.testing.assert_allclose(surface.weight.sum(axis=1), 1.0)
-    nearest = np.linalg.norm(surface.points[:, None] - rest, axis=2).argmin(axis=1)
-    assert (surface.index[:, 0] == nearest).all()
+    distance = np.linalg.norm(surface.points[:, None] - rest, axis=2)
+    carried = np.take_along_axis(distance, surface.index, axis=1)
+    np.testing.assert_allclose(carried, np.sort(distance, axis=1)[:, :CARRIERS])
     assert surface.neighbours.shape == (len(rest), NEIGHBOURS)
     assert (surface.neighbours != np.arange(len(rest))[:, None]).all()
     told = surface.document()
