@@ -6,13 +6,11 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
-from urllib.parse import urlencode
 
-from fastapi import APIRouter, Depends, Query, Request
+from fastapi import APIRouter, Query, Request
 from fastapi.responses import HTMLResponse, JSONResponse, Response
 
 from physworld_schemas.model import Model, ModelComparison, ModelVersion
-from physworld_services.dashboard.access import require_same_origin, require_writer
 from physworld_services.dashboard.clouds import Cloud, Layer, measured_layers, resampled, scene_cloud, thinned
 from physworld_services.dashboard.curves import chart, comparison_chart, given_curves, versions_chart
 from physworld_services.dashboard.lineage import lineage_graph
@@ -21,11 +19,8 @@ from physworld_services.dashboard.pages_scenes import PREDICTION, layer_response
 from physworld_services.dashboard.site import BASE, Site
 from physworld_services.dashboard.tables import held_out_of, noise_floor_of
 from physworld_storage import registry, resources
-from physworld_storage.access import tickets
-from physworld_storage.access.api_keys import ApiKey
 from physworld_storage.comparison import compare_versions
 from physworld_storage.errors import NotFound
-from physworld_storage.jobs.kinds.rollout import ready_version
 
 PAGE_SIZE = 50
 
@@ -105,26 +100,11 @@ def router(site: Site) -> APIRouter:
             request,
             "version.html",
             version=version,
-            card=_card(site, version),
+            card=card_of(site, version),
             graph=lineage_graph(site, version.scene_id, f"{version.name}:{version.version}"),
             has_curve=given_curves(version.metrics) is not None,
             has_cloud=version.scene_id is not None and site.arrays(version.artifacts, PREDICTION) is not None,
         )
-
-    @routes.get("/models/{name}/{number}/playground", dependencies=[Depends(require_writer)])
-    def playground(request: Request, name: str, number: str) -> HTMLResponse:
-        return site.page(request, "playground.html", version=_version(site, name, number))
-
-    @routes.post(
-        "/models/{name}/{number}/live", dependencies=[Depends(require_same_origin), Depends(require_writer)]
-    )
-    def live_ticket(request: Request, name: str, number: str) -> Response:
-        viewer: ApiKey = request.state.viewer
-        version = _version(site, name, number).version
-        with site.database.session() as session:
-            ready_version(session, name, version)
-            ticket, _ = tickets.issue(session, viewer.credential, f"session:{name}:{version}")
-        return JSONResponse({"path": f"/v1/live?{urlencode(_session(name, version, ticket))}"})
 
     @routes.get("/models/{name}/{number}/curve")
     def curve(name: str, number: str) -> Response:
@@ -159,17 +139,12 @@ def _distinct(site: Site, name: str, chosen: Sequence[str]) -> list[ModelVersion
     return list({one.version: one for one in found if one.state == "ready"}.values())
 
 
-def _session(name: str, number: int, ticket: str) -> dict[str, str | int]:
-    """The query of a live session: two frames a tick, interpolated, of the graph's vertices."""
-    return {"model": name, "version": number, "ticket": ticket, "frames": 2, "part": "vertices"}
-
-
 def _version(site: Site, name: str, number: int | str) -> ModelVersion:
     with site.database.reading() as session:
         return registry.get_version(session, name, number)
 
 
-def _card(site: Site, version: ModelVersion) -> dict[str, Any]:
+def card_of(site: Site, version: ModelVersion) -> dict[str, Any]:
     """The version's card; empty where there is none that can be read."""
     found = next((item for item in version.artifacts if item.name == CARD), None)
     if found is None:

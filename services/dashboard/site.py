@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import io
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from fastapi import Request
@@ -30,6 +30,7 @@ from physworld_storage.settings import Settings
 if TYPE_CHECKING:
     from physworld.scene import Scene
 
+Kept = TypeVar("Kept")
 BASE = "/dashboard"
 HERE = Path(__file__).parent
 STATIC = HERE / "static"
@@ -74,6 +75,10 @@ class Site:
         if found is None:
             return None
         return self._parsed.get(("arrays", found.sha256), lambda: self._read_arrays(found.sha256))
+
+    def kept(self, key: tuple[str, str], make: Callable[[], Kept]) -> Kept:
+        """What ``make`` gives for a digest, kept between requests as long as there is room."""
+        return self._parsed.get(key, make)
 
     def _read_scene(self, sha256: str) -> Scene:
         scene, _warnings = bundle_from_bytes(self.artifacts.read_bytes(sha256))

@@ -76,6 +76,8 @@ def figure(value: object, digits: int = 4) -> str:
         return DASH
     if isinstance(value, int):
         return f"{value:,}"
+    if isinstance(value, list | tuple):
+        return ", ".join(figure(item, digits) for item in value) or DASH
     if not isinstance(value, float):
         return str(value)
     if not math.isfinite(value):

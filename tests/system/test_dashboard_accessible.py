@@ -17,6 +17,12 @@ pytestmark = pytest.mark.browser
 AXE = (files("axe_playwright_python") / "axe.min.js").read_text()
 TAGS = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"]
 WIDTHS = (360, 1440)
+CLIPPED = """() => [...document.querySelectorAll(".top nav a")].filter((link) => {
+  const [box, bar] = [link.getBoundingClientRect(), link.parentElement.getBoundingClientRect()];
+  return box.left < 0 || box.right > Math.min(innerWidth, bar.right) + 1 || box.width < 1;
+}).map((link) => link.textContent)"""
+BRIGHT = """() => [...document.querySelectorAll("main img")].filter((picture) =>
+  !getComputedStyle(picture).filter.includes("invert")).map((picture) => picture.src)"""
 RUN = """async (tags) => {
   const found = await axe.run(document, { runOnly: { type: "tag", values: tags }, resultTypes: ["violations"] });
   return found.violations.map((rule) => [rule.id,
@@ -82,6 +88,12 @@ def test_axe_finds_nothing_on_any_page(stranger: Visit, world: World, scheme: st
         wide = stranger.page.evaluate("document.documentElement.scrollWidth")
         if wide > width:
             found[path].append(["wider than the window", [str(wide)]])
+        hidden = stranger.page.evaluate(CLIPPED)
+        if hidden:
+            found[path].append(["clipped navigation", hidden])
+        bright = stranger.page.evaluate(BRIGHT) if scheme == "dark" else []
+        if bright:
+            found[path].append(["white in the dark", bright])
     stranger.open("/nothing")
     found["/nothing"] = violations(stranger)
     stranger.errors.clear()  # Chromium notes the 404, and the playground's absent inference service

@@ -20,7 +20,7 @@ pytestmark = [pytest.mark.browser, pytest.mark.slow]
         ("/models", "swing", "tbody tr"),
         ("/models/chain_swing", "ready", "tbody tr"),
         ("/rollouts", "chain_swing", "tbody tr"),
-        ("/plans", "plan", "tbody tr"),
+        ("/plans", "chain ready", "tbody tr"),
         ("/", "pipeline", ".job"),
     ],
 )

@@ -58,12 +58,27 @@ def place(page: Page, name: str) -> np.ndarray:
     return np.array([float(x) for x in page.get_attribute("[data-playground]", f"data-{name}").split()])
 
 
-def test_the_points_follow_a_dragged_grip(served: Served, page: Page, tmp_path: Path) -> None:
+def enter(served: Served, page: Page) -> None:
+    """The playground, once frames and what belongs to the model have come."""
     page.goto(f"{served.url}/dashboard/models/{served.model}/{served.version}/playground")
     page.fill("#key", served.token)
     page.click("button[type=submit]")
-    page.wait_for_selector("[data-playground][data-ready]")
+    page.wait_for_selector("[data-playground][data-ready][data-accompanied]")
     until(page, lambda: int(page.get_attribute("[data-playground]", "data-frames") or 0) > 60)
+
+
+def at_grip(page: Page) -> tuple[float, float]:
+    """Where the first grip is drawn in the window [px]."""
+    left, top, width, height = page.evaluate("""() => {
+        const box = document.querySelector("[data-playground] canvas").getBoundingClientRect();
+        return [box.left, box.top, box.width, box.height];
+    }""")
+    share = page.evaluate("() => window.playgrounds[0].seen(0)")
+    return left + share[0] * width, top + share[1] * height
+
+
+def test_the_points_follow_a_dragged_grip(served: Served, page: Page, tmp_path: Path) -> None:
+    enter(served, page)
     centre, grip = place(page, "centre"), place(page, "grip")
 
     handle = page.evaluate("""() => {
@@ -101,3 +116,100 @@ def test_the_points_follow_a_dragged_grip(served: Served, page: Page, tmp_path: 
     page.click("[data-reset]")
     expect(page.locator("[data-note]")).to_be_hidden()
     until(page, lambda: bool(np.linalg.norm(place(page, "grip") - grip) < 2e-3))
+
+
+def test_a_still_pointer_leaves_a_still_grip(served: Served, page: Page) -> None:
+    enter(served, page)
+    x, y = at_grip(page)
+    before = place(page, "grip")
+    page.mouse.move(x + 9, y + 7)  # beside its middle
+    page.mouse.down()
+    page.mouse.move(x + 9, y + 7)
+    page.wait_for_timeout(1000)
+    assert np.linalg.norm(place(page, "grip") - before) < 1e-3
+    page.mouse.move(x + 69, y + 7, steps=6)
+    page.wait_for_timeout(1500)
+    places = []
+    for _ in range(10):
+        places.append(place(page, "grip"))
+        page.wait_for_timeout(60)
+    page.mouse.up()
+    assert np.linalg.norm(places[-1] - before) > 5e-3
+    assert np.ptp(places, axis=0).max() < 5e-4  # it does not swing around the pointer
+
+
+def test_the_body_is_a_surface_that_moves_with_the_vertices(served: Served, page: Page) -> None:
+    enter(served, page)
+    state = """() => { const it = window.playgrounds[0]; const out = it.surface.attribute.array; let mean = [0, 0, 0];
+        for (let i = 0; i < out.length; i += 1) mean[i % 3] += 3 * out[i] / out.length;
+        return { mesh: it.surface.mesh.visible, dots: it.body.points.visible, mean }; }"""
+    shown = page.evaluate(state)
+    assert shown["mesh"] and not shown["dots"]
+    until(page, lambda: bool(np.linalg.norm(page.evaluate(state)["mean"] - place(page, "centre")) < 0.02))
+    page.get_by_label("as a surface").uncheck()
+    shown = page.evaluate(state)
+    assert shown["dots"] and not shown["mesh"]
+
+
+def test_the_recorded_motion_is_driven_beside_the_recording(served: Served, page: Page) -> None:
+    enter(served, page)
+    expect(page.get_by_label("Recording")).to_be_checked()
+    ghost = "() => { const it = window.playgrounds[0].ghost; return [it.frame, it.clouds.length, it.start, it.end]; }"
+    first, drawn, start, end = page.evaluate(ghost)
+    assert drawn == 1
+    assert 0 <= start < end
+    before = place(page, "grip")
+    page.get_by_role("button", name="Move as recorded").click()
+    page.wait_for_timeout(200)
+    until(page, lambda: page.evaluate("() => window.playgrounds[0].replayed") is None)
+    assert page.evaluate(ghost)[0] > first
+    recorded = page.evaluate("""() => { const it = window.playgrounds[0];
+        return it.ghost.grip(it.ready.grips[0], it.ghost.end, it.centre.clone()).toArray(); }""")
+    wanted = np.linalg.norm(np.array(recorded) - before)
+    print(
+        f"recorded {1e3 * wanted:.1f} mm, off {1e3 * np.linalg.norm(place(page, 'grip') - recorded):.1f} mm"
+    )
+    assert wanted > 2e-3
+    assert np.linalg.norm(place(page, "grip") - recorded) < 0.25 * wanted
+
+
+def test_a_view_that_was_turned_is_set_back(served: Served, page: Page) -> None:
+    enter(served, page)
+    camera = "() => window.playgrounds[0].camera.position.toArray()"
+    before = page.evaluate(camera)
+    box = page.locator("[data-playground] canvas").bounding_box()
+    assert box is not None
+    page.mouse.move(box["x"] + 30, box["y"] + box["height"] - 30)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 160, box["y"] + box["height"] - 90, steps=5)
+    page.mouse.up()
+    assert page.evaluate(camera) != pytest.approx(before, rel=1e-3)
+    page.get_by_role("button", name="Show all").click()
+    assert page.evaluate(camera) == pytest.approx(before, rel=1e-6)
+    page.mouse.move(box["x"] + 160, box["y"] + box["height"] - 90)
+    page.mouse.wheel(0, -400)
+    page.focus("[data-playground] canvas")
+    page.keyboard.press("Home")
+    assert page.evaluate(camera) == pytest.approx(before, rel=1e-6)
+
+
+def test_what_is_recorded_comes_as_arrays_and_as_a_film(served: Served, page: Page, tmp_path: Path) -> None:
+    enter(served, page)
+    page.get_by_role("button", name="Record", exact=True).click()
+    page.focus("[data-playground] canvas")
+    page.keyboard.down("ArrowRight")
+    page.wait_for_timeout(1500)
+    page.keyboard.up("ArrowRight")
+    page.get_by_role("button", name="Stop recording").click()
+    for name, ending in (("npz", ".npz"), ("Film", ".webm")):
+        with page.expect_download() as download:
+            page.get_by_role("link", name=name).click()
+        assert download.value.suggested_filename == f"{served.model}-{served.version}{ending}"
+        download.value.save_as(tmp_path / f"kept{ending}")
+    with np.load(tmp_path / "kept.npz") as arrays:
+        times, vertices, controllers = (arrays[name] for name in ("times", "vertices", "controllers"))
+    assert len(times) > 20
+    assert vertices.shape[0] == controllers.shape[0] == len(times)
+    assert (np.diff(times) > 0).all()
+    assert controllers[-1, 0, 0] - controllers[0, 0, 0] > 0.01
+    assert (tmp_path / "kept.webm").read_bytes()[:4] == b"\x1aE\xdf\xa3"

@@ -4,16 +4,18 @@
 //   uint32 tick, uint32 number of the last control, float32 time, uint32 flags, float32 points and controllers [m].
 // A control is uint32 number, float32 velocities (grips, 3) [m/s]: a dragged grip is steered towards the pointer.
 
-import {
-  BufferAttribute, BufferGeometry, Color, DynamicDrawUsage, PerspectiveCamera, Plane, Points, Raycaster, Scene,
-  ShaderMaterial, Vector2, Vector3, WebGLRenderer,
-} from "three";
+import { DirectionalLight, HemisphereLight, PerspectiveCamera, Plane, Raycaster, Scene, Vector2, Vector3, WebGLRenderer } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import { colour, onSchemeChange } from "./palette.js";
-import { FRAGMENT, VERTEX, grid } from "./points.js";
+import { Ghost } from "./ghost.js";
+import { Cloud, grid } from "./points.js";
+import { Recorder } from "./record.js";
+import { Surface } from "./surface.js";
 
 const HEAD_BYTES = 16;
-const PICK_PIXELS = 28;
+const PICK_PIXELS = { mouse: 28, pen: 32, touch: 48 };
+const SETTLE_S = 0.5; // after the end of the recorded motion, to arrive
+const STILL = 1e-3; // of the body's size: a grip that is so near its target stays where it is
 const GAIN_PER_S = 12; // how fast a grip follows the pointer: it covers the gap in about a tenth of a second
 const KEYS = {
   ArrowLeft: [-1, 0, 0], ArrowRight: [1, 0, 0], ArrowUp: [0, 1, 0], ArrowDown: [0, -1, 0], PageUp: [0, 0, 1],
@@ -23,34 +25,6 @@ const ENDED = {
   1007: "the session refused a message", 1008: "the session was refused", 1013: "all live sessions are taken",
   4408: "nothing was moved for a while", 4409: "the connection was too slow",
 };
-
-/** Round points of one colour, whose places are set from a frame. */
-class Cloud {
-  constructor(count, role, size) {
-    this.role = role;
-    this.attribute = new BufferAttribute(new Float32Array(count * 3), 3).setUsage(DynamicDrawUsage);
-    const geometry = new BufferGeometry();
-    geometry.setAttribute("position", this.attribute);
-    this.material = new ShaderMaterial({
-      vertexShader: VERTEX,
-      fragmentShader: FRAGMENT,
-      uniforms: { size: { value: size }, scale: { value: 1 }, tint: { value: new Color() }, opacity: { value: 1 } },
-      alphaToCoverage: true,
-    });
-    this.points = new Points(geometry, this.material);
-    this.points.frustumCulled = false;
-    this.paint();
-  }
-
-  paint() {
-    this.material.uniforms.tint.value.set(colour(this.role));
-  }
-
-  set(values) {
-    this.attribute.array.set(values);
-    this.attribute.needsUpdate = true;
-  }
-}
 
 /** How many events fell into the last second. */
 class Rate {
@@ -80,15 +54,25 @@ class Playground {
     this.camera = new PerspectiveCamera(36, 1, 0.001, 1000);
     this.camera.up.set(0, 0, 1);
     this.orbit = new OrbitControls(this.camera, this.canvas);
+    const sun = new DirectionalLight(0xffffff, 1.6);
+    sun.position.set(0.4, -0.6, 1);
+    this.scene.add(new HemisphereLight(0xffffff, 0x667788, 1.7), sun);
+    this.recorder = new Recorder(this.canvas);
     this.ray = new Raycaster();
-    this.received = new Rate();
+    this.drawn = new Rate();
+    this.chosen = 0;
     this.keys = new Set();
     this.drag = null;
     this.sentAt = new Map();
     this.number = 0;
     this.frames = 0;
     this.clouds = [];
-    figure.querySelector("[data-reset]").addEventListener("click", () => this.again());
+    const pressed = (name, then) => figure.querySelector(`[data-${name}]`).addEventListener("click", then);
+    pressed("reset", () => this.again());
+    pressed("view", () => this.look());
+    pressed("replay", () => this.replay());
+    pressed("record", () => this.record());
+    for (const box of figure.querySelectorAll("[data-show]")) box.addEventListener("change", () => this.dress());
     this.canvas.addEventListener("pointerdown", (event) => this.grab(event), { capture: true });
     this.canvas.addEventListener("pointermove", (event) => this.move(event));
     for (const name of ["pointerup", "pointercancel"]) this.canvas.addEventListener(name, () => this.release());
@@ -111,8 +95,64 @@ class Playground {
     this.socket.onclose = (event) => this.say(`The session ended: ${event.reason || ENDED[event.code] || "the connection broke"}. Press Start again.`);
   }
 
+  /** The body's surface and the recording, where there are any; the session does not wait for them. */
+  async accompany() {
+    const load = async (url) => { const answer = await fetch(url); return answer.ok ? answer.json() : null; };
+    const [surface, ghost] = await Promise.all([load(this.figure.dataset.surface), Ghost.load(this.figure.dataset.ghost)]);
+    this.ghost = ghost;
+    if (surface) {
+      this.surface = new Surface(surface);
+      this.scene.add(this.surface.mesh);
+    }
+    const offered = { surface: Boolean(surface), measured: ghost?.has("measured"), twin: ghost?.has("twin") };
+    for (const [name, there] of Object.entries(offered)) this.figure.querySelector(`[data-for="${name}"]`).hidden = !there;
+    this.figure.querySelector("[data-replay]").hidden = !ghost?.has("controllers");
+    await this.dress();
+    this.figure.dataset.accompanied = "true";
+  }
+
+  /** Draw what the boxes say. */
+  async dress() {
+    const wanted = (name) => this.figure.querySelector(`[data-show="${name}"]`).checked;
+    if (this.surface) this.surface.mesh.visible = wanted("surface") && Boolean(this.body);
+    if (this.body) this.body.points.visible = !this.surface?.mesh.visible;
+    if (this.ghost) {
+      await Promise.all(["measured", "twin"].map((name) => this.ghost.show(name, this.scene, wanted(name))));
+      this.ghost.stale = true;
+      this.ghost.at(this.ghost.start);
+    }
+    if (this.surface && this.latest) this.surface.set(this.latest);
+    this.resize();
+  }
+
+  /** Move the grips as they moved in the recording, from its start. */
+  async replay() {
+    await this.ghost.values("controllers");
+    this.again();
+    this.replayed = performance.now();
+  }
+
+  /** Begin to record, or end it and offer what was recorded. */
+  async record() {
+    const button = this.figure.querySelector("[data-record]");
+    const links = ["film", "arrays"].map((name) => this.figure.querySelector(`[data-${name}]`));
+    if (!this.recorder.running) {
+      for (const link of links) link.hidden = true;
+      this.recorder.start();
+    } else {
+      const files = await this.recorder.stop(this.ready.points, this.ready.controllers.length);
+      for (const [name, url] of Object.entries(files)) {
+        const link = this.figure.querySelector(`[data-${name}]`);
+        Object.assign(link, { href: url, download: `${this.figure.dataset.name}.${name === "film" ? this.recorder.ending : "npz"}`, hidden: false });
+      }
+    }
+    button.textContent = this.recorder.running ? "Stop recording" : "Record";
+    button.setAttribute("aria-pressed", this.recorder.running);
+  }
+
   /** A fresh body: in the present session, or in a new one where that has ended. */
   again() {
+    this.replayed = null;
     if (this.socket?.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify({ type: "reset" }));
     else if (this.socket?.readyState !== WebSocket.CONNECTING) this.open().catch((error) => this.say(error.message));
   }
@@ -121,12 +161,18 @@ class Playground {
     const ready = JSON.parse(text);
     this.ready = ready;
     for (const cloud of this.clouds) this.scene.remove(cloud.points);
-    this.body = new Cloud(ready.points, "predicted", Math.min(0.05, Math.max(0.012, 0.45 / Math.sqrt(ready.points))));
+    this.body = new Cloud(ready.points, "model", Math.min(0.05, Math.max(0.012, 0.45 / Math.sqrt(ready.points))));
     this.markers = new Cloud(ready.controllers.length, "controllers", 0.03);
     this.handles = new Cloud(ready.grips.length, "controllers", 0.085);
     this.clouds = [this.body, this.markers, this.handles];
+    for (const cloud of [this.markers, this.handles]) { // a grip may lie inside the body
+      cloud.material.depthTest = false;
+      cloud.points.renderOrder = 2;
+    }
     for (const cloud of this.clouds) this.scene.add(cloud.points);
-    this.place(new Float32Array(ready.start.flat()));
+    this.latest = new Float32Array(ready.start.flat());
+    this.place(this.latest);
+    this.dress();
     this.places = this.grips(new Float32Array(ready.controllers.flat()));
     this.say("");
     this.figure.dataset.ready = "true";
@@ -141,14 +187,9 @@ class Playground {
       low.min(point.fromArray(values, i));
       high.max(point);
     }
-    const centre = low.clone().add(high).multiplyScalar(0.5);
+    this.centre = low.clone().add(high).multiplyScalar(0.5);
     this.radius = Math.max(high.clone().sub(low).length() * 0.8, 1e-3);
-    const distance = (this.radius * 1.3) / Math.sin((this.camera.fov / 2) * (Math.PI / 180));
-    this.camera.position.copy(centre).addScaledVector(new Vector3(0.4, -1, 0.3).normalize(), distance);
-    this.camera.near = distance / 200;
-    this.camera.far = distance * 20;
-    this.orbit.target.copy(centre);
-    this.orbit.update();
+    this.look();
     if (this.lines) this.scene.remove(this.lines);
     const [lines, step] = grid(low.clone().subScalar(this.radius / 3), high.clone().addScalar(this.radius / 3), null);
     this.lines = lines;
@@ -158,22 +199,37 @@ class Playground {
     this.resize();
   }
 
+  /** The camera as it was at the beginning. */
+  look() {
+    if (!this.centre) return;
+    const distance = (this.radius * 1.3) / Math.sin((this.camera.fov / 2) * (Math.PI / 180));
+    this.camera.position.copy(this.centre).addScaledVector(new Vector3(0.4, -1, 0.3).normalize(), distance);
+    this.camera.near = distance / 200;
+    this.camera.far = distance * 20;
+    this.camera.updateProjectionMatrix();
+    this.orbit.target.copy(this.centre);
+    this.orbit.update();
+  }
+
   take(buffer) {
     const now = performance.now();
     const [, number] = new Uint32Array(buffer, 0, 2);
+    this.acknowledged = number;
     const values = new Float32Array(buffer, HEAD_BYTES);
     const size = this.ready.points * 3;
-    this.body.set(values.subarray(0, size));
+    this.latest = values.subarray(0, size);
+    if (this.surface?.mesh.visible) this.moved = true;
+    else this.body.set(this.latest);
+    this.recorder.take(new Float32Array(buffer, 8, 1)[0], values);
     const controllers = values.subarray(size);
     this.markers.set(controllers);
     this.places = this.grips(controllers);
     this.handles.set(this.places.flatMap((place) => place.toArray()));
-    this.received.add(now);
     this.frames += 1;
     const sent = this.sentAt.get(number);
     if (sent !== undefined) {
-      this.delay = now - sent;
-      for (const old of this.sentAt.keys()) if (old <= number) this.sentAt.delete(old);
+      this.delay = now - sent.at;
+      for (const old of this.sentAt.keys()) if (old < number) this.sentAt.delete(old);
     }
     const mean = [0, 0, 0];
     for (let i = 0; i < size; i += 1) mean[i % 3] += values[i] / this.ready.points;
@@ -204,7 +260,7 @@ class Playground {
     if (!this.places || event.button !== 0) return;
     const { width, height } = this.canvas.getBoundingClientRect();
     const at = this.pointer(event);
-    let nearest = PICK_PIXELS;
+    let nearest = PICK_PIXELS[event.pointerType] ?? PICK_PIXELS.mouse;
     this.places.forEach((place, grip) => {
       const seen = place.clone().project(this.camera);
       const pixels = Math.hypot(((seen.x - at.x) * width) / 2, ((seen.y - at.y) * height) / 2);
@@ -215,6 +271,11 @@ class Playground {
       }
     });
     if (!this.drag) return;
+    this.replayed = null;
+    this.chosen = this.drag.grip;
+    this.ray.setFromCamera(at, this.camera); // the hand holds the grip where it took it
+    const held = this.ray.ray.intersectPlane(this.drag.plane, new Vector3());
+    this.drag.offset = held ? this.drag.target.clone().sub(held) : new Vector3();
     this.orbit.enabled = false;
     this.canvas.setPointerCapture(event.pointerId);
   }
@@ -222,7 +283,8 @@ class Playground {
   move(event) {
     if (!this.drag) return;
     this.ray.setFromCamera(this.pointer(event), this.camera);
-    this.ray.ray.intersectPlane(this.drag.plane, this.drag.target);
+    const held = this.ray.ray.intersectPlane(this.drag.plane, new Vector3());
+    if (held) this.drag.target.copy(held).add(this.drag.offset);
   }
 
   release() {
@@ -231,7 +293,10 @@ class Playground {
   }
 
   key(event, down) {
+    if (down && event.key === "Home") this.look();
+    if (down && event.key >= "1" && this.places?.[event.key - 1]) this.chosen = event.key - 1;
     if (!(event.key in KEYS)) return;
+    this.replayed = null;
     event.preventDefault();
     this.keys[down ? "add" : "delete"](event.key);
   }
@@ -240,37 +305,57 @@ class Playground {
   steer(now) {
     if (!this.ready || this.socket?.readyState !== WebSocket.OPEN || this.socket.bufferedAmount > 4096) return;
     const velocities = this.places.map(() => new Vector3());
-    if (this.drag) {
-      const { grip, target } = this.drag;
-      velocities[grip].copy(target).sub(this.places[grip]).multiplyScalar(GAIN_PER_S);
+    const time = this.replayed === null || this.replayed === undefined ? null : this.ghost.start + (now - this.replayed) / 1000;
+    if (this.drag) velocities[this.drag.grip].copy(this.towards(this.drag.grip, this.drag.target, now));
+    else if (time !== null) {
+      this.ghost.at(time);
+      this.ready.grips.forEach((members, grip) => {
+        velocities[grip].copy(this.towards(grip, this.ghost.grip(members, time + 1 / GAIN_PER_S, new Vector3()), now));
+      });
+      if (time > this.ghost.end + SETTLE_S) this.replayed = null;
     }
-    for (const key of this.keys) velocities[0].addScaledVector(new Vector3(...KEYS[key]), 0.25 * this.ready.speed_m_s);
+    for (const key of this.keys) velocities[this.chosen].addScaledVector(new Vector3(...KEYS[key]), 0.25 * this.ready.speed_m_s);
     for (const velocity of velocities) velocity.clampLength(0, this.ready.speed_m_s);
-    const active = Boolean(this.drag) || this.keys.size > 0;
+    const active = Boolean(this.drag) || time !== null || this.keys.size > 0;
     if (!active && !this.active) return;
     this.active = active;
     this.number += 1;
     const message = new ArrayBuffer(4 + 12 * velocities.length);
     new DataView(message).setUint32(0, this.number, true);
     new Float32Array(message, 4).set(velocities.flatMap((velocity) => velocity.toArray()));
-    this.sentAt.set(this.number, now);
+    this.sentAt.set(this.number, { at: now, velocities });
     if (this.sentAt.size > 500) this.sentAt.clear();
     this.socket.send(message);
+  }
+
+  /** The velocity that brings a grip to a target: from where it will be once what was sent has arrived. */
+  towards(grip, target, now) {
+    const expected = this.places[grip].clone();
+    const sent = [...this.sentAt].filter(([number]) => number >= (this.acknowledged ?? 0));
+    sent.forEach(([number, { at, velocities }], i) => {
+      if (number > this.acknowledged) expected.addScaledVector(velocities[grip], ((sent[i + 1]?.[1].at ?? now) - at) / 1000);
+    });
+    const gap = target.clone().sub(expected);
+    return gap.length() < STILL * this.radius ? gap.set(0, 0, 0) : gap.multiplyScalar(GAIN_PER_S);
   }
 
   draw(now) {
     requestAnimationFrame((next) => this.draw(next));
     this.steer(now);
+    if (this.moved) this.surface.set(this.latest);
+    this.moved = false;
     this.renderer.render(this.scene, this.camera);
+    this.drawn.add(performance.now());
     if (now - (this.toldAt ?? 0) < 250) return;
     this.toldAt = now;
-    const rate = this.received.value(performance.now());
+    const rate = this.drawn.value(performance.now());
     this.figure.querySelector("[data-fps]").textContent = rate;
     if (this.delay !== undefined) this.figure.querySelector("[data-delay]").textContent = Math.round(this.delay);
   }
 
   paint() {
-    for (const cloud of this.clouds) cloud.paint();
+    for (const cloud of [...this.clouds, ...(this.ghost?.clouds ?? [])]) cloud.paint();
+    this.surface?.paint();
     this.lines?.material.color.set(colour("grid"));
   }
 
@@ -282,7 +367,7 @@ class Playground {
     this.camera.updateProjectionMatrix();
     const pixels = clientHeight * this.renderer.getPixelRatio();
     const scale = pixels / (2 * Math.tan((this.camera.fov / 2) * (Math.PI / 180)));
-    for (const cloud of this.clouds) cloud.material.uniforms.scale.value = scale * (this.radius ?? 1);
+    for (const cloud of [...this.clouds, ...(this.ghost?.clouds ?? [])]) cloud.material.uniforms.scale.value = scale * (this.radius ?? 1);
   }
 
   say(words) {
@@ -295,5 +380,6 @@ window.playgrounds = []; // for tests, which have no other way to know where a g
 for (const figure of document.querySelectorAll("[data-playground]")) {
   const playground = new Playground(figure);
   window.playgrounds.push(playground);
+  playground.accompany().catch((error) => playground.say(`What belongs to the model could not be loaded: ${error.message}.`));
   playground.open().catch((error) => playground.say(`The session could not be opened: ${error.message}.`));
 }

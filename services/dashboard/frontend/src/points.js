@@ -1,6 +1,9 @@
 // What the 3D views share: round points, the ground's grid, line segments.
 
-import { BufferAttribute, BufferGeometry, LineBasicMaterial, LineSegments } from "three";
+import {
+  BufferAttribute, BufferGeometry, Color, DynamicDrawUsage, LineBasicMaterial, LineSegments, Points, ShaderMaterial,
+} from "three";
+import { colour } from "./palette.js";
 
 export const VERTEX = `
   uniform float size; uniform float scale;
@@ -48,4 +51,34 @@ export function segments(ends) {
   const geometry = new BufferGeometry();
   geometry.setAttribute("position", new BufferAttribute(new Float32Array(ends), 3));
   return new LineSegments(geometry, new LineBasicMaterial());
+}
+
+/** Round points of one colour, whose places are set from a frame. */
+export class Cloud {
+  constructor(count, role, size, opacity = 1) {
+    this.role = role;
+    this.attribute = new BufferAttribute(new Float32Array(count * 3), 3).setUsage(DynamicDrawUsage);
+    const geometry = new BufferGeometry();
+    geometry.setAttribute("position", this.attribute);
+    this.material = new ShaderMaterial({
+      vertexShader: VERTEX,
+      fragmentShader: FRAGMENT,
+      uniforms: { size: { value: size }, scale: { value: 1 }, tint: { value: new Color() }, opacity: { value: opacity } },
+      alphaToCoverage: opacity === 1,
+      transparent: opacity < 1,
+      depthWrite: opacity === 1,
+    });
+    this.points = new Points(geometry, this.material);
+    this.points.frustumCulled = false;
+    this.paint();
+  }
+
+  paint() {
+    this.material.uniforms.tint.value.set(colour(this.role));
+  }
+
+  set(values) {
+    this.attribute.array.set(values);
+    this.attribute.needsUpdate = true;
+  }
 }

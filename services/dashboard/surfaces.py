@@ -1,0 +1,125 @@
+"""The surface of a model's body, for the playground: the twin's filled cells, smoothed, carried by the vertices.
+
+The twin of a solid lies on a lattice of cells, each in 2 × 2 × 2 parts that are filled with material or not. Faces
+between filled and empty parts, smoothed after Taubin (1995), are the surface at rest. Each of its points hangs on the
+nearest ``CARRIERS`` vertices of the graph; the browser turns and moves it with them (``frontend/src/surface.js``).
+Bodies that lie on no lattice of cells (ropes, sheets) have no surface and are drawn as points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from physworld.arrays import Array
+
+CARRIERS, NEIGHBOURS = 4, 8
+SMOOTHING = ((0.5, -0.53),) * 6
+"""Steps of Taubin's smoothing: in and out again, which keeps the volume."""
+FILLED = 1e-6
+MOST_TRIANGLES = 40_000
+CORNERS = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A body's surface at rest and what carries it.
+
+    Attributes:
+        points: (m, 3) [m].
+        triangles: (t, 3), outward by the right hand.
+        index: carrying vertices of each point, (m, CARRIERS).
+        weight: of each of them, (m, CARRIERS), together 1.
+        rest: the graph's vertices at rest [m], (n, 3).
+        neighbours: of each vertex, by which its turn is known, (n, NEIGHBOURS).
+    """
+
+    points: Array
+    triangles: Array
+    index: Array
+    weight: Array
+    rest: Array
+    neighbours: Array
+
+    def document(self) -> dict[str, Any]:
+        """The surface as JSON: flat lists, places to a tenth of a millimetre of a metre-sized body."""
+        digits = max(4, 5 - int(np.floor(np.log10(max(float(np.ptp(self.rest)), 1e-6)))))
+        return {
+            "points": np.round(self.points, digits).ravel().tolist(),
+            "triangles": self.triangles.ravel().tolist(),
+            "index": self.index.ravel().tolist(),
+            "weight": np.round(self.weight, 4).ravel().tolist(),
+            "carriers": self.index.shape[1],
+            "rest": np.round(self.rest, digits).ravel().tolist(),
+            "neighbours": self.neighbours.ravel().tolist(),
+        }
+
+
+def body_surface(twin: Mapping[str, Array], rest: Array) -> Surface | None:
+    """The surface of a twin's body over the graph's ``rest`` vertices (n, 3); None without a lattice of cells."""
+    cells, fill = (twin.get(name) for name in ("lattice_cells", "lattice_fill"))
+    if (
+        cells is None
+        or fill is None
+        or cells.ndim != 2
+        or cells.shape[1] != 3
+        or fill.shape[1:] != (len(CORNERS),)
+    ):
+        return None
+    points, triangles = cell_surface(cells, fill > FILLED, twin["lattice_origin"], twin["lattice_spacing"])
+    if not 0 < len(triangles) <= MOST_TRIANGLES or len(rest) <= NEIGHBOURS:
+        return None
+    tree = cKDTree(rest)
+    distance, index = tree.query(points, CARRIERS)
+    weight = 1.0 / np.maximum(distance, 1e-3 * np.ptp(rest)) ** 2
+    neighbours = tree.query(rest, NEIGHBOURS + 1)[1][:, 1:]
+    return Surface(points, triangles, index, weight / weight.sum(axis=1, keepdims=True), rest, neighbours)
+
+
+def cell_surface(cells: Array, filled: Array, origin: Array, spacing: Array) -> tuple[Array, Array]:
+    """Points (m, 3) [m] and triangles (t, 3) around the filled parts of cells.
+
+    Args:
+        cells: places of the cells in the lattice, (C, 3) int.
+        filled: which of their parts hold material, the last axis running fastest, (C, 8) bool.
+        origin, spacing: of the lattice [m], (3,).
+    """
+    parts = (2 * cells[:, None, :] + CORNERS)[filled]
+    if not len(parts):
+        return np.empty((0, 3)), np.empty((0, 3), dtype=int)
+    low = parts.min(axis=0) - 1
+    taken = np.zeros(parts.max(axis=0) - low + 2, dtype=bool)
+    taken[tuple((parts - low).T)] = True
+    corners = []
+    for axis in range(3):
+        u, v = ((axis + 1) % 3, (axis + 2) % 3)
+        for side in (0, 1):
+            bare = np.argwhere(taken & ~np.roll(taken, 1 - 2 * side, axis=axis))
+            ring = np.zeros((4, 3), dtype=int)
+            ring[:, axis] = side
+            ring[:, u], ring[:, v] = (0, 1, 1, 0), (0, 0, 1, 1)
+            corners.append(bare[:, None, :] + (ring if side else ring[::-1]))
+    quads = np.concatenate(corners)
+    places, inverse = np.unique(quads.reshape(-1, 3), axis=0, return_inverse=True)
+    faces = inverse.reshape(-1, 4)
+    triangles = np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
+    return _smoothed(origin + (places + low) * (spacing / 2), faces), triangles
+
+
+def _smoothed(points: Array, faces: Array) -> Array:
+    """The points after Taubin's smoothing along the edges of the faces (q, 4)."""
+    edges = np.concatenate([faces[:, [k, (k + 1) % 4]] for k in range(4)])
+    edges = np.unique(np.sort(edges, axis=1), axis=0)
+    ends = np.concatenate([edges, edges[:, ::-1]])
+    count = np.bincount(ends[:, 0], minlength=len(points))[:, None]
+    smooth = np.asarray(points, dtype=float)
+    for step in SMOOTHING:
+        for factor in step:
+            total = np.zeros_like(smooth)
+            np.add.at(total, ends[:, 0], smooth[ends[:, 1]])
+            smooth = smooth + factor * (total / count - smooth)
+    return smooth
