@@ -121,7 +121,7 @@ def _cross(left: Tensor, right: Tensor) -> Tensor:
 
 
 def enter(
-    frame: GripFrame, window: Tensor, control_next: Tensor, n: int
+    frame: GripFrame, window: Tensor, control_next: Tensor
 ) -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:
     """(R, c̄), y^{t-h} … y^t (h+1, V, B, 3) and the control vertices at t+1 (C, B, 3) in the frame of that moment."""
     rotation, centre = turn_of(frame, control_next)

@@ -34,7 +34,7 @@ def framed_prior(step: nn.Module, spec: GraphSpec) -> Callable[[Tensor, Tensor, 
         if frame is None:
             found = step(window, control_next, phi)
             return found
-        turn, local, control_local = enter(frame, window, control_next, n)
+        turn, local, control_local = enter(frame, window, control_next)
         found = leave(frame, turn, step(local, control_local, phi))
         return found
 
