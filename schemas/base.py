@@ -21,7 +21,7 @@ LINE, LONGEST_TEXT = 120, 40
 """Characters of the line that an object is shown in, and of a text in it."""
 _LITERAL = "{said}"
 _PLAIN = frozenset({float, int, bool, type(None)})
-Seed = Annotated[int, Field(ge=0, lt=2**63)]
+Seed = Annotated[int, Field(ge=0, lt=2**63, json_schema_extra={"format": "int64"})]
 
 
 class Request(BaseModel):
