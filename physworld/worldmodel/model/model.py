@@ -274,8 +274,13 @@ class WorldModel(nn.Module):
     def step(
         self, window: Tensor, control_next: Tensor, phi: Tensor, constants: EdgeConstants | None = None
     ) -> Tensor:
-        """Positions of all vertices at t + 1 [m], (V, B, 3); control vertices go to ``control_next`` (C, B,
-        3).
+        """Positions of all vertices at t + 1 (V, B, 3) [m].
+
+        Args:
+            window: positions at t - h … t (h+1, V, B, 3) [m].
+            control_next: where the control vertices go (C, B, 3) [m].
+            phi: logarithms of property ratios (n, B, ·).
+            constants: what edges share over a rollout; None computes it here.
         """
         n, frame = self.spec.object_count, self.spec.frame
         if frame is None:
