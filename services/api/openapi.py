@@ -21,7 +21,7 @@ starts and deletes work, `admin` also manages keys.
 with an `Idempotency-Key` can be sent again without starting work twice.
 
 **Lists** are pages, newest first. `cursor` is opaque: pass `next_cursor` on as it is; another text is refused with
-400.
+422.
 
 **Problems** are RFC 9457 documents: `code` is stable, `detail` has the numbers that broke, `errors` the place of each
 fault.
@@ -64,6 +64,7 @@ def describe(app: FastAPI) -> None:
             for methods in document["paths"].values():
                 for operation in methods.values():
                     for parameter in operation.get("parameters", ()):
+                        parameter["schema"] = _without_null(parameter["schema"])
                         if parameter["name"] in PARAMETERS:
                             parameter.setdefault("description", PARAMETERS[parameter["name"]])
                     if operation.get("security"):
@@ -72,3 +73,11 @@ def describe(app: FastAPI) -> None:
         return app.openapi_schema
 
     app.openapi = openapi  # type: ignore[method-assign]
+
+
+def _without_null(schema: dict[str, Any]) -> dict[str, Any]:
+    """A parameter's schema without null: one that is not meant is left out, `null` would be a text."""
+    kinds = [kind for kind in schema.get("anyOf", ()) if kind != {"type": "null"}]
+    if len(kinds) != 1:
+        return schema
+    return {**kinds[0], **{key: value for key, value in schema.items() if key != "anyOf"}}
