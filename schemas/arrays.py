@@ -89,7 +89,14 @@ def array_of(
 ) -> np.ndarray:
     """The values as float64, finite, with one of the numbers of axes, none of them beyond ±``most``.
 
-    Raises ValueError that says what is wrong.
+    Args:
+        value: numbers in lists, or encoded.
+        name: for messages.
+        dimensions: the numbers of axes that it may have.
+        most: largest absolute value; None allows any finite one.
+
+    Raises:
+        ValueError: ragged, empty, of other axes, not finite or beyond ``most``; the message has the numbers.
     """
     import numpy as np
 

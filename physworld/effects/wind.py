@@ -34,6 +34,7 @@ class Wind(Effect):
     equation = "a = c (w - v) = p - c v"
     kind = "force"
     gates = ("push_x_m_s2", "push_y_m_s2", "push_z_m_s2", "rate_per_s")
+    contains = ("air_drag_linear",)
     instead = "repeat the recording in a closed box"
 
     push_x_m_s2: float = 0.0

@@ -4,7 +4,7 @@
 ``named``                 one set of effects holds 0.95 of the posterior
 ``equivalent_set``        two to four sets together do: these data cannot tell them apart
 ``data_issue``            what does are faults of the measurement only
-``numerical_issue``       nothing is supported, and what is left is no more than the solver's own error
+``numerical_issue``       nothing is supported, and finer cells or smaller steps change as much as what is left
 ``unexplained``           something is there, and no effect of the library removes a half of it with support
 ``nothing_to_explain``    the declared physics is near the noise, and nothing is supported beside it
 ========================  ============================================================================================
@@ -67,7 +67,7 @@ def decided(
         known: hypotheses, the declared physics first.
         weights: their posterior, (H,).
         sigma: noise [m]; None where it is not known.
-        solver: its own squared error over the noise's, beside what calibrated parameters can do.
+        solver: root mean squared change by finer cells and smaller steps, over the noise.
         tried: effects that were asked.
     """
     declared, before = known[0], known[0].fitted.misfit
@@ -81,8 +81,10 @@ def decided(
         if before <= WITHIN:
             reason = f"misfit {before:.2f} of the noise; {tried} effects tried"
             return Verdict(NOTHING, declared, (), reason)
-        if before**2 - 1.0 <= solver:
-            reason = f"misfit {before:.2f} of the noise; finer cells change {np.sqrt(solver):.2f} of it"
+        if before**2 - 1.0 <= solver**2:
+            reason = (
+                f"misfit {before:.2f} of the noise; finer cells and smaller steps change {solver:.2f} of it"
+            )
             return Verdict(NUMERICAL, declared, (), reason)
         reason = f"misfit {before:.2f} of the noise; no effect is supported"
         return Verdict(UNEXPLAINED, declared, (), reason)

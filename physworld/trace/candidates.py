@@ -50,6 +50,11 @@ class Candidate:
         """Whether a score to first order may miss the effect, so that it is looked for over its whole range."""
         return EFFECTS[self.effect].scanned
 
+    @property
+    def contains(self) -> tuple[str, ...]:
+        """Effects that it is with some strengths at zero."""
+        return EFFECTS[self.effect].contains
+
     def unknowns(self) -> list[Unknown]:
         """The gates, in units of their probes; with what is known of them beforehand."""
         return [

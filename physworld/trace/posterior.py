@@ -19,7 +19,7 @@ import numpy as np
 from physworld.arrays import Array
 from physworld.trace.left_out import LeftOut
 
-HALF = 0.5
+MOST = 0.42  # share of the root mean square, two thirds of the square: what an effect removes to be named
 _NOISE_KNOWN = 0.05  # share to which the variance of the noise is known
 _DRAWS = 4000
 

@@ -52,7 +52,6 @@ _OTHER_STIFFNESSES = tuple(0.12 * k for k in (-6, -5, -4, -3, -2, -1, 1, 2, 3, 4
 _SHAPES = (TWIST_RATIO, BENDING_RATIO)
 _THOROUGH = 2  # times the iterations of other fits: everything is compared with the declared physics
 _SLOWEST = 12.0  # times the cost of the declared physics that a run may take: strong friction is dear
-_KNOWN = 0.1  # share of the solver's squared error to which its estimate is known: a third of the error
 _RICHARDSON = {"finer cells": 2.04, "half the time step": 1.33}  # error over difference, of second order
 
 
@@ -129,7 +128,6 @@ class _Ground:
         blocks: rows of every block of frames.
         sigma: noise [m]; None where it is not known.
         numerics: root mean squared change by other cells and steps, over the noise, by name.
-        doubt: the solver's error as estimated from these, (frames, N, 3) [m] each.
         finer: the twin on finer cells.
         tracks: of the calibrated twin, (frames, N, 3) [m].
     """
@@ -139,7 +137,6 @@ class _Ground:
     blocks: list[Array]
     sigma: float | None
     numerics: dict[str, float]
-    doubt: list[Array]
     finer: Twin
     tracks: Array
 
@@ -171,13 +168,13 @@ class _Trace:
         chosen, refused = candidates(declared.fitted.twin, config.candidates)
         setting = self._setting(ground, declared.fitted.twin, declared.fitted.unknowns)
         early = early_part(ground.bare, self.split)
-        solver = _solver_error(ground, declared)
         sizes = (config.confirmed, config.additions, config.effects_at_most)
-        search = Search(setting, chosen, early, *sizes, _KNOWN * solver, config.seed)
+        search = Search(setting, chosen, early, *sizes, config.seed)
         self.clock.start()
         with self.clock.until(SEARCH):
             search.run(declared)
         known, weights = search.admitted(), search.weights()
+        solver = float(np.linalg.norm([v for n, v in ground.numerics.items() if n in _RICHARDSON]))
         verdict = decided(known, weights, ground.sigma, solver, search.library)
         if self.faults and verdict.name == NOTHING:
             reason = f"faulty sightings ({self.faults}); of the others {verdict.reason}"
@@ -251,7 +248,7 @@ class _Trace:
         block_of_row = self.split.block_of(white.frame_of_row)
         blocks = [np.flatnonzero(block_of_row == k) for k in range(self.split.blocks)]
         blocks = [rows for rows in blocks if len(rows)]
-        return _Ground(bare, white, blocks, sigma, numerics, doubt, finer, tracks)
+        return _Ground(bare, white, blocks, sigma, numerics, finer, tracks)
 
     def _declared(self, ground: _Ground) -> Hypothesis:
         """The declared physics."""
@@ -363,16 +360,6 @@ def _supported(known: list[Hypothesis], weights: Array, sigma: float) -> tuple[S
         )
         for w, h in ordered
     )
-
-
-def _solver_error(ground: _Ground, declared: Hypothesis) -> float:
-    """Mean squared estimate of the solver's own error, over the noise's, beside what calibrated parameters can do."""
-    basis = np.linalg.qr(declared.fitted.free_jacobian)[0]
-    found = 0.0
-    for change in ground.doubt:
-        shift = ground.bare.change(change)
-        found += float(np.mean((shift - basis @ (basis.T @ shift)) ** 2))
-    return found
 
 
 def _other_places(unknowns: list[Unknown]) -> list[dict[str, float]]:

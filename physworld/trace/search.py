@@ -4,12 +4,12 @@ Every candidate is scored to first order first: the share of the residual above 
 sensitivities and those of the calibrated parameters, within bounds and under priors. The most promising are fitted with
 the full simulator. A fit starts from its linear estimate, from multiples of it (a strength is underestimated where
 motion has run out of phase), from where other hypotheses have come to rest (their *basins*), and from the best of a
-low-discrepancy design over strengths, stiffness and whatever else nothing is known of, on the first part of the
-recording, where phases have not slipped yet.
+low-discrepancy design over strengths, stiffness and whatever else nothing is known of. All of them are ranked on the
+first part of the recording, where phases have not slipped yet, and the best are first fitted to that part.
 
-Then another effect is added to the best set as long as the posterior asks for it, at most three; of every larger set
-each effect is taken out again and exchanged, from the larger set's basin, so that a pair whose first half was wrong
-comes apart.
+Then another effect is added to the best set as long as the last one removed what one of two would, at most three; of
+every larger set each effect is taken out again and exchanged, from the larger set's basin, so that a pair whose first
+half was wrong comes apart.
 """
 
 from __future__ import annotations
@@ -23,20 +23,21 @@ from scipy.stats import qmc
 
 from physworld.arrays import Array
 from physworld.estimation.noise import Split
-from physworld.estimation.refit import prior_rows
+from physworld.estimation.refit import prior_rows, refit
 from physworld.estimation.simulations import Job
-from physworld.estimation.unknowns import Unknown, at, bounds_of
+from physworld.estimation.unknowns import Unknown, at, bounds_of, starting_at
 from physworld.estimation.whitening import Whitener
 from physworld.trace.candidates import Candidate
-from physworld.trace.hypotheses import Hypothesis, Setting, Values
+from physworld.trace.hypotheses import Hypothesis, ScaledWhitener, Setting, Values
 from physworld.trace.left_out import independent
-from physworld.trace.posterior import HALF, posterior, removes
+from physworld.trace.posterior import MOST, posterior, removes
 from physworld.trace.sensitivity import Response, candidate_responses
 
 _MULTIPLES = (0.3, 3.0, 9.0)  # of a linear estimate
 _VARIANTS = 3  # shapes of an effect that are fitted before its best is freed
 _DESIGN = 32  # places of the low-discrepancy design
-_FOLLOWED = 3  # of all starts, the best on the early frames
+_FOLLOWED = 3  # of all starts, the best on the early frames whose stiffness differs
+_EARLY_ITERATIONS = 2  # of each of these, on the early frames
 _STIFFNESS = 1.1  # logarithms of the stiffness that it spans, up and down
 _EARLY = 0.4  # share of the training frames that it looks at
 _LEAST_SHARE = 0.01  # of a strength's bound, where the design begins
@@ -44,10 +45,11 @@ WORTH = 0.1  # share of the error above the noise that an effect removes to firs
 _QUIET = (
     1.2  # misfit over the noise up to which what is there is small, and a score to first order says enough
 )
-_NEARLY_ALL = 0.7  # share of the error above the noise
+_HALF = 0.5  # of what the best one promises: what a rival has to promise to be fitted to all frames
+_FIRST_OF_TWO = 0.29  # share of the root mean square that goes with one of two effects of the same size
 _BASINS = 3  # other hypotheses' optima from which a fit starts
 _WORSE = 3.0  # times the best one's squared error above the noise: a fit that is left
-_APART = 0.05  # logarithm of the stiffness by which two optima are two basins
+_APART = 0.1  # logarithm of the stiffness by which two places are in two basins
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,21 @@ class Screened:
 
 
 @dataclass(frozen=True)
+class Begun:
+    """Where the fit of a candidate beside a hypothesis begins.
+
+    Attributes:
+        screened: its first-order score.
+        starts: places, by name, beside the linear estimate.
+        promised: share of the root mean square above the noise that goes on the early frames, fitted there.
+    """
+
+    screened: Screened
+    starts: list[Values]
+    promised: float
+
+
+@dataclass(frozen=True)
 class Step:
     """One step of a search: what every candidate scored beside a set of effects, and what was fitted on top of it."""
 
@@ -85,8 +102,6 @@ class Search:
         chosen: candidates.
         early: whitener of the first part of the training frames, and their end; None: no design.
         singles, additions, most: candidates that are fitted first, and on top of a set; effects at most.
-        solver: what the solver's own squared error is known to, over the noise's; beside an effect no other one is
-            looked for in less.
         seed: of the designs.
     """
 
@@ -96,7 +111,6 @@ class Search:
     singles: int
     additions: int
     most: int
-    solver: float = 0.0
     seed: int = 0
     hypotheses: dict[tuple[str, ...], Hypothesis] = field(default_factory=dict)
     screens: list[tuple[Hypothesis, list[Screened]]] = field(default_factory=list)
@@ -120,22 +134,28 @@ class Search:
             if size and self._total(larger) > self._total(base):
                 with simulations.time_permitting("fits without one of the effects"):
                     self._take_out(larger)
-            best = max((h for h in self.admitted() if h.doubt is None), key=self._total)
-            if len(best.members) <= size or best.left - 1.0 <= self.solver or simulations.ledger.cut:
+            known = (h for h in self._of_size(size + 1) if h.doubt is None)
+            best = max(known, key=self._total, default=base)
+            pays = best is not base and self._removes(base, best) >= _FIRST_OF_TWO
+            if not pays or simulations.ledger.cut:
                 break
             base = best
         return list(self.hypotheses.values())
 
     def admitted(self) -> list[Hypothesis]:
-        """Hypotheses of which every effect removes a half of what is left above the noise without it; ours is no
-        true twin, and what smaller shares of its error look like is no evidence."""
+        """Hypotheses of which every effect removes most of what is left above the noise without it, and with an effect
+        that it contains in its place; ours is no true twin, and what smaller shares of its error look like is no
+        evidence."""
         return [h for h in self.hypotheses.values() if self._relevant(h)]
 
     def _relevant(self, hypothesis: Hypothesis) -> bool:
         for member in hypothesis.members:
-            rest = self.hypotheses.get(_names([m for m in hypothesis.members if m is not member]))
-            without = self.hypotheses[()] if rest is None else rest
-            if self._removes(without, hypothesis) < HALF:
+            rest = [other.effect for other in hypothesis.members if other is not member]
+            simpler = [self.hypotheses.get(tuple(sorted(rest)), self.hypotheses[()])]
+            simpler += [
+                h for name in member.contains if (h := self.hypotheses.get(tuple(sorted([*rest, name]))))
+            ]
+            if any(self._removes(one, hypothesis) < MOST for one in simpler):
                 return False
         return True
 
@@ -158,7 +178,8 @@ class Search:
         return posterior([h.unseen for h in known], [self._log_prior(h) for h in known], self.seed)
 
     def _log_prior(self, hypothesis: Hypothesis) -> float:
-        return hypothesis.log_prior - len(hypothesis.members) * float(np.log(2.0 * self.library))
+        effects = sum(1 + len(member.contains) for member in hypothesis.members)
+        return hypothesis.log_prior - effects * float(np.log(2.0 * self.library))
 
     def _total(self, hypothesis: Hypothesis) -> float:
         """Log posterior up to a constant, all blocks alike."""
@@ -185,18 +206,16 @@ class Search:
         order = order[:count]
         if restless:  # a score to first order says nothing of an effect that is large
             order += [own for own in by_effect.values() if own not in order and own[0].candidate.scanned]
-        for own in order:
-            if not own[0].candidate.scanned and own[0].share < self._least(base):
-                continue
-            self.setting.simulations.stage = f"fit with {own[0].candidate.effect}"
-            self._fit(base, own)
-
-    def _least(self, base: Hypothesis) -> float:
-        """Share of what ``base`` leaves that a rival has to promise: half of what one effect removes, where that is
-        nearly all; else 0."""
-        tried = (h for h in self._of_size(len(base.members) + 1) if set(base.names) <= set(h.names))
-        most = max((self._removes(base, h) for h in tried if h.doubt is None), default=0.0)
-        return HALF * most if most >= _NEARLY_ALL else 0.0
+        simpler = [name for own in order for name in own[0].candidate.contains]
+        order += [by_effect[name] for name in simpler if name in by_effect and by_effect[name] not in order]
+        begun = [self._begun(base, own) for own in order]
+        most = max((one.promised for own in begun for one in own), default=0.0)
+        scored = max((own[0].share for own in order), default=0.0)
+        for own in sorted(begun, key=lambda own: -max(one.promised for one in own)):
+            promised, share = max(one.promised for one in own), own[0].screened.share
+            if promised >= _HALF * most or share >= _HALF * scored:
+                self.setting.simulations.stage = f"fit with {own[0].screened.candidate.effect}"
+                self._fit(base, own)
 
     def _take_out(self, larger: Hypothesis) -> None:
         """Fits without one of the effects of a set, and with another one in its place, from the set's basin."""
@@ -212,26 +231,31 @@ class Search:
             if known is not None and known.members and self._total(known) < self._total(larger):
                 self._add(known, self.additions)
 
-    def _fit(self, base: Hypothesis, variants: list[Screened]) -> None:
-        """Fits ``base`` with an effect more, the best variants' shapes first as they are, then free where that promises
+    def _begun(self, base: Hypothesis, variants: list[Screened]) -> list[Begun]:
+        """Where the fits of an effect begin: of its best variants the one that promises most, where that is known."""
+        kept = variants[: _VARIANTS if variants[0].candidate.shapes else 1]
+        self.setting.simulations.stage = f"fit with {variants[0].candidate.effect}"
+        begun = [self._best_early(base, one, _DESIGN // len(kept)) for one in kept]
+        best = max(begun, key=lambda one: one.promised)
+        return begun if best.promised == 0.0 else [best]
+
+    def _fit(self, base: Hypothesis, variants: list[Begun]) -> None:
+        """Fits ``base`` with an effect more, the variants' shapes first as they are, then free where that promises
         something."""
-        candidate = variants[0].candidate
+        candidate = variants[0].screened.candidate
         members = (*base.members, candidate)
         names = _names(members)
         shaped = bool(candidate.shapes)
         hopeless = self._hopeless(base)
         best: Hypothesis | None = None
-        for one in variants[: _VARIANTS if shaped else 1]:
-            own = (*base.members, one.candidate)
-            starts, promised = self._best_early(base, one)
-            if max(one.share, promised) < self._least(base):
-                continue
-            linear = {**base.values, **one.values}
-            scale = self._scale(base, one.error)
-            found = self.setting.fitted(own, linear, starts, not shaped, scale, hopeless)
+        for begun in variants:
+            own = (*base.members, begun.screened.candidate)
+            linear = {**base.values, **begun.screened.values}
+            scale = self._scale(base, begun.screened.error)
+            found = self.setting.fitted(own, linear, begun.starts, not shaped, scale, hopeless)
             if found is not None and (best is None or found.left < best.left):
                 best = found
-        if best is not None and shaped and self._removes(base, best) >= max(WORTH, self._least(base)):
+        if best is not None and shaped and self._removes(base, best) >= WORTH:
             places = [best.values]
             mirror = best.members[-1].mirror
             if mirror is not None:
@@ -282,30 +306,47 @@ class Search:
                 found.append(other)
         return found[:_BASINS]
 
-    def _best_early(self, base: Hypothesis, one: Screened) -> tuple[list[Values], float]:
-        """The best of all starts on the early frames, and the share of what ``base`` leaves there that goes with it."""
+    def _best_early(self, base: Hypothesis, one: Screened, design: int) -> Begun:
+        """The best of all starts on the early frames, among them ``design`` places of a low-discrepancy design, and the
+        share of what ``base`` leaves there that goes with it."""
         starts = self._starts(base, one)
         if self.early is None or (base.fitted.misfit <= _QUIET and not base.members):
-            return starts, 0.0
+            return Begun(one, starts, 0.0)
         white, frames = self.early
         members = (*base.members, one.candidate)
         twin, unknowns = self.setting.assembled(members, base.values, shapes=bool(base.members))
-        starts += self._designed(one, unknowns)
+        starts += self._designed(one, unknowns, design)
         low, high = bounds_of(unknowns)
         thetas = [np.clip([start.get(u.name, u.start) for u in unknowns], low, high) for start in starts]
         runs = self.setting.simulations.run([Job(at(twin, unknowns, theta), frames) for theta in thetas])
         errors = [np.inf if t is None else float(np.mean(white.residual(t) ** 2)) for t in runs]
         before = float(np.mean(white.residual(base.fitted.tracks[:frames]) ** 2))
-        best: list[Values] = [dict(starts[int(k)]) for k in np.argsort(errors)[:_FOLLOWED]]
-        return best, removes(before, min(errors))
+        best: list[Values] = []
+        for k in self._apart(errors, [start[self.setting.calibrated[0].name] for start in starts]):
+            here = starting_at(unknowns, thetas[k])
+            scaled = ScaledWhitener(white, self._scale(base, max(errors[k], 1.0)))
+            found = refit(self.setting.simulations, scaled, twin, here, frames, _EARLY_ITERATIONS)
+            if found is not None:
+                errors.append((scaled.scale * found.misfit) ** 2)
+                best.append({u.name: float(t) for u, t in zip(found.unknowns, found.theta, strict=True)})
+        return Begun(one, best, removes(before, min(errors)))
 
-    def _designed(self, one: Screened, unknowns: list[Unknown]) -> list[Values]:
+    @staticmethod
+    def _apart(errors: list[float], stiffnesses: list[float]) -> list[int]:
+        """The best of all places, no two of them at the same stiffness."""
+        found: list[int] = []
+        for k in np.argsort(errors):
+            if all(abs(stiffnesses[int(k)] - stiffnesses[other]) > _APART for other in found):
+                found.append(int(k))
+        return found[:_FOLLOWED]
+
+    def _designed(self, one: Screened, unknowns: list[Unknown], count: int) -> list[Values]:
         """A low-discrepancy design over strengths, stiffness, and what else is calibrated of which nothing is known
         beforehand."""
         first, *rest = self.setting.calibrated
         gates = one.candidate.unknowns()
         open_ = [u for u in rest if u.prior is None and u.name not in [gate.name for gate in gates]]
-        drawn = qmc.Sobol(1 + len(open_) + len(gates), seed=self.seed).random(_DESIGN)
+        drawn = qmc.Sobol(1 + len(open_) + len(gates), seed=self.seed).random_base2(int(np.log2(count)))
         places: list[Values] = []
         for row in drawn:
             place = {u.name: u.start for u in unknowns}

@@ -74,7 +74,16 @@ log = structlog.get_logger("physworld.api")
 
 
 class ApiProblem(HTTPException):
-    """A problem that a route or a middleware answers with; raised, never returned."""
+    """A problem that a route or a middleware answers with; raised, never returned.
+
+    Args:
+        status: of HTTP.
+        code: stable name of the problem, the end of its type.
+        detail: what went wrong, with the numbers.
+        errors: faults of single fields.
+        hint: what to do about it; None takes the code's own.
+        headers: of the answer, such as Retry-After.
+    """
 
     def __init__(
         self,
@@ -103,7 +112,18 @@ def problem_response(
     headers: Mapping[str, str] | None = None,
     **more: Any,
 ) -> JSONResponse:
-    """The answer for one problem; ``more`` are members of it that only this kind has."""
+    """The answer for one problem.
+
+    Args:
+        status: of HTTP.
+        code: stable name of the problem, the end of its type.
+        detail: what went wrong, with the numbers; characters that are not printable are replaced.
+        request_id: of the request, also in the log.
+        errors: faults of single fields.
+        hint: what to do about it; None takes the code's own.
+        headers: of the answer, such as Retry-After.
+        **more: members of the problem that only this kind has.
+    """
     problem = Problem(
         type=f"{TYPE_PREFIX}{code}",
         title=HTTPStatus(status).phrase,

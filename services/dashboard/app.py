@@ -74,7 +74,14 @@ FOREVER = "public, max-age=31536000, immutable"
 
 
 def mount(app: FastAPI, settings: Settings, database: Database, stores: Stores) -> None:
-    """Add the dashboard to the web process: pages and static files under /dashboard."""
+    """Add the dashboard to the web process: pages and static files under /dashboard.
+
+    Args:
+        app: the web process, with the API's gate and parsers in its state where it serves the API.
+        settings: of the installation.
+        database: holds rows and sessions.
+        stores: hold the files.
+    """
     gate = getattr(app.state, "gate", None) or Gate(
         database, Attempts()
     )  # one with the API's, where there is one

@@ -12,8 +12,10 @@ from scipy.optimize import lsq_linear
 
 from physworld.estimation.unknowns import Unknown
 from physworld.trace.answer import decided
+from physworld.trace.candidates import Candidate
 from physworld.trace.left_out import LeftOut, Linear, independent, left_out
-from physworld.trace.posterior import HALF, posterior, removes
+from physworld.trace.posterior import posterior, removes
+from physworld.trace.search import Search
 
 BLOCKS, ROWS = 5, 12
 
@@ -91,7 +93,7 @@ def test_what_wins_in_one_block_only_does_not_win_for_sure() -> None:
 
 
 def test_an_effect_removes_a_share_of_what_is_above_the_noise() -> None:
-    assert removes(3.0, 1.5) == HALF, "of the root mean square"
+    assert removes(3.0, 1.5) == 0.5, "of the root mean square"
     assert removes(3.0, 0.9) == 1.0
     assert removes(1.04, 1.0) == 0.0, "that much is not known of the noise"
 
@@ -112,6 +114,20 @@ def test_a_trace_names_a_drag_and_tells_what_is_left() -> None:
     assert 0.5 < report["effects"][0]["share_of_held_out_error"] <= 1.0
     assert report["remainder"]["over_noise"] < 1.3
     assert sum(h["posterior"] for h in report["hypotheses"]) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("wind", "drag", "admitted"), [(1.2, 5.0, True), (1.2, 1.5, False), (4.0, 9.0, False)]
+)
+def test_a_wind_has_to_earn_its_push_beside_the_drag_that_it_contains(
+    wind: float, drag: float, admitted: bool
+) -> None:
+    search = Search(None, [], None, 1, 1, 1)  # type: ignore[arg-type]
+    for name, left in ((None, 10.0), ("air_drag_linear", drag), ("wind", wind)):
+        members = () if name is None else (Candidate(name, "", ()),)
+        names = () if name is None else (name,)
+        search.hypotheses[names] = SimpleNamespace(members=members, left=left)  # type: ignore[assignment]
+    assert any(h.members and h.members[0].effect == "wind" for h in search.admitted()) == admitted
 
 
 @pytest.mark.slow
@@ -139,6 +155,6 @@ def test_no_other_name_is_given_where_something_unbelievable_predicts_best(
 
     gale = known("wind", 1.0, "a wind of 60 m/s is not believed")
     hypotheses = [known(None, 4.0), known("air_drag_linear", 1.1), gale]
-    found = decided(hypotheses, np.array(weights), 1e-3, 0.0, 20)
+    found = decided(hypotheses, np.array(weights), 1e-3, 0.5, 20)
     assert found.name == name and not found.equivalent
     assert ("not believed" in found.reason) == (weights[2] > 0.9)

@@ -14,7 +14,7 @@ from physworld.calibrate import CalibrationConfig
 from physworld.effects.registry import effect
 from physworld.estimation.simulations import Drive, Job, Ledger, Simulations, TimeUp, Workers
 from physworld.trace import Memory, TraceConfig, document, trace
-from physworld.trace.answer import NAMED, UNEXPLAINED, Verdict
+from physworld.trace.answer import NAMED, NUMERICAL, UNEXPLAINED, Verdict
 from physworld.trace.preparation import EXPERIMENT, SEARCH, Clock
 from physworld.twin.build import build_twin
 
@@ -93,7 +93,7 @@ def test_the_reason_tells_what_was_left_for_want_of_time() -> None:
 def test_a_trace_without_time_claims_nothing_and_with_all_remembered_what_it_claimed() -> None:
     scene, memory = sagging(effect("air_drag_linear", rate_per_s=4.0)), Memory()
     late = trace(scene, replace(CONFIG, time_limit_s=NO_TIME_S), memory=memory)
-    assert late.verdict.name == UNEXPLAINED and "sensitivities" in late.verdict.reason
+    assert late.verdict.name in (UNEXPLAINED, NUMERICAL) and "sensitivities" in late.verdict.reason
     assert late.held_out.before == late.held_out.after
     whole = trace(scene, CONFIG, memory=memory)
     assert whole.verdict.name == NAMED
