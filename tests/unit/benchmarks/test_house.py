@@ -100,6 +100,10 @@ def test_functions_that_tell_nothing_are_counted(wanting: set[str]) -> None:
 
 
 def test_a_base_class_that_tells_nothing_covers_nothing() -> None:
-    derived = ast.parse("class Base:\n    def f(self): pass\nclass D(Base):\n    def f(self, a, b, c, d): pass")
+    derived = ast.parse(
+        "class Base:\n    def f(self): pass\nclass D(Base):\n    def f(self, a, b, c, d): pass"
+    )
     told = told_elsewhere([derived])
-    assert [function.name for function, owner in functions(derived) if wants_args(function, owner, told)] == ["f"]
+    assert [function.name for function, owner in functions(derived) if wants_args(function, owner, told)] == [
+        "f"
+    ]
