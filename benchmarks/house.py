@@ -12,10 +12,12 @@ from __future__ import annotations
 import argparse
 import ast
 import json
+import re
 import subprocess
 import tomllib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +31,11 @@ INNER = ("physworld", "storage", "services")
 """Folders whose subfolders are rooms of their own."""
 SHORT_FILE, LONG_FUNCTION, MANY_PARAMETERS = 60, 80, 4
 CALLED_BY_FRAMEWORKS = ("wp", "router", "app", "pages", "command")
-"""Decorators of kernels, routes and commands: no Python caller reads an Args section of theirs."""
+"""Names in the decorators of kernels, routes and commands: no Python caller reads an Args section of theirs."""
+REFERENCE = re.compile(r"(?s)arguments\b.{0,90}:(?:meth|class|func):|:(?:meth|class|func):.{0,90}\barguments")
+"""Text that names the function, method or class whose arguments these are."""
+GENERATED = "# Made of async_"
+"""How a file begins that a script made of another one: its docstrings are those of the file that it was made of."""
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
@@ -66,37 +72,93 @@ def all_functions(module: ast.Module) -> Iterator[Function]:
     return (node for node in ast.walk(module) if isinstance(node, Function))
 
 
-def wants_args(function: Function, owner: ast.ClassDef | None) -> bool:
+@dataclass(frozen=True)
+class Told:
+    """What is told of parameters elsewhere than in a function's docstring.
+
+    Attributes:
+        inherited: classes and methods whose Args section stands in a base class.
+        annotations: names of types that carry their own help, as ``Json = Annotated[bool, typer.Option(help=...)]``.
+    """
+
+    inherited: frozenset[tuple[str, str]] = frozenset()
+    annotations: frozenset[str] = frozenset({"Annotated"})
+
+
+def wants_args(function: Function, owner: ast.ClassDef | None, told: Told) -> bool:
     """Whether it is public, is called by people, has four parameters or more, and no Args section tells of them.
 
-    A constructor's arguments are told by its class; a method that overrides another is counted like any other.
+    Not counted is what an Args section would only repeat, and drift from: a constructor whose class has the section; a
+    method that overrides one with it, since it is called through the base; a function that says whose arguments its own
+    are (``REFERENCE``); a command or dependency whose parameters are ``Annotated`` with their help; a kernel or route.
+
+    Args:
+        function: the function or method.
+        owner: its class; None of a function.
+        told: what base classes and types of the same checkout tell.
     """
     name = function.name
     public = name == "__init__" or not name.startswith("_")
     if not public or (owner is not None and owner.name.startswith("_")):
         return False
-    if any(_base_name(decorator) in CALLED_BY_FRAMEWORKS for decorator in function.decorator_list):
+    if any(_names(decorator) & set(CALLED_BY_FRAMEWORKS) for decorator in function.decorator_list):
         return False
-    given = function.args
-    count = len([*given.posonlyargs, *given.args, *given.kwonlyargs])
-    is_static = any(_base_name(decorator) == "staticmethod" for decorator in function.decorator_list)
+    if owner is not None and (owner.name, name) in told.inherited:
+        return False
+    given = [*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs]
+    if any(_type_name(one.annotation) in told.annotations for one in given):
+        return False
+    count = len(given)
+    is_static = any("staticmethod" in _names(decorator) for decorator in function.decorator_list)
     count -= owner is not None and not is_static
     texts = [ast.get_docstring(function) or ""]
     if name == "__init__" and owner is not None:
         texts.append(ast.get_docstring(owner) or "")
-    return count >= MANY_PARAMETERS and not any("Args:" in text for text in texts)
+    told_here = any("Args:" in text or REFERENCE.search(text) for text in texts)
+    return count >= MANY_PARAMETERS and not told_here
 
 
-def _base_name(node: ast.expr) -> str:
-    """The first name of a decorator: ``wp`` of ``@wp.kernel``."""
-    while not isinstance(node, ast.Name):
-        if isinstance(node, ast.Attribute):
-            node = node.value
-        elif isinstance(node, ast.Call):
-            node = node.func
-        else:
-            return ""
-    return node.id
+def _names(decorator: ast.expr) -> set[str]:
+    """The dotted names of a decorator without its arguments: ``wp`` and ``kernel`` of ``@wp.kernel(...)``."""
+    target = decorator.func if isinstance(decorator, ast.Call) else decorator
+    names = {node.id for node in ast.walk(target) if isinstance(node, ast.Name)}
+    return names | {node.attr for node in ast.walk(target) if isinstance(node, ast.Attribute)}
+
+
+def _type_name(node: ast.expr | None) -> str:
+    """The name of a type without what stands in its brackets."""
+    node = node.value if isinstance(node, ast.Subscript) else node
+    if isinstance(node, ast.Attribute):
+        return node.attr
+    return node.id if isinstance(node, ast.Name) else ""
+
+
+def told_elsewhere(modules: Iterable[ast.Module]) -> Told:
+    """What base classes, found by their names, and annotated types tell of the functions of these modules."""
+    bases: dict[str, set[str]] = {}
+    sections: set[tuple[str, str]] = set()
+    annotations = {"Annotated"}
+    for module in modules:
+        for node in ast.walk(module):
+            if isinstance(node, ast.Assign) and _type_name(node.value) == "Annotated":
+                annotations |= {target.id for target in node.targets if isinstance(target, ast.Name)}
+            if not isinstance(node, ast.ClassDef):
+                continue
+            bases.setdefault(node.name, set()).update(_type_name(base) for base in node.bases)
+            sections |= {
+                (node.name, inner.name)
+                for inner in node.body
+                if isinstance(inner, Function) and "Args:" in (ast.get_docstring(inner) or "")
+            }
+    inherited = set()
+    for name in bases:
+        above: set[str] = set()
+        waiting = set(bases[name])
+        while waiting:
+            above |= waiting
+            waiting = {base for known in waiting for base in bases.get(known, ())} - above
+        inherited |= {(name, method) for base, method in sections if base in above - {name}}
+    return Told(frozenset(inherited), frozenset(annotations))
 
 
 def unchecked(tree: Path, product: list[Path]) -> tuple[int, int]:
@@ -117,6 +179,8 @@ def counts(tree: Path) -> dict[str, Any]:
     rooms: dict[str, Counter[str]] = {}
     lengths: dict[Path, int] = {}
     found: Counter[str] = Counter()
+    modules = {path: ast.parse((tree / path).read_text()) for path in product}
+    told = told_elsewhere(modules.values())
     for path in files:
         if path.parts[0] not in PRODUCT + BESIDE:
             continue
@@ -126,10 +190,12 @@ def counts(tree: Path) -> dict[str, Any]:
         room.update(files=1, lines=lengths[path])
         if path.parts[0] not in PRODUCT:
             continue
-        module = ast.parse(text)
+        module = modules[path]
         short = lengths[path] < SHORT_FILE and path.name != "__init__.py"
         long = sum((f.end_lineno or f.lineno) - f.lineno + 1 > LONG_FUNCTION for f in all_functions(module))
-        bare = sum(wants_args(function, owner) for function, owner in functions(module))
+        bare = 0
+        if not text.startswith(GENERATED):
+            bare = sum(wants_args(function, owner, told) for function, owner in functions(module))
         for counter in (room, found):
             counter.update(short=short, long=long, bare=bare)
     unread, loose = unchecked(tree, product)

@@ -32,7 +32,7 @@ ADDITIONS = {
             "physworld/trace/candidates.py",
             "physworld/trace/experiment.py",
             "physworld/trace/verdict.py",
-            "physworld/trace/basins.py",
+            "physworld/trace/valleys.py",
             "physworld/trace/compound.py",
             "physworld/trace/unknowns.py",
         ),

@@ -194,7 +194,14 @@ def check_body(declaration: Declaration, measured: Measured, findings: Findings)
 def check_grips(
     declaration: Declaration, arrays: dict[str, Array], measured: Measured, findings: Findings
 ) -> None:
-    """Indices in range, each controller in one grip, boxes that hold material."""
+    """Indices in range, each controller in one grip, boxes that hold material.
+
+    Args:
+        declaration: ``scene.json`` as parsed.
+        arrays: ``scene.npz``, for boxes that need them.
+        measured: points and controllers that are shaped alike.
+        findings: takes faults and warnings.
+    """
     owner: dict[int, int] = {}
     controllers, count = measured.controllers.shape[1], measured.points.shape[1]
     for g, grip in enumerate(declaration.grips or []):
@@ -219,7 +226,14 @@ def check_grips(
 
 
 def check_ground(ground: GroundForm, noise_sigma_m: float, measured: Measured, findings: Findings) -> None:
-    """A plane under the object."""
+    """A plane under the object.
+
+    Args:
+        ground: as declared.
+        noise_sigma_m: per axis [m]; it sets how far a point may be below.
+        measured: points, what is seen of them, and the object's size.
+        findings: takes faults and warnings.
+    """
     where = ["scene.json", "ground", "height_m"]
     noise = GROUND_TOLERANCE_SIGMAS * noise_sigma_m
     tolerance = max(noise, GROUND_FAULT_SIZES * measured.size_m)

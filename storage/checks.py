@@ -41,7 +41,18 @@ def list_checks(
 
 
 def mark_check_ready(session: Session, check_id: str, report: CheckReport, lineage: Lineage) -> None:
-    """Fill in a pending check. Raises Conflict when it is not pending."""
+    """Fill in a pending check.
+
+    Args:
+        session: the transaction that commits the shard.
+        check_id: of a pending check.
+        report: what it found.
+        lineage: inputs, seeds and versions.
+
+    Raises:
+        NotFound: there is no such check.
+        Conflict: it is not pending.
+    """
     row = check_row(session, check_id)
     if row.state != "pending":
         raise Conflict(f"check {check_id} is {row.state}; only a pending one can become ready")

@@ -97,7 +97,16 @@ class EpisodeStore:
     ) -> tuple[str, str]:
         """Write one attempt at an episode, at once; its path and the digest of its arrays.
 
-        Raises StoreWriteFailed or StoreFull; nothing of it is then there.
+        Args:
+            dataset_id: the dataset that it belongs to.
+            index: of the episode in the dataset.
+            epoch: of the lease under which it is written; another attempt has another path.
+            arrays: by name, with time as their first axis where they have one.
+            attributes: what is noted beside them, as JSON.
+
+        Raises:
+            StoreWriteFailed: the store did not take it; nothing of it is then there.
+            StoreFull: there is no room; nothing of it is then there.
         """
         from physworld_storage.episode_files import (
             packed,  # zarr takes as long to import as the API's own routes

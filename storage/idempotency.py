@@ -46,8 +46,15 @@ def fingerprint(method: str, path: str, body: bytes) -> str:
 def reserve(session: Session, owner: str, key: str, fingerprint: str) -> Answer | None:
     """None: the key is new, do the work. An answer: repeat it.
 
-    Raises IdempotencyMismatch when the key came with another request, Conflict when it is too long or the
-    work of the first request was committed without an answer.
+    Args:
+        session: the transaction that does the work.
+        owner: of the key: equal keys of two owners are two keys.
+        key: as the client sent it, 1 to ``MAX_KEY_LENGTH`` characters.
+        fingerprint: of the request; a repetition has the same.
+
+    Raises:
+        IdempotencyMismatch: the key came with another request before.
+        Conflict: the key is too long, or the work of the first request was committed without an answer.
     """
     if not 0 < len(key) <= MAX_KEY_LENGTH:
         raise Conflict(f"an Idempotency-Key of {len(key)} characters; 1 to {MAX_KEY_LENGTH} are allowed")
@@ -63,7 +70,14 @@ def reserve(session: Session, owner: str, key: str, fingerprint: str) -> Answer 
 
 
 def record(session: Session, owner: str, key: str, answer: Answer) -> None:
-    """Keep the answer to a reserved key, in the transaction that does the work."""
+    """Keep the answer to a reserved key, in the transaction that does the work.
+
+    Args:
+        session: the transaction that does the work.
+        owner: of the key.
+        key: from ``reserve``.
+        answer: what every repetition gets.
+    """
     row = _row(session, owner, key)
     row.status = answer.status
     row.headers = dict(answer.headers)

@@ -57,7 +57,18 @@ def list_top_jobs(
     state: str | None = None,
     search: str | None = None,
 ) -> Page[Job]:
-    """Jobs that no pipeline owns, newest first. ``children`` is left empty: ``children_of`` gives them."""
+    """Jobs that no pipeline owns, newest first. ``children`` is left empty: ``children_of`` gives them.
+
+    Args:
+        session: the transaction that reads.
+        limit: most jobs of a page, 1 to ``pages.MAX_LIMIT``.
+        cursor: of the page before; None begins with the newest.
+        state: only jobs of this state.
+        search: words that a job or what it is about holds.
+
+    Raises:
+        InvalidCursor: no list of jobs gave this cursor out.
+    """
     statement = matching_jobs(select(JobRow).where(JobRow.parent_id.is_(None)), search)
     if state is not None:
         statement = statement.where(JobRow.state == state)

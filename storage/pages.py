@@ -34,7 +34,17 @@ def page_of(
 ) -> Page[Item]:
     """One page of ``statement`` sorted by ``keys`` (together unique), newest first unless ``ascending``.
 
-    Raises InvalidCursor for a cursor that this kind of list never gave out.
+    Args:
+        session: the transaction that reads.
+        statement: which rows, unsorted.
+        keys: columns to sort by, together unique; the cursor holds the last row's.
+        convert: a row to what the page holds.
+        limit: most items, 1 to ``MAX_LIMIT``; more are cut down to it.
+        cursor: of the page before; None begins at the beginning.
+        ascending: smallest keys first.
+
+    Raises:
+        InvalidCursor: this kind of list never gave the cursor out.
     """
     limit = max(1, min(limit, MAX_LIMIT))
     if cursor is not None:

@@ -64,7 +64,17 @@ class BoundedConnection(psycopg.Connection[Any]):
 def connect(
     patience: Patience, silence: Silence, arguments: Any, options: dict[str, Any]
 ) -> BoundedConnection:
-    """A connection of this patience, with ``statement_timeout`` set."""
+    """A connection of this patience, with ``statement_timeout`` set.
+
+    Args:
+        patience: how long connecting and a statement may take.
+        silence: counts how long the server has not answered.
+        arguments: positional ones of psycopg's ``connect``.
+        options: its named ones, over those of ``TCP``.
+
+    Raises:
+        ConnectionTimeout: the server did not answer within ``patience.connect_s``.
+    """
     asked_at = time.monotonic()
     timed = {
         "connect_timeout": patience.connect_s,

@@ -53,7 +53,20 @@ def allot_version(
     description: str = "",
     tags: list[str] | None = None,
 ) -> ModelVersionRow:
-    """The next version of ``name``, pending. The first one registers the name."""
+    """The next version of ``name``, pending. The first one registers the name.
+
+    Args:
+        session: the transaction that it belongs to.
+        name: of the model.
+        config: of the training that will fill it.
+        job_id: of that training.
+        scene_id: the recording that it comes from.
+        fit_id: whose twin demonstrates.
+        trace_id: whose effects the twin carries, if any.
+        dataset_id: what it learns from.
+        description: for people; it may change later.
+        tags: likewise.
+    """
     model = _lock_model(session, name)
     model.last_version += 1
     row = ModelVersionRow(
@@ -89,7 +102,21 @@ def publish(
     metrics: dict[str, Any],
     lineage: Lineage,
 ) -> ModelVersion:
-    """Make a pending version ready. Raises Conflict when it is not pending: versions are immutable."""
+    """Make a pending version ready.
+
+    Args:
+        session: the transaction that commits the training.
+        name: of the model.
+        version: its number.
+        artifacts: its files, the signature among them.
+        sha256: of the signed manifest.
+        metrics: held-out errors, speeds and what the card tells, as JSON.
+        lineage: inputs, seeds and versions.
+
+    Raises:
+        NotFound: there is no such version.
+        Conflict: it is not pending: versions are immutable.
+    """
     row = version_row(session, name, version)
     if row.state != "pending":
         raise Conflict(f"version {version} of {name} is {row.state}; only a pending version is published")
@@ -103,7 +130,14 @@ def publish(
 
 
 def fail_version(session: Session, name: str, version: int, message: str) -> None:
-    """Mark a pending version failed; a ready one stays as it is."""
+    """Mark a pending version failed; a ready one stays as it is.
+
+    Args:
+        session: the transaction that it belongs to.
+        name: of the model.
+        version: its number.
+        message: why it failed, for people.
+    """
     row = version_row(session, name, version)
     if row.state == "pending":
         row.state = "failed"
@@ -111,7 +145,17 @@ def fail_version(session: Session, name: str, version: int, message: str) -> Non
 
 
 def patch_version(session: Session, name: str, version: int | str, patch: VersionPatch) -> ModelVersion:
-    """Change description and tags, which are no part of the signed files; what is None stays."""
+    """Change description and tags, which are no part of the signed files; what is None stays.
+
+    Args:
+        session: the transaction that it belongs to.
+        name: of the model.
+        version: its number, or an alias.
+        patch: what to change.
+
+    Raises:
+        NotFound: there is no such version or alias.
+    """
     row = version_row(session, name, resolve(session, name, version))
     if patch.description is not None:
         row.description = patch.description
@@ -129,7 +173,17 @@ def get_model(session: Session, name: str) -> Model:
 def list_models(
     session: Session, *, limit: int = 50, cursor: str | None = None, search: str | None = None
 ) -> Page[Model]:
-    """Models, newest first."""
+    """Models, newest first.
+
+    Args:
+        session: the transaction that reads.
+        limit: most models of a page, 1 to ``pages.MAX_LIMIT``.
+        cursor: of the page before; None begins with the newest.
+        search: words that a name holds.
+
+    Raises:
+        InvalidCursor: no list of models gave this cursor out.
+    """
     statement = matching(select(ModelRow), search, ModelRow.name)
     keys = (ModelRow.created_at, ModelRow.name)
     return page_of(session, statement, keys, lambda row: _model(session, row), limit=limit, cursor=cursor)
@@ -150,7 +204,20 @@ def list_versions(
     state: str | None = None,
     search: str | None = None,
 ) -> Page[ModelVersion]:
-    """Versions of a model, newest first; a search looks at their descriptions, tags and states."""
+    """Versions of a model, newest first; a search looks at their descriptions, tags and states.
+
+    Args:
+        session: the transaction that reads.
+        name: of the model.
+        limit: most versions of a page, 1 to ``pages.MAX_LIMIT``.
+        cursor: of the page before; None begins with the newest.
+        state: only versions of this state.
+        search: words that a description, a tag, a message or a state holds.
+
+    Raises:
+        NotFound: there is no such model.
+        InvalidCursor: no list of versions gave this cursor out.
+    """
     _model_row(session, name)
     statement = select(ModelVersionRow).where(ModelVersionRow.name == name)
     columns = (
@@ -207,6 +274,12 @@ def baseline_of(
     """What a version of ``name`` on ``dataset`` is to be compared with, None where there is nothing.
 
     See ``find_baseline``; a dataset whose twin carries no effects has none.
+
+    Args:
+        session: the transaction that reads.
+        name: of the model.
+        dataset: what the version learns from.
+        config: of its training.
     """
     trace = session.get(TraceRow, dataset.trace_id) if dataset.trace_id else None
     if trace is None or not leaves_twin(trace):
@@ -220,6 +293,13 @@ def find_baseline(
     """The newest ready version of ``name`` that learned from the fit's own twin with these settings.
 
     The fit may be another one, if its twin is equal to the last bit.
+
+    Args:
+        session: the transaction that reads.
+        name: of the model.
+        fit_id: whose twin, without effects, demonstrated.
+        dataset_config: settings of the demonstrations, as JSON; equal ones are asked for.
+        config: of the training; equal ones are asked for.
     """
     fit = session.get_one(FitRow, fit_id)
     statement = (
@@ -242,7 +322,18 @@ def find_baseline(
 
 
 def set_alias(session: Session, name: str, alias: str, version: int) -> Model:
-    """Point ``alias`` at a ready version; it moves when it exists already."""
+    """Point ``alias`` at a ready version; it moves when it exists already.
+
+    Args:
+        session: the transaction that it belongs to.
+        name: of the model.
+        alias: as ``ALIAS_PATTERN`` has it, and not ``latest``.
+        version: number of a ready version.
+
+    Raises:
+        NotFound: there is no such version.
+        Conflict: the alias is reserved or misspelt, or the version is not ready.
+    """
     if alias == LATEST or not ALIAS_PATTERN.fullmatch(alias):
         raise Conflict(f"{alias!r} cannot be an alias: it is reserved or not [a-z][a-z0-9_-]{{0,31}}")
     row = version_row(session, name, version)

@@ -60,7 +60,27 @@ def create_scene(
     artifacts: list[Artifact] | None = None,
     tags: list[str] | None = None,
 ) -> Scene:
-    """Register a scene whose canonical bundle has ``digest``; the same digest gives back the same scene."""
+    """Register a scene whose canonical bundle has ``digest``; the same digest gives back the same scene.
+
+    Args:
+        session: the transaction that it belongs to.
+        name: for people.
+        kind: of the object, as the scene declares it.
+        digest: SHA-256 of the canonical bundle.
+        frames: T.
+        points: N, measured points a frame.
+        controllers: K, driven points a frame.
+        fps: frames a second [1/s].
+        duration_s: from the first frame to the last [s].
+        noise_sigma_m: tracking noise, one deviation per axis [m]; None where it is not known.
+        train: first frame, and the frame after the last, that may be fitted to.
+        test: likewise of the frames that only measure.
+        description: for people.
+        declared: ``scene.json`` as it was validated.
+        warnings: of the validator and of the importer.
+        artifacts: the stored files.
+        tags: for people, without repetitions.
+    """
     values = {
         "id": new_id("scene"),
         "name": name,
@@ -105,7 +125,18 @@ def list_scenes(
     kind: str | None = None,
     search: str | None = None,
 ) -> Page[Scene]:
-    """Scenes, newest first, without their declared documents, which are not read either."""
+    """Scenes, newest first, without their declared documents, which are not read either.
+
+    Args:
+        session: the transaction that reads.
+        limit: most scenes of a page, 1 to ``pages.MAX_LIMIT``.
+        cursor: of the page before; None begins with the newest.
+        kind: only objects of this kind.
+        search: words that an id, a name or a kind holds.
+
+    Raises:
+        InvalidCursor: no list of scenes gave this cursor out.
+    """
     statement = select(SceneRow).options(defer(SceneRow.declared, raiseload=True))
     statement = matching(statement, search, SceneRow.id, SceneRow.name, SceneRow.kind)
     if kind is not None:
@@ -128,7 +159,19 @@ def list_fits(
     scene_id: str | None = None,
     search: str | None = None,
 ) -> Page[Fit]:
-    """Fits, newest first."""
+    """Fits, newest first.
+
+    Args:
+        session: the transaction that reads.
+        limit: most fits of a page, 1 to ``pages.MAX_LIMIT``.
+        cursor: of the page before; None begins with the newest.
+        state: only fits of this state.
+        scene_id: only fits of this scene.
+        search: words that an id, a state or the scene's name holds.
+
+    Raises:
+        InvalidCursor: no list of fits gave this cursor out.
+    """
     statement = matching(select(FitRow), search, FitRow.id, FitRow.state, scene_id=FitRow.scene_id)
     if state is not None:
         statement = statement.where(FitRow.state == state)
@@ -145,7 +188,20 @@ def mark_fit_ready(
     artifacts: list[Artifact],
     lineage: Lineage,
 ) -> Fit:
-    """Fill in a pending fit. Raises Conflict when it is not pending."""
+    """Fill in a pending fit.
+
+    Args:
+        session: the transaction that commits the shard.
+        fit_id: of a pending fit.
+        parameters: calibrated numbers by name, with units and intervals.
+        metrics: held-out errors and how the search went, as JSON.
+        artifacts: twin, prediction and report.
+        lineage: inputs, seeds and versions.
+
+    Raises:
+        NotFound: there is no such fit.
+        Conflict: it is not pending.
+    """
     row = _required(session, FitRow, "fit", fit_id)
     if row.state != "pending":
         raise Conflict(f"fit {fit_id} is {row.state}; only a pending fit can become ready")
@@ -180,7 +236,20 @@ def list_datasets(
     scene_id: str | None = None,
     search: str | None = None,
 ) -> Page[Dataset]:
-    """Datasets, newest first."""
+    """Datasets, newest first.
+
+    Args:
+        session: the transaction that reads.
+        limit: most datasets of a page, 1 to ``pages.MAX_LIMIT``.
+        cursor: of the page before; None begins with the newest.
+        state: only datasets of this state.
+        fit_id: only demonstrations of this fit's twin.
+        scene_id: only those of this scene.
+        search: words that an id, a state or the scene's name holds.
+
+    Raises:
+        InvalidCursor: no list of datasets gave this cursor out.
+    """
     columns = (DatasetRow.id, DatasetRow.state)
     statement = matching(select(DatasetRow), search, *columns, scene_id=DatasetRow.scene_id)
     for column, wanted in (
@@ -205,7 +274,19 @@ def start_writing(session: Session, dataset_id: str) -> None:
 def add_episode(
     session: Session, dataset_id: str, shard_id: str, episode: Episode, seconds: float | None = None
 ) -> None:
-    """Commit one episode. The primary key (dataset, index) makes a second one impossible."""
+    """Commit one episode. The primary key (dataset, index) makes a second one impossible.
+
+    Args:
+        session: the transaction that commits the shard.
+        dataset_id: of a dataset that is being written.
+        shard_id: which wrote it.
+        episode: its index, path, digest and outcome.
+        seconds: that it took [s], where known.
+
+    Raises:
+        NotFound: there is no such dataset.
+        Conflict: the dataset is sealed or has failed.
+    """
     row = _required(session, DatasetRow, "dataset", dataset_id)
     if row.state != "writing":
         raise Conflict(f"dataset {dataset_id} is {row.state}; episodes are added while it is being written")
@@ -228,7 +309,18 @@ def get_episode(session: Session, dataset_id: str, index: int) -> Episode:
 def list_episodes(
     session: Session, dataset_id: str, *, limit: int = 50, cursor: str | None = None
 ) -> Page[Episode]:
-    """Committed episodes of a dataset, by index."""
+    """Committed episodes of a dataset, by index.
+
+    Args:
+        session: the transaction that reads.
+        dataset_id: whose episodes.
+        limit: most episodes of a page, 1 to ``pages.MAX_LIMIT``.
+        cursor: of the page before; None begins with the first.
+
+    Raises:
+        NotFound: there is no such dataset.
+        InvalidCursor: no list of episodes gave this cursor out.
+    """
     _required(session, DatasetRow, "dataset", dataset_id)
     statement = select(EpisodeRow).where(EpisodeRow.dataset_id == dataset_id)
     return page_of(
@@ -252,7 +344,21 @@ def seal_dataset(
     artifacts: list[Artifact],
     lineage: Lineage,
 ) -> Dataset:
-    """Close a dataset under the digest of its manifest. Raises Conflict when it is not being written."""
+    """Close a dataset under the digest of its manifest.
+
+    Args:
+        session: the transaction that commits the last shard.
+        dataset_id: of a dataset that is being written.
+        digest: SHA-256 of its manifest.
+        statistics: of its episodes, as JSON.
+        artifacts: manifest, card and pictures.
+        lineage: inputs, seeds and versions.
+
+    Raises:
+        NotFound: there is no such dataset.
+        Conflict: it is not being written.
+        ResultInvalid: fewer or more episodes were committed than were counted.
+    """
     row = _required(session, DatasetRow, "dataset", dataset_id)
     if row.state != "writing":
         raise Conflict(f"dataset {dataset_id} is {row.state}; only one that is being written is sealed")

@@ -35,14 +35,34 @@ def get_plan(session: Session, plan_id: str) -> Plan:
 def list_rollouts(
     session: Session, *, limit: int = 50, cursor: str | None = None, model: str | None = None
 ) -> Page[Rollout]:
-    """Rollouts that were jobs, newest first."""
+    """Rollouts that were jobs, newest first.
+
+    Args:
+        session: the transaction that reads.
+        limit: most rollouts of a page, 1 to ``pages.MAX_LIMIT``.
+        cursor: of the page before; None begins with the newest.
+        model: only rollouts of this model.
+
+    Raises:
+        InvalidCursor: no list of rollouts gave this cursor out.
+    """
     return _page(session, "rollout", Rollout, limit, cursor, model)
 
 
 def list_plans(
     session: Session, *, limit: int = 50, cursor: str | None = None, model: str | None = None
 ) -> Page[Plan]:
-    """Plans, newest first."""
+    """Plans, newest first.
+
+    Args:
+        session: the transaction that reads.
+        limit: most plans of a page, 1 to ``pages.MAX_LIMIT``.
+        cursor: of the page before; None begins with the newest.
+        model: only plans with this model.
+
+    Raises:
+        InvalidCursor: no list of plans gave this cursor out.
+    """
     return _page(session, "plan", Plan, limit, cursor, model)
 
 
@@ -60,7 +80,19 @@ def list_runs(
     model: str | None = None,
     search: str | None = None,
 ) -> Page[Rollout] | Page[Plan]:
-    """Rollouts or plans, newest first."""
+    """Rollouts or plans, newest first.
+
+    Args:
+        session: the transaction that reads.
+        kind: ``rollout`` or ``plan``.
+        limit: most runs of a page, 1 to ``pages.MAX_LIMIT``.
+        cursor: of the page before; None begins with the newest.
+        model: only runs of this model.
+        search: words that an id, a state or a model's name holds.
+
+    Raises:
+        InvalidCursor: no list of this kind gave this cursor out.
+    """
     if kind == "rollout":
         return _page(session, kind, Rollout, limit, cursor, model, search)
     return _page(session, kind, Plan, limit, cursor, model, search)
@@ -74,7 +106,20 @@ def mark_run_ready(
     artifacts: list[Artifact],
     lineage: Lineage,
 ) -> None:
-    """Fill in a pending run. Raises Conflict when it is not pending."""
+    """Fill in a pending run.
+
+    Args:
+        session: the transaction that commits the shard.
+        kind: ``rollout`` or ``plan``.
+        run_id: of a pending one.
+        figures: what it says beside its files, as JSON.
+        artifacts: its files, which join that of the request.
+        lineage: inputs, seeds and versions.
+
+    Raises:
+        NotFound: there is no such run.
+        Conflict: it is not pending.
+    """
     row = run_row(session, kind, run_id)
     if row.state != "pending":
         raise Conflict(f"{kind} {run_id} is {row.state}; only a pending one can become ready")

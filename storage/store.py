@@ -56,8 +56,16 @@ def open_store(
 ) -> Store:
     """The store that ``settings.store_url`` names, or what lies ``below`` a path in it.
 
-    ``uploads`` is for putting objects: there sending counts as silence, so each part has ``Patience.store_upload_s``.
-    Raises ConfigurationError, or StoreWriteFailed when the local folder cannot be made.
+    Args:
+        settings: ``store_url`` names a folder or a bucket, the rest the bucket's credentials.
+        below: path inside it.
+        patience: how long connecting and silence may last.
+        uploads: it is for putting objects: there sending counts as silence, so each part has
+            ``Patience.store_upload_s``.
+
+    Raises:
+        ConfigurationError: the URL is of no known kind.
+        StoreWriteFailed: the local folder cannot be made.
     """
     if settings.store_folder is not None:
         folder = settings.store_folder / below

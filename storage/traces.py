@@ -37,7 +37,20 @@ def list_traces(
     verdict: str | None = None,
     search: str | None = None,
 ) -> Page[Trace]:
-    """Traces, newest first."""
+    """Traces, newest first.
+
+    Args:
+        session: the transaction that reads.
+        limit: most traces of a page, 1 to ``pages.MAX_LIMIT``.
+        cursor: of the page before; None begins with the newest.
+        state: only traces of this state.
+        scene_id: only traces of this scene.
+        verdict: only traces with this answer.
+        search: words that an id, a state, a verdict or the scene's name holds.
+
+    Raises:
+        InvalidCursor: no list of traces gave this cursor out.
+    """
     columns = (TraceRow.id, TraceRow.state, TraceRow.verdict)
     statement = matching(select(TraceRow), search, *columns, scene_id=TraceRow.scene_id)
     for column, wanted in (
@@ -58,7 +71,20 @@ def mark_trace_ready(
     artifacts: list[Artifact],
     lineage: Lineage,
 ) -> None:
-    """Fill in a pending trace. Raises Conflict when it is not pending."""
+    """Fill in a pending trace.
+
+    Args:
+        session: the transaction that commits the shard.
+        trace_id: of a pending trace.
+        verdict: its answer in one word.
+        report: the whole answer, as JSON; what the pending one holds stays where it has no such key.
+        artifacts: twin, predictions and report.
+        lineage: inputs, seeds and versions.
+
+    Raises:
+        NotFound: there is no such trace.
+        Conflict: it is not pending.
+    """
     row = trace_row(session, trace_id)
     if row.state != "pending":
         raise Conflict(f"trace {trace_id} is {row.state}; only a pending trace can become ready")
@@ -109,7 +135,18 @@ def get_assessment(session: Session, assessment_id: str) -> Assessment:
 def list_assessments(
     session: Session, name: str, version: int, *, limit: int = 50, cursor: str | None = None
 ) -> Page[Assessment]:
-    """Assessments of a model version, newest first."""
+    """Assessments of a model version, newest first.
+
+    Args:
+        session: the transaction that reads.
+        name: of the model.
+        version: its number.
+        limit: most assessments of a page, 1 to ``pages.MAX_LIMIT``.
+        cursor: of the page before; None begins with the newest.
+
+    Raises:
+        InvalidCursor: no list of assessments gave this cursor out.
+    """
     statement = select(AssessmentRow).where(AssessmentRow.name == name, AssessmentRow.version == version)
     keys = (AssessmentRow.created_at, AssessmentRow.id)
     return page_of(session, statement, keys, _assessment, limit=limit, cursor=cursor)
@@ -118,7 +155,18 @@ def list_assessments(
 def mark_assessment_ready(
     session: Session, assessment_id: str, figures: dict[str, Any], lineage: Lineage
 ) -> AssessmentRow:
-    """Fill in a pending assessment. Raises Conflict when it is not pending."""
+    """Fill in a pending assessment.
+
+    Args:
+        session: the transaction that commits the shard.
+        assessment_id: of a pending assessment.
+        figures: errors on the recording, as JSON.
+        lineage: inputs, seeds and versions.
+
+    Raises:
+        NotFound: there is no such assessment.
+        Conflict: it is not pending.
+    """
     row = assessment_row(session, assessment_id)
     if row.state != "pending":
         raise Conflict(f"assessment {assessment_id} is {row.state}; only a pending one can become ready")

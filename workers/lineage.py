@@ -15,7 +15,14 @@ from physworld_schemas.base import Lineage, Reference
 def lineage_of(
     inputs: Sequence[Reference], config: dict[str, Any], seeds: dict[str, int], device: str | None = None
 ) -> dict[str, Any]:
-    """A lineage as JSON; ``config_digest`` is the SHA-256 of the configuration with sorted keys."""
+    """A lineage as JSON; ``config_digest`` is the SHA-256 of the configuration with sorted keys.
+
+    Args:
+        inputs: what was read, with digests.
+        config: the settings, as JSON.
+        seeds: by what they are for.
+        device: what computed; None stands for this machine's processor.
+    """
     canonical = json.dumps(config, sort_keys=True, separators=(",", ":"), allow_nan=False)
     lineage = Lineage(
         inputs=list(inputs),

@@ -26,6 +26,13 @@ def least_squares(
 ) -> Array:
     """The candidate (p,) of least squared residuals, from the best of ``starts`` (S, p) within the bounds.
 
+    Args:
+        residuals: of candidates (S, p) to (S, m); not finite where one could not be simulated.
+        starts: candidates (S, p).
+        lower: bounds (p,).
+        upper: likewise.
+        iterations: at most.
+
     Raises:
         CalibrationError: no start could be simulated.
     """

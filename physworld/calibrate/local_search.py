@@ -113,6 +113,15 @@ class FieldSearch:
 
     What a search finished is in the journal, if there is one, and is not simulated again.
 
+    Args:
+        scene: whose training frames are fitted.
+        twin: calibrated by the global stage.
+        config: which fields, how smooth, how many modes.
+        cancelled: polled between simulations.
+        progress: called with (done, in all, message).
+        journal: what was simulated before and is not again.
+        runner: of simulations without a gradient.
+
     Raises:
         ValueError: an unknown field, or none that could be searched.
     """

@@ -166,7 +166,14 @@ class RodSearch:
     def descend(
         self, unknowns: Sequence[Parameter], theta: Array, end: int, steps: int
     ) -> tuple[Array, float]:
-        """Gauss-Newton with priors over the frames up to ``end``: where it ends, and the cost there."""
+        """Gauss-Newton with priors over the frames up to ``end``: where it ends, and the cost there.
+
+        Args:
+            unknowns: with their priors and bounds.
+            theta: where it begins, in the unknowns' transforms, (p,).
+            end: the frame after the last one.
+            steps: at most.
+        """
         cost = np.inf
         for _ in range(steps):
             if not self.reaches(2):

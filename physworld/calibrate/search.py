@@ -51,6 +51,18 @@ class Search:
         simulations: runs so far.
         limit: how many there may be at the present stage.
         cut_short: whether something was not simulated because the limit was reached: the search did not end by itself.
+
+    Args:
+        scene: whose training frames are scored.
+        twin: candidates differ from it by what is searched.
+        max_simulations: of the whole search.
+        progress: called with (done, in all, message).
+        cancelled: polled between simulations.
+        journal: what was simulated before and is not again.
+        runner: of the simulations.
+
+    Raises:
+        CalibrationError: no point is visible in the training frames.
     """
 
     def __init__(

@@ -54,6 +54,15 @@ class PropertyField:
         factor: (P, r) with factor @ factor.T ≈ S and a unit diagonal.
         landmarks: how many were taken.
         unresolved: largest 1 - diag(C W⁻¹ Cᵀ): the share of variance that the landmarks miss somewhere.
+
+    Args:
+        features: of the particles, (P, F).
+        length_scale: of the kernel over the features, above 0.
+        landmarks: how many to begin with; they are doubled until ``unresolved`` holds or they are ``MOST_LANDMARKS``.
+        unresolved: share of variance that may be missed at one particle, 1 for any.
+
+    Raises:
+        ValueError: features that are not finite or not two-dimensional, or a length scale that is not positive.
     """
 
     def __init__(

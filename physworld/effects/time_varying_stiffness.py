@@ -87,7 +87,15 @@ class BoundGrowth(BoundTerm):
 
 
 class BoundStressGrowth(BoundParticleStress):
-    """The rate on particles: each stress is multiplied in the substep that uses it."""
+    """The rate on particles: each stress is multiplied in the substep that uses it.
+
+    Args:
+        rate_per_s: a of the factor exp(a t) [1/s].
+        device: of Warp.
+        covered: largest growth of the stiffness that the stable time step allows for; more of it is refused.
+        frequency_rad_s: what the growth adds to the fastest mode [rad/s].
+        friction_per_s: what it adds to the fastest friction [1/s].
+    """
 
     def __init__(
         self, rate_per_s: float, device: str, covered: float, frequency_rad_s: float, friction_per_s: float

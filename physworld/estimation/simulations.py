@@ -276,6 +276,13 @@ class Simulations:
         stage: what they are for.
         least_step_s: a twin that needs a smaller time step is not run.
         ledger: what stages cost, and until when they may go on.
+
+    Args:
+        drive: controllers and frame times of the scene.
+        runner: runs jobs, here or in other processes.
+        memory: tracks of earlier runs; None begins an empty one.
+        progress: called with (done, in all, stage).
+        cancelled: polled during simulations.
     """
 
     def __init__(

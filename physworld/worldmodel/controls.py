@@ -32,9 +32,17 @@ def grip_groups(spec: GraphSpec, controllers: Array) -> tuple[Array, ...]:
 
 
 def on_clock(controllers: Array, times: Array | None, dt_s: float, most_ticks: int) -> Array:
-    """Control paths (B, T, K, 3) [m] known at ``times`` (T,) [s] from 0, linearly interpolated at ticks of ``dt_s``.
+    """Control paths interpolated linearly at the ticks of a clock, (B, ticks, K, 3) [m].
 
-    Without ``times`` they are at ticks already. Raises ControlsInvalid, also where ``times`` go beyond ``most_ticks``.
+    Args:
+        controllers: paths of B candidates (B, T, K, 3) [m].
+        times: at which they are known (T,) [s], from 0; None where they are at ticks already.
+        dt_s: between two ticks [s].
+        most_ticks: how far the times may go.
+
+    Raises:
+        ControlsInvalid: as many times as places are asked for, finite, increasing from 0 and not beyond
+            ``most_ticks``.
     """
     if times is None:
         return controllers

@@ -69,11 +69,21 @@ class StepProgram(nn.Module):
         kinds: Tensor,
         rest_relative: Tensor,
     ) -> Tensor:
-        """Positions (V, 3) at t + 1."""
+        """Positions (V, 3) at t + 1.
+
+        Args:
+            window: last h + 1 positions of all vertices (h+1, V, 3) [m].
+            control_next: control vertices at t + 1 (C, 3) [m].
+            phi: logarithms of property ratios (n, ·).
+            senders: vertex that every edge comes from, (E,) int64.
+            receivers: vertex that it goes to, (E,) int64.
+            kinds: of the edges, (E,) int64.
+            rest_relative: sender minus receiver at rest (E, 3) [m].
+        """
         n, count, frame = self.objects, self.vertices, self.frame
         moved_to = control_next
         if frame is not None:
-            turn, local, ahead_of = enter(frame, window[:, :, None], control_next[:, None], n)
+            turn, local, ahead_of = enter(frame, window[:, :, None], control_next[:, None])
             window, control_next = local[:, :, 0], ahead_of[:, 0]
         prior = self.prior(window[:, :, None], control_next[:, None], phi[:, None])[:, 0]
         ahead = torch.cat([prior, control_next])

@@ -52,6 +52,12 @@ def twin_on(recording: Scene, home: Scene, twin: Twin, particle_budget: int) -> 
     rigid motion from the home recording's first points and controllers to this one's, and starts at rest. So is a mesh
     of triangles, whose diagonals are the home recording's. Ground and colliders are always the recording's.
 
+    Args:
+        recording: where the twin is put.
+        home: the recording that it was calibrated on.
+        twin: of the home recording.
+        particle_budget: of a body built from the recording; that of the home fit lets lattices agree.
+
     Raises:
         SceneUnsupported: the recording has other controllers, or, where the twin has to be moved, other points.
     """

@@ -25,7 +25,17 @@ class LiveRollout:
         history: Array | None = None,
         controllers: Array | None = None,
     ) -> None:
-        """From the recording's start, or from ``history`` (h+1, n, 3) and ``controllers`` (h+1, K, 3) [m]."""
+        """From the recording's start.
+
+        Args:
+            published: the model.
+            phi: logarithms of property ratios (n, 2); None is as published.
+            history: object vertices of the first frames (h+1, n, 3) [m]; None is the recording's start.
+            controllers: in those frames (h+1, K, 3) [m]; None is the recording's start.
+
+        Raises:
+            GraphInvalid: other shapes than these.
+        """
         self._published, spec = published, published.spec
         self._phi = published.phi if phi is None else np.asarray(phi, dtype=np.float64)
         self._first = np.array(published.start_history if history is None else history, dtype=np.float64)

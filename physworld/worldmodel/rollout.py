@@ -89,7 +89,14 @@ def rollout_tracks(model: WorldModel, tracks: list[Track]) -> list[Tensor]:
 
 
 def unroll_tracks(step: Step, tracks: list[Track], n: int, history: int) -> list[Tensor]:
-    """The same with any ``step``."""
+    """The same with any ``step``.
+
+    Args:
+        step: (window, control vertices, Φ) to all vertices at t + 1.
+        tracks: the episodes.
+        n: object vertices.
+        history: h.
+    """
     lengths = [track.positions.shape[0] for track in tracks]
     longest = max(lengths)
     padded = torch.stack([_held(track.positions, longest) for track in tracks], dim=2)
@@ -99,7 +106,14 @@ def unroll_tracks(step: Step, tracks: list[Track], n: int, history: int) -> list
 
 
 def unroll(model: WorldModel, start: Tensor, driven: Tensor, phi: Tensor) -> Tensor:
-    """All vertices (T, V, B, 3) from object frames (h+1, n, B, 3) and control vertices (T, C, B, 3)."""
+    """All vertices of B rollouts (T, V, B, 3) [m].
+
+    Args:
+        model: makes the steps.
+        start: object vertices of the first frames (h+1, n, B, 3) [m].
+        driven: control vertices of all frames (T, C, B, 3) [m].
+        phi: logarithms of property ratios (n, B, ·).
+    """
     return _unroll(_with_constants(model), start, driven, phi)
 
 

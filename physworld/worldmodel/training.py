@@ -212,7 +212,14 @@ def first_episodes(total: int, start_share: float) -> int:
 
 
 def episodes_at(step: int, first: int, total: int, steps: int) -> int:
-    """How many episodes take part from ``step`` of ``steps`` on; they join in ``JOIN_BATCHES`` batches."""
+    """How many episodes take part from ``step`` of ``steps`` on; they join in ``JOIN_BATCHES`` batches.
+
+    Args:
+        step: of the training.
+        first: episodes at the start.
+        total: episodes in the end.
+        steps: of the whole training.
+    """
     share = min(1.0, step / max(1.0, JOIN_SHARE * steps))
     return first + math.floor((total - first) * math.floor(share * JOIN_BATCHES) / JOIN_BATCHES)
 

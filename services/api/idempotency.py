@@ -40,7 +40,15 @@ def answer_of(status: int, model: BaseModel, headers: dict[str, str] | None = No
 
 
 class Idempotency:
-    """The Idempotency-Key of one request, or its absence."""
+    """The Idempotency-Key of one request, or its absence.
+
+    Args:
+        database: keeps keys and answers.
+        owner: of the key: the API key's id.
+        method: of the request.
+        path: of the request.
+        key: as the client sent it; None for a request without one.
+    """
 
     def __init__(self, database: Database, owner: str, method: str, path: str, key: str | None) -> None:
         self._database = database

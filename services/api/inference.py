@@ -19,7 +19,17 @@ _HINT = (
 
 
 def roll_out(url: str, database: Database, credential: str, request: RolloutCreate) -> Rollout:
-    """The answer of the inference service at ``url``. Raises ApiProblem: its own, or 503."""
+    """The answer of the inference service at ``url``.
+
+    Args:
+        url: of the inference service.
+        database: gives out the ticket.
+        credential: of the caller, as ``ApiKey.credential``.
+        request: as the API got it.
+
+    Raises:
+        ApiProblem: the inference service's own, or 503 where it does not answer.
+    """
     with database.session() as session:
         ticket, _ = tickets.issue(session, credential, f"rollout:{request.model}:{request.version}")
     try:

@@ -49,7 +49,16 @@ def import_shared() -> None:
 
 
 class Forked:
-    """A running program; the part of ``subprocess.Popen`` that a supervisor uses."""
+    """A running program; the part of ``subprocess.Popen`` that a supervisor uses.
+
+    Args:
+        name: of the process, in lists of processes.
+        module: whose ``main`` runs.
+        arguments: on its command line.
+        environment: all its variables.
+        output: descriptor that standard output and error are written to.
+        descriptors: that stay open in it; all others are closed.
+    """
 
     def __init__(
         self,

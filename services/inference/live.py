@@ -41,7 +41,14 @@ log = structlog.get_logger("physworld.live")
 
 
 class LiveSessions:
-    """The sessions of one process."""
+    """The sessions of one process.
+
+    Args:
+        database: redeems tickets.
+        models: versions that are loaded.
+        idle_s: after which a session that nobody steers ends [s].
+        most: sessions at a time.
+    """
 
     def __init__(
         self, database: Database, models: Models, *, idle_s: float = IDLE_S, most: int = MOST_SESSIONS

@@ -36,7 +36,18 @@ EXECUTED_ITERATIONS = 3.0
 def make(
     context: TaskContext, stores: Stores, request: PlanCreate, model: PublishedModel
 ) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Search, execute, measure. Raises Cancelled, ValueError for limits that leave the start out."""
+    """Search, execute, measure.
+
+    Args:
+        context: of the shard: its payload, progress and cancellation.
+        stores: hold scene and twin.
+        request: goal, limits and settings of the search.
+        model: predicts; the twin executes what was found.
+
+    Raises:
+        Cancelled: the job was.
+        ValueError: the limits leave the start out.
+    """
     payload = context.lease.payload
     scene = scene_of(stores, payload["scene_id"])
     twin = twin_of(stores, payload["fit_id"], payload.get("trace_id"))

@@ -116,7 +116,15 @@ def run(
 ) -> tuple[dict[str, Array], float]:
     """``points`` (B, S, N, 3) and ``vertices`` (B, S, n, 3) float32 as asked for, and the seconds it took.
 
-    ``progress(steps done, steps in all)`` may raise to stop. Raises RolloutDiverged.
+    Args:
+        request: which parts are asked for.
+        model: the version.
+        prepared: controllers (B, T, K, 3) [m], history, Φ and the frames that are shown.
+        threads: that step candidates side by side.
+        progress: called with (steps done, steps in all); may raise to stop.
+
+    Raises:
+        RolloutDiverged: a prediction left the numbers; the message says where.
     """
     started = time.perf_counter()
     driven = prepared.controllers

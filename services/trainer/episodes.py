@@ -50,6 +50,15 @@ class Episodes:
         total: how many there are, or will be.
         columns: of Φ: the properties, the ground's friction and the effects' strengths if the episodes differ in them.
         reached: steps taken and to take, for the progress while it waits.
+
+    Args:
+        context: of the shard: cancellation and progress while it waits.
+        stores: hold the episodes.
+        dataset_id: which may still be written.
+        spec: the graph, whose vertices are read.
+        history: h: frames before the present one that a step sees.
+        strengths: intervals of the twin's effects, of which each becomes a column of Φ.
+        ground_friction: calibrated coefficient; None without a ground.
     """
 
     def __init__(

@@ -39,7 +39,15 @@ def card_of(
     metrics: dict[str, Any],
     lineage: dict[str, Any],
 ) -> dict[str, Any]:
-    """What the version is: lineage, architecture, settings, metrics, intended use, limits."""
+    """What the version is: lineage, architecture, settings, metrics, intended use, limits.
+
+    Args:
+        payload: of the shard: name, version and the ids that it comes from.
+        config: of the training.
+        published: the model.
+        metrics: held-out errors and speeds, as JSON.
+        lineage: inputs, seeds and versions, as JSON.
+    """
     return {
         "schema_version": 1,
         "name": payload["name"],

@@ -64,7 +64,18 @@ class ApiKey:
 def create_key(
     session: Session, name: str, role: Role, *, lifetime_days: int | None = None, by: Actor = LOCAL
 ) -> tuple[ApiKey, str]:
-    """A new key and its token, which is never shown again."""
+    """A new key and its token, which is never shown again.
+
+    Args:
+        session: the transaction that it belongs to.
+        name: who or what uses the key, for people.
+        role: one of ``ROLES``.
+        lifetime_days: days until it ends, and the term that a rotation gives it again; None has no end.
+        by: who makes it, for the audit log.
+
+    Raises:
+        Conflict: an unknown role.
+    """
     token = _new_token()
     return ensure_key(session, token, name, role, lifetime_days=lifetime_days, by=by), token
 
@@ -80,8 +91,17 @@ def ensure_key(
 ) -> ApiKey:
     """Register a token that was made elsewhere (a deployment's secret); the same token twice is one key.
 
-    Raises KeyEnded for a token whose key was revoked, has expired or has another token now; Conflict for one that is
-    too short or known with another role.
+    Args:
+        session: the transaction that it belongs to.
+        token: at least ``MIN_TOKEN_LENGTH`` characters; only its SHA-256 is stored.
+        name: who or what uses the key, for people.
+        role: one of ``ROLES``.
+        lifetime_days: days until it ends; None has no end. A token that is known keeps its own.
+        by: who makes it, for the audit log.
+
+    Raises:
+        KeyEnded: the token's key was revoked, has expired or has another token now.
+        Conflict: the token is too short or known with another role, or the role is unknown.
     """
     if role not in ROLES:
         raise Conflict(f"role {role!r}; known: {', '.join(ROLES)}")
@@ -144,7 +164,16 @@ def rotate_key(
     """Give a key another token and its whole term again: the key, the token, and when the old token ends.
 
     Sessions that the old token opened end with it. Tokens from rotations before end now, whatever their grace was.
-    Raises NotFound, or Conflict for an ended key.
+
+    Args:
+        session: the transaction that it belongs to.
+        key_id: of a key that stands.
+        grace: how long the old token is taken beside the new one.
+        by: who rotates it, for the audit log.
+
+    Raises:
+        NotFound: there is no such key.
+        Conflict: the key was revoked or has expired.
     """
     now = utc_now()
     row = _locked(session, key_id)
@@ -191,7 +220,17 @@ def revoke_key(session: Session, key_id: str, *, by: Actor = LOCAL) -> ApiKey:
 def list_keys(
     session: Session, *, limit: int = 50, cursor: str | None = None, search: str | None = None
 ) -> Page[ApiKey]:
-    """Keys, newest first."""
+    """Keys, newest first.
+
+    Args:
+        session: the transaction that reads.
+        limit: most keys of a page, 1 to ``pages.MAX_LIMIT``.
+        cursor: of the page before; None begins with the newest.
+        search: words that an id, a name or a role holds.
+
+    Raises:
+        InvalidCursor: no list of keys gave this cursor out.
+    """
     statement = matching(select(ApiKeyRow), search, ApiKeyRow.id, ApiKeyRow.name, ApiKeyRow.role)
     keys = (ApiKeyRow.created_at, ApiKeyRow.id)
     return page_of(session, statement, keys, key_of_row, limit=limit, cursor=cursor)

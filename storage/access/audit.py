@@ -31,7 +31,15 @@ LOCAL = Actor()
 
 
 def record(session: Session, by: Actor, action: str, subject: str | None, **detail: Any) -> None:
-    """Add one entry: ``action`` as ``noun.participle``, done to ``subject`` (an id or a name)."""
+    """Add one entry to the audit log.
+
+    Args:
+        session: the transaction that does what is recorded.
+        by: who does it.
+        action: as ``noun.participle``, such as ``key.created``.
+        subject: an id or a name that it is done to.
+        **detail: what else the entry holds, as JSON.
+    """
     values = {"actor": by.key_id, "address": by.address, "action": action, "subject": subject}
     session.add(AuditRow(at=utc_now(), detail=detail, **values))
 

@@ -23,6 +23,12 @@ def append_event(session: Session, job_id: str, type: EventType, data: dict[str,
     """Append one event to the job's log.
 
     ``state`` carries {"state", "error"?}, ``progress`` a Progress, ``log`` {"message", …}.
+
+    Args:
+        session: the transaction in which it happens.
+        job_id: whose log it is.
+        type: ``state``, ``progress`` or ``log``.
+        data: as its type has it, JSON.
     """
     session.add(EventRow(job_id=job_id, type=type, at=utc_now(), data=data))
 
@@ -33,6 +39,13 @@ def events_after(
     """Events of the job with a larger ``seq``, oldest first; ``seq=0`` begins at the beginning.
 
     Up to ``whole_after`` progress events, of which each makes those before it worthless, are left out.
+
+    Args:
+        session: the transaction that reads.
+        job_id: whose log it is.
+        seq: number of the last event that is known.
+        limit: most events of an answer.
+        whole_after: number up to which progress events are left out; 0 leaves none out.
     """
     statement = select(EventRow).where(EventRow.job_id == job_id, EventRow.seq > seq)
     if whole_after > seq:

@@ -116,7 +116,14 @@ class JobKind:
         return f"{self.makes}s/{output_id}"
 
     def open_next(self, session: Session, parent: JobRow, ended: JobRow, children: Sequence[JobRow]) -> bool:
-        """Open what follows the child of a parent that has just ended; False when all is done."""
+        """Open what follows the child of a parent that has just ended; False when all is done.
+
+        Args:
+            session: the transaction that ends the child.
+            parent: the job that the child belongs to.
+            ended: the child that has just succeeded.
+            children: all of the parent's, in the order in which they were opened.
+        """
         raise NotImplementedError
 
     def stage_opened(self, session: Session, parent: JobRow, child: JobRow) -> None:

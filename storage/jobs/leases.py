@@ -75,7 +75,14 @@ class Publication:
 
 
 def claim(session: Session, shard_id: str, owner: str, lease_seconds: float) -> Lease | None:
-    """Take a queued shard, or None: somebody has it, it is done, called off, or must not start yet."""
+    """Take a queued shard, or None: somebody has it, it is done, called off, or must not start yet.
+
+    Args:
+        session: the transaction that it belongs to.
+        shard_id: as announced by the dispatcher.
+        owner: of the lease: the worker's name, for people.
+        lease_seconds: how long the lease holds without being renewed [s].
+    """
     seen = session.execute(
         select(ShardRow.job_id, ShardRow.state, ShardRow.epoch).where(ShardRow.id == shard_id)
     ).one_or_none()
@@ -126,6 +133,12 @@ def renew(
     """Prolong a lease and report progress.
 
     "held": carry on. "cancel": stop, then ``mark_cancelled``. "lost": stop at once and write nothing more.
+
+    Args:
+        session: the transaction that it belongs to.
+        lease: from ``claim``.
+        lease_seconds: how long it holds from now [s].
+        progress: how far the shard is; None reports only that its worker lives.
     """
     job = lock_job(session, lease.job_id)
     now = database_now(session)
@@ -145,7 +158,16 @@ def complete(session: Session, lease: Lease, result: dict[str, Any], digest: str
     """Commit a shard's result with everything that follows from it; False: it was not committed.
 
     False means that the lease was lost or the job is being cancelled: what was written for this attempt
-    belongs to nobody. Raises ResultInvalid, before anything is changed, for a result of the wrong form.
+    belongs to nobody.
+
+    Args:
+        session: the transaction that it belongs to.
+        lease: from ``claim``.
+        result: what the shard's kind parses as its ``result``.
+        digest: SHA-256 of what was written, where one file stands for it.
+
+    Raises:
+        ResultInvalid: the result is of the wrong form; nothing was changed.
     """
     parsed = parse_result(lease.kind, lease.index, result)
     job = lock_job(session, lease.job_id)
@@ -166,6 +188,12 @@ def fail(session: Session, lease: Lease, problem: Problem, retry: bool) -> Lease
     It is queued again when ``retry`` and it failed fewer than ``max_attempts`` times; losses do not count. Returns
     "lost" when the lease was no longer ours, "cancel" when the job was being cancelled (the shard then is),
     else "held".
+
+    Args:
+        session: the transaction that it belongs to.
+        lease: from ``claim``.
+        problem: what went wrong, as the API tells it.
+        retry: whether another attempt may succeed.
     """
     job = lock_job(session, lease.job_id)
     now = database_now(session)
@@ -223,6 +251,12 @@ def publishable(
 
     At most ``limit`` for each queue, oldest first, and so that at most ``window`` are announced at a time.
     A message too many is harmless: its ``claim`` finds nothing to take.
+
+    Args:
+        session: the transaction that reads.
+        limit: most shards of one queue.
+        republish_seconds: after which a message that nobody took counts as lost [s].
+        window: most shards of one queue that the broker knows of at a time.
     """
     now = database_now(session)
     stale = now - timedelta(seconds=republish_seconds)

@@ -16,7 +16,14 @@ CARD, SVG, PNG = "card.json", "coverage.svg", "coverage.png"
 
 
 def card_of(dataset_id: str, digest: str, config: DatasetConfig, coverage: Coverage) -> dict[str, Any]:
-    """The card as plain JSON."""
+    """The card as plain JSON.
+
+    Args:
+        dataset_id: of the dataset.
+        digest: SHA-256 of its manifest.
+        config: of the demonstrations.
+        coverage: what motions and properties the episodes reach.
+    """
     return {
         "schema_version": 1,
         "dataset_id": dataset_id,
@@ -30,7 +37,15 @@ def card_of(dataset_id: str, digest: str, config: DatasetConfig, coverage: Cover
 def store_card(
     store: ArtifactStore, dataset_id: str, digest: str, config: DatasetConfig, coverage: Coverage
 ) -> tuple[dict[str, Any], list[Artifact]]:
-    """The card, and the artifacts of it and its pictures."""
+    """The card, and the artifacts of it and its pictures.
+
+    Args:
+        store: takes the three files.
+        dataset_id: of the dataset.
+        digest: SHA-256 of its manifest.
+        config: of the demonstrations.
+        coverage: what motions and properties the episodes reach.
+    """
     card = card_of(dataset_id, digest, config, coverage)
     svg, png = coverage_pictures(coverage)
     text = json.dumps(card, indent=1, allow_nan=False).encode()

@@ -168,7 +168,16 @@ def trace_create(
     scene_ids: Sequence[str] = (),
     held_out_scene_ids: Sequence[str] = (),
 ) -> Call[Job]:
-    """POST /v1/traces."""
+    """POST /v1/traces.
+
+    Args:
+        scene_id: the recording.
+        config: settings; None has the defaults.
+        fit: settings of the calibration that it begins with; None has the trace's defaults.
+        fit_id: a ready fit whose twin to begin with, instead of a calibration.
+        scene_ids: other recordings of the object, fitted with it.
+        held_out_scene_ids: recordings that only the report sees.
+    """
     body = TraceCreate(
         scene_id=scene_id,
         scene_ids=list(scene_ids),
@@ -189,7 +198,14 @@ def trace_get(trace_id: str) -> Call[Trace]:
 def trace_list(
     *, limit: int | None, cursor: str | None, scene_id: str | None = None, verdict: str | None = None
 ) -> Call[Page[Trace]]:
-    """GET /v1/traces."""
+    """GET /v1/traces.
+
+    Args:
+        limit: most traces of a page; None leaves it to the service.
+        cursor: of the page before.
+        scene_id: only traces of this scene.
+        verdict: only traces with this answer.
+    """
     query = _given(limit=limit, cursor=cursor, scene_id=scene_id, verdict=verdict)
     return Call("GET", "/v1/traces", _TRACES, query=query)
 
@@ -202,7 +218,15 @@ def trace_tracks(trace_id: str) -> Call[bytes]:
 def assessment_create(
     name: str, version: int | str, scene_id: str, open_trace: bool, trace: TraceConfig | None
 ) -> Call[Job]:
-    """POST /v1/models/{name}/versions/{version}/assessments."""
+    """POST /v1/models/{name}/versions/{version}/assessments.
+
+    Args:
+        name: of the model.
+        version: its number, or an alias.
+        scene_id: a recording that the version was not made from.
+        open_trace: trace the recording when the version misses it.
+        trace: settings of that trace; None has the defaults.
+    """
     body = AssessmentCreate(scene_id=scene_id, open_trace=open_trace, trace=trace or TraceConfig())
     path = f"/v1/models/{_part(name)}/versions/{_part(version)}/assessments"
     return Call("POST", path, _JOB, body=body)
@@ -216,7 +240,14 @@ def assessment_get(assessment_id: str) -> Call[Assessment]:
 def assessment_list(
     name: str, version: int | str, *, limit: int | None, cursor: str | None
 ) -> Call[Page[Assessment]]:
-    """GET /v1/models/{name}/versions/{version}/assessments."""
+    """GET /v1/models/{name}/versions/{version}/assessments.
+
+    Args:
+        name: of the model.
+        version: its number, or an alias.
+        limit: most assessments of a page; None leaves it to the service.
+        cursor: of the page before.
+    """
     path = f"/v1/models/{_part(name)}/versions/{_part(version)}/assessments"
     return Call("GET", path, _ASSESSMENTS, query=_given(limit=limit, cursor=cursor))
 
@@ -251,7 +282,15 @@ def dataset_episode(dataset_id: str, index: int) -> Call[bytes]:
 def training_create(
     name: str, dataset_id: str, config: TrainingConfig | None, description: str, tags: list[str]
 ) -> Call[Job]:
-    """POST /v1/models."""
+    """POST /v1/models.
+
+    Args:
+        name: of the model.
+        dataset_id: a dataset, sealed or still being written.
+        config: settings; None has the defaults.
+        description: of the version, for people.
+        tags: likewise.
+    """
     body = TrainingCreate(
         name=name,
         dataset_id=dataset_id,
@@ -297,7 +336,14 @@ def alias_delete(name: str, alias: str) -> Call[Model]:
 def version_patch(
     name: str, version: int | str, description: str | None, tags: tuple[str, ...] | None
 ) -> Call[ModelVersion]:
-    """PATCH /v1/models/{name}/versions/{version}."""
+    """PATCH /v1/models/{name}/versions/{version}.
+
+    Args:
+        name: of the model.
+        version: its number, or an alias.
+        description: the new one; None leaves it.
+        tags: the new ones; None leaves them.
+    """
     body = VersionPatch(description=description, tags=None if tags is None else [*tags])
     return Call("PATCH", f"/v1/models/{_part(name)}/versions/{_part(version)}", _VERSION, body=body)
 
@@ -357,7 +403,14 @@ def job_get(job_id: str, *, wait_s: float | None = None) -> Call[Job]:
 def job_list(
     *, limit: int | None, cursor: str | None, state: str | None = None, kind: str | None = None
 ) -> Call[Page[Job]]:
-    """GET /v1/jobs."""
+    """GET /v1/jobs.
+
+    Args:
+        limit: most jobs of a page; None leaves it to the service.
+        cursor: of the page before.
+        state: only jobs of this state.
+        kind: only jobs of this kind.
+    """
     return Call("GET", "/v1/jobs", _JOBS, query=_given(limit=limit, cursor=cursor, state=state, kind=kind))
 
 

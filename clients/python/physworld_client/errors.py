@@ -195,6 +195,12 @@ class SigningKeyUntrusted(SignatureInvalid):
         service: that the files come from; None for a folder that was opened without one.
         signer: fingerprint of the key that signed, or its id where no list names it.
         trusted: fingerprints of the trusted keys.
+
+    Args:
+        text: the message.
+        service: address that the version came from, if from one.
+        signer: fingerprint of the key that signed.
+        trusted: fingerprints of the keys that are trusted there.
     """
 
     def __init__(self, text: str, service: str | None, signer: str, trusted: tuple[str, ...]) -> None:

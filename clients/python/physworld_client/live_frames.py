@@ -78,7 +78,17 @@ def ticket_create(model: str, version: int | str) -> Call[LiveTicket]:
 
 
 def address(base_url: str, ticket: LiveTicket, frames: int, part: Part) -> str:
-    """The WebSocket's address, ``frames`` a tick."""
+    """The WebSocket's address, ``frames`` a tick.
+
+    Args:
+        base_url: of the service, ``http`` or ``https``.
+        ticket: admits one session.
+        frames: sent for every tick of the model, 1 to 4; those between are interpolated.
+        part: whether vertices or points are sent.
+
+    Raises:
+        ValueError: another number of frames.
+    """
     if frames not in (1, 2, 3, 4):
         raise ValueError(f"frames is {frames}: a session sends 1 to 4 of them a tick")
     query = urlencode({"frames": frames, "part": part})

@@ -49,7 +49,14 @@ class Edges:
 
     @classmethod
     def sorted(cls, receivers: Array, senders: Array, kinds: Array, rest: Array) -> Edges:
-        """From edges in any order."""
+        """From edges in any order.
+
+        Args:
+            receivers: vertex that hears, (E,).
+            senders: vertex that is heard, (E,).
+            kinds: of the edges, below ``EDGE_KINDS``, (E,).
+            rest: what an edge has at rest, (E, ·).
+        """
         segments = receivers * EDGE_KINDS + kinds
         order = np.argsort(segments, kind="stable")
         ends, first, counts = np.unique(segments[order], return_index=True, return_counts=True)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from physworld_schemas.job import Event
 
 MM = 1e3
-DWARFS = 30.0
+DWARFS = 10.0
 """From this ratio of the largest to the smallest on, an axis is logarithmic."""
 PREDICTORS: dict[str, tuple[str, str, str]] = {
     "static": ("static", "#8a96a2", ":"),
@@ -74,7 +74,18 @@ def compared(
 def bars(
     values: Mapping[str, float], title: str, label: str, axes: Axes | None = None, line: float | None = None
 ) -> Axes:
-    """Horizontal bars by name, with a threshold."""
+    """Horizontal bars by name, with a threshold.
+
+    Args:
+        values: lengths by name, the first one on top.
+        title: over the axes.
+        label: of the lengths, with their unit.
+        axes: to draw into; None makes a figure.
+        line: place of the threshold, in the lengths' unit; None draws none.
+
+    Raises:
+        NothingToPlot: there is no value.
+    """
     if not values:
         raise NothingToPlot(title)
     drawn = _axes(axes)

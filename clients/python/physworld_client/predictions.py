@@ -86,7 +86,22 @@ def rollout_create(
     every: int,
     as_job: bool,
 ) -> Call[Rollout | Job]:
-    """POST /v1/rollouts."""
+    """POST /v1/rollouts.
+
+    Args:
+        model: its name.
+        controllers: paths (T, K, 3) or candidates (B, T, K, 3) [m].
+        version: its number, or an alias.
+        times: of the paths (T,) [s], from 0; None: they are ``dt_s`` apart.
+        dt_s: between two places of the controllers [s]; None is the model's own.
+        start: where the object is at first.
+        phi: logarithms of property factors (n, ·); None is as published.
+        stiffness_factor: over the whole body.
+        density_factor: likewise.
+        returns: vertices, points or both.
+        every: every how many ticks an answer holds.
+        as_job: always as a job, not only where the answer would be too large.
+    """
     fields: dict[str, Any] = {
         "model": model,
         "version": version,
@@ -126,7 +141,19 @@ def plan_create(
     limits: PlanLimits | None,
     config: PlanConfig | None,
 ) -> Call[Job]:
-    """POST /v1/plans; exactly one of ``points`` and ``shape``."""
+    """POST /v1/plans; exactly one of ``points`` and ``shape``.
+
+    Args:
+        model: its name.
+        version: its number, or an alias.
+        points: goal (3,) [m] by index of the measured point.
+        shape: goal of all vertices or points (·, 3) [m].
+        limits: of the grips' motion; None has the defaults.
+        config: of the search; None has the defaults.
+
+    Raises:
+        TypeError: both goals are given, or neither.
+    """
     if (points is None) == (shape is None):
         raise TypeError("plans.create takes either points or shape")
     goal: PointGoal | ShapeGoal

@@ -118,7 +118,14 @@ def client_options(base_url: str, token: str | None, timeout: float) -> dict[str
 def build_request(
     http: httpx.Client | httpx.AsyncClient, call: Call[Any], key: str, timeout: float
 ) -> httpx.Request:
-    """The HTTP request of a call. The multipart boundary comes from the key: a retry sends the same bytes."""
+    """The HTTP request of a call. The multipart boundary comes from the key: a retry sends the same bytes.
+
+    Args:
+        http: makes the request with its base address and headers.
+        call: method, path, body and upload.
+        key: the Idempotency-Key of a POST and the boundary of an upload.
+        timeout: of connecting and of every wait [s]; a call that answers late has a longer one of its own.
+    """
     headers: dict[str, str] = {}
     options: dict[str, Any] = {}
     if call.method == "POST":

@@ -91,6 +91,14 @@ class RecordedRun:
         memories: of every term.
         twice: whether the gradient runs every frame again.
         nbytes: memory kept for the gradient.
+
+    Args:
+        adjoint: problem, solver and recorder.
+        x: nodes at the start (n, 3) [m].
+        v: their velocities (n, 3) [m/s].
+        held: nodes that are led, and their paths.
+        times: of the frames (T,) [s].
+        progress: called with (frames done, frames in all); may raise to stop.
     """
 
     def __init__(

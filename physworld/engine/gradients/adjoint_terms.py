@@ -109,6 +109,15 @@ class RecordedAdjoint:
 
     Attributes:
         differentiated_bar: derivatives by the term's array of that name, as flat numbers; None where it has none.
+
+    Args:
+        term: bound to the run.
+        mass: of the nodes (n,) [kg].
+        now: state and derivatives of the substep that is taken back.
+        memories: of the term, recorded by the run.
+
+    Raises:
+        NotDifferentiable: one of the term's kernels has no backward pass.
     """
 
     def __init__(self, term: BoundTerm, mass: Array, now: Reverse, memories: list[Memory]) -> None:

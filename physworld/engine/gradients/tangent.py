@@ -39,6 +39,13 @@ class InternalTangent:
         stiffness_columns: the columns that add up to the derivative to the logarithm of the particle's stiffness
             factor (it scales the moduli, and a solid's friction; a thin body's friction is in its moduli's columns).
         particles: rows of ``parameter_out``.
+
+    Args:
+        lattice: of the body.
+        law: of its material.
+        stiffness_factor: of every particle (P,).
+        rest: particles or nodes at rest, as the forces take them [m].
+        device: of Warp.
     """
 
     def __init__(self, lattice: Lattice, law: Law, stiffness_factor: Array, rest: Array, device: str) -> None:

@@ -166,7 +166,15 @@ class DiscreteRods:
 
 
 class Launch:
-    """Device arrays of one run."""
+    """Device arrays of one run.
+
+    Args:
+        rods: the copies and their numbers.
+        x: nodes at the start (n, 3) [m], the same in every copy.
+        v: their velocities (n, 3) [m/s].
+        held: led nodes and their paths; one for all copies or one for each.
+        times: of the frames (T,) [s].
+    """
 
     def __init__(
         self, rods: DiscreteRods, x: Array, v: Array, held: Sequence[HeldNodes], times: Array

@@ -51,7 +51,14 @@ class Particles:
 
 
 class ParticleRun:
-    """One integration: device arrays of the grid, the captured substeps, the checks."""
+    """One integration: device arrays of the grid, the captured substeps, the checks.
+
+    Args:
+        engine: problem, grid and time step.
+        particles: their state on the device.
+        stress: of the law, launched once here.
+        grips: particles that are led, and their paths.
+    """
 
     def __init__(
         self, engine: UpdatedLagrangian, particles: Particles, stress: ParticleStress, grips: ParticleGrips

@@ -121,9 +121,16 @@ def _cross(left: Tensor, right: Tensor) -> Tensor:
 
 
 def enter(
-    frame: GripFrame, window: Tensor, control_next: Tensor, n: int
+    frame: GripFrame, window: Tensor, control_next: Tensor
 ) -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:
-    """(R, c̄), y^{t-h} … y^t (h+1, V, B, 3) and the control vertices at t+1 (C, B, 3) in the frame of that moment."""
+    """A window and the control vertices in the frame of that moment: (R, c̄), (h+1, V, B, 3) and (C, B, 3).
+
+    Args:
+        frame: which control vertices span it, and how far gravity falls in a tick.
+        window: positions at t - h … t (h+1, V, B, 3) [m], world axes.
+        control_next: control vertices at t + 1 (C, B, 3) [m], world axes.
+        n: object vertices.
+    """
     rotation, centre = turn_of(frame, control_next)
     ticks = torch.arange(1 - len(window), 1, dtype=window.dtype)
     fallen = (ticks.square()[:, None] * window.new_tensor(frame.fall))[:, None, None]

@@ -45,7 +45,15 @@ class InertialStep(nn.Module):
 def one_step_residual(
     step: Callable[[Tensor, Tensor, Tensor], Tensor], positions: Tensor, phi: Tensor, n: int, history: int
 ) -> Tensor:
-    """What a prior's ``step`` leaves of each step of a track (T, V, 3) with Φ (n, 2): (n, T-1-h, 3)."""
+    """What a prior leaves of each step of a track: (n, T-1-h, 3) [m].
+
+    Args:
+        step: the prior: (window, control vertices, Φ) to object vertices at t + 1.
+        positions: of all vertices (T, V, 3) [m].
+        phi: logarithms of property ratios (n, ·).
+        n: object vertices.
+        history: h.
+    """
     count = positions.shape[0] - 1 - history
     window = torch.stack([positions[k : k + count].transpose(0, 1) for k in range(history + 1)])
     following = positions[history + 1 :].transpose(0, 1)

@@ -274,15 +274,20 @@ class WorldModel(nn.Module):
     def step(
         self, window: Tensor, control_next: Tensor, phi: Tensor, constants: EdgeConstants | None = None
     ) -> Tensor:
-        """Positions of all vertices at t + 1 [m], (V, B, 3); control vertices go to ``control_next`` (C, B,
-        3).
+        """Positions of all vertices at t + 1 (V, B, 3) [m].
+
+        Args:
+            window: positions at t - h … t (h+1, V, B, 3) [m].
+            control_next: where the control vertices go (C, B, 3) [m].
+            phi: logarithms of property ratios (n, B, ·).
+            constants: what edges share over a rollout; None computes it here.
         """
         n, frame = self.spec.object_count, self.spec.frame
         if frame is None:
             ahead = torch.cat([self.prior(window, control_next, phi), control_next])
             correction = self.forward(window, ahead, phi, constants)
             return torch.cat([ahead[:n] + self.norm.change * correction, control_next])
-        turn, local, control_local = enter(frame, window, control_next, n)
+        turn, local, control_local = enter(frame, window, control_next)
         ahead = torch.cat([self.prior(local, control_local, phi), control_local])
         correction = self.forward(local, ahead, phi, constants)
         moved = leave(frame, turn, ahead[:n] + self.norm.change * correction)

@@ -55,7 +55,14 @@ def near_ends(places: Array, most: int, radius_m: float) -> tuple[Array, Array, 
 
 
 class KeptEdges:
-    """The COARSE and GRIP edges of B copies of a graph, side by side: vertex v of copy b is v B + b."""
+    """The COARSE and GRIP edges of B copies of a graph, side by side: vertex v of copy b is v B + b.
+
+    Args:
+        edges: of one copy.
+        vertices: V, of one copy.
+        batch: B.
+        device: of the index tensors.
+    """
 
     def __init__(self, edges: EdgeList, vertices: int, batch: int, device: torch.device) -> None:
         element = torch.arange(batch, device=device)
@@ -128,7 +135,15 @@ class CurrentEdges:
     def means(
         self, heard: Tensor, sent: Tensor, near_table: Tensor, kept_bias: Tensor, weight: Tensor
     ) -> Tensor:
-        """Mean messages (K, V, B, H); ``near_table`` (7, H) and ``kept_bias`` (E, H) are the layer's edge terms."""
+        """Mean messages of every vertex, by kind, (K, V, B, H).
+
+        Args:
+            heard: what receivers add (K, V, B, H).
+            sent: what senders add (K, V, B, H).
+            near_table: the layer's map of the seven features of a NEAR edge (7, H).
+            kept_bias: the layer's terms of the kept edges (E, H).
+            weight: of the edge's present length (K, H).
+        """
         bias = torch.cat([self.near @ near_table, kept_bias[self.rows]])
         hears, says = (side.flatten(1, 2)[:, :, None] for side in (heard, sent))
         return mean_messages(self.edges, hears, says, bias, self.length, weight).view_as(heard)

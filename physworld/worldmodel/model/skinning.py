@@ -102,8 +102,13 @@ def local_rotations(rest: Array, moved: Array, neighbours: int = 8, *, index: Ar
     """Rotation of every vertex's neighbourhood, (…, n, 3, 3): argmin_R Σ_j ‖R (rest_j − rest_i) − (moved_j
     − moved_i)‖².
 
-    ``rest`` (n, 3), ``moved`` (…, n, 3); ``index`` (n, K): their ``neighbourhoods`` where these are known already.
     Neighbourhoods on a line leave the turn about it free: it is then the least rotation that turns the line.
+
+    Args:
+        rest: vertices at rest (n, 3) [m].
+        moved: the same vertices later (…, n, 3) [m].
+        neighbours: how many make a neighbourhood.
+        index: the ``neighbourhoods`` (n, K), where they are known already.
     """
     index = neighbourhoods(rest, neighbours) if index is None else index
     before = rest[index] - rest[:, None]

@@ -57,7 +57,16 @@ class EdgeList:
 def mean_messages(
     edges: EdgeList, heard: Tensor, sent: Tensor, bias: Tensor, length: Tensor, weight: Tensor
 ) -> Tensor:
-    """Mean messages of every vertex, by kind, (K, V, B, H); 0 where it has no edge of that kind."""
+    """Mean messages of every vertex, by kind, (K, V, B, H); 0 where it has no edge of that kind.
+
+    Args:
+        edges: sorted by kind and receiver, E of one copy's graph.
+        heard: what receivers add (K, V, B, H).
+        sent: what senders add (K, V, B, H).
+        bias: of the edges (E, H).
+        length: of the edges at present (E, B) [m].
+        weight: of the length (K, H).
+    """
     if heard.device.type == "cpu" and heard.dtype == torch.float32:
         return _native_mean(edges, heard, sent, bias, length, weight)
     return mean_messages_torch(edges, heard, sent, bias, length, weight)
@@ -66,7 +75,7 @@ def mean_messages(
 def mean_messages_torch(
     edges: EdgeList, heard: Tensor, sent: Tensor, bias: Tensor, length: Tensor, weight: Tensor
 ) -> Tensor:
-    """The same in plain torch, on any device and in any precision."""
+    """The same in plain torch, on any device and in any precision: the arguments of :func:`mean_messages`."""
     senders, receivers = edges.senders.to(heard.device), edges.receivers.to(heard.device)
     along = sent.flatten(0, 1)[senders] + heard.flatten(0, 1)[receivers]
     weights = weight[receivers // heard.shape[1]]

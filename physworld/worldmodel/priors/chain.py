@@ -148,7 +148,14 @@ class ChainPrior:
 
 
 def chain_of(layout: ChainLayout, physics: ChainPhysics, dt_s: float, reach: Array) -> ChainPrior:
-    """The prior of a layout and its physics; the wave speed is lowered to what ``MOST_SUBSTEPS`` can carry."""
+    """The prior of a layout and its physics; the wave speed is lowered to what ``MOST_SUBSTEPS`` can carry.
+
+    Args:
+        layout: nodes along the body, and how vertices hang on them.
+        physics: wave speed, bending, losses and gravity.
+        dt_s: of the model's clock [s].
+        reach: largest |log ratio| of stiffness and of density that it has to stay stable at (2,).
+    """
     length = np.diff(layout.nodes)
     count, free = len(layout.nodes), layout.member.sum(axis=1) == 0
     mass = 0.5 * (np.append(length, 0.0) + np.append(0.0, length))

@@ -45,6 +45,12 @@ def fit_chain(episodes: list[Array], phis: list[Array], spec: GraphSpec, history
     """The chain of vertex tracks (T, V, 3) and their log property ratios (n, 2 or more).
 
     None where the body is no straight line at rest or no grip holds it: that is no rope.
+
+    Args:
+        episodes: vertex tracks (T, V, 3) [m], object vertices first.
+        phis: log property ratios of each (n, 2 or more).
+        spec: the graph.
+        history: h.
     """
     along = arc_lengths(spec)
     if along is None:

@@ -108,10 +108,19 @@ class ChainStep(nn.Module):
         bend: Tensor,
         ease: Tensor,
     ) -> Tensor:
-        """Nodes (K, M, 3) after a tick from places and velocities there, in plain torch.
+        """Nodes (K, M, 3) [m] after a tick, in plain torch.
 
-        The driven nodes are at here + s slope + s²/2 turn; ``pull`` (K-1, M, 1), ``bend`` (K-2, M, 1), ``ease`` (K, M,
-        1).
+        The driven nodes are at here + s slope + s²/2 turn, s from 0 to 1.
+
+        Args:
+            place: of the nodes (K, M, 3) [m].
+            velocity: in metres a tick (K, M, 3).
+            here: of the driven nodes (K, M, 3) [m].
+            slope: their first derivative to the share of a tick (K, M, 3) [m].
+            turn: their second one (K, M, 3) [m].
+            pull: (wave speed times tick)² over the rest length of the segments (K-1, M, 1) [m].
+            bend: of the joints (K-2, M, 1).
+            ease: inverse of the nodes' relative mass, 0 for driven ones (K, M, 1).
         """
         substeps, every = self.prior.substeps, self.prior.substeps // CALMINGS
         step = 1.0 / substeps

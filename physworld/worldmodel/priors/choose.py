@@ -42,6 +42,14 @@ def fit_priors(
 
     A chain that is wanted where the body is no rope gives way to the modal prior. ``frame``: "world" or "grip" axes of
     the modal prior, or with "auto" both, where the graph has a grip's frame. The chain is in world axes.
+
+    Args:
+        positions: vertex tracks (T, V, 3) [m], object vertices first.
+        phis: log property ratios of each (n, 2 or more).
+        spec: the graph.
+        config: history and number of modes.
+        wanted: a prior's name, or "auto".
+        frame: axes of the modal prior: "world", "grip", or "auto".
     """
     if wanted == NONE:
         return {NONE: InertialPrior(spec.object_count)}
@@ -76,7 +84,14 @@ def choose(errors: dict[str, float]) -> str:
 
 
 def prior_error(prior: Prior, tracks: list[Track], spec: GraphSpec, history: int) -> float:
-    """Mean distance [m] of object vertices over whole episodes, predicted by the prior alone, in the graph's frame."""
+    """Mean distance [m] of object vertices over whole episodes, predicted by the prior alone, in the graph's frame.
+
+    Args:
+        prior: without a network.
+        tracks: whole episodes.
+        spec: the graph.
+        history: h.
+    """
     alone = framed_prior(prior_step(prior, history), spec)
 
     def ahead(window: Tensor, control_next: Tensor, phi: Tensor) -> Tensor:

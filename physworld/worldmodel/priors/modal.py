@@ -115,9 +115,20 @@ def fit_prior(
     most_modes: int,
     frame: GripFrame | None = None,
 ) -> ModalPrior:
-    """The prior of vertex tracks (T, V, 3), object vertices first, and their log property ratios (n, 2 or more).
+    """The modal prior of vertex tracks.
 
     With a ``frame`` it is that of a step in the grip's frame (``physworld.worldmodel.model.frame``).
+
+    Args:
+        episodes: vertex tracks (T, V, 3) [m], object vertices first.
+        phis: log property ratios of each (n, 2 or more).
+        n: object vertices.
+        history: h.
+        most_modes: at most; few vertices have fewer.
+        frame: None for world axes.
+
+    Raises:
+        DatasetUnusable: the graph has no control vertex.
     """
     if episodes[0].shape[1] == n:
         raise DatasetUnusable("the graph has no control vertex: there is nothing to move the object by")

@@ -37,7 +37,14 @@ def mean_placing(n: int) -> Array:
 
 
 def find_places(seen: list[Seen], fields: Array, size: Array, history: int) -> Array:
-    """``placing`` (n, 2) from episodes and their Φ (E, n, 2); ``size`` (R,) of the modes, above 0."""
+    """Where each episode's Φ softens the modes: ``placing`` (n, 2), whose product with Φ is ζ.
+
+    Args:
+        seen: the episodes' amplitudes.
+        fields: their Φ (E, n, 2).
+        size: root mean square amplitudes of the modes (R,), above 0.
+        history: h.
+    """
     n = fields.shape[1]
     uniform = mean_placing(n)
     flat = fields.reshape(len(fields), -1)

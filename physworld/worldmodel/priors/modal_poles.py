@@ -29,7 +29,14 @@ INSIDE = 1e-3  # distance from the circle that is aimed at
 
 
 def growth(weight: Array, response: Array, zeta: float, history: int) -> float:
-    """Largest factor by which a free motion of the modes grows in a step: the spectral radius of C(ζ)."""
+    """Largest factor by which a free motion of the modes grows in a step: the spectral radius of C(ζ).
+
+    Args:
+        weight: of lagged amplitudes and drives (R, F).
+        response: their change by powers of ζ (2, R, L + 1).
+        zeta: how soft the body is, as a mean of Φ.
+        history: h.
+    """
     return float(np.abs(np.linalg.eigvals(_companion(weight, response, zeta, history))).max())
 
 
@@ -38,7 +45,12 @@ def without_growth(
 ) -> tuple[Array, Array]:
     """The map, weight (R, F) and response (2, R, L + 1), changed until no free motion grows for ζ within ``span``.
 
-    ``size`` (R,): root mean square amplitudes of the modes, above 0.
+    Args:
+        weight: of lagged amplitudes and drives (R, F).
+        response: their change by powers of ζ (2, R, L + 1).
+        size: root mean square amplitudes of the modes (R,), above 0.
+        span: smallest and largest ζ.
+        history: h.
     """
     zetas = np.linspace(*span, NODES) if response.any() else np.zeros(1)
     most = _most_growth(weight, response, zetas, history)

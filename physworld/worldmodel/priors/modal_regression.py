@@ -119,7 +119,12 @@ def scale_of(seen: list[Seen], size: Array, history: int) -> Array:
 def regress(grams: Grams, scale: Array, choice: Choice, modes: int, history: int) -> tuple[Array, Array]:
     """Ridge regression of the next amplitudes: weight (R, F) and response (2, R, L + 1) of ``choice``.
 
-    ``modes``: how many the normal equations have.
+    Args:
+        grams: normal equations of all episodes.
+        scale: of their inputs, one each.
+        choice: number of modes and the ridges.
+        modes: how many the normal equations have.
+        history: h.
     """
     block = (history + 1) * modes + 1
     lags = np.concatenate([np.arange(choice.modes) + k * modes for k in range(history + 1)])
@@ -142,8 +147,15 @@ def regress(grams: Grams, scale: Array, choice: Choice, modes: int, history: int
 def errors(weight: Array, response: Array, judged: list[Seen], softness: Array, history: int) -> Array:
     """Root mean square error of all amplitudes in open loop, by episode, (E,).
 
-    Those beyond the R fitted are predicted as 0. ``softness`` (E,): the ζ at which each is predicted. Infinite where a
+    Those beyond the R fitted are predicted as 0.  Infinite where a
     prediction left the numbers.
+
+    Args:
+        weight: of lagged amplitudes and drives (R, F).
+        response: their change by powers of ζ (2, R, L + 1).
+        judged: episodes, of which at most R amplitudes are predicted.
+        softness: the ζ at which each is predicted (E,).
+        history: h.
     """
     count, lags = len(weight), (history + 1) * len(weight)
     zeta = softness[:, None]

@@ -23,7 +23,16 @@ def form(
     recognises: Recognise,
     read_table: TableReader,
 ) -> Importer:
-    """An importer of one form: its ``read_table``, then what all share."""
+    """An importer of one form: its ``read_table``, then what all share.
+
+    Args:
+        name: as on the wire.
+        title: for people.
+        suffixes: of its files, with the dot.
+        help: one line for lists of importers.
+        recognises: whether a file is of this form, by its beginning.
+        read_table: a file to its markers.
+    """
 
     def read(data: bytes, scene_name: str, options: ImportOptions | None) -> tuple[Scene, list[str]]:
         given = options or ImportOptions()

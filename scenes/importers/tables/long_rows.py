@@ -30,6 +30,13 @@ def read_long(
 ) -> MarkerTable:
     """The tracks in rows of time (or frame), marker, x, y, z; the file stands at the first of them.
 
+    Args:
+        file: stands at the first row of values.
+        delimiter: between cells.
+        heads: of the columns.
+        name_at: column of the marker's name.
+        axes: columns of x, y and z, in any order.
+
     Raises:
         SceneInvalid: no column of time or frames, two rows of one marker and frame, or a cell that is no number.
     """

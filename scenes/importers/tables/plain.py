@@ -200,7 +200,17 @@ def _without_heads(file: TextFile, delimiter: str) -> MarkerTable:
 
 
 def seconds(where: str, values: Array, head: str, lines: list[int]) -> Array:
-    """A column of times in seconds, by its head. Raises SceneInvalid."""
+    """A column of times in seconds, by its head.
+
+    Args:
+        where: the file, for messages.
+        values: of the column (T,).
+        head: its heading; the unit is read there, else it is seconds.
+        lines: of the values in the file.
+
+    Raises:
+        SceneInvalid: times that are not finite or do not increase.
+    """
     return checked_times(where, values * (time_unit_of(head) or 1.0), lines[0] if lines else 1)
 
 

@@ -164,6 +164,12 @@ def reading_of(table: MarkerTable, where: str, options: ImportOptions) -> Readin
 def scene_of(reading: Reading, where: str, name: str, options: ImportOptions) -> tuple[Scene, list[str]]:
     """The scene of a recording, and its warnings.
 
+    Args:
+        reading: tracks, controllers and guesses.
+        where: the file's form, for messages.
+        name: of the scene where the options have none.
+        options: what was said of the body.
+
     Raises:
         SceneInvalid: facts of the body are missing, or the validator's faults.
     """

@@ -72,7 +72,19 @@ def create_ticket(
 def issue(
     database: Database, settings: Settings, credential: str, model: str, version: int | str
 ) -> LiveTicket:
-    """The ticket and the address that takes it. Raises NotFound, or ApiProblem: 409, 503."""
+    """The ticket and the address that takes it.
+
+    Args:
+        database: gives out the ticket.
+        settings: where the inference service is.
+        credential: of the caller, as ``ApiKey.credential``.
+        model: its name.
+        version: its number, or an alias.
+
+    Raises:
+        NotFound: there is no such version.
+        ApiProblem: 409 for a version that is not ready, 503 without an inference service.
+    """
     with database.session() as session:
         found = ready_version(registry.get_version(session, model, version))
         if not settings.inference_url:

@@ -26,13 +26,26 @@ MEANING = {
     "dataset": "Delete a dataset, with its episodes, that no model was trained on.",
     "rollout": "Delete a rollout.",
     "plan": "Delete a plan.",
+    "video": "Delete a film.",
     "assessment": "Delete an assessment.",
 }
 """What the route of each kind of ``removal.KINDS`` does."""
 
 
 def delete_object(database: Database, stores: Stores, actor: Actor, kind: str, object_id: str) -> None:
-    """Delete, and leave a line in the audit log; the files of a dataset's episodes go too, which nothing else names."""
+    """Delete, and leave a line in the audit log; the files of a dataset's episodes go too, which nothing else names.
+
+    Args:
+        database: holds the rows.
+        stores: hold the files.
+        actor: who deletes, for the audit log.
+        kind: of the object, as references name it.
+        object_id: its id.
+
+    Raises:
+        NotFound: there is no such object.
+        Conflict: something else still needs it.
+    """
     with database.session() as session:
         removal.remove(session, kind, object_id)
         audit.record(session, actor, f"{kind}.deleted", object_id)

@@ -135,7 +135,17 @@ def invalid(field: str, message: str) -> ApiProblem:
 
 
 def read_array(value: ArrayInput, field: str, dimensions: tuple[int, ...], most: float) -> Array:
-    """The values, finite and within ±``most``. Raises ApiProblem, 422, with the place and the numbers."""
+    """The values, finite and within ±``most``.
+
+    Args:
+        value: as it was sent.
+        field: its name in the request.
+        dimensions: the numbers of axes that it may have.
+        most: largest absolute value.
+
+    Raises:
+        ApiProblem: 422, with the place and the numbers.
+    """
     try:
         return array_of(value, field, dimensions, most)
     except ValueError as error:
