@@ -2,7 +2,7 @@
 #   api      web process, migration: neither torch nor warp
 #   worker   dispatcher, simulation workers: warp
 #   trainer  training workers: warp and torch
-#   inference  rollouts, plans and live sessions: warp and torch
+#   inference  rollouts, plans, films and live sessions: warp, torch and what encodes films
 # Dependencies are installed before the source is copied, so that a change of code rebuilds one small layer.
 # Build arguments: PIP_INDEX_URL and PIP_EXTRA_INDEX_URL where packages come from another index (the pinned CPU
 # build of torch lies on its project's own index). The classic builder forgets them at the end of a stage.
@@ -74,7 +74,7 @@ CMD ["python", "-m", "physworld_services.trainer"]
 FROM base AS inference
 ARG PIP_INDEX_URL=
 ARG PIP_EXTRA_INDEX_URL=
-RUN python requirements.py api sim train > requirements.txt \
+RUN python requirements.py api sim train video > requirements.txt \
     && pip install --no-deps --require-hashes -r requirements.txt \
     && ./install_torch.sh python
 ENV MPLCONFIGDIR=/var/cache/physworld/matplotlib

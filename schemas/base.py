@@ -14,7 +14,7 @@ from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 from physworld_schemas.wording import meant
 
 ObjectKind = Literal[
-    "scene", "check", "fit", "trace", "dataset", "model", "assessment", "rollout", "plan", "artifact"
+    "scene", "check", "fit", "trace", "dataset", "model", "assessment", "rollout", "plan", "video", "artifact"
 ]
 _UNSTORABLE = re.compile("[\0\ud800-\udfff]")
 LINE, LONGEST_TEXT = 120, 40

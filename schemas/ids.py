@@ -13,6 +13,7 @@ PREFIXES = {
     "assessment": "ass",
     "rollout": "rol",
     "plan": "pln",
+    "video": "vid",
     "job": "job",
     "shard": "shd",
     "key": "key",

@@ -9,7 +9,9 @@ from pydantic import Field
 
 from physworld_schemas.base import Problem, Reference, Resource
 
-JobKind = Literal["check", "fit", "trace", "dataset", "training", "assessment", "rollout", "plan", "pipeline"]
+JobKind = Literal[
+    "check", "fit", "trace", "dataset", "training", "assessment", "rollout", "plan", "video", "pipeline"
+]
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelling", "cancelled"]
 TERMINAL_STATES: frozenset[str] = frozenset({"succeeded", "failed", "cancelled"})
 

@@ -140,8 +140,8 @@ FOUND = (
         "A world model printed all of its arrays",
         f"{OBJECTS}::test_arrays_are_shown_by_their_shapes",
         f"{CLIENT}/world_model.py",
-        "@dataclass(frozen=True, repr=False)",
-        "@dataclass(frozen=True)",
+        "def __repr__(self)",
+        "def shown(self)",
     ),
     Stumble(
         "Types of answers had to be imported from the service's package",

@@ -41,10 +41,11 @@ from physworld_storage.tables import (
     SceneRow,
     ShardRow,
     TraceRow,
+    VideoRow,
 )
 
 NAMING = (
-    *(row.artifacts for row in (SceneRow, FitRow, TraceRow, DatasetRow, ModelVersionRow, RunRow)),
+    *(row.artifacts for row in (SceneRow, FitRow, TraceRow, DatasetRow, ModelVersionRow, RunRow, VideoRow)),
     DatasetRow.digest,
     ModelVersionRow.sha256,
     AssessmentRow.figures,

@@ -30,6 +30,7 @@ from physworld_storage.tables import (
     SceneRow,
     ShardRow,
     TraceRow,
+    VideoRow,
 )
 
 SHOWN = 3
@@ -67,6 +68,7 @@ KINDS: dict[str, Removable] = {
             _by("dataset", DatasetRow.id, DatasetRow.scene_id),
             _by("model", ModelVersionRow.name, ModelVersionRow.scene_id),
             _by("assessment", AssessmentRow.id, AssessmentRow.scene_id),
+            _by("video", VideoRow.id, VideoRow.scene_id),
         ),
     ),
     "check": Removable(CheckRow),
@@ -90,6 +92,7 @@ KINDS: dict[str, Removable] = {
     "assessment": Removable(AssessmentRow),
     "rollout": Removable(RunRow),
     "plan": Removable(RunRow),
+    "video": Removable(VideoRow),
 }
 
 

@@ -255,6 +255,25 @@ class CheckRow(Base):
     lineage: Mapped[Json]
 
 
+class VideoRow(Base):
+    """A film of a motion; ``report`` says what was drawn."""
+
+    __tablename__ = "videos"
+    __table_args__ = (Index(None, "created_at"), Index(None, "of", "source_id"))
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    of: Mapped[str]
+    source_id: Mapped[str]
+    scene_id: Mapped[str] = mapped_column(ForeignKey("scenes.id"), index=True)
+    state: Mapped[str]
+    created_at: Mapped[datetime]
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
+    config: Mapped[Json]
+    report: Mapped[Json | None]
+    lineage: Mapped[Json]
+    artifacts: Mapped[JsonList]
+
+
 class DatasetRow(Base):
     """A set of episodes, immutable once sealed."""
 

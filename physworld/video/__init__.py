@@ -1,6 +1,7 @@
 """Pictures of a motion: 3D Gaussians that vertices carry, rendered to frames and film, compared with given frames."""
 
 from physworld.camera import Camera, look_at, orbit_view
+from physworld.video.drawing import Drawing, checked_motion, eight_bit, whole_motion_view
 from physworld.video.film import FrameScores, compare_frames, encode_mp4, frames_per_second
 from physworld.video.gaussians import Gaussians, from_ply, gaussians_at_points, to_ply
 from physworld.video.moving import GaussianCarrier
@@ -8,11 +9,14 @@ from physworld.video.render import Renderer
 
 __all__ = [
     "Camera",
+    "Drawing",
     "FrameScores",
     "GaussianCarrier",
     "Gaussians",
     "Renderer",
+    "checked_motion",
     "compare_frames",
+    "eight_bit",
     "encode_mp4",
     "frames_per_second",
     "from_ply",
@@ -20,4 +24,5 @@ __all__ = [
     "look_at",
     "orbit_view",
     "to_ply",
+    "whole_motion_view",
 ]

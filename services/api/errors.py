@@ -216,8 +216,11 @@ async def _http(request: Request, error: Exception) -> JSONResponse:
 def _methods_at(request: Request) -> set[str]:
     """All methods that the document has for this address: the framework's answer names those of one route alone."""
     paths: dict[str, dict[str, object]] = request.app.openapi()["paths"]
-    here = (methods for path, methods in paths.items() if compile_path(path)[0].match(request.url.path))
-    return {method.upper() for methods in here for method in methods}
+    here = [path for path in paths if compile_path(path)[0].match(request.url.path)]
+    nearest = min(
+        here, key=lambda path: path.count("{"), default=None
+    )  # /scenes/preview is no /scenes/{scene_id}
+    return set() if nearest is None else {method.upper() for method in paths[nearest]}
 
 
 async def _invalid(request: Request, error: Exception) -> JSONResponse:

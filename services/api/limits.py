@@ -6,6 +6,8 @@ other thread alike. So the values that a body lists are bounded too, by its comm
 
 from __future__ import annotations
 
+import re
+
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -19,6 +21,8 @@ UPLOAD_PATHS = frozenset(
     {"/v1/scenes", "/v1/scenes/preview", "/dashboard/scenes", "/dashboard/scenes/preview"}
 )
 """Of the API, and of the dashboard, whose forms bring the same files."""
+PICTURE_PATH = re.compile(r"/v1/scenes/[^/]+/pictures/[^/]+")
+"""Of a splat, a camera or pictures beside a scene."""
 ARRAY_PATHS = frozenset({"/v1/rollouts"})
 
 
@@ -37,7 +41,8 @@ class BodyLimit:
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
-        if scope["path"] in UPLOAD_PATHS:
+        uploads = scope["path"] in UPLOAD_PATHS or PICTURE_PATH.fullmatch(scope["path"]) is not None
+        if uploads:
             allowed, limit = self.max_upload_bytes + MULTIPART_OVERHEAD_BYTES, self.max_upload_bytes
         elif scope["path"] in ARRAY_PATHS:
             allowed = limit = MAX_REQUEST_BYTES
@@ -48,7 +53,7 @@ class BodyLimit:
             await answer(too_large(int(declared), limit), scope)(scope, receive, send)
             return
         counted = listed = 0
-        most_listed = None if scope["path"] in UPLOAD_PATHS else MAX_LISTED_VALUES
+        most_listed = None if uploads else MAX_LISTED_VALUES
 
         async def receive_counted() -> Message:
             nonlocal counted, listed

@@ -36,6 +36,7 @@ from physworld_services.dashboard import (
     pages_start,
     pages_traces,
     pages_uploads,
+    pages_videos,
 )
 from physworld_services.dashboard.site import BASE, STATIC, Site
 from physworld_services.stores import Stores
@@ -53,8 +54,8 @@ from physworld_storage.errors import (
 from physworld_storage.settings import Settings
 
 POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; font-src 'self'; "
-    "connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; media-src 'self'; "
+    "font-src 'self'; connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
 )
 HEADERS = {
     "Content-Security-Policy": POLICY,
@@ -113,6 +114,7 @@ def create_dashboard(site: Site, gate: Gate, parsers: Parsers) -> FastAPI:
         pages_start,
         pages_objects,
         pages_keys,
+        pages_videos,
     )
     viewing = [Depends(access.require_viewer)]
     for module in pages:

@@ -16,6 +16,7 @@ from physworld_services.dashboard.curves import chart, comparison_chart, given_c
 from physworld_services.dashboard.lineage import lineage_graph
 from physworld_services.dashboard.lists import Asked
 from physworld_services.dashboard.pages_scenes import PREDICTION, layer_response, recording_of
+from physworld_services.dashboard.pages_videos import films_of
 from physworld_services.dashboard.site import BASE, Site
 from physworld_services.dashboard.tables import held_out_of, noise_floor_of
 from physworld_storage import registry, resources
@@ -101,6 +102,7 @@ def router(site: Site) -> APIRouter:
             "version.html",
             version=version,
             card=card_of(site, version),
+            films=films_of(site, ("model", f"{version.name}:{version.version}")),
             graph=lineage_graph(site, version.scene_id, f"{version.name}:{version.version}"),
             has_curve=given_curves(version.metrics) is not None,
             has_cloud=version.scene_id is not None and site.arrays(version.artifacts, PREDICTION) is not None,

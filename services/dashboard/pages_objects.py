@@ -18,7 +18,13 @@ from physworld_storage.access import audit
 from physworld_storage.errors import NotFound
 
 AFTERWARDS = {"fit": "fits", "scene": "scenes", "trace": "traces", "dataset": "datasets"}
-AFTERWARDS |= {"check": "scenes", "rollout": "rollouts", "plan": "plans", "assessment": "models"}
+AFTERWARDS |= {
+    "check": "scenes",
+    "rollout": "rollouts",
+    "plan": "plans",
+    "assessment": "models",
+    "video": "scenes",
+}
 ALIAS = r"^[a-z][a-z0-9_-]{0,31}$"
 
 

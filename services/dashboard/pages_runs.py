@@ -17,6 +17,7 @@ from physworld_services.dashboard.clouds import Cloud, Layer, thinned
 from physworld_services.dashboard.lineage import lineage_graph
 from physworld_services.dashboard.lists import Asked
 from physworld_services.dashboard.pages_scenes import layer_response
+from physworld_services.dashboard.pages_videos import films_of
 from physworld_services.dashboard.site import BASE, Site
 from physworld_storage import overview, registry, resources, runs
 from physworld_storage.errors import NotFound
@@ -70,7 +71,8 @@ def _add(routes: APIRouter, site: Site, kind: runs.RunKind) -> None:
         with site.database.reading() as session:
             version = registry.get_version(session, run.model, run.version)
         graph = lineage_graph(site, version.scene_id, run_id)
-        return site.page(request, f"{kind}.html", run=run, has_cloud=has_cloud, graph=graph)
+        films = films_of(site, ("rollout", run_id)) if kind == "rollout" else []
+        return site.page(request, f"{kind}.html", run=run, has_cloud=has_cloud, graph=graph, films=films)
 
     @routes.get(f"/{kind}s/{{run_id}}/cloud")
     def cloud(run_id: str) -> Response:

@@ -21,6 +21,7 @@ from physworld_services.dashboard.clouds import (
 from physworld_services.dashboard.curves import chart, frame_errors, given_curves, onto
 from physworld_services.dashboard.lineage import lineage_graph
 from physworld_services.dashboard.lists import Asked
+from physworld_services.dashboard.pages_videos import films_of
 from physworld_services.dashboard.samples import sample_folder
 from physworld_services.dashboard.site import BASE, Site
 from physworld_services.dashboard.tables import noise_floor_of
@@ -85,6 +86,7 @@ def router(site: Site) -> APIRouter:
             traces=traced,
             declared=_declared(record),
             checks=checked,
+            films=films_of(site, ("scene", scene_id), *((("fit", shown.id),) if shown else ())),
             graph=lineage_graph(site, scene_id, fit or scene_id),
             check=next((item for item in checked if item.report is not None), None),
         )

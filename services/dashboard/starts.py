@@ -26,6 +26,7 @@ from physworld_schemas.pipeline import PipelineCreate
 from physworld_schemas.plan import PlanConfig, PlanCreate, PlanLimits, PointGoal
 from physworld_schemas.rollout import ModelName, RolloutCreate, Version
 from physworld_schemas.trace import TraceCreate
+from physworld_schemas.video import VideoCreate
 from physworld_services.api.routes.library import require_known
 from physworld_services.api.routes.plans import plan_opening
 from physworld_services.api.routes.rollouts import rollout_opening
@@ -105,6 +106,10 @@ def _fit(site: Site, body: FitCreate) -> Opening:
 def _check(site: Site, body: CheckCreate) -> Opening:
     require_known(config=body.config)
     return lambda session: jobs.create_check(session, body)
+
+
+def _video(site: Site, body: VideoCreate) -> Opening:
+    return lambda session: jobs.create_video(session, body)
 
 
 def _trace(site: Site, body: TraceCreate) -> Opening:
@@ -194,6 +199,12 @@ STARTS: dict[str, Start] = {
     ),
     "rollout": Start(
         "Predict a motion", "Open loop, from the start of the recording.", RolloutForm, _rollout
+    ),
+    "video": Start(
+        "Draw a film",
+        "A recording, a twin, a prediction or a rollout, as a camera sees it.",
+        VideoCreate,
+        _video,
     ),
     "plan": Start(
         "Plan a motion", "Grips move so that the object reaches a goal; checked in the twin.", PlanForm, _plan

@@ -23,6 +23,7 @@ from physworld_schemas.job import Job
 from physworld_schemas.model import TrainingCreate
 from physworld_schemas.pipeline import PipelineCreate
 from physworld_schemas.trace import TraceCreate
+from physworld_schemas.video import VideoCreate
 from physworld_storage.changes import announce
 from physworld_storage.errors import Conflict, NotFound
 from physworld_storage.jobs.events import append_event
@@ -39,6 +40,7 @@ from physworld_storage.jobs.kinds import (
     rollout,
     trace,
     training,
+    video,
 )
 from physworld_storage.jobs.shards import CANCELLED, FAILED, QUEUED, lock_job
 from physworld_storage.pages import page_of
@@ -59,6 +61,11 @@ def create_fit(session: Session, scene_id: str, config: FitConfig, parent: JobRo
 def create_check(session: Session, request: CheckCreate) -> Job:
     """Open a check of a scene. Raises NotFound."""
     return _job(session, check.KIND.open(session, request))
+
+
+def create_video(session: Session, request: VideoCreate) -> Job:
+    """Open a film. Raises NotFound, or Conflict when what it shows is not ready."""
+    return _job(session, video.KIND.open(session, request))
 
 
 def create_trace(session: Session, request: TraceCreate) -> Job:

@@ -28,7 +28,6 @@ from physworld.arrays import Array
 from physworld_schemas.wording import reason
 
 _MOTIONS = ("vertices", "particles", "tracks", "points", "after")
-_SHOWN = 3000  # points of a motion that are drawn where there is no splat
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -65,30 +64,21 @@ def _film(given: argparse.Namespace) -> None:
     wp.config.quiet = True
     from PIL import Image
 
-    from physworld.video import (
-        GaussianCarrier,
-        Renderer,
-        encode_mp4,
-        frames_per_second,
-        from_ply,
-        gaussians_at_points,
-    )
+    from physworld.video import Drawing, eight_bit, encode_mp4, frames_per_second, from_ply
     from physworld_workers.commands.terminal import progress_bar
 
     moved, rest, times = _motion(given.motion, given.number)
     camera = _camera(given, moved)
-    if given.gaussians is not None:
-        splat = from_ply(given.gaussians.read_bytes())
-    else:
-        splat = gaussians_at_points(rest[:: max(1, len(rest) // _SHOWN)])
-    carrier, renderer = GaussianCarrier(splat, rest), Renderer(camera, device=given.device)
+    splat = None if given.gaussians is None else from_ply(given.gaussians.read_bytes())
+    drawing = Drawing(moved, rest, camera, splat, given.device)
     pictures, coverage = [], []
     with progress_bar(f"video {given.motion.name}") as shown:
-        for number, vertices in enumerate(moved):
-            picture = renderer.render(*carrier.at(vertices))
-            pictures.append(np.round(picture.rgb * 255.0).astype(np.uint8))
+        for number, picture in enumerate(drawing.frames()):
+            pictures.append(eight_bit(picture))
             coverage.append(picture.alpha.astype(np.float16))
-            shown(number + 1, len(moved), f"{len(splat)} Gaussians, {camera.width} x {camera.height} px")
+            shown(
+                number + 1, len(moved), f"{drawing.gaussians} Gaussians, {camera.width} x {camera.height} px"
+            )
     scores = _scores(given, np.stack(pictures), np.stack(coverage))
     given.out.parent.mkdir(parents=True, exist_ok=True)
     given.out.write_bytes(encode_mp4(pictures, frames_per_second(times)))
@@ -96,7 +86,7 @@ def _film(given: argparse.Namespace) -> None:
         given.frames.mkdir(parents=True, exist_ok=True)
         for number, pixels in enumerate(pictures):
             Image.fromarray(pixels).save(given.frames / f"{number:05d}.png")
-    print(f"{len(pictures)} frames, {len(splat)} Gaussians: {given.out}")
+    print(f"{len(pictures)} frames, {drawing.gaussians} Gaussians: {given.out}")
     for name, value in (scores or {}).items():
         print(f"{name:<8} {value if isinstance(value, str | None) else format(value, '.4g')}")
     if given.json is not None:
@@ -105,6 +95,8 @@ def _film(given: argparse.Namespace) -> None:
 
 def _motion(path: Path, number: int) -> tuple[Array, Array, Array]:
     """Moved points (T, n, 3), the same at rest (n, 3), and times (T,). Raises ValueError with what is wrong."""
+    from physworld.video import checked_motion
+
     arrays = _arrays(path)
     name = next((key for key in _MOTIONS if key in arrays), None)
     if name is None:
@@ -114,12 +106,7 @@ def _motion(path: Path, number: int) -> tuple[Array, Array, Array]:
         if not 0 <= number < len(moved):
             raise ValueError(f"{name} in {path} holds {len(moved)} motions; there is no number {number}")
         moved = moved[number]
-    if moved.ndim != 3 or moved.shape[2] != 3 or moved.shape[0] < 2 or moved.shape[1] < 2:
-        raise ValueError(
-            f"{name} in {path} must be of shape (T, n, 3) with T and n from 2 on, got {moved.shape}"
-        )
-    if not np.isfinite(moved).all():
-        raise ValueError(f"{name} in {path} holds {np.sum(~np.isfinite(moved))} numbers that are not finite")
+    moved = checked_motion(moved, f"{name} in {path}")
     clock = "tick_times" if name == "vertices" and "tick_times" in arrays else "times"  # a version's own
     if clock in arrays:
         times = np.asarray(arrays[clock], dtype=np.float64)
@@ -134,7 +121,7 @@ def _motion(path: Path, number: int) -> tuple[Array, Array, Array]:
 
 
 def _camera(given: argparse.Namespace, moved: Array) -> Any:
-    from physworld.video import Camera, orbit_view
+    from physworld.video import Camera, whole_motion_view
 
     if given.camera is not None:
         try:
@@ -153,7 +140,7 @@ def _camera(given: argparse.Namespace, moved: Array) -> Any:
     width, times, height = given.size.partition("x")
     if not (times and width.isdecimal() and height.isdecimal() and min(int(width), int(height)) > 0):
         raise ValueError(f"--size must be WIDTHxHEIGHT in pixels, got {given.size!r}")
-    return orbit_view(moved.reshape(-1, 3), given.azimuth, given.elevation, int(width), int(height))
+    return whole_motion_view(moved, given.azimuth, given.elevation, int(width), int(height))
 
 
 def _scores(given: argparse.Namespace, pictures: Array, coverage: Array) -> dict[str, Any] | None:

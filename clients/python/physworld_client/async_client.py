@@ -23,6 +23,7 @@ from physworld_client.async_resources import (
     AsyncPipelines,
     AsyncScenes,
 )
+from physworld_client.async_videos import AsyncVideos
 from physworld_client.calls import Call
 from physworld_client.known_keys import KnownKeys
 from physworld_client.location import where
@@ -47,8 +48,8 @@ class AsyncClient:
             terminal.
 
     Attributes:
-        scenes, checks, fits, traces, datasets, models, assessments, rollouts, plans, live, jobs, keys, pipelines,
-        artifacts:
+        scenes, checks, fits, traces, datasets, models, assessments, rollouts, plans, videos, live, jobs, keys,
+        pipelines, artifacts:
             the resources.
     """
 
@@ -82,6 +83,7 @@ class AsyncClient:
         self.assessments = AsyncAssessments(self)
         self.rollouts = AsyncRollouts(self)
         self.plans = AsyncPlans(self)
+        self.videos = AsyncVideos(self)
         self.live = AsyncLive(self)
         self.jobs = AsyncJobs(self)
         self.keys = AsyncKeys(self)

@@ -50,6 +50,12 @@ def open_bundle(path: str | Path) -> Upload:
     source = Path(path).expanduser()
     if source.is_dir():
         return _pack_folder(source)
+    return open_file(source)
+
+
+def open_file(path: str | Path) -> Upload:
+    """One file as it is, ready to be sent. Raises BundleUnreadable where there is none, or nothing in it."""
+    source = Path(path).expanduser()
     if not source.is_file():
         raise BundleUnreadable(f"no scene at {source}: neither a folder nor a file")
     if source.stat().st_size == 0:

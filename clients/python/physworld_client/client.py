@@ -28,6 +28,7 @@ from physworld_client.resources import (
     Pipelines,
     Scenes,
 )
+from physworld_client.videos import Videos
 
 Answer = TypeVar("Answer")
 
@@ -48,8 +49,8 @@ class Client:
             terminal.
 
     Attributes:
-        scenes, checks, fits, traces, datasets, models, assessments, rollouts, plans, live, jobs, keys, pipelines,
-        artifacts:
+        scenes, checks, fits, traces, datasets, models, assessments, rollouts, plans, videos, live, jobs, keys,
+        pipelines, artifacts:
             the resources.
     """
 
@@ -81,6 +82,7 @@ class Client:
         self.assessments = Assessments(self)
         self.rollouts = Rollouts(self)
         self.plans = Plans(self)
+        self.videos = Videos(self)
         self.live = Live(self)
         self.jobs = Jobs(self)
         self.keys = Keys(self)

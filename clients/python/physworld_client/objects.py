@@ -26,6 +26,7 @@ from physworld_schemas import (
     scene,
     signing,
     trace,
+    video,
 )
 
 if TYPE_CHECKING:
@@ -160,6 +161,10 @@ class Rollout(Tabled, rollout.Rollout):
 
 class Plan(Tabled, plan.Plan):
     __doc__ = plan.Plan.__doc__
+
+
+class Video(Tabled, video.Video):
+    __doc__ = video.Video.__doc__
 
 
 class Job(Tabled, job.Job):

@@ -27,6 +27,7 @@ from physworld_client.objects import (
     ScenePreview,
     SigningKey,
     Trace,
+    Video,
 )
 from physworld_schemas.arrays import EncodedArray
 from physworld_schemas.assessment import ErrorFigure
@@ -58,6 +59,7 @@ from physworld_schemas.plan import PlanConfig, PlanLimits, PointGoal, ShapeGoal
 from physworld_schemas.rollout import Part, Start
 from physworld_schemas.scene import ImportGuess, SceneImport
 from physworld_schemas.trace import Figure, FoundEffect, TraceConfig
+from physworld_schemas.video import CameraView, VideoConfig, VideoReport, VideoScores
 
 Array: TypeAlias = npt.NDArray[Any]
 """An array of any element type."""
@@ -68,6 +70,7 @@ __all__ = [
     "Array",
     "Artifact",
     "Assessment",
+    "CameraView",
     "Check",
     "CheckConfig",
     "CheckReport",
@@ -124,4 +127,8 @@ __all__ = [
     "Trace",
     "TraceConfig",
     "TrainingConfig",
+    "Video",
+    "VideoConfig",
+    "VideoReport",
+    "VideoScores",
 ]

@@ -26,6 +26,7 @@ MEANING = {
     "dataset": "Delete a dataset, with its episodes, that no model was trained on.",
     "rollout": "Delete a rollout.",
     "plan": "Delete a plan.",
+    "video": "Delete a film.",
     "assessment": "Delete an assessment.",
 }
 """What the route of each kind of ``removal.KINDS`` does."""

@@ -177,6 +177,7 @@ def test_a_body_that_is_no_text_is_refused_as_the_document_says(client: httpx.Cl
 def test_allow_names_every_method_of_an_address(client: httpx.Client) -> None:
     for path, methods in (
         ("/v1/scenes", {"GET", "POST"}),
+        ("/v1/scenes/preview", {"POST"}),
         ("/v1/fits/fit_x", {"DELETE", "GET"}),
         ("/v1/models/m/versions/1", {"DELETE", "GET", "PATCH"}),
         ("/v1/models/m/aliases/a", {"DELETE", "PUT"}),

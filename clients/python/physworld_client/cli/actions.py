@@ -12,7 +12,7 @@ from rich.progress import Progress
 
 from physworld_client.cli.fit import become
 from physworld_client.cli.lists import GROUPS, PAGE, download, ending
-from physworld_client.cli.options import DatasetName, JobName, Json, KeyName, Out, connected
+from physworld_client.cli.options import DatasetName, JobName, Json, KeyName, Out, SceneName, connected
 from physworld_client.cli.output import (
     print_json,
     print_state,
@@ -70,6 +70,22 @@ def scenes_add(
     )
     for line in found.lines:
         stdout.print(line, markup=False, soft_wrap=True)
+
+
+@connected(GROUPS["scenes"], "picture")
+def scenes_picture(
+    client: Client,
+    scene_id: SceneName,
+    path: Annotated[Path, typer.Argument(help="Splat (.ply), camera (.json) or pictures (.npz).")],
+    json: Json = False,
+) -> None:
+    """Keep a splat, a camera or pictures beside a scene, for its films."""
+    scene = client.videos.put_picture(scene_id, path)
+    if json:
+        print_json(scene)
+    else:
+        for artifact in scene.artifacts:
+            stdout.print(f"{artifact.name}  {artifact.size} bytes", markup=False)
 
 
 @connected(GROUPS["datasets"], "download")

@@ -44,6 +44,7 @@ from physworld_client.types import (
     Rollout,
     Scene,
     Trace,
+    Video,
 )
 from physworld_schemas.base import Artifact
 
@@ -162,6 +163,14 @@ def _plan(run: Plan) -> Sequence[object]:
     return (run.id, f"{run.model}:{run.version}", run.state, *errors, ago(run.created_at))
 
 
+def _film(film: Video) -> Sequence[object]:
+    scores = film.report.scores if film.report else None
+    frames = "" if film.report is None else film.report.frames
+    ratio = "" if scores is None or scores.psnr_db is None else f"{scores.psnr_db:.1f}"
+    similar = "" if scores is None else f"{scores.ssim:.3f}"
+    return (film.id, film.of, film.source_id, film.state, frames, ratio, similar, ago(film.created_at))
+
+
 def _assessment(one: Assessment) -> Sequence[object]:
     return (
         one.id,
@@ -262,6 +271,17 @@ PLANS = Listing(
     _plan,
     filters=(("model", "model", "Only plans with this model."),),
 )
+VIDEOS = Listing(
+    "list",
+    "Films, newest first.",
+    ("id", "of", "what", "state", "frames", "PSNR [dB]", "SSIM", "age"),
+    _film,
+    filters=(
+        ("scene", "scene_id", "Only films that belong to this scene."),
+        ("of", "of", "Only films of this kind: scene, fit, model or rollout."),
+        ("source", "source_id", "Only films of this object."),
+    ),
+)
 ASSESSMENTS = Listing(
     "list",
     "Recordings held against a model.",
@@ -291,6 +311,7 @@ RESOURCES = (
         "rollouts", "Predictions that were jobs.", (ROLLOUTS,), "rollout", files="the arrays of a rollout"
     ),
     Resource("plans", "Motions that reach a goal.", (PLANS,), "plan", files="the arrays of a plan"),
+    Resource("videos", "Films of motions, drawn by the service.", (VIDEOS,), "video", files="the film"),
     Resource("assessments", "New recordings held against models.", (ASSESSMENTS,), "assessment"),
     Resource("keys", "API keys of the service.", (KEYS,), "key", shown=False),
 )

@@ -30,6 +30,7 @@ SINGULAR = {
     "assessments": "assessment",
     "rollouts": "rollout",
     "plans": "plan",
+    "videos": "video",
     "jobs": "job",
     "keys": "key",
 }

@@ -19,7 +19,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from physworld_client.cli.lists import GROUPS
-from physworld_client.cli.names import one_of
+from physworld_client.cli.names import found, one_of
 from physworld_client.cli.options import Json, connected
 from physworld_client.cli.output import print_json, progress_text, stdout
 from physworld_client.client import Client
@@ -28,6 +28,7 @@ from physworld_client.types import Job
 from physworld_schemas.dataset import DatasetConfig
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.model import TrainingConfig
+from physworld_schemas.video import VideoConfig, VideoCreate
 
 PLAIN = (int, float, str, bool)
 
@@ -67,6 +68,12 @@ def _training(client: Client, given: dict[str, str], config: TrainingConfig) -> 
     return client.models.create(given["name"], given["dataset_id"], config)
 
 
+def _video(client: Client, given: dict[str, str], config: VideoConfig) -> Job:
+    asked = VideoCreate.model_validate({"of": given["of"], "id": given["id"]})
+    name, colon, version = asked.id.partition(":")
+    return client.videos.create(asked.of, f"{found(client, f'{asked.of}s', name)}{colon}{version}", config)
+
+
 TRACE = ("trace", "traces", "A ready trace, whose effects the demonstrations carry.")
 STARTS = (
     Start("fits", "add", "Calibrate a twin of a scene.", FitConfig, (("scene_id", "scenes"),), _fit),
@@ -86,6 +93,14 @@ STARTS = (
         TrainingConfig,
         (("name", ""), ("dataset_id", "datasets")),
         _training,
+    ),
+    Start(
+        "videos",
+        "add",
+        "Draw a film: OF is scene, fit, model or rollout, ID which of them (of a model NAME or NAME:VERSION).",
+        VideoConfig,
+        (("of", ""), ("id", "")),
+        _video,
     ),
 )
 

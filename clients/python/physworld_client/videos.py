@@ -1,0 +1,76 @@
+# Made of async_videos.py by `make sdk`: change that file.
+"""Films of motions, drawn by the service, and the pictures beside a scene that they show and are compared with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from physworld_client import films
+from physworld_client.pages import ListPage
+from physworld_client.resources import Resource
+from physworld_client.types import Job, Scene, Video
+from physworld_schemas.video import FILM, VideoConfig, VideoOf
+
+
+class Videos(Resource):
+    """Films: of a scene's recording, a fit's twin, a model's prediction of its recording, a rollout."""
+
+    def create(self, of: VideoOf, id: str, config: VideoConfig | None = None) -> Job:
+        """Starts a film; its job's output is the film.
+
+        Args:
+            of: "scene", "fit", "model" or "rollout".
+            id: of that; of a model "name", "name:3" or "name:alias".
+            config: camera, size and what is drawn; by default the scene's own camera and splat, where it has them.
+        """
+        return self._client.send(films.create(of, id, config))
+
+    def get(self, video_id: str) -> Video:
+        """One film: what was drawn, and its scores against the scene's pictures."""
+        return self._client.send(films.get(video_id))
+
+    def list(
+        self,
+        *,
+        limit: int | None = None,
+        cursor: str | None = None,
+        scene_id: str | None = None,
+        of: VideoOf | None = None,
+        source_id: str | None = None,
+    ) -> ListPage[Video]:
+        """Films, newest first.
+
+        Args:
+            limit: most films of a page; None leaves it to the service.
+            cursor: of the page before.
+            scene_id: only films that belong to this scene.
+            of: only films of this kind of object.
+            source_id: only films of this object.
+        """
+        return self._page(
+            lambda at: films.listed(limit=limit, cursor=at, scene_id=scene_id, of=of, source_id=source_id),
+            cursor,
+        )
+
+    def download(self, video_id: str, path: str | Path) -> Path:
+        """The film as an MP4 file at ``path``. Raises ValueError while there is none."""
+        video = self.get(video_id)
+        film = next((item for item in video.artifacts if item.name == FILM), None)
+        if film is None:
+            raise ValueError(f"video {video_id} is {video.state}: there is no film yet")
+        return self._client.artifacts.download(film, path)
+
+    def put_picture(self, scene_id: str, path: str | Path) -> Scene:
+        """Keeps a file beside a scene for its films, in the place of one of the same kind.
+
+        Args:
+            scene_id: of the scene.
+            path: of a splat of the object in the first frame (``.ply``), of the camera of the pictures (``.json``), or
+                of the pictures (``.npz`` with ``frames`` (T, H, W, 3) uint8 and perhaps ``masks`` (T, H, W)).
+
+        Raises:
+            BundleUnreadable: nothing is there, or a file of another kind.
+        """
+        name, upload = films.picture_at(path)
+        with upload, self._client.bars.sending(upload) as sent:
+            return self._client.send(films.put_picture(scene_id, name, sent))

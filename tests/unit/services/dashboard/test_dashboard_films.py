@@ -1,0 +1,127 @@
+"""The player of films: a button that asks for one, its states, the file by ranges, and where a film's page is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+from fastapi import FastAPI
+from serving import serve
+from test_dashboard_access import browser_at, login
+from tiny_scene import register, tiny_scene
+
+from physworld_schemas.video import Video, VideoConfig
+from physworld_services.dashboard import mount
+from physworld_services.dashboard.pages_videos import page_of
+from physworld_services.stores import Stores
+from physworld_storage import videos
+from physworld_storage.database import Database, open_database
+from physworld_storage.jobs import leases
+from physworld_storage.settings import Settings
+
+pytestmark = pytest.mark.slow
+
+FILM = bytes(range(200))
+REPORT = {
+    "frames": 12, "fps": 30.0, "drawn": "splat", "gaussians": 4, "seen_from": "scene", "seconds": 1.0,
+    "camera": {
+        "width": 64, "height": 48, "fx": 60.0, "fy": 60.0, "cx": 32.0, "cy": 24.0,
+        "world_to_camera": np.eye(4).tolist(),
+    },
+    "scores": {
+        "psnr_db": 31.25, "ssim": 0.943, "psnr_db_per_frame": [31.25] * 12, "ssim_per_frame": [0.943] * 12,
+    },
+}  # fmt: skip
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[tuple[Settings, Database, Stores]]:
+    settings = Settings(data_dir=tmp_path)
+    database = open_database(settings)
+    database.upgrade()
+    yield settings, database, Stores(settings)
+    database.dispose()
+
+
+@pytest.fixture
+def client(world: tuple[Settings, Database, Stores]) -> Iterator[httpx.Client]:
+    app = FastAPI()
+    mount(app, *world)
+    with serve(app) as origin, browser_at(origin) as client:
+        login(client, world[1])
+        yield client
+
+
+def card(client: httpx.Client, scene: str) -> str:
+    return client.get(f"/dashboard/scenes/{scene}").text.partition('id="films"')[2].partition("</section>")[0]
+
+
+def test_the_button_of_a_scene_asks_for_a_film_and_the_page_plays_it(
+    client: httpx.Client, world: tuple[Settings, Database, Stores]
+) -> None:
+    _, database, stores = world
+    scene = register(tiny_scene(), database, stores.artifacts)
+    assert "Nothing has been filmed yet" in card(client, scene)
+    assert f'name="id" value="{scene}"' in card(client, scene)
+    own = {"origin": str(client.base_url).rstrip("/")}
+    asked = client.post("/dashboard/start/video", data={"of": "scene", "id": scene}, headers=own)
+    assert asked.status_code == 303
+    assert "follow its job" in card(client, scene) and "<video" not in card(client, scene)
+    with database.session() as session:
+        (waiting,) = leases.publishable(session)
+        lease = leases.claim(session, waiting.shard_id, "test", 60.0)
+        made = stores.artifacts.put_bytes(FILM, "film.mp4", "video/mp4").model_dump()
+        assert lease is not None
+        assert leases.complete(session, lease, {"report": REPORT, "artifacts": [made]}, made["sha256"])
+    with database.reading() as session:
+        (film,) = videos.list_videos(session).data
+    shown = card(client, scene)
+    address = f"/dashboard/videos/{film.id}/film.mp4"
+    for text in (
+        f'src="{address}"',
+        "12 frames",
+        "4 Gaussians",
+        "PSNR 31.2",
+        "SSIM 0.943",
+        "camera of the scene",
+    ):
+        assert text in shown, text
+    whole = client.get(address)
+    assert (whole.status_code, whole.content, whole.headers["content-type"]) == (200, FILM, "video/mp4")
+    part = client.get(address, headers={"Range": "bytes=10-19"})
+    assert (part.status_code, part.content) == (206, FILM[10:20])
+    assert part.headers["content-range"] == "bytes 10-19/200"
+    assert client.get(address, headers={"Range": "bytes=900-"}).status_code == 416
+    assert "media-src 'self'" in client.get(f"/dashboard/scenes/{scene}").headers["content-security-policy"]
+    job_page = client.get(asked.headers["location"]).text
+    assert f"/dashboard/videos/{film.id}" in job_page
+    there = client.get(f"/dashboard/videos/{film.id}")
+    assert there.status_code == 303 and there.headers["location"] == f"/dashboard/scenes/{scene}#films"
+    form = client.get(f"/dashboard/start/video?job={film.job_id}").text
+    assert f'value="{scene}"' in form and 'name="config.azimuth_deg"' in form
+    assert client.post(f"/dashboard/delete/video/{film.id}", headers=own).status_code == 303
+    assert "Nothing has been filmed yet" in card(client, scene)
+    assert client.get(address).status_code == 404
+
+
+@pytest.mark.parametrize(
+    ("of", "source", "page"),
+    [
+        ("scene", "scn_1", "/scenes/scn_1"),
+        ("fit", "fit_1", "/scenes/scn_1?fit=fit_1"),
+        ("model", "beam:3", "/models/beam/3"),
+        ("rollout", "rol_1", "/rollouts/rol_1"),
+    ],
+)
+def test_a_film_is_played_on_the_page_of_what_it_shows(of: str, source: str, page: str) -> None:
+    film = Video.model_validate(
+        {
+            "id": "vid_1", "of": of, "source_id": source, "scene_id": "scn_1", "state": "ready",
+            "created_at": datetime.now(UTC), "job_id": "job_1", "config": VideoConfig(),
+        }
+    )  # fmt: skip
+    assert page_of(film) == page

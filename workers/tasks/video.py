@@ -1,0 +1,238 @@
+"""Draws a film: the motion of a recording, a twin, a model's prediction or a rollout, as the command line does.
+
+A scene may have pictures beside its archive (``physworld_storage.videos.put_picture``): ``splat.ply`` is its object in
+the first frame, ``camera.json`` where its pictures were taken from, ``frames.npz`` these pictures, ``frames``
+(T, H, W, 3) uint8 and, where the object's pixels are known, ``masks`` (T, H, W). They come from strangers and are read
+here, within the limits of archives.
+
+The file is ``film.mp4`` (H.264). A film of the recording's own motion, seen from the pictures' camera, is scored
+against them frame by frame; otherwise the report says why it is not.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import ValidationError
+
+from physworld.arrays import Array
+from physworld.camera import Camera
+from physworld.video import (
+    Drawing,
+    checked_motion,
+    compare_frames,
+    eight_bit,
+    encode_mp4,
+    frames_per_second,
+    from_ply,
+    whole_motion_view,
+)
+from physworld.video.gaussians import Gaussians
+from physworld_scenes.archives import ArchiveLimits, read_arrays
+from physworld_scenes.measured import hold
+from physworld_schemas.base import Reference
+from physworld_schemas.video import FILM, MOST_FRAMES, CameraView, VideoConfig, VideoReport, VideoScores
+from physworld_storage import resources
+from physworld_workers.context import HandlerResult, TaskContext
+from physworld_workers.lineage import lineage_of
+from physworld_workers.stores import Stores
+from physworld_workers.tasks.inputs import npz_arrays, scene_of, scene_reference
+
+SPLAT, CAMERA, FRAMES = "splat.ply", "camera.json", "frames.npz"
+PICTURE_LIMITS = ArchiveLimits(total_bytes=2 << 30, members=8, ratio=2000.0)
+MOVING = {"fit": ("particles", "tracks"), "model": ("tracks",), "rollout": ("vertices", "points")}
+"""What is drawn of the arrays of each kind: the first of these names that they hold."""
+
+SeenFrom = Literal["given", "scene", "whole"]
+
+
+def run(context: TaskContext, stores: Stores) -> HandlerResult:
+    """Read, draw, compare, store."""
+    started = time.perf_counter()
+    payload = context.lease.payload
+    config = VideoConfig.model_validate(payload["config"])
+    moved, times = motion_of(stores, payload, config.candidate)
+    pictures = _pictures_of(stores, payload["scene_id"])
+    camera, seen_from = _camera(config, moved, stores, pictures)
+    splat = _splat(stores, pictures) if config.look == "auto" else None
+    drawing = Drawing(moved, moved[0], camera, splat, stores.settings.device)
+    frames, not_scored = _frames_to_match(stores, pictures, payload["of"], seen_from, camera, len(moved))
+    scoring = Scoring(frames)
+
+    def drawn() -> Iterator[Array]:
+        context.progress(0, len(moved), "frames", "drawing")
+        for number, picture in enumerate(drawing.frames()):
+            context.check()
+            colours = eight_bit(picture)
+            scoring.add(number, colours, picture.alpha)
+            yield colours
+            context.progress(number + 1, len(moved), "frames", "drawing")
+
+    film = stores.artifacts.put_bytes(encode_mp4(drawn(), frames_per_second(times)), FILM, "video/mp4")
+    context.check()
+    report = VideoReport(
+        frames=len(moved),
+        fps=frames_per_second(times),
+        drawn="points" if splat is None else "splat",
+        gaussians=drawing.gaussians,
+        seen_from=seen_from,
+        camera=_view_of(camera),
+        scores=scoring.result(),
+        not_scored=not_scored,
+        seconds=time.perf_counter() - started,
+    )
+    inputs = [Reference.model_validate(payload["source"])]
+    if payload["of"] != "scene":
+        inputs.append(scene_reference(stores, payload["scene_id"]))
+    inputs += [Reference(kind="artifact", id=name, digest=digest) for name, digest in pictures.items()]
+    made_by = lineage_of(inputs, {"video": payload["config"]}, {}, stores.settings.device)
+    result = {"report": report.model_dump(mode="json"), "artifacts": [film.model_dump(mode="json")]}
+    return HandlerResult({**result, "lineage": made_by}, film.sha256)
+
+
+def motion_of(stores: Stores, payload: dict[str, Any], candidate: int) -> tuple[Array, Array]:
+    """Points (T, n, 3) [m] that move, and the frames' times (T,) [s]. Raises ValueError with the numbers."""
+    of, source = payload["of"], payload["source"]["id"]
+    if of == "scene":
+        scene = scene_of(stores, payload["scene_id"])
+        seen = scene.visible.any(axis=0)
+        if np.count_nonzero(seen) < 2:
+            raise ValueError(
+                f"{np.count_nonzero(seen)} points of scene {source} are ever seen; a film needs 2"
+            )
+        moved = np.where(scene.visible[..., None], scene.points, hold(scene.points, scene.visible))[:, seen]
+        times = scene.times
+    else:
+        arrays = npz_arrays(stores.artifacts.read_bytes(payload["motion"]))
+        name = next((key for key in MOVING[of] if key in arrays), None)
+        if name is None:
+            raise ValueError(
+                f"the arrays of {of} {source} are {sorted(arrays)}, none of {', '.join(MOVING[of])}"
+            )
+        moved, times = arrays[name], arrays["times"]
+        if moved.ndim == 4:
+            if candidate >= len(moved):
+                raise ValueError(
+                    f"{of} {source} has {len(moved)} candidates; there is no candidate {candidate}"
+                )
+            moved = moved[candidate]
+    moved = checked_motion(moved, f"the motion of {of} {source}")
+    if len(times) != len(moved):
+        raise ValueError(f"{of} {source} has {len(times)} times for {len(moved)} frames")
+    if len(moved) > MOST_FRAMES:
+        raise ValueError(f"{of} {source} has {len(moved)} frames; a film has at most {MOST_FRAMES}")
+    return moved, np.asarray(times, dtype=np.float64)
+
+
+@dataclass
+class Scoring:
+    """Scores of a film, frame by frame as it is drawn.
+
+    Attributes:
+        given: ``frames`` (T, H, W, 3) and, if there are some, ``masks`` (T, H, W); None scores nothing.
+        found: by name, one number a frame.
+    """
+
+    given: dict[str, Array] | None
+    found: dict[str, list[float]] = field(default_factory=dict)
+
+    def add(self, number: int, colours: Array, coverage: Array) -> None:
+        """Compare one frame: colours (H, W, 3) uint8, coverage (H, W) in [0, 1]."""
+        if self.given is None:
+            return
+        masks = self.given.get("masks")
+        scores = compare_frames(
+            colours[None],
+            self.given["frames"][number : number + 1],
+            None if masks is None else coverage[None],
+            None if masks is None else masks[number : number + 1],
+        )
+        for name, values in scores.per_frame.items():
+            self.found.setdefault(name, []).append(float(values[0]))
+
+    def result(self) -> VideoScores | None:
+        """Means and frames; equal frames have no finite PSNR and stay out of its mean."""
+        if self.given is None:
+            return None
+        ratios = [value if np.isfinite(value) else None for value in self.found["psnr_db"]]
+        finite = [value for value in ratios if value is not None]
+        overlaps = self.found.get("iou")
+        return VideoScores(
+            psnr_db=float(np.mean(finite)) if finite else None,
+            ssim=float(np.mean(self.found["ssim"])),
+            iou=None if overlaps is None else float(np.mean(overlaps)),
+            psnr_db_per_frame=ratios,
+            ssim_per_frame=self.found["ssim"],
+            iou_per_frame=overlaps,
+        )
+
+
+def _pictures_of(stores: Stores, scene_id: str) -> dict[str, str]:
+    """Digests of the pictures beside the scene, by name."""
+    with stores.database.reading() as session:
+        artifacts = resources.get_scene(session, scene_id).artifacts
+    return {item.name: item.sha256 for item in artifacts if item.name in (SPLAT, CAMERA, FRAMES)}
+
+
+def _camera(
+    config: VideoConfig, moved: Array, stores: Stores, pictures: dict[str, str]
+) -> tuple[Camera, SeenFrom]:
+    if config.camera is not None:
+        return camera_of(config.camera), "given"
+    if config.view == "auto" and CAMERA in pictures:
+        try:
+            view = CameraView.model_validate(json.loads(stores.artifacts.read_bytes(pictures[CAMERA])))
+        except (ValidationError, UnicodeDecodeError, json.JSONDecodeError) as error:
+            raise ValueError(f"{CAMERA} of the scene is no camera: {error}") from error
+        return camera_of(view), "scene"
+    angles = (config.azimuth_deg, config.elevation_deg)
+    return whole_motion_view(moved, *angles, config.width, config.height), "whole"
+
+
+def camera_of(view: CameraView) -> Camera:
+    """The library's camera. Raises ValueError for a transform that is not rigid."""
+    given = view.model_dump(exclude={"world_to_camera"})
+    return Camera(**given, world_to_camera=np.asarray(view.world_to_camera, dtype=np.float64))
+
+
+def _view_of(camera: Camera) -> CameraView:
+    numbers = {name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy")}
+    sizes = {"width": camera.width, "height": camera.height}
+    return CameraView(**sizes, **numbers, world_to_camera=camera.world_to_camera.tolist())
+
+
+def _splat(stores: Stores, pictures: dict[str, str]) -> Gaussians | None:
+    if SPLAT not in pictures:
+        return None
+    return from_ply(stores.artifacts.read_bytes(pictures[SPLAT]))
+
+
+def _frames_to_match(
+    stores: Stores, pictures: dict[str, str], of: str, seen_from: SeenFrom, camera: Camera, count: int
+) -> tuple[dict[str, Array] | None, str]:
+    """The pictures that the film is scored against, or None and why there are none."""
+    if FRAMES not in pictures:
+        return None, "the scene has no pictures"
+    if of == "rollout":
+        return None, "a rollout has a motion of its own, which the scene's pictures do not show"
+    if seen_from == "whole":
+        return None, "the film is not seen from the camera of the scene's pictures"
+    found = read_arrays(stores.artifacts.read_bytes(pictures[FRAMES]), PICTURE_LIMITS)
+    frames, masks = found.get("frames"), found.get("masks")
+    if frames is None or frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype != np.uint8:
+        shown = {name: f"{array.dtype} {array.shape}" for name, array in found.items()}
+        raise ValueError(f"{FRAMES} of the scene must hold frames (T, H, W, 3) uint8, it holds {shown}")
+    wanted = (count, camera.height, camera.width)
+    if frames.shape[:3] != wanted:
+        return None, (
+            f"the scene's pictures are {frames.shape[0]} of {frames.shape[2]} x {frames.shape[1]} px, the film has "
+            f"{count} of {camera.width} x {camera.height} px"
+        )
+    if masks is not None and masks.shape != wanted:
+        raise ValueError(f"masks in {FRAMES} of the scene have shape {masks.shape}, its frames {wanted}")
+    return {"frames": frames} if masks is None else {"frames": frames, "masks": masks}, ""
