@@ -124,6 +124,7 @@ def test_the_splat_and_the_camera_of_the_scene_are_taken_and_its_pictures_compar
     scores = second.report.scores if second.report else None
     assert scores is not None and second.report is not None and second.report.not_scored == ""
     assert scores.psnr_db is not None and scores.psnr_db > 25 and scores.ssim > 0.9 and scores.iou is not None
+    assert min(value or 0.0 for value in scores.psnr_db_per_frame) > 25  # each frame against its own picture
     assert scores.iou > 0.5 and len(scores.psnr_db_per_frame) == len(scores.ssim_per_frame) == len(pictures)
     keep(stores, scene_id, "frames.npz", npz(frames=255 - pictures))
     _, _, third = drawn(stores, runtime_with(), asked(stores, scene_id))
