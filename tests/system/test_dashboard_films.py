@@ -47,6 +47,7 @@ def add_film(world: World) -> None:
 
 def test_the_player_loads_the_film_and_fits_the_window(stranger: Visit, world: World) -> None:
     add_film(world)
+    stranger.open("/login")
     stranger.login(world.admin_token)
     for width in WIDTHS:
         stranger.page.set_viewport_size({"width": width, "height": 900})
