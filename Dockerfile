@@ -35,6 +35,7 @@ COPY physworld/ physworld/
 COPY services/__init__.py services/connections.py services/interpreter.py services/stores.py services/web.py physworld_services/
 COPY services/api/ physworld_services/api/
 COPY services/dashboard/ physworld_services/dashboard/
+COPY services/guide/ physworld_services/guide/
 USER 10001:10001
 EXPOSE 8000
 CMD ["python", "-m", "physworld_services.web", "--host", "0.0.0.0", "--port", "8000"]

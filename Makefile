@@ -5,6 +5,9 @@
 # make up                  the embedded service in the foreground
 # make lock [UPGRADE=name] write requirements.lock anew; UPGRADE=all moves every package to its newest release
 # make catalogue           schemas/catalogue.json and the tables of it in docs/
+# make docs                the guide of docs/, which a running service serves at /docs/guide
+# make reference           docs/reference/, made of the command line's parser and of the catalogue
+# make wheels              both distributions in dist/, with the guide in them
 # make sdk                 the synchronous half of the SDK, made of the asynchronous one
 # make audit               the SBOM (build/sbom.cdx.json), and known vulnerabilities of the locked packages
 SHELL := /bin/bash
@@ -14,7 +17,7 @@ JOBS ?= 2
 BIN := .venv/bin
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test test-fast bench lint up clean install dev catalogue sdk lock audit
+.PHONY: demo test test-fast bench lint up clean install dev catalogue docs reference wheels sdk lock audit
 
 install:
 	@scripts/bootstrap.sh
@@ -48,6 +51,15 @@ bench:
 catalogue: dev
 	$(BIN)/python -m scripts.catalogue
 
+docs: dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --clean
+
+reference: dev
+	$(BIN)/python -m scripts.make_reference
+
+wheels: docs
+	$(BIN)/python -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist . ./clients/python
+
 sdk: dev
 	$(BIN)/python scripts/make_sdk.py
 
@@ -62,6 +74,6 @@ audit: dev
 	$(BIN)/pip-audit --requirement requirements.lock --disable-pip --no-deps --strict
 
 clean:
-	rm -rf .venv .bootstrap .demo .pytest_cache .ruff_cache .mypy_cache .hypothesis .import_linter_cache build
+	rm -rf .venv .bootstrap .demo .pytest_cache .ruff_cache .mypy_cache .hypothesis .import_linter_cache build services/guide/site
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 	find . -name '*.egg-info' -type d -prune -exec rm -rf {} +

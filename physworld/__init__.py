@@ -3,4 +3,4 @@
 World frame z up; metres, seconds, kilograms; axis order time, entity, xyz.
 """
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

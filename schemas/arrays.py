@@ -9,7 +9,7 @@ import base64
 import math
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, WithJsonSchema
 
 if TYPE_CHECKING:
     import numpy as np
@@ -22,7 +22,19 @@ PIECE_BYTES = 3 * 2**18
 """Base64 is written and read in pieces: one call would hold the interpreter for the whole array."""
 
 Side = Annotated[int, Field(ge=0, lt=2**31)]
-Nested = list[Any]
+
+
+def _listed(axes: int) -> dict[str, Any]:
+    """JSON schema of a list of lists of numbers."""
+    return {"type": "array", "items": {"type": "number"} if axes == 1 else _listed(axes - 1)}
+
+
+Nested = Annotated[
+    list[Any],
+    WithJsonSchema(
+        {"anyOf": [_listed(axes) for axes in (2, 3, 4)], "description": "Values as lists of lists."}
+    ),
+]
 
 
 class EncodedArray(BaseModel):

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Iterator
 from datetime import datetime
 from html import escape
-from typing import Annotated, Any, Generic, Literal, Self, TypeVar
+from typing import Annotated, Any, Generic, Literal, Self, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
@@ -21,7 +21,7 @@ LINE, LONGEST_TEXT = 120, 40
 """Characters of the line that an object is shown in, and of a text in it."""
 _LITERAL = "{said}"
 _PLAIN = frozenset({float, int, bool, type(None)})
-Seed = Annotated[int, Field(ge=0, lt=2**63)]
+Seed = Annotated[int, Field(ge=0, lt=2**63, json_schema_extra={"format": "int64"})]
 
 
 class Request(BaseModel):
@@ -35,6 +35,10 @@ class Request(BaseModel):
         """Refuse text that Postgres keeps neither as text nor in JSON: NUL, and halves of surrogate pairs."""
         if _holds_unstorable(value):
             raise ValueError("holds a NUL character or half of a surrogate pair")
+        if isinstance(value, dict):
+            for name, field in cls.model_fields.items():
+                if isinstance(value.get(name), bool) and _is_number(field.annotation):
+                    raise ValueError(f"{name}: true and false are no numbers")
         return value
 
     @model_validator(mode="wrap")
@@ -160,6 +164,12 @@ def _holds_unstorable(value: Any) -> bool:
         elif isinstance(part, list):
             waiting += [item for item in part if type(item) not in _PLAIN]
     return False
+
+
+def _is_number(annotation: Any) -> bool:
+    """Whether a field takes numbers and neither true nor false."""
+    kinds = get_args(annotation) or (annotation,)
+    return bool not in kinds and (int in kinds or float in kinds)
 
 
 def _told(fault: ErrorDetails, known: Iterable[str]) -> InitErrorDetails:

@@ -20,7 +20,7 @@ Place = tuple[Coordinate, Coordinate, Coordinate]
 class PointGoal(Request):
     """Measured points ``index`` of the scene, (M,), to be at ``places`` [m], (M, 3)."""
 
-    kind: Literal["points"] = Field(default="points", description="Goal by points.")
+    kind: Literal["points"] = Field(description="Goal by points.")
     index: list[Annotated[int, Field(ge=0)]] = Field(
         min_length=1, max_length=10_000, description="Measured points of the scene.", examples=[[0]]
     )
@@ -44,7 +44,7 @@ class PointGoal(Request):
 class ShapeGoal(Request):
     """The whole body to take a shape, a cloud of points [m], (M, 3): two-way Chamfer distance to it."""
 
-    kind: Literal["shape"] = Field(default="shape", description="Goal by shape.")
+    kind: Literal["shape"] = Field(description="Goal by shape.")
     shape: ArrayInput = Field(
         description="Points of the wanted shape, (M, 3).", json_schema_extra={"unit": "m"}
     )

@@ -40,13 +40,35 @@ class Quality(Resource):
     still grips, over that in the first.
     """
 
-    verdict: Literal["passed", "failed", "unknown"] = "unknown"
-    reasons: list[str] = Field(default_factory=list)
-    metric: str | None = None
-    model_m: float | None = None
-    baselines_m: dict[str, float] = Field(default_factory=dict)
-    noise_floor_m: float | None = None
-    energy_growth: float | None = None
+    verdict: Literal["passed", "failed", "unknown"] = Field(
+        default="unknown", description="Whether it is good enough to become `latest`; unknown counts as good."
+    )
+    reasons: list[str] = Field(default_factory=list, description="Why it failed, each with its numbers.")
+    metric: str | None = Field(
+        default=None,
+        description="Metric by which its errors were judged; null: by none.",
+        examples=["track_m"],
+    )
+    model_m: float | None = Field(
+        default=None,
+        description="Its mean held-out error; null: it left the numbers, or was not judged.",
+        json_schema_extra={"unit": "m"},
+    )
+    baselines_m: dict[str, float] = Field(
+        default_factory=dict,
+        description="Mean held-out errors of the baselines, by name.",
+        json_schema_extra={"unit": "m"},
+    )
+    noise_floor_m: float | None = Field(
+        default=None,
+        description="What a perfect prediction would show; null: the noise is not declared.",
+        json_schema_extra={"unit": "m"},
+    )
+    energy_growth: float | None = Field(
+        default=None,
+        description="Kinetic energy in the last quarter of the time with still grips over that in the first.",
+        json_schema_extra={"unit": "1"},
+    )
 
 
 def quality_of(metrics: Mapping[str, Any]) -> Quality:

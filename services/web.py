@@ -1,4 +1,4 @@
-"""The web process: REST API, dashboard and documentation in one application.
+"""The web process: REST API, dashboard, guide and documentation of the API in one application.
 
 ``python -m physworld_services.web --host 127.0.0.1 --port 8000``, or any ASGI server on the factory
 ``physworld_services.web:create_app``. It reads and writes the database and the store; it never talks to the broker.
@@ -15,7 +15,7 @@ import uvicorn
 from fastapi import FastAPI
 from fastapi.responses import RedirectResponse
 
-from physworld_services import interpreter
+from physworld_services import guide, interpreter
 from physworld_services.api.app import create_api
 from physworld_services.api.logs import configure_logs
 from physworld_services.connections import Connection, Session
@@ -40,6 +40,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     database, stores = open_all(settings)
     app = create_api(settings, database, stores)
     mount_dashboard(app, settings, database, stores)
+    guide.mount(app)
 
     @app.get("/", include_in_schema=False)
     def home() -> RedirectResponse:

@@ -35,5 +35,5 @@ def lineage_of(
 
 
 def code_version() -> str:
-    """The version of this code, e.g. ``physworld 0.1.0``; the images hold it without installing a distribution."""
+    """The version of this code, e.g. ``physworld 0.2.0``; the images hold it without installing a distribution."""
     return f"physworld {physworld.__version__}"

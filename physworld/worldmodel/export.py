@@ -83,7 +83,7 @@ class StepProgram(nn.Module):
         n, count, frame = self.objects, self.vertices, self.frame
         moved_to = control_next
         if frame is not None:
-            turn, local, ahead_of = enter(frame, window[:, :, None], control_next[:, None], n)
+            turn, local, ahead_of = enter(frame, window[:, :, None], control_next[:, None])
             window, control_next = local[:, :, 0], ahead_of[:, 0]
         prior = self.prior(window[:, :, None], control_next[:, None], phi[:, None])[:, 0]
         ahead = torch.cat([prior, control_next])

@@ -11,6 +11,7 @@ import anyio
 from fastapi import APIRouter, FastAPI
 from fastapi_offline import FastAPIOffline
 
+import physworld
 from physworld_services.api import errors, routes
 from physworld_services.api.access import Access
 from physworld_services.api.attempts import Attempts
@@ -28,7 +29,7 @@ from physworld_services.stores import Stores
 from physworld_storage.database import Database
 from physworld_storage.settings import Settings
 
-VERSION = "0.1.0"
+VERSION = physworld.__version__
 PREFIX = "/v1"
 ABSENT = "0" * 64  # the digest of no artifact
 PARALLEL_UPLOADS = 2  # each by a process of its own

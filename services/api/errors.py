@@ -17,6 +17,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from sqlalchemy.exc import DataError
 from starlette.exceptions import HTTPException
+from starlette.routing import compile_path
 
 from physworld_scenes.errors import SceneInvalid
 from physworld_schemas.base import FieldError, Problem
@@ -37,6 +38,8 @@ from physworld_storage.errors import (
 PROBLEM_MEDIA_TYPE = "application/problem+json"
 TYPE_PREFIX = "urn:physworld:problem:"
 
+UNREAD = "There was an error parsing the body"
+"""What the framework says, with 400, of a body that is no JSON in UTF-8."""
 _CODES = {
     400: "bad_request",
     401: "unauthenticated",
@@ -193,8 +196,12 @@ async def _http(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, HTTPException)
     if isinstance(error, ApiProblem):
         return answer(error, request.scope)
-    status = error.status_code
+    status, headers = error.status_code, error.headers
     detail = str(error.detail)
+    if detail == UNREAD:
+        status, detail = 422, "the body is no JSON in UTF-8, or not of the form that this address takes"
+    if status == 405:
+        headers = {"Allow": ", ".join(sorted(_methods_at(request))) or (headers or {}).get("Allow", "")}
     if detail == HTTPStatus(status).phrase:
         detail = f"{detail}: {request.method} {request.url.path}"
     return problem_response(
@@ -202,8 +209,18 @@ async def _http(request: Request, error: Exception) -> JSONResponse:
         _CODES.get(status, "error"),
         detail,
         request_id=request_id_of(request.scope),
-        headers=error.headers,
+        headers=headers,
     )
+
+
+def _methods_at(request: Request) -> set[str]:
+    """All methods that the document has for this address: the framework's answer names those of one route alone."""
+    paths: dict[str, dict[str, object]] = request.app.openapi()["paths"]
+    here = [path for path in paths if compile_path(path)[0].match(request.url.path)]
+    nearest = min(
+        here, key=lambda path: path.count("{"), default=None
+    )  # /scenes/preview is no /scenes/{scene_id}
+    return set() if nearest is None else {method.upper() for method in paths[nearest]}
 
 
 async def _invalid(request: Request, error: Exception) -> JSONResponse:

@@ -46,7 +46,12 @@ MULTIPART_BODY: dict[str, Any] = {
                             "description": "zip or tar of scene.json and scene.npz, PhysTwin's "
                             "final_data.pkl, or a table of markers (GET /v1/importers)",
                         },
-                        "name": {"type": "string", "minLength": 1, "maxLength": 128},
+                        "name": {
+                            "type": "string",
+                            "minLength": 1,
+                            "maxLength": 128,
+                            "description": "name of the scene, in the place of the one that it brings",
+                        },
                         "options": {"type": "string", "description": "a SceneImport as JSON"},
                     },
                 },

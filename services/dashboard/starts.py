@@ -155,7 +155,11 @@ def _plan(site: Site, body: PlanForm) -> Opening:
     recording = _recording_of(site, body.model, body.version)
     seen = np.flatnonzero(recording.visible[0])
     places = recording.points[0, seen] + np.array([body.shift_x_m, body.shift_y_m, body.shift_z_m])
-    goal = PointGoal(index=[int(point) for point in seen], places=[tuple(place) for place in places.tolist()])
+    goal = PointGoal(
+        kind="points",
+        index=[int(point) for point in seen],
+        places=[tuple(place) for place in places.tolist()],
+    )
     asked = PlanCreate(
         model=body.model, version=body.version, goal=goal, limits=PlanLimits(), config=body.config
     )

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from physworld.arrays import Array
 
@@ -73,6 +72,8 @@ def body_surface(twin: Mapping[str, Array], rest: Array) -> Surface | None:
     points, triangles = cell_surface(cells, fill > FILLED, twin["lattice_origin"], twin["lattice_spacing"])
     if not 0 < len(triangles) <= MOST_TRIANGLES or len(rest) <= NEIGHBOURS:
         return None
+    from scipy.spatial import cKDTree  # half a second: not before somebody plays
+
     tree = cKDTree(rest)
     distance, index = tree.query(points, CARRIERS)
     weight = 1.0 / np.maximum(distance, 1e-3 * np.ptp(rest)) ** 2

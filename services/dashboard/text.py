@@ -12,6 +12,7 @@ from physworld_schemas.wording import roughly
 
 _AGES = ((60, 1, "s"), (3600, 60, "min"), (86_400, 3600, "h"), (30 * 86_400, 86_400, "d"))
 DASH = "–"
+NEXT_TO_NOTHING = 1e-6
 
 
 def utc_now() -> datetime:
@@ -107,7 +108,9 @@ def measured(value: float | None, unit: str) -> str:
 
 
 def _fixed(value: float, digits: int) -> str:
-    """Decimal notation with ``digits`` significant digits, zeros at the end kept."""
+    """Decimal notation with ``digits`` significant digits, zeros at the end kept; what is next to nothing is 0."""
+    if 0 < abs(value) < NEXT_TO_NOTHING:
+        return "0"
     places = digits - 1 - math.floor(math.log10(abs(value))) if value else digits - 1
     return f"{value:,.{max(0, places)}f}"
 

@@ -231,7 +231,7 @@ def _fit_result(world: World, recording: Scene) -> dict[str, Any]:
         "parameters": {"youngs_modulus": parameter, "density": density},
         "metrics": {"held_out": held_out(recording, PREDICTORS[:4])},
         "artifacts": [prediction.model_dump()],
-        "lineage": {"code_version": "0.1.0", "seeds": {"fit": 0}, "device": "cpu"},
+        "lineage": {"code_version": "0.2.0", "seeds": {"fit": 0}, "device": "cpu"},
     }
 
 
@@ -277,7 +277,7 @@ def _training_result(world: World, recording: Scene) -> dict[str, Any]:
             "noise_floor_m": 3.2e-4,
             "seconds": {"training": 91.0},
         },
-        "lineage": {"code_version": "0.1.0", "seeds": {"training": 7}, "device": "cpu"},
+        "lineage": {"code_version": "0.2.0", "seeds": {"training": 7}, "device": "cpu"},
     }
 
 

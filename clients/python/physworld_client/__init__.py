@@ -44,7 +44,7 @@ from physworld_client.errors import (
 )
 from physworld_client.tables import to_pandas
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "ApiError",

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from physworld_schemas.job import Event
 
 MM = 1e3
-DWARFS = 30.0
+DWARFS = 10.0
 """From this ratio of the largest to the smallest on, an axis is logarithmic."""
 PREDICTORS: dict[str, tuple[str, str, str]] = {
     "static": ("static", "#8a96a2", ":"),

@@ -35,7 +35,7 @@ RETRY_AFTER_LIMIT_S = 60.0
 LONG_POLL_MARGIN_S = 10.0
 DEFAULT_TIMEOUT_S = 30.0
 DEFAULT_MAX_RETRIES = 4
-USER_AGENT = "physworld-client/0.1.0"
+USER_AGENT = "physworld-client/0.2.0"
 
 
 @dataclass

@@ -121,7 +121,7 @@ def _cross(left: Tensor, right: Tensor) -> Tensor:
 
 
 def enter(
-    frame: GripFrame, window: Tensor, control_next: Tensor, n: int
+    frame: GripFrame, window: Tensor, control_next: Tensor
 ) -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:
     """A window and the control vertices in the frame of that moment: (R, c̄), (h+1, V, B, 3) and (C, B, 3).
 

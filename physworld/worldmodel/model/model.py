@@ -287,7 +287,7 @@ class WorldModel(nn.Module):
             ahead = torch.cat([self.prior(window, control_next, phi), control_next])
             correction = self.forward(window, ahead, phi, constants)
             return torch.cat([ahead[:n] + self.norm.change * correction, control_next])
-        turn, local, control_local = enter(frame, window, control_next, n)
+        turn, local, control_local = enter(frame, window, control_next)
         ahead = torch.cat([self.prior(local, control_local, phi), control_local])
         correction = self.forward(local, ahead, phi, constants)
         moved = leave(frame, turn, ahead[:n] + self.norm.change * correction)

@@ -27,14 +27,14 @@ def prior_step(
 
 def framed_prior(step: nn.Module, spec: GraphSpec) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
     """x̂^{t+1} in world axes by a prior's ``step``, which is taken in the grip's frame where the graph has one."""
-    frame, n = spec.frame, spec.object_count
+    frame = spec.frame
 
     def ahead(window: Tensor, control_next: Tensor, phi: Tensor) -> Tensor:
         found: Tensor
         if frame is None:
             found = step(window, control_next, phi)
             return found
-        turn, local, control_local = enter(frame, window, control_next, n)
+        turn, local, control_local = enter(frame, window, control_next)
         found = leave(frame, turn, step(local, control_local, phi))
         return found
 

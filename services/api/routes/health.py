@@ -23,8 +23,8 @@ _CODES = {"database": "database_unavailable", "store": "store_read_failed"}
 class Health(Resource):
     """The answer of a health check: which parts answered."""
 
-    status: str
-    checks: dict[str, str] = Field(default_factory=dict)
+    status: str = Field(description="`ok`.", examples=["ok"])
+    checks: dict[str, str] = Field(default_factory=dict, description="What each part said, by its name.")
 
 
 @router.get("/health/live")

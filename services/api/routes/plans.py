@@ -71,7 +71,7 @@ def _checked(body: PlanCreate, points: int) -> PlanCreate:
         shape = read_array(body.goal.shape, "goal.shape", (2,), FARTHEST_M)
         if shape.shape[1] != 3 or len(shape) > MOST_SHAPE_POINTS:
             raise invalid("goal.shape", f"goal.shape is {shape.shape}, not (M <= {MOST_SHAPE_POINTS}, 3)")
-        return body.model_copy(update={"goal": ShapeGoal(shape=EncodedArray.of(shape))})
+        return body.model_copy(update={"goal": ShapeGoal(kind="shape", shape=EncodedArray.of(shape))})
     beyond = [index for index in body.goal.index if index >= points]
     if beyond:
         raise invalid("goal.index", f"goal.index holds {beyond[:5]}; the scene has {points} points")

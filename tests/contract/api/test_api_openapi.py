@@ -65,6 +65,36 @@ def test_every_operation_is_described_and_names_its_problems(document: dict[str,
                 assert list(answer["content"]) == ["application/problem+json"], f"{method} {path} {status}"
 
 
+def test_nothing_in_the_document_is_without_words(document: dict[str, Any]) -> None:
+    mute = [*_mute(document["components"]["schemas"], "schemas"), *_mute(document["paths"], "paths")]
+    mute += [
+        name for name, schema in document["components"]["schemas"].items() if not schema.get("description")
+    ]
+    for method, path, operation in operations(document):
+        parts = [(p["name"], p) for p in operation.get("parameters", ())] + [*operation["responses"].items()]
+        mute += [f"{method} {path} {name}" for name, part in parts if not part.get("description")]
+    assert not mute
+    assert "cursor" in document["info"]["description"]
+
+
+def _mute(part: Any, place: str) -> Iterator[str]:
+    """Places of the properties without a description, anywhere in a part of the document."""
+    if isinstance(part, list):
+        for index, item in enumerate(part):
+            yield from _mute(item, f"{place}[{index}]")
+    if not isinstance(part, dict):
+        return
+    for name, item in part.items():
+        yield from _mute(item, f"{place}.{name}")
+        if name == "properties" and all(isinstance(schema, dict) for schema in item.values()):
+            yield from (f"{place}.{field}" for field, schema in item.items() if not schema.get("description"))
+
+
+def test_a_field_that_lost_its_words_would_be_found() -> None:
+    told = {"properties": {"a": {"description": "A.", "items": {"properties": {"b": {"type": "string"}}}}}}
+    assert list(_mute(told, "schemas")) == ["schemas.properties.a.items.b"]
+
+
 def test_requests_made_from_the_document_are_answered_as_it_says(
     service: Service, document: dict[str, Any]
 ) -> None:

@@ -165,3 +165,23 @@ def test_logs_are_json_lines_with_the_request_id(tmp_path: Path, monkeypatch: py
         ("/v1/jobs", 401, "mine")
     ]
     assert requests[0]["level"] == "info"
+
+
+def test_a_body_that_is_no_text_is_refused_as_the_document_says(client: httpx.Client) -> None:
+    headers = {"Content-Type": "application/json"}
+    answer = client.post("/v1/fits", content=b"\xff\xfe{", headers=headers)
+    assert_problem(answer, 422, "invalid_request")
+    assert "UTF-8" in answer.json()["detail"]
+
+
+def test_allow_names_every_method_of_an_address(client: httpx.Client) -> None:
+    for path, methods in (
+        ("/v1/scenes", {"GET", "POST"}),
+        ("/v1/scenes/preview", {"POST"}),
+        ("/v1/fits/fit_x", {"DELETE", "GET"}),
+        ("/v1/models/m/versions/1", {"DELETE", "GET", "PATCH"}),
+        ("/v1/models/m/aliases/a", {"DELETE", "PUT"}),
+    ):
+        answer = client.request("TRACE", path)
+        assert answer.status_code == 405
+        assert set(answer.headers["Allow"].split(", ")) == methods, path

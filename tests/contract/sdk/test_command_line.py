@@ -298,4 +298,4 @@ def test_a_report_that_is_none_is_named(tmp_path: Path) -> None:
 
 def test_the_version_is_that_of_the_distribution(tmp_path: Path) -> None:
     done = physworld(None, tmp_path, "version")
-    assert (done.returncode, done.stdout) == (0, "0.1.0\n")
+    assert (done.returncode, done.stdout) == (0, "0.2.0\n")

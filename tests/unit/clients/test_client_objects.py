@@ -16,13 +16,13 @@ import pytest
 from physworld_client import AsyncClient, Client, types
 from physworld_client.errors import ExtraMissing, NothingToPlot, PhysWorldError
 from physworld_client.pages import AsyncListPage, ListPage
-from physworld_client.plots import PREDICTORS
+from physworld_client.plots import DWARFS, PREDICTORS
 from physworld_client.predictions import Predicted
 from physworld_client.types import Dataset, Event, Fit, Job, ModelComparison, ModelVersion, Scene, Trace
 from physworld_client.world_model import WorldModel
 from pydantic import BaseModel
 
-from physworld.report import predictors
+from physworld.report import predictors, svg
 
 matplotlib.use("Agg")
 AT = datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)
@@ -182,6 +182,7 @@ def test_predictors_have_the_names_and_colours_of_the_pages() -> None:
     for name, (label, colour, _) in PREDICTORS.items():
         shown = predictors.PREDICTORS[name]
         assert (shown.label, f"--{shown.role}: {colour};" in light) == (label, True), name
+    assert DWARFS == svg.DWARFS
 
 
 def test_everything_shows_itself_in_one_line() -> None:

@@ -67,7 +67,7 @@ def test_a_body_in_free_fall_moves_steadily_in_the_frame() -> None:
     places = torch.as_tensor(falling[:, None, None])
     controls = torch.as_tensor(frame.shape[:, None] + 0.5)
     window = torch.cat([places[:4], controls.expand(4, -1, -1, -1)], dim=1)
-    turn, local, _ = enter(frame, window, controls, 1)
+    turn, local, _ = enter(frame, window, controls)
     moves = local[1:, 0, 0] - local[:-1, 0, 0]
     assert (moves - moves[0]).abs().max() < 1e-12
     ahead = leave(frame, turn, (local[-1, :1] + moves[-1]))

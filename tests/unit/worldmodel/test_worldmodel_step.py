@@ -158,7 +158,7 @@ def plain_peer(model: WorldModel, given: Inputs) -> np.ndarray:
     window, control, phi = given.window[:, :, None], given.control_next[:, None], given.phi[:, None]
     turn = None
     if frame is not None:
-        turn, window, control = enter(frame, window, control, n)
+        turn, window, control = enter(frame, window, control)
     with torch.no_grad():
         ahead = torch.cat([model.prior(window, control, phi), control])
         ahead[:n] += model.norm.change * PlainNetwork(model)(window, ahead, phi)
