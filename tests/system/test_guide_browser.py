@@ -81,6 +81,13 @@ def test_a_notebook_shows_its_figures(page: Page, address: str) -> None:
     assert figure.evaluate("image => image.complete && image.naturalWidth") > 100
 
 
+def test_a_film_of_the_gallery_plays(page: Page, address: str) -> None:
+    page.goto(f"{address}/gallery.html")
+    film = page.locator("video").first
+    film.evaluate("film => film.play()")
+    assert film.evaluate("film => film.videoWidth") == 640
+
+
 @pytest.mark.parametrize(
     "path", ["", "models.html", "reference/commands.html", "notebooks/demonstrations.html"]
 )
