@@ -78,6 +78,7 @@ KINDS: dict[str, Removable] = {
             _by("trace", TraceRow.id, TraceRow.fit_id),
             _by("dataset", DatasetRow.id, DatasetRow.fit_id),
             _by("model", ModelVersionRow.name, ModelVersionRow.fit_id),
+            _by("video", VideoRow.id, VideoRow.source_id),
         ),
     ),
     "trace": Removable(
@@ -90,7 +91,7 @@ KINDS: dict[str, Removable] = {
     ),
     "dataset": Removable(DatasetRow, (_by("model", ModelVersionRow.name, ModelVersionRow.dataset_id),)),
     "assessment": Removable(AssessmentRow),
-    "rollout": Removable(RunRow),
+    "rollout": Removable(RunRow, (_by("video", VideoRow.id, VideoRow.source_id),)),
     "plan": Removable(RunRow),
     "video": Removable(VideoRow),
 }
@@ -131,6 +132,9 @@ def remove_version(session: Session, name: str, version: int) -> None:
             "assessment",
             AssessmentRow.id,
             lambda _: (AssessmentRow.name == name) & (AssessmentRow.version == version),
+        ),
+        Dependents(
+            "video", VideoRow.id, lambda _: VideoRow.source_id == registry.reference_id(name, version)
         ),
     )
     _refuse_if_used(session, what, name, made)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from importlib.resources import files
 from pathlib import Path
+from typing import Literal
 
 import pytest
 from dashboard_browser import WATCH_POLICY
@@ -19,6 +22,8 @@ from physworld_services import guide
 pytestmark = [pytest.mark.slow, pytest.mark.browser]
 
 ROOT = Path(__file__).resolve().parents[2]
+AXE = (files("axe_playwright_python") / "axe.min.js").read_text()
+WCAG = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa"]
 
 
 @pytest.fixture(scope="module")
@@ -90,3 +95,24 @@ def test_pages_are_no_wider_than_a_phone(page: Page, address: str, path: str) ->
     page.set_viewport_size({"width": 360, "height": 800})
     page.goto(f"{address}/{path}")
     assert page.evaluate("document.documentElement.scrollWidth") <= 360
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("path", ["", "tutorial.html", "notebooks/missing_effect.html"])
+def test_axe_finds_nothing(
+    browser: Browser, address: str, path: str, scheme: Literal["light", "dark"]
+) -> None:
+    tab = browser.new_page(color_scheme=scheme)
+    tab.goto(f"{address}/{path}")
+    session = tab.context.new_cdp_session(
+        tab
+    )  # the pages' policy lets no script in, a debugger's does not ask
+    session.send("Runtime.evaluate", {"expression": AXE})
+    asked = (
+        f"axe.run(document, {{runOnly: {{type: 'tag', values: {json.dumps(WCAG)}}}}}).then(r => r.violations)"
+    )
+    answer = session.send(
+        "Runtime.evaluate", {"expression": asked, "awaitPromise": True, "returnByValue": True}
+    )
+    assert [(rule["id"], len(rule["nodes"])) for rule in answer["result"]["value"]] == []
+    tab.close()

@@ -64,7 +64,7 @@ def test_films_of_a_recording_and_of_a_rollout_come_from_the_service(tmp_path: P
             environment = {**os.environ, "PHYSWORLD_URL": state["api_url"], "PHYSWORLD_TOKEN": key}
 
             def physworld(*words: str) -> str:
-                command = [sys.executable, "-m", "physworld_client", *words]
+                command = [str(Path(sys.executable).parent / "physworld"), *words]
                 done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
                 assert done.returncode == 0, done.stderr
                 return done.stdout

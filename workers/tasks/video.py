@@ -33,8 +33,8 @@ from physworld.video import (
     whole_motion_view,
 )
 from physworld.video.gaussians import Gaussians
+from physworld.video.hidden import followed
 from physworld_scenes.archives import ArchiveLimits, read_arrays
-from physworld_scenes.measured import hold
 from physworld_schemas.base import Reference
 from physworld_schemas.video import FILM, MOST_FRAMES, CameraView, VideoConfig, VideoReport, VideoScores
 from physworld_storage import resources
@@ -105,7 +105,7 @@ def motion_of(stores: Stores, payload: dict[str, Any], candidate: int) -> tuple[
             raise ValueError(
                 f"{np.count_nonzero(seen)} points of scene {source} are ever seen; a film needs 2"
             )
-        moved = np.where(scene.visible[..., None], scene.points, hold(scene.points, scene.visible))[:, seen]
+        moved = followed(scene.points[:, seen], scene.visible[:, seen])
         times = scene.times
     else:
         arrays = npz_arrays(stores.artifacts.read_bytes(payload["motion"]))

@@ -21,10 +21,10 @@ router = APIRouter(responses=documented(401, 403, 404, 409, 422))
 MEANING = {
     "scene": "Delete a scene from which nothing was made.",
     "check": "Delete a check.",
-    "fit": "Delete a fit that no trace, dataset or model uses.",
+    "fit": "Delete a fit that no trace, dataset, model or film uses.",
     "trace": "Delete a trace that no dataset, model or assessment uses.",
     "dataset": "Delete a dataset, with its episodes, that no model was trained on.",
-    "rollout": "Delete a rollout.",
+    "rollout": "Delete a rollout that no film shows.",
     "plan": "Delete a plan.",
     "video": "Delete a film.",
     "assessment": "Delete an assessment.",

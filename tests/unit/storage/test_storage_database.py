@@ -28,7 +28,7 @@ pytestmark = pytest.mark.slow
 if TYPE_CHECKING:
     from conftest import Work
 
-NEWEST = "0008"
+NEWEST = "0009"
 SPAWN = multiprocessing.get_context("spawn")
 
 

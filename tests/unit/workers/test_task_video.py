@@ -7,6 +7,7 @@ import json
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import av
 import numpy as np
@@ -18,7 +19,7 @@ from physworld.video import Drawing, gaussians_at_points, orbit_view, to_ply
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.job import Job
 from physworld_schemas.video import FILM, CameraView, Video, VideoConfig, VideoCreate
-from physworld_storage import videos
+from physworld_storage import removal, videos
 from physworld_storage.errors import Conflict, NotFound
 from physworld_storage.jobs import jobs, leases
 from physworld_workers.execute import Runtime, run_shard
@@ -91,7 +92,7 @@ def test_a_recording_is_drawn_as_points_with_the_whole_motion_in_view(
     assert (depths > 0).all() and (pixels > 0).all() and (pixels < (64, 48)).all()
 
 
-def test_what_is_hidden_is_held_and_what_is_never_seen_is_left_out(
+def test_what_is_hidden_moves_on_and_what_is_never_seen_is_left_out(
     stores: Stores, scene_id: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = tiny_scene()
@@ -104,7 +105,7 @@ def test_what_is_hidden_is_held_and_what_is_never_seen_is_left_out(
     payload = {"of": "scene", "scene_id": scene_id, "source": {"kind": "scene", "id": scene_id}}
     moved, _ = task.motion_of(stores, payload, 0)
     assert moved.shape[1] == scene.points.shape[1] - 1
-    np.testing.assert_array_equal(moved[3:, 0], np.broadcast_to(scene.points[2, 1], moved[3:, 0].shape))
+    np.testing.assert_allclose(moved[:, 0], scene.points[:, 1], atol=1e-9)
 
 
 def test_the_splat_and_the_camera_of_the_scene_are_taken_and_its_pictures_compared(
@@ -123,6 +124,7 @@ def test_the_splat_and_the_camera_of_the_scene_are_taken_and_its_pictures_compar
     scores = second.report.scores if second.report else None
     assert scores is not None and second.report is not None and second.report.not_scored == ""
     assert scores.psnr_db is not None and scores.psnr_db > 25 and scores.ssim > 0.9 and scores.iou is not None
+    assert min(value or 0.0 for value in scores.psnr_db_per_frame) > 25  # each frame against its own picture
     assert scores.iou > 0.5 and len(scores.psnr_db_per_frame) == len(scores.ssim_per_frame) == len(pictures)
     keep(stores, scene_id, "frames.npz", npz(frames=255 - pictures))
     _, _, third = drawn(stores, runtime_with(), asked(stores, scene_id))
@@ -208,3 +210,67 @@ def test_only_what_is_there_and_ready_is_drawn(stores: Stores, scene_id: str) ->
         pytest.raises(Conflict, match="is pending; a film shows what is"),
     ):
         jobs.create_video(session, VideoCreate(of="fit", id=pending))
+
+
+def test_a_twin_is_drawn_from_its_prediction_and_stays_while_its_film_does(
+    runtime_with: RuntimeOf, stores: Stores, scene_id: str
+) -> None:
+    scene = tiny_scene()
+    prediction = npz(times=scene.times, tracks=scene.points, particles=np.repeat(scene.points, 3, axis=1))
+    with stores.database.session() as session:
+        fit_id = jobs.create_fit(session, scene_id, FitConfig()).outputs[0].id
+        (waiting,) = leases.publishable(session)
+        lease = leases.claim(session, waiting.shard_id, "test", 60.0)
+        files = [stores.artifacts.put_bytes(prediction, "prediction.npz").model_dump()]
+        assert lease is not None
+        assert leases.complete(session, lease, {"parameters": {}, "metrics": {}, "artifacts": files})
+    with stores.database.session() as session:
+        job = jobs.create_video(session, VideoCreate(of="fit", id=fit_id, config=SMALL))
+    outcome, _, video = drawn(stores, runtime_with(), job)
+    assert outcome == "done" and video.report is not None
+    assert (video.of, video.source_id, video.scene_id) == ("fit", fit_id, scene_id)
+    assert video.report.gaussians == 12 and video.report.frames == len(scene.times)
+    assert [reference.kind for reference in video.lineage.inputs] == ["fit", "scene"]
+    with stores.database.session() as session, pytest.raises(Conflict, match=f"was used by video {video.id}"):
+        removal.remove(session, "fit", fit_id)
+    with stores.database.session() as session:
+        removal.remove(session, "video", video.id)
+        removal.remove(session, "fit", fit_id)
+
+
+def moving(stores: Stores, of: str, candidate: int = 0, **arrays: Array) -> tuple[Array, Array]:
+    digest = stores.artifacts.put_bytes(npz(**arrays), "motion.npz").sha256
+    payload = {"of": of, "scene_id": "scn_1", "source": {"kind": of, "id": "it"}, "motion": digest}
+    return task.motion_of(stores, payload, candidate)
+
+
+def test_the_motion_of_every_kind_of_object_is_found_among_its_arrays(stores: Stores) -> None:
+    times, path = np.arange(3) / 30.0, np.random.default_rng(0).normal(size=(2, 3, 5, 3))
+    np.testing.assert_array_equal(moving(stores, "model", times=times, tracks=path[0])[0], path[0])
+    found, clock = moving(stores, "rollout", 1, times=times, points=path, vertices=path[:, :, :4])
+    np.testing.assert_array_equal(found, path[1, :, :4])
+    np.testing.assert_array_equal(clock, times)
+    np.testing.assert_array_equal(moving(stores, "rollout", times=times, points=path)[0], path[0])
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"candidate": 2}, "has 2 candidates; there is no candidate 2"),
+        ({"times": np.arange(4.0)}, "4 times for 3 frames"),
+        ({"points": np.full((2, 3, 5, 3), np.nan)}, "45 numbers that are not finite"),
+        ({"points": np.zeros((2, 1, 5, 3)), "times": np.zeros(1)}, r"got \(1, 5, 3\)"),
+        (
+            {"points": np.zeros((1, 3001, 2, 3)), "times": np.arange(3001.0)},
+            "3001 frames; a film has at most 3000",
+        ),
+    ],
+)
+def test_a_motion_that_cannot_be_drawn_is_refused_with_its_numbers(
+    stores: Stores, change: dict[str, Any], said: str
+) -> None:
+    given = {"times": np.arange(3) / 30.0, "points": np.zeros((2, 3, 5, 3)), **change}
+    with pytest.raises(ValueError, match=said):
+        moving(stores, "rollout", given.pop("candidate", 0), **given)
+    with pytest.raises(ValueError, match=r"are \['other', 'times'\], none of vertices, points"):
+        moving(stores, "rollout", times=np.arange(3.0), other=np.zeros(3))
