@@ -56,7 +56,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 def with_films(markdown: str) -> str:
     """The text with a player in the place of every picture that leads to a film."""
     return FILM.sub(
-        r'<video controls loop muted playsinline preload="none" width="640" height="480" aria-label="\1" '
+        r'<video controls loop muted playsinline preload="metadata" width="640" height="480" aria-label="\1" '
         r'poster="\2" src="\3"></video>',
         markdown,
     )

@@ -36,6 +36,7 @@ SIZE_PX = (640, 480)
 INK, BALL, TABLE = (0.10, 0.11, 0.14), (0.45, 0.48, 0.55), (0.86, 0.87, 0.90)
 MARGIN = 0.06  # of the picture that stays free on each side
 MARK = 0.006  # size of a measured point, as a share of what is shown
+BEFORE = 2.0  # sizes that a measured point is drawn nearer to the camera, lest the body around it hides it
 POSTER_AT = 0.55  # share of the film
 FRAMES_A_SECOND = 30.0  # at most; recordings have more
 HEAD = """# Gallery
@@ -81,6 +82,8 @@ def drawn(exhibit: Exhibit, motion: Motion, size_px: tuple[int, int] = SIZE_PX) 
     view = np.concatenate([motion.particles[shown[0] :: every].reshape(-1, 3), *_ball_box(motion)])
     camera = filled(orbit_view(view, exhibit.azimuth_deg, exhibit.elevation_deg, *size_px), view)
     renderer = Renderer(camera)
+    toward = camera.centre - view.mean(axis=0)
+    toward /= np.linalg.norm(toward)
     body = gaussians_at_points(motion.particles[0], _checks(motion.particles[0], exhibit))
     still = [_table(motion)] if motion.ground_m is not None else []
     pictures = []
@@ -94,7 +97,8 @@ def drawn(exhibit: Exhibit, motion: Motion, size_px: tuple[int, int] = SIZE_PX) 
             points, visible = motion.measured
             if visible[frame].any():
                 size = MARK * float(np.ptp(view, axis=0).max())
-                parts.append(_spheres(points[frame, visible[frame]], size, INK))
+                before = points[frame, visible[frame]] + BEFORE * size * toward
+                parts.append(_spheres(before, size, INK))
         pictures.append(np.round(renderer.render(_joined(parts)).rgb * 255.0).astype(np.uint8))
     return encode_mp4(pictures, rate / every / motion.slower), pictures[
         round(POSTER_AT * (len(pictures) - 1))

@@ -98,7 +98,9 @@ def test_pages_are_no_wider_than_a_phone(page: Page, address: str, path: str) ->
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("path", ["", "tutorial.html", "gallery.html", "dashboard.html", "notebooks/missing_effect.html"])
+@pytest.mark.parametrize(
+    "path", ["", "tutorial.html", "gallery.html", "dashboard.html", "notebooks/missing_effect.html"]
+)
 def test_axe_finds_nothing(
     browser: Browser, address: str, path: str, scheme: Literal["light", "dark"]
 ) -> None:
