@@ -4,6 +4,7 @@
 - A notebook ``notebooks/NAME.ipynb`` becomes the page ``notebooks/NAME.md``, with the outputs that it was saved with;
   the notebook itself lies beside it.
 - Links that lead from ``docs/`` to those files lead to their pages.
+- A picture that leads to a film becomes the film, which plays when it is asked to.
 - GitHub starts a list right below a paragraph; Python-Markdown wants an empty line between the two.
 """
 
@@ -28,6 +29,7 @@ PROJECT = {
 }
 ROOT_README = "../README.md"
 LINK = re.compile(r"(\[[^\]]*\]\()([^)\s#]+)(#[^)\s]*)?\)")
+FILM = re.compile(r"\[!\[([^\]]*)\]\(([^)\s]+)\)\]\(([^)\s]+\.mp4)\)")
 CODE = re.compile(r"(^```.*?^```|`[^`\n]+`)", re.MULTILINE | re.DOTALL)
 FENCE = re.compile(r"^\s*(```|~~~)")
 ITEM = re.compile(r"^(?:[-*+]|\d+\.) +\S")
@@ -47,8 +49,17 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Mend links and lists of a page before it is rendered."""
-    return with_lists(with_links(markdown, page.file.src_uri))
+    """Mend films, links and lists of a page before it is rendered."""
+    return with_lists(with_links(with_films(markdown), page.file.src_uri))
+
+
+def with_films(markdown: str) -> str:
+    """The text with a player in the place of every picture that leads to a film."""
+    return FILM.sub(
+        r'<video controls loop muted playsinline preload="none" width="640" height="480" aria-label="\1" '
+        r'poster="\2" src="\3"></video>',
+        markdown,
+    )
 
 
 def with_links(markdown: str, page: str) -> str:

@@ -16,7 +16,7 @@ from serving import serve
 from physworld_services import guide
 from physworld_services.web import create_app
 from physworld_storage.settings import Settings
-from scripts.guide_pages import notebook_page, with_links, with_lists
+from scripts.guide_pages import notebook_page, with_films, with_links, with_lists
 from scripts.make_reference import pages
 
 pytestmark = pytest.mark.slow
@@ -132,6 +132,14 @@ def test_links_out_of_docs_lead_to_their_pages() -> None:
     assert with_links("[a](docs/scenes.md)", "project/changes.md") == "[a](../scenes.md)"
     assert with_links("[a\nb](x.ipynb)", "notebooks/y.md") == "[a\nb](x.md)"
     assert with_links("`[a](../LICENSE)` [a](../LICENSE)", "index.md") == "`[a](../LICENSE)` a"
+
+
+def test_a_picture_that_leads_to_a_film_becomes_a_player(site: Path) -> None:
+    player = with_films("a [![b](c.webp)](d.mp4) [![b](c.webp)](d.html)")
+    assert player.startswith("a <video controls ") and player.endswith(" [![b](c.webp)](d.html)")
+    assert 'aria-label="b"' in player and 'poster="c.webp"' in player and 'src="d.mp4"' in player
+    films = re.findall(r'<video [^>]*poster="([^"]+)" src="([^"]+)"', (site / "gallery.html").read_text())
+    assert len(films) == 6 and all((site / part).is_file() for film in films for part in film)
 
 
 def test_a_list_below_a_paragraph_is_a_list() -> None:

@@ -256,3 +256,20 @@ def test_the_client_runs_without_torch_and_warp(tmp_path: Path) -> None:
         [sys.executable, "-c", program, str(tmp_path)], capture_output=True, text=True, check=True
     )
     assert done.stdout == "[]\n"
+
+
+def test_the_python_of_the_tutorial_runs_as_it_is_printed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = (Path(__file__).resolve().parents[3] / "docs" / "tutorial.md").read_text()
+    code = page.partition("```python\n")[2].partition("```")[0]
+    folder = tmp_path / "path" / "that" / "was" / "printed"
+    folder.mkdir(parents=True)
+    original = published()
+    write(folder, original)
+    monkeypatch.chdir(tmp_path)
+    found: dict[str, np.ndarray] = {}
+    exec(code, found)
+    driven_at_last = found["controllers"][-1] - original.start_controllers[-1]
+    assert driven_at_last[:, 2] == pytest.approx(0.05) and np.isfinite(found["vertices"]).all()
+    assert found["points"].shape == (40, 13, 3)
