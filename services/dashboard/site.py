@@ -47,7 +47,7 @@ class Site:
         self.stores = stores
         self.artifacts = stores.artifacts
         self.episodes = stores.episodes
-        self._templates = _environment()
+        self._templates = environment_of_pages()
         self._parsed = ByteCache(CACHED_BYTES)
 
     def page(self, request: Request, template: str, *, status: int = 200, **context: Any) -> HTMLResponse:
@@ -89,7 +89,8 @@ class Site:
             return {name: archive[name] for name in archive.files}
 
 
-def _environment() -> Environment:
+def environment_of_pages() -> Environment:
+    """Templates with their filters and names."""
     environment = Environment(
         loader=FileSystemLoader(HERE / "templates"),
         autoescape=True,

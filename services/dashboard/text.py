@@ -142,7 +142,7 @@ def plain(value: object) -> str:
     """A declared fact of any shape, as one line."""
     if isinstance(value, dict):
         return ", ".join(
-            f"{words(str(key))} {plain(item)}" for key, item in value.items() if item is not None
+            f"{words(str(key))} {plain(item)}" for key, item in value.items() if item not in (None, [], ())
         )
     if isinstance(value, list | tuple):
         if len(value) > 6:

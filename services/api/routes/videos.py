@@ -53,7 +53,13 @@ PICTURE_BODY: dict[str, Any] = {
                     "type": "object",
                     "required": ["bundle"],
                     "additionalProperties": False,
-                    "properties": {"bundle": {"type": "string", "format": "binary"}},
+                    "properties": {
+                        "bundle": {
+                            "type": "string",
+                            "format": "binary",
+                            "description": "the splat (PLY), the camera (JSON) or the pictures (npz with frames)",
+                        }
+                    },
                 },
                 "encoding": {"bundle": {"contentType": "application/octet-stream"}},
             }
@@ -75,8 +81,10 @@ def list_videos(
     database: DatabaseDep,
     page: PageDep,
     scene_id: Annotated[str | None, Query(pattern=ID_PATTERN)] = None,
-    of: VideoOf | None = None,
-    source_id: Annotated[str | None, Query(pattern=r"^[A-Za-z0-9_.:-]{1,128}$")] = None,
+    of: Annotated[VideoOf | None, Query(description="Only films of this kind of object.")] = None,
+    source_id: Annotated[
+        str | None, Query(pattern=r"^[A-Za-z0-9_.:-]{1,128}$", description="Only films of this object.")
+    ] = None,
 ) -> Page[Video]:
     """Films, newest first."""
     with database.reading() as session:
