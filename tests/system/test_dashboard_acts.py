@@ -92,7 +92,7 @@ def test_a_table_of_markers_is_looked_at_and_stored_when_that_is_confirmed(
     hangs = "the body hangs from its gripper along it"
     expect(told.get_by_role("row", name=re.compile("^up "))).to_contain_text(hangs)
     expect(told.locator("li", has_text="up is guessed to be y")).to_be_visible()
-    visit.page.get_by_label("Kind").select_option("sheet")
+    visit.page.get_by_label("Kind", exact=True).select_option("sheet")
     visit.page.get_by_label("Mass [kg]").fill("0.08")
     visit.page.locator("select[data-option=up]").select_option("y")
     visit.page.get_by_role("button", name="Look again").click()
@@ -198,7 +198,7 @@ def test_an_administrator_makes_a_key_whose_token_is_shown_once(stranger: Visit,
     stranger.open("/")
     stranger.login(world.admin_token)
     stranger.open("/keys")
-    stranger.page.get_by_label("Name").fill("robot-1")
+    stranger.page.get_by_label("Name", exact=True).fill("robot-1")
     stranger.page.get_by_role("button", name="Make it").click()
     token = stranger.page.locator("[data-token]").inner_text()
     assert token.startswith("pw_")

@@ -166,11 +166,9 @@ def test_the_recorded_motion_is_driven_beside_the_recording(served: Served, page
     recorded = page.evaluate("""() => { const it = window.playgrounds[0];
         return it.ghost.grip(it.ready.grips[0], it.ghost.end, it.centre.clone()).toArray(); }""")
     wanted = np.linalg.norm(np.array(recorded) - before)
-    print(
-        f"recorded {1e3 * wanted:.1f} mm, off {1e3 * np.linalg.norm(place(page, 'grip') - recorded):.1f} mm"
-    )
     assert wanted > 2e-3
-    assert np.linalg.norm(place(page, "grip") - recorded) < 0.25 * wanted
+    # what was sent last is drawn when its answer has come
+    until(page, lambda: np.linalg.norm(place(page, "grip") - recorded) < 0.25 * wanted)
 
 
 def test_a_view_that_was_turned_is_set_back(served: Served, page: Page) -> None:

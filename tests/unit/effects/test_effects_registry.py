@@ -162,9 +162,9 @@ def test_the_trace_names_no_effect(file: Path) -> None:
     assert _strings(file).isdisjoint(EFFECTS)
 
 
-def test_the_parts_of_an_effect_are_effects_with_those_gates() -> None:
-    summed = [kind for kind in EFFECTS.values() if kind.parts]
-    assert summed
-    for kind in summed:
-        for part, gates in kind.parts.items():
-            assert set(gates) <= set(EFFECTS[part].gates)
+def test_an_effect_that_contains_another_one_is_that_with_some_strengths_at_zero() -> None:
+    containing = [kind for kind in EFFECTS.values() if kind.contains]
+    assert containing
+    for kind in containing:
+        for name in kind.contains:
+            assert set(EFFECTS[name].gates) < set(kind.gates)

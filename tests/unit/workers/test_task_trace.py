@@ -186,7 +186,7 @@ def test_a_trace_whose_time_is_up_calls_off_what_it_has_asked_for(
     assert _job(stores, job).state == "succeeded"
     found = _trace(stores, job)
     assert len(asked) == 1 and asked[0] > 1
-    assert found.verdict == "unexplained" and "refit with air_drag_linear" in (found.reason or "")
+    assert found.verdict == "unexplained" and "searches were left" in (found.reason or "")
     states = [shard.state for shard in _shards(stores, job)]
     assert states.count("CANCELLED") == asked[0] and set(states) == {"DONE", "CANCELLED"}
 
