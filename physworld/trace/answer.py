@@ -2,7 +2,7 @@
 
 ========================  ============================================================================================
 ``named``                 one set of effects holds 0.95 of the posterior
-``equivalent_set``        two to four sets together do: these data cannot tell them apart
+``equivalent_set``        two to six sets together do: these data cannot tell them apart
 ``data_issue``            what does are faults of the measurement only
 ``numerical_issue``       nothing is supported, and finer cells or smaller steps change as much as what is left
 ``unexplained``           something is there, and no effect of the library removes a half of it with support
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 NAMED, EQUIVALENT, DATA, NUMERICAL = "named", "equivalent_set", "data_issue", "numerical_issue"
 UNEXPLAINED, NOTHING = "unexplained", "nothing_to_explain"
 SURE = 0.95  # posterior of a name, or of a set
-MOST_IN_SET = 4
+MOST_IN_SET = 6
 WITHIN = 1.2  # misfit over the noise up to which nothing is left to explain
 
 

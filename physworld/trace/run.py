@@ -4,7 +4,7 @@
 2. Noise; whitening by noise, by the points' own places and by what finer cells and a smaller step change (their
    estimated error as one standard deviation, Richardson's for second order).
 3. The declared physics; the search over sets of effects; their posterior from left-out blocks.
-4. The answer: the sets that hold 0.95 of the posterior, four at most. What remains is told beside it and forbids no
+4. The answer: the sets that hold 0.95 of the posterior, six at most. What remains is told beside it and forbids no
    name. Intervals; then, once, the held-out frames.
 """
 
