@@ -92,7 +92,7 @@ def test_a_table_of_markers_is_looked_at_and_stored_when_that_is_confirmed(
     hangs = "the body hangs from its gripper along it"
     expect(told.get_by_role("row", name=re.compile("^up "))).to_contain_text(hangs)
     expect(told.locator("li", has_text="up is guessed to be y")).to_be_visible()
-    visit.page.get_by_label("Kind", exact=True).select_option("sheet")
+    visit.page.locator("select[data-option=kind]").select_option("sheet")
     visit.page.get_by_label("Mass [kg]").fill("0.08")
     visit.page.locator("select[data-option=up]").select_option("y")
     visit.page.get_by_role("button", name="Look again").click()
