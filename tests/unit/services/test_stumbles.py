@@ -13,7 +13,7 @@ from physworld_schemas.hints import hint_of
 from physworld_schemas.key import KeyRotate
 from physworld_services.api.errors import problem_response
 from physworld_services.dashboard import text
-from physworld_services.dashboard.site import _environment
+from physworld_services.dashboard.site import environment_of_pages
 from physworld_services.embedded.folder import DataFolder
 
 AT = datetime(2026, 1, 2, tzinfo=UTC)
@@ -28,7 +28,7 @@ def shown(search: dict[str, object] | None) -> str:
         "job_id": "job_1",
         "config": {},
     }
-    macros = _environment().get_template("macros.html").make_module({"may_write": True})
+    macros = environment_of_pages().get_template("macros.html").make_module({"may_write": True})
     return str(macros.fit_state(Fit.model_validate({**fields, "search": search})))  # type: ignore[attr-defined]
 
 
