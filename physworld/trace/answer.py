@@ -5,7 +5,7 @@
 ``equivalent_set``        two to six sets together do: these data cannot tell them apart
 ``data_issue``            what does are faults of the measurement only
 ``numerical_issue``       nothing is supported, and finer cells or smaller steps change as much as what is left
-``unexplained``           something is there, and no effect of the library removes a half of it with support
+``unexplained``           something is there, and no effect of the library removes most of it with support
 ``nothing_to_explain``    the declared physics is near the noise, and nothing is supported beside it
 ========================  ============================================================================================
 

@@ -30,36 +30,40 @@ FIELDS = frozenset({"bundle", "name", "options"})
 FIELD_LIMIT_BYTES = 64 * 1024
 COPIED_BYTES = 1024 * 1024
 
-MULTIPART_BODY: dict[str, Any] = {
-    "requestBody": {
-        "required": True,
-        "content": {
-            "multipart/form-data": {
-                "schema": {
-                    "type": "object",
-                    "required": ["bundle"],
-                    "additionalProperties": False,
-                    "properties": {
-                        "bundle": {
-                            "type": "string",
-                            "format": "binary",
-                            "description": "zip or tar of scene.json and scene.npz, PhysTwin's "
-                            "final_data.pkl, or a table of markers (GET /v1/importers)",
-                        },
-                        "name": {
-                            "type": "string",
-                            "minLength": 1,
-                            "maxLength": 128,
-                            "description": "name of the scene, in the place of the one that it brings",
-                        },
-                        "options": {"type": "string", "description": "a SceneImport as JSON"},
-                    },
-                },
-                "encoding": {"bundle": {"contentType": "application/octet-stream"}},
-            }
-        },
+
+def form_of(properties: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """What OpenAPI says of a form that is sent with a file.
+
+    Args:
+        properties: schema of each field by name; the file is the field ``bundle``, which has to be there.
+    """
+    schema = {
+        "type": "object",
+        "required": ["bundle"],
+        "additionalProperties": False,
+        "properties": properties,
     }
-}
+    form = {"schema": schema, "encoding": {"bundle": {"contentType": "application/octet-stream"}}}
+    return {"requestBody": {"required": True, "content": {"multipart/form-data": form}}}
+
+
+MULTIPART_BODY = form_of(
+    {
+        "bundle": {
+            "type": "string",
+            "format": "binary",
+            "description": "zip or tar of scene.json and scene.npz, PhysTwin's "
+            "final_data.pkl, or a table of markers (GET /v1/importers)",
+        },
+        "name": {
+            "type": "string",
+            "minLength": 1,
+            "maxLength": 128,
+            "description": "name of the scene, in the place of the one that it brings",
+        },
+        "options": {"type": "string", "description": "a SceneImport as JSON"},
+    }
+)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from typing import Annotated, Any, cast
+from typing import Annotated, cast
 
 import anyio
 from fastapi import APIRouter, Query, Request, Response
@@ -27,7 +27,7 @@ from physworld_services.api.dependencies import (
 from physworld_services.api.errors import ApiProblem, documented
 from physworld_services.api.idempotency import Idempotency, IdempotencyDep, accepted, answer_of
 from physworld_services.api.limits import too_large
-from physworld_services.api.uploads import COPIED_BYTES, read_form
+from physworld_services.api.uploads import COPIED_BYTES, form_of, read_form
 from physworld_services.stores import Stores
 from physworld_storage import resources, videos
 from physworld_storage.idempotency import Answer
@@ -44,28 +44,15 @@ BEGINS: dict[str, tuple[bytes, str]] = {
     "splat.ply": (b"ply", "a splat in PLY"),
     "frames.npz": (b"PK\x03\x04", "an npz of pictures"),
 }
-PICTURE_BODY: dict[str, Any] = {
-    "requestBody": {
-        "required": True,
-        "content": {
-            "multipart/form-data": {
-                "schema": {
-                    "type": "object",
-                    "required": ["bundle"],
-                    "additionalProperties": False,
-                    "properties": {
-                        "bundle": {
-                            "type": "string",
-                            "format": "binary",
-                            "description": "the splat (PLY), the camera (JSON) or the pictures (npz with frames)",
-                        }
-                    },
-                },
-                "encoding": {"bundle": {"contentType": "application/octet-stream"}},
-            }
-        },
+PICTURE_BODY = form_of(
+    {
+        "bundle": {
+            "type": "string",
+            "format": "binary",
+            "description": "the splat (PLY), the camera (JSON) or the pictures (npz with frames)",
+        }
     }
-}
+)
 
 
 @router.post(
