@@ -3,8 +3,8 @@
 The model is rolled out over the recording, open loop from its start. Its mean track error is compared with what noise
 alone shows and with the held-out error on the model's card, both with intervals by blocks of frames
 (:mod:`physworld.evaluate.blocks`). Scored are all frames after the model's history, or of these the recording's
-held-out ones alone; another version of the model may be measured on the same frames. What follows from a model that has become worse is the database's business: the
-commit opens a trace (``physworld_storage.jobs.kinds.assessment``).
+held-out ones alone; another version of the model may be measured on the same frames. What follows from a model that has
+become worse is the database's business: the commit opens a trace (``physworld_storage.jobs.kinds.assessment``).
 """
 
 from __future__ import annotations
