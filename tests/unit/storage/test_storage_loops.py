@@ -188,7 +188,7 @@ def _assess(scene: Scene) -> AssessmentCreate:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"kind": "cloth"}, "shows a cloth, version 1 of bar is of a beam"),
+        ({"kind": "sheet"}, "shows a sheet, version 1 of bar is of a beam"),
         ({"controllers": 2}, "has 2 controllers"),
     ],
 )

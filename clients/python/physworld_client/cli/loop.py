@@ -94,12 +94,25 @@ def models_assess(
     scene: Annotated[str, typer.Argument(help="A recording's file or folder, or a scene of the service.")],
     version: VersionName = LATEST,
     trace: Annotated[bool, typer.Option(help="Open a trace where the model has become worse.")] = True,
+    held_out: Annotated[
+        bool, typer.Option("--held-out", help="Score the recording's held-out frames alone.")
+    ] = False,
+    beside: Annotated[
+        int | None, typer.Option(min=1, help="Another version, measured on the same frames.")
+    ] = None,
     timeout: Annotated[float | None, typer.Option(min=0, help="Seconds to wait; default for ever.")] = None,
     json: Json = False,
 ) -> None:
     """Hold a new recording of the object against a published model."""
     scene_id = _recording(client, scene)
-    job = client.assessments.create(name, scene_id, version, open_trace=trace)
+    job = client.assessments.create(
+        name,
+        scene_id,
+        version,
+        open_trace=trace,
+        frames="held_out" if held_out else "all",
+        compared_with=beside,
+    )
     client.jobs.wait(job, timeout)
     answer = client.assessments.get(job.outputs[0].id)
     if json:
@@ -197,5 +210,10 @@ def _print_assessment(found: Assessment) -> None:
     stdout.print(f"{found.outcome}: {found.reason}", markup=False, soft_wrap=True)
     baselines = ", ".join(f"{name} {millimetres(value)}" for name, value in found.baselines_m.items())
     stdout.print(f"also [mm]: twin {millimetres(found.twin_m)}, {baselines}", markup=False, soft_wrap=True)
+    other = found.compared
+    if other is not None:
+        low, high = (millimetres(end) for end in other.gain_ci95_m)
+        text = f"version {other.version} {_figure(other.measured)}, gain {millimetres(other.gain_m)}"
+        stdout.print(f"{text} (95 %: {low} to {high})", markup=False, soft_wrap=True)
     if found.trace_id is not None:
         stdout.print(f"trace opened: {found.trace_id}")
