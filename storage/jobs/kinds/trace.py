@@ -116,7 +116,10 @@ KIND = TraceJobs()
 def _fit_of(session: Session, fit_id: str, scene_id: str) -> Reference:
     fit = ready_fit(session, fit_id, "a trace")
     if fit.scene_id != scene_id:
-        raise Conflict(f"fit {fit_id} is of scene {fit.scene_id}, not of {scene_id}")
+        raise Conflict(
+            f"fit {fit_id} is of scene {fit.scene_id}, not of {scene_id}; recordings of one object are traced together "
+            "with the fit's as scene_id and the others in scene_ids"
+        )
     if (fit.metrics.get("local") or {}).get("kept"):
         raise Conflict(
             f"fit {fit_id} carries a field over its body, which a trace would have to search with its effects; "
