@@ -1,21 +1,27 @@
-"""The loop on the real service: a drag that no version knew, found on a new recording, and a version that knows it."""
+"""The loop on the real service: a drag that no version knew is found on a new recording, through a killed worker."""
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
+import psutil
 import pytest
 from looped_bar import BUDGET, DRAG_PER_S, shaken_bar, slow_bar
 from physworld_client import Client
-from service_process import ServiceProcess
+from service_process import ServiceProcess, until
 from tiny_scene import register
 
 from physworld_schemas.dataset import DatasetConfig
 from physworld_schemas.fit import FitConfig
+from physworld_schemas.job import Job
 from physworld_schemas.model import TrainingConfig
 from physworld_schemas.pipeline import PipelineCreate
 from physworld_schemas.trace import TraceConfig
+from physworld_storage.jobs.helpers import SIMULATION
+from physworld_storage.tables import JobRow, ShardRow
 
 pytestmark = [pytest.mark.slow, pytest.mark.service, pytest.mark.timeout(600)]
 
@@ -37,6 +43,23 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServiceProcess
         assert process.interrupt() == 0
 
 
+def kill_the_worker_that_traces(service: ServiceProcess, loop: Job) -> None:
+    """kill -9 of the worker that leads the loop's trace, once that shares its simulations."""
+    database, _ = service.stores()
+
+    def shards(kind: str) -> list[ShardRow]:
+        with database.reading() as session:
+            found = session.query(ShardRow).join(JobRow, JobRow.id == ShardRow.job_id)
+            return found.where(JobRow.parent_id == loop.id, ShardRow.kind == kind).all()
+
+    until(lambda: bool(shards(SIMULATION)), "no simulation is shared", ENDS_WITHIN_S)
+    (driver,) = shards("trace")
+    database.dispose()
+    assert driver.lease_owner is not None
+    worker = psutil.Process(int(driver.lease_owner.split("/")[2])).ppid()
+    os.kill(worker, signal.SIGKILL)  # its pool process dies with it
+
+
 def test_a_new_recording_ends_in_a_version_that_predicts_it_better(service: ServiceProcess) -> None:
     database, stores = service.stores()
     home, recording = (register(scene, database, stores.artifacts) for scene in (slow_bar(), shaken_bar()))
@@ -48,11 +71,14 @@ def test_a_new_recording_ends_in_a_version_that_predicts_it_better(service: Serv
         )
         client.jobs.wait(client.pipelines.create(chain), timeout=ENDS_WITHIN_S)
         begun = client.loops.create("bar", recording, 1, trace=TRACE)
+        kill_the_worker_that_traces(service, begun)
         told: list[float] = []
         job = client.jobs.wait(begun, timeout=ENDS_WITHIN_S, on_progress=lambda job: told.append(job.share))
         loop = client.loops.get(begun.id)
+        traced = client.jobs.get(client.traces.get(str(loop.trace_id)).job_id)
         newest = client.models.version("bar", 2)
     assert [item.kind for item in job.outputs] == ["assessment", "trace", "dataset", "model", "assessment"]
+    assert traced.attempt >= 2, "another worker took the trace over"
     assert told == sorted(told) and told[-1] == 1.0 and any(0.0 < share < 1.0 for share in told)
     assert (loop.outcome, loop.verdict, loop.new_version) == ("improved", "named", 2), loop.reason
     (effect,) = loop.effects
