@@ -10,6 +10,7 @@ from sqlalchemy.orm import Session
 from physworld_schemas.assessment import Assessment
 from physworld_schemas.base import Page
 from physworld_schemas.loop import Loop, LoopOutcome, VersionError
+from physworld_schemas.trace import Trace
 from physworld_storage.errors import NotFound
 from physworld_storage.jobs.kind import output_of
 from physworld_storage.jobs.kinds import loop
@@ -62,9 +63,7 @@ def _loop(session: Session, row: JobRow) -> Loop:
         made["comparison" if _is_comparison(child) else child.kind] = output_of(child)
     begun = row.config["assessment_id"] or made.get(loop.ASSESSMENT)
     trace_id = made.get(loop.TRACE)
-    traced = (
-        None if trace_id is None or session.get(TraceRow, trace_id) is None else get_trace(session, trace_id)
-    )
+    traced = _trace(session, trace_id)
     compared = _assessment(session, made.get("comparison"))
     number = made[loop.TRAINING].rpartition(":")[2] if loop.TRAINING in made else None
     outcome = _outcome(row, made, compared)
@@ -90,14 +89,13 @@ def _loop(session: Session, row: JobRow) -> Loop:
         **_errors(compared),
     }
     found = Loop.model_validate(fields)
-    first = _assessment(session, begun)
-    reasons = {
-        "as_expected": "" if first is None else first.reason,
-        "no_effect": ""
-        if traced is None
-        else f"The trace supports no effect ({traced.verdict}): {traced.reason}",
-    }
-    found.reason = reasons[outcome] if outcome in reasons else _gain(found)
+    if outcome == "as_expected":
+        first = _assessment(session, begun)
+        found.reason = "" if first is None else first.reason
+    elif outcome == "no_effect" and traced is not None:
+        found.reason = f"The trace supports no effect ({traced.verdict}): {traced.reason}"
+    else:
+        found.reason = _gain(found)
     return found
 
 
@@ -110,6 +108,13 @@ def _assessment(session: Session, assessment_id: str | None) -> Assessment | Non
     if assessment_id is None or session.get(AssessmentRow, assessment_id) is None:
         return None
     return get_assessment(session, assessment_id)
+
+
+def _trace(session: Session, trace_id: str | None) -> Trace | None:
+    """The trace; None where there is none, or where somebody has deleted it."""
+    if trace_id is None or session.get(TraceRow, trace_id) is None:
+        return None
+    return get_trace(session, trace_id)
 
 
 def _outcome(row: JobRow, made: dict[str, str], compared: Assessment | None) -> LoopOutcome | None:
