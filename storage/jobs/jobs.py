@@ -71,7 +71,7 @@ def create_video(session: Session, request: VideoCreate) -> Job:
 
 
 def create_trace(session: Session, request: TraceCreate) -> Job:
-    """Open a trace. Raises NotFound, or Conflict when the fit is not ready or of another scene."""
+    """Open a trace. Raises NotFound, or Conflict when the fit is not ready or of another kind of object."""
     opened = trace.KIND.open(
         session,
         request.scene_id,
