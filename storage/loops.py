@@ -15,8 +15,8 @@ from physworld_storage.errors import NotFound
 from physworld_storage.jobs.kind import output_of
 from physworld_storage.jobs.kinds import loop
 from physworld_storage.pages import page_of
-from physworld_storage.tables import AssessmentRow, JobRow, TraceRow
-from physworld_storage.traces import get_assessment, get_trace
+from physworld_storage.tables import AssessmentRow, JobRow, ModelVersionRow, TraceRow
+from physworld_storage.traces import get_assessment, get_trace, leaves_twin, trace_row
 
 
 def get_loop(session: Session, loop_id: str) -> Loop:
@@ -95,7 +95,7 @@ def _loop(session: Session, row: JobRow) -> Loop:
     elif outcome == "no_effect" and traced is not None:
         found.reason = f"The trace supports no effect ({traced.verdict}): {traced.reason}"
     else:
-        found.reason = _gain(found)
+        found.reason = _gain(found, _effects_of(session, found.model, found.version))
     return found
 
 
@@ -143,15 +143,26 @@ def _errors(compared: Assessment | None) -> dict[str, Any]:
     }
 
 
-def _gain(found: Loop) -> str:
-    """Both errors in a sentence; empty without them."""
+def _effects_of(session: Session, model: str, version: int) -> set[str]:
+    """Names of the effects that a version's twin carries already."""
+    row = session.get(ModelVersionRow, (model, version))
+    if row is None or row.trace_id is None:
+        return set()
+    traced = trace_row(session, row.trace_id)
+    return {effect["name"] for effect in traced.report.get("effects", ())} if leaves_twin(traced) else set()
+
+
+def _gain(found: Loop, carried: set[str]) -> str:
+    """Both errors in a sentence, and whether the effects are no other than those carried; empty without errors."""
     if found.before is None or found.after is None or found.gain_ci95_m is None:
         return ""
     low, high = (1e3 * end for end in found.gain_ci95_m)
+    known = carried == {effect.name for effect in found.effects}
+    anew = f"; the effects are those of version {found.before.version}, estimated anew" if known else ""
     return (
         f"On held-out frames of the new recording version {found.after.version} errs "
         f"{1e3 * found.after.measured.error_m:.3g} mm, version {found.before.version} "
-        f"{1e3 * found.before.measured.error_m:.3g} mm (gain 95 % {low:.3g} to {high:.3g} mm)"
+        f"{1e3 * found.before.measured.error_m:.3g} mm (gain 95 % {low:.3g} to {high:.3g} mm){anew}"
     )
 
 

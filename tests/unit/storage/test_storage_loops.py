@@ -107,7 +107,7 @@ def test_a_supported_effect_ends_in_the_next_version_with_both_errors(turns: Tur
     assert (found.before.version, found.before.measured.error_m) == (1, 5e-3)
     assert (found.after.version, found.after.measured.error_m) == (2, 2e-3)
     assert found.baselines_m == {"static": 0.1} and found.effects[0].name == "air_drag_linear"
-    assert "version 2 errs 2 mm, version 1 5 mm" in found.reason
+    assert "version 2 errs 2 mm, version 1 5 mm" in found.reason and "anew" not in found.reason
     with turns.database.reading() as session:
         version = registry.get_version(session, "bar", 2)
         trace = session.get_one(TraceRow, found.trace_id)
@@ -129,6 +129,7 @@ def test_a_second_turn_keeps_what_the_first_one_saw(turns: Turns) -> None:
     job = turns.finish(turns.open(second))
     found = turns.loop(job)
     assert (found.version, found.new_version) == (2, 3)
+    assert found.reason.endswith("; the effects are those of version 2, estimated anew")
     with turns.database.reading() as session:
         trace = session.get_one(TraceRow, found.trace_id)
         assert trace.report["scene_ids"] == [first.id, second.id]
