@@ -178,6 +178,8 @@ class Search:
         return posterior([h.unseen for h in known], [self._log_prior(h) for h in known], self.seed)
 
     def _log_prior(self, hypothesis: Hypothesis) -> float:
+        if not hypothesis.members:
+            return hypothesis.log_prior
         effects = sum(1 + len(member.contains) for member in hypothesis.members)
         return hypothesis.log_prior - effects * float(np.log(2.0 * self.library))
 
