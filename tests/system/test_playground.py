@@ -173,7 +173,7 @@ def test_the_recorded_motion_is_driven_beside_the_recording(served: Served, page
 
 def test_a_view_that_was_turned_is_set_back(served: Served, page: Page) -> None:
     enter(served, page)
-    camera = "() => window.playgrounds[0].camera.position.toArray()"
+    camera = "() => window.playgrounds[0].view.camera.position.toArray()"
     before = page.evaluate(camera)
     box = page.locator("[data-playground] canvas").bounding_box()
     assert box is not None
