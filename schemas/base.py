@@ -16,6 +16,8 @@ from physworld_schemas.wording import meant
 ObjectKind = Literal[
     "scene", "check", "fit", "trace", "dataset", "model", "assessment", "rollout", "plan", "video", "artifact"
 ]
+Unmade = Literal["failed", "cancelled"]
+"""States of an object that its job did not make."""
 _UNSTORABLE = re.compile("[\0\ud800-\udfff]")
 LINE, LONGEST_TEXT = 120, 40
 """Characters of the line that an object is shown in, and of a text in it."""

@@ -8,7 +8,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from physworld_schemas.assessment import Assessment
-from physworld_schemas.base import Artifact, Lineage, Page
+from physworld_schemas.base import Artifact, Lineage, Page, Unmade
 from physworld_schemas.trace import Trace
 from physworld_storage.errors import Conflict, NotFound
 from physworld_storage.pages import page_of
@@ -96,11 +96,11 @@ def mark_trace_ready(
     session.flush()
 
 
-def fail_trace(session: Session, trace_id: str) -> None:
-    """Mark a pending trace failed; a ready one stays as it is."""
+def end_trace(session: Session, trace_id: str, state: Unmade) -> None:
+    """Mark a pending trace failed or cancelled; a ready one stays as it is."""
     row = trace_row(session, trace_id)
     if row.state == "pending":
-        row.state = "failed"
+        row.state = state
 
 
 def trace_row(session: Session, trace_id: str) -> TraceRow:
@@ -177,11 +177,11 @@ def mark_assessment_ready(
     return row
 
 
-def fail_assessment(session: Session, assessment_id: str) -> None:
-    """Mark a pending assessment failed; a ready one stays as it is."""
+def end_assessment(session: Session, assessment_id: str, state: Unmade) -> None:
+    """Mark a pending assessment failed or cancelled; a ready one stays as it is."""
     row = assessment_row(session, assessment_id)
     if row.state == "pending":
-        row.state = "failed"
+        row.state = state
 
 
 def assessment_row(session: Session, assessment_id: str) -> AssessmentRow:

@@ -24,7 +24,7 @@ COVERAGE = "coverage.svg"
 CARD = "card.json"
 SHOWN_REJECTIONS = 12
 PICTURE_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
-DONE_STATES = frozenset({"sealed", "failed"})
+DONE_STATES = frozenset({"sealed", "failed", "cancelled"})
 
 Cursor = Annotated[str | None, Query(max_length=512)]
 
