@@ -75,7 +75,7 @@ def test_two_versions_are_held_side_by_side(client: httpx.Client) -> None:
     assert 'href="/dashboard/models/beam/compare"' in client.get("/dashboard/models/beam").text
     page = client.get("/dashboard/models/beam/compare?a=1&b=champion")
     assert page.status_code == 200
-    for text in ("Version 1", "Version 2", "4.00", "3.10", "0.900", "config.seed", "400", "310"):
+    for text in ("Version 1", "Version 2", "4.00", "3.10", "0.900", "Settings: seed", "400", "310"):
         assert text in page.text, text
     [told] = re.findall(r'data-series="([^"]*)"', page.text)
     lines = {line["label"]: line for line in json.loads(html.unescape(told))}

@@ -185,6 +185,7 @@ def test_ages(seconds: float, words: str) -> None:
         (1.5e-7, "1.5e-7"),
         (2.0e9, "2e9"),
         (0.0, "0"),
+        (-0.0, "0"),
         (7, "7"),
         (None, "–"),
         (True, "yes"),
@@ -195,10 +196,11 @@ def test_figures(value: object, words: str) -> None:
 
 
 def test_millimetres_keep_three_digits() -> None:
-    assert [text.millimetres(value) for value in (0.03, 0.0025, 0.00032, 0.0, None)] == [
+    assert [text.millimetres(value) for value in (0.03, 0.0025, 0.00032, 0.0, -0.0, None)] == [
         "30.0",
         "2.50",
         "0.320",
+        "0.00",
         "0.00",
         "–",
     ]
