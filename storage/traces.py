@@ -133,21 +133,30 @@ def get_assessment(session: Session, assessment_id: str) -> Assessment:
 
 
 def list_assessments(
-    session: Session, name: str, version: int, *, limit: int = 50, cursor: str | None = None
+    session: Session,
+    name: str | None = None,
+    version: int | None = None,
+    *,
+    limit: int = 50,
+    cursor: str | None = None,
 ) -> Page[Assessment]:
-    """Assessments of a model version, newest first.
+    """Assessments, newest first.
 
     Args:
         session: the transaction that reads.
-        name: of the model.
-        version: its number.
+        name: only those of this model; None: of all.
+        version: only those of this number; None: of all.
         limit: most assessments of a page, 1 to ``pages.MAX_LIMIT``.
         cursor: of the page before; None begins with the newest.
 
     Raises:
         InvalidCursor: no list of assessments gave this cursor out.
     """
-    statement = select(AssessmentRow).where(AssessmentRow.name == name, AssessmentRow.version == version)
+    statement = select(AssessmentRow)
+    if name is not None:
+        statement = statement.where(AssessmentRow.name == name)
+    if version is not None:
+        statement = statement.where(AssessmentRow.version == version)
     keys = (AssessmentRow.created_at, AssessmentRow.id)
     return page_of(session, statement, keys, _assessment, limit=limit, cursor=cursor)
 

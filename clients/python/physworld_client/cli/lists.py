@@ -284,10 +284,10 @@ VIDEOS = Listing(
 )
 ASSESSMENTS = Listing(
     "list",
-    "Recordings held against a model.",
+    "Recordings held against models.",
     ("id", "model", "scene", "state", "outcome", "age"),
     _assessment,
-    of=("name", "models"),
+    filters=(("model", "name", "Only assessments of this model."),),
 )
 KEYS = Listing("list", "Keys, newest first, ended ones too.", ("id", "name", "role", "until", "age"), _key)
 RESOURCES = (
