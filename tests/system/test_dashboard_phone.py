@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from dashboard_browser import Visit
 from dashboard_world import World
-from playwright.sync_api import Browser
+from playwright.sync_api import Browser, expect
 
 from physworld_storage.access import api_keys
 
@@ -49,6 +49,17 @@ def test_the_text_of_a_plot_can_be_read_and_nothing_is_empty_below_it(
     empty = curve.evaluate("(curve) => curve.getBoundingClientRect().bottom"
                            " - curve.querySelector('figure').getBoundingClientRect().bottom")  # fmt: skip
     assert empty <= 1
+
+
+def test_the_lineage_fits_its_panel_although_its_columns_are_wider(visit: Visit) -> None:
+    visit.page.set_viewport_size({"width": 920, "height": 900})
+    visit.open("/models/chain_swing/1")
+    graph = visit.page.locator("svg.lineage")
+    expect(graph.locator(".column")).to_have_count(5)
+    wanted, drawn, room = graph.evaluate(
+        "graph => [graph.viewBox.baseVal.width, graph.getBoundingClientRect().width, graph.parentElement.clientWidth]"
+    )
+    assert drawn <= room < wanted
 
 
 def test_text_stays_in_the_box_for_uploads(phone: Visit) -> None:

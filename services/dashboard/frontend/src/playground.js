@@ -1,11 +1,12 @@
 // The playground: `<figure data-playground="URL">` opens a live session of a world model and draws its answers.
 // POST to URL gives { path }, the WebSocket's address with a ticket. The first message is JSON: { dt_s, points,
-//   controllers [[x, y, z]], grips [[index]], speed_m_s, reach_m, start [[x, y, z]] }. Then binary frames, little-endian:
+//   controllers [[x, y, z]], grips [[index]], speed_m_s, reach_m, factors [name], start [[x, y, z]] }. Then binary frames, little-endian:
 //   uint32 tick, uint32 number of the last control, float32 time, uint32 flags, float32 points and controllers [m].
 // A control is uint32 number, float32 velocities (grips, 3) [m/s]: a dragged grip is steered towards the pointer.
 
 import { DirectionalLight, HemisphereLight, Plane, Raycaster, Vector2, Vector3 } from "three";
 import { onSchemeChange } from "./palette.js";
+import { Factors } from "./factors.js";
 import { Ghost } from "./ghost.js";
 import { Cloud } from "./points.js";
 import { Recorder } from "./record.js";
@@ -63,6 +64,7 @@ class Playground {
     this.number = 0;
     this.frames = 0;
     this.clouds = [];
+    this.factors = new Factors(figure.querySelector("[data-factors]"), (factors) => this.tell({ type: "factors", factors }));
     const pressed = (name, then) => figure.querySelector(`[data-${name}]`).addEventListener("click", then);
     pressed("reset", () => this.again());
     pressed("view", () => this.look());
@@ -149,8 +151,15 @@ class Playground {
   /** A fresh body: in the present session, or in a new one where that has ended. */
   again() {
     this.replayed = null;
-    if (this.socket?.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify({ type: "reset" }));
-    else if (this.socket?.readyState !== WebSocket.CONNECTING) this.open().catch((error) => this.say(error.message));
+    if (this.tell({ type: "reset" })) return;
+    if (this.socket?.readyState !== WebSocket.CONNECTING) this.open().catch((error) => this.say(error.message));
+  }
+
+  /** Send a message as text; false where there is no session to tell. */
+  tell(message) {
+    if (this.socket?.readyState !== WebSocket.OPEN) return false;
+    this.socket.send(JSON.stringify(message));
+    return true;
   }
 
   begin(text) {
@@ -170,6 +179,7 @@ class Playground {
     this.place(this.latest);
     this.dress();
     this.places = this.grips(new Float32Array(ready.controllers.flat()));
+    this.factors.offer(ready.factors);
     this.say("");
     this.figure.dataset.ready = "true";
   }
