@@ -156,19 +156,19 @@ def _input(
     if options is not None:
         return Input(kind="choice", options=[*empty, *options], **{**known, "value": str(value or "")})
     if "enum" in own:
-        listed = [(str(item), names.label(str(item))) for item in own["enum"]]
+        listed = [(str(item), str(item).replace("_", " ")) for item in own["enum"]]
         return Input(kind="choice", options=[*(empty if optional else []), *listed], **known)
     if own.get("type") == "boolean":
         return Input(kind="switch", **known)
     if own.get("type") in {"number", "integer"}:
         return _number(own, known)
     if own.get("type") == "array" and "enum" in own.get("items", {}):
-        listed = [(str(item), names.label(str(item))) for item in own["items"]["enum"]]
+        listed = [(str(item), str(item).replace("_", " ")) for item in own["items"]["enum"]]
         return Input(kind="choices", options=listed, **known)
     if own.get("type") == "array" and own.get("items", {}).get("type") == "string":
         return Input(kind="words", **{**known, "value": ", ".join(value or ())})
     if own.get("type") == "object" and "enum" in own.get("propertyNames", {}):
-        listed = [(str(item), names.label(str(item))) for item in own["propertyNames"]["enum"]]
+        listed = [(str(item), str(item).replace("_", " ")) for item in own["propertyNames"]["enum"]]
         return Input(kind="weights", options=listed, least=0.0, **{**known, "value": value or {}})
     if own.get("type") == "string" and "const" not in own:
         return Input(kind="text", **{**known, "value": "" if value is None else str(value)})
