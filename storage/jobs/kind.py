@@ -100,7 +100,14 @@ class JobKind:
         return self.name
 
     def end(self, session: Session, job: JobRow, state: Unmade, message: str) -> None:
-        """Mark what the job should have brought forth failed or cancelled, unless it is ready."""
+        """Mark what the job should have brought forth failed or cancelled, unless it is ready.
+
+        Args:
+            session: the transaction that ends the job.
+            job: locked.
+            state: what it is from now on.
+            message: why it failed, for people.
+        """
         raise NotImplementedError
 
     def reopen(self, session: Session, job: JobRow) -> None:
