@@ -81,7 +81,9 @@ class Assessment(Resource):
     name: str = Field(description="Name of the model.")
     version: int = Field(description="Version of the model.")
     scene_id: str = Field(description="Scene that it is about.", examples=["scn_01JZ8Q5V3M7X2K9T4B6N8R0C1D"])
-    state: Literal["pending", "ready", "failed"] = Field(description="Whether the answer is there.")
+    state: Literal["pending", "ready", "failed", "cancelled"] = Field(
+        description="Whether the answer is there."
+    )
     created_at: datetime = Field(description="When it was made, UTC.")
     job_id: str = Field(description="Job that makes it.", examples=["job_01JZ8Q5V3M7X2K9T4B6N8R0C1D"])
     config: dict[str, Any] = Field(default_factory=dict, description="Settings.")

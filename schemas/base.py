@@ -16,6 +16,8 @@ from physworld_schemas.wording import meant
 ObjectKind = Literal[
     "scene", "check", "fit", "trace", "dataset", "model", "assessment", "rollout", "plan", "video", "artifact"
 ]
+Unmade = Literal["failed", "cancelled"]
+"""States of an object that its job did not make."""
 _UNSTORABLE = re.compile("[\0\ud800-\udfff]")
 LINE, LONGEST_TEXT = 120, 40
 """Characters of the line that an object is shown in, and of a text in it."""
@@ -52,6 +54,13 @@ class Request(BaseModel):
             raise ValidationError.from_exception_data(error.title, faults) from None
 
 
+class _More:
+    """Shown at the end of a line that has no room for all fields."""
+
+    def __repr__(self) -> str:
+        return "…"
+
+
 class Resource(BaseModel):
     """An object that the service returns: a newer service may add fields."""
 
@@ -64,7 +73,7 @@ class Resource(BaseModel):
             shown = value if len(str(value)) <= LONGEST_TEXT else f"{str(value)[: LONGEST_TEXT - 1]}…"
             left -= len(f"{name}={shown!r}, ")
             if left < 0:
-                yield None, ...
+                yield None, _More()
                 return
             yield name, shown
 

@@ -10,7 +10,7 @@ from pydantic import Field
 from physworld_schemas.base import Lineage, Request, Resource, Seed
 from physworld_schemas.library import NamesOf
 
-CheckState = Literal["pending", "ready", "failed"]
+CheckState = Literal["pending", "ready", "failed", "cancelled"]
 Visibility = Literal["visible", "only_if_large", "invisible"]
 
 

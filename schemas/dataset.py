@@ -159,7 +159,7 @@ class Dataset(Resource):
     fit_id: str = Field(description="Fit whose twin is used.", examples=["fit_01JZ8Q5V3M7X2K9T4B6N8R0C1D"])
     trace_id: str | None = Field(default=None, description="Trace whose effect the twin carries; null: none.")
     scene_id: str = Field(description="Scene that it is about.", examples=["scn_01JZ8Q5V3M7X2K9T4B6N8R0C1D"])
-    state: Literal["pending", "writing", "sealed", "failed"] = Field(
+    state: Literal["pending", "writing", "sealed", "failed", "cancelled"] = Field(
         description="`sealed` is ready and never changes again."
     )
     created_at: datetime = Field(description="When it was made, UTC.")

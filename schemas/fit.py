@@ -223,7 +223,9 @@ class Fit(Resource):
 
     id: str = Field(description="Identifier: a prefix of its kind and 26 characters that sort by time.")
     scene_id: str = Field(description="Scene that it is about.", examples=["scn_01JZ8Q5V3M7X2K9T4B6N8R0C1D"])
-    state: Literal["pending", "ready", "failed"] = Field(description="Whether the twin is there.")
+    state: Literal["pending", "ready", "failed", "cancelled"] = Field(
+        description="Whether the twin is there."
+    )
     created_at: datetime = Field(description="When it was made, UTC.")
     job_id: str = Field(description="Job that makes it.", examples=["job_01JZ8Q5V3M7X2K9T4B6N8R0C1D"])
     config: FitConfig = Field(description="Settings.")

@@ -144,7 +144,9 @@ class ModelVersion(Resource):
 
     name: str = Field(description="Name of the model.")
     version: int = Field(description="Number; it only grows.")
-    state: Literal["pending", "ready", "failed"] = Field(description="`ready` never changes again.")
+    state: Literal["pending", "ready", "failed", "cancelled"] = Field(
+        description="`ready` never changes again."
+    )
     message: str = Field(default="", description="Why it failed, or what to know.")
     created_at: datetime = Field(description="When it was made, UTC.")
     job_id: str | None = Field(

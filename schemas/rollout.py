@@ -24,7 +24,7 @@ VersionName = Annotated[str, Field(pattern=r"^([1-9][0-9]{0,8}|[a-z][a-z0-9_-]{0
 Version = Annotated[int, Field(ge=1, lt=2**31)] | VersionName
 Start = Literal["recording", "rest"]
 Part = Literal["points", "vertices"]
-RunState = Literal["pending", "ready", "failed"]
+RunState = Literal["pending", "ready", "failed", "cancelled"]
 
 
 class RolloutCreate(Request):

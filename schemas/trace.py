@@ -14,7 +14,7 @@ from physworld_schemas.library import NamesOf
 Verdict = Literal[
     "named", "equivalent_set", "data_issue", "numerical_issue", "unexplained", "nothing_to_explain"
 ]
-TraceState = Literal["pending", "ready", "failed"]
+TraceState = Literal["pending", "ready", "failed", "cancelled"]
 
 
 class TraceConfig(Request):

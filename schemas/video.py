@@ -11,7 +11,7 @@ from physworld_schemas.base import Artifact, Lineage, Request, Resource
 from physworld_schemas.rollout import MAX_CANDIDATES
 
 VideoOf = Literal["scene", "fit", "model", "rollout"]
-VideoState = Literal["pending", "ready", "failed"]
+VideoState = Literal["pending", "ready", "failed", "cancelled"]
 PictureName = Literal["splat.ply", "camera.json", "frames.npz"]
 FILM = "film.mp4"
 MOST_SIDE_PX, LEAST_SIDE_PX = 1920, 16

@@ -154,7 +154,7 @@ def fill(client: Client) -> None:
         _wait(client, client.models.create(MODEL, client.datasets.list(limit=1).data[0].id, longer))
         client.models.set_alias(MODEL, "robot", 1)
         client.models.update(MODEL, 1, description="For the laboratory's robot", tags=["lab"])
-    if not client.assessments.list(MODEL, limit=1).data:
+    if not client.assessments.list(limit=1).data:
         _wait(client, client.assessments.create(MODEL, beam, open_trace=False))
     if not client.traces.list(limit=1).data:
         _wait(client, client.traces.create(rope, TraceConfig(time_limit_s=120, confirmed=3), fit=SMALL_FIT))
@@ -175,7 +175,7 @@ def pages(client: Client) -> dict[str, str]:
         "cancelled": next(job.id for job in jobs if job.state == "cancelled"),
         "scene": next(scene.id for scene in client.scenes.list().data if scene.name == MODEL),
         "trace": client.traces.list(limit=1).data[0].id,
-        "assessment": client.assessments.list(MODEL, limit=1).data[0].id,
+        "assessment": client.assessments.list(limit=1).data[0].id,
         "dataset": client.datasets.list(limit=1).data[0].id,
         "rollout": client.rollouts.list(limit=1).data[0].id,
         "plan": client.plans.list(limit=1).data[0].id,

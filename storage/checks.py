@@ -5,7 +5,7 @@ from __future__ import annotations
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from physworld_schemas.base import Lineage, Page
+from physworld_schemas.base import Lineage, Page, Unmade
 from physworld_schemas.check import Check, CheckReport
 from physworld_storage.errors import Conflict, NotFound
 from physworld_storage.pages import page_of
@@ -62,11 +62,11 @@ def mark_check_ready(session: Session, check_id: str, report: CheckReport, linea
     session.flush()
 
 
-def fail_check(session: Session, check_id: str) -> None:
-    """Mark a pending check failed; a ready one stays as it is."""
+def end_check(session: Session, check_id: str, state: Unmade) -> None:
+    """Mark a pending check failed or cancelled; a ready one stays as it is."""
     row = check_row(session, check_id)
     if row.state == "pending":
-        row.state = "failed"
+        row.state = state
 
 
 def check_row(session: Session, check_id: str) -> CheckRow:

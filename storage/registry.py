@@ -12,7 +12,7 @@ from typing import Any
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from physworld_schemas.base import Artifact, Lineage, Page
+from physworld_schemas.base import Artifact, Lineage, Page, Unmade
 from physworld_schemas.model import Model, ModelVersion, TrainingConfig, VersionPatch
 from physworld_storage.errors import Conflict, NotFound
 from physworld_storage.pages import page_of
@@ -129,18 +129,19 @@ def publish(
     return _version(row, [])
 
 
-def fail_version(session: Session, name: str, version: int, message: str) -> None:
-    """Mark a pending version failed; a ready one stays as it is.
+def end_version(session: Session, name: str, version: int, state: Unmade, message: str) -> None:
+    """Mark a pending version failed or cancelled; a ready one stays as it is.
 
     Args:
         session: the transaction that it belongs to.
         name: of the model.
         version: its number.
+        state: what it is from now on.
         message: why it failed, for people.
     """
     row = version_row(session, name, version)
     if row.state == "pending":
-        row.state = "failed"
+        row.state = state
         row.message = message
 
 

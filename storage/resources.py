@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session, defer
 
-from physworld_schemas.base import Artifact, Lineage, Page
+from physworld_schemas.base import Artifact, Lineage, Page, Unmade
 from physworld_schemas.dataset import Dataset, Episode
 from physworld_schemas.fit import Fit, Parameter
 from physworld_schemas.ids import new_id
@@ -214,11 +214,11 @@ def mark_fit_ready(
     return _fit(row)
 
 
-def fail_fit(session: Session, fit_id: str) -> None:
-    """Mark a pending fit failed; a ready one stays as it is."""
+def end_fit(session: Session, fit_id: str, state: Unmade) -> None:
+    """Mark a pending fit failed or cancelled; a ready one stays as it is."""
     row = _required(session, FitRow, "fit", fit_id)
     if row.state == "pending":
-        row.state = "failed"
+        row.state = state
 
 
 def get_dataset(session: Session, dataset_id: str) -> Dataset:
@@ -376,11 +376,11 @@ def seal_dataset(
     return _dataset(row)
 
 
-def fail_dataset(session: Session, dataset_id: str) -> None:
-    """Mark a dataset failed unless it is sealed."""
+def end_dataset(session: Session, dataset_id: str, state: Unmade) -> None:
+    """Mark a dataset failed or cancelled unless it is sealed."""
     row = _required(session, DatasetRow, "dataset", dataset_id)
     if row.state != "sealed":
-        row.state = "failed"
+        row.state = state
 
 
 def _required(session: Session, table: type[Row], kind: str, identifier: str) -> Row:

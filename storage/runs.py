@@ -8,7 +8,7 @@ from pydantic import BaseModel
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from physworld_schemas.base import Artifact, Lineage, Page
+from physworld_schemas.base import Artifact, Lineage, Page, Unmade
 from physworld_schemas.plan import Plan
 from physworld_schemas.rollout import Rollout
 from physworld_storage.errors import Conflict, NotFound
@@ -130,11 +130,11 @@ def mark_run_ready(
     session.flush()
 
 
-def fail_run(session: Session, kind: RunKind, run_id: str) -> None:
-    """Mark a pending run failed; a ready one stays as it is."""
+def end_run(session: Session, kind: RunKind, run_id: str, state: Unmade) -> None:
+    """Mark a pending run failed or cancelled; a ready one stays as it is."""
     row = run_row(session, kind, run_id)
     if row.state == "pending":
-        row.state = "failed"
+        row.state = state
 
 
 def run_digest(artifacts: list[Artifact], kind: RunKind) -> str | None:

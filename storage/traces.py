@@ -8,7 +8,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from physworld_schemas.assessment import Assessment
-from physworld_schemas.base import Artifact, Lineage, Page
+from physworld_schemas.base import Artifact, Lineage, Page, Unmade
 from physworld_schemas.trace import Trace
 from physworld_storage.errors import Conflict, NotFound
 from physworld_storage.pages import page_of
@@ -96,11 +96,11 @@ def mark_trace_ready(
     session.flush()
 
 
-def fail_trace(session: Session, trace_id: str) -> None:
-    """Mark a pending trace failed; a ready one stays as it is."""
+def end_trace(session: Session, trace_id: str, state: Unmade) -> None:
+    """Mark a pending trace failed or cancelled; a ready one stays as it is."""
     row = trace_row(session, trace_id)
     if row.state == "pending":
-        row.state = "failed"
+        row.state = state
 
 
 def trace_row(session: Session, trace_id: str) -> TraceRow:
@@ -133,21 +133,30 @@ def get_assessment(session: Session, assessment_id: str) -> Assessment:
 
 
 def list_assessments(
-    session: Session, name: str, version: int, *, limit: int = 50, cursor: str | None = None
+    session: Session,
+    name: str | None = None,
+    version: int | None = None,
+    *,
+    limit: int = 50,
+    cursor: str | None = None,
 ) -> Page[Assessment]:
-    """Assessments of a model version, newest first.
+    """Assessments, newest first.
 
     Args:
         session: the transaction that reads.
-        name: of the model.
-        version: its number.
+        name: only those of this model; None: of all.
+        version: only those of this number; None: of all.
         limit: most assessments of a page, 1 to ``pages.MAX_LIMIT``.
         cursor: of the page before; None begins with the newest.
 
     Raises:
         InvalidCursor: no list of assessments gave this cursor out.
     """
-    statement = select(AssessmentRow).where(AssessmentRow.name == name, AssessmentRow.version == version)
+    statement = select(AssessmentRow)
+    if name is not None:
+        statement = statement.where(AssessmentRow.name == name)
+    if version is not None:
+        statement = statement.where(AssessmentRow.version == version)
     keys = (AssessmentRow.created_at, AssessmentRow.id)
     return page_of(session, statement, keys, _assessment, limit=limit, cursor=cursor)
 
@@ -177,11 +186,11 @@ def mark_assessment_ready(
     return row
 
 
-def fail_assessment(session: Session, assessment_id: str) -> None:
-    """Mark a pending assessment failed; a ready one stays as it is."""
+def end_assessment(session: Session, assessment_id: str, state: Unmade) -> None:
+    """Mark a pending assessment failed or cancelled; a ready one stays as it is."""
     row = assessment_row(session, assessment_id)
     if row.state == "pending":
-        row.state = "failed"
+        row.state = state
 
 
 def assessment_row(session: Session, assessment_id: str) -> AssessmentRow:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from physworld_schemas.base import Artifact, Lineage, Page
+from physworld_schemas.base import Artifact, Lineage, Page, Unmade
 from physworld_schemas.scene import Scene
 from physworld_schemas.video import Video, VideoReport
 from physworld_storage import resources
@@ -75,11 +75,11 @@ def mark_video_ready(
     session.flush()
 
 
-def fail_video(session: Session, video_id: str) -> None:
-    """Mark a pending film failed; a ready one stays as it is."""
+def end_video(session: Session, video_id: str, state: Unmade) -> None:
+    """Mark a pending film failed or cancelled; a ready one stays as it is."""
     row = video_row(session, video_id)
     if row.state == "pending":
-        row.state = "failed"
+        row.state = state
 
 
 def video_row(session: Session, video_id: str) -> VideoRow:

@@ -17,6 +17,7 @@ from physworld.arrays import Array
 from physworld.report import pictures, words
 from physworld.report.curves import Residuals, residuals
 from physworld.report.markup import Child, Html, scrolled, tag
+from physworld.report.names import label
 from physworld.report.view import script, view
 from physworld.scene import Scene
 
@@ -177,7 +178,7 @@ def _effects(report: dict[str, Any]) -> Html | None:
         parts.append(_table(("effect", "", "number", "value", "95 % interval", ""), rows))
     if calibrated:
         entries = [
-            tag("tr", tag("td", words.label(name)), *_figure(figure)) for name, figure in calibrated.items()
+            tag("tr", tag("td", label(name)), *_figure(figure)) for name, figure in calibrated.items()
         ]  # fmt: skip
         title = "Calibrated with it" if rows else "Calibrated parameters"
         parts += [
@@ -198,7 +199,7 @@ def _parameters(effect: dict[str, Any], role: str) -> list[Html]:
         first = (words.title(effect), role) if number == 0 else ("", "")
         rows.append(
             tag("tr", tag("td", tag("strong", first[0])), tag("td", first[1], class_="quiet"),
-                tag("td", words.label(name)), *_figure(figure))
+                tag("td", label(name)), *_figure(figure))
         )  # fmt: skip
     return rows or [tag("tr", tag("td", words.title(effect)), tag("td", role, class_="quiet"))]
 
@@ -277,7 +278,7 @@ def _tried(model: dict[str, Any], kept: list[str] | None) -> Html:
 
 
 def _values(values: dict[str, float | None]) -> str:
-    return ", ".join(f"{words.label(k.split('.')[-1])} {words.number(v)}" for k, v in values.items())
+    return ", ".join(f"{label(k.split('.')[-1])} {words.number(v)}" for k, v in values.items())
 
 
 def _remainder(report: dict[str, Any]) -> Html:

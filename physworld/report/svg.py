@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from physworld.report.markup import Child, Html, scrolled, tag
 from physworld.report.predictors import NOISE
 from physworld.report.words import number
 
-TICKS = 5
-ROW = 26.0
-"""Height of a row of an interval chart [px]."""
+TICKS, NARROW_TICKS = 5, 4
+ROW, ABOVE = 26.0, 12.0
+"""Height of a row of an interval chart, and of a label above it [px]."""
 DWARFS = 10.0
 """Ratio of the largest line of a chart to the smallest from which on the axis is logarithmic."""
 
@@ -42,6 +42,8 @@ class Axes:
     top: float = 18.0
     bottom: float = 40.0
     log_y: bool = False
+    ticks: int = TICKS
+    """About how many numbers the horizontal axis has."""
 
     def x(self, value: float) -> float:
         """Place across."""
@@ -68,7 +70,7 @@ class Axes:
             parts.append(tag("line", class_="grid", x1=self.left, x2=self.width - self.right, y1=y, y2=y))
             parts.append(tag("text", short(tick), class_="tick", x=self.left - 8, y=y + 4, text_anchor="end"))
         foot = self.height - self.bottom
-        for tick in round_ticks(*self.x_range):
+        for tick in round_ticks(*self.x_range, self.ticks):
             x = self.x(tick)
             parts.append(tag("line", class_="axis", x1=x, x2=x, y1=foot, y2=foot + 4))
             parts.append(tag("text", short(tick), class_="tick", x=x, y=foot + 17, text_anchor="middle"))
@@ -96,11 +98,13 @@ class Axes:
         )  # fmt: skip
 
 
-def picture(width: float, height: float, title: str, *children: Child, **attributes: str) -> Html:
-    """An SVG element with a name for those who hear the page."""
+def picture(
+    width: float, height: float, title: str, *children: Child, kind: str = "", **attributes: str
+) -> Html:
+    """An SVG element with a name for those who hear the page; ``kind`` is a further class."""
     return tag(
-        "svg", tag("title", title), *children, class_="chart", viewBox=f"0 0 {width:g} {height:g}", role="img",
-        **attributes,
+        "svg", tag("title", title), *children, class_=f"chart {kind}".strip(),
+        viewBox=f"0 0 {width:g} {height:g}", role="img", **attributes,
     )  # fmt: skip
 
 
@@ -137,6 +141,7 @@ def line_chart(
     log_y: bool = False,
     height: float = 270.0,
     width: float = 720.0,
+    narrow: float | None = None,
     symmetric: bool = False,
     named: bool = True,
     unit: str = "",
@@ -152,34 +157,53 @@ def line_chart(
         split: where the held-out frames begin on the horizontal axis.
         log_y: logarithmic vertical axis.
         height, width: [px].
+        narrow: width of a second drawing for small windows [px], see :func:`drawings`; None: without one.
         symmetric: zero in the middle of the vertical axis.
         named: curves are named.
         unit: of the values.
     """
     values = [v for s in series for v in s.values if v is not None and math.isfinite(v)]
     x_range = (float(x[0]), float(x[-1])) if len(x) > 1 else (0.0, 1.0)
-    axes = Axes(width, height, x_range, _range(values, log_y, symmetric), log_y=log_y)
-    parts: list[Child] = []
-    if split is not None and x_range[0] < split < x_range[1]:
-        left = axes.x(split)
-        parts.append(
-            tag("rect", class_="held", x=left, y=axes.top, width=axes.width - axes.right - left,
-                height=axes.height - axes.top - axes.bottom)
+    y_range = _range(values, log_y, symmetric)
+
+    def drawn(across: float, ticks: int, kind: str) -> Html:
+        axes = Axes(across, height, x_range, y_range, log_y=log_y, ticks=ticks)
+        foot = axes.height - axes.bottom
+        parts: list[Child] = []
+        if split is not None and x_range[0] < split < x_range[1]:
+            left = axes.x(split)
+            parts.append(
+                tag("rect", class_="held", x=left, y=axes.top, width=axes.width - axes.right - left,
+                    height=foot - axes.top)
+            )  # fmt: skip
+            parts.append(tag("text", "held out", class_="note", x=left + 2, y=axes.top - 4))
+        parts += axes.grid(x_label, y_label)
+        parts += [axes.line(x, one) for one in series]
+        parts.append(tag("line", class_="playhead", x1=axes.left, x2=axes.left, y1=axes.top, y2=foot))
+        return picture(
+            axes.width, axes.height, title, *parts, kind=kind, data_time=f"{x_range[0]:.6g} {x_range[1]:.6g}",
+            data_span=f"{axes.left:g} {axes.width - axes.right:g}",
         )  # fmt: skip
-        parts.append(tag("text", "held out", class_="note", x=left + 2, y=axes.top - 4))
-    parts += axes.grid(x_label, y_label)
-    parts += [axes.line(x, one) for one in series]
-    foot = axes.height - axes.bottom
-    parts.append(tag("line", class_="playhead", x1=axes.left, x2=axes.left, y1=axes.top, y2=foot))
-    drawn = picture(
-        axes.width, axes.height, title, *parts, data_time=f"{x_range[0]:.6g} {x_range[1]:.6g}",
-        data_span=f"{axes.left:g} {axes.width - axes.right:g}",
-    )  # fmt: skip
+
     numbers = [{"label": s.label, "role": s.role, "values": [_plain(v) for v in s.values]} for s in series]
     return tag(
-        "figure", scrolled(title, drawn), legend_of(series) if named else None, class_="plot",
-        data_x=json.dumps([_plain(v) for v in x]), data_series=json.dumps(numbers), data_unit=unit,
+        "figure", scrolled(title, drawings(drawn, width, narrow)), legend_of(series) if named else None,
+        class_="plot", data_x=json.dumps([_plain(v) for v in x]), data_series=json.dumps(numbers), data_unit=unit,
     )  # fmt: skip
+
+
+def drawings(drawn: Callable[[float, int, str], Html], width: float, narrow: float | None) -> list[Html]:
+    """A chart, and the same for small windows, where text that shrinks with the picture could not be read.
+
+    The style sheet shows the one with the class ``wide`` or the one with ``narrow``; a single one has neither.
+
+    Args:
+        drawn: makes a picture of a width [px], a number of ticks across and a class.
+        width, narrow: the widths [px]; ``narrow`` None: only the first.
+    """
+    if narrow is None:
+        return [drawn(width, TICKS, "")]
+    return [drawn(width, TICKS, "wide"), drawn(narrow, NARROW_TICKS, "narrow")]
 
 
 def dwarfed(series: Sequence[Series]) -> bool:
@@ -207,6 +231,7 @@ def interval_chart(
     floor: float | None = None,
     log_x: bool = False,
     width: float = 720.0,
+    narrow: float | None = None,
 ) -> Html:
     """Values with their intervals, one a row, smallest at the left; ``floor`` is a line that no row can be left of.
 
@@ -216,40 +241,56 @@ def interval_chart(
         floor: noise floor, say, in the unit of the values; None: no line.
         log_x: logarithmic axis.
         width: [px].
+        narrow: width of a second drawing for small windows [px], whose labels stand above the rows; None: without one.
     """
     held = [v for row in rows for v in (row.value, *(row.ends or ())) if math.isfinite(v)]
     low, high = _range(held + ([] if floor is None else [floor]), log_x, False)
-    axes = Axes(width, ROW * len(rows) + 62.0, (low, high), (0.0, 1.0), left=230.0, top=8.0, bottom=44.0)
 
-    def across(value: float) -> float:
-        if not log_x:
-            return axes.x(value)
-        share = (math.log10(max(value, low)) - math.log10(low)) / (math.log10(high) - math.log10(low))
-        return axes.left + share * (axes.width - axes.left - axes.right)
+    def drawn(across: float, ticks: int, kind: str) -> Html:
+        above = kind == "narrow"
+        step = ROW + ABOVE if above else ROW
+        left = 14.0 if above else 230.0
+        axes = Axes(across, step * len(rows) + 62.0, (low, high), (0.0, 1.0), left=left, top=8.0, bottom=44.0)
+        return picture(axes.width, axes.height, title, *_rows(axes, step, above, ticks), kind=kind)
 
-    foot = axes.height - axes.bottom
-    parts: list[Child] = []
-    for tick in decades(low, high) if log_x else round_ticks(low, high):
-        x = across(tick)
-        parts.append(tag("line", class_="grid", x1=x, x2=x, y1=axes.top, y2=foot))
-        parts.append(tag("text", short(tick), class_="tick", x=x, y=foot + 16, text_anchor="middle"))
-    if floor is not None:
-        x = across(floor)
-        ends = {"x1": x, "x2": x, "y1": axes.top, "y2": foot}
-        parts.append(tag("line", class_=f"line {NOISE}", stroke_width=1.6, stroke_dasharray="3 3", **ends))
-    for place, row in enumerate(rows):
-        y = axes.top + ROW * (place + 0.5)
-        parts.append(tag("text", row.label, x=axes.left - 12, y=y + 4, text_anchor="end"))
-        if row.ends is not None and all(map(math.isfinite, row.ends)):
-            left, right = map(across, row.ends)
+    def _rows(axes: Axes, step: float, above: bool, ticks: int) -> list[Child]:
+        def place(value: float) -> float:
+            if not log_x:
+                return axes.x(value)
+            share = (math.log10(max(value, low)) - math.log10(low)) / (math.log10(high) - math.log10(low))
+            return axes.left + share * (axes.width - axes.left - axes.right)
+
+        foot = axes.height - axes.bottom
+        parts: list[Child] = []
+        for tick in decades(low, high) if log_x else round_ticks(low, high, ticks):
+            x = place(tick)
+            parts.append(tag("line", class_="grid", x1=x, x2=x, y1=axes.top, y2=foot))
+            parts.append(tag("text", short(tick), class_="tick", x=x, y=foot + 16, text_anchor="middle"))
+        if floor is not None:
+            x = place(floor)
+            ends = {"x1": x, "x2": x, "y1": axes.top, "y2": foot}
             parts.append(
-                tag("line", class_=f"line {row.role}", x1=left, x2=right, y1=y, y2=y, stroke_width=2.5)
+                tag("line", class_=f"line {NOISE}", stroke_width=1.6, stroke_dasharray="3 3", **ends)
             )
-        if math.isfinite(row.value):
-            parts.append(tag("circle", class_=f"dot {row.role}", cx=across(row.value), cy=y, r=4.5))
-    middle = 0.5 * (axes.left + axes.width - axes.right)
-    parts.append(tag("text", x_label, class_="label", x=middle, y=axes.height - 6, text_anchor="middle"))
-    return tag("figure", scrolled(title, picture(axes.width, axes.height, title, *parts)), class_="plot")
+        for number_of, row in enumerate(rows):
+            y = axes.top + step * (number_of + 1) - ROW / 2
+            label = {"x": 0.0, "y": y - 14} if above else {"x": axes.left - 12, "y": y + 4}
+            parts.append(
+                tag("text", row.label, class_="above" if above else None, text_anchor="start" if above else "end",
+                    **label)
+            )  # fmt: skip
+            if row.ends is not None and all(map(math.isfinite, row.ends)):
+                left, right = map(place, row.ends)
+                parts.append(
+                    tag("line", class_=f"line {row.role}", x1=left, x2=right, y1=y, y2=y, stroke_width=2.5)
+                )
+            if math.isfinite(row.value):
+                parts.append(tag("circle", class_=f"dot {row.role}", cx=place(row.value), cy=y, r=4.5))
+        middle = 0.5 * (axes.left + axes.width - axes.right)
+        parts.append(tag("text", x_label, class_="label", x=middle, y=axes.height - 6, text_anchor="middle"))
+        return parts
+
+    return tag("figure", scrolled(title, drawings(drawn, width, narrow)), class_="plot")
 
 
 def _plain(value: float | None) -> float | None:

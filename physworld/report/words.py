@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-import re
 from typing import Any
+
+from physworld.report.names import label
 
 VERDICTS = {
     "named": ("Effect named", "good"),
@@ -21,9 +22,6 @@ _PREFIXES = {
     "m": ((1.0, "m"), (1e-3, "mm")),
     "s": ((0.1, "s"), (1e-3, "ms")),
 }
-_UNIT_AT_THE_END = re.compile(
-    r"(?<=.)_(1_per_m|pa_s|pa|n_m2|n_m|m_s2|m_s|kg_m3|kg_m2|kg_m|per_s|per_m|rad|kg|m|s|n)$"
-)
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -105,11 +103,6 @@ def headline(report: dict[str, Any]) -> str:
 
 def _of(tried: int) -> str:
     return f"of {tried} candidates"
-
-
-def label(name: str) -> str:
-    """A number's name without the unit at its end."""
-    return _UNIT_AT_THE_END.sub("", name).replace("_", " ")
 
 
 def _with_strength(effect: dict[str, Any]) -> str:

@@ -212,14 +212,14 @@ def _where(scene: Scene, square: Array, seen: Array) -> str:
     worst = np.argsort(per_point)[-max(len(per_point) // 10, 1) :]
     share = float(per_point[worst].sum() / max(per_point.sum(), 1e-300))
     centre = start[worst].mean(axis=0)
-    place = ", ".join(f"{c:.3f}" for c in centre)
+    place = ", ".join(f"{c:z.3f}" for c in centre)
     return f"a tenth of the points, about ({place}) m at the start, carries {share:.0%} of its square"
 
 
 def _along(error: Array) -> str:
     values, vectors = np.linalg.eigh(error.T @ error)
     share = float(values[-1] / max(values.sum(), 1e-300))
-    way = ", ".join(f"{c:+.2f}" for c in vectors[:, -1])
+    way = ", ".join(f"{c:+z.2f}" for c in vectors[:, -1])
     return f"{share:.0%} of it along ({way})" if share > 0.5 else "it has no main direction"
 
 
@@ -244,5 +244,5 @@ def _with(scene: Scene, tracks: Array, error: Array, seen: Array, window: slice)
         size = float(np.linalg.norm(there) * np.linalg.norm(error[seen]))
         correlation = float(np.sum(there * error[seen])) / size if size > 0 else 0.0
         if abs(correlation) > _STRONG:
-            found.append((abs(correlation), f"it goes with {name} (correlation {correlation:+.2f})"))
+            found.append((abs(correlation), f"it goes with {name} (correlation {correlation:+z.2f})"))
     return [text for _, text in sorted(found, reverse=True)[:2]]

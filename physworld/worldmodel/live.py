@@ -60,6 +60,16 @@ class LiveRollout:
         """Object vertices now [m], (n, 3)."""
         return self._window[-1, : self._published.spec.object_count].astype(np.float64) + self._origin
 
+    def set_phi(self, phi: Array) -> None:
+        """Give the body other properties from the next step on: logarithms of property ratios (n, 2).
+
+        Raises GraphInvalid for another shape or values that are not finite; the properties are as before then.
+        """
+        given = np.asarray(phi, dtype=np.float64)
+        if given.shape != self._phi.shape or not np.isfinite(given).all():
+            raise GraphInvalid(f"phi of shape {given.shape}, not {self._phi.shape}, or not finite")
+        self._phi = given
+
     def step(self, controllers: Array) -> Array:
         """Move all controllers to (K, 3) [m] within one tick; the object vertices then, (n, 3) [m].
 

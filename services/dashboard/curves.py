@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 MOST_TIMES = 600
 TIMES_KEY = "times_s"
 MM = 1e3
+NARROW_PX = 320.0
+"""Width of a plot in a small window, about that of a phone."""
 VERSION_DASHES = (None, "7 3", "2 3", "9 3 2 3", "1 4", "12 4")
 """One colour is one predictor's; versions that are compared differ in their dash."""
 METRIC = "track_m"
@@ -104,10 +106,11 @@ def versions_chart(versions: Sequence[ModelVersion], floor_m: float | None) -> H
     return interval_chart(
         rows,
         title="Mean track errors of the versions with 95 % intervals",
-        x_label="mean track error on the held-out frames [mm], 95 % interval",
+        x_label="mean held-out track error [mm], 95 % interval",
         floor=None if floor_m is None else MM * floor_m,
         log_x=bool(values) and max(values) > DWARFS * min(values),
         width=980,
+        narrow=NARROW_PX,
     )
 
 
@@ -165,6 +168,7 @@ def training_charts(points: Sequence[tuple[float, Mapping[str, float]]]) -> list
                 log_y=bool(values) and max(values) > DWARFS * min(values),
                 height=220,
                 width=520,
+                narrow=NARROW_PX,
                 unit=unit,
             )
         )
@@ -212,6 +216,7 @@ def _drawn(times: Array, series: list[Series], split: float | None, floor_m: flo
         log_y=dwarfed(series),
         height=300,
         width=980,
+        narrow=NARROW_PX,
         unit="mm",
     )
 

@@ -13,13 +13,14 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ValidationError
 
+from physworld.report import names
 from physworld_services.dashboard.text import figure
 
 InputKind = Literal["number", "switch", "choice", "choices", "weights", "text", "words"]
 Options = Sequence[tuple[str, str]]
 Schema = Mapping[str, Any]
-SUFFIXES = ("_m_s2", "_kg_m3", "_m_s", "_hz", "_pa", "_s", "_m")
-"""Units at the end of a field's name, which the form writes beside the input."""
+MACHINES_LIMIT = 2**31 - 1
+"""From here on a bound is what a database holds, and tells nobody what to choose."""
 
 
 @dataclass(frozen=True)
@@ -139,12 +140,12 @@ def _input(
 ) -> Input | None:
     """The input of a field that is no model of its own; None for one that a form does not show."""
     own, optional = _without_null(schema)
-    help_, unit = str(schema.get("description", "")), str(schema.get("unit", own.get("unit", "")))
+    help_, unit = str(schema.get("description", "")), schema.get("unit", own.get("unit"))
     known: dict[str, Any] = {
         "name": place,
         "label": label_of(key),
         "help": help_,
-        "unit": "" if unit == "1" else unit,
+        "unit": names.unit(key) if unit is None else names.written(str(unit)),
     }
     known |= {"value": value, "required": required and not optional}
     empty = [("", "usual" if value is None else "–")] if optional or not required else []
@@ -177,7 +178,8 @@ def _input(
 def _number(schema: Schema, known: dict[str, Any]) -> Input:
     least = schema.get("minimum", schema.get("exclusiveMinimum"))
     most = schema.get("maximum", schema.get("exclusiveMaximum"))
-    low, high = (None if end is None else figure(float(end)) for end in (least, most))
+    low = None if least is None else figure(float(least))
+    high = None if most is None or most >= MACHINES_LIMIT else figure(float(most))
     bounds = f"{low} to {high}" if low and high else f"from {low}" if low else f"to {high}" if high else ""
     if "exclusiveMinimum" in schema:
         bounds = f"above {low}" + (f", to {high}" if high else "")
@@ -234,11 +236,10 @@ def _without_null(schema: Schema) -> tuple[Schema, bool]:
     if parts is None:
         return schema, False
     own = [part for part in parts if part.get("type") != "null"]
-    return (own[0] if own else schema), len(own) < len(parts)
+    text = [part for part in own if part.get("type") == "string"]  # a text may be a number as well
+    return (*text, *own, schema)[0], len(own) < len(parts)
 
 
 def label_of(key: str) -> str:
     """``time_limit_s`` as ``Time limit``, ``scene_id`` as ``Scene``."""
-    plain = key.removesuffix("_id") if key.endswith("_id") else key.replace("_ids", "s")
-    suffix = next((end for end in SUFFIXES if plain.endswith(end)), "")
-    return plain.removesuffix(suffix).replace("_", " ").capitalize()
+    return names.sentence(names.label(key))

@@ -15,13 +15,13 @@ from physworld_services.dashboard.site import BASE, Site
 from physworld_storage.family import Member, ancestors, family_of, related
 
 MOST_SHOWN = 6
-BOX_WIDTH, BOX_HEIGHT = 148, 42
+BOX_WIDTH, BOX_HEIGHT, INSET = 148, 42, 11
 STEP_X, STEP_Y = 196, 54
 TOP = 26
 TITLES = ("Scene", "Fits", "Traces", "Datasets", "Model versions", "Uses")
 LISTS = {"fit": "fits", "trace": "traces", "dataset": "datasets", "model": "models", "rollout": "rollouts"}
 LONGEST = 19
-"""Characters of a label."""
+"""Characters of a label; what a wide font makes longer than its box is cut off there."""
 
 
 def lineage_graph(site: Site, scene_id: str | None, focus: str) -> Html | None:
@@ -98,13 +98,14 @@ def _chosen(members: Sequence[Member], kept: set[str]) -> list[Member]:
 
 def _box(member: Member, x: float, y: float, here: bool) -> Html:
     said = f"{member.kind} {member.label}{f', {member.state}' if member.state else ''}"
+    texts = [tag("text", _cut(member.label), y=18 if member.state else 26)]
+    if member.state:
+        texts.append(tag("text", member.state, y=34, class_=f"state {member.state}"))
     parts = [
         tag("title", f"{member.kind} {member.key}{f', {member.state}' if member.state else ''}"),
         tag("rect", x=x, y=y, width=BOX_WIDTH, height=BOX_HEIGHT, rx=7),
-        tag("text", _cut(member.label), x=x + 11, y=y + (18 if member.state else 26)),
+        tag("svg", texts, x=x + INSET, y=y, width=BOX_WIDTH - 2 * INSET, height=BOX_HEIGHT),
     ]
-    if member.state:
-        parts.append(tag("text", member.state, x=x + 11, y=y + 34, class_=f"state {member.state}"))
     current = "true" if here else None
     return tag("a", parts, href=address_of(member), aria_label=said, aria_current=current, class_=member.kind)
 

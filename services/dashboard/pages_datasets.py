@@ -24,7 +24,7 @@ COVERAGE = "coverage.svg"
 CARD = "card.json"
 SHOWN_REJECTIONS = 12
 PICTURE_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
-DONE_STATES = frozenset({"sealed", "failed"})
+DONE_STATES = frozenset({"sealed", "failed", "cancelled"})
 
 Cursor = Annotated[str | None, Query(max_length=512)]
 
@@ -113,7 +113,7 @@ def _cloud(site: Site, dataset_id: str, index: int) -> Cloud:
     with site.database.reading() as session:
         episode = resources.get_episode(session, dataset_id, index)
     arrays, _attributes = site.episodes.verified(episode.path, episode.digest)
-    layers = [thinned(Layer("particles", "Particles", "predicted", np.asarray(arrays["particles"])))]
+    layers = [thinned(Layer("particles", "Particles", "particles", np.asarray(arrays["particles"])))]
     if arrays["controllers"].shape[1]:
         controllers = np.asarray(arrays["controllers"])
         layers.append(thinned(Layer("controllers", "Controllers", "controllers", controllers)))

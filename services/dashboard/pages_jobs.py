@@ -17,7 +17,7 @@ from physworld_services.dashboard.curves import training_charts
 from physworld_services.dashboard.lists import Asked, Looked
 from physworld_services.dashboard.samples import sample_folder
 from physworld_services.dashboard.site import BASE, Site
-from physworld_services.dashboard.text import figure
+from physworld_services.dashboard.text import progress_told
 from physworld_storage import loops, overview
 from physworld_storage.access import audit
 from physworld_storage.jobs import events, jobs
@@ -158,8 +158,8 @@ def describe(event: Event) -> str:
     """One line for an entry of the log."""
     data = event.data
     if event.type == "progress":
-        counted = f"{figure(data.get('done'))} of {figure(data.get('total'))} {data.get('unit', '')}".strip()
-        return f"{counted} · {data['message']}" if data.get("message") else counted
+        counted = progress_told(data.get("done", 0.0), data.get("total"), data.get("unit", ""))
+        return " · ".join(part for part in (counted, data.get("message")) if part)
     if event.type == "state":
         error = data.get("error") or {}
         detail = error.get("detail") or error.get("title")

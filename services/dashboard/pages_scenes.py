@@ -8,6 +8,7 @@ from fastapi import APIRouter, Query, Request
 from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
 
 from physworld.arrays import Array
+from physworld.report import names
 from physworld_schemas.fit import Fit
 from physworld_schemas.scene import Scene as SceneRecord
 from physworld_services.dashboard.clouds import (
@@ -180,19 +181,11 @@ def _declared(record: SceneRecord) -> list[tuple[str, object]]:
     for key in DECLARED_SHOWN:
         value = (record.declared or {}).get(key)
         if key == "body" and isinstance(value, dict):
-            facts += [(_fact_label(name), item) for name, item in value.items() if _is_short(item)]
+            facts += [(names.title(name), item) for name, item in value.items() if _is_short(item)]
         elif value not in (None, [], {}):
-            facts.append((_fact_label(key), value if _is_short(value) else f"{len(value)} declared"))
+            facts.append((names.title(key), value if _is_short(value) else f"{len(value)} declared"))
     return facts
 
 
 def _is_short(value: object) -> bool:
     return isinstance(value, str | int | float | dict) or (isinstance(value, list) and 0 < len(value) <= 4)
-
-
-def _fact_label(key: str) -> str:
-    """``density_kg_m3`` as ``Density [kg/m³]``."""
-    for suffix, unit in (("_kg_m3", "kg/m³"), ("_m_s2", "m/s²"), ("_kg", "kg"), ("_m", "m")):
-        if key.endswith(suffix):
-            return f"{key.removesuffix(suffix).replace('_', ' ').capitalize()} [{unit}]"
-    return key.replace("_", " ").capitalize()

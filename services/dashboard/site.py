@@ -104,6 +104,7 @@ def environment_of_pages() -> Environment:
         kinds=KINDS,
         static=_static_url,
         lasted=text.lasted,
+        progress_told=text.progress_told,
         held_out_of=held_out_of,
         metric_called=catalogue().metric,
         noise_floor_of=noise_floor_of,

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from physworld.report import names
 from physworld.report.predictors import PREDICTORS
 from physworld_schemas.library import Metric, catalogue
 
@@ -72,8 +73,8 @@ def held_out_rows(table: HeldOut) -> list[Row]:
 
 def label_of(name: str) -> str:
     """What a predictor is called at the beginning of a row."""
-    label = PREDICTORS[name].label if name in PREDICTORS else name.replace("_", " ")
-    return label[:1].upper() + label[1:]
+    label = PREDICTORS[name].label if name in PREDICTORS else names.label(name)
+    return names.sentence(label)
 
 
 def _best(metric: Metric, values: Mapping[str, float | None]) -> float | None:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from datetime import UTC, datetime
 
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
+from physworld.report import names
 from physworld.report.markup import Html
 from physworld_schemas.wording import roughly
+from physworld_services.dashboard.tables import label_of
 
 _AGES = ((60, 1, "s"), (3600, 60, "min"), (86_400, 3600, "h"), (30 * 86_400, 86_400, "d"))
 DASH = "–"
@@ -99,7 +101,7 @@ def millimetres(metres: float | None) -> str:
 
 def shown_unit(unit: str) -> str:
     """The unit in which :func:`measured` shows a value, with a comma before it; nothing where there is none."""
-    return "" if unit == "1" else f", {'mm' if unit == 'm' else unit}"
+    return "" if unit == "1" else f", {'mm' if unit == 'm' else names.written(unit)}"
 
 
 def measured(value: float | None, unit: str) -> str:
@@ -111,6 +113,7 @@ def _fixed(value: float, digits: int) -> str:
     """Decimal notation with ``digits`` significant digits, zeros at the end kept; what is next to nothing is 0."""
     if 0 < abs(value) < NEXT_TO_NOTHING:
         return "0"
+    value = abs(value) if value == 0 else value  # a zero has no sign
     places = digits - 1 - math.floor(math.log10(abs(value))) if value else digits - 1
     return f"{value:,.{max(0, places)}f}"
 
@@ -125,9 +128,34 @@ def size(count: int) -> str:
     return f"{value:.1f} GiB"
 
 
-def words(name: str) -> str:
-    """``world_model_finetuned`` as a person reads it."""
-    return name.replace("_", " ").strip()
+def amount(count: float, unit: str) -> str:
+    """``12 runs``, ``1 run``, ``87 %``: a count with its unit, which is given in the plural."""
+    if unit == "percent":
+        return f"{count:.0f} %"
+    return f"{figure(count)} {unit.removesuffix('s') if count == 1 else unit}".strip()
+
+
+def progress_told(done: float, total: float | None, unit: str) -> str:
+    """How far something has come: ``20 of 80 simulations``, ``87 %``; empty where nobody knows."""
+    if not total:
+        return ""
+    return (
+        amount(100 * done / total, unit) if unit == "percent" else f"{figure(done)} of {amount(total, unit)}"
+    )
+
+
+def coded(text: str) -> Markup:
+    """A sentence of the schemas, its parts between backticks as code."""
+    parts = text.split("`")
+    return Markup("").join(
+        Markup("<code>{}</code>").format(part) if number % 2 else escape(part)
+        for number, part in enumerate(parts)
+    )
+
+
+def uncoded(text: str) -> str:
+    """The same where there is no markup."""
+    return text.replace("`", "")
 
 
 def identifier(value: str) -> Markup:
@@ -141,9 +169,12 @@ def identifier(value: str) -> Markup:
 def plain(value: object) -> str:
     """A declared fact of any shape, as one line."""
     if isinstance(value, dict):
+        told = {str(key): item for key, item in value.items() if item not in (None, [], ())}
         return ", ".join(
-            f"{words(str(key))} {plain(item)}" for key, item in value.items() if item not in (None, [], ())
+            f"{names.label(key)} {plain(item)} {names.unit(key)}".strip() for key, item in told.items()
         )
+    if value in ("", [], ()):
+        return DASH
     if isinstance(value, list | tuple):
         if len(value) > 6:
             return f"{len(value)} entries"
@@ -166,7 +197,14 @@ FILTERS = {
     "shown_unit": shown_unit,
     "roughly": roughly,
     "size": size,
-    "words": words,
+    "amount": amount,
+    "coded": coded,
+    "uncoded": uncoded,
+    "words": names.label,
+    "name": names.title,
+    "unit": names.written,
+    "sentence": names.sentence,
+    "predictor": label_of,
     "identifier": identifier,
     "plain": plain,
 }

@@ -2,7 +2,8 @@
 
 ``/live?model=NAME&version=N&ticket=…&frames=2&part=points``: first a JSON text ``{"type": "ready", …}``, then binary
 frames (``session``), ``frames`` of them a tick, interpolated; ``part=vertices`` for the graph's vertices. The client
-sends binary control messages, and as JSON text ``{"type": "reset"}``. Velocities last ``HOLD_S``: a client that falls
+sends binary control messages, and as JSON text ``{"type": "reset"}`` and ``{"type": "factors", "factors": {NAME: x}}``,
+properties of the body relative to the model's. Velocities last ``HOLD_S``: a client that falls
 silent stops its grips.
 
 The model is stepped in a thread, never on the event loop. A slow reader gets fewer frames, the newest each time:
@@ -18,6 +19,7 @@ import asyncio
 import json
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from typing import Any
 
 import numpy as np
 import structlog
@@ -129,10 +131,23 @@ class _Connection:
             try:
                 if message.get("bytes") is not None:
                     self._control, self._steered_at = self._session.read(message["bytes"]), clock()
-                elif json.loads(message["text"]).get("type") == "reset":
-                    self._reset = True
-            except (ControlRefused, ValueError, AttributeError, RecursionError) as error:
+                else:
+                    self._told(json.loads(message["text"]))
+            except (
+                ControlRefused,
+                ValueError,
+                LookupError,
+                TypeError,
+                AttributeError,
+                RecursionError,
+            ) as error:
                 return UNREADABLE, str(error)[:120]
+
+    def _told(self, message: dict[str, Any]) -> None:
+        if message.get("type") == "reset":
+            self._reset = True
+        elif message.get("type") == "factors":
+            self._session.set_factors(dict(message["factors"]))
 
     async def _step(self) -> tuple[int, str]:
         loop = asyncio.get_running_loop()

@@ -13,6 +13,7 @@ Arrays of ``plan.npz``, T ticks of the plan after the h + 1 of the model's histo
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import numpy as np
@@ -48,6 +49,7 @@ def make(
         Cancelled: the job was.
         ValueError: the limits leave the start out.
     """
+    started = time.perf_counter()
     payload = context.lease.payload
     scene = scene_of(stores, payload["scene_id"])
     twin = twin_of(stores, payload["fit_id"], payload.get("trace_id"))
@@ -89,7 +91,8 @@ def make(
         "cost_history": np.array(found.costs),
         **goal_arrays,
     }
-    return _figures(task, goal, config, found, executed, motionless) | {"goal": request.goal.kind}, arrays
+    figures = _figures(task, goal, config, found, executed, motionless)
+    return figures | {"goal": request.goal.kind, "seconds": time.perf_counter() - started}, arrays
 
 
 def goal_of(request: PlanCreate) -> tuple[Goal, dict[str, Array]]:

@@ -7,7 +7,9 @@ A control message is uint32 its number, then float32 velocities [m/s], (G, 3) fo
 
 from __future__ import annotations
 
+import math
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +24,10 @@ HEAD = struct.Struct("<IIfI")
 SET_BACK = 1
 SPEED_PER_SIZE, REACH_PER_SIZE = 4.0, 1.5
 """Largest speed [1/s] and distance of a grip from its start, in sizes of the body."""
+
+
+MOST_FACTOR = 100.0
+"""Of a property of the body, and one over the least."""
 
 
 class ControlRefused(ValueError):
@@ -42,6 +48,7 @@ class LiveSession:
     def __init__(self, model: PublishedModel, *, vertices: bool = False) -> None:
         """``vertices``: frames hold the graph's object vertices in the place of the measured points."""
         self.dt_s = model.spec.dt_s
+        self._model = model
         self._skin = None if vertices else model.skin
         start = model.start_controllers[-1]
         self.groups = grip_groups(model.spec, start)
@@ -60,6 +67,7 @@ class LiveSession:
             "grips": [group.tolist() for group in self.groups],
             "speed_m_s": self.speed_m_s,
             "reach_m": self.reach_m,
+            "factors": [column.name for column in self._model.columns],
             "start": self._now[: -len(self._start)].astype(np.float32).tolist(),
         }
 
@@ -82,6 +90,24 @@ class LiveSession:
         speed = np.linalg.norm(velocity, axis=1, keepdims=True)
         velocity = velocity * np.minimum(1.0, self.speed_m_s / np.maximum(speed, 1e-12))
         return Control(struct.unpack_from("<I", message)[0], velocity)
+
+    def set_factors(self, factors: Mapping[str, Any]) -> None:
+        """Properties of the body by name, each relative to the model's own; one that is not named is as in the model.
+
+        They hold from the next tick on, and after a reset. Raises ControlRefused.
+        """
+        for name, factor in factors.items():
+            if isinstance(factor, bool) or not isinstance(factor, int | float) or not math.isfinite(factor):
+                raise ControlRefused(f"the factor of {name!r} is not a finite number")
+            if not 1 / MOST_FACTOR <= factor <= MOST_FACTOR:
+                raise ControlRefused(
+                    f"the factor of {name!r} is {factor:g}; it may be 0.01 to {MOST_FACTOR:g}"
+                )
+        columns = [column.name for column in self._model.columns]
+        unknown = sorted(set(factors) - set(columns))
+        if unknown:
+            raise ControlRefused(f"there is no property {unknown[0]!r}; there are {', '.join(columns)}")
+        self._rollout.set_phi(self._model.phi + [math.log(factors.get(name, 1.0)) for name in columns])
 
     def reset(self) -> None:
         """Back to the start."""

@@ -92,7 +92,7 @@ class Episodes:
     def track(self, index: int) -> Track:
         """Episode ``index`` once it is there. Raises Cancelled, LeaseLost, DatasetIncomplete or EpisodeCorrupt."""
         while (episode := self._committed(index)) is None:
-            if self._dataset().state in {"failed", "sealed"}:
+            if self._dataset().state in {"failed", "cancelled", "sealed"}:
                 raise DatasetIncomplete(
                     f"dataset {self._dataset_id} ended without episode {index} of {self.total}"
                 )
@@ -134,9 +134,9 @@ class Episodes:
     def sealed(self) -> Reference:
         """The dataset with its digest, once it is sealed. Raises Cancelled, LeaseLost or DatasetIncomplete."""
         while (dataset := self._dataset()).digest is None:
-            if dataset.state == "failed":
+            if dataset.state in {"failed", "cancelled"}:
                 raise DatasetIncomplete(
-                    f"dataset {self._dataset_id} failed: there is nothing to name as its origin"
+                    f"dataset {self._dataset_id} {dataset.state}: there is nothing to name as its origin"
                 )
             self._wait("waiting for the dataset's seal")
         return Reference(kind="dataset", id=dataset.id, digest=dataset.digest)

@@ -71,12 +71,12 @@ def card_of(
         },
         "intended_use": (
             "Predict the motion of this object under motions of its grips like those of the demonstrations, "
-            "open loop, at the clock dt_s."
+            "open loop, at the time step of the model."
         ),
         "limits": (
             f"One object and its grips, as recorded: {_SEEN[config.near_edges]}fracture, flow and other grips are not "
             "represented; motions much faster or wider than the demonstrations are extrapolated; the start needs "
-            "history + 1 frames."
+            f"{config.history + 1} frames."
         ),
     }
 

@@ -111,7 +111,7 @@ def fail_job(session: Session, job: JobRow, problem: Problem, now: datetime) -> 
     """
     _stop_shards(session, job, (QUEUED, RUNNING), now)
     job.error = problem.model_dump(mode="json")
-    kind_of(job).fail(session, job, problem.detail or problem.title)
+    kind_of(job).end(session, job, "failed", problem.detail or problem.title)
     job.finished_at = now
     _set_state(session, job, "failed")
     parent = _parent(session, job)
@@ -152,7 +152,7 @@ def settle_cancel(session: Session, job: JobRow, now: datetime) -> None:
         return
     if any(child.state not in TERMINAL_STATES for child in _children(session, job)):
         return
-    kind_of(job).fail(session, job, "cancelled")
+    kind_of(job).end(session, job, "cancelled", "")
     job.finished_at = now
     _set_state(session, job, "cancelled")
     parent = _parent(session, job)

@@ -18,7 +18,7 @@ from typing import Any, Generic, TypeVar
 from pydantic import Field
 from sqlalchemy.orm import Session
 
-from physworld_schemas.base import Lineage, Reference, Resource
+from physworld_schemas.base import Lineage, Reference, Resource, Unmade
 from physworld_schemas.ids import new_id
 from physworld_schemas.job import Job, Progress
 from physworld_schemas.job import JobKind as Name
@@ -99,8 +99,15 @@ class JobKind:
         """The kind of the references in a job's ``outputs``."""
         return self.name
 
-    def fail(self, session: Session, job: JobRow, message: str) -> None:
-        """Mark what the job should have brought forth failed, unless it is ready."""
+    def end(self, session: Session, job: JobRow, state: Unmade, message: str) -> None:
+        """Mark what the job should have brought forth failed or cancelled, unless it is ready.
+
+        Args:
+            session: the transaction that ends the job.
+            job: locked.
+            state: what it is from now on.
+            message: why it failed, for people.
+        """
         raise NotImplementedError
 
     def reopen(self, session: Session, job: JobRow) -> None:

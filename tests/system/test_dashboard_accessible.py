@@ -21,7 +21,7 @@ CLIPPED = """() => [...document.querySelectorAll(".top nav a")].filter((link) =>
   const [box, bar] = [link.getBoundingClientRect(), link.parentElement.getBoundingClientRect()];
   return box.left < 0 || box.right > Math.min(innerWidth, bar.right) + 1 || box.width < 1;
 }).map((link) => link.textContent)"""
-BRIGHT = """() => [...document.querySelectorAll("main img")].filter((picture) =>
+BRIGHT = """() => [...document.querySelectorAll("main img, main video")].filter((picture) =>
   !getComputedStyle(picture).filter.includes("invert")).map((picture) => picture.src)"""
 RUN = """async (tags) => {
   const found = await axe.run(document, { runOnly: { type: "tag", values: tags }, resultTypes: ["violations"] });

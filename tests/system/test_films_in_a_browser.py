@@ -64,3 +64,14 @@ def test_the_player_loads_the_film_and_fits_the_window(stranger: Visit, world: W
             assert player.evaluate("(film) => [film.videoWidth, film.videoHeight]") == [WIDTH, HEIGHT]
             assert box["width"] / box["height"] == pytest.approx(WIDTH / HEIGHT, rel=0.01)
     assert [url for url in stranger.requests if url.endswith("/film.mp4")]
+
+
+def test_a_film_of_points_is_dark_in_the_dark(visit: Visit, world: World) -> None:
+    add_film(world)
+    filters = {}
+    for scheme in ("light", "dark"):
+        visit.page.emulate_media(color_scheme=scheme)  # type: ignore[arg-type]
+        visit.open(f"/scenes/{world.scene_id}")
+        filters[scheme] = visit.page.locator("#films video").evaluate("film => getComputedStyle(film).filter")
+    assert filters["light"] == "none"
+    assert filters["dark"].startswith("invert")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -118,6 +119,27 @@ def test_the_points_follow_a_dragged_grip(served: Served, page: Page, tmp_path: 
     until(page, lambda: bool(np.linalg.norm(place(page, "grip") - grip) < 2e-3))
 
 
+def test_a_slider_changes_the_body_and_a_new_session_keeps_it(served: Served, page: Page) -> None:
+    sent: list[str] = []
+    page.on("websocket", lambda socket: socket.on("framesent", lambda said: sent.append(str(said))))
+    enter(served, page)
+    sliders = page.locator("[data-factors] label")
+    expect(sliders).to_have_text(["Stiffness× 1.00", "Density× 1.00"])
+    slider = sliders.nth(0).locator("input")
+    slider.focus()
+    slider.press("End")
+    expect(sliders.nth(0)).to_contain_text("× 4.00")
+    asked = {"type": "factors", "factors": {"stiffness": 4, "density": 1}}
+    until(page, lambda: any("factors" in said and json.loads(said) == asked for said in sent))
+    frames = int(page.get_attribute("[data-playground]", "data-frames") or 0)
+    until(page, lambda: int(page.get_attribute("[data-playground]", "data-frames") or 0) > frames + 10)
+    sent.clear()
+    page.evaluate("() => window.playgrounds[0].socket.close()")
+    expect(page.locator("[data-note]")).to_contain_text("The session ended")
+    page.click("[data-reset]")
+    until(page, lambda: any("factors" in said and json.loads(said) == asked for said in sent))
+
+
 def test_a_still_pointer_leaves_a_still_grip(served: Served, page: Page) -> None:
     enter(served, page)
     x, y = at_grip(page)
@@ -173,7 +195,7 @@ def test_the_recorded_motion_is_driven_beside_the_recording(served: Served, page
 
 def test_a_view_that_was_turned_is_set_back(served: Served, page: Page) -> None:
     enter(served, page)
-    camera = "() => window.playgrounds[0].camera.position.toArray()"
+    camera = "() => window.playgrounds[0].view.camera.position.toArray()"
     before = page.evaluate(camera)
     box = page.locator("[data-playground] canvas").bounding_box()
     assert box is not None

@@ -107,5 +107,5 @@ def test_a_cancelled_trace_ends_with_its_simulations(
 
     until(ended, "the trace does not stop", ENDS_WITHIN_S)
     assert client.jobs.get(job.id).state == "cancelled"
-    assert client.traces.get(job.outputs[0].id).state == "failed"
+    assert client.traces.get(job.outputs[0].id).state == "cancelled"
     assert {row.state for row in simulations(service, job)} <= {"DONE", "CANCELLED"}

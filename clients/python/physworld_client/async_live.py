@@ -10,7 +10,7 @@ A session ends with its block, or where the service ends it.
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager
 from typing import Literal
 
@@ -69,6 +69,18 @@ class AsyncLiveSession:
     async def reset(self) -> None:
         """Puts the body back to its start; velocities that were set go on for their 0.3 s."""
         await self._send(live_frames.RESET)
+
+    async def set_factors(self, factors: Mapping[str, float]) -> None:
+        """Gives the body other properties from the next tick on, also after a reset.
+
+        Args:
+            factors: relative to the model's own, 0.01 to 100, by the names in ``start.factors``; one that is not given
+                is as in the model. The service ends the session where it cannot take them.
+
+        Raises:
+            LiveSessionEnded: the session is over.
+        """
+        await self._send(live_frames.write_factors(factors))
 
     async def _send(self, message: bytes | str) -> None:
         try:

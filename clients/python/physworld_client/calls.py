@@ -231,16 +231,19 @@ def assessment_get(assessment_id: str) -> Call[Assessment]:
 
 
 def assessment_list(
-    name: str, version: int | str, *, limit: int | None, cursor: str | None
+    name: str | None, version: int | str | None, *, limit: int | None, cursor: str | None
 ) -> Call[Page[Assessment]]:
-    """GET /v1/models/{name}/versions/{version}/assessments.
+    """GET /v1/assessments, or /v1/models/{name}/versions/{version}/assessments.
 
     Args:
-        name: of the model.
-        version: its number, or an alias.
+        name: of the model; None: of every model.
+        version: its number, or an alias; None: every version.
         limit: most assessments of a page; None leaves it to the service.
         cursor: of the page before.
     """
+    if name is None or version is None:
+        query = _given(limit=limit, cursor=cursor, model=name)
+        return Call("GET", "/v1/assessments", _ASSESSMENTS, query=query)
     path = f"/v1/models/{_part(name)}/versions/{_part(version)}/assessments"
     return Call("GET", path, _ASSESSMENTS, query=_given(limit=limit, cursor=cursor))
 

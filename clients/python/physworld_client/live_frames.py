@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
 from urllib.parse import urlencode
 
@@ -41,6 +42,7 @@ class LiveStart:
         grips: which control points move as one body, G groups of numbers.
         speed_m_s: speeds beyond are cut.
         reach_m: a grip stops that far from its start, along each axis.
+        factors: properties that can be changed; none where the service is older than they are.
     """
 
     dt_s: float
@@ -49,6 +51,7 @@ class LiveStart:
     grips: tuple[tuple[int, ...], ...]
     speed_m_s: float
     reach_m: float
+    factors: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -95,6 +98,12 @@ def address(base_url: str, ticket: LiveTicket, frames: int, part: Part) -> str:
     return f"{base_url.replace('http', 'ws', 1)}{ticket.path}&{query}"
 
 
+def write_factors(factors: Mapping[str, float]) -> str:
+    """Properties of the body relative to the model's, by name."""
+    named = {name: float(factor) for name, factor in factors.items()}
+    return json.dumps({"type": "factors", "factors": named})
+
+
 def read_start(message: bytes | str) -> LiveStart:
     """The first message. Raises PhysWorldError where it is another one."""
     try:
@@ -106,6 +115,7 @@ def read_start(message: bytes | str) -> LiveStart:
             grips=tuple(tuple(int(number) for number in grip) for grip in ready["grips"]),
             speed_m_s=float(ready["speed_m_s"]),
             reach_m=float(ready["reach_m"]),
+            factors=tuple(map(str, ready.get("factors", ()))),
         )
     except (ValueError, KeyError, TypeError) as error:
         raise PhysWorldError(f"a live session began with {message[:120]!r}: {reason(error)}") from error

@@ -126,13 +126,23 @@ class Assessments(Resource):
 
     def list(
         self,
-        name: str,
-        version: int | str = LATEST,
+        name: str | None = None,
+        version: int | str | None = None,
         *,
         limit: int | None = None,
         cursor: str | None = None,
     ) -> ListPage[Assessment]:
-        """Assessments of a version, newest first."""
+        """Assessments, newest first: all of them, those of a model, or those of one version of it.
+
+        Args:
+            name: of the model; None: of every model.
+            version: number or alias, with ``name``; None: of every version.
+
+        Raises:
+            ValueError: a version without a model.
+        """
+        if version is not None and name is None:
+            raise ValueError(f"version {version} of which model? Give its name too")
         return self._page(lambda at: calls.assessment_list(name, version, limit=limit, cursor=at), cursor)
 
 

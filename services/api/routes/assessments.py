@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter, Response
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Response
 
 from physworld_schemas.assessment import Assessment, AssessmentCreate
 from physworld_schemas.base import Page
@@ -41,13 +43,22 @@ def create_assessment(
 
 
 @router.get("/models/{name}/versions/{version}/assessments", responses=documented(401, 403, 404, 422))
-def list_assessments(
+def list_assessments_of_version(
     name: ModelName, version: Version, database: DatabaseDep, page: PageDep
 ) -> Page[Assessment]:
     """Assessments of a version, newest first."""
     with database.reading() as session:
         number = registry.get_version(session, name, version).version
         return traces.list_assessments(session, name, number, limit=page.limit, cursor=page.cursor)
+
+
+@router.get("/assessments", responses=documented(401, 403, 422))
+def list_assessments(
+    database: DatabaseDep, page: PageDep, model: Annotated[str | None, Query(max_length=64)] = None
+) -> Page[Assessment]:
+    """Assessments of every model, newest first."""
+    with database.reading() as session:
+        return traces.list_assessments(session, model, limit=page.limit, cursor=page.cursor)
 
 
 @router.get("/assessments/{assessment_id}", responses=documented(401, 403, 404, 422))

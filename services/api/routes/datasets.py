@@ -37,7 +37,7 @@ def create_dataset(body: DatasetCreate, idempotency: IdempotencyDep) -> Response
 def list_datasets(
     database: DatabaseDep,
     page: PageDep,
-    state: Literal["pending", "writing", "sealed", "failed"] | None = None,
+    state: Literal["pending", "writing", "sealed", "failed", "cancelled"] | None = None,
     fit_id: Annotated[str | None, Query(pattern=ID_PATTERN)] = None,
     scene_id: Annotated[str | None, Query(pattern=ID_PATTERN)] = None,
 ) -> Page[Dataset]:

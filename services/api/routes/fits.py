@@ -32,7 +32,7 @@ def create_fit(body: FitCreate, idempotency: IdempotencyDep) -> Response:
 def list_fits(
     database: DatabaseDep,
     page: PageDep,
-    state: Literal["pending", "ready", "failed"] | None = None,
+    state: Literal["pending", "ready", "failed", "cancelled"] | None = None,
     scene_id: Annotated[str | None, Query(pattern=ID_PATTERN)] = None,
 ) -> Page[Fit]:
     """Fits, newest first."""

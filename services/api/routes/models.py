@@ -57,7 +57,7 @@ def list_versions(
     name: ModelName,
     database: DatabaseDep,
     page: PageDep,
-    state: Literal["pending", "ready", "failed"] | None = None,
+    state: Literal["pending", "ready", "failed", "cancelled"] | None = None,
 ) -> Page[ModelVersion]:
     """Versions, newest first."""
     with database.reading() as session:

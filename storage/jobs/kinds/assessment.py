@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 
 from physworld_schemas import queues
 from physworld_schemas.assessment import AssessmentCreate, ComparedVersion, ErrorFigure, Outcome
-from physworld_schemas.base import Reference
+from physworld_schemas.base import Reference, Unmade
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.ids import new_id
 from physworld_schemas.trace import TRACE_PARTICLES
@@ -112,9 +112,9 @@ class AssessmentJobs(JobKind):
         }
         return self.begin(session, job, row, payload)
 
-    def fail(self, session: Session, job: JobRow, message: str) -> None:
-        """The assessment has failed."""
-        traces.fail_assessment(session, output_of(job))
+    def end(self, session: Session, job: JobRow, state: Unmade, message: str) -> None:
+        """The assessment has failed or was cancelled."""
+        traces.end_assessment(session, output_of(job), state)
 
     def reopen(self, session: Session, job: JobRow) -> None:
         """The assessment is pending again."""

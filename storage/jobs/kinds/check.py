@@ -5,7 +5,7 @@ from __future__ import annotations
 from sqlalchemy.orm import Session
 
 from physworld_schemas import queues
-from physworld_schemas.base import Reference
+from physworld_schemas.base import Reference, Unmade
 from physworld_schemas.check import CheckCreate, CheckReport
 from physworld_schemas.ids import new_id
 from physworld_storage import checks
@@ -52,9 +52,9 @@ class CheckJobs(JobKind):
         row = CheckRow(id=check_id, scene_id=scene.id, config=config)
         return self.begin(session, job, row, {"check_id": check_id, "scene_id": scene.id, "config": config})
 
-    def fail(self, session: Session, job: JobRow, message: str) -> None:
-        """The check has failed."""
-        checks.fail_check(session, output_of(job))
+    def end(self, session: Session, job: JobRow, state: Unmade, message: str) -> None:
+        """The check has failed or was cancelled."""
+        checks.end_check(session, output_of(job), state)
 
     def reopen(self, session: Session, job: JobRow) -> None:
         """The check is pending again."""

@@ -8,7 +8,7 @@ from pydantic import Field
 from sqlalchemy.orm import Session
 
 from physworld_schemas import queues
-from physworld_schemas.base import Artifact, Reference
+from physworld_schemas.base import Artifact, Reference, Unmade
 from physworld_schemas.dataset import DatasetConfig, Episode
 from physworld_schemas.ids import new_id
 from physworld_storage import resources
@@ -172,9 +172,9 @@ class DatasetJobs(JobKind):
         row = DatasetRow(id=dataset_id, **origin, statistics={}, artifacts=[])
         return self.begin(session, job, row, {"dataset_id": dataset_id, **origin})
 
-    def fail(self, session: Session, job: JobRow, message: str) -> None:
-        """The dataset has failed; its episodes stay."""
-        resources.fail_dataset(session, output_of(job))
+    def end(self, session: Session, job: JobRow, state: Unmade, message: str) -> None:
+        """The dataset has failed or was cancelled; its episodes stay."""
+        resources.end_dataset(session, output_of(job), state)
 
     def reopen(self, session: Session, job: JobRow) -> None:
         """The dataset goes on with the episodes that it has."""

@@ -7,7 +7,7 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from physworld_schemas import queues
-from physworld_schemas.base import Artifact, Reference
+from physworld_schemas.base import Artifact, Reference, Unmade
 from physworld_schemas.fit import FitConfig, Parameter
 from physworld_schemas.ids import new_id
 from physworld_storage import resources
@@ -72,9 +72,9 @@ class FitJobs(JobKind):
         row = FitRow(id=fit_id, scene_id=scene_id, config=job.config, parameters={}, metrics={}, artifacts=[])
         return self.begin(session, job, row, {"fit_id": fit_id, "scene_id": scene_id, "config": job.config})
 
-    def fail(self, session: Session, job: JobRow, message: str) -> None:
-        """The fit has failed."""
-        resources.fail_fit(session, output_of(job))
+    def end(self, session: Session, job: JobRow, state: Unmade, message: str) -> None:
+        """The fit has failed or was cancelled."""
+        resources.end_fit(session, output_of(job), state)
 
     def reopen(self, session: Session, job: JobRow) -> None:
         """The fit is pending again."""

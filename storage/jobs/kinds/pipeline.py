@@ -20,7 +20,7 @@ from collections.abc import Sequence
 
 from sqlalchemy.orm import Session
 
-from physworld_schemas.base import Reference
+from physworld_schemas.base import Reference, Unmade
 from physworld_schemas.job import TERMINAL_STATES
 from physworld_schemas.model import TrainingCreate
 from physworld_schemas.pipeline import PipelineCreate
@@ -57,7 +57,7 @@ class PipelineJobs(JobKind):
         fit.KIND.open(session, scene.id, request.fit, parent=job)
         return job
 
-    def fail(self, session: Session, job: JobRow, message: str) -> None:
+    def end(self, session: Session, job: JobRow, state: Unmade, message: str) -> None:
         """Nothing of its own: what it makes is its children's."""
 
     def open_next(self, session: Session, parent: JobRow, ended: JobRow, children: Sequence[JobRow]) -> bool:

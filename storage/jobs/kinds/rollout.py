@@ -8,7 +8,7 @@ from pydantic import Field
 from sqlalchemy.orm import Session
 
 from physworld_schemas import queues
-from physworld_schemas.base import Artifact, Reference
+from physworld_schemas.base import Artifact, Reference, Unmade
 from physworld_schemas.ids import new_id
 from physworld_storage import runs
 from physworld_storage.errors import Conflict
@@ -81,9 +81,9 @@ class RunJobs(JobKind):
         }
         return self.begin(session, job, row, payload)
 
-    def fail(self, session: Session, job: JobRow, message: str) -> None:
-        """The run has failed."""
-        runs.fail_run(session, self._run, output_of(job))
+    def end(self, session: Session, job: JobRow, state: Unmade, message: str) -> None:
+        """The run has failed or was cancelled."""
+        runs.end_run(session, self._run, output_of(job), state)
 
     def reopen(self, session: Session, job: JobRow) -> None:
         """The run is pending again."""

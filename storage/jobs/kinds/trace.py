@@ -8,7 +8,7 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from physworld_schemas import queues
-from physworld_schemas.base import Artifact, Reference
+from physworld_schemas.base import Artifact, Reference, Unmade
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.ids import new_id
 from physworld_schemas.trace import TraceConfig, Verdict
@@ -101,9 +101,9 @@ class TraceJobs(JobKind):
         payload = {"trace_id": trace_id, "scene_id": scene_id, "fit_id": fit_id, **others, **settings}
         return self.begin(session, job, row, payload)
 
-    def fail(self, session: Session, job: JobRow, message: str) -> None:
-        """The trace has failed."""
-        traces.fail_trace(session, output_of(job))
+    def end(self, session: Session, job: JobRow, state: Unmade, message: str) -> None:
+        """The trace has failed or was cancelled."""
+        traces.end_trace(session, output_of(job), state)
 
     def reopen(self, session: Session, job: JobRow) -> None:
         """The trace is pending again."""

@@ -8,7 +8,7 @@ from pydantic import Field
 from sqlalchemy.orm import Session
 
 from physworld_schemas import queues
-from physworld_schemas.base import Artifact, Reference
+from physworld_schemas.base import Artifact, Reference, Unmade
 from physworld_schemas.job import Job
 from physworld_schemas.model import TrainingCreate
 from physworld_storage import registry
@@ -97,9 +97,9 @@ class TrainingJobs(JobKind):
         }
         return self.begin(session, job, None, payload)
 
-    def fail(self, session: Session, job: JobRow, message: str) -> None:
-        """The version has failed, and says why."""
-        registry.fail_version(session, *_version_of(job), message)
+    def end(self, session: Session, job: JobRow, state: Unmade, message: str) -> None:
+        """The version has failed or was cancelled, and says why."""
+        registry.end_version(session, *_version_of(job), state, message)
 
     def reopen(self, session: Session, job: JobRow) -> None:
         """The version is pending again."""

@@ -8,7 +8,7 @@ from pydantic import Field
 from sqlalchemy.orm import Session
 
 from physworld_schemas import queues
-from physworld_schemas.base import Artifact, Reference
+from physworld_schemas.base import Artifact, Reference, Unmade
 from physworld_schemas.ids import new_id
 from physworld_schemas.video import VideoCreate, VideoReport
 from physworld_storage import videos
@@ -60,9 +60,9 @@ class VideoJobs(JobKind):
         payload |= {"scene_id": scene.id, "motion": motion, "config": config}
         return self.begin(session, job, row, payload)
 
-    def fail(self, session: Session, job: JobRow, message: str) -> None:
+    def end(self, session: Session, job: JobRow, state: Unmade, message: str) -> None:
         """There will be no film."""
-        videos.fail_video(session, output_of(job))
+        videos.end_video(session, output_of(job), state)
 
     def reopen(self, session: Session, job: JobRow) -> None:
         """The film is pending again."""

@@ -148,6 +148,9 @@ def test_speed_and_reach_are_cut_and_silence_stops_the_grips(served: Served) -> 
         ("no json", "Expecting"),
         ("[" * 60_000, ""),
         ("[]", "get"),
+        ('{"type": "factors"}', "factors"),
+        ('{"type": "factors", "factors": 3}', ""),
+        ('{"type": "factors", "factors": {"colour": 2}}', "no property"),
         (b"x" * 100_000, "bytes"),
     ],
 )

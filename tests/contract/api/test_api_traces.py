@@ -103,7 +103,7 @@ def test_traces_are_refused_cancelled_and_done_once(client: httpx.Client, servic
     job = first.json()
     assert {item["kind"] for item in job["inputs"]} == {"scene", "fit"}
     assert client.post(f"/v1/jobs/{job['id']}/cancel").json()["state"] == "cancelled"
-    assert client.get(job["links"]["trace"]).json()["state"] == "failed"
+    assert client.get(job["links"]["trace"]).json()["state"] == "cancelled"
     assert_problem(client.get("/v1/traces/trc_none"), 404, "not_found")
 
 
@@ -196,8 +196,11 @@ def test_an_assessment_opens_a_trace_where_the_model_has_become_worse(
         assert done["links"]["trace"] == answer["links"]["trace"]
         service.work()
         assert client.get(answer["links"]["trace"]).json()["verdict"] == "named"
-    listed = client.get(f"{model}/assessments").json()["data"]
-    assert listed[0] == client.get(f"/v1/assessments/{assessment_id}").json()
+    name = model.split("/")[3]
+    for path in (f"{model}/assessments", "/v1/assessments", f"/v1/assessments?model={name}"):
+        listed = client.get(path).json()["data"]
+        assert listed[0] == client.get(f"/v1/assessments/{assessment_id}").json()
+    assert client.get("/v1/assessments?model=nobody").json()["data"] == []
 
 
 def test_assessments_need_a_ready_version(client: httpx.Client, service: Service, model: str) -> None:

@@ -78,6 +78,24 @@ def test_one_velocity_steers_all_grips_and_rows_steer_what_they_name(served: Ser
         assert session.frame().points.shape == (20, 3)
 
 
+def test_a_body_gets_other_properties_and_a_property_that_is_not_there_ends_the_session(
+    served: Served, client: Client
+) -> None:
+    def lifted(factors: dict[str, float]) -> np.ndarray:
+        with client.live.open(served.model) as session:
+            assert session.start.factors == ("stiffness", "density")
+            session.set_factors(factors)
+            session.reset()
+            while session.frame().controllers[0, 2] - session.start.controllers[0, 2] < 0.02:
+                session.steer(UP)
+            return session.frame().points - session.start.points
+
+    plain, stiff = lifted({}), lifted({"stiffness": 50.0})
+    assert np.abs(stiff - plain).max() > 1e-4
+    with pytest.raises(LiveSessionEnded, match="no property 'colour'"):
+        lifted({"colour": 2.0})
+
+
 def test_a_session_that_is_closed_says_so(served: Served, client: Client) -> None:
     with client.live.open(served.model) as session:
         pass

@@ -96,6 +96,14 @@ def test_the_loop_on_the_command_line(service: Service, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "worse_than_expected: The model errs more" in done.stdout
     opened = done.stdout.rpartition("trace opened: ")[2].strip()
+    [assessed] = output_of(service, tmp_path, "assessments", "list")
+    assert output_of(service, tmp_path, "assessments", "list", "--model", "looped") == [assessed]
+    with service.client() as client:
+        every = [client.assessments.list(*of).data for of in ((), ("looped",), ("looped", 1))]
+        assert [[item.id for item in page] for page in every] == 3 * [[assessed["id"]]]
+        assert client.assessments.list("looped", 2).data == client.assessments.list("nobody").data == []
+        with pytest.raises(ValueError, match="version 1 of which model"):
+            client.assessments.list(version=1)
     [newest] = output_of(service, tmp_path, "traces", "list", "-n", "1")
     assert newest["id"] == opened
     service.work()

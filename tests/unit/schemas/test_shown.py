@@ -20,6 +20,7 @@ def test_an_object_is_one_short_line() -> None:
     shown = repr(job)
     assert shown.startswith("Job(id='job_01JZ8Q5V3M7X2K9T4B6N8R0C1D', kind='fit', state='running'")
     assert len(shown) < 160 and "\n" not in shown and "episodes" not in shown
+    assert shown.endswith(", …)") and "Ellipsis" not in shown
     assert "12.80 mm" in repr(job.progress) and len(repr(job.progress)) < 160
 
 

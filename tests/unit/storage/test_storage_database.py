@@ -17,6 +17,7 @@ from alembic.script import ScriptDirectory
 from sqlalchemy import func, select, text
 
 from physworld_schemas.fit import FitConfig
+from physworld_storage import resources
 from physworld_storage.database import MIGRATIONS, Database, newest_revision, ping
 from physworld_storage.errors import DatabaseUnavailable
 from physworld_storage.jobs import jobs
@@ -28,7 +29,7 @@ pytestmark = pytest.mark.slow
 if TYPE_CHECKING:
     from conftest import Work
 
-NEWEST = "0009"
+NEWEST = "0010"
 SPAWN = multiprocessing.get_context("spawn")
 
 
@@ -49,6 +50,19 @@ def test_an_upgrade_twice_is_one(database: Database) -> None:
     database.upgrade()
     database.check()
     assert database.revision() == revision == NEWEST
+
+
+def test_an_upgrade_tells_the_cancelled_from_those_that_have_failed(work: Work, database: Database) -> None:
+    cancelled, failed = work.fit(), work.fit()
+    work.cancel(cancelled)
+    work.fail(work.claim(), retry=False)
+    with database.session() as session:  # as before the revision 0010
+        session.execute(text("UPDATE fits SET state = 'failed'"))
+        session.execute(text("UPDATE alembic_version SET version_num = '0009'"))
+    database.upgrade()
+    with database.reading() as session:
+        states = [resources.get_fit(session, job.outputs[0].id).state for job in (cancelled, failed)]
+    assert states == ["cancelled", "failed"]
 
 
 def test_the_newest_revision_is_known_without_the_migration_tool(database_url: str) -> None:

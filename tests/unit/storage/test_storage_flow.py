@@ -134,11 +134,15 @@ def test_a_failed_episode_calls_off_the_others(work: Work) -> None:
         assert (dataset.state, dataset.episodes_done) == ("failed", 1)
 
 
-def test_a_job_that_waits_is_cancelled_at_once(work: Work) -> None:
+def test_a_job_that_waits_is_cancelled_at_once_with_what_it_should_have_made(work: Work) -> None:
     job = work.fit()
     assert work.cancel(job).state == "cancelled"
     assert work.waiting() == []
     assert work.cancel(job).state == "cancelled"
+    with work.database.reading() as session:
+        assert resources.get_fit(session, job.outputs[0].id).state == "cancelled"
+        assert [fit.id for fit in resources.list_fits(session, state="cancelled").data] == [job.outputs[0].id]
+        assert resources.list_fits(session, state="failed").data == []
 
 
 def test_running_work_sees_the_cancel_at_its_next_renewal(work: Work) -> None:
@@ -155,7 +159,7 @@ def test_running_work_sees_the_cancel_at_its_next_renewal(work: Work) -> None:
     assert work.job(job).state == "cancelled"
     with work.database.reading() as session:
         dataset = resources.get_dataset(session, job.outputs[0].id)
-        assert (dataset.state, dataset.episodes_done) == ("failed", 0)
+        assert (dataset.state, dataset.episodes_done) == ("cancelled", 0)
 
 
 def test_cancel_goes_down_to_the_child_and_up_to_the_pipeline(work: Work) -> None:
@@ -237,7 +241,7 @@ def test_versions_are_allotted_without_gaps_and_never_twice(work: Work) -> None:
     assert [version.version for version in versions] == [2, 1]
 
 
-def test_a_cancelled_training_leaves_a_failed_version(work: Work) -> None:
+def test_a_cancelled_training_leaves_a_cancelled_version(work: Work) -> None:
     pipeline = work.pipeline(episodes=1)
     for _ in range(4):
         work.complete(work.claim())
@@ -245,7 +249,7 @@ def test_a_cancelled_training_leaves_a_failed_version(work: Work) -> None:
     work.cancel(pipeline)
     with work.database.reading() as session:
         version = registry.get_version(session, "soft-beam", 1)
-    assert (version.state, version.message) == ("failed", "cancelled")
+    assert (version.state, version.message) == ("cancelled", "")
 
 
 def test_jobs_are_listed_newest_first_in_pages(work: Work) -> None:

@@ -68,7 +68,7 @@ def test_a_ready_version_is_immutable(database: Database) -> None:
             session, "beam", version, artifacts=[], sha256="f" * 64, metrics={}, lineage=Lineage()
         )
     with database.session() as session:
-        registry.fail_version(session, "beam", version, "too late")
+        registry.end_version(session, "beam", version, "failed", "too late")
         assert registry.get_version(session, "beam", version).state == "ready"
 
 

@@ -112,6 +112,6 @@ def test_a_training_on_a_dataset_in_the_making_needs_a_share(work: Work) -> None
     work.cancel(made)
     with (
         work.database.session() as session,
-        pytest.raises(Conflict, match="failed; training needs one that is"),
+        pytest.raises(Conflict, match="cancelled; training needs one that is"),
     ):
         jobs.create_training(session, TrainingCreate(name="beam", dataset_id=dataset_id, config=STREAMED))

@@ -155,7 +155,7 @@ def test_a_cancelled_trace_stops_at_its_next_simulation(
     monkeypatch.setattr(helpers, "put_up", cancelled_meanwhile)
     assert run_shard(runtime_with(), driver) == "cancelled"
     assert _job(stores, job).state == "cancelled"
-    assert _trace(stores, job).state == "failed"
+    assert _trace(stores, job).state == "cancelled"
     assert {s.state for s in _shards(stores, job)} == {"CANCELLED"}
     assert stores.scratch.jobs() == []
 

@@ -195,7 +195,7 @@ def test_a_film_that_is_called_off_stops_and_leaves_nothing(
 
     monkeypatch.setattr(Drawing, "frames", slow)
     outcome, ended, video = drawn(stores, runtime_with(), job)
-    assert outcome == "cancelled" and ended.state == "cancelled" and video.state == "failed"
+    assert outcome == "cancelled" and ended.state == "cancelled" and video.state == "cancelled"
     assert len(shown) < len(tiny_scene().times) and video.artifacts == []
 
 

@@ -299,10 +299,10 @@ VIDEOS = Listing(
 )
 ASSESSMENTS = Listing(
     "list",
-    "Recordings held against a model.",
+    "Recordings held against models.",
     ("id", "model", "scene", "state", "outcome", "age"),
     _assessment,
-    of=("name", "models"),
+    filters=(("model", "name", "Only assessments of this model."),),
 )
 LOOPS = Listing(
     "list",

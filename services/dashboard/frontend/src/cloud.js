@@ -5,12 +5,14 @@
 // `pairs: "name"` draws a thin line from every point of the layer to its twin in the layer of that name.
 
 import {
-  BufferAttribute, BufferGeometry, Color, DynamicDrawUsage, LineBasicMaterial, LineSegments, PerspectiveCamera,
-  Points, Scene, ShaderMaterial, Vector3, WebGLRenderer,
+  BufferAttribute, BufferGeometry, DynamicDrawUsage, LineBasicMaterial, LineSegments, Points, Vector3,
 } from "three";
-import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import { colour, onSchemeChange } from "./palette.js";
-import { FRAGMENT, VERTEX, grid, segments } from "./points.js";
+import { roundPoints, segments } from "./points.js";
+import { View } from "./view.js";
+
+const DIRECTION = [0.62, -1, 0.36]; // from the middle of the scene to the camera
+const MARGIN = 1.16; // of what is seen, in sizes of the scene
 
 /** One set of moving points with its own colour, size and switch. */
 class Layer {
@@ -22,17 +24,7 @@ class Layer {
     this.geometry = new BufferGeometry();
     this.attribute = new BufferAttribute(new Float32Array(spec.count * 3), 3).setUsage(DynamicDrawUsage);
     this.geometry.setAttribute("position", this.attribute);
-    this.material = new ShaderMaterial({
-      vertexShader: VERTEX,
-      fragmentShader: FRAGMENT,
-      uniforms: {
-        size: { value: spec.size }, scale: { value: 1 }, tint: { value: new Color() },
-        opacity: { value: spec.opacity ?? 1 },
-      },
-      transparent: (spec.opacity ?? 1) < 1,
-      depthWrite: (spec.opacity ?? 1) === 1,
-      alphaToCoverage: (spec.opacity ?? 1) === 1,
-    });
+    this.material = roundPoints(spec.size, spec.opacity ?? 1);
     this.points = new Points(this.geometry, this.material);
     this.points.frustumCulled = false;
     this.paint();
@@ -86,7 +78,7 @@ class Pairs {
   }
 
   paint() {
-    this.lines.material.color.set(colour("error-line"));
+    this.lines.material.color.set(colour("error"));
   }
 
   show(frame) {
@@ -143,31 +135,25 @@ class Player {
     this.data = data;
     this.frame = 0;
     this.playing = false;
-    this.canvas = figure.querySelector("canvas");
-    this.renderer = new WebGLRenderer({ canvas: this.canvas, antialias: true, alpha: true });
-    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
-    this.scene = new Scene();
-    this.camera = new PerspectiveCamera(36, 1, 0.001, 1000);
-    this.camera.up.set(0, 0, 1);
-    this.orbit = new OrbitControls(this.camera, this.canvas);
-    this.orbit.addEventListener("change", () => this.render());
+    this.view = new View(figure.querySelector("canvas"));
+    this.view.orbit.addEventListener("change", () => this.render());
     this.layers = data.layers.map((spec) => new Layer(spec, data.times.length));
     this.pairs = [];
-    for (const layer of this.layers) this.scene.add(layer.points);
+    for (const layer of this.layers) this.view.scene.add(layer.points);
     for (const from of this.layers) {
       const to = this.layers.find((layer) => layer.spec.name === from.spec.pairs);
       if (to && to.spec.count === from.spec.count) this.pairs.push(new Pairs(from, to));
     }
-    for (const pair of this.pairs) this.scene.add(pair.lines);
+    for (const pair of this.pairs) this.view.scene.add(pair.lines);
   }
 
   async start() {
     await Promise.all(this.layers.filter((layer) => layer.shown).map((layer) => layer.load()));
+    this.resize();
     this.place();
     this.buildControls();
-    new ResizeObserver(() => this.resize()).observe(this.canvas.parentElement);
+    new ResizeObserver(() => this.resize()).observe(this.view.canvas.parentElement);
     onSchemeChange(() => this.paint());
-    this.resize();
     this.seek(0);
     this.figure.dataset.ready = "true";
   }
@@ -175,30 +161,21 @@ class Player {
   place() {
     const [low, high] = bounds(this.layers, this.data.box);
     const centre = low.clone().add(high).multiplyScalar(0.5);
-    const radius = Math.max(high.clone().sub(low).length() / 2, 1e-3);
-    const distance = (radius * 1.16) / Math.sin((this.camera.fov / 2) * (Math.PI / 180));
-    const direction = new Vector3(0.62, -1, 0.36).normalize();
-    this.camera.position.copy(centre).addScaledVector(direction, distance);
-    this.camera.near = distance / 200;
-    this.camera.far = distance * 20;
-    this.orbit.target.copy(centre);
-    this.orbit.update();
-    const [lines, step] = grid(low, high, this.data.floor);
-    this.grid = lines;
-    this.scene.add(lines);
+    this.radius = Math.max(high.clone().sub(low).length() / 2, 1e-3);
+    this.view.look(centre, this.radius * MARGIN, DIRECTION);
+    const told = this.view.lay(low, high, this.data.floor);
     if (this.data.box) {
       this.body = wireframe(this.data.box);
-      this.scene.add(this.body);
+      this.view.scene.add(this.body);
     }
-    this.radius = radius;
     const label = this.figure.querySelector("[data-scale]");
-    if (label) label.textContent = `grid ${step >= 1 ? `${step} m` : `${+(step * 100).toPrecision(2)} cm`}`;
+    if (label) label.textContent = told;
+    this.resize();
     this.paint();
   }
 
   paint() {
-    for (const item of [...this.layers, ...this.pairs]) item.paint();
-    this.grid.material.color.set(colour("grid"));
+    for (const item of [this.view, ...this.layers, ...this.pairs]) item.paint();
     this.body?.material.color.set(colour("particles"));
     this.render();
   }
@@ -289,19 +266,13 @@ class Player {
   }
 
   resize() {
-    const { clientWidth, clientHeight } = this.canvas.parentElement;
-    if (!clientWidth || !clientHeight) return;
-    this.renderer.setSize(clientWidth, clientHeight, false);
-    this.camera.aspect = clientWidth / clientHeight;
-    this.camera.updateProjectionMatrix();
-    const pixels = clientHeight * this.renderer.getPixelRatio();
-    const scale = pixels / (2 * Math.tan((this.camera.fov / 2) * (Math.PI / 180)));
-    for (const layer of this.layers) layer.material.uniforms.scale.value = scale * this.radius;
+    if (!this.view.resize()) return;
+    for (const layer of this.layers) layer.material.uniforms.scale.value = this.view.pixels * (this.radius ?? 1);
     this.render();
   }
 
   render() {
-    this.renderer.render(this.scene, this.camera);
+    this.view.render();
   }
 }
 

@@ -29,33 +29,36 @@ function moveTo(chart, time) {
 }
 
 /** Numbers of the lines at the time that is nearest to the pointer, in the figure's last line. */
-function tellNumbers(figure, chart) {
+function tellNumbers(figure, charts) {
   const times = JSON.parse(figure.dataset.x);
   const series = JSON.parse(figure.dataset.series);
   const told = document.createElement("output");
   told.className = "numbers quiet small";
   figure.append(told);
-  chart.addEventListener("pointermove", (event) => {
+  const tell = (chart) => (event) => {
     const time = timeAt(chart, event.clientX);
     if (time === null) return;
     const nearest = times.reduce((best, value, k) => (Math.abs(value - time) < Math.abs(times[best] - time) ? k : best), 0);
     const values = series.map((one) => `${one.label} ${number(one.values[nearest])}`);
     told.textContent = `${number(times[nearest])}: ${values.join(", ")} ${figure.dataset.unit}`;
-  });
+  };
+  for (const chart of charts) chart.addEventListener("pointermove", tell(chart));
 }
 
 function wire(element) {
   const follows = element.dataset.follow !== undefined;
   for (const figure of element.querySelectorAll("figure[data-series]")) {
-    const chart = figure.querySelector("svg[data-time]");
-    tellNumbers(figure, chart);
+    const charts = figure.querySelectorAll("svg[data-time]"); // one for wide windows, one for narrow ones
+    tellNumbers(figure, charts);
     if (!follows) continue;
-    chart.classList.add("seeks");
-    chart.addEventListener("click", (event) => {
-      const time = timeAt(chart, event.clientX);
-      if (time !== null) document.dispatchEvent(new CustomEvent("seek", { detail: time }));
-    });
-    document.addEventListener("frame", (event) => moveTo(chart, event.detail));
+    for (const chart of charts) {
+      chart.classList.add("seeks");
+      chart.addEventListener("click", (event) => {
+        const time = timeAt(chart, event.clientX);
+        if (time !== null) document.dispatchEvent(new CustomEvent("seek", { detail: time }));
+      });
+      document.addEventListener("frame", (event) => moveTo(chart, event.detail));
+    }
   }
   element.dataset.ready = "true";
 }

@@ -2,7 +2,9 @@
 // agree and follow the colour scheme.
 
 export function colour(role) {
-  return getComputedStyle(document.documentElement).getPropertyValue(`--${role}`).trim();
+  const found = getComputedStyle(document.documentElement).getPropertyValue(`--${role}`).trim();
+  if (!found) throw new Error(`the palette has no colour for ${role}`);
+  return found;
 }
 
 /** Calls `listener` when the person switches between light and dark. */

@@ -1,22 +1,24 @@
 // The playground: `<figure data-playground="URL">` opens a live session of a world model and draws its answers.
 // POST to URL gives { path }, the WebSocket's address with a ticket. The first message is JSON: { dt_s, points,
-//   controllers [[x, y, z]], grips [[index]], speed_m_s, reach_m, start [[x, y, z]] }. Then binary frames, little-endian:
+//   controllers [[x, y, z]], grips [[index]], speed_m_s, reach_m, factors [name], start [[x, y, z]] }. Then binary frames, little-endian:
 //   uint32 tick, uint32 number of the last control, float32 time, uint32 flags, float32 points and controllers [m].
 // A control is uint32 number, float32 velocities (grips, 3) [m/s]: a dragged grip is steered towards the pointer.
 
-import { DirectionalLight, HemisphereLight, PerspectiveCamera, Plane, Raycaster, Scene, Vector2, Vector3, WebGLRenderer } from "three";
-import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
-import { colour, onSchemeChange } from "./palette.js";
+import { DirectionalLight, HemisphereLight, Plane, Raycaster, Vector2, Vector3 } from "three";
+import { onSchemeChange } from "./palette.js";
+import { Factors } from "./factors.js";
 import { Ghost } from "./ghost.js";
-import { Cloud, grid } from "./points.js";
+import { Cloud } from "./points.js";
 import { Recorder } from "./record.js";
 import { Surface } from "./surface.js";
+import { View } from "./view.js";
 
 const HEAD_BYTES = 16;
 const PICK_PIXELS = { mouse: 28, pen: 32, touch: 48 };
 const SETTLE_S = 0.5; // after the end of the recorded motion, to arrive
 const STILL = 1e-3; // of the body's size: a grip that is so near its target stays where it is
 const GAIN_PER_S = 12; // how fast a grip follows the pointer: it covers the gap in about a tenth of a second
+const DIRECTION = [0.4, -1, 0.3]; // from the middle of the body to the camera
 const KEYS = {
   ArrowLeft: [-1, 0, 0], ArrowRight: [1, 0, 0], ArrowUp: [0, 1, 0], ArrowDown: [0, -1, 0], PageUp: [0, 0, 1],
   PageDown: [0, 0, -1],
@@ -48,15 +50,10 @@ class Playground {
     this.figure = figure;
     this.canvas = figure.querySelector("canvas");
     this.note = figure.querySelector("[data-note]");
-    this.renderer = new WebGLRenderer({ canvas: this.canvas, antialias: true, alpha: true });
-    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
-    this.scene = new Scene();
-    this.camera = new PerspectiveCamera(36, 1, 0.001, 1000);
-    this.camera.up.set(0, 0, 1);
-    this.orbit = new OrbitControls(this.camera, this.canvas);
+    this.view = new View(this.canvas);
     const sun = new DirectionalLight(0xffffff, 1.6);
     sun.position.set(0.4, -0.6, 1);
-    this.scene.add(new HemisphereLight(0xffffff, 0x667788, 1.7), sun);
+    this.view.scene.add(new HemisphereLight(0xffffff, 0x667788, 1.7), sun);
     this.recorder = new Recorder(this.canvas);
     this.ray = new Raycaster();
     this.drawn = new Rate();
@@ -67,6 +64,7 @@ class Playground {
     this.number = 0;
     this.frames = 0;
     this.clouds = [];
+    this.factors = new Factors(figure.querySelector("[data-factors]"), (factors) => this.tell({ type: "factors", factors }));
     const pressed = (name, then) => figure.querySelector(`[data-${name}]`).addEventListener("click", then);
     pressed("reset", () => this.again());
     pressed("view", () => this.look());
@@ -102,7 +100,7 @@ class Playground {
     this.ghost = ghost;
     if (surface) {
       this.surface = new Surface(surface);
-      this.scene.add(this.surface.mesh);
+      this.view.scene.add(this.surface.mesh);
     }
     const offered = { surface: Boolean(surface), measured: ghost?.has("measured"), twin: ghost?.has("twin") };
     for (const [name, there] of Object.entries(offered)) this.figure.querySelector(`[data-for="${name}"]`).hidden = !there;
@@ -117,7 +115,7 @@ class Playground {
     if (this.surface) this.surface.mesh.visible = wanted("surface") && Boolean(this.body);
     if (this.body) this.body.points.visible = !this.surface?.mesh.visible;
     if (this.ghost) {
-      await Promise.all(["measured", "twin"].map((name) => this.ghost.show(name, this.scene, wanted(name))));
+      await Promise.all(["measured", "twin"].map((name) => this.ghost.show(name, this.view.scene, wanted(name))));
       this.ghost.stale = true;
       this.ghost.at(this.ghost.start);
     }
@@ -153,14 +151,21 @@ class Playground {
   /** A fresh body: in the present session, or in a new one where that has ended. */
   again() {
     this.replayed = null;
-    if (this.socket?.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify({ type: "reset" }));
-    else if (this.socket?.readyState !== WebSocket.CONNECTING) this.open().catch((error) => this.say(error.message));
+    if (this.tell({ type: "reset" })) return;
+    if (this.socket?.readyState !== WebSocket.CONNECTING) this.open().catch((error) => this.say(error.message));
+  }
+
+  /** Send a message as text; false where there is no session to tell. */
+  tell(message) {
+    if (this.socket?.readyState !== WebSocket.OPEN) return false;
+    this.socket.send(JSON.stringify(message));
+    return true;
   }
 
   begin(text) {
     const ready = JSON.parse(text);
     this.ready = ready;
-    for (const cloud of this.clouds) this.scene.remove(cloud.points);
+    for (const cloud of this.clouds) this.view.scene.remove(cloud.points);
     this.body = new Cloud(ready.points, "model", Math.min(0.05, Math.max(0.012, 0.45 / Math.sqrt(ready.points))));
     this.markers = new Cloud(ready.controllers.length, "controllers", 0.03);
     this.handles = new Cloud(ready.grips.length, "controllers", 0.085);
@@ -169,11 +174,12 @@ class Playground {
       cloud.material.depthTest = false;
       cloud.points.renderOrder = 2;
     }
-    for (const cloud of this.clouds) this.scene.add(cloud.points);
+    for (const cloud of this.clouds) this.view.scene.add(cloud.points);
     this.latest = new Float32Array(ready.start.flat());
     this.place(this.latest);
     this.dress();
     this.places = this.grips(new Float32Array(ready.controllers.flat()));
+    this.factors.offer(ready.factors);
     this.say("");
     this.figure.dataset.ready = "true";
   }
@@ -190,25 +196,16 @@ class Playground {
     this.centre = low.clone().add(high).multiplyScalar(0.5);
     this.radius = Math.max(high.clone().sub(low).length() * 0.8, 1e-3);
     this.look();
-    if (this.lines) this.scene.remove(this.lines);
-    const [lines, step] = grid(low.clone().subScalar(this.radius / 3), high.clone().addScalar(this.radius / 3), null);
-    this.lines = lines;
-    this.scene.add(lines);
-    this.figure.querySelector("[data-scale]").textContent = `grid ${+(step * 100).toPrecision(2)} cm`;
+    const around = this.radius / 3;
+    const told = this.view.lay(low.clone().subScalar(around), high.clone().addScalar(around), null);
+    this.figure.querySelector("[data-scale]").textContent = told;
     this.paint();
     this.resize();
   }
 
   /** The camera as it was at the beginning. */
   look() {
-    if (!this.centre) return;
-    const distance = (this.radius * 1.3) / Math.sin((this.camera.fov / 2) * (Math.PI / 180));
-    this.camera.position.copy(this.centre).addScaledVector(new Vector3(0.4, -1, 0.3).normalize(), distance);
-    this.camera.near = distance / 200;
-    this.camera.far = distance * 20;
-    this.camera.updateProjectionMatrix();
-    this.orbit.target.copy(this.centre);
-    this.orbit.update();
+    if (this.centre) this.view.look(this.centre, this.radius * 1.3, DIRECTION);
   }
 
   take(buffer) {
@@ -252,7 +249,7 @@ class Playground {
 
   /** Where a grip is drawn, in shares of the canvas. */
   seen(grip) {
-    const place = this.places[grip].clone().project(this.camera);
+    const place = this.places[grip].clone().project(this.view.camera);
     return [(place.x + 1) / 2, (1 - place.y) / 2];
   }
 
@@ -262,34 +259,34 @@ class Playground {
     const at = this.pointer(event);
     let nearest = PICK_PIXELS[event.pointerType] ?? PICK_PIXELS.mouse;
     this.places.forEach((place, grip) => {
-      const seen = place.clone().project(this.camera);
+      const seen = place.clone().project(this.view.camera);
       const pixels = Math.hypot(((seen.x - at.x) * width) / 2, ((seen.y - at.y) * height) / 2);
       if (pixels < nearest) {
         nearest = pixels;
-        const facing = this.camera.getWorldDirection(new Vector3());
+        const facing = this.view.camera.getWorldDirection(new Vector3());
         this.drag = { grip, plane: new Plane().setFromNormalAndCoplanarPoint(facing, place), target: place.clone() };
       }
     });
     if (!this.drag) return;
     this.replayed = null;
     this.chosen = this.drag.grip;
-    this.ray.setFromCamera(at, this.camera); // the hand holds the grip where it took it
+    this.ray.setFromCamera(at, this.view.camera); // the hand holds the grip where it took it
     const held = this.ray.ray.intersectPlane(this.drag.plane, new Vector3());
     this.drag.offset = held ? this.drag.target.clone().sub(held) : new Vector3();
-    this.orbit.enabled = false;
+    this.view.orbit.enabled = false;
     this.canvas.setPointerCapture(event.pointerId);
   }
 
   move(event) {
     if (!this.drag) return;
-    this.ray.setFromCamera(this.pointer(event), this.camera);
+    this.ray.setFromCamera(this.pointer(event), this.view.camera);
     const held = this.ray.ray.intersectPlane(this.drag.plane, new Vector3());
     if (held) this.drag.target.copy(held).add(this.drag.offset);
   }
 
   release() {
     this.drag = null;
-    this.orbit.enabled = true;
+    this.view.orbit.enabled = true;
   }
 
   key(event, down) {
@@ -344,7 +341,7 @@ class Playground {
     this.steer(now);
     if (this.moved) this.surface.set(this.latest);
     this.moved = false;
-    this.renderer.render(this.scene, this.camera);
+    this.view.render();
     this.drawn.add(performance.now());
     if (now - (this.toldAt ?? 0) < 250) return;
     this.toldAt = now;
@@ -356,18 +353,13 @@ class Playground {
   paint() {
     for (const cloud of [...this.clouds, ...(this.ghost?.clouds ?? [])]) cloud.paint();
     this.surface?.paint();
-    this.lines?.material.color.set(colour("grid"));
+    this.view.paint();
   }
 
   resize() {
-    const { clientWidth, clientHeight } = this.canvas.parentElement;
-    if (!clientWidth || !clientHeight) return;
-    this.renderer.setSize(clientWidth, clientHeight, false);
-    this.camera.aspect = clientWidth / clientHeight;
-    this.camera.updateProjectionMatrix();
-    const pixels = clientHeight * this.renderer.getPixelRatio();
-    const scale = pixels / (2 * Math.tan((this.camera.fov / 2) * (Math.PI / 180)));
-    for (const cloud of [...this.clouds, ...(this.ghost?.clouds ?? [])]) cloud.material.uniforms.scale.value = scale * (this.radius ?? 1);
+    if (!this.view.resize()) return;
+    const scale = this.view.pixels * (this.radius ?? 1);
+    for (const cloud of [...this.clouds, ...(this.ghost?.clouds ?? [])]) cloud.material.uniforms.scale.value = scale;
   }
 
   say(words) {

@@ -1,18 +1,19 @@
 // What the 3D views share: round points, the ground's grid, line segments.
 
 import {
-  BufferAttribute, BufferGeometry, Color, DynamicDrawUsage, LineBasicMaterial, LineSegments, Points, ShaderMaterial,
+  BufferAttribute, BufferGeometry, Color, CustomBlending, DynamicDrawUsage, LineBasicMaterial, LineSegments,
+  NormalBlending, OneFactor, Points, ShaderMaterial, ZeroFactor,
 } from "three";
 import { colour } from "./palette.js";
 
-export const VERTEX = `
+const VERTEX = `
   uniform float size; uniform float scale;
   void main() {
     vec4 view = modelViewMatrix * vec4(position, 1.0);
     gl_Position = projectionMatrix * view;
     gl_PointSize = clamp(size * scale / -view.z, 2.0, 40.0);
   }`;
-export const FRAGMENT = `
+const FRAGMENT = `
   uniform vec3 tint; uniform float opacity;
   void main() {
     vec2 p = gl_PointCoord * 2.0 - 1.0;
@@ -23,6 +24,27 @@ export const FRAGMENT = `
     gl_FragColor = vec4(tint * light, opacity * edge);
     #include <colorspace_fragment>
   }`;
+
+/**
+ * The material of round points. The alpha of an opaque point's edge only says how many samples of a pixel the point
+ * covers: it is not written into the picture, where it would mix the page's background into the point.
+ */
+export function roundPoints(size, opacity) {
+  const opaque = opacity === 1;
+  return new ShaderMaterial({
+    vertexShader: VERTEX,
+    fragmentShader: FRAGMENT,
+    uniforms: { size: { value: size }, scale: { value: 1 }, tint: { value: new Color() }, opacity: { value: opacity } },
+    transparent: !opaque,
+    depthWrite: opaque,
+    alphaToCoverage: opaque,
+    blending: opaque ? CustomBlending : NormalBlending,
+    blendSrc: OneFactor,
+    blendDst: ZeroFactor,
+    blendSrcAlpha: ZeroFactor,
+    blendDstAlpha: OneFactor,
+  });
+}
 
 /** A round number of metres near a tenth of the extent: 1, 2 or 5 times a power of ten. */
 function gridStep(extent) {
@@ -60,14 +82,7 @@ export class Cloud {
     this.attribute = new BufferAttribute(new Float32Array(count * 3), 3).setUsage(DynamicDrawUsage);
     const geometry = new BufferGeometry();
     geometry.setAttribute("position", this.attribute);
-    this.material = new ShaderMaterial({
-      vertexShader: VERTEX,
-      fragmentShader: FRAGMENT,
-      uniforms: { size: { value: size }, scale: { value: 1 }, tint: { value: new Color() }, opacity: { value: opacity } },
-      alphaToCoverage: opacity === 1,
-      transparent: opacity < 1,
-      depthWrite: opacity === 1,
-    });
+    this.material = roundPoints(size, opacity);
     this.points = new Points(geometry, this.material);
     this.points.frustumCulled = false;
     this.paint();

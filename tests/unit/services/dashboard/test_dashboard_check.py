@@ -61,7 +61,7 @@ def test_the_button_of_the_card_starts_a_check_and_the_card_shows_its_answer(
         assert lease is not None and leases.complete(session, lease, {"report": REPORT})
     card = client.get(f"/dashboard/scenes/{scene}").text.partition('id="check"')[2].partition("</section>")[0]
     for text in (
-        "Youngs modulus pa", "190,000 to 210,000", "air drag linear", "only if large", "4.25 1/s", "never",
+        "Young&#39;s modulus", "190,000 to 210,000", "air drag linear", "only if large", "4.25 1/s", "never",
         "0 of 3 shapes", "actuation lag, measurement clock", "Shake the grip along &lt;x&gt;", "Check again",
     ):  # fmt: skip
         assert text in card, text

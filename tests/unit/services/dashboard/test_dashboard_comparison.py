@@ -75,7 +75,7 @@ def test_two_versions_are_held_side_by_side(client: httpx.Client) -> None:
     assert 'href="/dashboard/models/beam/compare"' in client.get("/dashboard/models/beam").text
     page = client.get("/dashboard/models/beam/compare?a=1&b=champion")
     assert page.status_code == 200
-    for text in ("Version 1", "Version 2", "4.00", "3.10", "0.900", "config.seed", "400", "310"):
+    for text in ("Version 1", "Version 2", "4.00", "3.10", "0.900", "Settings: seed", "400", "310"):
         assert text in page.text, text
     [told] = re.findall(r'data-series="([^"]*)"', page.text)
     lines = {line["label"]: line for line in json.loads(html.unescape(told))}
@@ -87,11 +87,13 @@ def test_two_versions_are_held_side_by_side(client: httpx.Client) -> None:
 
 def test_any_number_of_versions_is_plotted_with_intervals(client: httpx.Client) -> None:
     page = client.get("/dashboard/models/beam/compare?a=1&b=2&also=3").text
-    [forest] = re.findall(r"<title>Mean track errors of the versions.*?</svg>", page, re.DOTALL)
-    for version in (1, 2, 3):
-        assert f"world model, fine-tuned, version {version}<" in forest
-    assert forest.count("<circle") == 6  # twin and world model of each
-    assert forest.count('class="line model"') == 3  # an interval each
+    drawings = re.findall(r"<title>Mean track errors of the versions.*?</svg>", page, re.DOTALL)
+    assert len(drawings) == 2  # for wide and for narrow windows
+    for forest in drawings:
+        for version in (1, 2, 3):
+            assert f"world model, fine-tuned, version {version}<" in forest
+        assert forest.count("<circle") == 6  # twin and world model of each
+        assert forest.count('class="line model"') == 3  # an interval each
     assert 'name="also" value="3" checked' in page
 
 

@@ -26,6 +26,17 @@ def test_every_box_is_a_link_with_words_and_the_object_itself_is_marked() -> Non
     assert address_of(VERSION) == "/dashboard/models/soft%20beam/2"
 
 
+def test_text_is_cut_off_at_the_side_of_its_box() -> None:
+    wide = Member("fit_w", "fit", 1, "W" * 60, "ready", ("scn_1",))
+    picture = drawn([SCENE, wide], "fit_w")
+    [(outer, left, inner, texts)] = re.findall(
+        r'<rect x="196" y="26" width="(\d+)".*?<svg x="(\d+)" y="26" width="(\d+)" height="42">(.*?)</svg>',
+        picture,
+    )
+    assert int(left) > 196 and int(left) + int(inner) < 196 + int(outer)
+    assert texts.count("<text") == 2 and "WW…" in texts
+
+
 def test_columns_that_nothing_is_in_take_no_place() -> None:
     assert re.findall(r'class="column">([^<]+)<', drawn([SCENE, OLD, VERSION], "scn_1")) == [
         "Scene",

@@ -95,10 +95,20 @@ def test_an_axis_is_logarithmic_only_where_a_baseline_dwarfs_the_result() -> Non
     far = near | {"constant_velocity": np.full(5, 0.53)}
     linear, logarithmic = (curves.chart(times, errors, floor_m=0.0016) for errors in (near, far))
     zero = ">0</text>"
-    assert linear.count(zero) == 2 and logarithmic.count(zero) == 1  # the time axis begins at 0 in both
+    # there are two drawings, and in all of them the time axis begins at 0
+    assert linear.count(zero) == 2 * 2 and logarithmic.count(zero) == 2
     assert ">100</text>" in logarithmic
     heights = {one["label"]: one["values"][0] for one in lines_of(logarithmic)}
     assert heights == {"rigid follow": 13.0, "constant velocity": 530.0, "twin": 1.8, "noise floor": 1.6}
+
+
+def test_a_plot_is_drawn_for_wide_and_for_narrow_windows_with_the_same_lines() -> None:
+    times = np.linspace(0.0, 1.0, 5)
+    plot = curves.chart(times, {"twin": np.full(5, 0.0018)}, split=0.6, floor_m=None)
+    drawings = re.findall(r'<svg class="chart (\w+)" viewBox="0 0 (\d+) .*?</svg>', plot)
+    assert drawings == [("wide", "980"), ("narrow", "320")]
+    assert plot.count('class="line twin"') == 2  # a single line has no legend
+    assert plot.count(">held out</text>") == 2
 
 
 def test_a_predictor_has_one_colour_in_every_plot_and_every_colour_is_in_the_palette() -> None:
@@ -175,6 +185,7 @@ def test_ages(seconds: float, words: str) -> None:
         (1.5e-7, "1.5e-7"),
         (2.0e9, "2e9"),
         (0.0, "0"),
+        (-0.0, "0"),
         (7, "7"),
         (None, "–"),
         (True, "yes"),
@@ -185,10 +196,11 @@ def test_figures(value: object, words: str) -> None:
 
 
 def test_millimetres_keep_three_digits() -> None:
-    assert [text.millimetres(value) for value in (0.03, 0.0025, 0.00032, 0.0, None)] == [
+    assert [text.millimetres(value) for value in (0.03, 0.0025, 0.00032, 0.0, -0.0, None)] == [
         "30.0",
         "2.50",
         "0.320",
+        "0.00",
         "0.00",
         "–",
     ]

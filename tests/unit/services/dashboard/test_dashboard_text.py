@@ -19,4 +19,4 @@ def test_a_job_that_is_done_does_not_say_how_many_percent_it_did() -> None:
     counted = environment_of_pages().get_template("macros.html").module.counted
     done = SimpleNamespace(done=90.0, total=100.0, unit="percent")
     assert counted(SimpleNamespace(state="succeeded", progress=done)).strip() == ""
-    assert counted(SimpleNamespace(state="running", progress=done)).strip() == "90 / 100 percent"
+    assert counted(SimpleNamespace(state="running", progress=done)).strip() == "90 %"

@@ -190,6 +190,24 @@ def test_a_failed_job_has_a_button_that_retries_it(
         assert jobs.get_job(session, job.id).state == "queued"
 
 
+def test_what_was_cancelled_is_not_shown_as_failed(
+    client: httpx.Client, world: tuple[Settings, Database, Stores]
+) -> None:
+    _, database, stores = world
+    scene_id = register(tiny_scene(), database, stores.artifacts)
+    with database.session() as session:
+        fit = jobs.create_fit(session, scene_id, FitConfig())
+        trace = jobs.create_trace(session, TraceCreate(scene_id=scene_id))
+    with database.session() as session:
+        for job in (fit, trace):
+            jobs.cancel_job(session, job.id)
+    for path in ("fits?state=cancelled", "traces?state=cancelled", f"traces/{trace.outputs[0].id}"):
+        page = client.get(f"/dashboard/{path}").text
+        assert '<span class="badge cancelled">cancelled</span>' in page
+        assert "badge failed" not in page
+    assert "The trace was cancelled" in page
+
+
 def test_a_pipeline_that_closes_the_loop_shows_the_stage(
     client: httpx.Client, world: tuple[Settings, Database, Stores]
 ) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from published_tiny import tiny_model
 
 from physworld.worldmodel.published import PublishedModel
-from physworld_services.inference.session import HEAD, SET_BACK, LiveSession
+from physworld_services.inference.session import HEAD, SET_BACK, ControlRefused, LiveSession
 
 pytestmark = pytest.mark.slow
 
@@ -33,6 +35,43 @@ def test_a_client_learns_that_it_was_set_back_whichever_frames_are_left_out() ->
     session.sent(later)
     session.tick(still)
     assert not flags(session.frame(1.0, 0)) & SET_BACK
+
+
+def test_a_factor_changes_the_body_from_the_next_tick_on_as_it_changes_a_rollout() -> None:
+    model = tiny_model()[2]
+    velocity = np.tile([0.0, 0.0, 0.3], (4, 1))
+
+    def points(factors: dict[str, float] | None) -> np.ndarray:
+        session = LiveSession(model)
+        assert session.describe()["factors"] == ["stiffness", "density"]
+        if factors is not None:
+            session.set_factors(factors)
+            session.reset()
+        for _ in range(5):
+            session.tick(velocity)
+        return np.frombuffer(session.frame(1.0, 0), "<f4", offset=HEAD.size).reshape(-1, 3)
+
+    plain, stiff = points(None), points({"stiffness": 4.0})
+    assert np.array_equal(points({"stiffness": 1.0, "density": 1.0}), plain)
+    assert np.abs(stiff - plain).max() > 1e-5
+    steps = model.start_controllers[-1] + model.spec.dt_s * np.arange(1, 6)[:, None, None] * velocity
+    driven = np.concatenate([model.start_controllers, steps])
+    expected = model.skin.apply(model.rollout(driven, phi=model.phi + np.array([np.log(4.0), 0.0]))[-1])
+    assert stiff[: len(expected)] == pytest.approx(expected, abs=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("factors", "words"),
+    [
+        ({"stiffness": 0.001}, "0.01 to 100"),
+        ({"stiffness": "2"}, "not a finite number"),
+        ({"stiffness": True}, "not a finite number"),
+        ({"friction": 2.0}, "there are stiffness, density"),
+    ],
+)
+def test_a_factor_that_cannot_be_meant_is_refused(factors: dict[str, Any], words: str) -> None:
+    with pytest.raises(ControlRefused, match=words):
+        LiveSession(tiny_model()[2]).set_factors(factors)
 
 
 def test_a_frame_between_two_ticks_is_of_one_moment() -> None:
