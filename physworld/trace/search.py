@@ -224,11 +224,14 @@ class Search:
         """Fits again from the calibrated numbers of the best one: a material is the same whatever else acts on it, and
         a fit that has come to rest in a valley of its own says nothing of its effect."""
         calibrated = {unknown.name for unknown in self.setting.calibrated}
-        best = min(self._of_size(size), key=lambda h: h.left, default=None)
-        for known in [h for h in self._of_size(size) if best is not None and h is not best]:
-            place = {**known.values, **{n: v for n, v in best.values.items() if n in calibrated}}
+        ranked = sorted(self._of_size(size), key=lambda h: h.left)
+        for known in ranked[1:]:
+            shared = {n: v for n, v in ranked[0].values.items() if n in calibrated}
+            place = {**known.values, **shared}
             twin, unknowns = self.setting.assembled(known.members, place)
-            runs = self.setting.simulations.run([Job(at(twin, unknowns, starts_of(unknowns)), self.setting.frames)])
+            runs = self.setting.simulations.run(
+                [Job(at(twin, unknowns, starts_of(unknowns)), self.setting.frames)]
+            )
             if runs[0] is None or self._squared(runs[0]) >= known.fitted.misfit**2:
                 continue
             self.setting.simulations.stage = f"fit with {' and '.join(known.names)}"

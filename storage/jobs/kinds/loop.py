@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from sqlalchemy.orm import Session
 
 from physworld_schemas.assessment import AssessmentCreate
-from physworld_schemas.base import Reference
+from physworld_schemas.base import Reference, Unmade
 from physworld_schemas.dataset import DatasetConfig
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.loop import LoopCreate
@@ -77,7 +77,7 @@ class LoopJobs(JobKind):
             _open_trace(session, job, model, scene_id, request)
         return job
 
-    def fail(self, session: Session, job: JobRow, message: str) -> None:
+    def end(self, session: Session, job: JobRow, state: Unmade, message: str) -> None:
         """Nothing of its own: what it makes is its children's."""
 
     def open_next(self, session: Session, parent: JobRow, ended: JobRow, children: Sequence[JobRow]) -> bool:
