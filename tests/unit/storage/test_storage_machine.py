@@ -236,7 +236,7 @@ class Histories(RuleBasedStateMachine):
 
     @invariant()
     def resources_follow_their_jobs(self) -> None:
-        expected = {"succeeded": {"ready", "sealed"}, "failed": {"failed"}, "cancelled": {"failed"}}
+        expected = {"succeeded": {"ready", "sealed"}, "failed": {"failed"}, "cancelled": {"cancelled"}}
         with self.database.reading() as session:
             for row in [*session.scalars(select(FitRow)), *session.scalars(select(DatasetRow))]:
                 job = session.get_one(JobRow, row.job_id)
