@@ -11,12 +11,16 @@ from physworld_schemas.base import Lineage, Request, Resource
 from physworld_schemas.trace import TraceConfig
 
 Outcome = Literal["within_noise", "as_expected", "worse_than_expected"]
+Frames = Literal["all", "held_out"]
 
 
 class AssessmentCreate(Request):
     """Body of POST /v1/models/{name}/versions/{version}/assessments.
 
     ``open_trace`` says whether a recording that the model predicts worse than expected is traced, with ``trace``.
+    ``frames`` "held_out" scores the recording's held-out frames alone (its declared test frames, else the last 30 %),
+    which a trace or a training that uses the recording has not seen. ``compared_with`` is another version of the same
+    model that is measured on the same frames.
     """
 
     scene_id: str = Field(description="New recording of the model's object.")
@@ -24,6 +28,15 @@ class AssessmentCreate(Request):
         default=True, description="Trace the recording where the model errs more than its card promises."
     )
     trace: TraceConfig = Field(default_factory=TraceConfig, description="Settings of that trace.")
+    frames: Frames = Field(
+        default="all", description="Frames that are scored: all, or the recording's held-out ones alone."
+    )
+    compared_with: int | None = Field(
+        default=None,
+        ge=1,
+        lt=2**31,
+        description="Another version of the model, measured on the same frames; empty: none.",
+    )
 
 
 class ErrorFigure(Resource):
@@ -37,6 +50,23 @@ class ErrorFigure(Resource):
         json_schema_extra={"unit": "m"},
     )
     frames: int = Field(description="Frames that the mean is over.")
+
+
+class ComparedVersion(Resource):
+    """Another version on the frames of an assessment.
+
+    ``gain_m`` is its error minus that of the assessed version, frame by frame: above zero, the assessed one errs less.
+    """
+
+    version: int = Field(description="Its number.")
+    measured: ErrorFigure = Field(description="Its error on the same frames.")
+    twin_m: float = Field(description="Error of its twin.", json_schema_extra={"unit": "m"})
+    gain_m: float = Field(
+        description="Its error less that of the assessed version.", json_schema_extra={"unit": "m"}
+    )
+    gain_ci95_m: tuple[float, float] = Field(
+        description="95 % interval of the gain, by paired blocks of frames.", json_schema_extra={"unit": "m"}
+    )
 
 
 class Assessment(Resource):
@@ -81,6 +111,9 @@ class Assessment(Resource):
         default=None,
         description="Distance of the recording's start from the model's.",
         json_schema_extra={"unit": "m"},
+    )
+    compared: ComparedVersion | None = Field(
+        default=None, description="The other version on the same frames; null: none was asked for."
     )
     trace_id: str | None = Field(default=None, description="Trace that was opened; null: none.")
     links: dict[str, str] = Field(default_factory=dict, description="Addresses of what belongs to it.")

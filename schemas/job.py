@@ -10,7 +10,17 @@ from pydantic import Field
 from physworld_schemas.base import Problem, Reference, Resource
 
 JobKind = Literal[
-    "check", "fit", "trace", "dataset", "training", "assessment", "rollout", "plan", "video", "pipeline"
+    "check",
+    "fit",
+    "trace",
+    "dataset",
+    "training",
+    "assessment",
+    "rollout",
+    "plan",
+    "video",
+    "pipeline",
+    "loop",
 ]
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelling", "cancelled"]
 TERMINAL_STATES: frozenset[str] = frozenset({"succeeded", "failed", "cancelled"})
@@ -53,15 +63,17 @@ class Progress(Resource):
 
 
 class Job(Resource):
-    """A piece of work. A pipeline job owns child jobs (fit, trace, dataset, training)."""
+    """A piece of work. A pipeline and a loop own child jobs (fit, trace, dataset, training, assessment)."""
 
     id: str = Field(description="Identifier: a prefix of its kind and 26 characters that sort by time.")
     kind: JobKind = Field(description="What it does.")
     state: JobState = Field(description="Where it is.")
     progress: Progress = Field(default_factory=Progress, description="How far it is.")
     attempt: int = Field(default=0, description="Attempts so far.")
-    parent_id: str | None = Field(default=None, description="Pipeline that it belongs to; null: none.")
-    children: list[str] = Field(default_factory=list, description="Jobs of a pipeline, in order.")
+    parent_id: str | None = Field(
+        default=None, description="Pipeline or loop that it belongs to; null: none."
+    )
+    children: list[str] = Field(default_factory=list, description="Jobs of a pipeline or a loop, in order.")
     created_at: datetime = Field(description="When it was made, UTC.")
     started_at: datetime | None = Field(default=None, description="When a worker first took it.")
     finished_at: datetime | None = Field(default=None, description="When it ended.")

@@ -83,8 +83,9 @@ class TraceCreate(Request):
     """Body of POST /v1/traces.
 
     A trace calibrates the declared physics itself, with ``fit``'s budgets and mesh and never with damping. ``fit_id``
-    names a ready fit of the scene: its twin is taken instead where its physics is the declared one (no damping, the
-    usual law, a sheet that bends as a plate) and it has ``fit``'s number of particles and mesh.
+    names a ready fit: its twin is taken instead where its physics is the declared one (no damping, the usual law, a
+    sheet that bends as a plate) and it has ``fit``'s number of particles and mesh. A fit of another recording of the
+    same object gives its parameters, to a body that stands where the scene starts.
 
     ``scene_ids`` are further recordings of the same object, fitted together with ``scene_id``;
     ``held_out_scene_ids`` are recordings that only the report sees.

@@ -60,9 +60,10 @@ def family_of(session: Session, scene_id: str) -> list[Member]:
     asked = select(TraceRow.id, TraceRow.state, TraceRow.verdict, TraceRow.fit_id).where(
         TraceRow.scene_id == scene_id
     )
+    own = {member.key for member in found}  # a trace may begin with a fit of another recording
     for key, state, verdict, fit in _newest(session, asked, TraceRow):
         label = verdict.replace("_", " ") if verdict else _short(key)
-        found.append(Member(key, "trace", 2, label, state, (fit or scene_id,)))
+        found.append(Member(key, "trace", 2, label, state, (fit if fit in own else scene_id,)))
     columns = DatasetRow.id, DatasetRow.state, DatasetRow.fit_id, DatasetRow.trace_id
     made = select(*columns).where(DatasetRow.scene_id == scene_id)
     for key, state, fit, trace in _newest(session, made, DatasetRow):

@@ -49,13 +49,22 @@ class Split:
 
 def freeze(scene: Scene, blocks: int, shortest: int) -> Split:
     """The split of a scene, with ``blocks`` blocks at most, none shorter than ``shortest`` frames."""
-    first, end = max(scene.train[0], 1), scene.train[1]
-    test = scene.test
-    if test[1] <= test[0] or test[0] < end:
-        end = max(first + 1, round((1.0 - HELD_OUT_SHARE) * scene.frame_count))
-        test = (end, scene.frame_count)
+    first, test = max(scene.train[0], 1), held_out_frames(scene)
+    end = scene.train[1] if _declares_split(scene) else test[0]
     count = int(np.clip((end - first) // shortest, 1, blocks))
     return Split((first, end), test, np.linspace(first, end, count + 1).round().astype(int))
+
+
+def held_out_frames(scene: Scene) -> tuple[int, int]:
+    """The half-open range of frames of a scene that no inference looks at."""
+    if _declares_split(scene):
+        return scene.test
+    end = max(max(scene.train[0], 1) + 1, round((1.0 - HELD_OUT_SHARE) * scene.frame_count))
+    return (end, scene.frame_count)
+
+
+def _declares_split(scene: Scene) -> bool:
+    return scene.test[1] > scene.test[0] >= scene.train[1]
 
 
 def noise_sigma(scene: Scene, split: Split, tracks: Array) -> float | None:

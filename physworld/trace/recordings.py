@@ -157,7 +157,7 @@ class JointSimulations(Simulations):
             own = moved(self._twin_of(twin, k), places[recording.points])
             found += self.under(recording.drive, [Job(own, recording.scene.frame_count)])
         for recording in self.recordings.held_out:
-            own = taken_over(twin, _built_like(twin, recording.scene, self._budget))
+            own = placed_in(recording.scene, twin, self._budget)
             found += self.under(recording.drive, [Job(own, recording.scene.frame_count)])
         return found
 
@@ -198,6 +198,20 @@ def taken_over(twin: Twin, other: Twin) -> Twin:
         ground_friction=twin.ground_friction,
         effects=twin.effects,
     )
+
+
+def placed_in(scene: Scene, twin: Twin, budget: int) -> Twin:
+    """A recording's own body, start and grips with the parameters and effects of another recording's twin.
+
+    Args:
+        scene: the recording.
+        twin: of another recording of the same object.
+        budget: particles of the body.
+
+    Raises:
+        SceneUnsupported: the recording does not say enough for a body of the twin's form.
+    """
+    return taken_over(twin, _built_like(twin, scene, budget))
 
 
 def side_by_side(parts: Sequence[Array], frames: int) -> Array:

@@ -25,7 +25,7 @@ from physworld.arrays import Array
 from physworld.estimation.noise import Split
 from physworld.estimation.refit import prior_rows, refit
 from physworld.estimation.simulations import Job
-from physworld.estimation.unknowns import Unknown, at, bounds_of, starting_at
+from physworld.estimation.unknowns import Unknown, at, bounds_of, starting_at, starts_of
 from physworld.estimation.whitening import Whitener
 from physworld.trace.candidates import Candidate
 from physworld.trace.hypotheses import Hypothesis, ScaledWhitener, Setting, Values
@@ -134,8 +134,8 @@ class Search:
             if size and self._total(larger) > self._total(base):
                 with simulations.time_permitting("fits without one of the effects"):
                     self._take_out(larger)
-            known = (h for h in self._of_size(size + 1) if h.doubt is None)
-            best = max(known, key=self._total, default=base)
+            known = [h for h in self._of_size(size + 1) if h.doubt is None]
+            best = max([h for h in known if self._relevant(h)] or known, key=self._total, default=base)
             pays = best is not base and self._removes(base, best) >= _FIRST_OF_TWO
             if not pays or simulations.ledger.cut:
                 break
@@ -178,6 +178,8 @@ class Search:
         return posterior([h.unseen for h in known], [self._log_prior(h) for h in known], self.seed)
 
     def _log_prior(self, hypothesis: Hypothesis) -> float:
+        if not hypothesis.members:
+            return hypothesis.log_prior
         effects = sum(1 + len(member.contains) for member in hypothesis.members)
         return hypothesis.log_prior - effects * float(np.log(2.0 * self.library))
 
@@ -216,6 +218,27 @@ class Search:
             if promised >= _HALF * most or share >= _HALF * scored:
                 self.setting.simulations.stage = f"fit with {own[0].screened.candidate.effect}"
                 self._fit(base, own)
+        self._share(len(base.members) + 1)
+
+    def _share(self, size: int) -> None:
+        """Fits again from the calibrated numbers of the best one: a material is the same whatever else acts on it, and
+        a fit that has come to rest in a valley of its own says nothing of its effect."""
+        calibrated = {unknown.name for unknown in self.setting.calibrated}
+        best = min(self._of_size(size), key=lambda h: h.left, default=None)
+        for known in [h for h in self._of_size(size) if best is not None and h is not best]:
+            place = {**known.values, **{n: v for n, v in best.values.items() if n in calibrated}}
+            twin, unknowns = self.setting.assembled(known.members, place)
+            runs = self.setting.simulations.run([Job(at(twin, unknowns, starts_of(unknowns)), self.setting.frames)])
+            if runs[0] is None or self._squared(runs[0]) >= known.fitted.misfit**2:
+                continue
+            self.setting.simulations.stage = f"fit with {' and '.join(known.names)}"
+            found = self.setting.fitted(known.members, place, scale=known.unseen.scale)
+            if found is not None and found.left < known.left:
+                self.hypotheses[known.names] = found
+
+    def _squared(self, tracks: Array) -> float:
+        """Mean squared whitened residual of tracks (frames, N, 3)."""
+        return float(np.mean(self.setting.white.residual(tracks) ** 2))
 
     def _take_out(self, larger: Hypothesis) -> None:
         """Fits without one of the effects of a set, and with another one in its place, from the set's basin."""

@@ -13,6 +13,7 @@ from physworld.arrays import Array
 from physworld.report.markup import Html
 from physworld.report.predictors import NOISE, PREDICTORS
 from physworld.report.svg import DWARFS, Interval, Series, dwarfed, interval_chart, line_chart
+from physworld_schemas.loop import Loop
 from physworld_schemas.model import ModelVersion
 from physworld_services.dashboard.tables import held_out_of
 
@@ -27,6 +28,8 @@ NARROW_PX = 320.0
 VERSION_DASHES = (None, "7 3", "2 3", "9 3 2 3", "1 4", "12 4")
 """One colour is one predictor's; versions that are compared differ in their dash."""
 METRIC = "track_m"
+LONGEST_NAME = 18
+"""Characters of a recording's name in the label of a row."""
 FEWEST = 2
 """Points that make a line."""
 
@@ -108,6 +111,33 @@ def versions_chart(versions: Sequence[ModelVersion], floor_m: float | None) -> H
         log_x=bool(values) and max(values) > DWARFS * min(values),
         width=980,
         narrow=NARROW_PX,
+    )
+
+
+def turns_chart(turns: Sequence[Loop], names: Mapping[str, str]) -> Html | None:
+    """Errors of the versions before and after each loop with their intervals, oldest first; None without any.
+
+    Args:
+        turns: loops of one model, newest first.
+        names: of their recordings, by id.
+    """
+    rows = []
+    for turn in reversed(turns):
+        recording = names.get(turn.scene_id, turn.scene_id)[:LONGEST_NAME]
+        for one, role in ((turn.before, "before"), (turn.after, "after")):
+            if one is not None:
+                low, high = one.measured.ci95_m
+                label = f"{recording}, version {one.version}"
+                rows.append(Interval(label, role, MM * one.measured.error_m, (MM * low, MM * high)))
+    if not rows:
+        return None
+    values = [row.value for row in rows if row.value > 0]
+    return interval_chart(
+        rows,
+        title="Errors of the versions before and after each loop",
+        x_label="mean track error on held-out frames of the new recording [mm], 95 % interval",
+        log_x=bool(values) and max(values) > DWARFS * min(values),
+        width=980,
     )
 
 

@@ -18,22 +18,38 @@ from physworld_services.dashboard.lists import Asked, Looked
 from physworld_services.dashboard.samples import sample_folder
 from physworld_services.dashboard.site import BASE, Site
 from physworld_services.dashboard.text import progress_told
-from physworld_storage import overview
+from physworld_storage import loops, overview
 from physworld_storage.access import audit
 from physworld_storage.jobs import events, jobs
 
 PAGE_SIZE = 20
 EVENTS_SHOWN = 100
+STAGES = {
+    "pipeline": ("fit", "trace", "dataset", "training"),
+    "loop": ("assessment", "trace", "dataset", "training"),
+}
+"""Of jobs that consist of others: the kinds of these."""
 FILTERS = ("all", "running", "queued", "succeeded", "failed", "cancelled")
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A job of the list, what it is about, and a pipeline's children."""
+    """A job of the list, what it is about, and the children of one that consists of others."""
 
     job: Job
     subject: str
     children: list[Job] = field(default_factory=list)
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """Kinds of the children that are there or may follow, in their order; empty where the job has none."""
+        every = STAGES.get(self.job.kind, ())
+        traced = self.job.kind != "pipeline" or self.job.config.get("close_the_loop", False)
+        there = {child.kind for child in self.children}
+        ended = self.job.state in TERMINAL_STATES
+        return tuple(
+            kind for kind in every if kind in there or not (ended or (kind == "trace" and not traced))
+        )
 
 
 def router(site: Site) -> APIRouter:
@@ -113,6 +129,8 @@ def _job(site: Site, job_id: str) -> dict[str, Any]:
         latest = overview.latest_events(session, list(family), EVENTS_SHOWN)
         subject = overview.subjects_of(session, [job]).get(job_id, "")
         inputs = [_link(session, reference) for reference in job.inputs]
+        parent = None if job.parent_id is None else jobs.get_job(session, job.parent_id)
+        turn = loops.get_loop(session, job_id) if job.kind == "loop" else None
         told = [events.figures_of(session, item.id) for item in family.values() if item.kind == "training"]
         links = {
             item.id: [_link(session, reference) for reference in item.outputs] for item in family.values()
@@ -125,6 +143,8 @@ def _job(site: Site, job_id: str) -> dict[str, Any]:
     return {
         "job": job,
         "children": children,
+        "parent": parent,
+        "turn": turn,
         "subject": subject,
         "inputs": inputs,
         "links": links,

@@ -12,20 +12,29 @@ from fastapi.responses import HTMLResponse, JSONResponse, Response
 
 from physworld_schemas.model import Model, ModelComparison, ModelVersion
 from physworld_services.dashboard.clouds import Cloud, Layer, measured_layers, resampled, scene_cloud, thinned
-from physworld_services.dashboard.curves import chart, comparison_chart, given_curves, versions_chart
+from physworld_services.dashboard.curves import (
+    chart,
+    comparison_chart,
+    given_curves,
+    turns_chart,
+    versions_chart,
+)
 from physworld_services.dashboard.lineage import lineage_graph
 from physworld_services.dashboard.lists import Asked
 from physworld_services.dashboard.pages_scenes import PREDICTION, layer_response, recording_of
 from physworld_services.dashboard.pages_videos import films_of
 from physworld_services.dashboard.site import BASE, Site
 from physworld_services.dashboard.tables import held_out_of, noise_floor_of
-from physworld_storage import registry, resources
+from physworld_storage import loops, overview, registry, resources
 from physworld_storage.comparison import compare_versions
 from physworld_storage.errors import NotFound
 
 PAGE_SIZE = 50
 
 CHOICES = 200
+TURNS = 12
+"""Newest loops of a model that its page shows."""
+BASELINES = ("static", "rigid_follow", "constant_velocity")
 MOST_COMPARED = 4
 """Versions beside the two of a comparison that its plots show."""
 CARD = "card.json"
@@ -64,8 +73,13 @@ def router(site: Site) -> APIRouter:
             page = registry.list_versions(
                 session, name, limit=PAGE_SIZE, cursor=asked.cursor, state=asked.state, search=asked.q
             )
+            turns = loops.list_loops(session, limit=TURNS, model=name).data
+            names = overview.scene_names(session, {turn.scene_id for turn in turns})
         context = asked.context(page.next_cursor)
-        return site.page(request, "model.html", model=model, versions=page.data, **context)
+        context |= {"turns": turns, "names": names, "plot": turns_chart(turns, names)}
+        return site.page(
+            request, "model.html", model=model, versions=page.data, baselines=BASELINES, **context
+        )
 
     @routes.get("/models/{name}/compare")
     def compare_page(

@@ -21,11 +21,12 @@ from physworld_schemas.check import CheckCreate
 from physworld_schemas.dataset import DatasetCreate
 from physworld_schemas.fit import FitCreate
 from physworld_schemas.job import Job
+from physworld_schemas.loop import LoopCreate
 from physworld_schemas.model import TrainingCreate
 from physworld_schemas.pipeline import PipelineCreate
 from physworld_schemas.plan import PlanConfig, PlanCreate, PlanLimits, PointGoal
 from physworld_schemas.rollout import ModelName, RolloutCreate, Version
-from physworld_schemas.trace import TraceCreate
+from physworld_schemas.trace import TraceConfig, TraceCreate
 from physworld_schemas.video import VideoCreate
 from physworld_services.api.routes.library import require_known
 from physworld_services.api.routes.plans import plan_opening
@@ -45,6 +46,15 @@ class AssessmentForm(AssessmentCreate):
 
     model: ModelName = Field(description="Model of the object.")
     version: Version = Field(default="latest", description="Number, alias or `latest`.")
+
+
+class LoopForm(Body):
+    """Trace a recording that a model predicts badly, and train the next version on what is found."""
+
+    model: ModelName = Field(description="Model of the object.")
+    version: Version = Field(default="latest", description="Number, alias or `latest`.")
+    scene_id: str = Field(description="New recording of the object.")
+    trace: TraceConfig = Field(default_factory=TraceConfig, description="Settings of the trace.")
 
 
 class RolloutForm(Body):
@@ -135,6 +145,12 @@ def _assessment(site: Site, body: AssessmentForm) -> Opening:
     return opening
 
 
+def _loop(site: Site, body: LoopForm) -> Opening:
+    require_known(trace=body.trace)
+    request = LoopCreate(model=body.model, version=body.version, scene_id=body.scene_id, trace=body.trace)
+    return lambda session: jobs.create_loop(session, request)
+
+
 def _rollout(site: Site, body: RolloutForm) -> Opening:
     recording = _recording_of(site, body.model, body.version)
     start = recording.controllers[:1]
@@ -197,6 +213,12 @@ STARTS: dict[str, Start] = {
     "assessment": Start(
         "Assess a recording", "Does a published model still predict its object?", AssessmentForm, _assessment
     ),
+    "loop": Start(
+        "Close the loop",
+        "From a recording that a model predicts badly to its next version, with the errors of both.",
+        LoopForm,
+        _loop,
+    ),
     "rollout": Start(
         "Predict a motion", "Open loop, from the start of the recording.", RolloutForm, _rollout
     ),
@@ -256,6 +278,8 @@ def body_of(job: Job) -> dict[str, Any]:
     if job.kind == "assessment":
         name, _, version = first.get("model", "").rpartition(":")
         return {**job.config, "scene_id": first.get("scene"), "model": name, "version": version}
+    if job.kind == "loop":
+        return {name: job.config[name] for name in LoopForm.model_fields}
     return dict(job.config)
 
 

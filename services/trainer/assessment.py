@@ -2,8 +2,9 @@
 
 The model is rolled out over the recording, open loop from its start. Its mean track error is compared with what noise
 alone shows and with the held-out error on the model's card, both with intervals by blocks of frames
-(:mod:`physworld.evaluate.blocks`). What follows from a model that has become worse is the database's business: the
-commit opens a trace (``physworld_storage.jobs.kinds.assessment``).
+(:mod:`physworld.evaluate.blocks`). Scored are all frames after the model's history, or of these the recording's
+held-out ones alone; another version of the model may be measured on the same frames. What follows from a model that has
+become worse is the database's business: the commit opens a trace (``physworld_storage.jobs.kinds.assessment``).
 """
 
 from __future__ import annotations
@@ -15,11 +16,22 @@ from typing import Any
 import numpy as np
 from safetensors.numpy import load as load_tensors
 
+from physworld.arrays import Array
 from physworld.errors import SceneUnsupported
-from physworld.evaluate.blocks import AS_EXPECTED, WITHIN_NOISE, Comparison, Mean, compare
+from physworld.estimation.noise import held_out_frames
+from physworld.evaluate.blocks import (
+    AS_EXPECTED,
+    WITHIN_NOISE,
+    Comparison,
+    Mean,
+    compare,
+    mean_with_interval,
+    paired_gain,
+)
 from physworld.evaluate.metrics import noise_floor, track_error_per_frame
 from physworld.evaluate.table import held_out_table
 from physworld.scene import Scene
+from physworld.twin.twin import Twin
 from physworld.worldmodel.foreign import ForeignPrediction, predict, twin_on
 from physworld.worldmodel.published import PublishedModel
 from physworld_schemas.base import Reference
@@ -35,42 +47,74 @@ from physworld_workers.tasks.inputs import named, scene_of, scene_reference, twi
 PLACING, ROLLING, COMPARING = (
     "placing the twin", "rolling the model out over the recording", "comparing with noise and card",
 )  # fmt: skip
+PLACING_OTHER, ROLLING_OTHER = "placing the other version's twin", "rolling the other version out"
 BASELINES = ("static", "rigid_follow", "constant_velocity")
 
 
 def run(context: TaskContext, stores: Stores) -> HandlerResult:
     """Roll out, compare, say."""
     payload = context.lease.payload
-    with stores.database.reading() as session:
-        version = registry.get_version(session, payload["name"], payload["version"])
-        fit = resources.get_fit(session, payload["fit_id"])
-    recording, home = scene_of(stores, payload["scene_id"]), scene_of(stores, payload["model_scene_id"])
-    twin = twin_of(stores, payload["fit_id"], payload.get("trace_id"))
-    context.plan({PLACING: 1.0, ROLLING: 1.0, COMPARING: 1.0})
-    context.begin(PLACING)
-    placed = twin_on(recording, home, twin, fit.config.particle_budget)
-    context.begin(ROLLING, "rollouts")
-    predicted = predict(_model(stores, version), recording, placed)
+    recording = scene_of(stores, payload["scene_id"])
+    other = payload.get("compared")
+    origins = [payload] if other is None else [payload, other]
+    stages = [(PLACING, ROLLING), (PLACING_OTHER, ROLLING_OTHER)][: len(origins)]
+    context.plan({stage: 1.0 for pair in stages for stage in pair} | {COMPARING: 1.0})
+    versions, predictions = [], []
+    for origin, (placing, rolling) in zip(origins, stages, strict=True):
+        with stores.database.reading() as session:
+            version = registry.get_version(session, payload["name"], origin["version"])
+        context.begin(placing)
+        placed = _placed(stores, recording, origin)
+        context.begin(rolling, "rollouts")
+        versions.append(version)
+        predictions.append(predict(_model(stores, version), recording, placed))
     context.begin(COMPARING)
-    found = assess(recording, predicted, version)
+    first = max(predicted.first_frame for predicted in predictions)
+    window = scored_frames(recording, first, payload.get("frames", "all"))
+    found = assess(recording, predictions[0], versions[0], window)
+    for version, predicted in zip(versions[1:], predictions[1:], strict=True):
+        found["compared"] = compared(recording, predictions[0], version, predicted, window)
     inputs = [
-        Reference(
-            kind="model", id=registry.reference_id(version.name, version.version), digest=version.sha256
+        *(
+            Reference(kind="model", id=registry.reference_id(one.name, one.version), digest=one.sha256)
+            for one in versions
         ),
         scene_reference(stores, payload["scene_id"]),
     ]
     return HandlerResult({**found, "lineage": lineage_of(inputs, {}, {})})
 
 
-def assess(recording: Scene, predicted: ForeignPrediction, version: ModelVersion) -> dict[str, Any]:
-    """The answer's figures. Raises SceneUnsupported when the model left the numbers or nothing can be scored."""
-    window = slice(max(1, predicted.first_frame), recording.frame_count)
-    measured, visible = recording.points[window], recording.visible[window]
-    errors = track_error_per_frame(predicted.tracks[window], measured, visible)
-    if not np.isfinite(predicted.tracks[window]).all() or not np.isfinite(errors).any():
+def scored_frames(recording: Scene, first: int, frames: str) -> slice:
+    """Which frames of a recording are scored. Raises SceneUnsupported when none is left.
+
+    Args:
+        recording: of the object.
+        first: first frame that every network predicted by itself.
+        frames: "all", or "held_out": of these the ones that a trace of the recording does not look at.
+    """
+    begin, end = 1, recording.frame_count
+    if frames == "held_out":
+        begin, end = held_out_frames(recording)
+    window = slice(max(begin, first, 1), end)
+    if window.start >= window.stop:
         raise SceneUnsupported(
-            f"of {len(errors)} frames after the model's history {int(np.isfinite(errors).sum())} can be scored"
+            f"no frame can be scored: frames {begin} to {end} are asked for, and the model predicts from {first} on"
         )
+    return window
+
+
+def assess(
+    recording: Scene, predicted: ForeignPrediction, version: ModelVersion, window: slice
+) -> dict[str, Any]:
+    """The answer's figures. Raises SceneUnsupported when the model left the numbers or nothing can be scored.
+
+    Args:
+        recording: of the object.
+        predicted: by the version.
+        version: with the errors of its card.
+        window: frames that are scored.
+    """
+    errors = _errors(recording, predicted.tracks, window)
     curve = version.metrics["held_out"]["per_frame"][METRIC].get(WORLD_MODEL, [])
     promised = [np.nan if value is None else value for value in curve]
     if not np.isfinite(promised).any():
@@ -78,13 +122,9 @@ def assess(recording: Scene, predicted: ForeignPrediction, version: ModelVersion
             f"version {version.version} of {version.name} has no error of its own on held-out frames to compare with: "
             "its prediction left the numbers there, or nothing was visible"
         )
-    floors = (
-        None if recording.noise_sigma_m is None else noise_floor(recording.noise_sigma_m),
-        version.metrics.get("noise_floor_m"),
-    )
+    floors = (_floor(recording), version.metrics.get("noise_floor_m"))
     comparison = compare(errors, floors[0], np.array(promised), floors[1])
     baselines = held_out_table(_scored(recording, window), {})[METRIC]
-    twin_errors = track_error_per_frame(predicted.twin_tracks[window], measured, visible)
     answer = {
         "outcome": comparison.outcome,
         "reason": sentence(comparison, floors[0]),
@@ -93,10 +133,43 @@ def assess(recording: Scene, predicted: ForeignPrediction, version: ModelVersion
         "excess_m": comparison.excess,
         "excess_ci95_m": list(comparison.excess_ci95),
         "baselines_m": {name: baselines[name] for name in BASELINES},
-        "twin_m": float(np.nanmean(twin_errors)),
+        "twin_m": _twin_error(recording, predicted, window),
         "start_mismatch_m": predicted.start_mismatch_m,
     }
     plain: dict[str, Any] = json_safe(answer)
+    return plain
+
+
+def compared(
+    recording: Scene,
+    predicted: ForeignPrediction,
+    version: ModelVersion,
+    other: ForeignPrediction,
+    window: slice,
+) -> dict[str, Any]:
+    """Another version on the same frames, and what it errs more than the assessed one, by paired blocks.
+
+    Args:
+        recording: of the object.
+        predicted: by the assessed version.
+        version: the other one.
+        other: by the other one.
+        window: frames that are scored.
+
+    Raises:
+        SceneUnsupported: the other version left the numbers.
+    """
+    errors = _errors(recording, other.tracks, window)
+    gain = paired_gain(errors, _errors(recording, predicted.tracks, window))
+    plain: dict[str, Any] = json_safe(
+        {
+            "version": version.version,
+            "measured": _wire(mean_with_interval(errors), _floor(recording)),
+            "twin_m": _twin_error(recording, other, window),
+            "gain_m": gain.value,
+            "gain_ci95_m": list(gain.ci95),
+        }
+    )
     return plain
 
 
@@ -130,6 +203,37 @@ def _wire(mean: Mean, floor: float | None) -> dict[str, Any]:
 def _scored(recording: Scene, window: slice) -> Scene:
     """The recording with the scored frames as its held-out ones, as the table of baselines reads it."""
     return replace(recording, test=(window.start, window.stop))
+
+
+def _errors(recording: Scene, tracks: Array, window: slice) -> Array:
+    """Mean track error of every scored frame (F,) [m]. Raises SceneUnsupported when nothing can be scored."""
+    errors = track_error_per_frame(tracks[window], recording.points[window], recording.visible[window])
+    if not np.isfinite(tracks[window]).all() or not np.isfinite(errors).any():
+        raise SceneUnsupported(
+            f"of {len(errors)} scored frames {int(np.isfinite(errors).sum())} can be scored: "
+            "the model left the numbers, or nothing was visible"
+        )
+    return errors
+
+
+def _twin_error(recording: Scene, predicted: ForeignPrediction, window: slice) -> float:
+    errors = track_error_per_frame(
+        predicted.twin_tracks[window], recording.points[window], recording.visible[window]
+    )
+    return float(np.nanmean(errors))
+
+
+def _floor(recording: Scene) -> float | None:
+    return None if recording.noise_sigma_m is None else noise_floor(recording.noise_sigma_m)
+
+
+def _placed(stores: Stores, recording: Scene, origin: dict[str, Any]) -> Twin:
+    """The twin of a version, put where the recording starts."""
+    with stores.database.reading() as session:
+        fit = resources.get_fit(session, origin["fit_id"])
+    home = scene_of(stores, origin["model_scene_id"])
+    twin = twin_of(stores, origin["fit_id"], origin.get("trace_id"))
+    return twin_on(recording, home, twin, fit.config.particle_budget)
 
 
 def _model(stores: Stores, version: ModelVersion) -> PublishedModel:

@@ -20,6 +20,7 @@ from physworld_schemas.check import CheckCreate
 from physworld_schemas.dataset import DatasetConfig
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.job import Job
+from physworld_schemas.loop import LoopCreate
 from physworld_schemas.model import TrainingCreate
 from physworld_schemas.pipeline import PipelineCreate
 from physworld_schemas.trace import TraceCreate
@@ -35,6 +36,7 @@ from physworld_storage.jobs.kinds import (
     dataset,
     fit,
     kind_of,
+    loop,
     pipeline,
     plan,
     rollout,
@@ -69,7 +71,7 @@ def create_video(session: Session, request: VideoCreate) -> Job:
 
 
 def create_trace(session: Session, request: TraceCreate) -> Job:
-    """Open a trace. Raises NotFound, or Conflict when the fit is not ready or of another scene."""
+    """Open a trace. Raises NotFound, or Conflict when the fit is not ready or of another kind of object."""
     opened = trace.KIND.open(
         session,
         request.scene_id,
@@ -106,6 +108,11 @@ def create_training(session: Session, request: TrainingCreate, parent: JobRow | 
 def create_pipeline(session: Session, request: PipelineCreate) -> Job:
     """Open fit, dataset and training as one job. Raises NotFound."""
     return _job(session, pipeline.KIND.open(session, request))
+
+
+def create_loop(session: Session, request: LoopCreate) -> Job:
+    """Open one turn of the loop. Raises NotFound, or Conflict when the version or the recording does not do."""
+    return _job(session, loop.KIND.open(session, request))
 
 
 def create_run(

@@ -208,6 +208,11 @@ def output_of(job: JobRow) -> str:
     return str(job.outputs[0]["id"])
 
 
+def share_of(job: JobRow) -> float:
+    """How much of a stored job is done, 0 to 1."""
+    return 1.0 if job.state == "succeeded" else Progress.model_validate(job.progress).share
+
+
 def scene_row(session: Session, scene_id: str) -> SceneRow:
     """The scene, or NotFound."""
     scene = session.get(SceneRow, scene_id)

@@ -32,7 +32,18 @@ RUN = """async (tags) => {
 
 def pages(world: World) -> list[str]:
     """Every page that the dashboard has."""
-    starts = ("pipeline", "fit", "trace", "dataset", "training", "assessment", "rollout", "plan", "video")
+    starts = (
+        "pipeline",
+        "fit",
+        "trace",
+        "dataset",
+        "training",
+        "assessment",
+        "loop",
+        "rollout",
+        "plan",
+        "video",
+    )
     return [
         "/",
         f"/jobs/{world.pipeline_id}",

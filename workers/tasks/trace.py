@@ -19,6 +19,7 @@ from physworld.calibrate.parameters import bending_ratio
 from physworld.engine.thin.triangles import Mesh
 from physworld.materials.sheet import SheetLaw
 from physworld.trace import TraceConfig, trace
+from physworld.trace.recordings import placed_in
 from physworld.twin.twin import Twin
 from physworld_schemas.base import Reference
 from physworld_schemas.fit import FitConfig
@@ -84,7 +85,7 @@ def _traced(context: TaskContext, stores: Stores, scene: Scene) -> Any:
         runner=SharedRunner(context, stores),
         memory=SharedMemory(stores, context.lease.job_id),
         journal=stored_journal(stores, context.lease.job_id, payload),
-        calibrated_twin=_undamped_twin(stores, payload["fit_id"], fit),
+        calibrated_twin=_undamped_twin(stores, payload["fit_id"], fit, payload["scene_id"]),
         progress=shown,
         cancelled=context.cancelled,
     )
@@ -129,15 +130,17 @@ class _Progress:
         self._context.progress(round(100 * self._share, 1), 100, "percent", text)
 
 
-def _undamped_twin(stores: Stores, fit_id: str | None, asked: FitConfig) -> Twin | None:
+def _undamped_twin(stores: Stores, fit_id: str | None, asked: FitConfig, scene_id: str) -> Twin | None:
     """The fit's twin where its physics is the declared one and its cells are those asked for; else None.
 
-    A sheet whose bending has a shape of its own is none: an effect such as fibres may have gone into it.
+    A sheet whose bending has a shape of its own is none: an effect such as fibres may have gone into it. Of a fit of
+    another recording the parameters are taken, in a body that stands where the traced scene starts.
     """
     if fit_id is None:
         return None
     with stores.database.reading() as session:
-        config = resources.get_fit(session, fit_id).config
+        fit = resources.get_fit(session, fit_id)
+    config = fit.config
     cells = (config.particle_budget, config.mesh)
     if cells != (asked.particle_budget, asked.mesh) or not config.usual_physics:
         return None
@@ -147,4 +150,8 @@ def _undamped_twin(stores: Stores, fit_id: str | None, asked: FitConfig) -> Twin
         if not np.allclose(shape, 1.0, rtol=_PLATE):
             return None
     damped = re.compile("drag|viscosity|relaxation")
-    return None if any(value for name, value in twin.parameters.items() if damped.search(name)) else twin
+    if any(value for name, value in twin.parameters.items() if damped.search(name)):
+        return None
+    if fit.scene_id == scene_id:
+        return twin
+    return placed_in(scene_of(stores, scene_id), twin, asked.particle_budget)

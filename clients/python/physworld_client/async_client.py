@@ -13,7 +13,7 @@ from physworld_client import transport as wire
 from physworld_client.async_artifacts import AsyncArtifacts
 from physworld_client.async_keys import AsyncKeys
 from physworld_client.async_live import AsyncLive
-from physworld_client.async_loop import AsyncAssessments, AsyncChecks, AsyncTraces
+from physworld_client.async_loop import AsyncAssessments, AsyncChecks, AsyncLoops, AsyncTraces
 from physworld_client.async_predict import AsyncPlans, AsyncRollouts
 from physworld_client.async_resources import (
     AsyncDatasets,
@@ -48,7 +48,7 @@ class AsyncClient:
             terminal.
 
     Attributes:
-        scenes, checks, fits, traces, datasets, models, assessments, rollouts, plans, videos, live, jobs, keys,
+        scenes, checks, fits, traces, datasets, models, assessments, loops, rollouts, plans, videos, live, jobs, keys,
         pipelines, artifacts:
             the resources.
     """
@@ -81,6 +81,7 @@ class AsyncClient:
         self.datasets = AsyncDatasets(self)
         self.models = AsyncModels(self)
         self.assessments = AsyncAssessments(self)
+        self.loops = AsyncLoops(self)
         self.rollouts = AsyncRollouts(self)
         self.plans = AsyncPlans(self)
         self.videos = AsyncVideos(self)

@@ -21,6 +21,7 @@ from physworld_client.types import (
     Episode,
     Fit,
     Job,
+    Loop,
     Model,
     ModelComparison,
     ModelVersion,
@@ -35,6 +36,7 @@ from physworld_schemas.check import CheckConfig, CheckCreate
 from physworld_schemas.dataset import DatasetConfig, DatasetCreate
 from physworld_schemas.fit import FitConfig, FitCreate
 from physworld_schemas.key import KeyCreate, KeyRotate, Role
+from physworld_schemas.loop import LoopCreate
 from physworld_schemas.model import AliasSet, TrainingConfig, TrainingCreate, VersionPatch
 from physworld_schemas.pipeline import PipelineCreate
 from physworld_schemas.scene import SceneImport
@@ -79,6 +81,8 @@ _VERSION = TypeAdapter(ModelVersion)
 _COMPARISON = TypeAdapter(ModelComparison)
 _SIGNING_KEYS = TypeAdapter(Page[SigningKey])
 _ASSESSMENT = TypeAdapter(Assessment)
+_LOOP = TypeAdapter(Loop)
+_LOOPS = TypeAdapter(Page[Loop])
 _JOB = TypeAdapter(Job)
 _SCENES = TypeAdapter(Page[Scene])
 _FITS = TypeAdapter(Page[Fit])
@@ -215,19 +219,8 @@ def trace_tracks(trace_id: str) -> Call[bytes]:
     return Call("GET", f"/v1/traces/{_part(trace_id)}/tracks", BYTES)
 
 
-def assessment_create(
-    name: str, version: int | str, scene_id: str, open_trace: bool, trace: TraceConfig | None
-) -> Call[Job]:
-    """POST /v1/models/{name}/versions/{version}/assessments.
-
-    Args:
-        name: of the model.
-        version: its number, or an alias.
-        scene_id: a recording that the version was not made from.
-        open_trace: trace the recording when the version misses it.
-        trace: settings of that trace; None has the defaults.
-    """
-    body = AssessmentCreate(scene_id=scene_id, open_trace=open_trace, trace=trace or TraceConfig())
+def assessment_create(name: str, version: int | str, body: AssessmentCreate) -> Call[Job]:
+    """POST /v1/models/{name}/versions/{version}/assessments."""
     path = f"/v1/models/{_part(name)}/versions/{_part(version)}/assessments"
     return Call("POST", path, _JOB, body=body)
 
@@ -253,6 +246,31 @@ def assessment_list(
         return Call("GET", "/v1/assessments", _ASSESSMENTS, query=query)
     path = f"/v1/models/{_part(name)}/versions/{_part(version)}/assessments"
     return Call("GET", path, _ASSESSMENTS, query=_given(limit=limit, cursor=cursor))
+
+
+def loop_create(body: LoopCreate) -> Call[Job]:
+    """POST /v1/loops."""
+    return Call("POST", "/v1/loops", _JOB, body=body)
+
+
+def loop_get(loop_id: str) -> Call[Loop]:
+    """GET /v1/loops/{id}."""
+    return Call("GET", f"/v1/loops/{_part(loop_id)}", _LOOP)
+
+
+def loop_list(
+    *, limit: int | None, cursor: str | None, model: str | None = None, state: str | None = None
+) -> Call[Page[Loop]]:
+    """GET /v1/loops.
+
+    Args:
+        limit: most loops of a page; None leaves it to the service.
+        cursor: of the page before.
+        model: only loops of this model.
+        state: only loops in this state.
+    """
+    query = _given(limit=limit, cursor=cursor, model=model, state=state)
+    return Call("GET", "/v1/loops", _LOOPS, query=query)
 
 
 def dataset_create(fit_id: str, config: DatasetConfig | None, trace_id: str | None = None) -> Call[Job]:

@@ -17,7 +17,7 @@ from physworld_client.keys import Keys
 from physworld_client.known_keys import KnownKeys
 from physworld_client.live import Live
 from physworld_client.location import where
-from physworld_client.loop import Assessments, Checks, Traces
+from physworld_client.loop import Assessments, Checks, Loops, Traces
 from physworld_client.predict import Plans, Rollouts
 from physworld_client.progress import Bars
 from physworld_client.resources import (
@@ -49,7 +49,7 @@ class Client:
             terminal.
 
     Attributes:
-        scenes, checks, fits, traces, datasets, models, assessments, rollouts, plans, videos, live, jobs, keys,
+        scenes, checks, fits, traces, datasets, models, assessments, loops, rollouts, plans, videos, live, jobs, keys,
         pipelines, artifacts:
             the resources.
     """
@@ -80,6 +80,7 @@ class Client:
         self.datasets = Datasets(self)
         self.models = Models(self)
         self.assessments = Assessments(self)
+        self.loops = Loops(self)
         self.rollouts = Rollouts(self)
         self.plans = Plans(self)
         self.videos = Videos(self)

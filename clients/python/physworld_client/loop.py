@@ -9,9 +9,13 @@ from physworld_client import calls
 from physworld_client.arrays import arrays_of
 from physworld_client.pages import ListPage
 from physworld_client.resources import LATEST, Resource
-from physworld_client.types import Array, Assessment, Check, Job, Trace
+from physworld_client.types import Array, Assessment, Check, Job, Loop, Trace
+from physworld_schemas.assessment import AssessmentCreate, Frames
 from physworld_schemas.check import CheckConfig
+from physworld_schemas.dataset import DatasetConfig
 from physworld_schemas.fit import FitConfig
+from physworld_schemas.loop import LoopCreate
+from physworld_schemas.model import TrainingConfig
 from physworld_schemas.trace import TraceConfig
 
 
@@ -93,9 +97,28 @@ class Assessments(Resource):
         *,
         open_trace: bool = True,
         trace: TraceConfig | None = None,
+        frames: Frames = "all",
+        compared_with: int | None = None,
     ) -> Job:
-        """Starts an assessment; its job's outputs are the assessment and the trace that it may open."""
-        return self._client.send(calls.assessment_create(name, version, scene_id, open_trace, trace))
+        """Starts an assessment; its job's outputs are the assessment and the trace that it may open.
+
+        Args:
+            name: of the model.
+            scene_id: a recording that the version was not made from.
+            version: its number, or an alias.
+            open_trace: trace the recording where the version errs more than expected.
+            trace: settings of that trace; None has the defaults.
+            frames: that are scored: "all", or the recording's "held_out" ones alone.
+            compared_with: another version of the model, measured on the same frames; None: none.
+        """
+        body = AssessmentCreate(
+            scene_id=scene_id,
+            open_trace=open_trace,
+            trace=trace or TraceConfig(),
+            frames=frames,
+            compared_with=compared_with,
+        )
+        return self._client.send(calls.assessment_create(name, version, body))
 
     def get(self, assessment_id: str) -> Assessment:
         """One assessment."""
@@ -121,3 +144,57 @@ class Assessments(Resource):
         if version is not None and name is None:
             raise ValueError(f"version {version} of which model? Give its name too")
         return self._page(lambda at: calls.assessment_list(name, version, limit=limit, cursor=at), cursor)
+
+
+class Loops(Resource):
+    """From a recording that a model predicts badly to the next version of the model."""
+
+    def create(
+        self,
+        model: str | None = None,
+        scene_id: str | None = None,
+        version: int | str = LATEST,
+        *,
+        assessment_id: str | None = None,
+        trace: TraceConfig | None = None,
+        dataset: DatasetConfig | None = None,
+        training: TrainingConfig | None = None,
+    ) -> Job:
+        """Starts a loop; its id is the job's.
+
+        Args:
+            model: name of the model; None with an ``assessment_id``.
+            scene_id: a recording that the version was not made from; None with an ``assessment_id``.
+            version: its number, or an alias.
+            assessment_id: a ready assessment that found the model worse than expected, to go on from.
+            trace: settings of the trace; None has the defaults.
+            dataset: settings of the demonstrations; None has the version's.
+            training: settings of the training; None has the version's.
+        """
+        body = LoopCreate(
+            model=model,
+            version=version,
+            scene_id=scene_id,
+            assessment_id=assessment_id,
+            trace=trace or TraceConfig(),
+            dataset=dataset,
+            training=training,
+        )
+        return self._client.send(calls.loop_create(body))
+
+    def get(self, loop_id: str) -> Loop:
+        """One loop: how it ended, what it made, and the errors of both versions."""
+        return self._client.send(calls.loop_get(loop_id))
+
+    def list(
+        self,
+        *,
+        limit: int | None = None,
+        cursor: str | None = None,
+        model: str | None = None,
+        state: str | None = None,
+    ) -> ListPage[Loop]:
+        """Loops, newest first."""
+        return self._page(
+            lambda at: calls.loop_list(limit=limit, cursor=at, model=model, state=state), cursor
+        )

@@ -20,6 +20,7 @@ from physworld_schemas import (
     fit,
     job,
     key,
+    loop,
     model,
     plan,
     rollout,
@@ -153,6 +154,23 @@ class Assessment(Tabled, assessment.Assessment):
         found = (("promised", self.expected, plots.BEFORE), ("measured", self.measured, plots.AFTER))
         rows = [(label, one.error_m, one.ci95_m, colour) for label, one, colour in found if one is not None]
         return plots.compared(rows, f"{self.name} version {self.version}: {self.outcome or self.state}", axes)
+
+
+class Loop(Tabled, loop.Loop):
+    __doc__ = loop.Loop.__doc__
+
+    def plot(self, axes: Axes | None = None) -> Axes:
+        """Errors of both versions on the new recording's held-out frames, with intervals, below the baselines'."""
+        rows: list[tuple[str, float, tuple[float, float] | None, str]] = [
+            (label, value, None, colour)
+            for name, (label, colour, _) in plots.PREDICTORS.items()
+            if (value := self.baselines_m.get(name)) is not None
+        ]
+        for one, colour in ((self.before, plots.BEFORE), (self.after, plots.AFTER)):
+            if one is not None:
+                figure = one.measured
+                rows.append((f"version {one.version}", figure.error_m, figure.ci95_m, colour))
+        return plots.compared(rows, f"{self.model}: {self.outcome or self.state}", axes)
 
 
 class Rollout(Tabled, rollout.Rollout):

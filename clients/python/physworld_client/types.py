@@ -18,6 +18,7 @@ from physworld_client.objects import (
     Event,
     Fit,
     Job,
+    Loop,
     Model,
     ModelComparison,
     ModelVersion,
@@ -30,7 +31,7 @@ from physworld_client.objects import (
     Video,
 )
 from physworld_schemas.arrays import EncodedArray
-from physworld_schemas.assessment import ErrorFigure
+from physworld_schemas.assessment import ComparedVersion, ErrorFigure
 from physworld_schemas.base import Artifact, FieldError, Lineage, Page, Problem, Reference
 from physworld_schemas.check import (
     CheckConfig,
@@ -47,6 +48,7 @@ from physworld_schemas.dataset import DatasetConfig
 from physworld_schemas.fit import FitConfig, LocalStage, Numerics, Parameter, SearchState
 from physworld_schemas.job import TERMINAL_STATES, Progress
 from physworld_schemas.key import Role
+from physworld_schemas.loop import LoopCreate, VersionError
 from physworld_schemas.model import (
     ComparedError,
     Difference,
@@ -80,6 +82,7 @@ __all__ = [
     "CheckedPair",
     "CheckedParameter",
     "ComparedError",
+    "ComparedVersion",
     "Dataset",
     "DatasetConfig",
     "Difference",
@@ -97,6 +100,8 @@ __all__ = [
     "Job",
     "Lineage",
     "LocalStage",
+    "Loop",
+    "LoopCreate",
     "MeasuredError",
     "Model",
     "ModelComparison",
@@ -127,6 +132,7 @@ __all__ = [
     "Trace",
     "TraceConfig",
     "TrainingConfig",
+    "VersionError",
     "Video",
     "VideoConfig",
     "VideoReport",

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from pydantic import Field
 from sqlalchemy.orm import Session
 
 from physworld_schemas import queues
-from physworld_schemas.assessment import AssessmentCreate, ErrorFigure, Outcome
+from physworld_schemas.assessment import AssessmentCreate, ComparedVersion, ErrorFigure, Outcome
 from physworld_schemas.base import Reference, Unmade
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.ids import new_id
@@ -17,7 +19,7 @@ from physworld_storage.jobs.events import append_event
 from physworld_storage.jobs.kind import JobKind, ShardKind, ShardResult, output_of, scene_row
 from physworld_storage.jobs.kinds import trace
 from physworld_storage.registry import reference_id, version_row
-from physworld_storage.tables import AssessmentRow, JobRow, ShardRow
+from physworld_storage.tables import AssessmentRow, JobRow, ModelVersionRow, ShardRow
 
 
 class AssessmentResult(ShardResult):
@@ -32,6 +34,7 @@ class AssessmentResult(ShardResult):
     baselines_m: dict[str, float | None] = Field(default_factory=dict)
     twin_m: float | None = None
     start_mismatch_m: float
+    compared: ComparedVersion | None = None
 
 
 def _apply(session: Session, job: JobRow, shard: ShardRow, result: AssessmentResult) -> None:
@@ -63,20 +66,26 @@ class AssessmentJobs(JobKind):
         ),
     )
 
-    def open(self, session: Session, name: str, version: int, request: AssessmentCreate) -> JobRow:
-        """A recording held against a model version. Raises NotFound, or Conflict when the version is not ready.
+    def open(
+        self,
+        session: Session,
+        name: str,
+        version: int,
+        request: AssessmentCreate,
+        parent: JobRow | None = None,
+    ) -> JobRow:
+        """A recording held against a model version. Raises NotFound, or Conflict when a version is not ready.
 
         Args:
             session: the transaction that it belongs to.
             name: of the model.
             version: its number.
             request: the recording, and whether a trace may follow.
+            parent: the loop that it belongs to.
         """
-        model = version_row(session, name, version)
-        if model.state != "ready" or model.fit_id is None or model.scene_id is None:
-            raise Conflict(
-                f"version {version} of {name} is {model.state}; an assessment needs a ready version"
-            )
+        model = assessable(session, name, version)
+        other = request.compared_with
+        compared = None if other is None else assessable(session, name, other)
         scene = scene_row(session, request.scene_id)
         assessment_id = new_id("assessment")
         job = self.queued(
@@ -88,6 +97,7 @@ class AssessmentJobs(JobKind):
             ],
             output_id=assessment_id,
             config=request.model_dump(mode="json"),
+            parent=parent,
         )
         row = AssessmentRow(
             id=assessment_id, name=name, version=version, scene_id=scene.id, config=job.config, figures={}
@@ -95,11 +105,10 @@ class AssessmentJobs(JobKind):
         payload = {
             "assessment_id": assessment_id,
             "name": name,
-            "version": version,
             "scene_id": scene.id,
-            "model_scene_id": model.scene_id,
-            "fit_id": model.fit_id,
-            "trace_id": model.trace_id,
+            "frames": request.frames,
+            **_origin(model),
+            "compared": None if compared is None else _origin(compared),
         }
         return self.begin(session, job, row, payload)
 
@@ -113,3 +122,21 @@ class AssessmentJobs(JobKind):
 
 
 KIND = AssessmentJobs()
+
+
+def assessable(session: Session, name: str, version: int) -> ModelVersionRow:
+    """The row of a ready version that knows its twin. Raises NotFound, or Conflict when it is not ready."""
+    model = version_row(session, name, version)
+    if model.state != "ready" or model.fit_id is None or model.scene_id is None:
+        raise Conflict(f"version {version} of {name} is {model.state}; an assessment needs a ready version")
+    return model
+
+
+def _origin(model: ModelVersionRow) -> dict[str, Any]:
+    """What a worker needs to put a version's twin on a recording."""
+    return {
+        "version": model.version,
+        "model_scene_id": model.scene_id,
+        "fit_id": model.fit_id,
+        "trace_id": model.trace_id,
+    }

@@ -154,7 +154,9 @@ class DatasetJobs(JobKind):
                 raise Conflict(f"trace {trace_id} is {trace.state}; a dataset needs a ready trace")
             if trace.scene_id != fit.scene_id:
                 raise Conflict(
-                    f"trace {trace_id} is of scene {trace.scene_id}, fit {fit_id} of {fit.scene_id}"
+                    f"trace {trace_id} is of scene {trace.scene_id}, fit {fit_id} of {fit.scene_id}: its twin stands "
+                    "in another recording; a trace of both together (scene_id the fit's, scene_ids the other), or "
+                    "a loop, leaves a twin in the fit's"
                 )
             inputs.append(Reference(kind="trace", id=trace_id, digest=trace_digest(trace)))
         dataset_id = new_id("dataset")

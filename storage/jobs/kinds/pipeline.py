@@ -21,11 +21,11 @@ from collections.abc import Sequence
 from sqlalchemy.orm import Session
 
 from physworld_schemas.base import Reference, Unmade
-from physworld_schemas.job import TERMINAL_STATES, Progress
+from physworld_schemas.job import TERMINAL_STATES
 from physworld_schemas.model import TrainingCreate
 from physworld_schemas.pipeline import PipelineCreate
 from physworld_schemas.trace import TRACE_PARTICLES
-from physworld_storage.jobs.kind import JobKind, output_of, scene_row
+from physworld_storage.jobs.kind import JobKind, output_of, scene_row, share_of
 from physworld_storage.jobs.kinds import dataset, fit, trace, training
 from physworld_storage.registry import find_baseline
 from physworld_storage.tables import JobRow, TraceRow
@@ -105,7 +105,7 @@ class PipelineJobs(JobKind):
             kinds.append(TRACE)
             if request.compare:
                 kinds += [DATASET, TRAINING]
-        done = sum(SHARES[child.kind] * _fraction(child) for child in children)
+        done = sum(SHARES[child.kind] * share_of(child) for child in children)
         return float(min(1.0, done / sum(SHARES[kind] for kind in kinds)))
 
 
@@ -147,7 +147,3 @@ def _is_comparison(session: Session, children: Sequence[JobRow]) -> bool:
     traced = trace_row(session, output_of(children[kinds.index(TRACE)]))
     last_dataset = next(job for job in reversed(children) if job.kind == DATASET)
     return leaves_twin(traced) and all(item["kind"] != "trace" for item in last_dataset.inputs)
-
-
-def _fraction(job: JobRow) -> float:
-    return 1.0 if job.state == "succeeded" else Progress.model_validate(job.progress).share

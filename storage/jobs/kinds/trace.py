@@ -65,14 +65,14 @@ class TraceJobs(JobKind):
         scene_ids: Sequence[str] = (),
         held_out_scene_ids: Sequence[str] = (),
     ) -> JobRow:
-        """A trace of a scene, from a ready fit of it or its own. Raises NotFound, or Conflict when the fit does not do.
+        """A trace of a scene, from a ready fit of its object. Raises NotFound, or Conflict when the fit does not do.
 
         Args:
             session: the transaction that it belongs to.
             scene_id: of the scene that is traced.
             fit: settings of the calibration.
             config: settings of the trace.
-            fit_id: of a ready fit of the scene.
+            fit_id: of a ready fit of the scene, or of another recording of its object.
             parent: the pipeline that it belongs to.
             scene_ids: scenes that are fitted with the first.
             held_out_scene_ids: scenes that are only reported on.
@@ -115,8 +115,9 @@ KIND = TraceJobs()
 
 def _fit_of(session: Session, fit_id: str, scene_id: str) -> Reference:
     fit = ready_fit(session, fit_id, "a trace")
-    if fit.scene_id != scene_id:
-        raise Conflict(f"fit {fit_id} is of scene {fit.scene_id}, not of {scene_id}")
+    home, scene = scene_row(session, fit.scene_id), scene_row(session, scene_id)
+    if home.kind != scene.kind:
+        raise Conflict(f"fit {fit_id} is of a {home.kind}, scene {scene_id} shows a {scene.kind}")
     if (fit.metrics.get("local") or {}).get("kept"):
         raise Conflict(
             f"fit {fit_id} carries a field over its body, which a trace would have to search with its effects; "

@@ -121,7 +121,15 @@ class Service:
             return {"report": CHECKED}, None
         if lease.kind == "assessment":
             figure = {"error_m": 2e-3, "ci95_m": [1e-3, 3e-3], "noise_floor_m": 1e-4, "frames": 10}
-            excess = {"excess_m": 0.0, "excess_ci95_m": [-1e-6, 1e-6], "start_mismatch_m": 0.0}
+            excess: dict[str, Any] = {
+                "excess_m": 0.0,
+                "excess_ci95_m": [-1e-6, 1e-6],
+                "start_mismatch_m": 0.0,
+            }
+            other = payload["compared"]
+            if other is not None:
+                worse = {"version": other["version"], "measured": {**figure, "error_m": 5e-3}, "twin_m": 4e-3}
+                excess["compared"] = {**worse, "gain_m": 3e-3, "gain_ci95_m": [2e-3, 4e-3]}
             named = {"outcome": self.outcome, "reason": "it is so", "measured": figure, "expected": figure}
             return {**named, **excess}, None
         if lease.kind == "dataset_plan":

@@ -9,7 +9,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from api_service import REPORT, TRACKS, Service, assert_problem, scene_id
+from api_service import REPORT, TRACKS, Service, assert_problem, bundle, scene_id, upload
 
 from physworld_schemas.trace import TraceCreate
 
@@ -89,8 +89,13 @@ def test_traces_are_refused_cancelled_and_done_once(client: httpx.Client, servic
     fit_id = fit["outputs"][0]["id"]
     assert_problem(client.post("/v1/traces", json={"scene_id": scene, "fit_id": fit_id}), 409, "conflict")
     service.work()
+    block = upload(client, bundle("a block", kind="block")).json()["id"]
+    refused = client.post("/v1/traces", json={"scene_id": block, "fit_id": fit_id})
+    assert "is of a beam" in assert_problem(refused, 409, "conflict")["detail"]
     other = scene_id(client, "another strip")
-    assert_problem(client.post("/v1/traces", json={"scene_id": other, "fit_id": fit_id}), 409, "conflict")
+    elsewhere = client.post("/v1/traces", json={"scene_id": other, "fit_id": fit_id})
+    assert elsewhere.status_code == 202, "a fit of another recording of the object will do"
+    client.post(f"/v1/jobs/{elsewhere.json()['id']}/cancel")
     headers = {"Idempotency-Key": "trace-once"}
     body = {"scene_id": scene, "fit_id": fit_id}
     first, again = (client.post("/v1/traces", json=body, headers=headers) for _ in range(2))

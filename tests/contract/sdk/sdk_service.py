@@ -91,7 +91,9 @@ class Service:
         if lease.kind == "assessment":
             figure = {"error_m": 0.009, "ci95_m": [0.008, 0.01], "noise_floor_m": 0.0005, "frames": 10}
             promised = {**figure, "error_m": 0.001, "ci95_m": [0.0009, 0.0012]}
+            other = lease.payload["compared"]
             return {
+                "compared": None if other is None else compared_with(other["version"]),
                 "outcome": "worse_than_expected",
                 "reason": "The model errs more than noise and its card allow",
                 "measured": figure,
@@ -195,3 +197,15 @@ def write_scene(folder: Path, name: str = "strip", *, seed: int = 0) -> Path:
     }
     (folder / "scene.json").write_text(json.dumps(declared))
     return folder
+
+
+def compared_with(version: int) -> dict[str, Any]:
+    """Another version in an assessment: it errs 30 mm, 21 mm more than the assessed one."""
+    figure = {"error_m": 0.03, "ci95_m": [0.02, 0.04], "noise_floor_m": 0.0005, "frames": 10}
+    return {
+        "version": version,
+        "measured": figure,
+        "twin_m": 0.02,
+        "gain_m": 0.021,
+        "gain_ci95_m": [0.01, 0.03],
+    }

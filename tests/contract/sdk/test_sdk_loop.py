@@ -15,6 +15,7 @@ from test_command_line import output_of, physworld, worker
 from physworld_schemas.check import CheckConfig
 from physworld_schemas.dataset import DatasetConfig
 from physworld_schemas.fit import FitConfig
+from physworld_schemas.pipeline import PipelineCreate
 from physworld_schemas.trace import TraceConfig
 
 
@@ -115,3 +116,56 @@ def test_the_loop_on_the_command_line(service: Service, tmp_path: Path) -> None:
     job = output_of(service, tmp_path, "traces", "add", newest["scene_id"])
     cancelled = output_of(service, tmp_path, "traces", "cancel", job["outputs"][0]["id"])
     assert (cancelled["id"], cancelled["state"]) == (job["id"], "cancelled")
+
+
+def test_a_turn_of_the_loop_from_the_sdk_and_the_command_line(
+    service: Service, client: Client, tmp_path: Path
+) -> None:
+    home = client.scenes.create(write_scene(tmp_path / "turned", "turned"))
+    client.pipelines.create(
+        PipelineCreate(scene_id=home.id, model_name="turned", dataset=DatasetConfig(episodes=1))
+    )
+    service.work()
+    new = client.scenes.create(write_scene(tmp_path / "new", "turned again"))
+    with pytest.raises(Conflict, match="needs another one"):
+        client.loops.create("turned", home.id)
+    job = client.loops.create("turned", new.id, 1, trace=TraceConfig(seed=4))
+    running = client.loops.get(job.id)
+    assert (running.state, running.outcome, running.version) == ("queued", None, 1)
+    service.work()
+    client.jobs.wait(job, timeout=30)
+    loop = client.loops.get(job.id)
+    assert (loop.outcome, loop.verdict, loop.new_version) == ("improved", "named", 2)
+    assert loop.before is not None and loop.before.measured.error_m == 0.03
+    assert [item.id for item in client.loops.list(model="turned").data] == [job.id]
+    assert client.loops.list(model="turned", state="failed").data == []
+    assert client.traces.get(str(loop.trace_id)).config.seed == 4
+
+    shown = physworld(service, tmp_path, "loops", "show", job.id[-8:].lower())
+    assert shown.returncode != 0, "the end of an id names nothing"
+    shown = physworld(service, tmp_path, "loops", "show", job.id)
+    assert "improved: On held-out frames of the new recording version 2 errs 9 mm" in shown.stdout, (
+        shown.stderr
+    )
+    assert "version 1   30 mm (95 %: 20 to 40), its twin 20" in shown.stdout
+    assert "effect      air_drag_linear" in shown.stdout and "also [mm]: static 50" in shown.stdout
+    [listed] = output_of(service, tmp_path, "loops", "list", "--model", "turned")
+    assert listed["id"] == job.id
+
+    started = output_of(service, tmp_path, "loops", "add", "--assessment", str(loop.assessment_id))
+    assert output_of(service, tmp_path, "loops", "cancel", started["id"])["state"] == "cancelled"
+    nothing = physworld(service, tmp_path, "loops", "add", "turned")
+    assert nothing.returncode == 2 and "a MODEL and a SCENE are needed" in nothing.stderr
+    with worker(service):
+        held = physworld(
+            service, tmp_path, "models", "assess", "turned", new.id, "--held-out", "--beside", "1"
+        )
+    assert "version 1 30 mm (95 %: 20 to 40), gain 21 (95 %: 10 to 30)" in held.stdout, held.stderr
+
+    async def same() -> None:
+        async with AsyncClient(service.url, service.token) as other:
+            assert await other.loops.get(job.id) == loop
+            with pytest.raises(NotFound):
+                await other.loops.get("job_none")
+
+    asyncio.run(same())

@@ -18,7 +18,7 @@ from physworld_client.errors import ExtraMissing, NothingToPlot, PhysWorldError
 from physworld_client.pages import AsyncListPage, ListPage
 from physworld_client.plots import DWARFS, PREDICTORS
 from physworld_client.predictions import Predicted
-from physworld_client.types import Dataset, Event, Fit, Job, ModelComparison, ModelVersion, Scene, Trace
+from physworld_client.types import Dataset, Event, Fit, Job, Loop, ModelComparison, ModelVersion, Scene, Trace
 from physworld_client.world_model import WorldModel
 from pydantic import BaseModel
 
@@ -144,6 +144,24 @@ def test_traces_comparisons_datasets_and_jobs_are_drawn() -> None:
     motions = {"motions": {"lift": 3, "twist": 1}}
     assert [bar.get_width() for bar in dataset(motions).plot().patches] == [3, 1]
     assert [bar.get_width() for bar in job().plot().patches] == [2.0, 10.0]
+
+
+def test_a_loop_draws_its_baselines_above_both_versions() -> None:
+    fields = {"id": "job_1", "model": "bar", "version": 1, "scene_id": "scn_1", "state": "succeeded"}
+    figure = {"error_m": 0.018, "ci95_m": [0.012, 0.026], "frames": 36}
+    both = {
+        "before": {"version": 1, "measured": figure},
+        "after": {"version": 2, "measured": {**figure, "error_m": 0.0017, "ci95_m": [0.0014, 0.0021]}},
+        "baselines_m": {"rigid_follow": 0.009, "static": 0.01, "constant_velocity": None},
+    }
+    axes = Loop.model_validate({**fields, "created_at": AT, "outcome": "improved", **both}).plot()
+    assert [label.get_text() for label in axes.get_yticklabels()] == [
+        "static", "rigid follow", "version 1", "version 2",
+    ]  # fmt: skip
+    points = [line.get_xdata()[0] for line in axes.lines if line.get_marker() == "o"]
+    np.testing.assert_allclose(points, [10.0, 9.0, 18.0, 1.7])
+    with pytest.raises(NothingToPlot):
+        Loop.model_validate({**fields, "created_at": AT}).plot()
 
 
 def test_a_job_with_its_events_is_the_share_over_time() -> None:

@@ -130,6 +130,16 @@ def test_a_wind_has_to_earn_its_push_beside_the_drag_that_it_contains(
     assert any(h.members and h.members[0].effect == "wind" for h in search.admitted()) == admitted
 
 
+def test_without_a_candidate_that_makes_sense_the_declared_physics_has_everything() -> None:
+    """A tilt of a gravity that is zero, say, is no candidate."""
+    search = Search(None, [], None, 1, 1, 1)  # type: ignore[arg-type]
+    unseen = LeftOut(np.full(BLOCKS, 10.0), np.full(BLOCKS, ROWS))
+    declared: Any = SimpleNamespace(members=(), left=10.0, log_prior=-1.0, unseen=unseen)
+    search.hypotheses[()] = declared
+    assert search.library == 0
+    np.testing.assert_array_equal(search.weights(), [1.0])
+
+
 @pytest.mark.slow
 def test_a_trace_names_nothing_where_nothing_acts() -> None:
     from test_trace_run import CONFIG, SIGMA, beam, recorded

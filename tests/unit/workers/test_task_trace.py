@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from tiny_scene import register, tiny_scene
 
-from physworld.scene import Body
+from physworld.scene import Body, Grip
 from physworld.trace import Memory
 from physworld.trace import TraceConfig as LibraryConfig
 from physworld.trace.preparation import Clock
@@ -269,4 +269,38 @@ def test_a_fit_whose_physics_is_not_the_declared_one_is_calibrated_anew(
         scene = replace(scene, grips=())
     twin = build_twin(scene, FIT.particle_budget).with_parameters(**law)
     monkeypatch.setattr(task, "twin_of", lambda stores, fit_id: twin)
-    assert (task._undamped_twin(stores, fit_id, FIT) is twin) is taken
+    assert (task._undamped_twin(stores, fit_id, FIT, scene_id) is twin) is taken
+
+
+def test_a_trace_begins_with_the_fit_of_another_recording_in_its_own_body(
+    runtime_with: Callable[..., Runtime], stores: Stores, scene_id: str
+) -> None:
+    shift = np.array([0.3, 0.0, 0.1])
+    scene = tiny_scene()
+    low, high = np.array([0.0, -0.015, -0.015]), np.array([0.12, 0.015, 0.015])
+    held = Grip((0, 1, 2, 3), low + shift, np.array([0.02, 0.015, 0.015]) + shift)
+    moved = replace(
+        scene,
+        points=scene.points + shift,
+        controllers=scene.controllers + shift,
+        body=Body(box_min_m=low + shift, box_max_m=high + shift, density_kg_m3=300.0),
+        grips=(held,),
+    )
+    other = register(moved, stores.database, stores.artifacts)
+    with stores.database.session() as session:
+        fit_id = jobs.create_fit(session, scene_id, FIT).outputs[0].id
+    (fitting,) = _waiting(stores)
+    assert run_shard(runtime_with(), fitting) == "done"
+    home, placed = twin_of(stores, fit_id), task._undamped_twin(stores, fit_id, FIT, other)
+    assert placed is not None and placed.parameters == home.parameters
+    offset = placed.body.start.mean(axis=0) - home.body.start.mean(axis=0)
+    np.testing.assert_allclose(offset, shift, atol=1e-3)
+    with stores.database.session() as session:
+        request = TraceCreate(scene_id=other, fit_id=fit_id, fit=FIT, config=SMALL)
+        job = jobs.create_trace(session, request)
+    (driver,) = _waiting(stores)
+    assert run_shard(runtime_with(), driver) == "done"
+    trace = _trace(stores, job)
+    assert (trace.state, trace.scene_id, trace.fit_id) == ("ready", other, fit_id)
+    stages = [stage["name"] for stage in (trace.model_extra or {})["stages"]]
+    assert "declared physics" in stages and "calibration" not in stages, "the fit's parameters are taken"

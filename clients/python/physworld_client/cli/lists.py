@@ -38,6 +38,7 @@ from physworld_client.types import (
     Episode,
     Fit,
     Job,
+    Loop,
     Model,
     ModelVersion,
     Plan,
@@ -182,6 +183,13 @@ def _assessment(one: Assessment) -> Sequence[object]:
     )
 
 
+def _loop(one: Loop) -> Sequence[object]:
+    versions = f"{one.version} → {one.new_version}" if one.new_version else str(one.version)
+    effects = ", ".join(effect.name for effect in one.effects)
+    end = (one.outcome or one.state, effects, loop_errors(one))
+    return (one.id, one.model, versions, *end, ago(one.created_at))
+
+
 def _key(key: ApiKey) -> Sequence[object]:
     return (key.id, key.name, key.role, ending(key), ago(key.created_at))
 
@@ -195,6 +203,13 @@ def ending(key: ApiKey) -> str:
 
 def _job(job: Job) -> Sequence[object]:
     return (job.id, job.kind, job.state, progress_text(job), ago(job.created_at))
+
+
+def loop_errors(one: Loop) -> str:
+    """``18.3 → 1.66`` [mm], version before and after; empty before they are measured."""
+    if one.before is None or one.after is None:
+        return ""
+    return f"{millimetres(one.before.measured.error_m)} → {millimetres(one.after.measured.error_m)}"
 
 
 def held_out_errors(trace: Trace) -> str:
@@ -289,6 +304,16 @@ ASSESSMENTS = Listing(
     _assessment,
     filters=(("model", "name", "Only assessments of this model."),),
 )
+LOOPS = Listing(
+    "list",
+    "Turns of the loop, newest first.",
+    ("id", "model", "versions", "outcome", "effects", "before → after [mm]", "age"),
+    _loop,
+    filters=(
+        ("model", "model", "Only loops of this model."),
+        ("state", "state", "Only loops in this state."),
+    ),
+)
 KEYS = Listing("list", "Keys, newest first, ended ones too.", ("id", "name", "role", "until", "age"), _key)
 RESOURCES = (
     Resource("scenes", "Measured scenes.", (SCENES,), "scene", files="the files of a scene"),
@@ -313,6 +338,7 @@ RESOURCES = (
     Resource("plans", "Motions that reach a goal.", (PLANS,), "plan", files="the arrays of a plan"),
     Resource("videos", "Films of motions, drawn by the service.", (VIDEOS,), "video", files="the film"),
     Resource("assessments", "New recordings held against models.", (ASSESSMENTS,), "assessment"),
+    Resource("loops", "From a badly predicted recording to the next version.", (LOOPS,), "loop", shown=False),
     Resource("keys", "API keys of the service.", (KEYS,), "key", shown=False),
 )
 

@@ -28,6 +28,7 @@ SINGULAR = {
     "datasets": "dataset",
     "models": "model",
     "assessments": "assessment",
+    "loops": "loop",
     "rollouts": "rollout",
     "plans": "plan",
     "videos": "video",
@@ -66,7 +67,8 @@ def found(client: Client, resource: str, given: str) -> str:
         PhysWorldError: nothing is called that, or several are.
     """
     what = SINGULAR[resource]
-    prefix = f"{PREFIXES[what]}_" if what in PREFIXES else ""
+    named = "job" if what == "loop" else what  # a loop's id is its job's
+    prefix = f"{PREFIXES[named]}_" if named in PREFIXES else ""
     if re.fullmatch(prefix + _ULID, given) if prefix else not re.fullmatch(_MODEL, given):
         return given  # an id; or what can be no model's name, which the request itself will say
     listed = islice(getattr(client, resource).list(limit=PAGE).auto_paging_iter(), MOST)

@@ -26,6 +26,7 @@ FitName = Annotated[str, typer.Argument(help=help_of("fits")), Named("fits")]
 TraceName = Annotated[str, typer.Argument(help=help_of("traces")), Named("traces")]
 DatasetName = Annotated[str, typer.Argument(help=help_of("datasets")), Named("datasets")]
 ModelName = Annotated[str, typer.Argument(help=help_of("models")), Named("models")]
+LoopName = Annotated[str, typer.Argument(help=help_of("loops")), Named("loops")]
 JobName = Annotated[str, typer.Argument(help=help_of("jobs")), Named("jobs")]
 KeyName = Annotated[str, typer.Argument(help=help_of("keys")), Named("keys")]
 """Arguments that name one object: by id, the beginning of one, or a name."""

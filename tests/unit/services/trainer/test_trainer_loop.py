@@ -13,6 +13,7 @@ from tiny_scene import register, tiny_scene
 
 from physworld.effects.registry import effect
 from physworld.errors import SceneUnsupported
+from physworld.estimation.noise import freeze
 from physworld.worldmodel.foreign import ForeignPrediction
 from physworld_schemas.assessment import Assessment, AssessmentCreate
 from physworld_schemas.dataset import DatasetConfig
@@ -20,7 +21,7 @@ from physworld_schemas.fit import FitConfig
 from physworld_schemas.job import Job
 from physworld_schemas.model import ModelVersion, TrainingConfig, TrainingCreate
 from physworld_schemas.trace import TraceCreate
-from physworld_services.trainer.assessment import assess
+from physworld_services.trainer.assessment import assess, scored_frames
 from physworld_storage import registry, traces
 from physworld_storage.database import open_database
 from physworld_storage.jobs import jobs, leases
@@ -229,4 +230,33 @@ def test_a_version_that_left_the_numbers_at_home_promises_nothing(plain: ModelVe
     scene = tiny_scene(FRAMES)
     predicted = ForeignPrediction(scene.points, scene.points, 1, 0.0)
     with pytest.raises(SceneUnsupported, match="no error of its own on held-out frames"):
-        assess(scene, predicted, plain.model_copy(update={"metrics": metrics}))
+        assess(scene, predicted, plain.model_copy(update={"metrics": metrics}), slice(1, FRAMES))
+
+
+def test_two_versions_are_held_against_frames_that_neither_has_seen(
+    runtime: Runtime, scene_id: str, fit_id: str, plain: ModelVersion
+) -> None:
+    drag = _version(runtime, fit_id, _trace(runtime, scene_id, fit_id, "named"))
+    request = {"frames": "held_out", "compared_with": drag.version, "open_trace": False}
+    job, found = _assess(runtime, scene_id, **request)
+    assert job.state == "succeeded", job.error
+    scene = tiny_scene(FRAMES)
+    assert found.measured is not None and found.compared is not None
+    assert found.measured.frames == found.compared.measured.frames == scene.test[1] - scene.test[0]
+    assert found.compared.version == drag.version
+    gain = found.compared.gain_m
+    assert gain == pytest.approx(found.compared.measured.error_m - found.measured.error_m)
+    assert found.compared.gain_ci95_m[0] <= gain <= found.compared.gain_ci95_m[1]
+    assert found.compared.twin_m != found.twin_m, "each version brings its own twin"
+    assert {item.id for item in found.lineage.inputs} == {"bar:1", f"bar:{drag.version}", scene_id}
+
+
+def test_frames_that_are_scored_are_those_that_a_trace_holds_out() -> None:
+    scene = tiny_scene(FRAMES)
+    split = freeze(scene, 12, 3)
+    assert scored_frames(scene, 1, "held_out") == slice(*split.test) != scored_frames(scene, 1, "all")
+    assert scored_frames(scene, split.test[0] + 2, "held_out").start == split.test[0] + 2
+    undeclared = replace(scene, test=(0, 0))
+    assert scored_frames(undeclared, 1, "held_out") == slice(*freeze(undeclared, 12, 3).test)
+    with pytest.raises(SceneUnsupported, match="no frame can be scored"):
+        scored_frames(scene, FRAMES, "held_out")
