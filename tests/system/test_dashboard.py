@@ -50,9 +50,9 @@ def test_a_wrong_key_is_refused(stranger: Visit) -> None:
 def test_the_job_list_moves_with_the_work(visit: Visit, world: World) -> None:
     assert world.running is not None
     row = visit.page.locator(f"#{world.running_id}")
-    expect(row).to_contain_text("10 / 80 simulations")
+    expect(row).to_contain_text("10 of 80 simulations")
     report(world, world.running, 40, 80, "simulations", "local stage")
-    expect(row).to_contain_text("40 / 80 simulations")
+    expect(row).to_contain_text("40 of 80 simulations")
     assert row.locator("progress").evaluate("bar => bar.value") == 0.5
     with world.database.session() as session:
         added = jobs.create_pipeline(session, PipelineCreate(scene_id=world.scene_id))

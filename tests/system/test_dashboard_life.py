@@ -146,7 +146,7 @@ def test_from_an_empty_folder_to_a_model_that_is_played_with_and_back(life: Visi
 
     # play
     visit.open("/models/bar/1/playground")
-    page.wait_for_selector("[data-playground][data-ready][data-accompanied]")
+    page.wait_for_selector("[data-playground][data-ready][data-accompanied][data-frames]")
     page.get_by_role("button", name="Record", exact=True).click()
     page.focus("[data-playground] canvas")
     page.keyboard.down("ArrowRight")

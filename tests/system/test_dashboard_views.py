@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from dashboard_browser import Visit
 from dashboard_world import World
-from playwright.sync_api import Page
+from playwright.sync_api import Page, expect
 
 from physworld_services.dashboard.clouds import Cloud, Layer
 
@@ -41,7 +43,7 @@ def test_a_view_that_becomes_narrow_still_shows_every_point(visit: Visit, world:
     visit.open(f"/scenes/{world.scene_id}")
     visit.points_shown()
     visit.page.set_viewport_size({"width": 360, "height": 900})
-    visit.page.wait_for_function("document.querySelector('figure canvas').width < 360")
+    expect(visit.page.locator("figure canvas")).to_have_attribute("width", re.compile("^3[0-5].$"))
     assert_inside(visit.page)
 
 
