@@ -103,6 +103,19 @@ class Whitener:
         errors: Array = np.clip(np.array(found), -3.0, 3.0) * self.sigma
         return errors
 
+    def until(self, end: int) -> Whitener:
+        """Of the sightings before frame ``end``, by their noise alone."""
+        kept = self.frames < end
+        return replace(
+            self,
+            measured=self.measured[kept],
+            visible=self.visible[: end - self.first],
+            frames=self.frames[kept],
+            points=self.points[kept],
+            places=(),
+            common=None,
+        )
+
     def _seen(self, tracks: Array) -> Array:
         return tracks[self.first : self.first + len(self.visible)][self.visible]
 

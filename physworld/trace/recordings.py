@@ -34,7 +34,7 @@ from physworld.estimation.simulations import (
 from physworld.estimation.whitening import moved, responses
 from physworld.evaluate.numerics import refined
 from physworld.scene import Scene
-from physworld.twin.build import build_twin
+from physworld.twin.build import build_twin, taken_over
 from physworld.twin.twin import Twin
 
 FITTED, HELD_OUT = "fitted", "held_out"
@@ -116,7 +116,7 @@ class JointSimulations(Simulations):
         factors = (1.0, refinement, 1.0 / refinement) if twin.lattice.smooth else (1.0,)
         for factor in factors if len(recordings.fitted) > 1 else ():
             lead = twin if factor == 1.0 else refined(recordings.lead.scene, twin, budget, factor)
-            others = [_built_like(twin, r.scene, budget, factor) for r in recordings.fitted[1:]]
+            others = [placed_in(r.scene, twin, budget, factor) for r in recordings.fitted[1:]]
             self._levels.append((lead, others))
 
     def run(self, jobs: Sequence[Job]) -> list[Array | None]:
@@ -179,39 +179,21 @@ class JointSimulations(Simulations):
         )
 
 
-def _built_like(twin: Twin, scene: Scene, budget: int, refinement: float = 1.0) -> Twin:
-    """A recording's own twin, in the form and with the flow law of ``twin``; a mesh of triangles if that is one."""
-    return build_twin(
-        scene, budget, twin.device, refinement, twin.plasticity, twin.formulation, twin.transfer,
-        mesh_of(twin.lattice),
-    )  # fmt: skip
-
-
-def taken_over(twin: Twin, other: Twin) -> Twin:
-    """``other``'s body, start and grips with the parameters and effects of ``twin``."""
-    return replace(
-        other,
-        natural=twin.natural if other.natural is not None else None,
-        law=twin.law,
-        air_drag_per_s=twin.air_drag_per_s,
-        grip_softness=twin.grip_softness,
-        ground_friction=twin.ground_friction,
-        effects=twin.effects,
-    )
-
-
-def placed_in(scene: Scene, twin: Twin, budget: int) -> Twin:
+def placed_in(scene: Scene, twin: Twin, budget: int, refinement: float = 1.0) -> Twin:
     """A recording's own body, start and grips with the parameters and effects of another recording's twin.
 
     Args:
         scene: the recording.
-        twin: of another recording of the same object.
-        budget: particles of the body.
+        twin: of another recording of the same object; of a mesh of triangles if that is one.
+        budget, refinement: particles of the body, and how many times finer its cells are.
 
     Raises:
         SceneUnsupported: the recording does not say enough for a body of the twin's form.
     """
-    return taken_over(twin, _built_like(twin, scene, budget))
+    return taken_over(twin, build_twin(
+        scene, budget, twin.device, refinement, twin.plasticity, twin.formulation, twin.transfer,
+        mesh_of(twin.lattice),
+    ))  # fmt: skip
 
 
 def side_by_side(parts: Sequence[Array], frames: int) -> Array:

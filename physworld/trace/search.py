@@ -15,7 +15,7 @@ half was wrong comes apart.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.optimize import lsq_linear
@@ -232,16 +232,13 @@ class Search:
             runs = self.setting.simulations.run(
                 [Job(at(twin, unknowns, starts_of(unknowns)), self.setting.frames)]
             )
-            if runs[0] is None or self._squared(runs[0]) >= known.fitted.misfit**2:
+            white = self.setting.white
+            if runs[0] is None or np.mean(white.residual(runs[0]) ** 2) >= known.fitted.misfit**2:
                 continue
             self.setting.simulations.stage = f"fit with {' and '.join(known.names)}"
             found = self.setting.fitted(known.members, place, scale=known.unseen.scale)
             if found is not None and found.left < known.left:
                 self.hypotheses[known.names] = found
-
-    def _squared(self, tracks: Array) -> float:
-        """Mean squared whitened residual of tracks (frames, N, 3)."""
-        return float(np.mean(self.setting.white.residual(tracks) ** 2))
 
     def _take_out(self, larger: Hypothesis) -> None:
         """Fits without one of the effects of a set, and with another one in its place, from the set's basin."""
@@ -435,17 +432,7 @@ class Search:
 def early_part(white: Whitener, split: Split) -> tuple[Whitener, int]:
     """The whitener of the first part of the training frames, and the frame at which that ends."""
     end = split.train[0] + max(int(np.ceil(_EARLY * (split.train[1] - split.train[0]))), 3)
-    kept = white.frames < end
-    shorter = replace(
-        white,
-        measured=white.measured[kept],
-        visible=white.visible[: end - white.first],
-        frames=white.frames[kept],
-        points=white.points[kept],
-        places=(),
-        common=None,
-    )
-    return shorter, end
+    return white.until(end), end
 
 
 def _names(members: Sequence[Candidate]) -> tuple[str, ...]:

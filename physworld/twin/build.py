@@ -247,3 +247,16 @@ def _release_time(scene: Scene) -> float:
     if released >= scene.train[1] or driven[: released + 1].any():
         return 0.0
     return float(scene.times[max(released - 1, 0)])
+
+
+def taken_over(twin: Twin, other: Twin) -> Twin:
+    """``other``'s body, start and grips with the parameters and effects of ``twin``."""
+    return replace(
+        other,
+        natural=twin.natural if other.natural is not None else None,
+        law=twin.law,
+        air_drag_per_s=twin.air_drag_per_s,
+        grip_softness=twin.grip_softness,
+        ground_friction=twin.ground_friction,
+        effects=twin.effects,
+    )

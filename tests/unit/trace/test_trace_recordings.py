@@ -22,10 +22,9 @@ from physworld.trace.recordings import (
     JointSimulations,
     Recordings,
     side_by_side,
-    taken_over,
 )
 from physworld.trace.unknowns import with_strengths
-from physworld.twin.build import build_twin
+from physworld.twin.build import build_twin, taken_over
 
 pytestmark = pytest.mark.slow
 
