@@ -126,7 +126,7 @@ def test_a_loop_is_cancelled_with_its_children(client: httpx.Client, service: Se
     assert client.post(f"/v1/jobs/{job['id']}/cancel").json()["state"] == "cancelled"
     loop = client.get(f"/v1/loops/{job['id']}").json()
     assert (loop["state"], loop["outcome"]) == ("cancelled", None)
-    assert client.get(loop["links"]["trace"]).json()["state"] == "failed"
+    assert client.get(loop["links"]["trace"]).json()["state"] == "cancelled"
     with service.client("read") as reader:
         assert reader.get(f"/v1/loops/{job['id']}").status_code == 200
         assert_problem(reader.post("/v1/loops", json=body), 403, "forbidden")

@@ -164,9 +164,13 @@ def test_every_resource_of_the_table_has_its_list(service: Service, tmp_path: Pa
 
 
 def test_the_shell_is_told_how_to_complete(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [physworld_command(), "--show-completion", "bash"], capture_output=True, text=True, check=False
-    )
+    shell = [
+        "bash",
+        "-c",
+        '"$0" --show-completion && true',
+        physworld_command(),
+    ]  # it asks which shell began it
+    done = subprocess.run(shell, capture_output=True, text=True, check=False)
     assert done.returncode == 0 and "_PHYSWORLD_COMPLETE" in done.stdout
 
 
