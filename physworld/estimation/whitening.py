@@ -88,6 +88,13 @@ class Whitener:
         """Whitened change of a prediction, (M,), of a difference of tracks (frames, N, 3)."""
         return self._whiten(self._seen(difference) / self.sigma)
 
+    def over_from(self, other: Whitener, columns: Array) -> Array:
+        """Columns (M, p) that another whitener of the same sightings has whitened, by this one."""
+        if not columns.shape[1]:
+            return columns
+        plain = [other._coloured(column) for column in columns.T]
+        return np.stack([self._whiten(column.reshape(-1, 3)) for column in plain], axis=1)
+
     @property
     def frame_of_row(self) -> Array:
         """Frame of every row, (M,)."""
@@ -130,6 +137,18 @@ class Whitener:
             flat = flat - basis @ (shrink * (basis.T @ flat))
         return flat
 
+    def _coloured(self, flat: Array) -> Array:
+        """What is whitened to ``flat`` (M,), (V, 3)."""
+        if self.common is not None:
+            basis, shrink = self.common
+            flat = flat + basis @ (shrink / (1.0 - shrink) * (basis.T @ flat))
+        out: Array = flat.reshape(-1, 3).copy()
+        for place in self.places:
+            block = out[place.rows].reshape(-1)
+            grown = place.shrink / (1.0 - place.shrink) * (place.basis.T @ block)
+            out[place.rows] = (block + place.basis @ grown).reshape(-1, 3)
+        return out
+
     def knowing(self, differences: list[Array]) -> Whitener:
         """With changes of the prediction, (frames, N, 3) each, that are as likely as not: one deviation each."""
         if not differences:
@@ -137,6 +156,27 @@ class Whitener:
         factors = np.stack([self.change(difference) for difference in differences], axis=1)
         u, s, _ = np.linalg.svd(factors, full_matrices=False)
         return replace(self, common=(u, 1.0 - 1.0 / np.sqrt(1.0 + s**2)))
+
+
+@dataclass(frozen=True)
+class ScaledWhitener:
+    """Whitens as ``base`` does, and divides by ``scale``, deviations of the noise that a sighting counts as."""
+
+    base: Whitener
+    scale: float
+
+    @property
+    def measured(self) -> Array:
+        """Sightings, (V, 3) [m]."""
+        return self.base.measured
+
+    def residual(self, tracks: Array) -> Array:
+        """Whitened measured minus predicted, (M,), of tracks (frames, N, 3)."""
+        return self.base.residual(tracks) / self.scale
+
+    def change(self, difference: Array) -> Array:
+        """Whitened change of a prediction, (M,), of a difference of tracks (frames, N, 3)."""
+        return self.base.change(difference) / self.scale
 
 
 def whitener(scene: Scene, split: Split, sigma: float, responses: Array) -> Whitener:

@@ -12,7 +12,6 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.estimation.noise import Split
-from physworld.estimation.whitening import Whitener
 from physworld.evaluate.baselines import constant_velocity, rigid_follow, static
 from physworld.evaluate.metrics import chamfer_l2
 from physworld.scene import Scene
@@ -174,19 +173,16 @@ class Outcomes:
         """All that are fitted, side by side."""
         return self.recordings.scene
 
-    def of(
-        self, declared: Hypothesis, model: Hypothesis, white: Whitener, sigma: float | None
-    ) -> list[Outcome]:
+    def of(self, declared: Hypothesis, model: Hypothesis, sigma: float | None) -> list[Outcome]:
         """Open-loop predictions of every recording before and after, and their errors on frames that were not used.
 
         Args:
             declared: the declared physics.
             model: what the verdict takes.
-            white: whitener of the training frames.
             sigma: noise per axis [m], None where it is not known.
         """
         every = [*self.recordings.fitted, *self.recordings.held_out]
-        before, after = (self._predictions(m, white, every) for m in (declared, model))
+        before, after = (self._predictions(m, every) for m in (declared, model))
         found = []
         for recording, was, now in zip(every, before, after, strict=True):
             noise = recording.scene.noise_sigma_m or sigma
@@ -211,9 +207,9 @@ class Outcomes:
     def _recordings_of(self, outcomes: list[Outcome]) -> tuple[Recording, ...]:
         return self.recordings.held_out if outcomes[0].role == HELD_OUT else self.recordings.fitted
 
-    def _predictions(self, model: Hypothesis, white: Whitener, recordings: list[Recording]) -> list[Array]:
+    def _predictions(self, model: Hypothesis, recordings: list[Recording]) -> list[Array]:
         """Open loop over all frames, [(T, N, 3)], with the points' own places from the training frames."""
-        places = white.place_errors(model.fitted.tracks)
+        places = model.white.place_errors(model.fitted.tracks)
         found = []
         for recording, tracks in zip(
             recordings, self.simulations.predictions(model.fitted.twin, places), strict=True

@@ -9,18 +9,20 @@ the effect's own file by way of the candidates.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from physworld.arrays import Array
+from physworld.errors import SimulationError
 from physworld.estimation.refit import Refit, prior_rows, refit
-from physworld.estimation.simulations import Simulations
+from physworld.estimation.simulations import Job
 from physworld.estimation.unknowns import Unknown
-from physworld.estimation.whitening import Whitener
+from physworld.estimation.whitening import ScaledWhitener, Whitener
 from physworld.trace.candidates import Candidate
 from physworld.trace.left_out import LeftOut, Linear, left_out
+from physworld.trace.recordings import JointSimulations
 from physworld.twin.twin import Twin
 
 Values = Mapping[str, float]
@@ -30,39 +32,20 @@ _SAME = 1.5  # ratio of two such estimates that are one
 
 
 @dataclass(frozen=True)
-class ScaledWhitener:
-    """Whitens by noise, places and solver (``base``), and divides by ``scale``, deviations of a sighting."""
-
-    base: Whitener
-    scale: float
-
-    @property
-    def measured(self) -> Array:
-        """Sightings, (V, 3) [m]."""
-        return self.base.measured
-
-    def residual(self, tracks: Array) -> Array:
-        """Whitened measured minus predicted, (M,), of tracks (frames, N, 3)."""
-        return self.base.residual(tracks) / self.scale
-
-    def change(self, difference: Array) -> Array:
-        """Whitened change of a prediction, (M,), of a difference of tracks (frames, N, 3)."""
-        return self.base.change(difference) / self.scale
-
-
-@dataclass(frozen=True)
 class Hypothesis:
     """A set of effects with everything fitted.
 
     Attributes:
         members: the candidates in it; none: the declared physics.
-        fitted: the optimum; residual and Jacobian are whitened by noise, places and solver.
+        fitted: the optimum; residual and Jacobian are whitened by ``white``.
         unseen: its errors on left-out blocks.
+        white: by noise, solver, and the points' places as its own motion carries them.
     """
 
     members: tuple[Candidate, ...]
     fitted: Refit
     unseen: LeftOut
+    white: Whitener
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -99,7 +82,8 @@ class Setting:
 
     Attributes:
         simulations: of the recordings.
-        white: by noise, places and solver.
+        white: by noise, places and solver, of the calibrated twin.
+        whitening: the same of a twin whose tracked points answer so to their own places, (frames, N, 3, r).
         blocks: rows of every block of frames.
         frames: from the first to before this one.
         iterations: of a fit.
@@ -107,8 +91,9 @@ class Setting:
         calibrated: unknowns that every hypothesis has.
     """
 
-    simulations: Simulations
+    simulations: JointSimulations
     white: Whitener
+    whitening: Callable[[Array], Whitener]
     blocks: Sequence[Array]
     frames: int
     iterations: int
@@ -142,6 +127,7 @@ class Setting:
         shapes: bool = True,
         scale: float = 1.0,
         hopeless: float = np.inf,
+        white: Whitener | None = None,
     ) -> Hypothesis | None:
         """A hypothesis from the best of several starts; None where no run was usable.
 
@@ -151,29 +137,40 @@ class Setting:
             shapes: whether the numbers that only shape effects are free.
             scale: deviations of the noise that a sighting counts as, as a first guess.
             hopeless: squared residual, over the noise, above which the search ends after two iterations.
+            white: as a first guess, of another hypothesis; None for the calibrated twin's.
         """
+        white = white or self.white
         twin, unknowns = self.assembled(members, values, shapes)
         places = [np.array([start.get(u.name, u.start) for u in unknowns]) for start in starts]
         found: Hypothesis | None = None
         known: Array | None = None
-        for _ in range(_ROUNDS):
-            white = ScaledWhitener(self.white, scale)
+        for number in range(_ROUNDS):
             limit = hopeless / scale**2
+            scaled = ScaledWhitener(white, scale)
             done = refit(
-                self.simulations, white, twin, unknowns, self.frames, self.iterations, places, limit, known
+                self.simulations, scaled, twin, unknowns, self.frames, self.iterations, places, limit, known
             )
             if done is None:
                 return found
-            plain = replace(done, residual=scale * done.residual, jacobian=scale * done.jacobian)
+            own = self._own(done.twin) or white
+            slopes = own.over_from(white, scale * done.jacobian)
+            plain = replace(done, residual=own.residual(done.tracks), jacobian=slopes)
             linear = Linear(plain.residual, plain.jacobian, plain.unknowns, plain.theta)
-            new = Hypothesis(tuple(members), plain, left_out(linear, self.blocks, scale))
+            new = Hypothesis(tuple(members), plain, left_out(linear, self.blocks, scale), own)
             if found is None or new.left <= found.left:
                 found = new
             following = new.unseen.scale
-            if max(scale, following) <= _SAME * min(scale, following):
+            if number and max(scale, following) <= _SAME * min(scale, following):
                 break
             if float(np.sum(plain.residual**2)) > hopeless:
                 break
-            scale, unknowns, places, hopeless = following, done.unknowns, [], np.inf
+            scale, unknowns, places, hopeless, white = following, done.unknowns, [], np.inf, own
             known = plain.jacobian / scale
         return found
+
+    def _own(self, twin: Twin) -> Whitener | None:
+        """The whitener of a twin's own motion; None where that cannot be trusted."""
+        try:
+            return self.whitening(self.simulations.first_look(Job(twin, self.frames))[1])
+        except SimulationError:
+            return None

@@ -124,7 +124,8 @@ class _Ground:
     """What is known before hypotheses.
 
     Attributes:
-        bare, white: whiteners without and with the solver's own error.
+        bare, white: whiteners without and with the solver's own error, of the calibrated twin.
+        whitening: the second of a motion whose points answer so to their places, (frames, N, 3, r).
         blocks: rows of every block of frames.
         sigma: noise [m]; None where it is not known.
         numerics: root mean squared change by other cells and steps, over the noise, by name.
@@ -134,6 +135,7 @@ class _Ground:
 
     bare: Whitener
     white: Whitener
+    whitening: Callable[[Array], Whitener]
     blocks: list[Array]
     sigma: float | None
     numerics: dict[str, float]
@@ -185,7 +187,7 @@ class _Trace:
         self.notes += remarks(ground.sigma, config.noise_m is not None, ground.numerics)
         simulations.stage = "held-out frames"
         measured = Outcomes(self.recordings, simulations, config)
-        outcomes = measured.of(declared, verdict.model, ground.white, ground.sigma)
+        outcomes = measured.of(declared, verdict.model, ground.sigma)
         unseen = [o for o in outcomes if o.role == HELD_OUT] or [o for o in outcomes if o.role == FITTED]
         held_out = measured.together(unseen, ground.sigma)
         shares = self._shares(verdict, declared, held_out, measured, ground)
@@ -244,11 +246,16 @@ class _Trace:
         )
         numerics = {n: float(np.sqrt(np.mean(bare.change(d) ** 2))) for n, d in directions.items()}
         doubt = [_RICHARDSON[n] * d for n, d in directions.items() if n in _RICHARDSON]
-        white = bare.knowing([*self._turns(tracks, scale), *doubt])
+        also = [*self._turns(tracks, scale), *doubt]
+
+        def whitening(answers: Array) -> Whitener:
+            return whitener(self.scene, self.split, scale, answers).knowing(also)
+
+        white = whitening(answers)
         block_of_row = self.split.block_of(white.frame_of_row)
         blocks = [np.flatnonzero(block_of_row == k) for k in range(self.split.blocks)]
         blocks = [rows for rows in blocks if len(rows)]
-        return _Ground(bare, white, blocks, sigma, numerics, finer, tracks)
+        return _Ground(bare, white, whitening, blocks, sigma, numerics, finer, tracks)
 
     def _declared(self, ground: _Ground) -> Hypothesis:
         """The declared physics."""
@@ -267,8 +274,8 @@ class _Trace:
         return declared
 
     def _setting(self, ground: _Ground, twin: Twin, unknowns: Sequence[Unknown]) -> Setting:
-        known = (self.simulations, ground.white, ground.blocks, self.frames, self.config.iterations)
-        return Setting(*known, twin, unknowns)
+        known = (self.simulations, ground.white, ground.whitening, ground.blocks, self.frames)
+        return Setting(*known, self.config.iterations, twin, unknowns)
 
     def _unknowns(self) -> list[Unknown]:
         """What is calibrated beside effects."""
@@ -307,7 +314,7 @@ class _Trace:
             twin = model.fitted.twin
             kept = tuple(e for e in twin.effects if e.name != name)
             without = replace(model, fitted=replace(model.fitted, twin=replace(twin, effects=kept)))
-            outcomes = measured.of(declared, without, ground.white, ground.sigma)
+            outcomes = measured.of(declared, without, ground.sigma)
             unseen = [o for o in outcomes if o.role == HELD_OUT] or [o for o in outcomes if o.role == FITTED]
             back[name] = max(measured.together(unseen, ground.sigma).after - held_out.after, 0.0)
         total = sum(back.values())

@@ -26,9 +26,9 @@ from physworld.estimation.noise import Split
 from physworld.estimation.refit import prior_rows, refit
 from physworld.estimation.simulations import Job
 from physworld.estimation.unknowns import Unknown, at, bounds_of, starting_at, starts_of
-from physworld.estimation.whitening import Whitener
+from physworld.estimation.whitening import ScaledWhitener, Whitener
 from physworld.trace.candidates import Candidate
-from physworld.trace.hypotheses import Hypothesis, ScaledWhitener, Setting, Values
+from physworld.trace.hypotheses import Hypothesis, Setting, Values
 from physworld.trace.left_out import independent
 from physworld.trace.posterior import MOST, posterior, removes
 from physworld.trace.sensitivity import Response, candidate_responses
@@ -232,11 +232,10 @@ class Search:
             runs = self.setting.simulations.run(
                 [Job(at(twin, unknowns, starts_of(unknowns)), self.setting.frames)]
             )
-            white = self.setting.white
-            if runs[0] is None or np.mean(white.residual(runs[0]) ** 2) >= known.fitted.misfit**2:
+            if runs[0] is None or np.mean(known.white.residual(runs[0]) ** 2) >= known.fitted.misfit**2:
                 continue
             self.setting.simulations.stage = f"fit with {' and '.join(known.names)}"
-            found = self.setting.fitted(known.members, place, scale=known.unseen.scale)
+            found = self.setting.fitted(known.members, place, scale=known.unseen.scale, white=known.white)
             if found is not None and found.left < known.left:
                 self.hypotheses[known.names] = found
 
@@ -247,7 +246,7 @@ class Search:
             known = self.hypotheses.get(_names(rest))
             values = larger.values
             again = self.setting.fitted(
-                rest, values, [known.values] if known else [], scale=larger.unseen.scale
+                rest, values, [known.values] if known else [], scale=larger.unseen.scale, white=larger.white
             )
             if again is not None and (known is None or again.left < known.left):
                 self.hypotheses[_names(rest)] = known = again
@@ -275,7 +274,7 @@ class Search:
             own = (*base.members, begun.screened.candidate)
             linear = {**base.values, **begun.screened.values}
             scale = self._scale(base, begun.screened.error)
-            found = self.setting.fitted(own, linear, begun.starts, not shaped, scale, hopeless)
+            found = self.setting.fitted(own, linear, begun.starts, not shaped, scale, hopeless, base.white)
             if found is not None and (best is None or found.left < best.left):
                 best = found
         if best is not None and shaped and self._removes(base, best) >= WORTH:
@@ -284,7 +283,7 @@ class Search:
             if mirror is not None:
                 places.append({**best.values, **_mirrored(best, best.members[-1])})
             for place in places:
-                found = self.setting.fitted(best.members, place, scale=best.unseen.scale)
+                found = self.setting.fitted(best.members, place, scale=best.unseen.scale, white=best.white)
                 if found is not None and found.left < best.left:
                     best = found
         known = self.hypotheses.get(names)
@@ -390,7 +389,7 @@ class Search:
         setting = self.setting
         chosen = [c for c in self.chosen if c.effect not in base.names]
         responses = candidate_responses(
-            setting.simulations, setting.white, base.fitted.twin, base.fitted.tracks, chosen, setting.frames
+            setting.simulations, base.white, base.fitted.twin, base.fitted.tracks, chosen, setting.frames
         )
         found = [self._screen(base, response) for response in responses if not response.failed]
         return sorted((one for one in found if one is not None), key=lambda one: -one.share)

@@ -75,3 +75,14 @@ def test_a_point_without_a_place_is_left_out_unless_none_has_one(parts: tuple) -
     assert set(whitener(scene, split, SIGMA, responses).points) == {0, 2}
     scene.visible[0] = False
     assert set(whitener(scene, split, SIGMA, responses).points) == {0, 1, 2}
+
+
+def test_columns_go_from_one_whitener_to_another(parts: tuple) -> None:
+    scene, split, responses, _ = parts
+    rng = np.random.default_rng(7)
+    own = whitener(scene, split, 0.01, responses).knowing([rng.normal(size=scene.points.shape) * 0.02])
+    other = whitener(scene, split, 0.01, responses + rng.normal(scale=0.3, size=responses.shape))
+    changes = [rng.normal(size=scene.points.shape) for _ in range(3)]
+    columns, wanted = (np.stack([w.change(c) for c in changes], axis=1) for w in (own, other))
+    np.testing.assert_allclose(other.over_from(own, columns), wanted, rtol=1e-9, atol=1e-9)
+    assert other.over_from(own, columns[:, :0]).shape == (len(columns), 0)

@@ -48,6 +48,8 @@ def traced(**strengths: float) -> TraceResult:
         twin = twin.with_effect(effect("air_drag_linear", rate_per_s=strengths["rate_per_s"]))
     if "tilt_x_rad" in strengths:
         twin = twin.with_effect(effect("gravity_tilt", tilt_x_rad=strengths["tilt_x_rad"]))
+    if "viscosity_pa_s" in strengths:
+        twin = twin.with_effect(effect("viscosity_kelvin_voigt", viscosity_pa_s=strengths["viscosity_pa_s"]))
     tracks = twin.observe(twin.simulate_nodes(*scene.control_track(), scene.times), scene.times)
     noise = np.random.default_rng(0).normal(scale=SIGMA, size=tracks.shape)
     return trace(replace(scene, points=tracks + noise, noise_sigma_m=SIGMA), CONFIG)
@@ -65,7 +67,16 @@ def test_two_effects_are_named_together() -> None:
     assert report["held_out"]["after"] < 1.3 * SIGMA
 
 
-@pytest.mark.parametrize("strengths", [{"rate_per_s": 4.0}])
+def test_a_viscosity_behind_a_drag_is_named_beside_it() -> None:
+    found = traced(rate_per_s=2.5, viscosity_pa_s=90.0)
+    assert found.verdict.name == "named"
+    numbers = {e.name: e.parameters for e in found.effects}
+    assert set(numbers) == {"air_drag_linear", "viscosity_kelvin_voigt"}
+    assert numbers["air_drag_linear"]["rate_per_s"].value == pytest.approx(2.5, rel=0.25)
+    assert numbers["viscosity_kelvin_voigt"]["viscosity_pa_s"].value == pytest.approx(90.0, rel=0.25)
+
+
+@pytest.mark.parametrize("strengths", [{"rate_per_s": 4.0}, {"viscosity_pa_s": 90.0}])
 def test_one_that_acts_alone_stays_alone(strengths: dict[str, float]) -> None:
     found = traced(**strengths)
     assert len(found.effects) == 1 and len(found.verdict.model.members) == 1
