@@ -84,7 +84,8 @@ class TaskContext:
         self.database = database
         self.settings = settings
         self._interval_s = min(RENEW_INTERVAL_S, settings.lease_seconds / 4)
-        self._progress: Progress | None = None
+        self._stage = ""
+        self._pending: dict[str, Progress] = {}
         self._pace = Pace()
         self._lock = threading.Lock()
         self._fresh = threading.Event()
@@ -115,6 +116,7 @@ class TaskContext:
         """A stage of the plan begins, of which ``progress`` tells from now on. Raises Cancelled, LeaseLost."""
         self.check()
         self._pace.begin(stage)
+        self._stage = stage
         self.progress(0, total, unit, stage)
 
     def progress(
@@ -125,7 +127,10 @@ class TaskContext:
         message: str = "",
         figures: Mapping[str, float] | None = None,
     ) -> None:
-        """Report how far the stage is, and so the shard; written to the database at most twice a second.
+        """Report how far the stage is, and so the shard.
+
+        The newest report of every stage is written to the database, at most twice a second, and figures also when the
+        handler ends.
 
         Args:
             done: how much of the stage is done.
@@ -138,7 +143,7 @@ class TaskContext:
         told = Progress(done=done, total=total, unit=unit, message=message, fraction=share, eta_s=left_s)
         told.figures = {name: value for name, value in (figures or {}).items() if math.isfinite(value)}
         with self._lock:
-            self._progress = told
+            self._pending[self._stage] = told
         self._fresh.set()
 
     def cancelled(self) -> bool:
@@ -162,17 +167,12 @@ class TaskContext:
             raise Cancelled(f"job {self.lease.job_id} was cancelled")
 
     def _beat(self) -> None:
-        while not self._stop.is_set():
+        while True:
             self._fresh.wait(self._interval_s)
             if self._stop.is_set():
-                return
+                break
             self._fresh.clear()
-            with self._lock:
-                progress, self._progress = self._progress, None
-            try:
-                self._renew(progress)
-            except DatabaseUnavailable as error:
-                logger.warning("lease %s not renewed: %s", self.lease.shard_id, error)
+            self._tell()
             if (self._cancelled or self._lost) and self._abandon is not None:
                 if not self._stop.wait(GRACE_S):
                     self._leave_behind(self._abandon)
@@ -180,6 +180,18 @@ class TaskContext:
             if self._lost:
                 return
             self._stop.wait(min(PROGRESS_INTERVAL_S, self._interval_s))
+        if any(progress.figures for progress in self._pending.values()):
+            self._tell()
+
+    def _tell(self) -> None:
+        """Renew the lease with what was reported since the last time."""
+        with self._lock:
+            pending, self._pending = self._pending, {}
+        try:
+            for progress in pending.values() or (None,):
+                self._renew(progress)
+        except DatabaseUnavailable as error:
+            logger.warning("lease %s not renewed: %s", self.lease.shard_id, error)
 
     def _leave_behind(self, abandon: Callable[[], None]) -> None:
         """End every shard that this process holds, and then the process."""

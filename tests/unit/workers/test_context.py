@@ -72,6 +72,27 @@ def test_progress_reaches_the_job(stores: Stores, lease: leases.Lease, settings:
     assert len(events) < 20
 
 
+def test_the_last_report_of_every_stage_is_written_however_short_it_was(
+    stores: Stores, lease: leases.Lease, settings: Settings, job: Job
+) -> None:
+    with TaskContext(lease, stores.database, settings) as context:
+        context.plan({"training": 8.0, "measuring": 1.0, "exporting": 1.0})
+        context.begin("training", "steps", 10)
+        context.progress(10, 10, "steps", "loss 0.2", {"loss": 0.2})
+        context.begin("measuring")
+        context.begin("exporting")
+        context.progress(1, 1, "files", "model.pt", {"validation_m": 0.003})
+    with stores.database.reading() as session:
+        told = [event.data for event in log.events_after(session, job.id, 0, 500) if event.type == "progress"]
+        figures = log.figures_of(session, job.id)
+    fractions = [data["fraction"] for data in told]
+    assert fractions == sorted(fractions) and fractions[-1] == 1.0
+    assert {name: value for _, one in figures for name, value in one.items()} == {
+        "loss": 0.2,
+        "validation_m": 0.003,
+    }
+
+
 def test_a_cancel_is_seen_by_a_handler_that_only_polls(
     stores: Stores, lease: leases.Lease, settings: Settings, job: Job
 ) -> None:

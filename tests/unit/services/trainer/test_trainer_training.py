@@ -156,7 +156,9 @@ def test_progress_covers_what_follows_the_steps_and_never_falls(runtime: Runtime
         told = [event.data for event in log.events_after(session, job.id, 0) if event.type == "progress"]
         figures = log.figures_of(session, job.id)
     fractions = [data["fraction"] for data in told]
-    assert len(fractions) > 2 and fractions == sorted(fractions)
+    assert len(fractions) >= 2 and fractions == sorted(
+        fractions
+    )  # a report each for stages that lasted 0.5 s
     training = [data["fraction"] for data in told if data["message"].startswith("loss")]
     assert max(training, default=0.0) < 0.9  # fine-tuning, measuring and exporting are still to come
     assert job.share == 1.0 and job.progress.eta_s is None
