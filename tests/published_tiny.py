@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 from safetensors.numpy import save as save_tensors
-from tiny_scene import register, tiny_scene
+from tiny_scene import register, tiny_scene, tiny_thing
 
 from physworld.demonstrate import DemonstrationConfig, derived_seed, make_episode
 from physworld.scene import Scene
@@ -35,10 +35,11 @@ SMALL = WorldModelConfig(hidden=16, message_passing_steps=2, history=2, vertices
 
 
 @cache
-def tiny_model() -> tuple[Scene, Twin, PublishedModel]:
-    """The scene, its twin with prior parameters, and a model that learned from the twin."""
-    scene = tiny_scene(FRAMES)
-    twin = build_twin(scene, 60).with_parameters(youngs_modulus_pa=3e4)
+def tiny_model(kind: str = "beam") -> tuple[Scene, Twin, PublishedModel]:
+    """The scene, its twin with prior parameters, and a model that learned from the twin: a bar's, or a thing's."""
+    scene = tiny_scene(FRAMES) if kind == "beam" else tiny_thing(kind, FRAMES)
+    twin = build_twin(scene, 60)
+    twin = twin.with_parameters(youngs_modulus_pa=3e4) if kind == "beam" else twin
     view = view_scene(scene, twin, SMALL)
     settings = DemonstrationConfig(frames=FRAMES)
     episodes = [make_episode(scene, twin, settings, derived_seed(0, index))[0] for index in range(EPISODES)]
@@ -53,6 +54,7 @@ def publish_tiny(
     artifacts: ArtifactStore,
     *,
     name: str = NAME,
+    kind: str = "beam",
     lacking: str | None = None,
     card: dict[str, Any] | None = None,
     changed: dict[str, Callable[[np.ndarray], np.ndarray]] | None = None,
@@ -60,10 +62,10 @@ def publish_tiny(
 ) -> tuple[str, int]:
     """Register scene, fit and model; the model's name and version.
 
-    ``lacking``: a tensor that is left out, as in a version of an older layout; ``card``: more of its card;
-    ``changed``: what becomes of tensors, by name; ``weights``: a file in the place of them all.
+    ``kind``: of the thing; ``lacking``: a tensor that is left out, as in a version of an older layout; ``card``: more
+    of its card; ``changed``: what becomes of tensors, by name; ``weights``: a file in the place of them all.
     """
-    scene, twin, model = tiny_model()
+    scene, twin, model = tiny_model(kind)
     scene_id = register(scene, database, artifacts)
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **twin.to_arrays())

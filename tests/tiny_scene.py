@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Scene
@@ -46,6 +48,31 @@ def tiny_scene(frames: int = FRAMES) -> Scene:
                 region_max_m=np.array([0.02, SIDE_M / 2, SIDE_M / 2]),
             ),
         ),
+    )
+
+
+def tiny_thing(kind: str, frames: int = FRAMES) -> Scene:
+    """As :func:`tiny_scene`, of another kind: a "rope" of the same length, or a "sheet" as long and half as wide."""
+    bar = tiny_scene(frames)
+    x = np.linspace(0.0, LENGTH_M, 7)
+    y = np.zeros(1) if kind == "rope" else np.linspace(0.0, LENGTH_M / 2, 4)
+    points = np.array([[a, b, 0.0] for a in x for b in y])
+    held = points[:1] if kind == "rope" else points[: len(y)]
+    lift = bar.controllers[:, :1] - bar.controllers[:1, :1]
+    body = (
+        Body(radius_m=3e-3, density_kg_m3=300.0)
+        if kind == "rope"
+        else Body(thickness_m=2e-3, density_kg_m3=300.0)
+    )
+    return replace(
+        bar,
+        name=f"tiny {kind}",
+        kind=kind,
+        points=points + lift,
+        visible=np.ones((frames, len(points)), dtype=bool),
+        controllers=held + lift,
+        body=body,
+        grips=(Grip(controllers=tuple(range(len(held)))),),
     )
 
 

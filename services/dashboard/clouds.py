@@ -68,6 +68,7 @@ class Cloud:
         split: the first held-out frame.
         floor: height of the ground [m].
         box: corners of the undeformed body [m], where it is declared to be a box.
+        surface: address of the body that a layer's points carry, and the name of that layer; None: points only.
     """
 
     times: Array
@@ -75,6 +76,7 @@ class Cloud:
     split: int | None = None
     floor: float | None = None
     box: tuple[list[float], list[float]] | None = None
+    surface: tuple[str, str] | None = None
 
     def layer(self, name: str) -> Layer | None:
         """The layer of this name."""
@@ -82,7 +84,11 @@ class Cloud:
 
     def describe(self, url: str, query: str = "") -> dict[str, object]:
         """The JSON of the view; ``url`` + ``/`` + layer name + ``query`` is the address of a buffer."""
+        body = None
+        if self.surface is not None:
+            body = {"url": self.surface[0], "layer": self.surface[1], "label": "Surface", "role": "model"}
         return {
+            "surface": body,
             "times": [round(float(time), 6) for time in self.times],
             "split": self.split,
             "floor": self.floor,

@@ -2,32 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
 from urllib.parse import urlencode
 
 import numpy as np
 from fastapi import APIRouter, Depends, Request
 from fastapi.responses import HTMLResponse, JSONResponse, Response
-from safetensors import SafetensorError
-from safetensors.numpy import load as load_tensors
 
-from physworld.arrays import Array
 from physworld_schemas.model import ModelVersion
 from physworld_services.dashboard.access import require_same_origin, require_writer
 from physworld_services.dashboard.clouds import Cloud, Layer, measured_layers, resampled, scene_cloud, thinned
-from physworld_services.dashboard.pages_models import card_of
 from physworld_services.dashboard.pages_scenes import PREDICTION, layer_response, recording_of
 from physworld_services.dashboard.site import BASE, Site
-from physworld_services.dashboard.surfaces import Surface, body_surface
+from physworld_services.dashboard.version_body import KEPT, start_s, surface_of
 from physworld_storage import registry, resources
 from physworld_storage.access import tickets
 from physworld_storage.access.api_keys import ApiKey
 from physworld_storage.errors import NotFound
 from physworld_storage.jobs.kinds.rollout import ready_version
-
-WEIGHTS, TWIN = "model.safetensors", "twin.npz"
-KEPT = {"Cache-Control": "private, max-age=600"}
 
 
 def router(site: Site) -> APIRouter:
@@ -49,7 +40,7 @@ def router(site: Site) -> APIRouter:
 
     @routes.get("/surface")
     def surface(name: str, number: str) -> Response:
-        found = _surface(site, _version(site, name, number))
+        found = surface_of(site, _version(site, name, number))
         return JSONResponse(None if found is None else found.document(), headers=KEPT)
 
     @routes.get("/ghost")
@@ -59,7 +50,7 @@ def router(site: Site) -> APIRouter:
         if cloud is None:
             return JSONResponse(None)
         described = cloud.describe(f"{BASE}/models/{name}/{number}/ghost")
-        return JSONResponse({**described, "start_s": _start_s(site, version)})
+        return JSONResponse({**described, "start_s": start_s(site, version)})
 
     @routes.get("/ghost/{layer}")
     def ghost_layer(name: str, number: str, layer: str) -> Response:
@@ -81,33 +72,6 @@ def _version(site: Site, name: str, number: str) -> ModelVersion:
         return registry.get_version(session, name, number)
 
 
-def _tensors(site: Site, version: ModelVersion) -> Mapping[str, Array]:
-    """What the version's weights say of its body; empty where they cannot be read."""
-    found = next((item for item in version.artifacts if item.name == WEIGHTS), None)
-    return {} if found is None else site.kept(("body", found.sha256), lambda: _body_of(site, found.sha256))
-
-
-def _body_of(site: Site, sha256: str) -> Mapping[str, Array]:
-    try:
-        tensors: dict[str, Array] = load_tensors(site.artifacts.read_bytes(sha256))
-    except SafetensorError:
-        return {}
-    return {
-        name: tensors[name] for name in ("rest.vertices", "start.time", "start.history") if name in tensors
-    }
-
-
-def _surface(site: Site, version: ModelVersion) -> Surface | None:
-    """The surface of the body that the version learned from its twin; None where there is none to draw."""
-    rest = _tensors(site, version).get("rest.vertices")
-    if rest is None or version.fit_id is None:
-        return None
-    with site.database.reading() as session:
-        fit = resources.get_fit(session, version.fit_id)
-    twin = site.arrays(fit.artifacts, TWIN)
-    return None if twin is None else body_surface(twin, rest.astype(np.float64))
-
-
 def _ghost(site: Site, version: ModelVersion) -> Cloud | None:
     """The recording that the version was made of, and what its twin predicts of it; None without a recording."""
     if version.scene_id is None:
@@ -125,12 +89,3 @@ def _ghost(site: Site, version: ModelVersion) -> Cloud | None:
     driven = recording.controllers.astype(np.float32)
     layers.append(Layer("controllers", "Recorded grips", "controllers", driven, shown=False))
     return scene_cloud(recording, layers)
-
-
-def _start_s(site: Site, version: ModelVersion) -> float:
-    """When in the recording a session begins [s]: at the end of the model's history."""
-    tensors: Mapping[str, Any] = _tensors(site, version)
-    dt_s = card_of(site, version).get("architecture", {}).get("dt_s")
-    if dt_s is None or not {"start.time", "start.history"} <= set(tensors):
-        return 0.0
-    return float(tensors["start.time"][0]) + (len(tensors["start.history"]) - 1) * float(dt_s)

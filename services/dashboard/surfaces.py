@@ -1,20 +1,23 @@
-"""The surface of a model's body, for the playground: the twin's filled cells, smoothed, carried by the vertices.
+"""The surface of a model's body, for the 3D views: the twin's filled cells, carried by the vertices.
 
 The twin of a solid lies on a lattice of cells, each in 2 × 2 × 2 parts that are filled with material or not. Faces
-between filled and empty parts, smoothed after Taubin (1995), are the surface at rest. Each of its points hangs on the
-nearest ``CARRIERS`` vertices of the graph; the browser turns and moves it with them (``frontend/src/surface.js``).
-Bodies that lie on no lattice of cells (ropes, sheets) have no surface and are drawn as points.
+between filled and empty parts, smoothed after Taubin (1995), are the surface at rest; of a sheet it is the filled parts
+themselves, two triangles each, seen from both sides. Each of its points hangs on the nearest ``CARRIERS`` vertices of
+the graph; the browser turns and moves it with them (``frontend/src/surface.js``). Ropes are tubes (``tubes.py``).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
 from physworld.arrays import Array
+from physworld.engine.lattice.lattice import Lattice
+from physworld.engine.thin.triangles import TriangleLattice
+from physworld_services.dashboard.tubes import Tubes, body_tubes
 
 CARRIERS, NEIGHBOURS = 4, 8
 SMOOTHING = ((0.5, -0.53),) * 6
@@ -48,6 +51,7 @@ class Surface:
         """The surface as JSON: flat lists, places to a tenth of a millimetre of a metre-sized body."""
         digits = max(4, 5 - int(np.floor(np.log10(max(float(np.ptp(self.rest)), 1e-6)))))
         return {
+            "kind": "skin",
             "points": np.round(self.points, digits).ravel().tolist(),
             "triangles": self.triangles.ravel().tolist(),
             "index": self.index.ravel().tolist(),
@@ -58,18 +62,25 @@ class Surface:
         }
 
 
-def body_surface(twin: Mapping[str, Array], rest: Array) -> Surface | None:
-    """The surface of a twin's body over the graph's ``rest`` vertices (n, 3); None without a lattice of cells."""
+def body_surface(twin: Mapping[str, Array], rest: Array, particle_index: Array) -> Surface | Tubes | None:
+    """What a twin's body looks like from outside; None of one without cells, or with too many of them.
+
+    Args:
+        twin: arrays of a stored twin.
+        rest: the graph's vertices at rest [m], (n, 3).
+        particle_index: number of the twin's particle that each vertex is, (n,).
+    """
     cells, fill = (twin.get(name) for name in ("lattice_cells", "lattice_fill"))
-    if (
-        cells is None
-        or fill is None
-        or cells.ndim != 2
-        or cells.shape[1] != 3
-        or fill.shape[1:] != (len(CORNERS),)
-    ):
+    if cells is None or fill is None or cells.ndim != 2 or fill.shape != (len(cells), 2 ** cells.shape[1]):
         return None
-    points, triangles = cell_surface(cells, fill > FILLED, twin["lattice_origin"], twin["lattice_spacing"])
+    if cells.shape[1] == 1:
+        return body_tubes(twin, particle_index)
+    if cells.shape[1] == 2:
+        points, triangles = sheet_surface(twin, fill > FILLED)
+    else:
+        points, triangles = cell_surface(
+            cells, fill > FILLED, twin["lattice_origin"], twin["lattice_spacing"]
+        )
     if not 0 < len(triangles) <= MOST_TRIANGLES or len(rest) <= NEIGHBOURS:
         return None
     from scipy.spatial import cKDTree  # half a second: not before somebody plays
@@ -79,6 +90,25 @@ def body_surface(twin: Mapping[str, Array], rest: Array) -> Surface | None:
     weight = 1.0 / np.maximum(distance, 1e-3 * np.ptp(rest)) ** 2
     neighbours = tree.query(rest, NEIGHBOURS + 1)[1][:, 1:]
     return Surface(points, triangles, index, weight / weight.sum(axis=1, keepdims=True), rest, neighbours)
+
+
+def sheet_surface(twin: Mapping[str, Array], filled: Array) -> tuple[Array, Array]:
+    """Points (m, 3) [m] and triangles (t, 3) of a sheet at rest.
+
+    Args:
+        twin: arrays of a stored twin of a sheet.
+        filled: which parts of its cells hold material, the last axis running fastest, (C, 4) bool.
+    """
+    of = TriangleLattice if "lattice_odd" in twin else Lattice
+    lattice = of(**{field.name: twin[f"lattice_{field.name}"] for field in fields(of)})
+    corners = CORNERS[:4, 1:]
+    parts = (2 * lattice.cells[:, None, :] + corners)[filled]
+    quads = parts[:, None, :] + corners
+    places, inverse = np.unique(quads.reshape(-1, 2), axis=0, return_inverse=True)
+    low, right, left, high = inverse.reshape(-1, 4)[:, [0, 2, 1, 3]].T
+    triangles = np.concatenate([np.stack([low, right, high], axis=1), np.stack([low, high, left], axis=1)])
+    points: Array = lattice.interpolation(lattice.origin + places * (lattice.spacing / 2)) @ twin["body_rest"]
+    return points, triangles
 
 
 def cell_surface(cells: Array, filled: Array, origin: Array, spacing: Array) -> tuple[Array, Array]:

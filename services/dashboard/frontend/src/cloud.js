@@ -1,7 +1,8 @@
 // 3D view of a page: `<figure data-cloud="URL">` with a canvas and controls becomes a player of moving points.
 // The JSON at URL: { times: [s], split: frame | null, floor: m | null, box: [corner, corner] | null (declared body),
-//   layers: [{ name, label, role, count, size, shown, url, pairs? }] }
+//   layers: [{ name, label, role, count, size, shown, url, pairs? }], surface?: { url, label, role, layer } }
 // A layer's URL gives float32 little-endian (frames, count, 3) [m], z up; NaN marks a point that is not visible.
+// `surface` is a body, as `surfaces.py` and `tubes.py` describe it, which the points of a layer carry.
 // `pairs: "name"` draws a thin line from every point of the layer to its twin in the layer of that name.
 
 import {
@@ -9,6 +10,7 @@ import {
 } from "three";
 import { colour, onSchemeChange } from "./palette.js";
 import { roundPoints, segments } from "./points.js";
+import { bodyOf } from "./surface.js";
 import { View } from "./view.js";
 
 const DIRECTION = [0.62, -1, 0.36]; // from the middle of the scene to the camera
@@ -98,6 +100,38 @@ class Pairs {
   }
 }
 
+/** The body that a layer's points carry, with its own switch. */
+class Body {
+  constructor(spec, data, carriers) {
+    this.spec = spec;
+    this.carriers = carriers;
+    this.shown = true;
+    this.surface = bodyOf(data, spec.role);
+  }
+
+  static async load(spec, layers) {
+    const answer = await fetch(spec.url);
+    if (!answer.ok) throw new Error(`${spec.label}: ${answer.status}`);
+    const body = new Body(spec, await answer.json(), layers.find((layer) => layer.spec.name === spec.layer));
+    await body.load();
+    return body;
+  }
+
+  async load() {
+    await this.carriers.load();
+  }
+
+  paint() {
+    this.surface.paint();
+  }
+
+  show(frame) {
+    this.surface.mesh.visible = this.shown;
+    const size = this.carriers.spec.count * 3;
+    if (this.shown) this.surface.set(this.carriers.values.subarray(frame * size, (frame + 1) * size));
+  }
+}
+
 /** Corners of everything that the layers show over all frames, and of the declared body. */
 function bounds(layers, box) {
   const low = new Vector3(Infinity, Infinity, Infinity);
@@ -139,6 +173,7 @@ class Player {
     this.view.orbit.addEventListener("change", () => this.render());
     this.layers = data.layers.map((spec) => new Layer(spec, data.times.length));
     this.pairs = [];
+    this.bodies = [];
     for (const layer of this.layers) this.view.scene.add(layer.points);
     for (const from of this.layers) {
       const to = this.layers.find((layer) => layer.spec.name === from.spec.pairs);
@@ -149,6 +184,8 @@ class Player {
 
   async start() {
     await Promise.all(this.layers.filter((layer) => layer.shown).map((layer) => layer.load()));
+    if (this.data.surface) this.bodies = [await Body.load(this.data.surface, this.layers)];
+    for (const body of this.bodies) this.view.scene.add(body.surface.mesh);
     this.resize();
     this.place();
     this.buildControls();
@@ -175,7 +212,7 @@ class Player {
   }
 
   paint() {
-    for (const item of [this.view, ...this.layers, ...this.pairs]) item.paint();
+    for (const item of [this.view, ...this.layers, ...this.pairs, ...this.bodies]) item.paint();
     this.body?.material.color.set(colour("particles"));
     this.render();
   }
@@ -198,7 +235,7 @@ class Player {
     this.speed = find("speed");
     this.clock = find("clock");
     const legend = find("legend");
-    for (const layer of this.layers) legend.append(this.switch(layer));
+    for (const layer of [...this.bodies, ...this.layers]) legend.append(this.switch(layer));
     document.addEventListener("seek", (event) => this.seek(this.frameAt(event.detail)));
   }
 
@@ -256,7 +293,7 @@ class Player {
   seek(frame) {
     const { times, split } = this.data;
     this.frame = Math.max(0, Math.min(times.length - 1, frame));
-    for (const item of [...this.layers, ...this.pairs]) item.show(this.frame);
+    for (const item of [...this.layers, ...this.pairs, ...this.bodies]) item.show(this.frame);
     this.slider.value = this.frame;
     this.figure.dataset.frame = this.frame;
     const part = split == null ? "" : this.frame >= split ? " · held out" : " · training";
@@ -282,6 +319,7 @@ async function mount(figure) {
     const response = await fetch(figure.dataset.cloud);
     if (!response.ok) throw new Error(`the server answered ${response.status}`);
     const player = new Player(figure, await response.json());
+    window.players.push(player);
     await player.start();
     note.remove();
   } catch (error) {
@@ -289,4 +327,5 @@ async function mount(figure) {
   }
 }
 
+window.players = []; // for tests, which have no other way to see what is drawn
 for (const figure of document.querySelectorAll("[data-cloud]")) mount(figure);

@@ -4,13 +4,13 @@
 //   uint32 tick, uint32 number of the last control, float32 time, uint32 flags, float32 points and controllers [m].
 // A control is uint32 number, float32 velocities (grips, 3) [m/s]: a dragged grip is steered towards the pointer.
 
-import { DirectionalLight, HemisphereLight, Plane, Raycaster, Vector2, Vector3 } from "three";
+import { Plane, Raycaster, Vector2, Vector3 } from "three";
 import { onSchemeChange } from "./palette.js";
 import { Factors } from "./factors.js";
 import { Ghost } from "./ghost.js";
 import { Cloud } from "./points.js";
 import { Recorder } from "./record.js";
-import { Surface } from "./surface.js";
+import { bodyOf } from "./surface.js";
 import { View } from "./view.js";
 
 const HEAD_BYTES = 16;
@@ -51,9 +51,6 @@ class Playground {
     this.canvas = figure.querySelector("canvas");
     this.note = figure.querySelector("[data-note]");
     this.view = new View(this.canvas);
-    const sun = new DirectionalLight(0xffffff, 1.6);
-    sun.position.set(0.4, -0.6, 1);
-    this.view.scene.add(new HemisphereLight(0xffffff, 0x667788, 1.7), sun);
     this.recorder = new Recorder(this.canvas);
     this.ray = new Raycaster();
     this.drawn = new Rate();
@@ -99,7 +96,7 @@ class Playground {
     const [surface, ghost] = await Promise.all([load(this.figure.dataset.surface), Ghost.load(this.figure.dataset.ghost)]);
     this.ghost = ghost;
     if (surface) {
-      this.surface = new Surface(surface);
+      this.surface = bodyOf(surface);
       this.view.scene.add(this.surface.mesh);
     }
     const offered = { surface: Boolean(surface), measured: ghost?.has("measured"), twin: ghost?.has("twin") };

@@ -1,4 +1,4 @@
-// The body of the playground as a surface that hangs on the graph's vertices.
+// A body as a surface that hangs on the graph's vertices: a solid's skin or a sheet; ropes are tubes (`tube.js`).
 // A point of the surface at rest x is drawn at the weighted mean of v + R (x - X) over its carriers: X is where a vertex
 // lies at rest, v where it is now, R how far its neighbourhood has turned. R is found by the iteration of Müller et al.
 // (2016, "A robust method to extract the rotational part of deformations"), which begins with the last frame's turn.
@@ -7,13 +7,20 @@ import {
   BufferAttribute, BufferGeometry, DoubleSide, DynamicDrawUsage, Matrix3, Mesh, MeshLambertMaterial, Quaternion, Vector3,
 } from "three";
 import { colour } from "./palette.js";
+import { Tube } from "./tube.js";
 
 const ITERATIONS = 3;
 
-export class Surface {
+/** The body that the server described: a skin or tubes. */
+export function bodyOf(data, role) {
+  return data.kind === "tube" ? new Tube(data, role) : new Surface(data, role);
+}
+
+class Surface {
   /** @param {object} data what `surfaces.py` writes */
-  constructor(data) {
+  constructor(data, role = "model") {
     this.data = data;
+    this.role = role;
     this.count = data.points.length / 3;
     this.vertices = data.rest.length / 3;
     this.turns = Array.from({ length: this.vertices }, () => new Quaternion());
@@ -27,7 +34,7 @@ export class Surface {
   }
 
   paint() {
-    this.mesh.material.color.set(colour("model"));
+    this.mesh.material.color.set(colour(this.role));
   }
 
   /** Places of the graph's vertices now, x, y, z each. */

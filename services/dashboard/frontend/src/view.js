@@ -1,6 +1,8 @@
 // A canvas with a scene in it, seen from around: camera, background, ground. Shared by the pages' 3D views.
 
-import { Color, PerspectiveCamera, Scene, Vector3, WebGLRenderer } from "three";
+import {
+  Color, DirectionalLight, HemisphereLight, PerspectiveCamera, Scene, Vector3, WebGLRenderer,
+} from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import { colour } from "./palette.js";
 import { grid } from "./points.js";
@@ -14,6 +16,9 @@ export class View {
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
     this.scene = new Scene();
     this.scene.background = new Color();
+    const sun = new DirectionalLight(0xffffff, 1.6); // surfaces are lit; points and lines have light of their own
+    sun.position.set(0.4, -0.6, 1);
+    this.scene.add(new HemisphereLight(0xffffff, 0x667788, 1.7), sun);
     this.camera = new PerspectiveCamera((2 * HALF_ANGLE * 180) / Math.PI, 1, 0.001, 1000);
     this.camera.up.set(0, 0, 1);
     this.orbit = new OrbitControls(this.camera, canvas);
