@@ -31,6 +31,8 @@ BENCHMARKS = (
     "service.idle_and_start",
     "service.api_load",
     "service.cancelling",
+    "service.new_user",
+    "service.time_left",
     "speed.video",
 )
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")

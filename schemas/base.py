@@ -19,6 +19,7 @@ ObjectKind = Literal[
 Unmade = Literal["failed", "cancelled"]
 """States of an object that its job did not make."""
 _UNSTORABLE = re.compile("[\0\ud800-\udfff]")
+STORABLE_TEXT = r"^[^\x00]*$"
 LINE, LONGEST_TEXT = 120, 40
 """Characters of the line that an object is shown in, and of a text in it."""
 _LITERAL = "{said}"
@@ -26,10 +27,24 @@ _PLAIN = frozenset({float, int, bool, type(None)})
 Seed = Annotated[int, Field(ge=0, lt=2**63, json_schema_extra={"format": "int64"})]
 
 
+def _told_storable(schema: dict[str, Any]) -> None:
+    """Say of every plain text in the schema of a request that it holds no NUL, which ``_storable`` refuses."""
+    for part in schema.get("properties", {}).values():
+        _tell_storable(part)
+
+
+def _tell_storable(part: dict[str, Any]) -> None:
+    if part.get("type") == "string" and not part.keys() & {"pattern", "enum", "const", "format"}:
+        part["pattern"] = STORABLE_TEXT
+    for inner in (*part.get("anyOf", ()), part.get("items")):
+        if isinstance(inner, dict):
+            _tell_storable(inner)
+
+
 class Request(BaseModel):
     """A body that a client sends: an unknown field is an error, not a silent typo."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", json_schema_extra=_told_storable)
 
     @model_validator(mode="before")
     @classmethod

@@ -7,6 +7,7 @@ unit, which is made of symbols (``_m_s2``); what it does not say without doubt (
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 
 _SYMBOL = r"(?:kg|pa|rad|deg|hz|px|db|m|s|n)\d?"
 _UNIT_AT_THE_END = re.compile(rf"(?<=[^_])_((?:per_)?{_SYMBOL}(?:_{_SYMBOL})*)$")
@@ -56,6 +57,18 @@ def title(name: str) -> str:
 def sentence(words: str) -> str:
     """Words with a capital at their beginning."""
     return words[:1].upper() + words[1:]
+
+
+def reworded(text: str, fields: Iterable[str]) -> str:
+    """A sentence with the names of fields in it as words: ``shows air_drag_linear`` as ``shows air drag linear``.
+
+    Args:
+        text: the sentence.
+        fields: names that may be in it; a longer one goes before one that it contains.
+    """
+    for field in sorted(set(fields), key=len, reverse=True):
+        text = text.replace(field, label(field))
+    return text
 
 
 def _words(name: str) -> str:

@@ -129,7 +129,8 @@ class _Curve:
         slopes = np.gradient(self.knots, self.arcs, axis=0)
         end = np.where((places > inside)[:, None], slopes[-1], slopes[0])
         weights: Array = CubicHermiteSpline(self.arcs, self.knots, slopes)(inside)
-        return weights + (places - inside)[:, None] * end
+        weights += (places - inside)[:, None] * end
+        return weights
 
     def drawn(self) -> Array:
         """Weights at the places that are drawn, from end to end, (m, n)."""

@@ -76,6 +76,7 @@ def _check(given: argparse.Namespace) -> None:
     from physworld.check import CheckConfig, check, document
     from physworld.estimation.simulations import Workers, in_turn
     from physworld_workers.commands.terminal import progress_bar, read_scene
+    from physworld_workers.tasks.check import worded
 
     scene = read_scene(given.scene)
     config = CheckConfig(noise_m=given.noise, values=dict(given.value))
@@ -87,7 +88,7 @@ def _check(given: argparse.Namespace) -> None:
         config = replace(config, calibration=replace(config.calibration, particle_budget=given.particles))
     pool = Workers(given.processes) if given.processes > 1 else nullcontext(in_turn)
     with progress_bar(f"check {scene.name}") as shown, pool as runner:
-        report = document(check(scene, config, runner=runner, progress=shown))
+        report = worded(document(check(scene, config, runner=runner, progress=shown)))
     _print(report)
     if given.json is not None:
         given.json.parent.mkdir(parents=True, exist_ok=True)

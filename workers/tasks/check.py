@@ -6,8 +6,11 @@ on where it was.
 
 from __future__ import annotations
 
+from typing import Any
+
 from physworld.calibrate import CalibrationConfig
 from physworld.check import CheckConfig, check, document
+from physworld.report import names
 from physworld_schemas.check import CheckConfig as WireConfig
 from physworld_storage.jobs import helpers
 from physworld_workers.context import HandlerResult, TaskContext
@@ -36,7 +39,18 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     context.check()
     inputs = [scene_reference(stores, payload["scene_id"])]
     made_by = lineage_of(inputs, {"check": payload["config"]}, {"check": payload["config"]["seed"]})
-    return HandlerResult({"report": document(result), "lineage": made_by})
+    return HandlerResult({"report": worded(document(result)), "lineage": made_by})
+
+
+def worded(report: dict[str, Any]) -> dict[str, Any]:
+    """The document of a check whose proposal calls effects as people do; its lists keep their names in the registry."""
+    proposal = report["proposal"]
+    if proposal is not None:
+        fields = {
+            label for change in (*proposal["shows"], *proposal["separates"]) for label in change["labels"]
+        }
+        proposal["description"] = names.reworded(proposal["description"], fields)
+    return report
 
 
 def translate(config: WireConfig, device: str) -> CheckConfig:

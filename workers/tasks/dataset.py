@@ -130,10 +130,10 @@ def seal(context: TaskContext, stores: Stores) -> HandlerResult:
             f"dataset {dataset_id} holds {len(indices)} episodes of {config.episodes}; missing {missing[:20]}"
         )
     coverage = Coverage(len(episodes))
-    for done, committed in enumerate(episodes):
+    for done, committed in enumerate(episodes, start=1):
         context.check()
-        context.progress(done, len(episodes), "episodes", "verifying")
         coverage.add(*stores.episodes.verified(committed.path, committed.digest))
+        context.progress(done, len(episodes), "episodes", "verifying")
     manifest = stores.episodes.write_manifest(dataset_id, episodes)
     context.check()
     stores.episodes.remove_orphans(dataset_id, [committed.path for committed in episodes])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+import re
 from collections.abc import Iterator
 
 import pytest
@@ -13,6 +14,7 @@ import physworld_schemas
 from physworld.report import names
 from physworld_schemas.job import Event
 from physworld_schemas.library import catalogue
+from physworld_schemas.model import VersionPatch
 from physworld_services.dashboard.forms import form_of
 from physworld_services.dashboard.pages_jobs import describe
 from physworld_services.dashboard.site import environment_of_pages
@@ -100,3 +102,16 @@ def test_an_event_says_percent_once() -> None:
 def test_a_length_among_settings_has_its_unit_and_nothing_is_a_dash() -> None:
     assert plain({"region_max_m": [0.03, 0.5], "steps": 3}) == "region max (0.03, 0.5) m, steps 3"
     assert [plain(empty) for empty in ("", [], None)] == ["–", "–", "–"]
+
+
+def test_a_sentence_calls_fields_as_people_do() -> None:
+    fields = ["air_drag", "air_drag_linear", "actuation_lag"]
+    told = names.reworded("this shows air_drag_linear and tells actuation_lag from air_drag", fields)
+    assert told == "this shows air drag linear and tells actuation lag from air drag"
+
+
+def test_a_request_says_that_texts_hold_no_nul() -> None:
+    schema = VersionPatch.model_json_schema()
+    tags = next(part for part in schema["properties"]["tags"]["anyOf"] if part.get("type") == "array")
+    assert re.fullmatch(tags["items"]["pattern"], "a tag\nof two lines")
+    assert not re.fullmatch(tags["items"]["pattern"], "half\x00")
