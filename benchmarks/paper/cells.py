@@ -217,7 +217,7 @@ def report(held: dict[str, dict[str, Any] | None], springs: dict[str, Any]) -> R
         "A cell: the paper's relation / ours, the row over its table's reference row (the row with 1.00 / 1.00), "
         "ours as the geometric mean over pairs of scene and seed; in brackets in how many pairs ours lies on the "
         "same side of 1 as the paper's. CD and Track: below 1 errs less. FPS: above 1 is faster. "
-        "The line at the end names the machine that printed this; where cells were measured is said with their own tables.",
+        "The line at the end names the machine that printed this; where cells were measured stands with their tables.",
         "World models, their twin and the network on the recording alone: small networks on "
         f"{', '.join(SCENES)}, three seeds (`benchmarks.paper.tables`). Spring–mass networks: against the twin of "
         f"their own run on {', '.join(springs['recordings'])} (`benchmarks.measured.springs`).",
