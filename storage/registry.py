@@ -315,11 +315,16 @@ def find_baseline(
         )
         .order_by(ModelVersionRow.version.desc())
     )
-    wanted = (config.model_dump(mode="json"), dataset_config, fit_digest(fit))
+    wanted = (config, dataset_config, fit_digest(fit))
     for version, dataset, other in session.execute(statement):
-        if (version.config, dataset.config, fit_digest(other)) == wanted:
+        if (trained_with(version), dataset.config, fit_digest(other)) == wanted:
             return version
     return None
+
+
+def trained_with(version: ModelVersionRow) -> TrainingConfig:
+    """The settings of a version's training; those from before the setting ``frame`` took the world's axes."""
+    return TrainingConfig.model_validate({"frame": "world", **version.config})
 
 
 def set_alias(session: Session, name: str, alias: str, version: int) -> Model:

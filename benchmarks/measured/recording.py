@@ -41,11 +41,11 @@ def measure(name: str, scene: Scene, config: CalibrationConfig, steps: Path) -> 
         steps: folder of the fit's finished steps, where its twin is kept too.
     """
     begun = time.perf_counter()
-    models, unfit = scoring.fit_all(scene)
+    models, unfit = scoring.fit_all(scene, steps)
     tracks, reasons = scoring.predict(scene, models)
     reasons |= unfit
     tracks |= dict.fromkeys(unfit)
-    fitted, failure = _fit(name, scene, config, steps)
+    fitted, failure = fit_twin(name, scene, config, steps)
     found = None if fitted is None else scoring.attempt(lambda: fitted.tracks, scene)
     tracks["twin"] = None if found is None else found[0]
     reason = failure if found is None else found[1]
@@ -92,7 +92,7 @@ def transfer(
         own: held-out track errors of this recording's own predictors [m].
     """
     whole: scoring.Predictions
-    models, unfit = scoring.fit_all(source)
+    models, unfit = scoring.fit_all(source, twin.parent)
     whole, reasons = scoring.predict(scene, {name: model for name, model in models.items() if name != COPIES})
     reasons |= unfit
     whole |= dict.fromkeys(unfit)
@@ -133,9 +133,10 @@ def published(scene: Scene) -> list[dict[str, Any]]:
     return [entry for entry in entries if entry["source"] in declared]
 
 
-def _fit(
+def fit_twin(
     name: str, scene: Scene, config: CalibrationConfig, steps: Path
 ) -> tuple[FitResult | None, str | None]:
+    """The calibrated twin, kept in ``steps``, or why there is none; a search that was cut off goes on."""
     try:
         fitted = calibrate(scene, config, journal=journal_in(steps / f"{name}.json", scene, f"{config}"))
     except scoring.FAILURES as error:

@@ -19,10 +19,12 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.measured.kept import fitted as kept_or_fitted
 from physworld.arrays import Array
 from physworld.baselines import PEERS
 from physworld.errors import PhysworldError
@@ -56,13 +58,18 @@ def fits() -> dict[str, Fit]:
     return {name: partial(_as_it_is, baseline) for name, baseline in BASELINES.items()} | PEERS
 
 
-def fit_all(scene: Scene) -> tuple[dict[str, Model], Reasons]:
-    """Every model that could be fitted to the training frames, and why the others could not."""
+def fit_all(scene: Scene, folder: Path | None = None) -> tuple[dict[str, Model], Reasons]:
+    """Every model that could be fitted to the training frames, and why the others could not.
+
+    Args:
+        scene: the recording.
+        folder: where networks that take minutes are kept (:mod:`benchmarks.measured.kept`).
+    """
     models: dict[str, Model] = {}
     reasons: Reasons = {}
     for name, fit in fits().items():
         try:
-            models[name] = fit(scene)
+            models[name] = kept_or_fitted(name, fit, scene, folder)
         except FAILURES as error:
             reasons[name] = words(error)
     return models, reasons

@@ -13,13 +13,24 @@ from collections.abc import Callable
 from physworld.arrays import Array
 from physworld.baselines.elastic_rod import fit_elastic_rod
 from physworld.baselines.linear_cloth import fit_linear_cloth
+from physworld.baselines.phystwin import fit_phystwin
 from physworld.baselines.rigid_links import fit_rigid_links
+from physworld.baselines.spring_gaus import fit_spring_gaus
 from physworld.scene import Scene
 
 PEERS: dict[str, Callable[[Scene], Callable[[Scene], Array]]] = {
     "elastic_rod": fit_elastic_rod,
     "rigid_links": fit_rigid_links,
     "linear_cloth": fit_linear_cloth,
+    "phystwin": fit_phystwin,
+    "spring_gaus": fit_spring_gaus,
 }
 
-__all__ = ["PEERS", "fit_elastic_rod", "fit_linear_cloth", "fit_rigid_links"]
+__all__ = [
+    "PEERS",
+    "fit_elastic_rod",
+    "fit_linear_cloth",
+    "fit_phystwin",
+    "fit_rigid_links",
+    "fit_spring_gaus",
+]

@@ -23,12 +23,12 @@ from physworld_schemas.base import Reference, Unmade
 from physworld_schemas.dataset import DatasetConfig
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.loop import LoopCreate
-from physworld_schemas.model import TrainingConfig, TrainingCreate
+from physworld_schemas.model import TrainingCreate
 from physworld_schemas.trace import MOST_RECORDINGS, NO_OTHER_PHYSICS, TRACE_PARTICLES
 from physworld_storage.errors import Conflict
 from physworld_storage.jobs.kind import JobKind, output_of, scene_row, share_of
 from physworld_storage.jobs.kinds import assessment, dataset, trace, training
-from physworld_storage.registry import reference_id, resolve
+from physworld_storage.registry import reference_id, resolve, trained_with
 from physworld_storage.tables import AssessmentRow, DatasetRow, FitRow, JobRow, ModelVersionRow, SceneRow
 from physworld_storage.traces import assessment_row, leaves_twin, trace_row
 
@@ -102,7 +102,7 @@ class LoopJobs(JobKind):
             asked = TrainingCreate(
                 name=model.name,
                 dataset_id=output_of(ended),
-                config=request.training or TrainingConfig.model_validate(model.config),
+                config=request.training or trained_with(model),
             )
             training.KIND.open(session, asked, parent=parent)
         else:

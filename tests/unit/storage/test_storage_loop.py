@@ -20,7 +20,7 @@ from physworld_storage.errors import Conflict, ResultInvalid
 from physworld_storage.jobs import helpers, jobs, leases
 from physworld_storage.scratch import ScratchStore
 from physworld_storage.settings import Settings
-from physworld_storage.tables import JobRow, ShardRow, utc_now
+from physworld_storage.tables import JobRow, ModelVersionRow, ShardRow, utc_now
 
 pytestmark = pytest.mark.slow
 
@@ -230,6 +230,30 @@ def test_the_comparison_is_made_once_and_found_again(work: Work, database: Datab
     assert finish(work, database, closed_loop(work, database, scene.id), "named") == short
     other = TrainingConfig(steps=7)
     assert finish(work, database, closed_loop(work, database, scene.id, training=other), "named") == long
+
+
+def test_a_version_from_before_the_frame_was_a_setting_stood_in_the_worlds_axes(
+    work: Work, database: Database
+) -> None:
+    scene, world = work.scene(), TrainingConfig(frame="world")
+    assert len(finish(work, database, closed_loop(work, database, scene.id, training=world), "named")) == 6
+    with database.session() as session:
+        row = session.get_one(ModelVersionRow, ("beam", 1))
+        row.config = {name: value for name, value in row.config.items() if name != "frame"}
+    with database.reading() as session:
+        assert registry.trained_with(session.get_one(ModelVersionRow, ("beam", 1))) == world
+    again = closed_loop(work, database, scene.id, training=world)
+    assert "training" in finish(work, database, again, "named")
+    assert _baselines(database)[3] == 1, "found again, without a second comparison"
+    finish(work, database, closed_loop(work, database, scene.id), "named")
+    assert _baselines(database)[5] == 4, "in axes that are chosen: a comparison of its own"
+
+
+def _baselines(database: Database) -> dict[int, int | None]:
+    """What each version is compared with."""
+    with database.reading() as session:
+        rows = session.query(ShardRow).where(ShardRow.kind == "training").all()
+        return {row.payload["version"]: row.payload["baseline"] for row in rows}
 
 
 def test_the_training_is_told_what_to_compare_with(work: Work, database: Database) -> None:
