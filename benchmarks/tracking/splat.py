@@ -25,6 +25,8 @@ from physworld_scenes.importers.pictures import read_pictures
 
 SAME_SURFACE_M = 0.01
 FAR_BELOW_M = -1e3
+MARGIN_PX = 6
+"""Around the object, so that a rope is wider than the window of SSIM."""
 
 
 def score_splat(folder: Path, config: SplatConfig | None = None, whole: bool = False) -> dict[str, Any]:
@@ -76,6 +78,24 @@ def score_splat(folder: Path, config: SplatConfig | None = None, whole: bool = F
     return found | {"frames": {str(frame): row for frame, row in rows.items()}}
 
 
+def table(figures: list[dict[str, Any]]) -> str:
+    """Markdown."""
+    lines = [
+        "| recording | views | pixels | Gaussians | PSNR of frames [dB] | IoU | processor [s] |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for row in figures:
+        frames = row.get("frames", {"0": {"psnr_where_both_db": row.get("psnr_db"), "iou": 1.0}})
+        names = ", ".join(frames)
+        ratios = ", ".join(f"{each['psnr_where_both_db']:.1f}" for each in frames.values())
+        overlaps = ", ".join(f"{each['iou']:.2f}" for each in frames.values())
+        lines.append(
+            f"| {row['recording']}, {row['what']} | {row['views']} | {row['pixels']} | {row['gaussians']} | "
+            f"{names}: {ratios} | {overlaps} | {row['processor_seconds']:.0f} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
 def _compare(stage: Stage, view: View, picture: Any, vertices: Array, frame: int) -> dict[str, float]:
     _, depth, seen = stage.show(vertices, view.camera)
     object_here = seen == 0
@@ -86,7 +106,7 @@ def _compare(stage: Stage, view: View, picture: Any, vertices: Array, frame: int
     wanted = np.where(visible[..., None], given, 1.0)
     rendered = np.where(covered[..., None] | (object_here & ~visible)[..., None], 1.0, picture.rgb)
     rows, columns = np.nonzero(object_here)
-    box = (slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1))
+    box = tuple(slice(max(at.min() - MARGIN_PX, 0), at.max() + 1 + MARGIN_PX) for at in (rows, columns))
     scores = compare_frames(rendered[box][None], wanted[box][None])
     alpha = np.where(object_here & ~visible, False, picture.alpha >= 0.5)
     both = visible & (picture.alpha >= 0.5)

@@ -7,7 +7,7 @@ from physworld.video.gaussians import Gaussians, from_ply, gaussians_at_points, 
 from physworld.video.moving import GaussianCarrier
 from physworld.video.render import Renderer
 from physworld.video.splat_fit import FittedSplat, SplatConfig, fit_splat
-from physworld.video.splat_start import SplatView
+from physworld.video.splat_start import SplatView, surface_of
 
 __all__ = [
     "Camera",
@@ -29,6 +29,7 @@ __all__ = [
     "gaussians_at_points",
     "look_at",
     "orbit_view",
+    "surface_of",
     "to_ply",
     "whole_motion_view",
 ]

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from physworld.arrays import Array
 from physworld.camera import Camera
 from physworld.errors import SplatNotFitted
+from physworld.scene import Scene
 from physworld.video.gaussians import SH_DC, Gaussians
 
 SMOOTHED_PX = 2.0
@@ -62,6 +63,13 @@ class SplatView:
         if self.mask is None:
             return np.ones(self.picture.shape[:2], dtype=bool)
         return np.asarray(self.mask, dtype=bool)
+
+
+def surface_of(scene: Scene) -> Array:
+    """Points (P, 3) [m] of the object's surface in the first frame: its cloud, else the tracked points seen there."""
+    if scene.surface_points is not None and len(scene.surface_points):
+        return scene.surface_points
+    return np.asarray(scene.points[0][scene.visible[0]])
 
 
 def start_from_depth(views: list[SplatView], most: int) -> Gaussians:
