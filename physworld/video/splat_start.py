@@ -20,6 +20,8 @@ STEP_M = 0.02
 """Of depth, over which nothing is averaged."""
 DENSEST_PX = 1.5
 """Between Gaussians at the densest."""
+WIDENED = 1.02
+"""How much the grid is, when it holds too many."""
 OPAQUE_LOGIT = 2.0
 WIDTH_SHARE = 0.5
 """A Gaussian's deviation, of the distance to its neighbours."""
@@ -87,6 +89,14 @@ def start_from_depth(views: list[SplatView], most: int) -> Gaussians:
     if not pixels:
         raise SplatNotFitted(f"none of {len(views)} views has depth on the object; give points instead")
     spacing = max(DENSEST_PX, float(np.sqrt(pixels / most)))
+    found = _on_grids(measured, spacing)
+    while len(found) > most:  # pixels at edges do not divide evenly
+        spacing *= WIDENED
+        found = _on_grids(measured, spacing)
+    return found
+
+
+def _on_grids(measured: list[tuple[SplatView, Array]], spacing: float) -> Gaussians:
     places: list[Array] = []
     colours: list[Array] = []
     widths: list[Array] = []

@@ -174,6 +174,16 @@ def test_a_fitted_splat_shows_the_picture_better_than_its_start_and_lies_on_the_
     assert np.abs(np.linalg.norm(read.means, axis=1) - 0.2).mean() < 0.02  # 0.2 m is the ball's radius
 
 
+def test_a_start_has_no_more_gaussians_than_are_wanted_and_spreads_them_over_the_object() -> None:
+    view, _ = shown(CAMERA)
+    second = shown(look_at(np.array([0.9, 0.3, 0.3]), np.zeros(3), 96, 72))[0]
+    for views in ([view], [view, second]):
+        for most in (7, 100, 333):
+            start = start_from_depth(views, most)
+            assert 0.5 * most < len(start) <= most
+            assert (np.ptp(start.means, axis=0) > 0.1).all()  # of a ball of 0.4 m, whose front is seen
+
+
 def test_two_cameras_are_fitted_together_from_points_without_depth() -> None:
     other = look_at(np.array([0.9, 0.3, 0.3]), np.zeros(3), 96, 72)
     views = [replace(shown(camera)[0], depth=None) for camera in (CAMERA, other)]
