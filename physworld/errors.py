@@ -18,6 +18,7 @@ PhysworldError
 ├── LawAnswerRefused        a model's answer names no law of the library, or not in the asked form
 ├── LawAnswerUnavailable    the model that was asked gave no answer
 ├── TrackingFailed          pictures show too little of the object to follow it
+├── SplatNotFitted          or too little to fit a splat to
 ├── Cancelled               the caller asked to stop
 ├── WorkerLost              a process that shares simulations ended
 └── TrainingDiverged        a loss or a weight is not finite
@@ -112,3 +113,7 @@ class TrainingDiverged(PhysworldError):
 
 class GaussiansUnreadable(PhysworldError):
     """A splat is not of the layout that it must have, or holds numbers that are none."""
+
+
+class SplatNotFitted(PhysworldError):
+    """The pictures do not show enough of an object to fit a splat to."""

@@ -63,8 +63,10 @@ class VideoConfig(Request):
     )
     width: Side = Field(default=640, description="Width of a view of the whole motion.")
     height: Side = Field(default=480, description="Height of a view of the whole motion.")
-    look: Literal["auto", "points"] = Field(
-        default="auto", description="The scene's splat where it has one, or spheres at the points."
+    look: Literal["auto", "points", "fitted"] = Field(
+        default="auto",
+        description="The scene's splat where it has one, or spheres at the points; or a splat that is fitted to the "
+        "first of the scene's pictures, within their masks, and kept beside the film.",
     )
     candidate: int = Field(
         default=0, ge=0, lt=MAX_CANDIDATES, description="Of a rollout: which of its control paths."
@@ -105,7 +107,7 @@ class VideoReport(Resource):
 
     frames: int = Field(description="Frames of the film.")
     fps: float = Field(description="Its rate, that of the motion.", json_schema_extra={"unit": "Hz"})
-    drawn: Literal["splat", "points"] = Field(description="What was drawn.")
+    drawn: Literal["splat", "points", "fitted"] = Field(description="What was drawn.")
     gaussians: int = Field(description="How many Gaussians or spheres.")
     seen_from: Literal["given", "scene", "whole"] = Field(description="Whose camera it was.")
     camera: CameraView = Field(description="The camera.")

@@ -1,4 +1,5 @@
-"""``python -m benchmarks.tracking render NAME FOLDER [--cameras N]`` and ``... measure FOLDER... [--json FILE]``."""
+"""``python -m benchmarks.tracking render NAME FOLDER [--cameras N]`` and ``... measure FOLDER... [--json FILE]``,
+and ``... splat FOLDER...``."""
 
 from __future__ import annotations
 
@@ -23,11 +24,20 @@ def main() -> None:
     measure.add_argument("folders", type=Path, nargs="+")
     measure.add_argument("--json", type=Path, default=None, help="write the figures to this file")
     measure.add_argument("--scenes", type=Path, default=None, help="keep the scenes in this folder")
+    splat = commands.add_parser("splat", help="fit a splat to the first frame and compare all frames")
+    splat.add_argument("folders", type=Path, nargs="+")
+    splat.add_argument("--steps", type=int, default=None)
+    splat.add_argument("--most", type=int, default=None, help="Gaussians")
+    splat.add_argument("--whole", action="store_true", help="the whole picture instead of the object")
+    splat.add_argument("--json", type=Path, default=None, help="write the figures to this file")
     given = parser.parse_args()
     if given.command == "render":
         from benchmarks.tracking.render import write
 
         write(given.name, given.folder, given.cameras, given.frames, given.seed)
+        return
+    if given.command == "splat":
+        _splat(given)
         return
     from benchmarks.tracking.measure import scene_of, score, table
     from physworld_scenes.bundle import write_bundle
@@ -39,6 +49,21 @@ def main() -> None:
         print(json.dumps(figures[-1]), flush=True)
         if given.scenes is not None:
             write_bundle(scene, given.scenes / folder.name)
+    print(table(figures))
+    if given.json is not None:
+        given.json.write_text(json.dumps(figures, indent=1) + "\n")
+
+
+def _splat(given: argparse.Namespace) -> None:
+    from benchmarks.tracking.splat import score_splat, table
+    from physworld.video import SplatConfig
+
+    told = {"steps": given.steps, "most": given.most}
+    config = SplatConfig(**{name: value for name, value in told.items() if value is not None})
+    figures = []
+    for folder in given.folders:
+        figures.append(score_splat(folder, config, given.whole))
+        print(json.dumps(figures[-1]), flush=True)
     print(table(figures))
     if given.json is not None:
         given.json.write_text(json.dumps(figures, indent=1) + "\n")

@@ -37,6 +37,7 @@ class Followed:
         cloud: of the first frame [m], (S, 3), one point a cell of 2.5 mm.
         masks: the object in every camera's first frame, each (H, W) bool.
         pixels: of all points in the camera that follows them, (T, N, 2).
+        views: the cameras, in the world of the points.
     """
 
     points: Array
@@ -46,6 +47,7 @@ class Followed:
     cloud: Array
     masks: list[Array]
     pixels: Array
+    views: list[View]
 
 
 def masks_of(
@@ -130,6 +132,7 @@ def follow_all(
         thinned(np.concatenate(clouds), CLOUD_CELL_M),
         [np.zeros((0, 0), dtype=bool) if mask is None else mask for mask in masks],
         np.concatenate([tracks.pixels for _, tracks, _ in kept], axis=1)[:, chosen],
+        views,
     )
 
 

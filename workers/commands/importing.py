@@ -110,6 +110,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--points", type=int, default=None, help="to follow in each camera")
     parser.add_argument("--undeformed", action="store_true", help="the first frame is undeformed and at rest")
     parser.add_argument("--picture", type=Path, default=None, help="PNG of what was followed")
+    parser.add_argument(
+        "--pictures",
+        type=Path,
+        default=None,
+        help="folder for what films need: a fitted splat, camera, frames",
+    )
     return parser
 
 
@@ -134,6 +140,8 @@ def _import(given: argparse.Namespace) -> None:
     _say(scene, warnings, given.out)
     if given.picture is not None and followed is not None:
         _draw(given, followed)
+    if given.pictures is not None and followed is not None:
+        _keep_pictures(given.pictures, followed)
 
 
 def _options(given: argparse.Namespace) -> ImportOptions:
@@ -320,10 +328,7 @@ def _draw(given: argparse.Namespace, followed: Followed) -> None:
     """First and last picture of the first camera with mask and points: green seen, red not."""
     from PIL import Image, ImageDraw
 
-    from physworld_scenes.importers.pictures import read_pictures
-
-    options = _picture_options(given)
-    view = read_pictures(given.source, given.depth_scale, slice(options.first, options.last)).views[0]
+    view = followed.views[0]
     pictures = []
     for frame in (0, view.frames - 1):
         colour = view.colour(frame).copy()
@@ -343,6 +348,26 @@ def _draw(given: argparse.Namespace, followed: Followed) -> None:
     given.picture.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(np.hstack(pictures)).save(given.picture)
     print(f"{given.picture}: the first frame with the object's pixels, and the last")
+
+
+def _keep_pictures(folder: Path, followed: Followed) -> None:
+    """What ``physworld scenes picture`` takes: splat of the first frame, first camera, and its pictures."""
+    from physworld.video import SplatConfig, SplatView
+    from physworld_workers.commands.splat import fitted_splat
+
+    shown = [
+        SplatView(view.camera, view.colour(0), mask, view.depth(0))
+        for view, mask in zip(followed.views, followed.masks, strict=True)
+        if mask.size
+    ]
+    fitted_splat(shown, None, SplatConfig(), folder / "splat.ply")
+    view = followed.views[0]
+    numbers = {name: getattr(view.camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    facts = {**numbers, "world_to_camera": view.camera.world_to_camera.tolist()}
+    (folder / "camera.json").write_text(json.dumps(facts, indent=1) + "\n")
+    frames = np.stack([view.colour(frame) for frame in range(view.frames)])
+    np.savez_compressed(folder / "frames.npz", frames=frames)
+    print(f"{folder}: splat.ply, camera.json, frames.npz of camera 0 ({view.frames} frames)")
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from physworld.arrays import Array
+from physworld.camera import Camera
 from physworld_schemas.wording import reason
 
 _MOTIONS = ("vertices", "particles", "tracks", "points", "after")
@@ -120,23 +121,28 @@ def _motion(path: Path, number: int) -> tuple[Array, Array, Array]:
     return moved, rest, times
 
 
-def _camera(given: argparse.Namespace, moved: Array) -> Any:
-    from physworld.video import Camera, whole_motion_view
+def camera_in(path: Path) -> Camera:
+    """The camera in a JSON file. Raises ValueError with what is wrong."""
+    try:
+        facts = json.loads(path.read_text())
+        return Camera(
+            width=int(facts["width"]),
+            height=int(facts["height"]),
+            fx=float(facts["fx"]),
+            fy=float(facts["fy"]),
+            cx=float(facts["cx"]),
+            cy=float(facts["cy"]),
+            world_to_camera=np.asarray(facts["world_to_camera"], dtype=np.float64),
+        )
+    except (KeyError, TypeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path} is no camera: {reason(error)}") from error
+
+
+def _camera(given: argparse.Namespace, moved: Array) -> Camera:
+    from physworld.video import whole_motion_view
 
     if given.camera is not None:
-        try:
-            facts = json.loads(given.camera.read_text())
-            return Camera(
-                width=int(facts["width"]),
-                height=int(facts["height"]),
-                fx=float(facts["fx"]),
-                fy=float(facts["fy"]),
-                cx=float(facts["cx"]),
-                cy=float(facts["cy"]),
-                world_to_camera=np.asarray(facts["world_to_camera"], dtype=np.float64),
-            )
-        except (KeyError, TypeError, json.JSONDecodeError) as error:
-            raise ValueError(f"{given.camera} is no camera: {reason(error)}") from error
+        return camera_in(given.camera)
     width, times, height = given.size.partition("x")
     if not (times and width.isdecimal() and height.isdecimal() and min(int(width), int(height)) > 0):
         raise ValueError(f"--size must be WIDTHxHEIGHT in pixels, got {given.size!r}")

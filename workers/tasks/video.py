@@ -24,12 +24,17 @@ from physworld.arrays import Array
 from physworld.camera import Camera
 from physworld.video import (
     Drawing,
+    SplatConfig,
+    SplatView,
     checked_motion,
     compare_frames,
     eight_bit,
     encode_mp4,
+    fit_splat,
     frames_per_second,
     from_ply,
+    surface_of,
+    to_ply,
     whole_motion_view,
 )
 from physworld.video.gaussians import Gaussians
@@ -59,7 +64,10 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     moved, times = motion_of(stores, payload, config.candidate)
     pictures = _pictures_of(stores, payload["scene_id"])
     camera, seen_from = _camera(config, moved, stores, pictures)
-    splat = _splat(stores, pictures) if config.look == "auto" else None
+    fitted = None
+    if config.look == "fitted":
+        fitted = _fitted(context, stores, pictures, payload["scene_id"])
+    splat = _splat(stores, pictures) if config.look == "auto" else fitted
     drawing = Drawing(moved, moved[0], camera, splat, stores.settings.device)
     frames, not_scored = _frames_to_match(stores, pictures, payload["of"], seen_from, camera, len(moved))
     scoring = Scoring(frames)
@@ -78,7 +86,7 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     report = VideoReport(
         frames=len(moved),
         fps=frames_per_second(times),
-        drawn="points" if splat is None else "splat",
+        drawn="points" if splat is None else "splat" if fitted is None else "fitted",
         gaussians=drawing.gaussians,
         seen_from=seen_from,
         camera=_view_of(camera),
@@ -91,7 +99,13 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
         inputs.append(scene_reference(stores, payload["scene_id"]))
     inputs += [Reference(kind="artifact", id=name, digest=digest) for name, digest in pictures.items()]
     made_by = lineage_of(inputs, {"video": payload["config"]}, {}, stores.settings.device)
-    result = {"report": report.model_dump(mode="json"), "artifacts": [film.model_dump(mode="json")]}
+    made = [film]
+    if fitted is not None:
+        made.append(stores.artifacts.put_bytes(to_ply(fitted), SPLAT, "application/x-ply"))
+    result = {
+        "report": report.model_dump(mode="json"),
+        "artifacts": [item.model_dump(mode="json") for item in made],
+    }
     return HandlerResult({**result, "lineage": made_by}, film.sha256)
 
 
@@ -185,13 +199,17 @@ def _camera(
     if config.camera is not None:
         return camera_of(config.camera), "given"
     if config.view == "auto" and CAMERA in pictures:
-        try:
-            view = CameraView.model_validate(json.loads(stores.artifacts.read_bytes(pictures[CAMERA])))
-        except (ValidationError, UnicodeDecodeError, json.JSONDecodeError) as error:
-            raise ValueError(f"{CAMERA} of the scene is no camera: {error}") from error
-        return camera_of(view), "scene"
+        return _scene_camera(stores, pictures), "scene"
     angles = (config.azimuth_deg, config.elevation_deg)
     return whole_motion_view(moved, *angles, config.width, config.height), "whole"
+
+
+def _scene_camera(stores: Stores, pictures: dict[str, str]) -> Camera:
+    try:
+        view = CameraView.model_validate(json.loads(stores.artifacts.read_bytes(pictures[CAMERA])))
+    except (ValidationError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{CAMERA} of the scene is no camera: {error}") from error
+    return camera_of(view)
 
 
 def camera_of(view: CameraView) -> Camera:
@@ -212,6 +230,45 @@ def _splat(stores: Stores, pictures: dict[str, str]) -> Gaussians | None:
     return from_ply(stores.artifacts.read_bytes(pictures[SPLAT]))
 
 
+def _fitted(context: TaskContext, stores: Stores, pictures: dict[str, str], scene_id: str) -> Gaussians:
+    """A splat of the scene's first picture."""
+    missing = [name for name in (CAMERA, FRAMES) if name not in pictures]
+    if missing:
+        raise ValueError(f"a splat is fitted to the scene's pictures; it has no {' and no '.join(missing)}")
+    given = _frames_of(stores, pictures)
+    mask = given["masks"][0] if "masks" in given else None
+    view = SplatView(_scene_camera(stores, pictures), given["frames"][0], mask)
+
+    def told(done: int, total: int, message: str) -> None:
+        context.check()
+        context.progress(done, total, "steps", f"fitting {message}")
+
+    config = SplatConfig(device=stores.settings.device)
+    return fit_splat([view], surface_of(scene_of(stores, scene_id)), config, told).gaussians
+
+
+def _frames_of(stores: Stores, pictures: dict[str, str]) -> dict[str, Array]:
+    """``frames`` (T, H, W, 3) uint8 and, if there are some, ``masks`` (T, H, W), of the scene's pictures."""
+    found = read_arrays(stores.artifacts.read_bytes(pictures[FRAMES]), PICTURE_LIMITS)
+    frames, masks = found.get("frames"), found.get("masks")
+    if (
+        frames is None
+        or frames.ndim != 4
+        or frames.shape[-1] != 3
+        or frames.dtype != np.uint8
+        or not frames.size
+    ):
+        shown = {name: f"{array.dtype} {array.shape}" for name, array in found.items()}
+        raise ValueError(f"{FRAMES} of the scene must hold frames (T, H, W, 3) uint8, it holds {shown}")
+    if masks is None:
+        return {"frames": frames}
+    if masks.shape != frames.shape[:3]:
+        raise ValueError(
+            f"masks in {FRAMES} of the scene have shape {masks.shape}, its frames {frames.shape[:3]}"
+        )
+    return {"frames": frames, "masks": masks}
+
+
 def _frames_to_match(
     stores: Stores, pictures: dict[str, str], of: str, seen_from: SeenFrom, camera: Camera, count: int
 ) -> tuple[dict[str, Array] | None, str]:
@@ -222,17 +279,12 @@ def _frames_to_match(
         return None, "a rollout has a motion of its own, which the scene's pictures do not show"
     if seen_from == "whole":
         return None, "the film is not seen from the camera of the scene's pictures"
-    found = read_arrays(stores.artifacts.read_bytes(pictures[FRAMES]), PICTURE_LIMITS)
-    frames, masks = found.get("frames"), found.get("masks")
-    if frames is None or frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype != np.uint8:
-        shown = {name: f"{array.dtype} {array.shape}" for name, array in found.items()}
-        raise ValueError(f"{FRAMES} of the scene must hold frames (T, H, W, 3) uint8, it holds {shown}")
+    given = _frames_of(stores, pictures)
+    frames = given["frames"]
     wanted = (count, camera.height, camera.width)
     if frames.shape[:3] != wanted:
         return None, (
             f"the scene's pictures are {frames.shape[0]} of {frames.shape[2]} x {frames.shape[1]} px, the film has "
             f"{count} of {camera.width} x {camera.height} px"
         )
-    if masks is not None and masks.shape != wanted:
-        raise ValueError(f"masks in {FRAMES} of the scene have shape {masks.shape}, its frames {wanted}")
-    return {"frames": frames} if masks is None else {"frames": frames, "masks": masks}, ""
+    return given, ""

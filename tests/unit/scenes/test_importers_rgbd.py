@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 from tracking_pictured import BOTTOM, FRAMES, LEFT, RIGHT, TOP, write
 
+from physworld.video import Renderer, from_ply
 from physworld_scenes.bundle import read_bundle
 from physworld_scenes.errors import SceneInvalid
 from physworld_scenes.importers.pictures import is_pictures, read_pictures
 from physworld_workers.commands import importing
+from physworld_workers.commands.video import camera_in
 
 pytestmark = pytest.mark.slow
 
@@ -31,7 +33,7 @@ def test_the_command_writes_a_scene_with_z_up(folder: Path, tmp_path: Path) -> N
     out, picture = tmp_path / "scene", tmp_path / "look.png"
     arguments = [str(folder), f"--out={out}", BOX, "--kind=sheet", "--fps=30", "--points=40", "--up=-y",
                  f"--patch={LEFT},{TOP},{LEFT + 30},{BOTTOM}", f"--held={LEFT},{TOP},{LEFT + 15},{BOTTOM}",
-                 f"--picture={picture}"]  # fmt: skip
+                 f"--picture={picture}", f"--pictures={tmp_path / 'pictures'}"]  # fmt: skip
     assert importing.main(arguments) == 0
     scene = read_bundle(out)
     assert scene.frame_count == FRAMES and scene.kind == "sheet" and scene.fps == 30.0
@@ -41,6 +43,17 @@ def test_the_command_writes_a_scene_with_z_up(folder: Path, tmp_path: Path) -> N
     assert np.ptp(scene.points[0, :, 2]) > 0.05
     assert scene.controllers.shape == (FRAMES, 8, 3) and len(scene.grips) == 1
     assert len(scene.surface_points) > 100 and picture.is_file()
+    # the splat lies where the scene does and shows what the camera saw
+    splat = from_ply((tmp_path / "pictures/splat.ply").read_bytes())
+    assert np.abs(splat.means[:, 1] - 0.5).mean() < 5e-3
+    with np.load(tmp_path / "pictures/frames.npz") as kept:
+        frames = kept["frames"]
+    camera = camera_in(tmp_path / "pictures/camera.json")
+    assert frames.shape == (FRAMES, camera.height, camera.width, 3)
+    seen = Renderer(camera).render(splat)
+    inside = np.s_[TOP + 4 : BOTTOM - 4, LEFT + 4 : RIGHT - 4]
+    assert (seen.alpha[inside] > 0.5).mean() > 0.98
+    assert np.mean((seen.rgb[inside] - frames[0][inside] / 255.0) ** 2) < 10**-2.5  # a PSNR of 25 dB
 
 
 def test_without_a_box_it_says_what_is_missing(

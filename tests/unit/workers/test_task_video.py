@@ -15,7 +15,7 @@ import pytest
 from tiny_scene import tiny_scene
 
 from physworld.arrays import Array
-from physworld.video import Drawing, gaussians_at_points, orbit_view, to_ply
+from physworld.video import Drawing, from_ply, gaussians_at_points, orbit_view, to_ply
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.job import Job
 from physworld_schemas.video import FILM, CameraView, Video, VideoConfig, VideoCreate
@@ -274,3 +274,30 @@ def test_a_motion_that_cannot_be_drawn_is_refused_with_its_numbers(
         moving(stores, "rollout", given.pop("candidate", 0), **given)
     with pytest.raises(ValueError, match=r"are \['other', 'times'\], none of vertices, points"):
         moving(stores, "rollout", times=np.arange(3.0), other=np.zeros(3))
+
+
+def test_a_splat_is_fitted_to_the_first_picture_and_kept_beside_the_film(
+    runtime_with: RuntimeOf, stores: Stores, scene_id: str
+) -> None:
+    scene = tiny_scene()
+    asked_for = VideoConfig(look="fitted")
+    outcome, job, _ = drawn(stores, runtime_with(), asked(stores, scene_id, asked_for))
+    assert outcome == "failed" and job.error is not None
+    assert "it has no camera.json and no frames.npz" in job.error.detail
+    camera = task.camera_of(view())
+    grey = gaussians_at_points(scene.points[0], np.full((scene.points.shape[1], 3), 0.3))
+    pictures = list(Drawing(scene.points, scene.points[0], camera, grey).frames())
+    frames = np.stack([np.round(picture.rgb * 255).astype(np.uint8) for picture in pictures])
+    masks = np.stack([picture.alpha > 0.5 for picture in pictures])
+    keep(stores, scene_id, "camera.json", view().model_dump_json().encode())
+    keep(stores, scene_id, "frames.npz", npz(frames=frames, masks=masks))
+    outcome, _, video = drawn(stores, runtime_with(), asked(stores, scene_id, asked_for))
+    assert outcome == "done" and video.report is not None and video.report.scores is not None
+    assert (video.report.drawn, video.report.seen_from) == ("fitted", "scene")
+    assert [item.name for item in video.artifacts] == [FILM, "splat.ply"]
+    splat = from_ply(stores.artifacts.read_bytes(video.artifacts[1].sha256))
+    assert len(splat) == video.report.gaussians
+    assert video.report.scores.iou_per_frame is not None and video.report.scores.iou_per_frame[0] > 0.6
+    keep(stores, scene_id, "frames.npz", npz(frames=frames, masks=np.zeros_like(masks)))
+    outcome, job, _ = drawn(stores, runtime_with(), asked(stores, scene_id, asked_for))
+    assert outcome == "failed" and job.error is not None and "no pixel of the object" in job.error.detail

@@ -30,6 +30,7 @@ from physworld_client.cli import (
     predict,
     run,
     running,
+    splat,
     trace,
     up,
     video,
@@ -56,6 +57,7 @@ app.command("trace", cls=trace.ManyHeldOut)(trace.trace)
 connected(app, "rollout")(predict.rollout)
 connected(app, "plan")(predict.plan)
 app.command("video")(video.video)
+app.command("splat")(splat.splat)
 app.command("import")(importing.import_recording)
 app.command("catalogue")(catalogue.catalogue)
 app.add_typer(effects.effects, name="effects")

@@ -62,6 +62,9 @@ def import_recording(
         bool, typer.Option("--undeformed", help="The first frame is undeformed and at rest.")
     ] = False,
     picture: Annotated[Path | None, typer.Option(callback=PNG_FILE, help="PNG of what was followed.")] = None,
+    pictures: Annotated[
+        Path | None, typer.Option(help="Folder for what films need: a fitted splat, camera, frames.")
+    ] = None,
 ) -> None:
     """Make a scene of a recording; needs no service."""
     given = {
@@ -92,6 +95,7 @@ def import_recording(
         "--frames": frames,
         "--points": points,
         "--picture": picture,
+        "--pictures": pictures,
     }
     options = [f"{option}={value}" for option, value in given.items() if value is not None]
     options += [f"--box={value}" for value in box or []] + [f"--mask={value}" for value in mask or []]

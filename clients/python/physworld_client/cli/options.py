@@ -48,8 +48,8 @@ def written_as(*suffixes: str) -> Callable[[Path | None], Path | None]:
     return checked
 
 
-JSON_FILE, NPZ_FILE, MP4_FILE, PNG_FILE, HTML_FILE = map(
-    written_as, (".json", ".npz", ".mp4", ".png", ".html")
+JSON_FILE, NPZ_FILE, MP4_FILE, PNG_FILE, HTML_FILE, PLY_FILE = map(
+    written_as, (".json", ".npz", ".mp4", ".png", ".html", ".ply")
 )
 
 CONNECTION = {"url": Url, "token": Token, "data": Data}

@@ -1,0 +1,123 @@
+"""The blending of projected Gaussians: run by one Warp kernel, and its gradient by another (Kerbl et al. 2023).
+
+Warp's own adjoint of a loop whose length depends on data forgets what the loop overwrote, so the adjoint is written
+out: with V the weighted sum of a pixel, the derivative to a Gaussian's alpha needs only what lies behind it, which is
+V less what was summed before it. Both kernels walk from front to back.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+from torch import Tensor
+
+from physworld.arrays import Array
+from physworld.video.render_kernels import TILE, blend, blend_adjoint
+
+
+@dataclass(frozen=True)
+class Canvas:
+    """What is drawn on.
+
+    Attributes:
+        width, height: [px].
+        starts, order: of ``projection.tiles``.
+        background: colour where nothing is, in [0, 1].
+        device: Warp device.
+    """
+
+    width: int
+    height: int
+    starts: Array
+    order: Array
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    device: str = "cpu"
+
+    def arrays(self, *given: Array) -> list[Any]:
+        """Warp arrays of tiles, centres, conics, opacities, colours and depths."""
+        kinds = (wp.int32, wp.int32, wp.vec2f, wp.vec3f, wp.float32, wp.vec3f, wp.float32)
+        plain = (np.int32, np.int32, *(np.float32,) * 5)
+        return [
+            wp.array(np.ascontiguousarray(values, dtype=numbers), dtype=kind, device=self.device)
+            for values, kind, numbers in zip((self.starts, self.order, *given), kinds, plain, strict=True)
+        ]
+
+
+def blended(canvas: Canvas, inputs: list[Any]) -> list[Any]:
+    """Colour (H·W,) of three, coverage and sum of depths (H·W,), as Warp arrays.
+
+    Args:
+        canvas: what is drawn on.
+        inputs: of ``Canvas.arrays``.
+    """
+    pixels = canvas.width * canvas.height
+    outputs = [
+        wp.zeros(pixels, dtype=kind, device=canvas.device) for kind in (wp.vec3f, wp.float32, wp.float32)
+    ]
+    wp.launch(
+        blend,
+        dim=pixels,
+        inputs=[
+            canvas.width, -(-canvas.width // TILE), *inputs, wp.vec3f(*canvas.background), *outputs,
+        ],
+        device=canvas.device,
+    )  # fmt: skip
+    return outputs
+
+
+class Blend(torch.autograd.Function):
+    """``Blend.apply(centre, conic, opacity, colour, depth, canvas)``: colour (H, W, 3), coverage and summed depth
+    [m] (H, W), with derivatives to the first five."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        centre: Tensor,
+        conic: Tensor,
+        opacity: Tensor,
+        colour: Tensor,
+        depth: Tensor,
+        canvas: Canvas,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Draw. Shapes (G, 2), (G, 3), (G,), (G, 3), (G,)."""
+        given = [tensor.detach().numpy() for tensor in (centre, conic, opacity, colour, depth)]
+        ctx.inputs = canvas.arrays(*given)
+        ctx.canvas = canvas
+        ctx.outputs = blended(canvas, ctx.inputs)
+        shape = (canvas.height, canvas.width)
+        rgb, alpha, far = (torch.from_numpy(output.numpy()).double() for output in ctx.outputs)
+        return rgb.reshape(*shape, 3), alpha.reshape(shape), far.reshape(shape)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        """The derivatives of a function of the picture, from those to the picture."""
+        canvas, inputs = ctx.canvas, ctx.inputs
+        device = canvas.device
+        count = len(inputs[2])
+        kinds = (wp.vec3f, wp.float32, wp.float32)
+        asked = [
+            wp.array(
+                np.ascontiguousarray(
+                    gradient.numpy().reshape(-1, 3) if kind is wp.vec3f else gradient.numpy().ravel(),
+                    dtype=np.float32,
+                ),
+                dtype=kind,
+                device=device,
+            )
+            for gradient, kind in zip(gradients, kinds, strict=True)
+        ]
+        kinds_out = (wp.vec2f, wp.vec3f, wp.float32, wp.vec3f, wp.float32)
+        found = [wp.zeros(count, dtype=kind, device=device) for kind in kinds_out]
+        wp.launch(
+            blend_adjoint,
+            dim=canvas.width * canvas.height,
+            inputs=[
+                canvas.width, -(-canvas.width // TILE), *inputs, *ctx.outputs, *asked, *found,
+            ],
+            device=device,
+        )  # fmt: skip
+        return (*(torch.from_numpy(array.numpy()).double() for array in found), None)
