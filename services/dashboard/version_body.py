@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 from safetensors import SafetensorError
@@ -12,9 +13,11 @@ from physworld.arrays import Array
 from physworld_schemas.model import ModelVersion
 from physworld_services.dashboard.pages_models import card_of
 from physworld_services.dashboard.site import Site
-from physworld_services.dashboard.surfaces import Surface, body_surface
-from physworld_services.dashboard.tubes import Tubes
 from physworld_storage import resources
+
+if TYPE_CHECKING:
+    from physworld_services.dashboard.surfaces import Surface
+    from physworld_services.dashboard.tubes import Tubes
 
 KEPT = {"Cache-Control": "private, max-age=600"}
 """Headers of what belongs to a version, which never changes."""
@@ -32,6 +35,8 @@ def surface_of(site: Site, version: ModelVersion) -> Surface | Tubes | None:
     twin = site.arrays(fit.artifacts, TWIN)
     if twin is None:
         return None
+    from physworld_services.dashboard.surfaces import body_surface  # loads the engine
+
     return body_surface(twin, tensors[REST].astype(np.float64), tensors[PARTICLES].astype(int))
 
 
