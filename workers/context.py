@@ -129,8 +129,7 @@ class TaskContext:
     ) -> None:
         """Report how far the stage is, and so the shard.
 
-        The newest report of every stage is written to the database, at most twice a second, and figures also when the
-        handler ends.
+        The newest report of every stage is written to the database, at most twice a second and when the handler ends.
 
         Args:
             done: how much of the stage is done.
@@ -180,7 +179,7 @@ class TaskContext:
             if self._lost:
                 return
             self._stop.wait(min(PROGRESS_INTERVAL_S, self._interval_s))
-        if any(progress.figures for progress in self._pending.values()):
+        if self._pending:
             self._tell()
 
     def _tell(self) -> None:

@@ -129,8 +129,14 @@ def _import(given: argparse.Namespace) -> None:
     if given.look:
         _look(given, options)
         return
+    of_pictures = given.source.is_dir() and any(form.recognises(given.source) for form in FOLDERS)
+    for option, value in (("--picture", given.picture), ("--pictures", given.pictures)):
+        if value is not None and not of_pictures:
+            raise ValueError(
+                f"{option} {value} needs pictures with depth, which {given.source} does not hold"
+            )
     followed = None
-    if given.source.is_dir() and any(form.recognises(given.source) for form in FOLDERS):
+    if of_pictures:
         scene, warnings, followed = _pictures(given, options)
     elif given.source.is_dir():
         scene, warnings = read_bundle(given.source), []

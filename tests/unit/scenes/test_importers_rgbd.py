@@ -64,6 +64,18 @@ def test_without_a_box_it_says_what_is_missing(
     assert not (tmp_path / "scene").exists()
 
 
+@pytest.mark.parametrize("option", ["--picture", "--pictures"])
+def test_pictures_of_a_source_without_any_are_refused_before_a_scene_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str
+) -> None:
+    table = tmp_path / "markers.csv"
+    table.write_text("t,x,y,z\n0,0,0,0\n0.1,0,0,0\n")
+    out = tmp_path / "scene"
+    assert importing.main([str(table), f"--out={out}", f"{option}={tmp_path / 'kept.png'}"]) == 2
+    assert f"{option} {tmp_path / 'kept.png'} needs pictures with depth" in capsys.readouterr().err
+    assert not out.exists()
+
+
 def test_pictures_that_disagree_or_are_cut_short_are_refused_by_name(folder: Path) -> None:
     assert is_pictures(folder)
     (folder / "depth/11.png").unlink()

@@ -188,6 +188,7 @@ def test_no_task_writes_below_the_data_folder(runtime_with, fit: Fit, stores: St
 def test_a_dataset_is_sealed_under_the_digest_of_its_manifest(runtime_with, fit: Fit, stores: Stores) -> None:
     job, dataset = _make_dataset(runtime_with(), fit, episodes=EPISODES, frames=8, seed=7)
     assert (job.state, dataset.state) == ("succeeded", "sealed")
+    assert job.progress.done == job.progress.total == EPISODES  # also what was told last
     assert dataset.statistics["episodes"] == EPISODES and dataset.statistics["frames"] == 8 * EPISODES
     assert dataset.digest is not None
     lines = []
