@@ -47,3 +47,19 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip("the measured recordings (../shared/data) are not on this machine")
     return folder
+
+
+@pytest.fixture(scope="session")
+def gpu() -> str:
+    """A GPU's name in Warp and torch; the test is skipped where there is none.
+
+    Such tests compare it with the CPU. All others of the simulation run on it where ``PHYSWORLD_DEVICE=cuda:0`` is set.
+    """
+    import torch
+    import warp as wp
+
+    wp.config.quiet = True
+    wp.init()
+    if not torch.cuda.is_available() or not wp.get_cuda_device_count():
+        pytest.skip("no CUDA device on this machine")
+    return "cuda:0"

@@ -36,17 +36,15 @@ from torch_geometric.nn import MessagePassing
 from benchmarks.harness import Report, Timing, interleave, run_alone
 from benchmarks.peers.plain_network import PlainNetwork
 from benchmarks.peers.spring_mass import SUBSTEPS, SpringMass
+from benchmarks.speed.held_bar import held_bar, held_bar_sequence
 from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Scene
 from physworld.twin.build import build_twin
-from physworld.worldmodel.model.config import WorldModelConfig
-from physworld.worldmodel.model.features import Normalisation
-from physworld.worldmodel.model.graph import GraphSpec, build_graph
+from physworld.worldmodel.model.graph import GraphSpec
 from physworld.worldmodel.model.model import WorldModel
 from physworld.worldmodel.native.engine import RolloutEngine
 from physworld.worldmodel.rollout import unroll
 
 HIDDEN = (64, 128)
-VERTICES, CONTROLS, SPACING_M = 146, 4, 0.01
 OUR_FRAMES, PEER_FRAMES, BATCH = 204, 34, 8
 CANDIDATES, BATCH_STEPS = 32, 30
 BAR_M = np.array([0.4, 0.08, 0.08])
@@ -171,10 +169,10 @@ def measure(repeats: int, seed: int) -> Report:
 
 def cases_of(hidden: int, seed: int) -> tuple[dict[str, Callable[[], float]], GraphSpec]:
     """What is measured of the model at one width, by name, each of ``LABELS``; the graph."""
-    model, spec = _model(hidden, seed)
-    rebuilt, _ = _model(hidden, seed, "current")
+    model, spec = held_bar(hidden, seed)
+    rebuilt, _ = held_bar(hidden, seed, "current")
     naive = PlainNetwork(model)
-    start, driven, phi = _sequence(spec, seed)
+    start, driven, phi = held_bar_sequence(spec, seed, OUR_FRAMES)
     cases = {
         "ours": _engine_case(model, start, driven, phi),
         "ours_rebuilt": _engine_case(rebuilt, start, driven, phi),
@@ -186,33 +184,6 @@ def cases_of(hidden: int, seed: int) -> tuple[dict[str, Callable[[], float]], Gr
         **_batch_cases(model, start, driven, phi),
     }
     return cases, spec
-
-
-def _model(hidden: int, seed: int, near_edges: str = "material") -> tuple[WorldModel, GraphSpec]:
-    """A bar held at one end, random weights."""
-    axes = (np.arange(40), np.arange(8), np.arange(8))
-    bar = SPACING_M * np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    config = WorldModelConfig(
-        hidden=hidden, vertices=VERTICES, neighbours=7, coarse_vertices=8, near_edges=near_edges
-    )
-    groups = (np.arange(CONTROLS),)
-    spec = build_graph(bar, bar, bar[:CONTROLS], dt_s=1 / 30, config=config, control_groups=groups)
-    scales = Normalisation(3e-3, 1e-3, (1e-3,) * 3, (4e-3,) * 3, (4e-3,) * 3, (0.2, 0.1))
-    torch.manual_seed(seed)
-    model = WorldModel(config, spec, scales)
-    with torch.no_grad():  # they start at zero, and the engine leaves out a network that adds nothing
-        model.skip.weight.normal_(0.0, 0.01)
-        model.decoder.out.weight.normal_(0.0, 0.01)
-    return model, spec
-
-
-def _sequence(spec: GraphSpec, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Start (h+1, n, 3), control path (T, C, 3), properties (n, 2)."""
-    rng = np.random.default_rng(seed)
-    start = spec.rest_vertices + rng.normal(0.0, 1e-3, (4, spec.object_count, 3))
-    controls = spec.rest_vertices[spec.neighbours[spec.object_count :, 0]]
-    sway = 0.01 * np.sin(0.3 * np.arange(OUR_FRAMES))[:, None, None]
-    return start, controls + sway, rng.normal(0.0, 0.1, (spec.object_count, 2))
 
 
 def _engine_case(

@@ -46,6 +46,7 @@ from physworld.calibrate.local_stage import LocalResult
 from physworld.calibrate.parameters import Parameter, affordable, flow_law, parameters_of, relaxing
 from physworld.calibrate.rods import calibrate_rod
 from physworld.calibrate.search import Progress, Search
+from physworld.devices import default_device
 from physworld.engine.thin.triangles import Mesh
 from physworld.estimation.journal import Journal
 from physworld.estimation.least_squares import Solution
@@ -91,7 +92,7 @@ class CalibrationConfig:
 
     particle_budget: int = 2000
     max_simulations: int = 400
-    device: str = "cpu"
+    device: str = field(default_factory=default_device)
     damping: Literal["auto", "none"] = "auto"
     bending: Literal["auto", "declared"] = "auto"
     law: str | None = None

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
 from physworld.arrays import Array
+from physworld.devices import default_device
 from physworld.engine.lattice.lattice import Lattice
 from physworld.engine.terms.term import Term
 from physworld.materials.laws import Law
@@ -53,7 +54,7 @@ class Problem:
     friction_factor: Array | None = None
     span_s: tuple[float, float] | None = None
     sections: Sections | None = None
-    device: str = field(default="cpu")
+    device: str = field(default_factory=default_device)
 
     def nodal_mass(self) -> Array:
         """Lumped nodal masses [kg], (n,)."""

@@ -14,6 +14,7 @@ import numpy as np
 import warp as wp
 
 from physworld.arrays import Array
+from physworld.devices import default_device
 from physworld.errors import SceneUnsupported
 from physworld.shapes import sdf_kernels as kernels
 from physworld.shapes.surface_mesh import SurfaceMesh, require_closed
@@ -109,7 +110,7 @@ def half_space() -> Shape:
 
 
 def mesh_shape(
-    mesh: SurfaceMesh, margin_m: float = 0.0, cells: int = _MESH_CELLS, device: str = "cpu"
+    mesh: SurfaceMesh, margin_m: float = 0.0, cells: int = _MESH_CELLS, device: str | None = None
 ) -> Shape:
     """Sampled distances to a closed mesh; a :class:`trimesh.Trimesh` has the same ``vertices`` and ``faces``.
 
@@ -122,6 +123,7 @@ def mesh_shape(
     Raises:
         SceneUnsupported: the mesh is not closed, or thinner than the grid can show.
     """
+    device = device or default_device()
     mesh = require_closed(
         SurfaceMesh(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)), "a shape"
     )

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from physworld.arrays import Array
+from physworld.devices import default_device
 from physworld.engine.formulations import RODS, Formulation, choose_formulation
 from physworld.engine.rods.chain import Chain
 from physworld.engine.thin.self_contact import COARSE, apart_m, refuse_thickness
@@ -43,7 +44,7 @@ _DRIVEN_SHARE = 5e-4  # controllers that moved this share of the body's size dri
 def build_twin(
     scene: Scene,
     particle_budget: int = 2000,
-    device: str = "cpu",
+    device: str | None = None,
     refinement: float = 1.0,
     plasticity: Plasticity | None = None,
     formulation: str = "auto",
@@ -56,7 +57,7 @@ def build_twin(
         scene: the recording.
         particle_budget: about how many particles a solid gets, see :func:`physworld.geometry.reference.reference_body`
             for sheets and rods.
-        device: Warp device of the simulations.
+        device: Warp device of the simulations; by default :func:`physworld.devices.default_device`.
         refinement: cells are this many times smaller along every axis, whatever the body.
         plasticity: flow law, or None.
         formulation: "total_lagrangian", "updated_lagrangian", or "auto": by the law and the scene. The body's notes say
@@ -123,7 +124,7 @@ def build_twin(
         plasticity=plasticity,
         formulation=choice.formulation.name,
         transfer=transfer,
-        device=device,
+        device=device or default_device(),
     )
 
 

@@ -10,7 +10,7 @@ total Lagrangian form, the particles in the updated one (:mod:`physworld.engine.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -19,6 +19,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.sparse.linalg import splu
 
 from physworld.arrays import Array
+from physworld.devices import default_device
 from physworld.effects.base import Effect
 from physworld.effects.registry import in_order
 from physworld.engine.formulations import FORMULATIONS, Formulation, Start
@@ -101,7 +102,7 @@ class Twin:
     properties: Array | None = None
     natural: Array | None = None
     drive: Array | None = None
-    device: str = "cpu"
+    device: str = field(default_factory=default_device)
 
     @property
     def lattice(self) -> Lattice:
@@ -359,9 +360,9 @@ class Twin:
         return arrays_of(self)
 
     @classmethod
-    def from_arrays(cls, arrays: dict[str, Array], device: str = "cpu") -> Twin:
+    def from_arrays(cls, arrays: dict[str, Array], device: str | None = None) -> Twin:
         """The twin that :meth:`to_arrays` took apart, to be simulated on ``device``."""
-        return cls(**parts_of(arrays), device=device)
+        return cls(**parts_of(arrays), device=device or default_device())
 
     @property
     def contacts(self) -> tuple[Term, ...]:

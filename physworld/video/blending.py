@@ -7,7 +7,7 @@ V less what was summed before it. Both kernels walk from front to back.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ import warp as wp
 from torch import Tensor
 
 from physworld.arrays import Array
+from physworld.devices import default_device
 from physworld.video.render_kernels import TILE, blend, blend_adjoint
 
 
@@ -35,7 +36,7 @@ class Canvas:
     starts: Array
     order: Array
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    device: str = "cpu"
+    device: str = field(default_factory=default_device)
 
     def arrays(self, *given: Array) -> list[Any]:
         """Warp arrays of tiles, centres, conics, opacities, colours and depths."""

@@ -76,7 +76,7 @@ class Drawing:
         rest: Array,
         camera: Camera,
         splat: Gaussians | None = None,
-        device: str = "cpu",
+        device: str | None = None,
     ) -> None:
         if splat is None:
             splat = gaussians_at_points(rest[:: max(1, -(-len(rest) // MOST_DRAWN))])

@@ -14,6 +14,7 @@ import torch
 
 from physworld.arrays import Array
 from physworld.camera import Camera
+from physworld.devices import default_device
 from physworld.video.blending import Canvas, blended
 from physworld.video.gaussians import SH_DC, Gaussians
 from physworld.video.projection import matrices, project, tiles
@@ -45,9 +46,12 @@ class Renderer:
     """
 
     def __init__(
-        self, camera: Camera, background: tuple[float, float, float] = (1.0, 1.0, 1.0), device: str = "cpu"
+        self,
+        camera: Camera,
+        background: tuple[float, float, float] = (1.0, 1.0, 1.0),
+        device: str | None = None,
     ) -> None:
-        self.camera, self.device = camera, device
+        self.camera, self.device = camera, device or default_device()
         self.background = background
 
     def render(self, gaussians: Gaussians, turn: Array | None = None) -> Picture:

@@ -10,7 +10,7 @@ opacities and colours; there is one colour a Gaussian, which a few cameras do no
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from physworld.arrays import Array
+from physworld.devices import default_device
 from physworld.errors import SplatNotFitted
 from physworld.video.blending import Blend, Canvas
 from physworld.video.gaussians import SH_DC, Gaussians
@@ -68,7 +69,7 @@ class SplatConfig:
     opacity_step: float = 5e-2
     colour_step: float = 5e-2
     seed: int = 0
-    device: str = "cpu"
+    device: str = field(default_factory=default_device)
 
     def __post_init__(self) -> None:
         if min(self.steps, self.most) < 1:

@@ -84,8 +84,11 @@ def rollout_batch(
 
 
 def rollout_tracks(model: WorldModel, tracks: list[Track]) -> list[Tensor]:
-    """Rollouts (T, V, 3) of episodes from their first h + 1 frames, all in one batch."""
-    return unroll_tracks(_with_constants(model), tracks, model.spec.object_count, model.config.history)
+    """Rollouts (T, V, 3) of episodes from their first h + 1 frames, all in one batch on the model's device."""
+    device = model.norm.change.device
+    there = [Track(track.positions.to(device), track.phi.to(device)) for track in tracks]
+    moved = unroll_tracks(_with_constants(model), there, model.spec.object_count, model.config.history)
+    return [path.cpu() for path in moved]
 
 
 def unroll_tracks(step: Step, tracks: list[Track], n: int, history: int) -> list[Tensor]:

@@ -1,15 +1,12 @@
 """Training the graph network on demonstration episodes (paper, section Model Training).
 
-    loss = mean_b Σ_{i=1..τ} ‖x_pred^{t+i} - x^{t+i}‖² / (Σ_{i=1..τ} ‖x̂^{t+i} - x^{t+i}‖² + τ σ_change²)
-
-unrolled from a random frame t whose history carries random-walk noise, so that training sees the kind of
-errors that a rollout makes; Φ carries noise too, so that it can be fine-tuned later. x̂ is the prior unrolled
-alone from the same frame: a sub-sequence counts by the share of the prior's error that is left, so that the few in
-which small errors grow fast do not drown the others. With a τ of a few frames the network learns corrections that do
-not last: τ is long from the first step. A running average of the weights is what is validated (open-loop
+The loss (``physworld.worldmodel.loss``) is of a sub-sequence of τ steps, unrolled from a random frame t whose history
+carries random-walk noise, so that training sees the kind of errors that a rollout makes; Φ carries noise too, so that
+it can be fine-tuned later. With a τ of a few frames the network learns corrections that do not last: τ is long from the
+first step. A running average of the weights is what is validated (open-loop
 rollouts of whole held-out episodes) and returned; the best one wins; ``patience`` validations without a better one end
-the training. The same seed, data and settings give the same weights, and so does a run that was interrupted and resumed
-from a checkpoint.
+the training. On a CPU the same seed, data and settings give the same weights, and so does a run that was interrupted
+and resumed from a checkpoint; on CUDA, where sums have no order of their own, they do up to rounding.
 
 A slack rope or a body that snaps through has sub-sequences in which a gradient grows without end over the unrolled
 frames. A step whose gradient is ``EXPLODED`` times the usual one, or no number, is left out and counted;
@@ -40,8 +37,9 @@ from physworld.worldmodel.errors import (
     TrainingCancelled,
     TrainingDiverged,
 )
+from physworld.worldmodel.loss import GraphedLoss, Loss, plain_loss
 from physworld.worldmodel.model.config import TrainingConfig, WorldModelConfig
-from physworld.worldmodel.model.features import Normalisation
+from physworld.worldmodel.model.features import Normalisation, Scales
 from physworld.worldmodel.model.graph import GraphSpec
 from physworld.worldmodel.model.inertia import one_step_residual
 from physworld.worldmodel.model.model import WorldModel
@@ -84,7 +82,8 @@ class TrainingResult:
 
 @dataclass
 class _Run:
-    """Everything that changes while training; what a checkpoint holds.
+    """Everything that changes while training; what a checkpoint holds, but for ``norm``, the model's scales on the CPU,
+    and ``gradient``, which computes its losses.
 
     ``usual``: running norm of the gradient, 0 before the first; ``loss`` of the last step that was used, at first that
     of the prior alone; ``in_a_row`` and ``left_out``: steps left out, lately and in all.
@@ -94,6 +93,8 @@ class _Run:
     average: WorldModel
     optimiser: torch.optim.Adam
     generator: torch.Generator
+    norm: Scales
+    gradient: Loss
     step: int = 0
     best_error_m: float = math.inf
     best_step: int = 0
@@ -125,6 +126,7 @@ def train(
     progress: Callable[[int, int, float], None] | None = None,
     validated: Callable[[int, float], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
+    device: str = "cpu",
 ) -> TrainingResult:
     """Train on ``tracks``; see the module's docstring.
 
@@ -141,6 +143,7 @@ def train(
         progress: called after each step with (step, steps, loss).
         validated: called after each validation with (step, open-loop error [m]).
         cancelled: asked before each step; true raises TrainingCancelled.
+        device: of the network while it learns, "cpu" or "cuda:0"; data, priors and result are on the CPU.
     """
     if not tracks:
         raise DatasetUnusable("no episode to train on")
@@ -164,7 +167,7 @@ def train(
         spec,
         lambda track: one_step_residual(ahead, track.positions, track.phi, spec.object_count, h),
     )
-    run = _start(config, spec, scales, prior, columns, training)
+    run = _start(config, spec, scales, prior, columns, training, torch.device(device))
     identity = _identity(config, training, scales)
     if checkpoint is not None:
         _restore(run, checkpoint, identity)
@@ -191,7 +194,7 @@ def train(
             progress(run.step, training.steps, run.loss)
     run.average.load_state_dict(run.best_weights)
     return TrainingResult(
-        model=run.average,
+        model=run.average.cpu(),
         validation=run.validation,
         losses=run.losses,
         best_step=run.best_step,
@@ -238,45 +241,34 @@ def _start(
     prior: Prior,
     columns: tuple[PhiColumn, ...],
     training: TrainingConfig,
+    device: torch.device,
 ) -> _Run:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(training.seed)
-        model = WorldModel(config, spec, scales, prior, columns)
+        model = WorldModel(config, spec, scales, prior, columns).to(device)
     generator = torch.Generator().manual_seed(training.seed)
     optimiser = torch.optim.Adam(model.parameters(), lr=training.learning_rate)
-    return _Run(model, copy.deepcopy(model), optimiser, generator)
+    gradient = GraphedLoss() if GraphedLoss.fits(model) else plain_loss
+    return _Run(model, copy.deepcopy(model), optimiser, generator, Scales(scales, spec), gradient)
 
 
 def _train_step(run: _Run, sampler: WindowSampler, training: TrainingConfig, look_ahead: int) -> None:
     """One optimiser step, or none where the gradient explodes. Raises TrainingDiverged."""
     model, h = run.model, run.model.config.history
     batch = sampler.draw(h + 1 + look_ahead, training.batch_size, run.generator)
-    n, change = model.spec.object_count, model.norm.change
-    window = _with_noise(batch.positions[: h + 1], n, training.noise_history * change, run.generator)
-    noise = torch.randn(batch.phi.shape, generator=run.generator) * model.norm.properties
+    n, norm = model.spec.object_count, run.norm
+    window = _with_noise(batch.positions[: h + 1], n, training.noise_history * norm.change, run.generator)
+    noise = torch.randn(batch.phi.shape, generator=run.generator) * norm.properties
     phi = batch.phi + training.noise_properties * noise
-    constants = model.edge_constants()
-    alone = window
-    left = beside = torch.zeros(training.batch_size)
-    for truth in batch.positions[h + 1 :]:
-        predicted = model.step(window, truth[n:], phi, constants)
-        left = left + _squared(predicted[:n] - truth[:n])
-        window = torch.cat([window[1:], predicted[None]])
-        with torch.no_grad():
-            ahead = model.prior_ahead(alone, truth[n:], phi)
-            beside = beside + _squared(ahead - truth[:n])
-            alone = torch.cat([alone[1:], torch.cat([ahead, truth[n:]])[None]])
-    loss = (left / (beside + look_ahead * change.square())).mean()
     share = run.step / training.steps
     floor = training.learning_rate_floor
     warm = min(1.0, (run.step + 1) / (WARM_UP_SHARE * training.steps))
     rate = warm * training.learning_rate * (floor + (1.0 - floor) * 0.5 * (1.0 + math.cos(math.pi * share)))
     for group in run.optimiser.param_groups:
         group["lr"] = rate
-    run.optimiser.zero_grad(set_to_none=True)
-    loss.backward()  # type: ignore[no-untyped-call]  # torch's has no types
-    norm = torch.nn.utils.clip_grad_norm_(model.parameters(), training.gradient_clip)
-    if not _usable(run, loss.item(), norm.item()):
+    loss = run.gradient(model, window, batch.positions[h + 1 :], phi)
+    size = torch.nn.utils.clip_grad_norm_(model.parameters(), training.gradient_clip)
+    if not _usable(run, loss.item(), size.item()):
         return
     run.optimiser.step()
     keep = min(training.average_decay, (1.0 + run.step) / (10.0 + run.step))
@@ -297,11 +289,6 @@ def _usable(run: _Run, loss: float, norm: float) -> bool:
     if run.in_a_row >= MOST_LEFT_OUT:
         raise TrainingDiverged(run.step + 1 - run.in_a_row, loss)
     return False
-
-
-def _squared(gap: Tensor) -> Tensor:
-    """Mean over vertices of the squared length of (n, B, 3), (B,)."""
-    return gap.square().sum(dim=-1).mean(dim=0)
 
 
 def _with_noise(window: Tensor, n: int, scale: Tensor, generator: torch.Generator) -> Tensor:
@@ -358,7 +345,7 @@ def _checkpoint(run: _Run, identity: dict[str, Any]) -> bytes:
 
 
 def _restore(run: _Run, checkpoint: bytes, identity: dict[str, Any]) -> None:
-    held = torch.load(io.BytesIO(checkpoint), weights_only=True)
+    held = torch.load(io.BytesIO(checkpoint), map_location="cpu", weights_only=True)
     if held["identity"] != repr(identity):
         raise CheckpointMismatch(f"checkpoint of {held['identity']}, but this run is {identity!r}")
     run.model.load_state_dict(held["model"])

@@ -193,6 +193,7 @@ def _train(
             progress=progress,
             validated=validated,
             cancelled=context.cancelled,
+            device=stores.settings.device,
         )
 
     try:

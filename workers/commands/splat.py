@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from physworld.arrays import Array
+from physworld.devices import default_device
 
 if TYPE_CHECKING:
     from physworld.video import FittedSplat, SplatConfig, SplatView
@@ -40,7 +41,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--steps", type=int, default=None, help="of the fit")
     parser.add_argument("--most", type=int, default=None, help="Gaussians at most")
     parser.add_argument("--json", type=Path, default=None, help="write the losses to this file")
-    parser.add_argument("--device", default="cpu", help="cpu or cuda")
+    parser.add_argument("--device", default=default_device(), help="cpu or cuda:0")
     return parser
 
 

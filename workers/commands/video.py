@@ -26,6 +26,7 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.camera import Camera
+from physworld.devices import default_device
 from physworld_schemas.wording import reason
 
 _MOTIONS = ("vertices", "particles", "tracks", "points", "after")
@@ -55,7 +56,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--against", type=Path, default=None, help="frames to compare with: folder or npz")
     parser.add_argument("--lpips", type=Path, default=None, help="torch.export program of LPIPS")
     parser.add_argument("--json", type=Path, default=None, help="write the scores to this file")
-    parser.add_argument("--device", default="cpu", help="cpu or cuda")
+    parser.add_argument("--device", default=default_device(), help="cpu or cuda:0")
     return parser
 
 

@@ -27,7 +27,7 @@ a plane or in space.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -47,11 +47,26 @@ class GripFrame:
     shape: Array
     fall: Array
     line: Array
+    _tensors: dict[tuple[torch.device, torch.dtype], tuple[Tensor, Tensor, Tensor]] = field(
+        default_factory=dict, init=False, compare=False, repr=False
+    )
 
     @property
     def shape_square(self) -> float:
         """Σ |shape|² [m²]."""
         return float((self.shape**2).sum())
+
+    def tensors(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """``shape``, ``fall`` and ``line`` of the kind of ``like``: copied to its device once."""
+        key, values = (like.device, like.dtype), (self.shape, self.fall, self.line)
+        if torch.compiler.is_exporting():  # what is exported holds its constants itself
+            shape, fall, line = (like.new_tensor(value) for value in values)
+            return shape, fall, line
+        if key not in self._tensors:
+            with torch.inference_mode(False):  # so that gradients may be taken with them
+                shape, fall, line = (like.new_tensor(value) for value in values)
+            self._tensors[key] = shape, fall, line
+        return self._tensors[key]
 
 
 def grip_frame(controls: Array, gravity_m_s2: Array, dt_s: float) -> GripFrame | None:
@@ -66,12 +81,12 @@ def grip_frame(controls: Array, gravity_m_s2: Array, dt_s: float) -> GripFrame |
 
 def turn_of(frame: GripFrame, controls: Tensor) -> tuple[Tensor, Tensor]:
     """R (B, 3, 3) and c̄ (B, 3) of control vertices (C, B, 3)."""
-    shape = controls.new_tensor(frame.shape)
+    shape, _, line = frame.tensors(controls)
     centre = controls.mean(dim=0)
     arms = controls - centre
     seen = torch.einsum("cbi,cj->bij", arms, shape) / frame.shape_square
     if np.any(frame.line):
-        return _least_turn(seen, controls.new_tensor(frame.line)), centre
+        return _least_turn(seen, line), centre
     size = torch.linalg.vector_norm(seen, dim=(1, 2), keepdim=True)
     return polar(seen + cofactors(seen) / size), centre
 
@@ -91,7 +106,9 @@ def _least_turn(seen: Tensor, line: Tensor) -> Tensor:
     none = torch.zeros_like(x)
     cross = torch.stack([none, -z, y, z, none, -x, -y, x, none], dim=1).reshape(-1, 3, 3)
     near = (1.0 + onto @ line).clamp(min=OPPOSITE)
-    turned: Tensor = torch.eye(3, dtype=seen.dtype) + cross + cross @ cross / near[:, None, None]
+    turned: Tensor = (
+        torch.eye(3, dtype=seen.dtype, device=seen.device) + cross + cross @ cross / near[:, None, None]
+    )
     return turned
 
 
@@ -132,14 +149,15 @@ def enter(
         n: object vertices.
     """
     rotation, centre = turn_of(frame, control_next)
-    ticks = torch.arange(1 - len(window), 1, dtype=window.dtype)
-    fallen = (ticks.square()[:, None] * window.new_tensor(frame.fall))[:, None, None]
+    ticks = torch.arange(1 - len(window), 1, dtype=window.dtype, device=window.device)
+    fall = frame.tensors(window)[1]
+    fallen = (ticks.square()[:, None] * fall)[:, None, None]
     local = torch.einsum("svbi,bij->svbj", window - centre - fallen, rotation)
-    ahead = torch.einsum("cbi,bij->cbj", control_next - centre - window.new_tensor(frame.fall), rotation)
+    ahead = torch.einsum("cbi,bij->cbj", control_next - centre - fall, rotation)
     return (rotation, centre), local, ahead
 
 
 def leave(frame: GripFrame, turn: tuple[Tensor, Tensor], ahead: Tensor) -> Tensor:
     """x^{t+1} of ŷ^{t+1} (n, B, 3)."""
     rotation, centre = turn
-    return torch.einsum("vbj,bij->vbi", ahead, rotation) + centre + ahead.new_tensor(frame.fall)
+    return torch.einsum("vbj,bij->vbi", ahead, rotation) + centre + frame.tensors(ahead)[1]

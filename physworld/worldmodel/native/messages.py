@@ -10,7 +10,7 @@ plain torch does.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from types import ModuleType
 from typing import Any
@@ -36,6 +36,21 @@ class EdgeList:
     senders: Tensor
     receivers: Tensor
     order: Array
+    _elsewhere: dict[torch.device, tuple[Tensor, Tensor, Tensor]] = field(
+        default_factory=dict, init=False, compare=False, repr=False
+    )
+
+    def on(self, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+        """Senders, receivers and the receivers' number of edges, at least 1, on a device: copied to it once."""
+        if device not in self._elsewhere:
+            with torch.inference_mode(False):  # so that gradients may be taken with them
+                degree = self.offsets.diff().clamp(min=1)
+                self._elsewhere[device] = (
+                    self.senders.to(device),
+                    self.receivers.to(device),
+                    degree.to(device),
+                )
+        return self._elsewhere[device]
 
     @classmethod
     def from_neighbours(cls, neighbours: Array, kind: Array, kinds: int) -> EdgeList:
@@ -76,12 +91,11 @@ def mean_messages_torch(
     edges: EdgeList, heard: Tensor, sent: Tensor, bias: Tensor, length: Tensor, weight: Tensor
 ) -> Tensor:
     """The same in plain torch, on any device and in any precision: the arguments of :func:`mean_messages`."""
-    senders, receivers = edges.senders.to(heard.device), edges.receivers.to(heard.device)
-    along = sent.flatten(0, 1)[senders] + heard.flatten(0, 1)[receivers]
-    weights = weight[receivers // heard.shape[1]]
+    senders, receivers, degree = edges.on(heard.device)
+    along = sent.flatten(0, 1).index_select(0, senders) + heard.flatten(0, 1).index_select(0, receivers)
+    weights = weight.index_select(0, receivers // heard.shape[1])
     messages = torch.relu(along + bias[:, None] + length[..., None] * weights[:, None])
     total = torch.zeros_like(heard).flatten(0, 1).index_add(0, receivers, messages)
-    degree = edges.offsets.diff().clamp(min=1).to(heard.device)
     return (total / degree[:, None, None]).view_as(heard)
 
 

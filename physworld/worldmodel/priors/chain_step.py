@@ -131,7 +131,7 @@ class ChainStep(nn.Module):
         weight = step**2 * (self._free * self.gravity).permute(2, 0, 1)
         tense, dash, before = pull * self.length[:, None], self.dash[:, None] * substeps, None
         still, back = 1.0 - self._free[..., 0], -self._differ.T
-        times = step * torch.arange(substeps + 1, dtype=place.dtype)[:, None, None, None]
+        times = step * torch.arange(substeps + 1, dtype=place.dtype, device=place.device)[:, None, None, None]
         led = torch.diff(here + times * (slope + 0.5 * times * turn), dim=0)
         for substep in range(substeps):
             pulled, bent = (self._differ @ place).split(self._counts, dim=1)  # type: ignore[no-untyped-call]  # torch's has no types

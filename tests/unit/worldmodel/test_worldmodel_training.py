@@ -119,7 +119,7 @@ def test_a_step_whose_gradient_explodes_is_left_out(
 
 
 def test_only_what_is_far_from_usual_explodes() -> None:
-    run = training_module._Run(None, None, None, None)  # type: ignore[arg-type]
+    run = training_module._Run(*[None] * 6)  # type: ignore[arg-type]
     used = [training_module._usable(run, 0.5, norm) for norm in (2.0, 3.0, 40.0, 1e9, float("inf"), 5.0)]
     assert used == [True, True, True, False, False, True]
     assert (run.left_out, run.in_a_row) == (2, 0)

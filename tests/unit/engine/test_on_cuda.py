@@ -1,0 +1,84 @@
+"""Twins move on a GPU as on a CPU, alone and side by side."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_scene import FPS, box_body, made_scene
+
+from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Ground, Scene
+from physworld.twin.batch import Episode, simulate_batch
+from physworld.twin.build import build_twin
+from physworld.twin.twin import Twin
+
+FRAMES = 12
+MOVED_M = 0.02  # what the grips do
+SAME_M = 2e-5  # solids strain in single precision, and sums have another order
+PLATE = np.array([[0.0, 0.0, 0.0], [0.0, 0.03, 0.0], [0.0, 0.0, 0.03]])
+
+
+def solid() -> Scene:
+    points = np.linspace([0.04, 0.02, 0.04], [0.16, 0.02, 0.04], 4)
+    grips = (Grip((0, 1, 2), np.zeros(3), np.array([0.032, 0.04, 0.04])),)
+    body = box_body([0, 0, 0], [0.16, 0.04, 0.04], density_kg_m3=500.0)
+    return made_scene(
+        points, "beam", PLATE, FRAMES, body=body, grips=grips, ground=Ground(-0.001, 0.4),
+        initial_state=UNDEFORMED_AT_REST,
+    )  # fmt: skip
+
+
+def sheet() -> Scene:
+    plane = np.stack(np.meshgrid(*[np.linspace(0, 0.2, 3)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
+    points = np.concatenate([plane, np.zeros((9, 1))], axis=1)
+    return made_scene(
+        points, "sheet", PLATE, FRAMES, body=Body(thickness_m=2e-3), initial_state=UNDEFORMED_AT_REST
+    )
+
+
+def rope() -> Scene:
+    points = np.linspace([0.0, 0.0, 0.0], [0.3, 0.0, 0.0], 5)
+    return made_scene(
+        points, "rope", PLATE[:1], FRAMES, body=Body(radius_m=0.004), initial_state=UNDEFORMED_AT_REST
+    )
+
+
+SCENES = {make.__name__: make for make in (solid, sheet, rope)}
+
+
+def lifted(twin: Twin, direction: float) -> Episode:
+    times = np.arange(FRAMES) / FPS
+    shift = MOVED_M * np.sin(0.5 * np.pi * times * FPS / 10)[:, None, None] ** 2 * [0.3 * direction, 0.2, 1.0]
+    return Episode(times, twin.controllers_start + shift, times)
+
+
+def nodes_of(twin: Twin, one: Episode) -> np.ndarray:
+    return twin.simulate(one.control_times, one.control_points, one.frame_times)
+
+
+@pytest.mark.parametrize("formulation", ["auto", "updated_lagrangian"])
+@pytest.mark.parametrize("shape", SCENES)
+def test_a_twin_moves_as_on_a_cpu(shape: str, formulation: str, gpu: str) -> None:
+    if shape != "solid" and formulation != "auto":
+        pytest.skip("the updated form is of solids")
+    here, there = (
+        build_twin(SCENES[shape](), 400, device=device, formulation=formulation) for device in ("cpu", gpu)
+    )
+    one = lifted(here, 1.0)
+    expected, found = nodes_of(here, one), nodes_of(there, one)
+    assert np.abs(expected - expected[0]).max() > 0.3 * MOVED_M
+    assert np.abs(found - expected).max() < SAME_M
+
+
+@pytest.mark.parametrize("shape", SCENES)
+def test_episodes_side_by_side_move_as_on_a_cpu(shape: str, gpu: str) -> None:
+    here = build_twin(SCENES[shape](), 400, device="cpu")
+    there = replace(here, device=gpu)
+    episodes = [lifted(here, direction) for direction in np.linspace(-1.0, 1.0, 16)]
+    expected, found = (
+        [outcome.trusted() for outcome in simulate_batch(twin, episodes)] for twin in (here, there)
+    )
+    assert np.abs(expected[0] - expected[-1]).max() > 1e-3
+    for one, other in zip(expected, found, strict=True):
+        assert np.abs(one - other).max() < SAME_M
