@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import warp as wp
 from scipy.optimize import brentq
@@ -20,6 +22,7 @@ from benchmarks.verification.cases import (
     ringing,
     run,
 )
+from physworld.devices import default_device
 from physworld.engine.lattice.lattice import Lattice, box_lattice
 from physworld.engine.problem import Problem, nodal_mass
 from physworld.engine.terms.contact import GroundContact
@@ -29,6 +32,7 @@ from physworld.engine.total.formulation import TotalLagrangian
 from physworld.materials.neo_hookean import NeoHookean
 from physworld.materials.solid import SolidLaw
 
+_ON: dict[str, Any] = {"device": default_device()}
 LENGTH, DEPTH = 0.3, 0.03
 STIFF = NeoHookean(2e6, 0.0, density_kg_m3=600.0)
 CLAMPED_FREE = 1.8751040687  # first root of cos x cosh x = -1
@@ -237,9 +241,13 @@ def twist_patch(cells: float) -> float:
 
 def internal_forces(lattice: Lattice, law: SolidLaw, x: np.ndarray) -> np.ndarray:
     """Internal forces (n, 3) [N] at nodal positions ``x`` (n, 3)."""
-    forces = InternalForces(lattice, law, np.ones(lattice.fill.size), rest_nodes(lattice), "cpu")
-    out = wp.zeros(x.size, dtype=wp.float64)
-    forces.launch(wp.array(x.reshape(-1), dtype=wp.float64), wp.zeros(3, dtype=wp.float64), out)
+    forces = InternalForces(lattice, law, np.ones(lattice.fill.size), rest_nodes(lattice), default_device())
+    out = wp.zeros(x.size, dtype=wp.float64, **_ON)
+    forces.launch(
+        wp.array(x.reshape(-1), dtype=wp.float64, **_ON),
+        wp.zeros(3, dtype=wp.float64, **_ON),
+        out,
+    )
     return out.numpy().reshape(-1, 3)
 
 

@@ -6,6 +6,8 @@ differences, and find the moment at which the stiffness of the free nodes become
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import warp as wp
 from scipy.linalg import eigh, null_space
@@ -13,12 +15,14 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from benchmarks.verification.cases import Case
+from physworld.devices import default_device
 from physworld.engine.lattice.lattice import Lattice, box_lattice
 from physworld.engine.problem import Problem
 from physworld.engine.thin.twist import BoundTwist, Twist, span_between
 from physworld.engine.total.forces import InternalForces
 from physworld.materials.rod import RodLaw
 
+_ON: dict[str, Any] = {"device": default_device()}
 LENGTH = 0.4
 ROD = RodLaw(stretching_n=2e4, bending_n_m2=2e-2, density_kg_m=0.05)
 GREENHILL = 2 * brentq(lambda x: np.sin(x) - x * np.cos(x), 4.4, 4.6)
@@ -52,18 +56,21 @@ class _Forces:
         turn = Rotation.from_rotvec(np.array([0.0, 1.0])[:, None] * axis / np.linalg.norm(axis)).as_matrix()
         still = np.repeat(np.eye(3)[None], 2, axis=0)
         self._twist = _bound(lattice, start, np.stack([still, turn]), np.array([0.0, 1.0]))
-        self._law = InternalForces(lattice, ROD, np.ones(lattice.fill.size), start, "cpu")
-        self._still = wp.zeros(3, dtype=wp.float64)
-        self._clock = wp.array([1.0, 1.0, 1.0], dtype=wp.float64)
-        self._counter = wp.array([1, 0, 1], dtype=wp.int32)
+        self._law = InternalForces(lattice, ROD, np.ones(lattice.fill.size), start, default_device())
+        self._still = wp.zeros(3, dtype=wp.float64, **_ON)
+        self._clock = wp.array([1.0, 1.0, 1.0], dtype=wp.float64, **_ON)
+        self._counter = wp.array([1, 0, 1], dtype=wp.int32, **_ON)
 
     def law(self, x: np.ndarray) -> np.ndarray:
-        force = wp.zeros(x.size, dtype=wp.float64)
-        self._law.launch(wp.array(x.reshape(-1), dtype=wp.float64), self._still, force)
+        force = wp.zeros(x.size, dtype=wp.float64, **_ON)
+        self._law.launch(wp.array(x.reshape(-1), dtype=wp.float64, **_ON), self._still, force)
         return force.numpy()
 
     def twist(self, x: np.ndarray) -> np.ndarray:
-        force, nodes = wp.zeros(x.size, dtype=wp.float64), wp.array(x.reshape(-1), dtype=wp.float64)
+        force, nodes = (
+            wp.zeros(x.size, dtype=wp.float64, **_ON),
+            wp.array(x.reshape(-1), dtype=wp.float64, **_ON),
+        )
         self._twist.launch(nodes, nodes, self._clock, self._counter, force)
         return force.numpy() / self._twist.moments_n_m[0]
 
@@ -156,10 +163,13 @@ def writhe(cells: float, height: float = 0.45, frames: int = 31) -> float:
         slope = _coil(np.array([1e-6]), share * height)[0] - _coil(np.array([-1e-6]), share * height)[0]
         turns.append(Rotation.from_rotvec([np.arctan2(slope[2], slope[1]), 0.0, 0.0]).as_matrix())
     bound = _bound(lattice, shapes[0], np.stack([turns, turns]), times)
-    clock = wp.array([times[1], 1 / times[1], times[1]], dtype=wp.float64)
+    clock = wp.array([times[1], 1 / times[1], times[1]], dtype=wp.float64, **_ON)
     for frame, x in enumerate(shapes):
-        nodes, force = wp.array(x.reshape(-1), dtype=wp.float64), wp.zeros(x.size, dtype=wp.float64)
-        bound.launch(nodes, nodes, clock, wp.array([frame, 0, 1], dtype=wp.int32), force)
+        nodes, force = (
+            wp.array(x.reshape(-1), dtype=wp.float64, **_ON),
+            wp.zeros(x.size, dtype=wp.float64, **_ON),
+        )
+        bound.launch(nodes, nodes, clock, wp.array([frame, 0, 1], dtype=wp.int32, **_ON), force)
     return float(bound.angles_rad[0] / (-2 * np.pi * gauss_writhe(height)) - 1)
 
 

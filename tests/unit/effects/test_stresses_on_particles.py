@@ -9,6 +9,7 @@ import pytest
 import warp as wp
 from effect_twins import TWINS
 
+from physworld.devices import default_device
 from physworld.effects.base import Effect
 from physworld.effects.registry import effect
 from physworld.engine.problem import Problem
@@ -28,7 +29,7 @@ class Stressed:
         problem = Problem(TWIN.lattice, TWIN.law, TWIN.body.rest, TWIN.gravity_m_s2)
         self.engine = UpdatedLagrangian(added.problem(problem, TWIN))
         self.count = len(self.engine.solid)
-        self.clock = wp.array([0.1, 1.0 / STEP, STEP], dtype=wp.float64, device="cpu")
+        self.clock = wp.array([0.1, 1.0 / STEP, STEP], dtype=wp.float64, device=default_device())
         self.substep = 0
         self.engine.terms.begin(np.array([0.0, 0.1]), np.zeros((self.count, 3)))
 
@@ -37,9 +38,9 @@ class Stressed:
         room = -(-self.count // 8) * 8
         whole = np.tile(np.eye(3), (room, 1, 1))
         whole[: self.count] = F
-        stress = wp.full(6 * room, before, dtype=wp.float32, device="cpu")
-        counter = wp.array([0, self.substep, 100], dtype=wp.int32, device="cpu")
-        none = wp.zeros(3 * self.count, dtype=wp.float32, device="cpu")
+        stress = wp.full(6 * room, before, dtype=wp.float32, device=default_device())
+        counter = wp.array([0, self.substep, 100], dtype=wp.int32, device=default_device())
+        none = wp.zeros(3 * self.count, dtype=wp.float32, device=default_device())
         self.engine.terms.launch(none, none, wp.array(whole, dtype=wp.mat33d), stress, self.clock, counter)
         self.substep += 1
         return stress.numpy().reshape(-1, 6)[: self.count] / self.engine.volume[:, None]

@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 from bodies import rest_nodes
 
+from physworld.devices import default_device
 from physworld.engine.lattice.lattice import box_lattice
 from physworld.engine.total.forces import InternalForces
 from physworld.materials.solid import SolidLaw
@@ -19,7 +20,7 @@ def nodal_forces(
     law: SolidLaw, x: np.ndarray, clock: tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> np.ndarray:
     """Internal forces [N] of the body at nodal positions (n, 3)."""
-    forces = InternalForces(LATTICE, law, np.ones(LATTICE.fill.size), REST, "cpu")
+    forces = InternalForces(LATTICE, law, np.ones(LATTICE.fill.size), REST, default_device())
     out = wp.zeros(x.size, dtype=wp.float64)
     forces.launch(wp.array(x.reshape(-1), dtype=wp.float64), wp.array(clock, dtype=wp.float64), out)
     return out.numpy().reshape(-1, 3)
@@ -33,7 +34,7 @@ def mean_stress(law: SolidLaw, F: np.ndarray) -> np.ndarray:
 
 def inverts(law: SolidLaw, F: np.ndarray) -> bool:
     """Whether the kernel reports an inversion at F."""
-    forces = InternalForces(LATTICE, law, np.ones(LATTICE.fill.size), REST, "cpu")
+    forces = InternalForces(LATTICE, law, np.ones(LATTICE.fill.size), REST, default_device())
     out = wp.zeros(REST.size, dtype=wp.float64)
     x = wp.array((REST @ F.T).reshape(-1), dtype=wp.float64)
     forces.launch(x, wp.zeros(3, dtype=wp.float64), out)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from physworld.devices import default_device
 from physworld.engine.updated.hencky_kernels import eigen_type, stretch
 
 EXACT = 1e-12
@@ -33,11 +34,11 @@ def test_principal_stretches_are_those_of_numpy(beside: str) -> None:
     F = np.array([CASES[beside], *CASES.values(), np.eye(3)])
     C = np.random.default_rng(5).normal(scale=10.0, size=F.shape).astype(np.float32)
     dt = 1e-3
-    clock = wp.array([0.1, 1.0 / dt, dt], dtype=wp.float64, device="cpu")
-    state = wp.array(F.reshape(-1), dtype=wp.float64, device="cpu")
-    eigen = wp.zeros(8, dtype=eigen_type, device="cpu")
-    velocity = wp.array(C.reshape(-1), dtype=wp.float32, device="cpu")
-    wp.launch(stretch, 1, inputs=[clock, velocity, state], outputs=[eigen], device="cpu")
+    clock = wp.array([0.1, 1.0 / dt, dt], dtype=wp.float64, device=default_device())
+    state = wp.array(F.reshape(-1), dtype=wp.float64, device=default_device())
+    eigen = wp.zeros(8, dtype=eigen_type, device=default_device())
+    velocity = wp.array(C.reshape(-1), dtype=wp.float32, device=default_device())
+    wp.launch(stretch, 1, inputs=[clock, velocity, state], outputs=[eigen], device=default_device())
     trial = F + dt * C.astype(float) @ F
     assert np.abs(state.numpy().reshape(-1, 3, 3) - trial).max() < 1e-14 * np.abs(trial).max()
     vectors, values = eigen.numpy()[:, :3], eigen.numpy()[:, 3]

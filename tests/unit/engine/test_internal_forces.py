@@ -8,6 +8,7 @@ import warp as wp
 from bodies import rest_nodes
 from scipy.spatial.transform import Rotation
 
+from physworld.devices import default_device
 from physworld.engine.lattice.lattice import Lattice, box_lattice
 from physworld.engine.total.forces import InternalForces
 from physworld.materials.laws import Law
@@ -39,7 +40,7 @@ BODIES = {
 def forces_of(
     lattice: Lattice, law: Law, x: np.ndarray, viscous_from: np.ndarray | None = None
 ) -> np.ndarray:
-    forces = InternalForces(lattice, law, np.ones(lattice.fill.size), rest_nodes(lattice), "cpu")
+    forces = InternalForces(lattice, law, np.ones(lattice.fill.size), rest_nodes(lattice), default_device())
     clock = wp.zeros(3, dtype=wp.float64)
     out = wp.zeros(x.size, dtype=wp.float64)
     if viscous_from is not None:
@@ -170,7 +171,7 @@ def test_internal_friction_dissipates_and_leaves_rigid_motion_alone(name: str, l
 def test_a_particle_without_material_never_stops_a_run() -> None:
     lattice = box_lattice(np.zeros(3), np.array([0.1, 0.05, 0.05]), (2, 1, 1))
     lattice.fill[0, 0] = 0.0
-    forces = InternalForces(lattice, SOLID, np.ones(lattice.fill.size), rest_nodes(lattice), "cpu")
+    forces = InternalForces(lattice, SOLID, np.ones(lattice.fill.size), rest_nodes(lattice), default_device())
     x = rest_nodes(lattice)
     out = wp.zeros(x.size, dtype=wp.float64)
     forces.launch(wp.array((-x).reshape(-1), dtype=wp.float64), wp.zeros(3, dtype=wp.float64), out)
@@ -180,4 +181,4 @@ def test_a_particle_without_material_never_stops_a_run() -> None:
 
 def test_a_law_of_another_dimension_is_refused() -> None:
     with pytest.raises(ValueError, match="does not fit a lattice of dimension 3"):
-        InternalForces(BODIES["solid"][0], ROD, np.ones(80), rest_nodes(BODIES["solid"][0]), "cpu")
+        InternalForces(BODIES["solid"][0], ROD, np.ones(80), rest_nodes(BODIES["solid"][0]), default_device())

@@ -8,6 +8,7 @@ import pytest
 import warp as wp
 
 from benchmarks.peers.flex_sheet import FlexSheet, record
+from physworld.devices import default_device
 from physworld.engine.thin.triangles import Mesh, triangle_lattice
 from physworld.engine.total.forces import InternalForces
 from physworld.materials.sheet import SheetLaw
@@ -38,7 +39,7 @@ def test_forces_of_a_crumpled_mesh_are_mujocos(cells: tuple[int, int], odd: bool
     data.qpos[:] = pushed.ravel()
     mujoco.mj_forward(model, data)
     lattice = triangle_lattice(np.array(sheet.size_m), Mesh(cells, odd))
-    forces = InternalForces(lattice, law_of(sheet), np.ones(lattice.fill.size), rest, "cpu")
+    forces = InternalForces(lattice, law_of(sheet), np.ones(lattice.fill.size), rest, default_device())
     found = wp.zeros(rest.size, dtype=wp.float64)
     forces.launch(wp.array((rest + pushed).ravel(), dtype=wp.float64), wp.zeros(3, dtype=wp.float64), found)
     assert found.numpy() == pytest.approx(data.qfrc_spring, abs=1e-7 * np.abs(data.qfrc_spring).max())

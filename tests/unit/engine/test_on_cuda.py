@@ -15,7 +15,9 @@ from physworld.twin.twin import Twin
 
 FRAMES = 12
 MOVED_M = 0.02  # what the grips do
-SAME_M = 2e-5  # solids strain in single precision, and sums have another order
+SAME_M = {"auto": 2e-5, "updated_lagrangian": 2e-4}
+"""Solids strain in single precision, sums have another order, and particles on the ground of the updated form are pushed
+all at once on a GPU, one after another on a CPU."""
 PLATE = np.array([[0.0, 0.0, 0.0], [0.0, 0.03, 0.0], [0.0, 0.0, 0.03]])
 
 
@@ -68,7 +70,7 @@ def test_a_twin_moves_as_on_a_cpu(shape: str, formulation: str, gpu: str) -> Non
     one = lifted(here, 1.0)
     expected, found = nodes_of(here, one), nodes_of(there, one)
     assert np.abs(expected - expected[0]).max() > 0.3 * MOVED_M
-    assert np.abs(found - expected).max() < SAME_M
+    assert np.abs(found - expected).max() < SAME_M[formulation]
 
 
 @pytest.mark.parametrize("shape", SCENES)
@@ -81,4 +83,4 @@ def test_episodes_side_by_side_move_as_on_a_cpu(shape: str, gpu: str) -> None:
     )
     assert np.abs(expected[0] - expected[-1]).max() > 1e-3
     for one, other in zip(expected, found, strict=True):
-        assert np.abs(one - other).max() < SAME_M
+        assert np.abs(one - other).max() < SAME_M["auto"]

@@ -18,6 +18,7 @@ from bodies import (
     still_clamp,
 )
 
+from physworld.devices import default_device
 from physworld.engine.gradients.adjoint import Adjoint
 from physworld.engine.lattice.lattice import Lattice, box_lattice
 from physworld.engine.problem import HeldNodes, Problem
@@ -82,11 +83,11 @@ def deformed(lattice: Lattice, amount: float) -> np.ndarray:
 
 
 def on_device(values: np.ndarray) -> wp.array:
-    return wp.array(np.ascontiguousarray(values).reshape(-1), dtype=wp.float64, device="cpu")
+    return wp.array(np.ascontiguousarray(values).reshape(-1), dtype=wp.float64, device=default_device())
 
 
 def rubbed(friction: FrictionForces, x: np.ndarray, v: np.ndarray) -> np.ndarray:
-    force, at = wp.zeros(x.size, dtype=wp.float64, device="cpu"), on_device(x)
+    force, at = wp.zeros(x.size, dtype=wp.float64, device=default_device()), on_device(x)
     friction.prepare(at)
     friction.launch(on_device(v), force)
     return force.numpy().reshape(-1, 3)
@@ -101,22 +102,22 @@ def test_the_operator_is_the_friction_of_the_explicit_forces(name: str) -> None:
     dt = 1e-5
     found = []
     for friction in (law, replace(law, **{"viscosity_pa_s" if name == "solid" else "relaxation_s": 0.0})):
-        forces = InternalForces(lattice, friction, ones, rest, "cpu")
-        out = wp.zeros(x.size, dtype=wp.float64, device="cpu")
-        clock = wp.array([0.0, 1.0 / dt, dt], dtype=wp.float64, device="cpu")
+        forces = InternalForces(lattice, friction, ones, rest, default_device())
+        out = wp.zeros(x.size, dtype=wp.float64, device=default_device())
+        clock = wp.array([0.0, 1.0 / dt, dt], dtype=wp.float64, device=default_device())
         forces.launch(on_device(x - dt * v), clock, out)
         out.zero_()
         forces.launch(on_device(x), clock, out)
         found.append(out.numpy().reshape(-1, 3))
     expected = found[0] - found[1]
-    force = rubbed(FrictionForces(lattice, law, ones, rest, "cpu"), x, v)
+    force = rubbed(FrictionForces(lattice, law, ones, rest, default_device()), x, v)
     assert np.abs(force - expected).max() < 20 * SINGLE * np.abs(expected).max()
 
 
 @pytest.mark.parametrize("name", BODIES)
 def test_the_operator_is_symmetric_takes_energy_and_is_silent_in_rigid_motion(name: str) -> None:
     lattice, law = BODIES[name]
-    friction = FrictionForces(lattice, law, np.ones(lattice.fill.size), rest_nodes(lattice), "cpu")
+    friction = FrictionForces(lattice, law, np.ones(lattice.fill.size), rest_nodes(lattice), default_device())
     x = deformed(lattice, 3e-3)
     u, v = np.random.default_rng(2).normal(size=(2, *x.shape))
     size = np.abs(np.sum(u * rubbed(friction, x, u)))

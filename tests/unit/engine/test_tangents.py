@@ -10,6 +10,7 @@ import warp as wp
 from bodies import rest_nodes
 from scipy.spatial.transform import Rotation
 
+from physworld.devices import default_device
 from physworld.engine.gradients.tangent import InternalTangent
 from physworld.engine.lattice.lattice import Lattice, box_lattice
 from physworld.engine.total.forces import InternalForces
@@ -68,7 +69,7 @@ def upload(values: np.ndarray) -> wp.array:
 def forces(law: Law, factor: np.ndarray, x: np.ndarray, before: np.ndarray | None = None) -> np.ndarray:
     """Forces (n, 3) at x; with friction if the positions before are given."""
     lattice = shape_of(law)
-    model = InternalForces(lattice, law, factor, rest_nodes(lattice), "cpu")
+    model = InternalForces(lattice, law, factor, rest_nodes(lattice), default_device())
     out, clock = wp.zeros(x.size, dtype=wp.float64), wp.zeros(3, dtype=wp.float64)
     if before is not None:
         model.launch(upload(before), clock, out)
@@ -82,7 +83,7 @@ def products(law: Law, friction: bool) -> tuple[np.ndarray, np.ndarray, np.ndarr
     """d(w.f)/dx, d(w.f)/dx_previous (n, 3) and d(w.f)/d log p (P, columns) at :func:`state`."""
     lattice = shape_of(law)
     x, before, w = state(lattice)
-    tangent = InternalTangent(lattice, law, np.ones(lattice.fill.size), rest_nodes(lattice), "cpu")
+    tangent = InternalTangent(lattice, law, np.ones(lattice.fill.size), rest_nodes(lattice), default_device())
     out, late = wp.zeros(x.size, dtype=wp.float64), wp.zeros(x.size, dtype=wp.float64)
     columns = len(tangent.parameters)
     parameters = wp.zeros(tangent.particles * columns, dtype=wp.float64)
@@ -117,7 +118,7 @@ def test_the_elastic_product_is_symmetric(name: str) -> None:
     lattice = shape_of(law)
     x, _, w = state(lattice)
     other = np.random.default_rng(12).normal(size=x.shape)
-    tangent = InternalTangent(lattice, law, np.ones(lattice.fill.size), rest_nodes(lattice), "cpu")
+    tangent = InternalTangent(lattice, law, np.ones(lattice.fill.size), rest_nodes(lattice), default_device())
     out = np.zeros((2, x.size))
     for k, direction in enumerate((w, other)):
         result = wp.zeros(x.size, dtype=wp.float64)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from physworld.devices import default_device
 from physworld.engine.problem import HeldNodes, Problem
 from physworld.engine.thin.triangles import Mesh, TriangleLattice, triangle_lattice
 from physworld.engine.total.forces import InternalForces
@@ -27,7 +28,7 @@ def at_rest(mesh: TriangleLattice) -> np.ndarray:
 
 
 def forces_of(mesh: TriangleLattice, x: np.ndarray, law: SheetLaw = LAW) -> np.ndarray:
-    forces = InternalForces(mesh, law, np.ones(mesh.fill.size), at_rest(mesh), "cpu")
+    forces = InternalForces(mesh, law, np.ones(mesh.fill.size), at_rest(mesh), default_device())
     found = wp.zeros(x.size, dtype=wp.float64)
     forces.launch(wp.array(x.ravel(), dtype=wp.float64), wp.zeros(3, dtype=wp.float64), found)
     return found.numpy().reshape(x.shape)
@@ -129,7 +130,7 @@ def test_a_free_mesh_swings_and_friction_stills_it() -> None:
 
 def test_the_time_step_is_stable_and_its_limit_is_the_fastest_mode() -> None:
     mesh = lattice()
-    forces = InternalForces(mesh, LAW, np.ones(mesh.fill.size), at_rest(mesh), "cpu")
+    forces = InternalForces(mesh, LAW, np.ones(mesh.fill.size), at_rest(mesh), default_device())
     mass = mesh.lumped(LAW.density_kg_m2 * mesh.particle_measures)
     found = fastest_frequency(forces, at_rest(mesh), mass, float(mesh.spacing.min()))
     n = len(mass)
@@ -173,7 +174,7 @@ def test_friction_does_not_feel_a_turn_of_a_bent_sheet() -> None:
     bent = at_rest(mesh)
     bent[:, 2] += 0.4 * (bent[:, 0] - bent[:, 0].mean()) ** 2
     forces = InternalForces(
-        mesh, replace(LAW, relaxation_s=0.1), np.ones(mesh.fill.size), at_rest(mesh), "cpu"
+        mesh, replace(LAW, relaxation_s=0.1), np.ones(mesh.fill.size), at_rest(mesh), default_device()
     )
     clock = wp.array([0.0, 1e3, 1e-3], dtype=wp.float64)
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from physworld.devices import default_device
 from physworld.engine.updated.stress import ParticleStress, padded
 from physworld.materials.library import SOLID_LAWS
 
@@ -20,11 +21,11 @@ def launched(
     room = padded(len(F))
     full_F, full_C = np.repeat(np.eye(3)[None], room, axis=0), np.zeros((room, 3, 3))
     full_F[: len(F)], full_C[: len(C)] = F, C
-    F_d = wp.array(full_F, dtype=wp.mat33d, device="cpu")
-    C_d = wp.array(full_C.reshape(-1).astype(np.float32), dtype=wp.float32, device="cpu")
-    out = wp.zeros(6 * room, dtype=wp.float32, device="cpu")
-    flags = wp.zeros(4, dtype=wp.int32, device="cpu")
-    stress.launch(F_d, C_d, out, wp.array([dt, 1 / dt, dt], dtype=wp.float64, device="cpu"), flags)
+    F_d = wp.array(full_F, dtype=wp.mat33d, device=default_device())
+    C_d = wp.array(full_C.reshape(-1).astype(np.float32), dtype=wp.float32, device=default_device())
+    out = wp.zeros(6 * room, dtype=wp.float32, device=default_device())
+    flags = wp.zeros(4, dtype=wp.int32, device=default_device())
+    stress.launch(F_d, C_d, out, wp.array([dt, 1 / dt, dt], dtype=wp.float64, device=default_device()), flags)
     assert not flags.numpy().any()
     xx, yy, zz, yz, xz, xy = out.numpy().reshape(-1, 6)[: len(F)].T
     tau = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
@@ -38,7 +39,7 @@ def test_the_stress_of_every_law_is_the_derivative_of_its_energy(name: str) -> N
     F = np.eye(3) + 0.1 * rng.normal(size=(COUNT, 3, 3))
     volume = rng.uniform(0.5, 2.0, COUNT)
     _, tau, ratio = launched(
-        ParticleStress(law, None, volume, np.ones(COUNT), "cpu"), F, np.zeros_like(F), 1e-12
+        ParticleStress(law, None, volume, np.ones(COUNT), default_device()), F, np.zeros_like(F), 1e-12
     )
     step, P = 1e-6, np.empty_like(F)
     for i in range(3):
@@ -56,7 +57,9 @@ def test_the_deformation_gradient_advances_with_the_velocity_gradient_and_fricti
     rng = np.random.default_rng(1)
     F = np.eye(3) + 0.1 * rng.normal(size=(COUNT, 3, 3))
     C = rng.normal(size=(COUNT, 3, 3)).astype(np.float32).astype(float)
-    new, tau, _ = launched(ParticleStress(law, None, np.ones(COUNT), np.ones(COUNT), "cpu"), F, C, 1e-3)
+    new, tau, _ = launched(
+        ParticleStress(law, None, np.ones(COUNT), np.ones(COUNT), default_device()), F, C, 1e-3
+    )
     assert np.abs(new - (np.eye(3) + 1e-3 * C) @ F).max() < 1e-14
     J = np.linalg.det(new)[:, None, None]
     assert np.abs(tau - 7.0 * J * (C + C.transpose(0, 2, 1))).max() < 1e-2

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from physworld.devices import default_device
 from physworld.engine.updated.stress import ParticleStress, padded
 from physworld.materials.neo_hookean import NeoHookean
 from physworld.materials.plastic import DruckerPrager, Identity, Plasticity, StVenantKirchhoff, VonMises
@@ -22,17 +23,19 @@ def mapped(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(F, Kirchhoff stress, memory) after the return mapping of trial gradients (P, 3, 3)."""
     count = len(F)
-    stress = ParticleStress(LAW, law, np.ones(count), np.ones(count), "cpu")
+    stress = ParticleStress(LAW, law, np.ones(count), np.ones(count), default_device())
     if memory is not None:
         stress.memory.assign(memory)
     room = padded(count)
     F_d = wp.array(
-        np.concatenate([F, np.tile(np.eye(3), (room - count, 1, 1))]), dtype=wp.mat33d, device="cpu"
+        np.concatenate([F, np.tile(np.eye(3), (room - count, 1, 1))]),
+        dtype=wp.mat33d,
+        device=default_device(),
     )
-    C = wp.zeros(9 * room, dtype=wp.float32, device="cpu")
-    out = wp.zeros(6 * count, dtype=wp.float32, device="cpu")
-    flags = wp.zeros(4, dtype=wp.int32, device="cpu")
-    clock = wp.array([DT, 1.0 / dt, dt], dtype=wp.float64, device="cpu")
+    C = wp.zeros(9 * room, dtype=wp.float32, device=default_device())
+    out = wp.zeros(6 * count, dtype=wp.float32, device=default_device())
+    flags = wp.zeros(4, dtype=wp.int32, device=default_device())
+    clock = wp.array([DT, 1.0 / dt, dt], dtype=wp.float64, device=default_device())
     stress.launch(F_d, C, out, clock, flags)
     assert not flags.numpy().any()
     xx, yy, zz, yz, xz, xy = out.numpy().reshape(-1, 6).T
