@@ -8,7 +8,7 @@ Embedded and distributed differ here and nowhere else::
     PHYSWORLD_BROKER_PREFIX  of every key in a broker that is shared    none
     PHYSWORLD_STORE_URL      file:///folder or s3://bucket/prefix      file://{data_dir}/store
     PHYSWORLD_INFERENCE_URL  http://host:port of the inference service   none (the embedded service sets it)
-    PHYSWORLD_DEVICE         of the simulations, cpu or cuda:0          cpu
+    PHYSWORLD_DEVICE         of simulations and training: cpu, cuda:0   cpu
     PHYSWORLD_TRUSTED_PROXIES  whose word on client and scheme counts     none
     PHYSWORLD_SIGNING_KEY    base64 of an Ed25519 key (32 bytes)        made in data_dir (``physworld_storage.signing``)
     PHYSWORLD_SIGNING_KEY_FILE  a file that holds it                    none

@@ -106,7 +106,7 @@ def measure(repeats: int, seed: int) -> Report:
             + ", ".join(f"{ratio:.2f} times it at {budget}" for budget, ratio in least.items())
             + " particles.",
             "Every episode gives the same numbers as alone at that time step, bit for bit "
-            "(`tests/unit/engine/test_batch.py`). Not measured on CUDA, for which batches are meant.",
+            "(`tests/unit/engine/test_batch.py`). On a GPU: [below](#a-gpu-beside-one-thread-of-its-machines-cpu).",
         ],
         seed=seed,
     )  # fmt: skip

@@ -59,8 +59,8 @@ def measure(repeats: int, seed: int) -> Report:
         rows=rows,
         notes=[
             f"The GPU is one {figures['gpu']}.",
-            f"Simulation: {FRAMES} frames of {EPISODES} demonstrations of `sample/soft_beam` with their set-up, time an "
-            "episode. Side by side all take the smallest time step.",
+            f"Simulation: {FRAMES} frames of {EPISODES} demonstrations of `sample/soft_beam` with their set-up, time "
+            "an episode. Side by side all take the smallest time step.",
             f"Training: the loss of {BATCH} sub-sequences of {LOOK_AHEAD} steps and its gradient.",
         ],
         seed=seed,

@@ -179,7 +179,7 @@ class RecordedRun:
 
     def _keep_last(self, row: int) -> None:
         """The velocities after the last substep follow those before it."""
-        self.history.numpy()[row] = self._run.v.numpy()
+        self.history[row].assign(self._run.v.numpy())
 
 
 class _Recorder(BoundTerm):
@@ -219,4 +219,4 @@ class _Checkpoint:
         solver.forces.memory.assign(self._friction)
         for memory, kept in zip(memories, self._memories, strict=True):
             memory.now.assign(kept)
-            memory.rows.numpy()[0] = kept
+            memory.rows[0].assign(kept)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from made_scene import FPS, box_body, made_scene
+from same_numbers import assert_same
 
 from physworld.effects.registry import effect
 from physworld.engine.total.batch import Batch
@@ -96,7 +97,7 @@ def test_episodes_side_by_side_are_those_that_run_alone(name: str) -> None:
     dt = float(time_steps(twin, episodes).min())
     outcomes = simulate_batch(twin, episodes)
     for one, outcome in zip(episodes, outcomes, strict=True):
-        np.testing.assert_array_equal(outcome.trusted(), alone(twin, one, dt))
+        assert_same(outcome.trusted(), alone(twin, one, dt))
     ends = [outcome.trusted()[-1] for outcome in outcomes]
     assert min(np.abs(ends[0] - ends[1]).max(), np.abs(ends[0] - ends[2]).max()) > MOST
 
@@ -105,7 +106,7 @@ def test_a_batch_of_one_is_a_single_run() -> None:
     twin = TWINS["solid"]
     one = episode(twin, (0.0, 0.03, 0.03))
     (outcome,) = simulate_batch(twin, [one])
-    np.testing.assert_array_equal(
+    assert_same(
         outcome.trusted(), twin.simulate_nodes(one.control_times, one.control_points, one.frame_times)
     )
 
@@ -139,7 +140,7 @@ def test_an_episode_that_blows_up_has_its_error_and_spoils_no_neighbour() -> Non
         alone(twin, torn)
     assert str(broken.error) == str(single.value)
     for one, outcome in zip(calm, (first, last), strict=True):
-        np.testing.assert_array_equal(outcome.trusted(), alone(twin, one))
+        assert_same(outcome.trusted(), alone(twin, one))
 
 
 def test_a_batch_that_is_lost_stops() -> None:

@@ -7,6 +7,7 @@ compiled for each of them; ``test_cuda_source`` and ``test_updated_lagrangian_cu
 from __future__ import annotations
 
 import pkgutil
+import re
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -115,6 +116,23 @@ def test_the_stress_of_an_effect_compiles_for_cuda(name: str, tmp_path: Path) ->
     assert compiles(model.kernel.module, tmp_path)
     if model.dim == 3:
         assert compiles(stress_adjoint(model).module, tmp_path / "adjoint")
+
+
+HOST_WRITES = {  # arrays that lie on the CPU whatever the device of the simulation
+    "engine/total/formulation.py": {"clock", "counter"},
+    "baselines/spring_steps.py": {"_path", "grad", "_met"},
+}
+
+
+def test_nothing_is_written_into_a_copy_on_the_host() -> None:
+    """``array.numpy()[…] = …`` changes an array of the CPU and no other: a gradient was wrong on CUDA for it."""
+    root, found = Path(physworld.__file__).parent, {}
+    for path in root.rglob("*.py"):
+        written = set(re.findall(r"(\w+)\.numpy\(\)\[[^\]]*\] *[-+*/]?=[^=]", path.read_text()))
+        written |= set(re.findall(r"np\.\w+\.at\([^,]*?(\w+)\.numpy\(\),", path.read_text()))
+        if written:
+            found[str(path.relative_to(root))] = written
+    assert found == HOST_WRITES
 
 
 def test_the_lists_are_complete() -> None:

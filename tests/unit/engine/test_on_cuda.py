@@ -16,8 +16,8 @@ from physworld.twin.twin import Twin
 FRAMES = 12
 MOVED_M = 0.02  # what the grips do
 SAME_M = {"auto": 2e-5, "updated_lagrangian": 2e-4}
-"""Solids strain in single precision, sums have another order, and particles on the ground of the updated form are pushed
-all at once on a GPU, one after another on a CPU."""
+"""Solids strain in single precision, sums have another order, and the ground of the updated form pushes all particles
+at once on a GPU, one after another on a CPU."""
 PLATE = np.array([[0.0, 0.0, 0.0], [0.0, 0.03, 0.0], [0.0, 0.0, 0.03]])
 
 
