@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 from physworld_client import Client
 from physworld_client.types import (
+    TERMINAL_STATES,
     DatasetConfig,
     FitConfig,
     Job,
@@ -163,7 +164,10 @@ def fill(client: Client) -> None:
     if not client.videos.list(limit=1).data:
         _wait(client, client.videos.create("scene", beam))
     if not client.jobs.list(state="cancelled").data:
-        client.jobs.cancel(client.fits.create(rope, SMALL_FIT).id)
+        cancelled = client.jobs.cancel(client.fits.create(rope, SMALL_FIT).id)
+        while cancelled.state not in TERMINAL_STATES:
+            time.sleep(0.2)
+            cancelled = client.jobs.get(cancelled.id)
 
 
 def pages(client: Client) -> dict[str, str]:
