@@ -9,6 +9,7 @@ take.
 
 All times are of the database's clock and without pauses, in which nobody worked on the job. ``JobRow.pace`` holds
 
+* of both ``of``, the recordings that it goes back to;
 * of a running job ``begun``, when it would have begun without its pauses; ``marks``, pairs of its fraction and the
   seconds in which it came there; ``course``, what it goes by; ``whole_s``, how long the same took before, or null;
   ``children``, seconds that jobs of these kinds take;
@@ -31,7 +32,7 @@ from physworld_schemas.job import Progress
 from physworld_storage.jobs.kind import share_of
 from physworld_storage.jobs.kinds import KINDS, kind_of
 from physworld_storage.jobs.progress import Course, longest_share, seconds_left, share_of_time
-from physworld_storage.tables import JobRow
+from physworld_storage.tables import DatasetRow, FitRow, JobRow, TraceRow
 
 LOOKED_AT, TAKEN = 20, 5
 """Jobs of a kind among which the most alike are sought, and most that the median is of."""
@@ -39,8 +40,16 @@ PAUSE_S = 10.0
 """Without a word of any worker, after which nobody worked: who works tells so about every second."""
 STEP = 0.01
 """Of the fraction, from one mark to the next."""
-WEIGHT = 0.25
+WEIGHT = 0.5
 """Of how long the same took before, in shares of a job's time: as much counts the pace so far when so much is over."""
+NAMES = {"name", "model_name", "description", "tags", "dataset_id", "fit_id", "trace_id"}
+"""Settings that say nothing of the time."""
+ORIGINS: dict[str, type[FitRow | TraceRow | DatasetRow]] = {
+    "fit": FitRow,
+    "trace": TraceRow,
+    "dataset": DatasetRow,
+}
+"""Tables of what jobs make of a scene, by the kind of their references."""
 
 
 def begin(session: Session, job: JobRow, now: datetime) -> None:
@@ -52,9 +61,11 @@ def begin(session: Session, job: JobRow, now: datetime) -> None:
         now: by the database's clock.
     """
     if job.pace is None:
-        past = _past(session, job.kind, job.config, job.inputs)
+        of = _recordings(session, job)
+        past = _past(session, job.kind, job.config, of)
         course = _median_course([example.course for example in past])
         job.pace = {
+            "of": of,
             "begun": now.isoformat(),
             "marks": [],
             "course": course,
@@ -85,7 +96,7 @@ def end(job: JobRow, now: datetime) -> None:
         job.pace = None
         return
     course = [[fraction, min(1.0, round(at_s / lasted_s, 4))] for fraction, at_s in job.pace["marks"]]
-    job.pace = {"lasted_s": round(lasted_s, 2), "course": course}
+    job.pace = {"of": job.pace["of"], "lasted_s": round(lasted_s, 2), "course": course}
 
 
 def worked_s(job: JobRow, now: datetime) -> float:
@@ -156,7 +167,7 @@ def _left_of_children_s(parent: JobRow, children: Sequence[JobRow], now: datetim
     """
     assert parent.pace is not None
     known: dict[str, float] = parent.pace["children"]
-    ended = [child for child in children if child.state == "succeeded"]
+    ended = [child for child in children if child.state == "succeeded" and child.pace is not None]
     times = [(_whole_s(child, now), kind_of(child).seconds(child.config)) for child in ended or children]
     usual_s = sum(usual for whole, usual in times if whole is not None)
     took_s = sum(whole for whole, _ in times if whole is not None)
@@ -209,43 +220,46 @@ class Example:
     course: Course
 
 
-def _past(
-    session: Session, kind: str, config: dict[str, Any], inputs: list[dict[str, Any]] | None = None
-) -> list[Example]:
-    """The last jobs of a kind that differ in the fewest settings and inputs, the newest first.
+def _past(session: Session, kind: str, config: dict[str, Any], of: list[str] | None = None) -> list[Example]:
+    """The last jobs of a kind that differ in the fewest settings and recordings, the newest first.
 
     Args:
         session: the transaction that reads.
         kind: of the jobs.
         config: what is asked now.
-        inputs: what it is asked of; None: not known yet.
+        of: the recordings that it goes back to; None: not known yet.
     """
     succeeded = (JobRow.kind == kind, JobRow.state == "succeeded", JobRow.pace.is_not(None))
-    columns = select(JobRow.config, JobRow.inputs, JobRow.pace).where(*succeeded)
+    columns = select(JobRow.config, JobRow.pace).where(*succeeded)
     decisive = KINDS[kind].decisive
-    asked = {**config, "inputs": _ids(inputs)}
     found = [
         Example(
-            before,
-            _unlike(asked, {**before, "inputs": inputs and _ids(of)}),
-            pace["lasted_s"],
-            pace["course"],
+            config=before,
+            unlike=_unlike(config, before) + (of is not None and of != pace["of"]),
+            lasted_s=pace["lasted_s"],
+            course=pace["course"],
         )
-        for before, of, pace in session.execute(columns.order_by(JobRow.created_at.desc()).limit(LOOKED_AT))
+        for before, pace in session.execute(columns.order_by(JobRow.created_at.desc()).limit(LOOKED_AT))
         if pace is not None and all(before.get(name) == config.get(name) for name in decisive)
     ]
     fewest = min((example.unlike for example in found), default=0)
     return [example for example in found if example.unlike == fewest][:TAKEN]
 
 
-def _ids(inputs: list[dict[str, Any]] | None) -> list[str] | None:
-    return inputs and [str(item["id"]) for item in inputs]
+def _recordings(session: Session, job: JobRow) -> list[str]:
+    """Ids of the scenes that the job's inputs go back to, and of inputs that go back to none."""
+    found = set()
+    for item in job.inputs:
+        table = ORIGINS.get(item["kind"])
+        row = None if table is None else session.get(table, item["id"])
+        found.add(str(item["id"] if row is None else row.scene_id))
+    return sorted(found)
 
 
 def _unlike(one: dict[str, Any], other: dict[str, Any]) -> int:
-    """In how many settings two configurations differ."""
+    """In how many settings two configurations differ that say something of the time."""
     count = 0
-    for name in one.keys() | other.keys():
+    for name in (one.keys() | other.keys()) - NAMES:
         mine, yours = one.get(name), other.get(name)
         if isinstance(mine, dict) and isinstance(yours, dict):
             count += _unlike(mine, yours)

@@ -97,6 +97,7 @@ def test_a_job_that_succeeds_keeps_its_course(hours: Hours) -> None:
     job = hours.fit()
     hours.run(hours.work.claim(), EARLY, 20.0)
     assert hours.pace(job) == {
+        "of": [job.inputs[0].id],
         "lasted_s": 20.0, "course": [[0.1, 0.2], [0.3, 0.6], [0.8, 0.8], [0.9, 0.9]],
     }  # fmt: skip
 
@@ -137,9 +138,25 @@ def test_what_is_asked_again_is_known_from_the_first_word(hours: Hours) -> None:
         hours.tell(lease, fraction)
         left.append(hours.left_s(job))
     wholes = [
-        (worked + 0.25 * 20.0) / (share + 0.25) for worked, share in ((0.5, 0.0), (8.0, 0.2), (24.0, 0.6))
+        (worked + 0.5 * 20.0) / (share + 0.5) for worked, share in ((0.5, 0.0), (8.0, 0.2), (24.0, 0.6))
     ]
     assert left == pytest.approx([wholes[0], 0.8 * wholes[1], 0.4 * wholes[2]], abs=0.1)
+
+
+def test_a_dataset_of_another_fit_of_the_same_recording_is_the_same_again(hours: Hours) -> None:
+    scene = hours.work.scene()
+    whole_s = []
+    for scene_id in (scene.id, scene.id, hours.work.scene().id):
+        fit = hours.work.finish(hours.fit(scene_id))
+        with hours.database.session() as session:
+            job = jobs.create_dataset(session, fit.outputs[0].id, DatasetConfig(episodes=2))
+        lease = hours.work.claim()
+        found = hours.pace(job)
+        assert found is not None and found["of"] == [scene_id]
+        whole_s.append(found["whole_s"])
+        hours.run(lease, (), 4.0)
+        hours.work.finish(job)
+    assert whole_s == [None, 4.0, None]
 
 
 def test_the_time_left_goes_on_where_the_fraction_stands_still(hours: Hours) -> None:
@@ -312,4 +329,8 @@ def test_a_word_reads_no_events_and_the_course_needs_none(hours: Hours) -> None:
     with hours.database.session() as session:
         session.execute(text("DELETE FROM events"))
     assert hours.work.complete(lease)
-    assert hours.pace(job) == {"lasted_s": 12.0, "course": [[0.3, pytest.approx(1 / 3, abs=1e-3)]]}
+    assert hours.pace(job) == {
+        "of": [job.inputs[0].id],
+        "lasted_s": 12.0,
+        "course": [[0.3, pytest.approx(1 / 3, abs=1e-3)]],
+    }
