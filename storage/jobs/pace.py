@@ -252,7 +252,7 @@ def _recordings(session: Session, job: JobRow) -> list[str]:
     for item in job.inputs:
         table = ORIGINS.get(item["kind"])
         row = None if table is None else session.get(table, item["id"])
-        found.add(str(item["id"] if row is None else row.scene_id))
+        found.add(str(getattr(row, "scene_id", item["id"])))
     return sorted(found)
 
 
