@@ -45,7 +45,7 @@ class Progress(Resource):
     eta_s: float | None = Field(
         default=None,
         ge=0,
-        description="Until the job ends, at its pace so far; null: too early to tell, or it has ended.",
+        description="Until the job ends, as earlier jobs of its kind went; null: too early to tell, or it has ended.",
         json_schema_extra={"unit": "s"},
     )
 

@@ -123,10 +123,17 @@ class SceneRow(Base):
 
 
 class JobRow(Base):
-    """A piece of work; ``stage_done`` of ``stage_total`` shards of stage ``stage`` are done."""
+    """A piece of work; ``stage_done`` of ``stage_total`` shards of stage ``stage`` are done.
+
+    ``pace`` says how it goes in time (``physworld_storage.jobs.pace``).
+    """
 
     __tablename__ = "jobs"
-    __table_args__ = (Index(None, "state"), Index(None, "created_at"))
+    __table_args__ = (
+        Index(None, "state"),
+        Index(None, "created_at"),
+        Index(None, "kind", "state", "created_at"),
+    )
 
     id: Mapped[str] = mapped_column(primary_key=True)
     kind: Mapped[str]
@@ -145,6 +152,7 @@ class JobRow(Base):
     outputs: Mapped[JsonList]
     config: Mapped[Json]
     error: Mapped[Json | None] = mapped_column(JSON(none_as_null=True))
+    pace: Mapped[Json | None] = mapped_column(JSON(none_as_null=True))
 
 
 class ShardRow(Base):

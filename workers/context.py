@@ -112,10 +112,17 @@ class TaskContext:
         """Say which stages the shard goes through, in their order, and about how long each takes (in one unit)."""
         self._pace.plan(weights)
 
-    def begin(self, stage: str, unit: str = "", total: float = 1.0) -> None:
-        """A stage of the plan begins, of which ``progress`` tells from now on. Raises Cancelled, LeaseLost."""
+    def begin(self, stage: str, unit: str = "", total: float = 1.0, usual: float | None = None) -> None:
+        """A stage of the plan begins, of which ``progress`` tells from now on. Raises Cancelled, LeaseLost.
+
+        Args:
+            stage: of the plan.
+            unit: what is counted.
+            total: how much there is to do.
+            usual: with how much the stage ends as a rule, where the total is a budget; None: with all of it.
+        """
         self.check()
-        self._pace.begin(stage)
+        self._pace.begin(stage, usual)
         self._stage = stage
         self.progress(0, total, unit, stage)
 
@@ -138,8 +145,8 @@ class TaskContext:
             message: what is being done.
             figures: the newest figures of the work, finite ones.
         """
-        share, left_s = self._pace.reach(done, total)
-        told = Progress(done=done, total=total, unit=unit, message=message, fraction=share, eta_s=left_s)
+        share = self._pace.reach(done, total)
+        told = Progress(done=done, total=total, unit=unit, message=message, fraction=share)
         told.figures = {name: value for name, value in (figures or {}).items() if math.isfinite(value)}
         with self._lock:
             self._pending[self._stage] = told

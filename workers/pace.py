@@ -1,25 +1,20 @@
-"""How much of a shard's work is done, and how long it will take yet, by the stages that its handler goes through."""
+"""How much of a shard's work is done, by the stages that its handler goes through."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
-from physworld_storage.jobs.progress import seconds_left
+NEARLY = 0.9
+"""Of a stage that may end before its budget is spent: what is done when it has spent as much as usual."""
 
 
 class Pace:
-    """Shares of a shard's time by stage, where the work stands, and the time left at its pace.
+    """Shares of a shard's time by stage, about, and where the work stands."""
 
-    Args:
-        clock: monotonic [s].
-    """
-
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
+    def __init__(self) -> None:
         self._stages: dict[str, tuple[float, float]] = {}
         self._stage = (0.0, 1.0)
-        self._anchor: tuple[float, float] | None = None
+        self._usual: float | None = None
         self._share = 0.0
 
     def plan(self, weights: Mapping[str, float]) -> None:
@@ -30,21 +25,25 @@ class Pace:
             self._stages[stage] = (at / whole, (at + weight) / whole)
             at += weight
 
-    def begin(self, stage: str) -> None:
-        """The work of a stage of the plan begins. Raises KeyError for one that was not planned."""
-        self._stage = self._stages[stage]
+    def begin(self, stage: str, usual: float | None = None) -> None:
+        """The work of a stage of the plan begins. Raises KeyError for one that was not planned.
 
-    def reach(self, done: float, total: float) -> tuple[float, float | None]:
-        """Share of the shard that is done, and seconds left (None: too early to tell), at ``done`` of the stage.
-
-        The time counts from the first thing that was done: what an earlier attempt had reached is not its doing.
+        Args:
+            stage: of the plan.
+            usual: with how much done such a stage ends as a rule, where its total is a budget; None: with all of it.
         """
+        self._stage, self._usual = self._stages[stage], usual
+
+    def reach(self, done: float, total: float) -> float:
+        """Share of the shard that is done at ``done`` of the stage; it never falls."""
         begin, end = self._stage
         part = min(1.0, max(0.0, done / total)) if total > 0 else 0.0
+        if self._usual is not None and self._usual < total:
+            usual = self._usual / total
+            part = (
+                NEARLY * part / usual
+                if part <= usual
+                else 1.0 - (1.0 - NEARLY) * (1.0 - part) / (1.0 - usual)
+            )
         self._share = max(self._share, begin + (end - begin) * part)
-        if self._anchor is None:
-            if done > 0:
-                self._anchor = (self._clock(), self._share)
-            return self._share, None
-        since, begun = self._anchor
-        return self._share, seconds_left(self._clock() - since, self._share, begun)
+        return self._share

@@ -9,6 +9,7 @@ workers that finish the last two episodes at the same moment start the next stag
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from datetime import datetime, timedelta
 from typing import Any
 
@@ -19,6 +20,7 @@ from physworld_schemas.base import Problem, Reference
 from physworld_schemas.job import TERMINAL_STATES, Progress
 from physworld_storage.clock import database_now
 from physworld_storage.errors import Conflict
+from physworld_storage.jobs import pace
 from physworld_storage.jobs.events import append_event
 from physworld_storage.jobs.kind import ShardResult, Tells
 from physworld_storage.jobs.kinds import SHARDS, kind_of
@@ -43,10 +45,24 @@ def shard_started(session: Session, job: JobRow, attempt: int, now: datetime) ->
     for row in (_parent(session, job), job):
         if row is None:
             continue
+        pace.begin(session, row, now)
         row.heartbeat_at = now
         if row.state == "queued":
             row.started_at = now
             _set_state(session, row, "running")
+
+
+def heard_from(session: Session, job: JobRow, now: datetime) -> None:
+    """A worker is at the job, and so at its parent.
+
+    Args:
+        session: the transaction that it belongs to.
+        job: locked.
+        now: by the database's clock.
+    """
+    for row in (_parent(session, job), job):
+        if row is not None:
+            row.heartbeat_at = now
 
 
 def shard_succeeded(
@@ -61,7 +77,7 @@ def shard_succeeded(
         result: of the shard's kind.
         now: by the database's clock.
     """
-    job.heartbeat_at = now
+    heard_from(session, job, now)
     kind = SHARDS[shard.kind]
     if kind.is_helper:
         return
@@ -94,10 +110,12 @@ def report_progress(
         span: the part of the job that such shards cover.
         now: by the database's clock.
     """
-    _set_progress(session, job, of_the_job(progress, _progress(job), span, _elapsed_s(job, now)))
+    _set_progress(session, job, of_the_job(progress, _progress(job), span), (), now)
     parent = _parent(session, job)
     if parent is not None and parent.state not in TERMINAL_STATES:
-        _set_progress(session, parent, _parent_progress(session, parent, job, now))
+        own = _progress(job)
+        message = f"{job.kind}: {own.done:g} of {own.total:g} {own.unit}"
+        _report_children(session, parent, message, now)
 
 
 def fail_job(session: Session, job: JobRow, problem: Problem, now: datetime) -> None:
@@ -184,42 +202,41 @@ def _child_succeeded(session: Session, child: JobRow, now: datetime) -> None:
     parent = _parent(session, child)
     if parent is None or parent.state in TERMINAL_STATES:  # what ran beside this child has failed
         return
-    parent.heartbeat_at = now
     parent.outputs = [*parent.outputs, *child.outputs]
     message = f"{child.kind} done"
     append_event(session, parent.id, "log", {"message": message, "child": child.id, "kind": child.kind})
-    progress = _parent_progress(session, parent, child, now)
-    _set_progress(session, parent, progress.model_copy(update={"message": message}))
+    _report_children(session, parent, message, now)
     if not kind_of(parent).open_next(session, parent, child, _children(session, parent)):
         parent.finished_at = now
         _set_state(session, parent, "succeeded")
 
 
-def _parent_progress(session: Session, parent: JobRow, active: JobRow, now: datetime) -> Progress:
-    share = kind_of(parent).share_done(parent, _children(session, parent))
-    own = _progress(active)
-    message = f"{active.kind}: {own.done:g} of {own.total:g} {own.unit}"
-    before = _progress(parent)
-    told = Progress(done=100 * max(share, before.fraction or 0.0), total=100, unit="percent", message=message)
-    found = of_the_job(told, before, (0.0, 1.0), _elapsed_s(parent, now))
-    return found.model_copy(update={"done": round(found.done, 2)})
+def _report_children(session: Session, parent: JobRow, message: str, now: datetime) -> None:
+    """Store and log what the children's progress comes to."""
+    children, before = _children(session, parent), _progress(parent)
+    share = max(before.fraction or 0.0, pace.share_done(parent, children))
+    told = Progress(done=round(100 * share, 2), total=100, unit="percent", message=message)
+    _set_progress(session, parent, of_the_job(told, before, (0.0, 1.0)), children, now)
 
 
 def _progress(job: JobRow) -> Progress:
     return Progress.model_validate(job.progress)
 
 
-def _elapsed_s(job: JobRow, now: datetime) -> float | None:
-    return None if job.started_at is None else (now - job.started_at).total_seconds()
-
-
-def _set_progress(session: Session, job: JobRow, progress: Progress) -> None:
+def _set_progress(
+    session: Session, job: JobRow, progress: Progress, children: Sequence[JobRow], now: datetime
+) -> None:
     job.progress = progress.model_dump()
+    pace.mark(job, now)
+    job.progress = {**job.progress, "eta_s": pace.left_s(job, children, now)}
     append_event(session, job.id, "progress", job.progress)
 
 
 def _set_state(session: Session, job: JobRow, state: str) -> None:
     job.state = state
+    if state == "succeeded":
+        assert job.finished_at is not None
+        pace.end(job, job.finished_at)
     if state in TERMINAL_STATES:
         whole = {"fraction": 1.0} if state == "succeeded" else {}
         job.progress = {**job.progress, **whole, "eta_s": None}

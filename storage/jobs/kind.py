@@ -87,12 +87,14 @@ class JobKind:
         shards: the kinds of its shards, in the order of its stages; helpers last.
         makes: the kind of what it brings forth.
         has_children: whether it consists of other jobs instead of shards.
+        decisive: settings without which two such jobs go other ways, so that one says nothing of the other's time.
     """
 
     name: Name
     unit: str
     shards: tuple[ShardKind[Any], ...] = ()
     has_children = False
+    decisive: tuple[str, ...] = ()
 
     @property
     def makes(self) -> str:
@@ -137,8 +139,12 @@ class JobKind:
         """A child has gone on to its next stage: open what need not wait for the child's end."""
         raise NotImplementedError
 
-    def share_done(self, parent: JobRow, children: Sequence[JobRow]) -> float:
-        """How much of a parent's work is done, 0 to 1."""
+    def chain(self, parent: JobRow, children: Sequence[JobRow]) -> list[tuple[str, dict[str, Any]]]:
+        """Kind and configuration of all jobs that a parent will have had, as far as can be told from those opened."""
+        raise NotImplementedError
+
+    def seconds(self, config: dict[str, Any]) -> float:
+        """About how long such a job takes on the sample scene and two cores [s]; only the ratios count."""
         raise NotImplementedError
 
     def queued(

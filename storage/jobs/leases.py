@@ -32,6 +32,7 @@ from physworld_storage.errors import NotFound
 from physworld_storage.jobs import losses
 from physworld_storage.jobs.flow import (
     fail_job,
+    heard_from,
     report_progress,
     settle_cancel,
     shard_started,
@@ -146,7 +147,7 @@ def renew(
     reached = {} if progress is None else {"progress": progress.model_dump(mode="json")}
     if not _compare_and_set(session, lease, renewed_at=now, **prolonged, **reached):
         return "lost"
-    job.heartbeat_at = now
+    heard_from(session, job, now)
     if job.state == "cancelling":
         return "cancel"
     if progress is not None and SHARDS[lease.kind].progress is Tells.ITS_OWN:

@@ -112,6 +112,10 @@ class AssessmentJobs(JobKind):
         }
         return self.begin(session, job, row, payload)
 
+    def seconds(self, config: dict[str, Any]) -> float:
+        """Of one recording."""
+        return 5.0
+
     def end(self, session: Session, job: JobRow, state: Unmade, message: str) -> None:
         """The assessment has failed or was cancelled."""
         traces.end_assessment(session, output_of(job), state)

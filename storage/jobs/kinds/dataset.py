@@ -105,7 +105,7 @@ class DatasetJobs(JobKind):
             _planned,
             _episodes,
             Tells.NOTHING,
-            span=(0.0, 0.02),
+            span=(0.0, 0.1),
         ),
         ShardKind(
             "episode",
@@ -115,7 +115,7 @@ class DatasetJobs(JobKind):
             _written,
             _seal,
             Tells.SHARDS_DONE,
-            span=(0.02, 0.95),
+            span=(0.1, 0.95),
         ),
         ShardKind(
             "dataset_seal",
@@ -171,6 +171,10 @@ class DatasetJobs(JobKind):
         origin = {"fit_id": fit_id, "trace_id": trace_id, "scene_id": fit.scene_id, "config": job.config}
         row = DatasetRow(id=dataset_id, **origin, statistics={}, artifacts=[])
         return self.begin(session, job, row, {"dataset_id": dataset_id, **origin})
+
+    def seconds(self, config: dict[str, Any]) -> float:
+        """By its episodes."""
+        return 2.0 + 0.3 * float(config["episodes"])
 
     def end(self, session: Session, job: JobRow, state: Unmade, message: str) -> None:
         """The dataset has failed or was cancelled; its episodes stay."""

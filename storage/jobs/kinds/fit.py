@@ -72,6 +72,10 @@ class FitJobs(JobKind):
         row = FitRow(id=fit_id, scene_id=scene_id, config=job.config, parameters={}, metrics={}, artifacts=[])
         return self.begin(session, job, row, {"fit_id": fit_id, "scene_id": scene_id, "config": job.config})
 
+    def seconds(self, config: dict[str, Any]) -> float:
+        """By its particles; most searches end before their budget is spent."""
+        return 3.0 + 0.0125 * float(config["particle_budget"])
+
     def end(self, session: Session, job: JobRow, state: Unmade, message: str) -> None:
         """The fit has failed or was cancelled."""
         resources.end_fit(session, output_of(job), state)

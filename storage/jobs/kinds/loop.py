@@ -15,6 +15,7 @@ trace that the version itself came from: its twin then stands where the fit's st
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from sqlalchemy.orm import Session
 
@@ -23,17 +24,16 @@ from physworld_schemas.base import Reference, Unmade
 from physworld_schemas.dataset import DatasetConfig
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.loop import LoopCreate
-from physworld_schemas.model import TrainingCreate
+from physworld_schemas.model import TrainingConfig, TrainingCreate
 from physworld_schemas.trace import MOST_RECORDINGS, NO_OTHER_PHYSICS, TRACE_PARTICLES
 from physworld_storage.errors import Conflict
-from physworld_storage.jobs.kind import JobKind, output_of, scene_row, share_of
+from physworld_storage.jobs.kind import JobKind, output_of, scene_row
 from physworld_storage.jobs.kinds import assessment, dataset, trace, training
 from physworld_storage.registry import reference_id, resolve, trained_with
 from physworld_storage.tables import AssessmentRow, DatasetRow, FitRow, JobRow, ModelVersionRow, SceneRow
 from physworld_storage.traces import assessment_row, leaves_twin, trace_row
 
 ASSESSMENT, TRACE, DATASET, TRAINING = (part.KIND.name for part in (assessment, trace, dataset, training))
-SHARES = {ASSESSMENT: 0.03, TRACE: 0.6, DATASET: 0.2, TRAINING: 0.17}  # of a loop's time, about
 WORSE = "worse_than_expected"
 
 
@@ -116,13 +116,21 @@ class LoopJobs(JobKind):
     def stage_opened(self, session: Session, parent: JobRow, child: JobRow) -> None:
         """Nothing: every child waits for the end of the one before."""
 
-    def share_done(self, parent: JobRow, children: Sequence[JobRow]) -> float:
-        """How much of the loop is done, 0 to 1."""
-        kinds = [TRACE, DATASET, TRAINING, ASSESSMENT]
-        if parent.config["assessment_id"] is None:
-            kinds.append(ASSESSMENT)
-        done = sum(SHARES[child.kind] * share_of(child) for child in children)
-        return float(min(1.0, done / sum(SHARES[kind] for kind in kinds)))
+    def chain(self, parent: JobRow, children: Sequence[JobRow]) -> list[tuple[str, dict[str, Any]]]:
+        """Kinds and configurations; dataset and training are the usual ones where they are the version's own."""
+        request = request_of(parent)
+        data, learning = request.dataset or DatasetConfig(), request.training or TrainingConfig()
+        traced = request.trace.model_dump(mode="json")
+        first: list[tuple[str, dict[str, Any]]] = (
+            [(ASSESSMENT, {})] if parent.config["assessment_id"] is None else []
+        )
+        return [
+            *first,
+            (TRACE, {"fit": {"particle_budget": TRACE_PARTICLES}, "trace": traced}),
+            (DATASET, data.model_dump(mode="json")),
+            (TRAINING, {"config": learning.model_dump(mode="json")}),
+            (ASSESSMENT, {}),
+        ]
 
 
 KIND = LoopJobs()

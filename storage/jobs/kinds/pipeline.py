@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from typing import Any
 
 from sqlalchemy.orm import Session
 
@@ -25,14 +26,13 @@ from physworld_schemas.job import TERMINAL_STATES
 from physworld_schemas.model import TrainingCreate
 from physworld_schemas.pipeline import PipelineCreate
 from physworld_schemas.trace import TRACE_PARTICLES
-from physworld_storage.jobs.kind import JobKind, output_of, scene_row, share_of
+from physworld_storage.jobs.kind import JobKind, output_of, scene_row
 from physworld_storage.jobs.kinds import dataset, fit, trace, training
 from physworld_storage.registry import find_baseline
 from physworld_storage.tables import JobRow, TraceRow
 from physworld_storage.traces import leaves_twin, trace_row
 
 FIT, TRACE, DATASET, TRAINING = (part.KIND.name for part in (fit, trace, dataset, training))
-SHARES = {FIT: 0.35, TRACE: 0.6, DATASET: 0.35, TRAINING: 0.30}  # of a pipeline's time, about
 NAME_LENGTH = 64
 
 
@@ -42,6 +42,7 @@ class PipelineJobs(JobKind):
     name = "pipeline"
     unit = "percent"
     has_children = True
+    decisive = ("close_the_loop", "compare")
 
     def open(self, session: Session, request: PipelineCreate) -> JobRow:
         """The whole chain; its first child, the fit, is opened with it. Raises NotFound."""
@@ -97,16 +98,17 @@ class PipelineJobs(JobKind):
         if request.training.start_share < 1.0:
             _open_training(session, parent, request, output_of(child))
 
-    def share_done(self, parent: JobRow, children: Sequence[JobRow]) -> float:
-        """How much of the pipeline is done, 0 to 1; a comparison counts until it is known to be left out."""
-        request = PipelineCreate.model_validate(parent.config)
-        kinds = [FIT, DATASET, TRAINING]
-        if request.close_the_loop:
-            kinds.append(TRACE)
-            if request.compare:
-                kinds += [DATASET, TRAINING]
-        done = sum(SHARES[child.kind] * share_of(child) for child in children)
-        return float(min(1.0, done / sum(SHARES[kind] for kind in kinds)))
+    def chain(self, parent: JobRow, children: Sequence[JobRow]) -> list[tuple[str, dict[str, Any]]]:
+        """Kinds and configurations; a comparison counts until a dataset without one has been opened."""
+        asked = parent.config
+        model = [(DATASET, asked["dataset"]), (TRAINING, {"config": asked["training"]})]
+        if not asked["close_the_loop"]:
+            return [(FIT, asked["fit"]), *model]
+        first = next((job for job in children if job.kind == DATASET), None)
+        compares = asked["compare"] and (first is None or not _is_traced(first))
+        particles = min(asked["fit"]["particle_budget"], TRACE_PARTICLES)
+        traced = {"fit": {**asked["fit"], "particle_budget": particles}, "trace": asked["trace"]}
+        return [(FIT, asked["fit"]), (TRACE, traced), *model, *(model if compares else ())]
 
 
 KIND = PipelineJobs()
@@ -146,4 +148,9 @@ def _is_comparison(session: Session, children: Sequence[JobRow]) -> bool:
         return False
     traced = trace_row(session, output_of(children[kinds.index(TRACE)]))
     last_dataset = next(job for job in reversed(children) if job.kind == DATASET)
-    return leaves_twin(traced) and all(item["kind"] != "trace" for item in last_dataset.inputs)
+    return leaves_twin(traced) and not _is_traced(last_dataset)
+
+
+def _is_traced(job: JobRow) -> bool:
+    """Whether a dataset is of a trace's twin."""
+    return any(item["kind"] == "trace" for item in job.inputs)

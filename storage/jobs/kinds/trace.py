@@ -101,6 +101,11 @@ class TraceJobs(JobKind):
         payload = {"trace_id": trace_id, "scene_id": scene_id, "fit_id": fit_id, **others, **settings}
         return self.begin(session, job, row, payload)
 
+    def seconds(self, config: dict[str, Any]) -> float:
+        """By its particles and refits."""
+        asked = config["trace"]
+        return 0.005 * float(config["fit"]["particle_budget"] * asked["confirmed"] * asked["iterations"])
+
     def end(self, session: Session, job: JobRow, state: Unmade, message: str) -> None:
         """The trace has failed or was cancelled."""
         traces.end_trace(session, output_of(job), state)

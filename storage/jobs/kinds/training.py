@@ -97,6 +97,12 @@ class TrainingJobs(JobKind):
         }
         return self.begin(session, job, None, payload)
 
+    def seconds(self, config: dict[str, Any]) -> float:
+        """By the steps and the width of the network; reading, priors, measuring and exports are the rest."""
+        asked = config["config"]
+        steps = float(asked["steps"]) + 0.4 * float(asked["fine_tune_steps"])
+        return 23.0 + 0.009 * float(asked["hidden"]) * steps
+
     def end(self, session: Session, job: JobRow, state: Unmade, message: str) -> None:
         """The version has failed or was cancelled, and says why."""
         registry.end_version(session, *_version_of(job), state, message)

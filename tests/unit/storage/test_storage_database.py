@@ -29,7 +29,7 @@ pytestmark = pytest.mark.slow
 if TYPE_CHECKING:
     from conftest import Work
 
-NEWEST = "0010"
+NEWEST = "0011"
 SPAWN = multiprocessing.get_context("spawn")
 
 
@@ -58,6 +58,8 @@ def test_an_upgrade_tells_the_cancelled_from_those_that_have_failed(work: Work, 
     work.fail(work.claim(), retry=False)
     with database.session() as session:  # as before the revision 0010
         session.execute(text("UPDATE fits SET state = 'failed'"))
+        session.execute(text("DROP INDEX ix_jobs_kind_state_created_at"))
+        session.execute(text("ALTER TABLE jobs DROP COLUMN pace"))
         session.execute(text("UPDATE alembic_version SET version_num = '0009'"))
     database.upgrade()
     with database.reading() as session:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from datetime import timedelta
 from typing import TYPE_CHECKING
 
 import pytest
@@ -10,7 +9,6 @@ import pytest
 from physworld_schemas.job import Progress
 from physworld_storage.jobs import leases
 from physworld_storage.jobs.progress import of_the_job, seconds_left
-from physworld_storage.tables import JobRow
 
 if TYPE_CHECKING:
     from conftest import Work
@@ -20,15 +18,13 @@ LEASE_SECONDS = 30.0
 
 def test_the_time_left_is_the_time_so_far_for_what_is_left() -> None:
     assert seconds_left(30.0, 0.75) == pytest.approx(10.0)
-    assert seconds_left(30.0, 0.75, begun=0.5) == pytest.approx(30.0)  # an earlier attempt did half of it
     assert seconds_left(30.0, 1.0) == 0.0
     assert seconds_left(1.0, 0.75) is None and seconds_left(30.0, 0.001) is None
 
 
 def test_a_shards_share_is_put_into_the_part_of_the_job_that_it_covers() -> None:
-    told = of_the_job(Progress(done=5, total=10), Progress(), (0.95, 1.0), 97.5)
+    told = of_the_job(Progress(done=5, total=10), Progress(), (0.95, 1.0))
     assert told.fraction == pytest.approx(0.975)
-    assert told.eta_s == pytest.approx(2.5)
     assert (told.done, told.total) == (5, 10)
 
 
@@ -50,7 +46,7 @@ def test_a_dataset_is_not_done_before_it_is_sealed(work: Work) -> None:
     for _ in range(4):
         assert work.complete(work.claim())
         shares.append(work.job(job).progress.fraction)
-    assert shares == sorted(shares) and shares[0] < 0.05 and 0.9 < shares[-1] < 1.0
+    assert shares == sorted(shares) and shares[0] <= 0.1 and 0.9 < shares[-1] < 1.0
     assert work.complete(work.claim())
     done = work.job(job)
     assert (done.state, done.share, done.progress.fraction, done.progress.eta_s) == (
@@ -59,14 +55,3 @@ def test_a_dataset_is_not_done_before_it_is_sealed(work: Work) -> None:
         1.0,
         None,
     )
-
-
-def test_a_running_dataset_says_when_it_will_end(work: Work) -> None:
-    job = work.dataset(episodes=4)
-    assert work.complete(work.claim())
-    with work.database.session() as session:
-        row = session.get_one(JobRow, job.id)
-        row.started_at = row.started_at - timedelta(seconds=60)
-    assert work.complete(work.claim())
-    progress = work.job(job).progress
-    assert progress.eta_s == pytest.approx(60.0 * (1.0 - progress.fraction) / progress.fraction, rel=0.05)

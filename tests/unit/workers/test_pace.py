@@ -1,4 +1,4 @@
-"""How much of a shard's work is done, by its stages, and how long it will take yet."""
+"""How much of a shard's work is done, by its stages."""
 
 from __future__ import annotations
 
@@ -9,45 +9,37 @@ from physworld_services.trainer.training import stages_of
 from physworld_workers.pace import Pace
 
 
-class Clock:
-    """Seconds that pass when told to."""
-
-    def __init__(self) -> None:
-        self.now_s = 100.0
-
-    def __call__(self) -> float:
-        return self.now_s
-
-
 def test_stages_count_by_their_weights_and_the_share_never_falls() -> None:
-    pace = Pace(Clock())
+    pace = Pace()
     pace.plan({"reading": 1.0, "training": 6.0, "exporting": 3.0})
     shares = []
     for stage, steps in (("reading", (0, 1)), ("training", (0, 3, 6, 2)), ("exporting", (0, 5, 6))):
         pace.begin(stage)
-        shares += [pace.reach(done, 6)[0] for done in steps]
+        shares += [pace.reach(done, 6) for done in steps]
     assert shares == pytest.approx([0.0, 1 / 60, 0.1, 0.4, 0.7, 0.7, 0.7, 0.95, 1.0])
 
 
-def test_the_time_left_is_told_at_the_pace_of_this_attempt() -> None:
-    clock = Clock()
-    pace = Pace(clock)
-    pace.plan({"reading": 20.0, "training": 60.0, "exporting": 20.0})
-    pace.begin("reading")
-    assert pace.reach(0, 1) == (0.0, None)
-    pace.begin("training")
-    share, left = pace.reach(50, 100)  # the checkpoint of an attempt before this one
-    assert (share, left) == (pytest.approx(0.5), None)
-    clock.now_s += 10.0
-    share, left = pace.reach(75, 100)
-    assert share == pytest.approx(0.65)
-    assert left == pytest.approx(10.0 * 0.35 / 0.15, abs=0.1)
+def test_a_stage_with_a_budget_is_nearly_done_where_such_stages_end() -> None:
+    pace = Pace()
+    pace.plan({"calibrating": 70.0, "measuring": 30.0})
+    pace.begin("calibrating", usual=50.0)
+    shares = [pace.reach(done, 400) for done in (25, 50, 225, 400)]
+    assert shares == pytest.approx([0.7 * 0.45, 0.7 * 0.9, 0.7 * 0.95, 0.7])
+    pace.begin("measuring")
+    assert pace.reach(1, 2) == pytest.approx(0.85)
+
+
+def test_a_budget_below_the_usual_is_spent() -> None:
+    pace = Pace()
+    pace.plan({"calibrating": 1.0})
+    pace.begin("calibrating", usual=50.0)
+    assert pace.reach(6, 12) == pytest.approx(0.5)
 
 
 def test_without_a_plan_what_is_counted_is_the_whole() -> None:
-    pace = Pace(Clock())
-    assert pace.reach(3, 12)[0] == 0.25
-    assert pace.reach(4, 0)[0] == 0.25  # a total that is not known says nothing
+    pace = Pace()
+    assert pace.reach(3, 12) == 0.25
+    assert pace.reach(4, 0) == 0.25  # a total that is not known says nothing
 
 
 def test_a_stage_that_was_not_planned_is_refused() -> None:
