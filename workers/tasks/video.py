@@ -6,7 +6,7 @@ the first frame, ``camera.json`` where its pictures were taken from, ``frames.np
 here, within the limits of archives.
 
 The file is ``film.mp4`` (H.264). A film of the recording's own motion, seen from the pictures' camera, is scored
-against them frame by frame; otherwise the report says why it is not.
+against them frame by frame, and ``recording.mp4`` shows them at the same times; otherwise the report says why not.
 """
 
 from __future__ import annotations
@@ -41,7 +41,15 @@ from physworld.video.gaussians import Gaussians
 from physworld.video.hidden import followed
 from physworld_scenes.archives import ArchiveLimits, read_arrays
 from physworld_schemas.base import Reference
-from physworld_schemas.video import FILM, MOST_FRAMES, CameraView, VideoConfig, VideoReport, VideoScores
+from physworld_schemas.video import (
+    FILM,
+    MOST_FRAMES,
+    RECORDING,
+    CameraView,
+    VideoConfig,
+    VideoReport,
+    VideoScores,
+)
 from physworld_storage import resources
 from physworld_workers.context import HandlerResult, TaskContext
 from physworld_workers.lineage import lineage_of
@@ -81,11 +89,15 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
             yield colours
             context.progress(number + 1, len(moved), "frames", "drawing")
 
-    film = stores.artifacts.put_bytes(encode_mp4(drawn(), frames_per_second(times)), FILM, "video/mp4")
+    fps = frames_per_second(times)
+    made = [stores.artifacts.put_bytes(encode_mp4(drawn(), fps), FILM, "video/mp4")]
+    if frames is not None:
+        recorded = encode_mp4(_while_wanted(context, frames["frames"]), fps)
+        made.append(stores.artifacts.put_bytes(recorded, RECORDING, "video/mp4"))
     context.check()
     report = VideoReport(
         frames=len(moved),
-        fps=frames_per_second(times),
+        fps=fps,
         drawn="points" if splat is None else "splat" if fitted is None else "fitted",
         gaussians=drawing.gaussians,
         seen_from=seen_from,
@@ -99,14 +111,20 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
         inputs.append(scene_reference(stores, payload["scene_id"]))
     inputs += [Reference(kind="artifact", id=name, digest=digest) for name, digest in pictures.items()]
     made_by = lineage_of(inputs, {"video": payload["config"]}, {}, stores.settings.device)
-    made = [film]
     if fitted is not None:
         made.append(stores.artifacts.put_bytes(to_ply(fitted), SPLAT, "application/x-ply"))
     result = {
         "report": report.model_dump(mode="json"),
         "artifacts": [item.model_dump(mode="json") for item in made],
     }
-    return HandlerResult({**result, "lineage": made_by}, film.sha256)
+    return HandlerResult({**result, "lineage": made_by}, made[0].sha256)
+
+
+def _while_wanted(context: TaskContext, frames: Array) -> Iterator[Array]:
+    """The frames (T, H, W, 3) one by one. Raises when the job is called off."""
+    for frame in frames:
+        context.check()
+        yield frame
 
 
 def motion_of(stores: Stores, payload: dict[str, Any], candidate: int) -> tuple[Array, Array]:

@@ -108,6 +108,32 @@ def test_the_button_of_a_scene_asks_for_a_film_and_the_page_plays_it(
     assert client.get(address).status_code == 404
 
 
+def test_a_film_with_its_recording_has_a_switch_and_both_files(
+    client: httpx.Client, world: tuple[Settings, Database, Stores]
+) -> None:
+    _, database, stores = world
+    scene = register(tiny_scene(), database, stores.artifacts)
+    own = {"origin": str(client.base_url).rstrip("/")}
+    client.post("/dashboard/start/video", data={"of": "scene", "id": scene}, headers=own)
+    with database.session() as session:
+        (waiting,) = leases.publishable(session)
+        lease = leases.claim(session, waiting.shard_id, "test", 60.0)
+        put = stores.artifacts.put_bytes
+        made = [put(FILM, "film.mp4", "video/mp4"), put(FILM[::-1], "recording.mp4", "video/mp4")]
+        found = {"report": REPORT, "artifacts": [item.model_dump() for item in made]}
+        assert lease is not None and leases.complete(session, lease, found, made[0].sha256)
+    with database.reading() as session:
+        (film,) = videos.list_videos(session).data
+    shown = card(client, scene)
+    assert 'data-frames="12"' in shown and "/static/film" in shown
+    for choice in ("Drawing", "Recording", "Overlay", "Side by side"):
+        assert f"{choice}</label>" in shown, choice
+    for name, content in (("film.mp4", FILM), ("recording.mp4", FILM[::-1])):
+        address = f"/dashboard/videos/{film.id}/{name}"
+        assert f'src="{address}"' in shown and client.get(address).content == content
+    assert client.get(f"/dashboard/videos/{film.id}/splat.ply").status_code == 404
+
+
 @pytest.mark.parametrize(
     ("of", "source", "page"),
     [
