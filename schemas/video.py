@@ -103,6 +103,14 @@ class VideoScores(Resource):
     )
     ssim_per_frame: list[float] = Field(description="1 where both pictures are equal.")
     iou_per_frame: list[float] | None = Field(default=None, description="Null: no masks.")
+    lpips: float | None = Field(
+        default=None,
+        description="Mean over the frames, by AlexNet; null: the worker has no weights of LPIPS, or a side of "
+        "the film is less than 31 px.",
+    )
+    lpips_per_frame: list[float] | None = Field(
+        default=None, description="0 where both pictures are equal; null: not measured."
+    )
 
 
 class VideoReport(Resource):

@@ -7,13 +7,14 @@ here, within the limits of archives.
 
 The file is ``film.mp4`` (H.264). A film of the recording's own motion, seen from the pictures' camera, is scored
 against them frame by frame, and ``recording.mp4`` shows them at the same times; otherwise the report says why not.
+LPIPS is among the scores where its weights are installed beside the worker (``physworld_workers.lpips_weights``).
 """
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -39,6 +40,7 @@ from physworld.video import (
 )
 from physworld.video.gaussians import Gaussians
 from physworld.video.hidden import followed
+from physworld.video.lpips import LEAST_SIDE_PX, Lpips
 from physworld_scenes.archives import ArchiveLimits, read_arrays
 from physworld_schemas.base import Reference
 from physworld_schemas.video import (
@@ -53,6 +55,7 @@ from physworld_schemas.video import (
 from physworld_storage import resources
 from physworld_workers.context import HandlerResult, TaskContext
 from physworld_workers.lineage import lineage_of
+from physworld_workers.lpips_weights import are_installed, installed_weights
 from physworld_workers.stores import Stores
 from physworld_workers.tasks.inputs import npz_arrays, scene_of, scene_reference
 
@@ -78,7 +81,8 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     splat = _splat(stores, pictures) if config.look == "auto" else fitted
     drawing = Drawing(moved, moved[0], camera, splat, stores.settings.device)
     frames, not_scored = _frames_to_match(stores, pictures, payload["of"], seen_from, camera, len(moved))
-    scoring = Scoring(frames)
+    lpips = None if frames is None else _lpips(frames["frames"], stores.settings.device)
+    scoring = Scoring(frames, lpips)
 
     def drawn() -> Iterator[Array]:
         context.progress(0, len(moved), "frames", "drawing")
@@ -167,10 +171,12 @@ class Scoring:
 
     Attributes:
         given: ``frames`` (T, H, W, 3) and, if there are some, ``masks`` (T, H, W); None scores nothing.
+        lpips: distance of two pictures (H, W, 3) in [0, 1]; None: not measured.
         found: by name, one number a frame.
     """
 
     given: dict[str, Array] | None
+    lpips: Callable[[Array, Array], float] | None = None
     found: dict[str, list[float]] = field(default_factory=dict)
 
     def add(self, number: int, colours: Array, coverage: Array) -> None:
@@ -183,6 +189,7 @@ class Scoring:
             self.given["frames"][number : number + 1],
             None if masks is None else coverage[None],
             None if masks is None else masks[number : number + 1],
+            self.lpips,
         )
         for name, values in scores.per_frame.items():
             self.found.setdefault(name, []).append(float(values[0]))
@@ -193,7 +200,7 @@ class Scoring:
             return None
         ratios = [value if np.isfinite(value) else None for value in self.found["psnr_db"]]
         finite = [value for value in ratios if value is not None]
-        overlaps = self.found.get("iou")
+        overlaps, distances = self.found.get("iou"), self.found.get("lpips")
         return VideoScores(
             psnr_db=float(np.mean(finite)) if finite else None,
             ssim=float(np.mean(self.found["ssim"])),
@@ -201,7 +208,16 @@ class Scoring:
             psnr_db_per_frame=ratios,
             ssim_per_frame=self.found["ssim"],
             iou_per_frame=overlaps,
+            lpips=None if distances is None else float(np.mean(distances)),
+            lpips_per_frame=distances,
         )
+
+
+def _lpips(frames: Array, device: str) -> Lpips | None:
+    """By AlexNet, where its weights are installed and the frames (T, H, W, 3) are large enough for it."""
+    if min(frames.shape[1:3]) < LEAST_SIDE_PX["alexnet"] or not are_installed("alexnet"):
+        return None
+    return Lpips(installed_weights("alexnet"), device)
 
 
 def _pictures_of(stores: Stores, scene_id: str) -> dict[str, str]:

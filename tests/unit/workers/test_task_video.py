@@ -153,6 +153,26 @@ def test_pictures_of_another_size_or_count_are_named_with_their_numbers(
     assert f"are {count} of 32 x 24 px, the film has {count} of 64 x 48 px" in video.report.not_scored
 
 
+def test_lpips_is_a_score_where_its_weights_are_installed(
+    runtime_with: RuntimeOf, stores: Stores, scene_id: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    count = len(tiny_scene().times)
+    keep(stores, scene_id, "frames.npz", npz(frames=np.zeros((count, 48, 64, 3), np.uint8)))
+    asked_for = VideoConfig(camera=view())
+    found = {}
+    for net in ("absent", "there"):
+        monkeypatch.setattr(task, "are_installed", lambda _, net=net: net == "there")
+        monkeypatch.setattr(task, "installed_weights", lambda name: name)
+        monkeypatch.setattr(task, "Lpips", lambda *_: lambda one, other: float(np.abs(one - other).mean()))
+        _, _, video = drawn(stores, runtime_with(), asked(stores, scene_id, asked_for))
+        assert video.report is not None and video.report.scores is not None
+        found[net] = video.report.scores
+    assert found["absent"].lpips is None and found["absent"].lpips_per_frame is None
+    distances = found["there"].lpips_per_frame
+    assert distances is not None and len(distances) == count and min(distances) > 0.5
+    assert found["there"].lpips == pytest.approx(np.mean(distances))
+
+
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [

@@ -33,7 +33,8 @@ REPORT = {
         "world_to_camera": np.eye(4).tolist(),
     },
     "scores": {
-        "psnr_db": 31.25, "ssim": 0.943, "psnr_db_per_frame": [31.25] * 12, "ssim_per_frame": [0.943] * 12,
+        "psnr_db": 31.25, "ssim": 0.943, "lpips": 0.0625, "lpips_per_frame": [0.0625] * 12,
+        "psnr_db_per_frame": [31.25] * 12, "ssim_per_frame": [0.943] * 12,
     },
 }  # fmt: skip
 
@@ -86,7 +87,7 @@ def test_the_button_of_a_scene_asks_for_a_film_and_the_page_plays_it(
         "12 frames",
         "4 Gaussians",
         "PSNR 31.2",
-        "SSIM 0.943",
+        "SSIM 0.943, LPIPS 0.0625",
         "camera of the scene",
     ):
         assert text in shown, text
