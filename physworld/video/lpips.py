@@ -148,4 +148,4 @@ class Lpips:
         return float(((unit[0] - unit[1]).square() * linear).sum(dim=0).mean())
 
     def _tensor(self, values: Array) -> Tensor:
-        return torch.as_tensor(np.ascontiguousarray(values, dtype=np.float32), device=self.device)
+        return torch.as_tensor(np.array(values, dtype=np.float32, order="C"), device=self.device)
