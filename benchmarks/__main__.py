@@ -31,6 +31,7 @@ BENCHMARKS = (
     "service.idle_and_start",
     "service.api_load",
     "service.cancelling",
+    "service.import_memory",
     "service.new_user",
     "service.time_left",
     "speed.video",

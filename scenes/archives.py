@@ -159,28 +159,6 @@ def read_arrays(
     }
 
 
-def write_arrays(arrays: dict[str, Array]) -> bytes:
-    """An ``npz`` whose bytes depend on the arrays alone: sorted, stored, no timestamps."""
-    files = {}
-    for name, array in arrays.items():
-        buffer = io.BytesIO()
-        np.lib.format.write_array(buffer, np.ascontiguousarray(array), version=(1, 0), allow_pickle=False)
-        files[f"{name}.npy"] = buffer.getvalue()
-    return write_zip(files)
-
-
-def write_zip(files: dict[str, bytes]) -> bytes:
-    """A zip whose bytes depend on names and contents alone: sorted, stored, the epoch of zip as date."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
-        for name in sorted(files):
-            entry = zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))
-            entry.create_system = 3
-            entry.external_attr = (stat.S_IFREG | 0o644) << 16
-            archive.writestr(entry, files[name])
-    return buffer.getvalue()
-
-
 def _read_zip(data: bytes, wanted: frozenset[str] | None, limits: ArchiveLimits) -> dict[str, bytes]:
     """Wanted members of a zip (all of them for None)."""
     _check_directory(data, limits)

@@ -10,15 +10,19 @@ no code here knows stay in ``Scene.declared`` and ``Scene.extra_arrays``.
 from __future__ import annotations
 
 import copy
+import io
 import json
+import shutil
+import tempfile
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
 from physworld.arrays import Array
 from physworld.scene import AS_MEASURED, UNDEFORMED_AT_REST, Body, Grip, Ground, Scene
 from physworld.shapes.surface_mesh import SurfaceMesh
+from physworld_scenes.archive_writing import Member, stream_arrays, stream_zip
 from physworld_scenes.archives import (
     DEFAULT_LIMITS,
     ArchiveLimits,
@@ -26,8 +30,6 @@ from physworld_scenes.archives import (
     read_archive,
     read_arrays,
     single_folder,
-    write_arrays,
-    write_zip,
 )
 from physworld_scenes.colliders import (
     MAX_MESH_BYTES,
@@ -47,6 +49,8 @@ from physworld_schemas.wording import pictures_among
 
 JSON_NAME = "scene.json"
 ARRAYS_NAME = "scene.npz"
+SPOOLED_BYTES, COPIED_BYTES, COPIED_VALUES = 32 << 20, 1 << 20, 1 << 18
+"""What stays in memory of an archive that is being written, and what is copied at once."""
 
 FIELD_OF_ARRAY = {
     "points": "points",
@@ -179,15 +183,29 @@ def canonical_archive(scene: Scene) -> bytes:
 
     Reading it gives the scene back exactly, and writing that again gives the same bytes, on any machine.
     """
-    return write_zip(_files_of(scene))
+    buffer = io.BytesIO()
+    write_archive(scene, buffer)
+    return buffer.getvalue()
+
+
+def write_archive(scene: Scene, stream: IO[bytes]) -> None:
+    """Write the canonical archive to a stream that can seek; large arrays are copied to a temporary file on the way."""
+    with tempfile.SpooledTemporaryFile(max_size=SPOOLED_BYTES) as arrays:
+        size = _write_arrays(scene, arrays)
+        files = [Member.of(name, content) for name, content in _files_beside(scene).items()]
+        arrays.seek(0)
+        whole = Member(ARRAYS_NAME, size, lambda entry: shutil.copyfileobj(arrays, entry, COPIED_BYTES))
+        stream_zip([whole, *files], stream)
 
 
 def write_bundle(scene: Scene, folder: Path | str) -> None:
     """Write ``scene.json``, ``scene.npz`` and the meshes of colliders into ``folder`` (made if absent)."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    for name, content in _files_of(scene).items():
+    for name, content in _files_beside(scene).items():
         (folder / name).write_bytes(content)
+    with (folder / ARRAYS_NAME).open("w+b") as stream:
+        _write_arrays(scene, stream)
 
 
 def scene_from_parts(
@@ -251,24 +269,34 @@ def parts_of(scene: Scene) -> tuple[dict[str, Any], dict[str, Array]]:
     return declared, arrays | scene.extra_arrays
 
 
-def _files_of(scene: Scene) -> dict[str, bytes]:
-    declared, arrays = parts_of(scene)
-    text = json.dumps(declared, sort_keys=True, indent=1, allow_nan=False) + "\n"
-    return {
-        JSON_NAME: text.encode("ascii"),
-        ARRAYS_NAME: write_arrays({name: _stored(name, array) for name, array in arrays.items()}),
-        **mesh_files(scene),
-    }
+def _files_beside(scene: Scene) -> dict[str, bytes]:
+    """The files of a bundle without its arrays."""
+    text = json.dumps(parts_of(scene)[0], sort_keys=True, indent=1, allow_nan=False) + "\n"
+    return {JSON_NAME: text.encode("ascii"), **mesh_files(scene)}
+
+
+def _write_arrays(scene: Scene, stream: IO[bytes]) -> int:
+    """Write the bundle's arrays; how many bytes they take."""
+    stream_arrays({name: _stored(name, array) for name, array in parts_of(scene)[1].items()}, stream)
+    return stream.seek(0, io.SEEK_END)
 
 
 def _stored(name: str, array: Array) -> Array:
     """Little endian; measured doubles as float32 when that loses nothing."""
     if name in FIELD_OF_ARRAY and name not in CLOCKS and array.dtype == np.float64:
+        narrow = np.empty(array.shape, dtype="<f4")
+        rows = max(1, COPIED_VALUES // max(array[:1].size, 1))
+        blocks = [slice(start, start + rows) for start in range(0, len(array), rows)]
         with np.errstate(over="ignore"):
-            narrow = array.astype("<f4")
-        if np.array_equal(narrow, array, equal_nan=True):
-            return narrow
+            if all(_narrowed(array[block], narrow[block]) for block in blocks):
+                return narrow
     return array.astype(array.dtype.newbyteorder("<"), copy=False)
+
+
+def _narrowed(array: Array, narrow: Array) -> bool:
+    """Write doubles into single precision of the same shape; whether that loses nothing."""
+    narrow[...] = array
+    return np.array_equal(narrow, array, equal_nan=True)
 
 
 def _without_gaps(points: Array, visible: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Checks of what was measured: shapes, times, places, visibility, units, jumps, controllers.
+"""Checks of what was measured: shapes, times, places, visibility, units, controllers.
 
 Every check adds its findings and lets the next one run, so that one reading names every fault. A *fault* says
 that no result could be trusted; a *warning* says that a person should look. Thresholds stand at the top with
@@ -23,9 +23,6 @@ PLAUSIBLE_OBJECT_M = (0.01, 5.0)
 
 UNIT_FACTORS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "kilometres": 1e3}
 
-FASTEST_POINT_M_S = 50.0
-"""Ten times the fastest recorded whip at hand (4.6 m/s); beyond it, a tracker swapped two points."""
-
 FAR_CONTROLLER_FAULT = 3.0
 FAR_CONTROLLER_WARNING = 1.5
 """Closest approach of a controller to a tracked point, in object sizes. Markers on the clamp of a beam that
@@ -35,6 +32,9 @@ CONTROL_CHECK_FRAMES = 40
 FPS_FAULT = 1.5
 FPS_WARNING = 1.1
 """Factor between the declared frame rate and one over the median time step."""
+
+BLOCK_VALUES = 1 << 20
+"""So many numbers are looked at together, not a whole recording."""
 
 UNEVEN_STEP = 3.0
 NAMED_AT_MOST = 5
@@ -176,17 +176,29 @@ def check_places(arrays: dict[str, Array], measured: Measured, findings: Finding
         given = cleaned.get(name, arrays.get(name))
         if given is None or not given.size or given.dtype.kind not in "fiu":
             continue
-        far = np.nan_to_num(np.abs(given.astype(np.float64)), posinf=0.0)  # those are another check's
-        if far.max() > FARTHEST_M:
-            first = tuple(int(i) for i in np.unravel_index(int(far.argmax()), far.shape))
+        count, farthest, first = _farthest(given)
+        if count:
             findings.fault(
                 ["scene.npz", name],
-                f"{int((far > FARTHEST_M).sum())} of {far.size} values are farther than {FARTHEST_M:g} m from the"
-                " origin,"
-                f" the farthest {far.max():.4g} m at {first}: not metres?{unit_hint(measured.size_m)}",
+                f"{count} of {given.size} values are farther than {FARTHEST_M:g} m from the origin,"
+                f" the farthest {farthest:.4g} m at {first}: not metres?{unit_hint(measured.size_m)}",
             )
             near = False
     return near
+
+
+def _farthest(places: Array) -> tuple[int, float, tuple[int, ...]]:
+    """How many values lie beyond ``FARTHEST_M``, the farthest of all [m], and its indices; some rows at a time."""
+    count, farthest, first = 0, -1.0, 0
+    row = places[:1].size
+    rows = max(1, BLOCK_VALUES // max(row, 1))
+    for start in range(0, len(places), rows):
+        far = np.abs(places[start : start + rows].astype(np.float64))
+        far = np.nan_to_num(far, copy=False, posinf=0.0)  # those are another check's
+        count += int((far > FARTHEST_M).sum())
+        if far.size and far.max() > farthest:
+            farthest, first = float(far.max()), start * row + int(far.argmax())
+    return count, farthest, tuple(int(i) for i in np.unravel_index(first, places.shape))
 
 
 def check_visibility(measured: Measured, findings: Findings) -> None:
@@ -229,30 +241,6 @@ def check_units(measured: Measured, findings: Findings) -> None:
         )
     elif size > PLAUSIBLE_OBJECT_M[1]:
         findings.warn(where, f"the object measures {size:.4g} m: not metres?{unit_hint(size)}")
-
-
-def check_jumps(measured: Measured, findings: Findings) -> None:
-    """No point moves faster than anything recorded, nor by more than the object's size in one frame."""
-    where = ["scene.npz", "points"]
-    step = np.diff(measured.times)
-    if (step <= 0.0).any() or not np.isfinite(step).all():
-        return
-    both = measured.seen[1:] & measured.seen[:-1]
-    length = np.where(both, np.linalg.norm(np.diff(measured.points, axis=0), axis=2), 0.0)
-    speed = length / step[:, None]
-    _name_jumps(where, speed, speed > FASTEST_POINT_M_S, f"faster than {FASTEST_POINT_M_S:g} m/s", findings)
-    if measured.controllers.shape[1]:
-        driven = np.linalg.norm(np.diff(measured.controllers, axis=0), axis=2) / step[:, None]
-        limit = f"faster than {FASTEST_POINT_M_S:g} m/s"
-        _name_jumps(["scene.npz", "controllers"], driven, driven > FASTEST_POINT_M_S, limit, findings)
-    far = (length > measured.size_m) & (speed <= FASTEST_POINT_M_S)
-    if far.any() and measured.seen.shape[1] > 1:
-        t, i = np.argwhere(far)[0]
-        findings.warn(
-            where,
-            f"{int(far.sum())} steps are longer than the object ({measured.size_m:.3g} m), first point {i}"
-            f" into frame {t + 1} by {length[t, i]:.3g} m",
-        )
 
 
 def check_controllers(measured: Measured, object_size_m: float, findings: Findings) -> None:
@@ -408,19 +396,6 @@ def _measure(arrays: dict[str, Array], findings: Findings) -> Measured:
         size = float(np.linalg.norm(np.ptp(cleaned[t, seen[t]], axis=0)))
     times = np.asarray(arrays["times"], dtype=np.float64)
     return Measured(cleaned, seen, controllers, times, size)
-
-
-def _name_jumps(where: list[str], speed: Array, bad: Array, limit: str, findings: Findings) -> None:
-    if not bad.any():
-        return
-    t, i = np.unravel_index(int(np.argmax(np.where(bad, speed, 0.0))), speed.shape)
-    first_t, first_i = np.argwhere(bad)[0]
-    findings.fault(
-        where,
-        f"{int(bad.sum())} steps are {limit}, first point {first_i} into frame {first_t + 1}"
-        f" at {speed[first_t, first_i]:.3g} m/s, the fastest point {i} into frame {t + 1}"
-        f" at {speed[t, i]:.3g} m/s",
-    )
 
 
 def _some(indices: Array) -> str:

@@ -16,13 +16,13 @@ from physworld.arrays import Array
 from physworld.shapes.surface_mesh import SurfaceMesh
 from physworld_scenes.colliders import check_colliders
 from physworld_scenes.declaration import BodyForm, Declaration, GripForm, GroundForm, check_form
+from physworld_scenes.jumps import check_jumps
 from physworld_scenes.measured import (
     Findings,
     Measured,
     check_arrays,
     check_control_times,
     check_controllers,
-    check_jumps,
     check_places,
     check_times,
     check_units,
@@ -237,13 +237,16 @@ def check_ground(ground: GroundForm, noise_sigma_m: float, measured: Measured, f
     where = ["scene.json", "ground", "height_m"]
     noise = GROUND_TOLERANCE_SIGMAS * noise_sigma_m
     tolerance = max(noise, GROUND_FAULT_SIZES * measured.size_m)
-    height = np.where(measured.seen, measured.points[..., 2], np.inf)
-    under = int((height[measured.first_frame] < ground.height_m - tolerance).sum())
-    lowest = height.min(axis=1)
-    depth = ground.height_m - lowest
     first = measured.first_frame
+    lowest = [
+        points[seen, 2].min(initial=np.inf)
+        for points, seen in zip(measured.points, measured.seen, strict=True)
+    ]
+    depth = ground.height_m - np.array(lowest)
     if depth[first] > tolerance:
-        i = int(np.argmin(height[first]))
+        height = np.where(measured.seen[first], measured.points[first, :, 2], np.inf)
+        under = int((height < ground.height_m - tolerance).sum())
+        i = int(np.argmin(height))
         findings.fault(
             where,
             f"is {ground.height_m:.4g} m, and point {i} lies {depth[first]:.4g} m below it in frame {first}"

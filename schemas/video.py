@@ -13,7 +13,10 @@ from physworld_schemas.rollout import MAX_CANDIDATES
 VideoOf = Literal["scene", "fit", "model", "rollout"]
 VideoState = Literal["pending", "ready", "failed", "cancelled"]
 PictureName = Literal["splat.ply", "camera.json", "frames.npz"]
-FILM = "film.mp4"
+FilmName = Literal["film.mp4", "recording.mp4"]
+FILM: FilmName = "film.mp4"
+RECORDING: FilmName = "recording.mp4"
+"""The scene's own pictures as a film of the same frames and size, where the film is compared with them."""
 MOST_SIDE_PX, LEAST_SIDE_PX = 1920, 16
 MOST_FRAMES = 3000
 MAX_CAMERA_BYTES = 16 * 1024
@@ -100,6 +103,14 @@ class VideoScores(Resource):
     )
     ssim_per_frame: list[float] = Field(description="1 where both pictures are equal.")
     iou_per_frame: list[float] | None = Field(default=None, description="Null: no masks.")
+    lpips: float | None = Field(
+        default=None,
+        description="Mean over the frames, by AlexNet; null: the worker has no weights of LPIPS, or a side of "
+        "the film is less than 31 px.",
+    )
+    lpips_per_frame: list[float] | None = Field(
+        default=None, description="0 where both pictures are equal; null: not measured."
+    )
 
 
 class VideoReport(Resource):
@@ -117,7 +128,10 @@ class VideoReport(Resource):
 
 
 class Video(Resource):
-    """A film of a motion; ``report`` and the artifact ``film.mp4`` are there once it is ready."""
+    """A film of a motion; ``report`` and the artifact ``film.mp4`` are there once it is ready.
+
+    Where it is compared with the scene's pictures, ``recording.mp4`` shows these, frame by frame at the same times.
+    """
 
     id: str = Field(description="Identifier: a prefix of its kind and 26 characters that sort by time.")
     of: VideoOf = Field(description="What moves in it.")
@@ -134,5 +148,7 @@ class Video(Resource):
         default_factory=Lineage, description="What it was made from, by which code, with which seeds."
     )
     artifacts: list[Artifact] = Field(
-        default_factory=list, description="Files, by name and SHA-256; download them from /v1/artifacts."
+        default_factory=list,
+        description="Files, by name and SHA-256; download them from /v1/artifacts: `film.mp4`, with scores "
+        '`recording.mp4`, and with `look` "fitted" `splat.ply`.',
     )

@@ -1,7 +1,7 @@
 """Frames: to an MP4 film (H.264) in memory, and compared with given frames.
 
-Scores are PSNR, SSIM (Wang et al. 2004), IoU of masks, and LPIPS where a network is given. LPIPS (Zhang et al. 2018)
-needs a trained network's weights, which nothing here ships: without one it is "not measured".
+Scores are PSNR, SSIM (Wang et al. 2004), IoU of masks, and LPIPS (``lpips.py``) where a network is given. LPIPS needs a
+trained network's weights, which nothing here ships: without one it is "not measured".
 """
 
 from __future__ import annotations

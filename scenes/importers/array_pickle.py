@@ -3,7 +3,7 @@
 A pickle is a program; here it can reach five names, and none of them is numpy's own code: stand-ins take the
 state that numpy would be given, check it and build the array from bytes. Any other name that the pickle asks
 for is refused by that name. The interpreter is the pure Python one: the C one allocates what a forged memo
-index says.
+index says. Large arrays are not copied out of the file's bytes: they are views of it, which nobody can write to.
 """
 
 from __future__ import annotations
@@ -40,18 +40,22 @@ MALFORMED = (
 """What the interpreter raises on a truncated or forged stream."""
 
 
+VIEWED_BYTES = 1 << 20
+"""What is read at once and is at least as long is a view of the file."""
+
+
 class PickleRefused(ValueError):
     """A pickle that is not just arrays; the message names what it wanted."""
 
 
 def load_arrays(data: bytes) -> Any:
-    """The object in the pickle: dicts, lists, tuples, strings, numbers and numpy arrays of numbers.
+    """The object in the pickle: dicts, lists, tuples, strings, numbers and read-only numpy arrays of numbers.
 
     Raises:
         PickleRefused: it calls something, holds something else, or is damaged.
     """
     try:
-        loaded = _ArrayUnpickler(io.BytesIO(data)).load()
+        loaded = _ArrayUnpickler(_Content(data)).load()
         return _Unwrapping().of(loaded, depth=0)
     except PickleRefused:
         raise
@@ -59,6 +63,23 @@ def load_arrays(data: bytes) -> Any:
         raise PickleRefused(
             f"the pickle of {len(data)} bytes is damaged or truncated ({reason(error)[:200]})"
         ) from error
+
+
+class _Content(io.BytesIO):
+    """The file, which gives views of its bytes where much is read."""
+
+    def __init__(self, data: bytes) -> None:
+        super().__init__(data)
+        self._view = memoryview(data)
+
+    def read(self, size: int | None = -1, /) -> Any:
+        """As of any file, or a view."""
+        if size is None or size < VIEWED_BYTES:
+            return super().read(size)
+        start = self.tell()
+        found = self._view[start : start + size]
+        self.seek(start + len(found))
+        return found
 
 
 class _Dtype:
@@ -106,7 +127,7 @@ class _Callable:
 
 
 def _build(shape: Any, dtype: Any, order: str, content: Any) -> Array:
-    if not isinstance(dtype, _Dtype) or not isinstance(content, bytes | bytearray):
+    if not isinstance(dtype, _Dtype) or not isinstance(content, bytes | bytearray | memoryview):
         raise PickleRefused("holds an array of Python objects; only numbers are read")
     if not isinstance(shape, tuple) or not all(isinstance(n, int) and n >= 0 for n in shape):
         raise PickleRefused(f"holds an array of shape {str(shape)[:80]}")
@@ -115,7 +136,8 @@ def _build(shape: Any, dtype: Any, order: str, content: Any) -> Array:
         raise PickleRefused(
             f"holds an array that claims shape {shape} of {kind} and has {len(content)} bytes"
         )
-    return np.frombuffer(content, dtype=kind).reshape(shape, order="F" if order == "F" else "C").copy()
+    own = bytes(content) if isinstance(content, bytearray) else content
+    return np.frombuffer(own, dtype=kind).reshape(shape, order="F" if order == "F" else "C")
 
 
 def _empty_array(kind: Any, *_placeholder: object) -> _Array:
@@ -189,6 +211,8 @@ class _Unwrapping:
 
 
 def _plain(value: Any) -> Any:
+    if isinstance(value, memoryview):
+        return bytes(value)
     if value is None or isinstance(value, str | bytes | bool | int | float):
         return value
     raise PickleRefused(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -118,9 +118,52 @@ def estimate_noise(points: Array, visible: Array) -> float | None:
     """
     if len(points) < 4:
         return None
-    seen = visible[:-3] & visible[1:-2] & visible[2:-1] & visible[3:]
-    third = np.abs(np.diff(points, n=3, axis=0)[seen])
-    if not third.size:
+
+    def third_differences() -> Iterator[Array]:
+        for t in range(len(points) - 3):
+            seen = visible[t : t + 4].all(axis=0)
+            yield np.abs(np.diff(points[t : t + 4], n=3, axis=0)[0, seen]).ravel()
+
+    middle = median_of(third_differences)
+    if middle is None:
         return None
-    sigma = float(np.median(third)) / GAUSSIAN_MAD / THIRD_DIFFERENCE_GAIN**0.5
+    sigma = middle / GAUSSIAN_MAD / THIRD_DIFFERENCE_GAIN**0.5
     return sigma if sigma > 0.0 else None
+
+
+def median_of(blocks: Callable[[], Iterator[Array]]) -> float | None:
+    """The median of numbers that are not negative and come in blocks, as ``np.median`` of all of them at once.
+
+    The numbers are made twice and never held together: counted by their leading bits, whose order is theirs, and then
+    sorted where the middle lies.
+
+    Args:
+        blocks: makes the blocks (n,), the same ones each time.
+
+    Returns:
+        The median, nan if a number is none; None without any.
+    """
+    counts = np.zeros(1 << 16, dtype=np.int64)
+    for block in blocks():
+        if np.isnan(block).any():
+            return float("nan")
+        counts += np.bincount(_leading_bits(block), minlength=len(counts))
+    total = int(counts.sum())
+    if not total:
+        return None
+    ranks = ((total - 1) // 2, total // 2)
+    upto = np.cumsum(counts)
+    first, last = (int(np.searchsorted(upto, rank, side="right")) for rank in ranks)
+    chosen = []
+    for block in blocks():
+        leading = _leading_bits(block)
+        chosen.append(block[(leading >= first) & (leading <= last)])
+    near = np.sort(np.concatenate(chosen))
+    before = int(upto[first] - counts[first])
+    return float(np.mean([near[rank - before] for rank in ranks]))
+
+
+def _leading_bits(numbers: Array) -> Array:
+    """Of doubles that are not negative: the exponent and the first five bits of the fraction, (n,)."""
+    bits = np.ascontiguousarray(numbers, dtype=np.float64).view(np.uint64) >> np.uint64(47)
+    return bits.astype(np.int64)

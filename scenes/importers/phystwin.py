@@ -60,8 +60,8 @@ def read_bytes(data: bytes, name: str, options: ImportOptions | None = None) -> 
     """The scene in a ``final_data.pkl``, and its warnings; ``name`` unless the options have one."""
     options = options or ImportOptions()
     content = _load(data)
-    arrays = {key: np.asarray(content[key]) for key in REQUIRED}
-    points = _turn(arrays["object_points"])
+    arrays = {key: np.asarray(content.pop(key)) for key in REQUIRED}
+    points = _turn(arrays.pop("object_points"))
     visible = arrays["object_visibilities"].astype(bool)
     visible[1:] &= arrays["object_motions_valid"][:-1].astype(bool)
     surface, interior = _turn(arrays["surface_points"]), _turn(arrays["interior_points"])
@@ -151,7 +151,9 @@ def _load(data: bytes) -> dict[Any, Any]:
 
 def _turn(points: Array) -> Array:
     """z-down to z-up; adding zero keeps the invisible points' zeros from becoming -0."""
-    turned: Array = np.asarray(points, dtype=np.float64) * Z_DOWN_TO_Z_UP + 0.0
+    turned = np.array(points, dtype=np.float64)
+    turned *= Z_DOWN_TO_Z_UP
+    turned += 0.0
     return turned
 
 

@@ -27,7 +27,7 @@ from typing import Any
 import scipy.spatial  # noqa: F401  so that a child need not
 import trimesh  # noqa: F401
 
-from physworld_scenes.bundle import canonical_archive, checked
+from physworld_scenes.bundle import checked, write_archive
 from physworld_scenes.errors import SceneInvalid
 from physworld_scenes.importers import ImportOptions, import_any, look_at
 from physworld_scenes.importers.library import limit_here
@@ -115,7 +115,8 @@ def _read(request: dict[str, Any]) -> int:
         scene, warnings = import_any(data, request["filename"], options)
         if request["name"] is not None and request["name"] != scene.name:
             scene, warnings = checked(dataclasses.replace(scene, name=request["name"]))
-        (folder / ARCHIVE).write_bytes(canonical_archive(scene))
+        with (folder / ARCHIVE).open("w+b") as stream:
+            write_archive(scene, stream)
         found = {
             "name": scene.name,
             "kind": scene.kind,

@@ -8,7 +8,7 @@ from urllib.parse import quote
 from fastapi import APIRouter, Header
 from fastapi.responses import RedirectResponse, Response, StreamingResponse
 
-from physworld_schemas.video import FILM, Video, VideoOf
+from physworld_schemas.video import FilmName, Video, VideoOf
 from physworld_services.api.ranges import parse_range
 from physworld_services.dashboard.site import BASE, Site
 from physworld_storage import videos
@@ -26,10 +26,12 @@ def router(site: Site) -> APIRouter:
     def one(video_id: str) -> Response:
         return RedirectResponse(f"{BASE}{page_of(_video(site, video_id))}#films", 303)
 
-    @routes.get(f"/{{video_id}}/{FILM}")
-    def film(video_id: str, byte_range: Annotated[str | None, Header(alias="Range")] = None) -> Response:
-        """The film by byte range, which players need to seek; it never changes."""
-        found = next((item for item in _video(site, video_id).artifacts if item.name == FILM), None)
+    @routes.get("/{video_id}/{name}")
+    def film(
+        video_id: str, name: FilmName, byte_range: Annotated[str | None, Header(alias="Range")] = None
+    ) -> Response:
+        """The film, or that of the recording, by byte range, which players need to seek; it never changes."""
+        found = next((item for item in _video(site, video_id).artifacts if item.name == name), None)
         if found is None or not site.artifacts.exists(found.sha256):
             raise NotFound("film of video", video_id)
         wanted = parse_range(byte_range, found.size)

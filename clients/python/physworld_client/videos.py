@@ -9,7 +9,7 @@ from physworld_client import films
 from physworld_client.pages import ListPage
 from physworld_client.resources import Resource
 from physworld_client.types import Job, Scene, Video
-from physworld_schemas.video import FILM, VideoConfig, VideoOf
+from physworld_schemas.video import FILM, FilmName, VideoConfig, VideoOf
 
 
 class Videos(Resource):
@@ -52,10 +52,23 @@ class Videos(Resource):
             cursor,
         )
 
-    def download(self, video_id: str, path: str | Path) -> Path:
-        """The film as an MP4 file at ``path``. Raises ValueError while there is none."""
+    def download(self, video_id: str, path: str | Path, name: FilmName = FILM) -> Path:
+        """The film as an MP4 file at ``path``.
+
+        Args:
+            video_id: of the film.
+            path: of the file to write.
+            name: "film.mp4", or "recording.mp4": the scene's own pictures, where the film is compared with them.
+
+        Raises:
+            ValueError: there is none yet, or no recording beside it, with the reason.
+        """
         video = self.get(video_id)
-        film = next((item for item in video.artifacts if item.name == FILM), None)
+        film = next((item for item in video.artifacts if item.name == name), None)
+        if film is None and video.report is not None:
+            raise ValueError(
+                f"video {video_id} has no {name}: {video.report.not_scored or 'it was drawn before'}"
+            )
         if film is None:
             raise ValueError(f"video {video_id} is {video.state}: there is no film yet")
         return self._client.artifacts.download(film, path)

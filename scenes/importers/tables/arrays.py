@@ -76,7 +76,8 @@ def table_of(where: str, form: str, arrays: dict[str, Array]) -> MarkerTable:
         labels += members
     checked_size(where, frames, len(labels))
     names = checked_labels(where, labels)
-    places = np.concatenate([np.asarray(track, dtype=np.float64) for track in tracks.values()], axis=1)
+    parts = [np.asarray(track, dtype=np.float64) for track in tracks.values()]
+    places = np.ascontiguousarray(parts[0]) if len(parts) == 1 else np.concatenate(parts, axis=1)
     if facts.seen is not None:
         main = next((name for name in tracks if MAIN.match(_last(name))), next(iter(tracks)))
         begin = labels.index(sets[main][0])

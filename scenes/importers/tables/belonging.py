@@ -288,7 +288,9 @@ def third_difference_noise(places: Array, seen: Array) -> Array:
     if len(places) < 4:
         return np.zeros(places.shape[1])
     four = seen[:-3] & seen[1:-2] & seen[2:-1] & seen[3:]
-    third = np.abs(np.diff(places, n=3, axis=0)).max(axis=2)
+    third = np.empty(four.shape)
+    for t in range(len(third)):
+        third[t] = np.abs(np.diff(places[t : t + 4], n=3, axis=0)[0]).max(axis=1)
     found = np.zeros(places.shape[1])
     for i in range(places.shape[1]):
         if four[:, i].any():

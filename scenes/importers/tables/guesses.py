@@ -90,14 +90,17 @@ def faster_acceleration(places: Array, seen: Array, step_s: float) -> float:
     stride = max(1, min(round(ACCELERATION_STEP_S / step_s), (len(places) - 1) // 2))
     if len(places) < 2 * stride + 1:
         return 0.0
-    second = places[2 * stride :] - 2.0 * places[stride:-stride] + places[: -2 * stride]
-    known = seen[2 * stride :] & seen[stride:-stride] & seen[: -2 * stride]
-    sizes = np.linalg.norm(second, axis=2)[known]
+    found = []
+    for t in range(len(places) - 2 * stride):
+        before, now, after = (places[t + step * stride] for step in range(3))
+        known = seen[t] & seen[t + stride] & seen[t + 2 * stride]
+        found.append(np.linalg.norm(after - 2.0 * now + before, axis=1)[known])
+    sizes = np.concatenate(found)
     return float(np.quantile(sizes, 0.95)) / (stride * step_s) ** 2 if sizes.size else 0.0
 
 
 def up(
-    table: MarkerTable, where: str, given: str | None, kind: str | None, body: Array, gripper: Array | None
+    table: MarkerTable, where: str, given: str | None, kind: str | None, low: Array, gripper: Array | None
 ) -> tuple[str, str, str | None]:
     """The axis that points up, how it was found, and a warning if the data speak against it.
 
@@ -106,7 +109,7 @@ def up(
         where: its name, in errors.
         given: the axis that a person says.
         kind: of the object; a beam stands out from its clamp where a rope or a cloth hangs.
-        body: seen places on the body, (M, 3), in the file's axes.
+        low: the least of each coordinate of the body's seen places, (3,), in the file's axes.
         gripper: from the body's middle to the gripper's, the mean of all frames, (3,); None: no gripper.
 
     Raises:
@@ -133,7 +136,6 @@ def up(
             "guessed: the body hangs from its gripper along it",
             f"up is guessed to be {hangs}: --up says it",
         )
-    low = body.min(axis=0)
     if low[1] >= 0.0 > low[2]:
         return (
             "y",

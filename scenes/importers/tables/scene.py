@@ -113,30 +113,37 @@ def reading_of(table: MarkerTable, where: str, options: ImportOptions) -> Readin
         )
     seen, who = _unswapped(table, where, who, lines)
     guessed: list[Guess] = []
-    body = table.places[:, list(who.body)][seen[:, list(who.body)]]
-    if not len(body):
+    body, body_seen = _chosen(table.places, who.body), _chosen(seen, who.body)
+    if not body_seen.any():
         raise refused(where, f"none of the {len(who.body)} markers on the body is ever seen")
     times, fps, rate_how = guesses.clock(table, where, options.fps)
-    everything = table.places[seen]
-    fast = guesses.faster_acceleration(table.places[:, list(who.body)], seen[:, list(who.body)], 1.0 / fps)
-    extent = float(np.linalg.norm(np.ptp(everything, axis=0)))
+    fast = guesses.faster_acceleration(body, body_seen, 1.0 / fps)
+    low, high = _corners(table.places, seen)
+    extent = float(np.linalg.norm(high - low))
     unit, unit_how, unsure = guesses.unit(table, where, options.unit, extent, fast)
     scale = METRES_PER_UNIT[unit]
     held, held_seen, held_labels = _controllers(table, seen, who, scale)
     axis, up_how, against = guesses.up(
-        table, where, options.up, options.kind, body, _towards(table, seen, who, held, held_seen)
+        table,
+        where,
+        options.up,
+        options.kind,
+        _corners(body, body_seen)[0],
+        _towards(body, body_seen, held, held_seen),
     )
     warnings += [said for said in (unsure, against) if said]
     turn = scale * ROTATION_FROM_UP[axis]
-    first = int(np.argmax(seen[:, list(who.body)].any(axis=1)))
+    first = int(np.argmax(body_seen.any(axis=1)))
     if first:
         lines.append(f"the first {first} frames are left out: no marker on the body is seen in them")
     if len(times) - first < 2:
         raise refused(
             where, f"markers on the body are seen in {len(times) - first} frames; a motion needs 2 or more"
         )
-    visible = seen[first:, list(who.body)]
-    points = fill_gaps(table.places[first:, list(who.body)], visible) @ turn.T
+    visible = body_seen[first:]
+    points = fill_gaps(body[first:], visible)
+    for frame in points:
+        frame[...] = frame @ turn.T
     controllers = fill_gaps(held[first:], held_seen[first:]) @ turn.T
     interpolated = int((~held_seen[first:]).sum())
     if held_seen.size and interpolated / held_seen[first:].size > GAP_WARNING:
@@ -209,6 +216,19 @@ def scene_of(reading: Reading, where: str, name: str, options: ImportOptions) ->
     return scene, [*reading.warnings, *assumed, *warnings]
 
 
+def _chosen(values: Array, markers: tuple[int, ...]) -> Array:
+    """Of (T, N, ...) those of some markers; all of them in their order are not copied."""
+    return values if markers == tuple(range(values.shape[1])) else values[:, list(markers)]
+
+
+def _corners(places: Array, seen: Array) -> tuple[Array, Array]:
+    """The least and the greatest of each coordinate (3,) of places (T, N, 3) where they are seen (T, N)."""
+    shown = [(frame[known].min(axis=0), frame[known].max(axis=0)) for frame, known in zip(places, seen, strict=True)
+             if known.any()]  # fmt: skip
+    low, high = zip(*shown, strict=True)
+    return np.min(low, axis=0), np.max(high, axis=0)
+
+
 def fill_gaps(positions: Array, valid: Array) -> Array:
     """Positions (T, N, 3) with every gap interpolated in time, held at the ends; zero if never seen."""
     filled = np.zeros_like(positions)
@@ -239,8 +259,9 @@ def _unswapped(table: MarkerTable, where: str, who: Belonging, lines: list[str])
     """What is seen (T, N) without samples whose label was on another marker; markers that mostly were are dropped."""
     used = sorted({*who.gripper, *who.body})
     seen = table.seen.copy()
-    sigma = third_difference_noise(table.places[:, used], seen[:, used])
-    wrong = swapped(table.places[:, used], seen[:, used], sigma) & seen[:, used]
+    places = _chosen(table.places, tuple(used))
+    sigma = third_difference_noise(places, seen[:, used])
+    wrong = swapped(places, seen[:, used], sigma) & seen[:, used]
     if not wrong.any():
         return seen, who
     gone = {used[i] for i in np.flatnonzero(lost(wrong, seen[:, used]))}
@@ -291,19 +312,19 @@ def _carried(body: RigidBody, arms: Array) -> Array:
     return body.places[:, None] + arms + w * twice + np.cross(np.broadcast_to(v, twice.shape), twice)
 
 
-def _towards(table: MarkerTable, seen: Array, who: Belonging, held: Array, held_seen: Array) -> Array | None:
-    """From the body's middle to the gripper's, the mean of the frames in which both are seen, (3,)."""
-    body = list(who.body)
-    both = (
-        seen[:, body].any(axis=1) & held_seen.any(axis=1)
-        if held.shape[1]
-        else np.zeros(len(held), dtype=bool)
-    )
+def _towards(body: Array, body_seen: Array, held: Array, held_seen: Array) -> Array | None:
+    """From the body's middle to the gripper's, the mean of the frames in which both are seen, (3,).
+
+    Args:
+        body, held: places (T, N, 3) and (T, K, 3).
+        body_seen, held_seen: where they are seen, (T, N) and (T, K).
+    """
+    both = body_seen.any(axis=1) & held_seen.any(axis=1)
     if not both.any():
         return None
     middles = [
         np.where(known[both][..., None], places[both], 0.0).sum(axis=1) / known[both].sum(axis=1)[:, None]
-        for places, known in ((held, held_seen), (table.places[:, body], seen[:, body]))
+        for places, known in ((held, held_seen), (body, body_seen))
     ]
     return np.asarray((middles[0] - middles[1]).mean(axis=0))
 

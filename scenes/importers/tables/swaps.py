@@ -31,9 +31,13 @@ def swapped(places: Array, seen: Array, sigma: Array) -> Array:
     wrong = np.zeros(seen.shape, dtype=bool)
     if len(places) < 3 or places.shape[1] < 2:
         return wrong
-    expected = 2.0 * places[1:-1] - places[:-2]
+
+    def expected_at(t: int) -> Array:
+        """Places (N, 3) in frame t + 2, from the two frames before."""
+        return np.asarray(2.0 * places[t + 1] - places[t])
+
     known = seen[1:-1] & seen[:-2]
-    off = np.linalg.norm(places[2:] - expected, axis=2)
+    off = np.stack([np.linalg.norm(places[t + 2] - expected_at(t), axis=1) for t in range(len(places) - 2)])
     both = known & seen[2:]
     usual = np.array(
         [np.median(off[both[:, i], i]) if both[:, i].any() else 0.0 for i in range(seen.shape[1])]
@@ -48,12 +52,13 @@ def swapped(places: Array, seen: Array, sigma: Array) -> Array:
                 wrong[since[i] : frame, i] = True
                 since[i] = -1
             continue
-        there = np.linalg.norm(expected[t] - places[frame, i], axis=1)
+        expected = expected_at(t)
+        there = np.linalg.norm(expected - places[frame, i], axis=1)
         there[~known[t]] = np.inf
         there[i] = np.inf
         j = int(np.argmin(there))
-        apart = float(np.linalg.norm(expected[t, j] - expected[t, i])) if np.isfinite(there[j]) else np.inf
-        back = float(np.linalg.norm(places[frame, j] - expected[t, i]))
+        apart = float(np.linalg.norm(expected[j] - expected[i])) if np.isfinite(there[j]) else np.inf
+        back = float(np.linalg.norm(places[frame, j] - expected[i]))
         gone = not seen[frame, j] or NEARER * back < off[t, j]
         if NEARER * there[j] < off[t, i] and off[t, i] > JUMP_SHARE * apart and gone:
             since[i] = frame

@@ -154,8 +154,11 @@ def checked_places(where: str, labels: tuple[str, ...], places: Array) -> tuple[
         SceneInvalid: a value is too large for a place.
     """
     seen: Array = np.asarray(np.isfinite(places).all(axis=2))
-    places = np.where(seen[..., None], places, 0.0)
-    largest = np.abs(places).max(axis=2, initial=0.0)
+    if not seen.all():
+        places = np.where(seen[..., None], places, 0.0)
+    largest = np.zeros(seen.shape)
+    for row, frame in zip(largest, places, strict=True):
+        np.abs(frame).max(axis=1, initial=0.0, out=row)
     if (largest > FARTHEST).any():
         frame, marker = np.argwhere(largest > FARTHEST)[0]
         raise refused(

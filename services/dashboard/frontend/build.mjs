@@ -17,7 +17,7 @@ rmSync(OUT, { recursive: true, force: true });
 mkdirSync(`${OUT}/licences`, { recursive: true });
 
 await build({
-  entryPoints: ["src/app.js", "src/cloud.js", "src/curve.js", "src/playground.js", "src/upload.js", "src/style.css"],
+  entryPoints: ["app.js", "cloud.js", "curve.js", "film.js", "playground.js", "upload.js", "style.css"].map((name) => `src/${name}`),
   outdir: OUT,
   bundle: true,
   minify: true,

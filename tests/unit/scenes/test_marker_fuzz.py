@@ -285,8 +285,8 @@ def test_a_scene_that_cannot_be_written_leaves_what_was_there(
     out.mkdir()
     (out / "scene.json").write_text("before")
     monkeypatch.setattr(
-        "physworld_scenes.bundle.write_arrays",
-        lambda arrays: (_ for _ in ()).throw(OSError(28, "No space left")),
+        "physworld_scenes.bundle.stream_arrays",
+        lambda arrays, stream: (_ for _ in ()).throw(OSError(28, "No space left")),
     )
     assert importing.main([str(source), f"--out={out}", *SAID]) == 2
     assert "No space left" in capsys.readouterr().err

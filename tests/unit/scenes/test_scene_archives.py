@@ -17,14 +17,13 @@ from hypothesis import strategies as st
 from scene_parts import sound_parts
 from test_scene_bundle import files_of, tar_of
 
+from physworld_scenes.archive_writing import write_arrays, write_zip
 from physworld_scenes.archives import (
     ArchiveLimits,
     ArchiveRefused,
     read_archive,
     read_arrays,
     single_folder,
-    write_arrays,
-    write_zip,
 )
 from physworld_scenes.bundle import bundle_from_bytes, read_bundle
 from physworld_scenes.errors import SceneInvalid

@@ -19,7 +19,7 @@ from hypothesis.extra import numpy as npst
 from scene_parts import sound_parts
 
 from physworld.scene import AS_MEASURED, UNDEFORMED_AT_REST, Scene
-from physworld_scenes.archives import write_arrays, write_zip
+from physworld_scenes.archive_writing import write_arrays, write_zip
 from physworld_scenes.bundle import (
     bundle_from_bytes,
     canonical_archive,

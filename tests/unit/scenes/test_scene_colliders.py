@@ -12,7 +12,7 @@ import pytest
 import trimesh
 from scene_parts import FRAMES, sound_parts
 
-from physworld_scenes.archives import write_arrays, write_zip
+from physworld_scenes.archive_writing import write_arrays, write_zip
 from physworld_scenes.bundle import bundle_from_bytes, canonical_archive, read_bundle, validate, write_bundle
 from physworld_scenes.colliders import MeshRefused, read_mesh, write_mesh
 from physworld_scenes.errors import SceneInvalid

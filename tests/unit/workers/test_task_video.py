@@ -18,7 +18,7 @@ from physworld.arrays import Array
 from physworld.video import Drawing, from_ply, gaussians_at_points, orbit_view, to_ply
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.job import Job
-from physworld_schemas.video import FILM, CameraView, Video, VideoConfig, VideoCreate
+from physworld_schemas.video import FILM, RECORDING, CameraView, Video, VideoConfig, VideoCreate
 from physworld_storage import removal, videos
 from physworld_storage.errors import Conflict, NotFound
 from physworld_storage.jobs import jobs, leases
@@ -50,9 +50,9 @@ def keep(stores: Stores, scene_id: str, name: str, content: bytes) -> None:
         videos.put_picture(session, scene_id, stores.artifacts.put_bytes(content, name))
 
 
-def frames_of(stores: Stores, video: Video) -> Array:
-    (film,) = video.artifacts
-    assert (film.name, film.media_type) == (FILM, "video/mp4")
+def frames_of(stores: Stores, video: Video, name: str = FILM) -> Array:
+    film = next(item for item in video.artifacts if item.name == name)
+    assert film.media_type == "video/mp4"
     with av.open(io.BytesIO(stores.artifacts.read_bytes(film.sha256))) as opened:
         return np.stack([frame.to_ndarray(format="rgb24") for frame in opened.decode(video=0)])
 
@@ -84,6 +84,7 @@ def test_a_recording_is_drawn_as_points_with_the_whole_motion_in_view(
     assert (report.frames, report.drawn, report.seen_from) == (len(scene.times), "points", "whole")
     assert report.fps == pytest.approx(1.0 / np.median(np.diff(scene.times)))
     assert report.scores is None and report.not_scored == "the scene has no pictures"
+    assert [item.name for item in video.artifacts] == [FILM]
     pictures = frames_of(stores, video)
     assert pictures.shape == (len(scene.times), 48, 64, 3)
     assert all((picture < 128).any() for picture in pictures)  # something dark on white in every frame
@@ -126,6 +127,9 @@ def test_the_splat_and_the_camera_of_the_scene_are_taken_and_its_pictures_compar
     assert scores.psnr_db is not None and scores.psnr_db > 25 and scores.ssim > 0.9 and scores.iou is not None
     assert min(value or 0.0 for value in scores.psnr_db_per_frame) > 25  # each frame against its own picture
     assert scores.iou > 0.5 and len(scores.psnr_db_per_frame) == len(scores.ssim_per_frame) == len(pictures)
+    assert [item.name for item in second.artifacts] == [FILM, RECORDING]
+    recorded = frames_of(stores, second, RECORDING)
+    assert recorded.shape == pictures.shape and abs(recorded.astype(float) - pictures).mean() < 4
     keep(stores, scene_id, "frames.npz", npz(frames=255 - pictures))
     _, _, third = drawn(stores, runtime_with(), asked(stores, scene_id))
     assert third.report is not None and third.report.scores is not None
@@ -147,6 +151,26 @@ def test_pictures_of_another_size_or_count_are_named_with_their_numbers(
     _, _, video = drawn(stores, runtime_with(), asked(stores, scene_id, config))
     assert video.report is not None and video.report.seen_from == "given"
     assert f"are {count} of 32 x 24 px, the film has {count} of 64 x 48 px" in video.report.not_scored
+
+
+def test_lpips_is_a_score_where_its_weights_are_installed(
+    runtime_with: RuntimeOf, stores: Stores, scene_id: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    count = len(tiny_scene().times)
+    keep(stores, scene_id, "frames.npz", npz(frames=np.zeros((count, 48, 64, 3), np.uint8)))
+    asked_for = VideoConfig(camera=view())
+    found = {}
+    for net in ("absent", "there"):
+        monkeypatch.setattr(task, "are_installed", lambda _, net=net: net == "there")
+        monkeypatch.setattr(task, "installed_weights", lambda name: name)
+        monkeypatch.setattr(task, "Lpips", lambda *_: lambda one, other: float(np.abs(one - other).mean()))
+        _, _, video = drawn(stores, runtime_with(), asked(stores, scene_id, asked_for))
+        assert video.report is not None and video.report.scores is not None
+        found[net] = video.report.scores
+    assert found["absent"].lpips is None and found["absent"].lpips_per_frame is None
+    distances = found["there"].lpips_per_frame
+    assert distances is not None and len(distances) == count and min(distances) > 0.5
+    assert found["there"].lpips == pytest.approx(np.mean(distances))
 
 
 @pytest.mark.parametrize(
@@ -294,8 +318,8 @@ def test_a_splat_is_fitted_to_the_first_picture_and_kept_beside_the_film(
     outcome, _, video = drawn(stores, runtime_with(), asked(stores, scene_id, asked_for))
     assert outcome == "done" and video.report is not None and video.report.scores is not None
     assert (video.report.drawn, video.report.seen_from) == ("fitted", "scene")
-    assert [item.name for item in video.artifacts] == [FILM, "splat.ply"]
-    splat = from_ply(stores.artifacts.read_bytes(video.artifacts[1].sha256))
+    assert [item.name for item in video.artifacts] == [FILM, RECORDING, "splat.ply"]
+    splat = from_ply(stores.artifacts.read_bytes(video.artifacts[2].sha256))
     assert len(splat) == video.report.gaussians
     assert video.report.scores.iou_per_frame is not None and video.report.scores.iou_per_frame[0] > 0.6
     keep(stores, scene_id, "frames.npz", npz(frames=frames, masks=np.zeros_like(masks)))

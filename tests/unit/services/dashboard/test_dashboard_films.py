@@ -33,7 +33,8 @@ REPORT = {
         "world_to_camera": np.eye(4).tolist(),
     },
     "scores": {
-        "psnr_db": 31.25, "ssim": 0.943, "psnr_db_per_frame": [31.25] * 12, "ssim_per_frame": [0.943] * 12,
+        "psnr_db": 31.25, "ssim": 0.943, "lpips": 0.0625, "lpips_per_frame": [0.0625] * 12,
+        "psnr_db_per_frame": [31.25] * 12, "ssim_per_frame": [0.943] * 12,
     },
 }  # fmt: skip
 
@@ -86,7 +87,7 @@ def test_the_button_of_a_scene_asks_for_a_film_and_the_page_plays_it(
         "12 frames",
         "4 Gaussians",
         "PSNR 31.2",
-        "SSIM 0.943",
+        "SSIM 0.943, LPIPS 0.0625",
         "camera of the scene",
     ):
         assert text in shown, text
@@ -106,6 +107,32 @@ def test_the_button_of_a_scene_asks_for_a_film_and_the_page_plays_it(
     assert client.post(f"/dashboard/delete/video/{film.id}", headers=own).status_code == 303
     assert "Nothing has been filmed yet" in card(client, scene)
     assert client.get(address).status_code == 404
+
+
+def test_a_film_with_its_recording_has_a_switch_and_both_files(
+    client: httpx.Client, world: tuple[Settings, Database, Stores]
+) -> None:
+    _, database, stores = world
+    scene = register(tiny_scene(), database, stores.artifacts)
+    own = {"origin": str(client.base_url).rstrip("/")}
+    client.post("/dashboard/start/video", data={"of": "scene", "id": scene}, headers=own)
+    with database.session() as session:
+        (waiting,) = leases.publishable(session)
+        lease = leases.claim(session, waiting.shard_id, "test", 60.0)
+        put = stores.artifacts.put_bytes
+        made = [put(FILM, "film.mp4", "video/mp4"), put(FILM[::-1], "recording.mp4", "video/mp4")]
+        found = {"report": REPORT, "artifacts": [item.model_dump() for item in made]}
+        assert lease is not None and leases.complete(session, lease, found, made[0].sha256)
+    with database.reading() as session:
+        (film,) = videos.list_videos(session).data
+    shown = card(client, scene)
+    assert 'data-frames="12"' in shown and "/static/film" in shown
+    for choice in ("Drawing", "Recording", "Overlay", "Side by side"):
+        assert f"{choice}</label>" in shown, choice
+    for name, content in (("film.mp4", FILM), ("recording.mp4", FILM[::-1])):
+        address = f"/dashboard/videos/{film.id}/{name}"
+        assert f'src="{address}"' in shown and client.get(address).content == content
+    assert client.get(f"/dashboard/videos/{film.id}/splat.ply").status_code == 404
 
 
 @pytest.mark.parametrize(
