@@ -7,6 +7,7 @@ when the training fails. Ready versions are immutable.
 from __future__ import annotations
 
 import re
+from contextlib import closing
 from typing import Any
 
 from sqlalchemy import select
@@ -397,11 +398,12 @@ def _latest(session: Session, name: str) -> tuple[int | None, ModelVersion | Non
         .order_by(ModelVersionRow.version.desc())
     )
     refused: ModelVersion | None = None
-    for row in session.scalars(statement.execution_options(yield_per=1)):
-        version = _version(row, [])
-        if version.quality.verdict != "failed":
-            return row.version, refused
-        refused = refused or version
+    with closing(session.scalars(statement.execution_options(yield_per=1))) as rows:
+        for row in rows:
+            version = _version(row, [])
+            if version.quality.verdict != "failed":
+                return row.version, refused
+            refused = refused or version
     return None, refused
 
 
