@@ -86,7 +86,7 @@ def settings(training: TrainingConfig = TRAINING, fit: CalibrationConfig = FIT) 
         f"{name}.{item.name}": getattr(part, item.name)
         for name, part in parts.items()
         for item in fields(part)
-        if getattr(part, item.name) != item.default
+        if getattr(part, item.name) != getattr(type(part)(), item.name)
     }
     return {"episodes": EPISODES} | chosen
 

@@ -26,9 +26,13 @@ PARTS = (
     "/report",
     "/surface",
     "/ghost",
-    "/film.mp4",
 )
-ELSEWHERE = {"/fits/*", "/checks/*", "/videos/*"}  # lead to the page of what they belong to
+ELSEWHERE = {"/fits/*", "/checks/*", "/videos/*", "/videos/*/*"}  # films, or lead to what they belong to
+    "/fits/*",
+    "/checks/*",
+    "/videos/*",
+    "/videos/*/*",
+}  # lead to the page of what they belong to, or are films
 MOST_BYTES = 6_000_000
 
 
