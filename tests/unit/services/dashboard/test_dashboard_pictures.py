@@ -28,11 +28,6 @@ PARTS = (
     "/ghost",
 )
 ELSEWHERE = {"/fits/*", "/checks/*", "/videos/*", "/videos/*/*"}  # films, or lead to what they belong to
-    "/fits/*",
-    "/checks/*",
-    "/videos/*",
-    "/videos/*/*",
-}  # lead to the page of what they belong to, or are films
 MOST_BYTES = 6_000_000
 
 
