@@ -14,6 +14,7 @@ import json
 import os
 import platform
 import statistics
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
@@ -75,15 +76,16 @@ class Report:
         """One line: script, machine, versions, seed, date."""
         machine = self.machine
         versions = ", ".join(f"{name} {version}" for name, version in machine["packages"].items())
+        command = machine.get("command", f"benchmarks.{self.name}")
         return (
-            f"`python -m benchmarks.{self.name}`; {machine['cpu']}, {machine['cores']} cores, load "
-            f"{machine['load']:.1f} at the start; Python {machine['python']}, {versions}; seed {self.seed}; "
+            f"`python -m {command}`; {machine['cpu']}, {machine['cores']} cores, "
+            f"load {machine['load']:.1f} at the start; Python {machine['python']}, {versions}; seed {self.seed}; "
             f"{machine['date']}"
         )
 
 
 def describe_machine() -> dict[str, Any]:
-    """CPU, cores this process may use, memory, versions, load, date."""
+    """What runs, CPU, cores this process may use, memory, versions, load, date."""
     packages = {}
     for name in PACKAGES:
         try:
@@ -91,6 +93,7 @@ def describe_machine() -> dict[str, Any]:
         except importlib.metadata.PackageNotFoundError:
             continue
     return {
+        "command": _command(),
         "cpu": _cpu_model(),
         "cores": len(os.sched_getaffinity(0)),
         "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
@@ -159,6 +162,12 @@ def run_alone(measure: Callable[[int, int], Report]) -> None:
 
 def _row(cells: Sequence[str]) -> str:
     return "| " + " | ".join(cells) + " |"
+
+
+def _command() -> str:
+    """The module that was started, as ``python -m`` takes it."""
+    spec = getattr(sys.modules["__main__"], "__spec__", None)
+    return "benchmarks" if spec is None else str(spec.name).removesuffix(".__main__")
 
 
 def _cpu_model() -> str:

@@ -112,12 +112,14 @@ def measure(repeats: int, seed: int) -> Report:
     )  # fmt: skip
 
 
-def demonstrations(budget: int, seed: int) -> tuple[Twin, list[Integration]]:
-    """A twin of the sample scene and its episodes, planned and not yet run."""
+def demonstrations(
+    budget: int, seed: int, frames: int = FRAMES, episodes: int = EPISODES
+) -> tuple[Twin, list[Integration]]:
+    """A twin of the sample scene on the CPU and its episodes, planned and not yet run."""
     scene = read_bundle(SCENE)
-    twin = build_twin(scene, budget)
-    config = DemonstrationConfig(frames=FRAMES, replay_share=0.0)
-    plans = [plan_episode(scene, twin, config, derived_seed(seed, index)) for index in range(EPISODES)]
+    twin = build_twin(scene, budget, device="cpu")
+    config = DemonstrationConfig(frames=frames, replay_share=0.0)
+    plans = [plan_episode(scene, twin, config, derived_seed(seed, index)) for index in range(episodes)]
     runs = [
         twin.integration(
             plan.control_times, plan.control_points, plan.times, properties=plan.properties, from_rest=True
@@ -125,6 +127,19 @@ def demonstrations(budget: int, seed: int) -> tuple[Twin, list[Integration]]:
         for plan in plans
     ]
     return twin, runs
+
+
+def run_together(engine: Batch, twin: Twin, runs: list[Integration]) -> None:
+    """The episodes of an engine that has been set up for them. Raises what one of them raised."""
+    ended = engine.run(
+        [twin.body.start] * len(runs),
+        [run.velocity for run in runs],
+        [run.held for run in runs],
+        [run.knots for run in runs],
+    )
+    for nodes in ended:
+        if not isinstance(nodes, np.ndarray):
+            raise nodes
 
 
 def _episode_seconds(
@@ -144,15 +159,7 @@ def _episode_seconds(
                 engine = TotalLagrangian(taken[0].problem)
             ready = time.process_time()
             if isinstance(engine, Batch):
-                ended = engine.run(
-                    [twin.body.start] * width,
-                    [run.velocity for run in taken],
-                    [run.held for run in taken],
-                    [run.knots for run in taken],
-                )
-                for nodes in ended:
-                    if not isinstance(nodes, np.ndarray):
-                        raise nodes
+                run_together(engine, twin, taken)
             else:
                 engine.run(twin.body.start, taken[0].velocity, taken[0].held, taken[0].knots)
             parts.run_s += time.process_time() - ready

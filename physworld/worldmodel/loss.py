@@ -97,7 +97,7 @@ class GraphedLoss:
         torch.cuda.current_stream(device).wait_stream(aside)
         model.zero_grad(set_to_none=True)
         self._graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(self._graph):
+        with torch.cuda.device(device), torch.cuda.graph(self._graph):
             loss = unrolled_loss(model, *self._inputs)
             loss.backward()  # type: ignore[no-untyped-call]
         self._loss = loss.detach()

@@ -25,6 +25,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from physworld.demonstrate.config import StrengthRange
+from physworld.devices import torch_device
 from physworld.worldmodel.errors import CheckpointMismatch, TrainingCancelled
 from physworld.worldmodel.finetune import FineTuneResult, fine_tune
 from physworld.worldmodel.model import config as settings_of
@@ -160,6 +161,8 @@ def _train(
     first = first_episodes(episodes.total, training.start_share)
     tracks = [episodes.track(index) for index in range(first)]
 
+    device = torch_device(stores.settings.device)
+    logger.info("job %s trains on %s", job_id, device)
     context.begin(PRIORS)
     latest: dict[str, float] = {}
 
@@ -193,7 +196,7 @@ def _train(
             progress=progress,
             validated=validated,
             cancelled=context.cancelled,
-            device=stores.settings.device,
+            device=device,
         )
 
     try:

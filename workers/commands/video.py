@@ -29,7 +29,7 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.camera import Camera
-from physworld.devices import default_device
+from physworld.devices import default_device, torch_device
 from physworld_schemas.wording import reason
 
 _MOTIONS = ("vertices", "particles", "tracks", "points", "after")
@@ -199,7 +199,7 @@ def _lpips(named: str, device: str) -> Callable[[Array, Array], float]:
 
     for net in NETS:
         if named == net:
-            return Lpips(installed_weights(net), device)
+            return Lpips(installed_weights(net), torch_device(device))
     if not Path(named).is_file():
         raise ValueError(f"--lpips takes {', '.join(NETS)} or a file; there is no file {named}")
     network = torch.export.load(named).module()

@@ -23,6 +23,7 @@ from pydantic import ValidationError
 
 from physworld.arrays import Array
 from physworld.camera import Camera
+from physworld.devices import torch_device
 from physworld.video import (
     Drawing,
     SplatConfig,
@@ -217,7 +218,7 @@ def _lpips(frames: Array, device: str) -> Lpips | None:
     """By AlexNet, where its weights are installed and the frames (T, H, W, 3) are large enough for it."""
     if min(frames.shape[1:3]) < LEAST_SIDE_PX["alexnet"] or not are_installed("alexnet"):
         return None
-    return Lpips(installed_weights("alexnet"), device)
+    return Lpips(installed_weights("alexnet"), torch_device(device))
 
 
 def _pictures_of(stores: Stores, scene_id: str) -> dict[str, str]:

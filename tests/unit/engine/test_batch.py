@@ -6,48 +6,24 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_scene import FPS, box_body, made_scene
+from made_scene import FPS
 from same_numbers import assert_same
+from three_scenes import SCENES
 
 from physworld.effects.registry import effect
 from physworld.engine.total.batch import Batch
 from physworld.engine.total.formulation import TotalLagrangian
 from physworld.errors import BatchRefused, CFLViolation, UnstableSimulation
 from physworld.materials.library import with_law
-from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Ground, Scene
 from physworld.twin.batch import Episode, simulate_batch
 from physworld.twin.build import build_twin
 from physworld.twin.twin import Twin
 
 FRAMES = 5
-PLATE = np.array([[0.0, 0.0, 0.0], [0.0, 0.03, 0.0], [0.0, 0.0, 0.03]])
 MOST = 1e-3  # [m] what must differ between episodes that are meant to differ
 
 
-def solid() -> Scene:
-    points = np.linspace([0.04, 0.02, 0.04], [0.16, 0.02, 0.04], 4)
-    grips = (Grip((0, 1, 2), np.zeros(3), np.array([0.032, 0.04, 0.04])),)
-    body = box_body([0, 0, 0], [0.16, 0.04, 0.04], density_kg_m3=500.0)
-    return made_scene(
-        points, "beam", PLATE, FRAMES, body=body, grips=grips, ground=Ground(-0.001, 0.4),
-        initial_state=UNDEFORMED_AT_REST,
-    )  # fmt: skip
-
-
-def sheet() -> Scene:
-    plane = np.stack(np.meshgrid(*[np.linspace(0, 0.2, 3)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
-    points = np.concatenate([plane, np.zeros((9, 1))], axis=1)
-    body = Body(thickness_m=2e-3)
-    return made_scene(points, "sheet", PLATE, FRAMES, body=body, initial_state=UNDEFORMED_AT_REST)
-
-
-def rope() -> Scene:
-    points = np.linspace([0.0, 0.0, 0.0], [0.3, 0.0, 0.0], 5)
-    body = Body(radius_m=0.004)
-    return made_scene(points, "rope", PLATE[:1], FRAMES, body=body, initial_state=UNDEFORMED_AT_REST)
-
-
-TWINS = {make.__name__: build_twin(make(), 200) for make in (solid, sheet, rope)}
+TWINS = {name: build_twin(make(FRAMES), 200) for name, make in SCENES.items()}
 CHANGED = {
     "solid": {"youngs_modulus_pa": 3e4, "poissons_ratio": 0.2, "viscosity_pa_s": 4.0, "density_kg_m3": 300.0},
     "sheet": {"bending_n_m": 1e-4, "air_drag_per_s": 2.0, "density_kg_m2": 1.0},

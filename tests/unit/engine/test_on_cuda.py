@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_scene import FPS, box_body, made_scene
+from made_scene import FPS
+from three_scenes import SCENES
 
-from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Ground, Scene
 from physworld.twin.batch import Episode, simulate_batch
 from physworld.twin.build import build_twin
 from physworld.twin.twin import Twin
@@ -18,35 +18,6 @@ MOVED_M = 0.02  # what the grips do
 SAME_M = {"auto": 2e-5, "updated_lagrangian": 2e-4}
 """Solids strain in single precision, sums have another order, and the ground of the updated form pushes all particles
 at once on a GPU, one after another on a CPU."""
-PLATE = np.array([[0.0, 0.0, 0.0], [0.0, 0.03, 0.0], [0.0, 0.0, 0.03]])
-
-
-def solid() -> Scene:
-    points = np.linspace([0.04, 0.02, 0.04], [0.16, 0.02, 0.04], 4)
-    grips = (Grip((0, 1, 2), np.zeros(3), np.array([0.032, 0.04, 0.04])),)
-    body = box_body([0, 0, 0], [0.16, 0.04, 0.04], density_kg_m3=500.0)
-    return made_scene(
-        points, "beam", PLATE, FRAMES, body=body, grips=grips, ground=Ground(-0.001, 0.4),
-        initial_state=UNDEFORMED_AT_REST,
-    )  # fmt: skip
-
-
-def sheet() -> Scene:
-    plane = np.stack(np.meshgrid(*[np.linspace(0, 0.2, 3)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
-    points = np.concatenate([plane, np.zeros((9, 1))], axis=1)
-    return made_scene(
-        points, "sheet", PLATE, FRAMES, body=Body(thickness_m=2e-3), initial_state=UNDEFORMED_AT_REST
-    )
-
-
-def rope() -> Scene:
-    points = np.linspace([0.0, 0.0, 0.0], [0.3, 0.0, 0.0], 5)
-    return made_scene(
-        points, "rope", PLATE[:1], FRAMES, body=Body(radius_m=0.004), initial_state=UNDEFORMED_AT_REST
-    )
-
-
-SCENES = {make.__name__: make for make in (solid, sheet, rope)}
 
 
 def lifted(twin: Twin, direction: float) -> Episode:
@@ -65,7 +36,8 @@ def test_a_twin_moves_as_on_a_cpu(shape: str, formulation: str, gpu: str) -> Non
     if shape != "solid" and formulation != "auto":
         pytest.skip("the updated form is of solids")
     here, there = (
-        build_twin(SCENES[shape](), 400, device=device, formulation=formulation) for device in ("cpu", gpu)
+        build_twin(SCENES[shape](FRAMES), 400, device=device, formulation=formulation)
+        for device in ("cpu", gpu)
     )
     one = lifted(here, 1.0)
     expected, found = nodes_of(here, one), nodes_of(there, one)
@@ -75,7 +47,7 @@ def test_a_twin_moves_as_on_a_cpu(shape: str, formulation: str, gpu: str) -> Non
 
 @pytest.mark.parametrize("shape", SCENES)
 def test_episodes_side_by_side_move_as_on_a_cpu(shape: str, gpu: str) -> None:
-    here = build_twin(SCENES[shape](), 400, device="cpu")
+    here = build_twin(SCENES[shape](FRAMES), 400, device="cpu")
     there = replace(here, device=gpu)
     episodes = [lifted(here, direction) for direction in np.linspace(-1.0, 1.0, 16)]
     expected, found = (
