@@ -18,7 +18,7 @@ from physworld.arrays import Array
 from physworld.errors import SimulationError
 from physworld.estimation.refit import Refit, prior_rows, refit
 from physworld.estimation.simulations import Job
-from physworld.estimation.unknowns import Unknown
+from physworld.estimation.unknowns import Unknown, at
 from physworld.estimation.whitening import ScaledWhitener, Whitener
 from physworld.trace.candidates import Candidate
 from physworld.trace.left_out import LeftOut, Linear, left_out
@@ -118,6 +118,17 @@ class Setting:
         unknowns = [*(u for u in self.calibrated if u.name not in names), *own]
         unknowns = [u.starting(values.get(u.name, u.start)) for u in unknowns]
         return twin, unknowns
+
+    def best_of(
+        self, members: Sequence[Candidate], places: Sequence[Values], white: Whitener
+    ) -> tuple[Values, float]:
+        """Of several places of a set of effects the one with the smallest mean squared residual, and that."""
+        twin, unknowns = self.assembled(members, places[0])
+        thetas = [[place.get(u.name, u.start) for u in unknowns] for place in places]
+        runs = self.simulations.run([Job(at(twin, unknowns, np.array(t)), self.frames) for t in thetas])
+        errors = [np.inf if t is None else float(np.mean(white.residual(t) ** 2)) for t in runs]
+        best = int(np.argmin(errors))
+        return places[best], errors[best]
 
     def fitted(
         self,

@@ -18,7 +18,7 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.calibrate import Journal
-from physworld.calibrate.parameters import BENDING_COUPLING, BENDING_RATIO, TWIST_RATIO, parameters_of
+from physworld.calibrate.parameters import BENDING_COUPLING, parameters_of
 from physworld.calibrate.rod_parameters import LOSSES, lossless, rod_parameters
 from physworld.engine.formulations import RODS
 from physworld.engine.thin.triangles import TriangleLattice
@@ -42,14 +42,12 @@ from physworld.trace.preparation import EXPERIMENT, SEARCH, Beginning, Clock, re
 from physworld.trace.recordings import FITTED, HELD_OUT, JointSimulations, Recordings, side_by_side
 from physworld.trace.report import describe
 from physworld.trace.result import Stage, Supported, TraceResult
-from physworld.trace.search import Search, early_part
+from physworld.trace.search import Search
 from physworld.trace.sensitivity import numerical_directions
+from physworld.trace.starts import Starts, early_part, other_places
 from physworld.trace.unknowns import KNOWN_BEFOREHAND, hold_unknowns, of_parameter
 from physworld.twin.twin import Twin
 
-_OTHER_STIFFNESSES = tuple(0.12 * k for k in (-6, -5, -4, -3, -2, -1, 1, 2, 3, 4, 5, 6))
-"""Logarithms: a phase that has slipped by a period is a local minimum, so others are looked at before a descent."""
-_SHAPES = (TWIST_RATIO, BENDING_RATIO)
 _THOROUGH = 2  # times the iterations of other fits: everything is compared with the declared physics
 _SLOWEST = 12.0  # times the cost of the declared physics that a run may take: strong friction is dear
 _RICHARDSON = {"finer cells": 2.04, "half the time step": 1.33}  # error over difference, of second order
@@ -169,9 +167,9 @@ class _Trace:
         declared = self._declared(ground)
         chosen, refused = candidates(declared.fitted.twin, config.candidates)
         setting = self._setting(ground, declared.fitted.twin, declared.fitted.unknowns)
-        early = early_part(ground.bare, self.split)
+        starts = Starts(setting, early_part(ground.bare, self.split), config.seed)
         sizes = (config.confirmed, config.additions, config.effects_at_most)
-        search = Search(setting, chosen, early, *sizes, config.seed)
+        search = Search(setting, chosen, starts, *sizes, config.seed)
         self.clock.start()
         with self.clock.until(SEARCH):
             search.run(declared)
@@ -268,7 +266,8 @@ class _Trace:
         rows = sum(len(own) for own in ground.blocks)
         scale = np.sqrt(max(first, 1.0) * rows / independent(max(first, 1.0), rows, len(ground.blocks)))
         start = {u.name: u.start for u in unknowns}
-        declared = thorough.fitted((), start, _other_places(unknowns), scale=float(scale))
+        places = [place for basin in other_places(unknowns, start) for place in basin]
+        declared = thorough.fitted((), start, places, scale=float(scale))
         if declared is None:
             raise RuntimeError("the calibrated twin cannot be simulated again")
         return declared
@@ -367,19 +366,3 @@ def _supported(known: list[Hypothesis], weights: Array, sigma: float) -> tuple[S
         )
         for w, h in ordered
     )
-
-
-def _other_places(unknowns: list[Unknown]) -> list[dict[str, float]]:
-    """Where the declared physics is looked for beside where it was calibrated: over its stiffness, for a phase that has
-    slipped by a period is a local minimum; and over that again from other values of what decides in which of these
-    minima it lies: the shapes of a sheet's stiffness, one deviation of their priors away, and what is not known at all
-    beforehand, a quarter of its range from its lower end.
-    """
-    own, first = {u.name: u.start for u in unknowns}, unknowns[0].name
-    bases = [own]
-    for u in unknowns[1:]:
-        if u.prior is None:
-            bases.append({**own, u.name: u.bounds[0] + 0.25 * (u.bounds[1] - u.bounds[0])})
-        elif u.name in _SHAPES:
-            bases.append({**own, u.name: own[u.name] + u.prior[1]})
-    return [{**base, first: own[first] + shift} for base in bases for shift in (*_OTHER_STIFFNESSES, 0.0)]

@@ -1,11 +1,9 @@
 """One search over sets of effects: forward additions, backward deletions, starts that every hypothesis shares.
 
-Every candidate is scored to first order first: the share of the residual above the noise that goes with its
-sensitivities and those of the calibrated parameters, within bounds and under priors. The most promising are fitted with
-the full simulator. A fit starts from its linear estimate, from multiples of it (a strength is underestimated where
-motion has run out of phase), from where other hypotheses have come to rest (their *basins*), and from the best of a
-low-discrepancy design over strengths, stiffness and whatever else nothing is known of. All of them are ranked on the
-first part of the recording, where phases have not slipped yet, and the best are first fitted to that part.
+Every candidate is scored to first order first (:mod:`physworld.trace.screening`). The most promising are fitted with
+the full simulator from the best of their near starts (:mod:`physworld.trace.starts`). Where one of them comes near the
+noise, the stiffness that it has found is right and no other basin is looked for. Where none does, all are begun far
+away too.
 
 Then another effect is added to the best set as long as the last one removed what one of two would, at most three; of
 every larger set each effect is taken out again and exchanged, from the larger set's basin, so that a pair whose first
@@ -18,29 +16,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.optimize import lsq_linear
-from scipy.stats import qmc
 
 from physworld.arrays import Array
-from physworld.estimation.noise import Split
-from physworld.estimation.refit import prior_rows, refit
-from physworld.estimation.simulations import Job
-from physworld.estimation.unknowns import Unknown, at, bounds_of, starting_at, starts_of
-from physworld.estimation.whitening import ScaledWhitener, Whitener
 from physworld.trace.candidates import Candidate
 from physworld.trace.hypotheses import Hypothesis, Setting, Values
-from physworld.trace.left_out import independent
 from physworld.trace.posterior import MOST, posterior, removes
-from physworld.trace.sensitivity import Response, candidate_responses
+from physworld.trace.screening import Screened, screened
+from physworld.trace.starts import NO_WORSE, Begun, Starts, basins, elsewhere, scale_at
 
-_MULTIPLES = (0.3, 3.0, 9.0)  # of a linear estimate
-_VARIANTS = 3  # shapes of an effect that are fitted before its best is freed
-_DESIGN = 32  # places of the low-discrepancy design
-_FOLLOWED = 3  # of all starts, the best on the early frames whose stiffness differs
-_EARLY_ITERATIONS = 2  # of each of these, on the early frames
-_STIFFNESS = 1.1  # logarithms of the stiffness that it spans, up and down
-_EARLY = 0.4  # share of the training frames that it looks at
-_LEAST_SHARE = 0.01  # of a strength's bound, where the design begins
+_VARIANTS = 3  # shapes of an effect that are begun before its best is freed
 WORTH = 0.1  # share of the error above the noise that an effect removes to first order, to be fitted
 _QUIET = (
     1.2  # misfit over the noise up to which what is there is small, and a score to first order says enough
@@ -48,40 +32,8 @@ _QUIET = (
 _HALF = 0.5  # of what the best one promises: what a rival has to promise to be fitted to all frames
 _FIRST_OF_TWO = 0.29  # share of the root mean square that goes with one of two effects of the same size
 _BASINS = 3  # other hypotheses' optima from which a fit starts
+_MULTIPLES = (1.0, 0.3, 3.0)  # of its strengths, where an effect is tried with the material of the best one
 _WORSE = 3.0  # times the best one's squared error above the noise: a fit that is left
-_APART = 0.1  # logarithm of the stiffness by which two places are in two basins
-
-
-@dataclass(frozen=True)
-class Screened:
-    """A candidate's first-order score against a hypothesis.
-
-    Attributes:
-        candidate: which.
-        values: linear estimates of all unknowns, by name, in the scale of the search.
-        share: of the root mean square residual above the noise that goes, to first order.
-        error: mean squared residual over the noise's that stays.
-    """
-
-    candidate: Candidate
-    values: Values
-    share: float
-    error: float
-
-
-@dataclass(frozen=True)
-class Begun:
-    """Where the fit of a candidate beside a hypothesis begins.
-
-    Attributes:
-        screened: its first-order score.
-        starts: places, by name, beside the linear estimate.
-        promised: share of the root mean square above the noise that goes on the early frames, fitted there.
-    """
-
-    screened: Screened
-    starts: list[Values]
-    promised: float
 
 
 @dataclass(frozen=True)
@@ -100,20 +52,23 @@ class Search:
     Attributes:
         setting: what all hypotheses share.
         chosen: candidates.
-        early: whitener of the first part of the training frames, and their end; None: no design.
+        starts: where fits begin.
         singles, additions, most: candidates that are fitted first, and on top of a set; effects at most.
-        seed: of the designs.
+        hypotheses: that were fitted, by their effects.
+        screens: what was scored beside which of them.
+        settled: errors that the sets of a size had when they were last fitted from each other's numbers.
     """
 
     setting: Setting
     chosen: list[Candidate]
-    early: tuple[Whitener, int] | None
+    starts: Starts
     singles: int
     additions: int
     most: int
     seed: int = 0
     hypotheses: dict[tuple[str, ...], Hypothesis] = field(default_factory=dict)
     screens: list[tuple[Hypothesis, list[Screened]]] = field(default_factory=list)
+    settled: dict[int, list[float]] = field(default_factory=dict)
 
     @property
     def library(self) -> int:
@@ -167,9 +122,9 @@ class Search:
     def steps(self) -> tuple[Step, ...]:
         """What was scored and fitted, set by set."""
         found = []
-        for base, screened in self.screens:
+        for base, scores in self.screens:
             tried = (h for h in self.hypotheses.values() if len(h.members) == len(base.members) + 1)
-            found.append(Step(base, screened, tuple(h for h in tried if set(base.names) <= set(h.names))))
+            found.append(Step(base, scores, tuple(h for h in tried if set(base.names) <= set(h.names))))
         return tuple(found)
 
     def weights(self) -> Array:
@@ -196,48 +151,99 @@ class Search:
         nothing = self._removes(base) == 0.0
         if nothing and base.members:
             return
-        screened = self.screened(base)
-        self.screens.append((base, screened))
+        scores = screened(self.setting, base, self.chosen)
+        self.screens.append((base, scores))
         if nothing:
             return
+        quiet, size = _near(base), len(base.members) + 1
+        order = self._worth(base, scores, count)
+        self._begin(base, order, far=False)
+        if not quiet and not base.members and not any(_near(known) for known in self._of_size(size)):
+            self._begin(base, order, far=True)
+        self._settle(size)
+
+    def _worth(self, base: Hypothesis, scores: Sequence[Screened], count: int) -> list[list[Screened]]:
+        """The variants of every effect that is fitted beside ``base``, the most promising effect first."""
         by_effect: dict[str, list[Screened]] = {}
-        for one in screened:
+        for one in scores:
             by_effect.setdefault(one.candidate.effect, []).append(one)
-        order = [own for own in by_effect.values() if own[0].share > WORTH]
-        restless = base.fitted.misfit > _QUIET and not base.members
-        order = order[:count]
-        if restless:  # a score to first order says nothing of an effect that is large
+        least = _FIRST_OF_TWO if _near(base) else WORTH
+        order = [own for own in by_effect.values() if own[0].share > least][:count]
+        if (
+            not _near(base) and not base.members
+        ):  # a score to first order says nothing of an effect that is large
             order += [own for own in by_effect.values() if own not in order and own[0].candidate.scanned]
         simpler = [name for own in order for name in own[0].candidate.contains]
-        order += [by_effect[name] for name in simpler if name in by_effect and by_effect[name] not in order]
-        begun = [self._begun(base, own) for own in order]
-        most = max((one.promised for own in begun for one in own), default=0.0)
-        scored = max((own[0].share for own in order), default=0.0)
-        for own in sorted(begun, key=lambda own: -max(one.promised for one in own)):
-            promised, share = max(one.promised for one in own), own[0].screened.share
-            if promised >= _HALF * most or share >= _HALF * scored:
-                self.setting.simulations.stage = f"fit with {own[0].screened.candidate.effect}"
-                self._fit(base, own)
-        self._share(len(base.members) + 1)
+        return order + [
+            by_effect[name] for name in simpler if name in by_effect and by_effect[name] not in order
+        ]
 
-    def _share(self, size: int) -> None:
-        """Fits again from the calibrated numbers of the best one: a material is the same whatever else acts on it, and
-        a fit that has come to rest in a valley of its own says nothing of its effect."""
-        calibrated = {unknown.name for unknown in self.setting.calibrated}
-        ranked = sorted(self._of_size(size), key=lambda h: h.left)
-        for known in ranked[1:]:
-            shared = {n: v for n, v in ranked[0].values.items() if n in calibrated}
-            place = {**known.values, **shared}
-            twin, unknowns = self.setting.assembled(known.members, place)
-            runs = self.setting.simulations.run(
-                [Job(at(twin, unknowns, starts_of(unknowns)), self.setting.frames)]
-            )
-            if runs[0] is None or np.mean(known.white.residual(runs[0]) ** 2) >= known.fitted.misfit**2:
+    def _begin(self, base: Hypothesis, order: Sequence[list[Screened]], far: bool) -> None:
+        """Fits of ``base`` with each of the effects, those that promise at least half of what the best one does."""
+        begun = [self._begun(base, own, far) for own in order]
+        most = max((one.promised for one in begun), default=0.0)
+        scored = max((one.screened.share for one in begun), default=0.0)
+        for one in sorted(begun, key=lambda one: -one.promised):
+            known = self.hypotheses.get(_names((*base.members, one.screened.candidate)))
+            if far and known is not None and one.promised <= self.starts.promised(base, known):
                 continue
-            self.setting.simulations.stage = f"fit with {' and '.join(known.names)}"
-            found = self.setting.fitted(known.members, place, scale=known.unseen.scale, white=known.white)
-            if found is not None and found.left < known.left:
-                self.hypotheses[known.names] = found
+            if one.promised >= _HALF * most > 0.0 or (not far and one.screened.share >= _HALF * scored):
+                self.setting.simulations.stage = f"fit with {one.screened.candidate.effect}"
+                self._fit(base, one)
+
+    def _begun(self, base: Hypothesis, variants: list[Screened], far: bool) -> Begun:
+        """Where the fit of an effect begins: of its best variants the one that promises most."""
+        kept = variants[: _VARIANTS if variants[0].candidate.shapes else 1]
+        self.setting.simulations.stage = f"fit with {variants[0].candidate.effect}"
+        if not far and _near(base):
+            return Begun(kept[0], [], 0.0)
+        best = sorted(self.hypotheses.values(), key=self._total, reverse=True)
+        others = basins(base, best, self.setting.calibrated[0].name, _BASINS)
+        begun = [
+            self.starts.far(base, one, others, 1.0 / len(kept))
+            if far
+            else self.starts.near(base, one, others)
+            for one in kept
+        ]
+        return max(begun, key=lambda one: one.promised)
+
+    def _settle(self, size: int) -> None:
+        """Fits the best set of a size from elsewhere too, and all others from its calibrated numbers: a material is the
+        same whatever else acts on it, and a fit that has come to rest in a valley of its own says nothing of its
+        effect."""
+        ranked = sorted(self._of_size(size), key=lambda h: h.left)
+        if not ranked or self.settled.get(size) == [h.left for h in ranked]:
+            return
+        best = ranked[0]
+        if size not in self.settled:
+            for shape in elsewhere(self.setting.calibrated, best.values):
+                best = self._again(best, shape, np.inf)
+        shared = {u.name: best.values[u.name] for u in self.setting.calibrated if u.name in best.values}
+        for known in ranked:
+            if known.members == best.members:
+                continue
+            own = {n: v for n, v in known.values.items() if n not in shared}
+            scaled = [{n: f * v for n, v in own.items()} for f in _MULTIPLES]
+            self._again(
+                known,
+                [{**known.values, **shared, **one} for one in scaled],
+                NO_WORSE * known.fitted.misfit**2,
+            )
+        self.settled[size] = sorted(h.left for h in self._of_size(size))
+
+    def _again(self, known: Hypothesis, places: Sequence[Values], most: float) -> Hypothesis:
+        """The better one of a hypothesis and its fit from the best of these places, if that has an error below."""
+        self.setting.simulations.stage = f"fit with {' and '.join(known.names)}"
+        place, error = self.setting.best_of(known.members, places, known.white)
+        if error >= most:
+            return known
+        scale = scale_at(known, self.setting, error)
+        hopeless = known.fitted.misfit**2 * len(known.fitted.residual)
+        found = self.setting.fitted(known.members, place, scale=scale, hopeless=hopeless, white=known.white)
+        if found is None or found.left >= known.left:
+            return known
+        self.hypotheses[known.names] = found
+        return found
 
     def _take_out(self, larger: Hypothesis) -> None:
         """Fits without one of the effects of a set, and with another one in its place, from the set's basin."""
@@ -250,33 +256,19 @@ class Search:
             )
             if again is not None and (known is None or again.left < known.left):
                 self.hypotheses[_names(rest)] = known = again
-            if known is not None and known.members and self._total(known) < self._total(larger):
+            if known is None or not known.members or self._total(known) >= self._total(larger):
+                continue
+            if self._removes(self.hypotheses[()], known) >= _FIRST_OF_TWO:
                 self._add(known, self.additions)
 
-    def _begun(self, base: Hypothesis, variants: list[Screened]) -> list[Begun]:
-        """Where the fits of an effect begin: of its best variants the one that promises most, where that is known."""
-        kept = variants[: _VARIANTS if variants[0].candidate.shapes else 1]
-        self.setting.simulations.stage = f"fit with {variants[0].candidate.effect}"
-        begun = [self._best_early(base, one, _DESIGN // len(kept)) for one in kept]
-        best = max(begun, key=lambda one: one.promised)
-        return begun if best.promised == 0.0 else [best]
-
-    def _fit(self, base: Hypothesis, variants: list[Begun]) -> None:
-        """Fits ``base`` with an effect more, the variants' shapes first as they are, then free where that promises
-        something."""
-        candidate = variants[0].screened.candidate
+    def _fit(self, base: Hypothesis, begun: Begun) -> None:
+        """Fits ``base`` with an effect more, its shape first as it is, then free where that promises something."""
+        candidate, hopeless = begun.screened.candidate, self._hopeless(base)
         members = (*base.members, candidate)
-        names = _names(members)
+        first, *others = begun.starts or [{**base.values, **begun.screened.values}]
+        scale = scale_at(base, self.setting, begun.screened.error)
         shaped = bool(candidate.shapes)
-        hopeless = self._hopeless(base)
-        best: Hypothesis | None = None
-        for begun in variants:
-            own = (*base.members, begun.screened.candidate)
-            linear = {**base.values, **begun.screened.values}
-            scale = self._scale(base, begun.screened.error)
-            found = self.setting.fitted(own, linear, begun.starts, not shaped, scale, hopeless, base.white)
-            if found is not None and (best is None or found.left < best.left):
-                best = found
+        best = self.setting.fitted(members, first, others, not shaped, scale, hopeless, base.white)
         if best is not None and shaped and self._removes(base, best) >= WORTH:
             places = [best.values]
             mirror = best.members[-1].mirror
@@ -286,14 +278,9 @@ class Search:
                 found = self.setting.fitted(best.members, place, scale=best.unseen.scale, white=best.white)
                 if found is not None and found.left < best.left:
                     best = found
-        known = self.hypotheses.get(names)
+        known = self.hypotheses.get(_names(members))
         if best is not None and (known is None or best.left < known.left):
-            self.hypotheses[names] = best
-
-    def _scale(self, base: Hypothesis, error: float) -> float:
-        """Deviations of the noise that a sighting counts as at a mean squared residual of ``error``."""
-        rows, blocks = len(base.fitted.residual), len(self.setting.blocks)
-        return float(np.sqrt(max(error, 1.0) * rows / independent(max(error, 1.0), rows, blocks)))
+            self.hypotheses[_names(members)] = best
 
     def _hopeless(self, base: Hypothesis) -> float:
         """Squared residual above which a fit is left: it is far from removing a half of what ``base`` leaves, and the
@@ -304,134 +291,10 @@ class Search:
         )
         return rows * (1.0 + max(_WORSE * max(left - 1.0, 0.0), 0.5 * (base.fitted.misfit**2 - 1.0)))
 
-    def _starts(self, base: Hypothesis, one: Screened) -> list[Values]:
-        """Places to start from beside the linear estimate."""
-        gates = [u.name for u in one.candidate.unknowns()]
-        linear = {**base.values, **one.values}
-        strengths = {name: linear[name] for name in gates}
-        starts: list[Values] = [{**base.values, **strengths}]
-        starts += [{**linear, **{n: f * s for n, s in strengths.items()}} for f in _MULTIPLES]
-        for other in self._basins(base):
-            kept = {n: v for n, v in other.values.items() if n in base.values}
-            starts += [
-                {**base.values, **kept, **{n: f * s for n, s in strengths.items()}} for f in (1.0, 0.3, 3.0)
-            ]
-        return starts
 
-    def _basins(self, base: Hypothesis) -> list[Hypothesis]:
-        """The best hypotheses whose stiffness is another one than that of ``base``."""
-        first = self.setting.calibrated[0].name
-        found: list[Hypothesis] = []
-        for other in sorted(self.hypotheses.values(), key=self._total, reverse=True):
-            here = [base.values.get(first, 0.0), *(h.values.get(first, 0.0) for h in found)]
-            if other is not base and all(abs(other.values.get(first, 0.0) - t) > _APART for t in here):
-                found.append(other)
-        return found[:_BASINS]
-
-    def _best_early(self, base: Hypothesis, one: Screened, design: int) -> Begun:
-        """The best of all starts on the early frames, among them ``design`` places of a low-discrepancy design, and the
-        share of what ``base`` leaves there that goes with it."""
-        starts = self._starts(base, one)
-        if self.early is None or (base.fitted.misfit <= _QUIET and not base.members):
-            return Begun(one, starts, 0.0)
-        white, frames = self.early
-        members = (*base.members, one.candidate)
-        twin, unknowns = self.setting.assembled(members, base.values, shapes=bool(base.members))
-        starts += self._designed(one, unknowns, design)
-        low, high = bounds_of(unknowns)
-        thetas = [np.clip([start.get(u.name, u.start) for u in unknowns], low, high) for start in starts]
-        runs = self.setting.simulations.run([Job(at(twin, unknowns, theta), frames) for theta in thetas])
-        errors = [np.inf if t is None else float(np.mean(white.residual(t) ** 2)) for t in runs]
-        before = float(np.mean(white.residual(base.fitted.tracks[:frames]) ** 2))
-        best: list[Values] = []
-        for k in self._apart(errors, [start[self.setting.calibrated[0].name] for start in starts]):
-            here = starting_at(unknowns, thetas[k])
-            scaled = ScaledWhitener(white, self._scale(base, max(errors[k], 1.0)))
-            found = refit(self.setting.simulations, scaled, twin, here, frames, _EARLY_ITERATIONS)
-            if found is not None:
-                errors.append((scaled.scale * found.misfit) ** 2)
-                best.append({u.name: float(t) for u, t in zip(found.unknowns, found.theta, strict=True)})
-        return Begun(one, best, removes(before, min(errors)))
-
-    @staticmethod
-    def _apart(errors: list[float], stiffnesses: list[float]) -> list[int]:
-        """The best of all places, no two of them at the same stiffness."""
-        found: list[int] = []
-        for k in np.argsort(errors):
-            if all(abs(stiffnesses[int(k)] - stiffnesses[other]) > _APART for other in found):
-                found.append(int(k))
-        return found[:_FOLLOWED]
-
-    def _designed(self, one: Screened, unknowns: list[Unknown], count: int) -> list[Values]:
-        """A low-discrepancy design over strengths, stiffness, and what else is calibrated of which nothing is known
-        beforehand."""
-        first, *rest = self.setting.calibrated
-        gates = one.candidate.unknowns()
-        open_ = [u for u in rest if u.prior is None and u.name not in [gate.name for gate in gates]]
-        drawn = qmc.Sobol(1 + len(open_) + len(gates), seed=self.seed).random_base2(int(np.log2(count)))
-        places: list[Values] = []
-        for row in drawn:
-            place = {u.name: u.start for u in unknowns}
-            place[first.name] += _STIFFNESS * (2.0 * row[0] - 1.0)
-            for share, unknown in zip(row[1:], open_, strict=False):
-                low, high = unknown.bounds
-                place[unknown.name] = low + share * (high - low)
-            for share, gate in zip(row[1 + len(open_) :], gates, strict=True):
-                lowest, highest = gate.bounds
-                signed = 2.0 * float(share) - 1.0 if lowest < 0 else float(share)
-                size = _LEAST_SHARE ** (1.0 - abs(signed))
-                place[gate.name] = float(np.sign(signed) * size * (highest if signed > 0 else -lowest))
-            places.append(place)
-        return places
-
-    def screened(self, base: Hypothesis) -> list[Screened]:
-        """First-order scores of all candidates that ``base`` has not, best first."""
-        setting = self.setting
-        chosen = [c for c in self.chosen if c.effect not in base.names]
-        responses = candidate_responses(
-            setting.simulations, base.white, base.fitted.twin, base.fitted.tracks, chosen, setting.frames
-        )
-        found = [self._screen(base, response) for response in responses if not response.failed]
-        return sorted((one for one in found if one is not None), key=lambda one: -one.share)
-
-    def _screen(self, base: Hypothesis, response: Response) -> Screened | None:
-        candidate, columns = response.candidate, response.columns
-        if not np.any(columns):
-            return None
-        gates = candidate.unknowns()
-        freed = {gate.name for gate in gates}
-        kept = [k for k, u in enumerate(base.fitted.unknowns) if u.name not in freed]
-        known = [base.fitted.unknowns[k] for k in kept]
-        start = np.concatenate([base.fitted.theta[kept], [base.values.get(g.name, 0.0) for g in gates]])
-        unknowns = [u.starting(t) for u, t in zip([*known, *gates], start, strict=True)]
-        jacobian = np.concatenate([base.fitted.jacobian[:, kept], columns], axis=1)
-        change = self._bounded(base, jacobian, unknowns, start)
-        error = float(np.mean((base.fitted.residual - jacobian @ change) ** 2))
-        share = removes(base.fitted.misfit**2, error)
-        values = {u.name: float(t) for u, t in zip(unknowns, start + change, strict=True)}
-        return Screened(candidate, values, share, error)
-
-    def _bounded(self, base: Hypothesis, jacobian: Array, unknowns: list[Unknown], start: Array) -> Array:
-        """Linear change of all unknowns (p,) within their bounds, by what a sighting counts beside ``base``."""
-        slope, residual = jacobian / base.unseen.scale, base.fitted.residual / base.unseen.scale
-        prior_residual, prior_slope = prior_rows(unknowns, start)
-        normal = slope.T @ slope + prior_slope.T @ prior_slope
-        gradient = slope.T @ residual + prior_slope.T @ prior_residual
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-        root = np.linalg.cholesky(normal * scale * scale[:, None] + 1e-9 * np.eye(len(scale)))
-        low, high = bounds_of(unknowns)
-        reach = 0.3 * (high - low)
-        low, high = np.maximum(low, start - reach), np.minimum(high, start + reach)
-        bounds = np.minimum(low - start, 0.0) / scale, np.maximum(high - start, 1e-12) / scale
-        target = np.linalg.solve(root, gradient * scale)
-        change: Array = scale * lsq_linear(root.T, target, bounds, method="bvls").x
-        return change
-
-
-def early_part(white: Whitener, split: Split) -> tuple[Whitener, int]:
-    """The whitener of the first part of the training frames, and the frame at which that ends."""
-    end = split.train[0] + max(int(np.ceil(_EARLY * (split.train[1] - split.train[0]))), 3)
-    return white.until(end), end
+def _near(known: Hypothesis) -> bool:
+    """Whether a hypothesis leaves so little above the noise that its numbers are about right."""
+    return known.fitted.misfit <= _QUIET
 
 
 def _names(members: Sequence[Candidate]) -> tuple[str, ...]:

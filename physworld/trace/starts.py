@@ -1,0 +1,237 @@
+"""Where fits of a hypothesis begin.
+
+*Near* starts are the linear estimate of the strengths, multiples of it (a strength is underestimated where motion has
+run out of phase), and both where other hypotheses have come to rest (their *basins*). *Far* starts are a
+low-discrepancy design over strengths, stiffness and whatever else nothing is known of. All are ranked on the first part
+of the recording, where phases have not slipped yet; the best of the far ones are first fitted to that part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import qmc
+
+from physworld.arrays import Array
+from physworld.calibrate.parameters import BENDING_RATIO, TWIST_RATIO
+from physworld.estimation.noise import Split
+from physworld.estimation.refit import refit
+from physworld.estimation.simulations import Job
+from physworld.estimation.unknowns import Unknown, at, bounds_of, starting_at
+from physworld.estimation.whitening import ScaledWhitener, Whitener
+from physworld.trace.hypotheses import Hypothesis, Setting, Values
+from physworld.trace.left_out import independent
+from physworld.trace.posterior import removes
+from physworld.trace.screening import Screened
+
+_EARLY = 0.4  # share of the training frames on which starts are ranked
+_MULTIPLES = (0.3, 3.0, 9.0)  # of a linear estimate
+_DESIGN = 32  # places of the low-discrepancy design
+_STIFFNESS = 1.1  # logarithms of the stiffness that it spans, up and down
+_LEAST_SHARE = 0.01  # of a strength's bound, where the design begins
+_FOLLOWED = 3  # of all starts, the best on the early frames whose stiffness differs
+_ITERATIONS = 2  # of each of these, on the early frames
+_SHIFTS = tuple(0.12 * k for k in range(-6, 7))  # logarithms of the stiffness about a place
+_SHAPES = (TWIST_RATIO, BENDING_RATIO)
+NO_WORSE = 2.0  # times the best one's squared error: a start that is no worse is followed
+_APART = 0.1  # logarithm of the stiffness by which two places are in two basins
+
+
+@dataclass(frozen=True)
+class Begun:
+    """Where the fit of a candidate beside a hypothesis begins.
+
+    Attributes:
+        screened: its first-order score.
+        starts: places, by name, the best first.
+        promised: share of the root mean square above the noise that the best one removes on the early frames.
+    """
+
+    screened: Screened
+    starts: list[Values]
+    promised: float
+
+
+@dataclass(frozen=True)
+class Starts:
+    """Makes and ranks starts.
+
+    Attributes:
+        setting: what all hypotheses share.
+        early: whitener of the first part of the training frames, by the noise alone, and their end.
+        seed: of the designs.
+    """
+
+    setting: Setting
+    early: tuple[Whitener, int]
+    seed: int = 0
+
+    def near(self, base: Hypothesis, one: Screened, basins: Sequence[Hypothesis]) -> Begun:
+        """The best of the near starts, and the linear one.
+
+        Args:
+            base: the hypothesis that gets an effect more.
+            one: the effect's score beside it.
+            basins: hypotheses whose calibrated numbers are tried too.
+        """
+        starts = self._near(base, one, basins)
+        unknowns, places, errors = self._ranked(base, one, starts)
+        best = int(np.argmin(errors))
+        return Begun(one, [_named(unknowns, places[best]), starts[0]], self._promised(base, errors[best]))
+
+    def far(self, base: Hypothesis, one: Screened, basins: Sequence[Hypothesis], share: float = 1.0) -> Begun:
+        """The best of the near and far starts, fitted to the early frames.
+
+        Args:
+            base, one, basins: see :meth:`near`.
+            share: of the design's places.
+        """
+        design = self._designed(base, one, int(_DESIGN * share))
+        unknowns, places, errors = self._ranked(base, one, [*self._near(base, one, basins), *design])
+        twin, _ = self.setting.assembled((*base.members, one.candidate), base.values, bool(base.members))
+        white, frames = self.early
+        first = [u.name for u in unknowns].index(self.setting.calibrated[0].name)
+        fits: list[tuple[float, Values]] = []
+        for k in apart(errors, [place[first] for place in places], _FOLLOWED):
+            here = starting_at(unknowns, places[k])
+            scaled = ScaledWhitener(white, scale_at(base, self.setting, errors[k]))
+            found = refit(self.setting.simulations, scaled, twin, here, frames, _ITERATIONS, hopeless=0.0)
+            if found is not None:
+                fits.append(((scaled.scale * found.misfit) ** 2, _named(found.unknowns, found.theta)))
+        fits = sorted(fits, key=lambda fit: fit[0]) or [(min(errors), _named(unknowns, places[0]))]
+        return Begun(one, [values for _, values in fits], self._promised(base, fits[0][0]))
+
+    def promised(self, base: Hypothesis, known: Hypothesis) -> float:
+        """Share of what ``base`` leaves on the early frames that goes with a hypothesis that is fitted."""
+        white, frames = self.early
+        return self._promised(base, float(np.mean(white.residual(known.fitted.tracks[:frames]) ** 2)))
+
+    def _promised(self, base: Hypothesis, error: float) -> float:
+        white, frames = self.early
+        return removes(float(np.mean(white.residual(base.fitted.tracks[:frames]) ** 2)), error)
+
+    def _ranked(
+        self, base: Hypothesis, one: Screened, starts: Sequence[Values]
+    ) -> tuple[list[Unknown], list[Array], list[float]]:
+        """Unknowns, places (p,) of the starts, and mean squared residuals of each on the early frames."""
+        white, frames = self.early
+        members = (*base.members, one.candidate)
+        twin, unknowns = self.setting.assembled(members, base.values, shapes=bool(base.members))
+        low, high = bounds_of(unknowns)
+        places = [np.clip([start.get(u.name, u.start) for u in unknowns], low, high) for start in starts]
+        runs = self.setting.simulations.run([Job(at(twin, unknowns, place), frames) for place in places])
+        errors = [np.inf if t is None else float(np.mean(white.residual(t) ** 2)) for t in runs]
+        return unknowns, places, errors
+
+    @staticmethod
+    def _near(base: Hypothesis, one: Screened, basins: Sequence[Hypothesis]) -> list[Values]:
+        linear = {**base.values, **one.values}
+        strengths = {u.name: linear[u.name] for u in one.candidate.unknowns()}
+        starts: list[Values] = [linear, {**base.values, **strengths}]
+        starts += [{**linear, **{n: f * s for n, s in strengths.items()}} for f in _MULTIPLES]
+        for other in basins:
+            kept = {n: v for n, v in other.values.items() if n in base.values}
+            starts += [
+                {**base.values, **kept, **{n: f * s for n, s in strengths.items()}} for f in (1.0, 0.3, 3.0)
+            ]
+        return starts
+
+    def _designed(self, base: Hypothesis, one: Screened, count: int) -> list[Values]:
+        """A low-discrepancy design over strengths, stiffness, and what else is calibrated of which nothing is known
+        beforehand."""
+        first, *rest = self.setting.calibrated
+        gates = one.candidate.unknowns()
+        open_ = [u for u in rest if u.prior is None and u.name not in [gate.name for gate in gates]]
+        drawn = qmc.Sobol(1 + len(open_) + len(gates), seed=self.seed).random_base2(int(np.log2(count)))
+        places: list[Values] = []
+        for row in drawn:
+            place = dict(base.values)
+            place[first.name] += _STIFFNESS * (2.0 * row[0] - 1.0)
+            for share, unknown in zip(row[1:], open_, strict=False):
+                low, high = unknown.bounds
+                place[unknown.name] = low + share * (high - low)
+            for share, gate in zip(row[1 + len(open_) :], gates, strict=True):
+                lowest, highest = gate.bounds
+                signed = 2.0 * float(share) - 1.0 if lowest < 0 else float(share)
+                size = _LEAST_SHARE ** (1.0 - abs(signed))
+                place[gate.name] = float(np.sign(signed) * size * (highest if signed > 0 else -lowest))
+            places.append(place)
+        return places
+
+
+def early_part(white: Whitener, split: Split) -> tuple[Whitener, int]:
+    """The whitener of the first part of the training frames, and the frame at which that ends."""
+    end = split.train[0] + max(int(np.ceil(_EARLY * (split.train[1] - split.train[0]))), 3)
+    return white.until(end), end
+
+
+def other_places(unknowns: Sequence[Unknown], own: Values) -> list[list[Values]]:
+    """Where calibrated numbers are looked for beside where they are, as lists of places over the stiffness, for a phase
+    that has slipped by a period is a local minimum. The first list is about the place itself; one more each from other
+    values of what decides in which of these minima it lies (:func:`elsewhere`).
+
+    Args:
+        unknowns: what is calibrated, the stiffness first.
+        own: where they are, by name, in the scale of the search.
+    """
+    return [_over_stiffness(unknowns[0], own), *elsewhere(unknowns, own)]
+
+
+def elsewhere(unknowns: Sequence[Unknown], own: Values) -> list[list[Values]]:
+    """Places over the stiffness with other shapes of a sheet's stiffness, one deviation of their priors away, and with
+    another value of what is not known at all beforehand, as how sharply grips hold: a quarter of its range from its
+    lower end."""
+    found = []
+    for u in unknowns[1:]:
+        if u.name in own and u.prior is None:
+            other = u.bounds[0] + 0.25 * (u.bounds[1] - u.bounds[0])
+        elif u.name in own and u.name in _SHAPES and u.prior is not None:
+            other = own[u.name] + u.prior[1]
+        else:
+            continue
+        found.append(_over_stiffness(unknowns[0], {**own, u.name: other}))
+    return found
+
+
+def _over_stiffness(stiffness: Unknown, own: Values) -> list[Values]:
+    return [{**own, stiffness.name: own[stiffness.name] + shift} for shift in _SHIFTS]
+
+
+def basins(base: Hypothesis, known: Sequence[Hypothesis], stiffness: str, most: int) -> list[Hypothesis]:
+    """The first hypotheses of ``known`` whose stiffness is another one than that of ``base`` and of each other.
+
+    Args:
+        base: where a search begins.
+        known: other hypotheses, the best first.
+        stiffness: name of the unknown.
+        most: so many.
+    """
+    found: list[Hypothesis] = []
+    for other in known:
+        here = [base.values.get(stiffness, 0.0), *(h.values.get(stiffness, 0.0) for h in found)]
+        if other is not base and all(abs(other.values.get(stiffness, 0.0) - t) > _APART for t in here):
+            found.append(other)
+    return found[:most]
+
+
+def apart(errors: Sequence[float], stiffnesses: Sequence[float], most: int) -> list[int]:
+    """The best of all places, no two of them at the same stiffness (a logarithm), and none far worse than the best."""
+    found: list[int] = []
+    for k in np.argsort(errors):
+        if errors[k] <= NO_WORSE * min(errors) and all(
+            abs(stiffnesses[int(k)] - stiffnesses[other]) > _APART for other in found
+        ):
+            found.append(int(k))
+    return found[:most]
+
+
+def scale_at(base: Hypothesis, setting: Setting, error: float) -> float:
+    """Deviations of the noise that a sighting counts as at a mean squared residual of ``error``."""
+    rows, blocks = len(base.fitted.residual), len(setting.blocks)
+    return float(np.sqrt(max(error, 1.0) * rows / independent(max(error, 1.0), rows, blocks)))
+
+
+def _named(unknowns: Sequence[Unknown], theta: Array) -> dict[str, float]:
+    return {u.name: float(t) for u, t in zip(unknowns, theta, strict=True)}
