@@ -155,10 +155,9 @@ class Search:
         self.screens.append((base, scores))
         if nothing:
             return
-        quiet, size = _near(base), len(base.members) + 1
-        order = self._worth(base, scores, count)
+        order, size = self._worth(base, scores, count), len(base.members) + 1
         self._begin(base, order, far=False)
-        if not quiet and not base.members and not any(_near(known) for known in self._of_size(size)):
+        if not base.members and not any(_near(known) for known in [base, *self._of_size(size)]):
             self._begin(base, order, far=True)
         self._settle(size)
 
@@ -167,11 +166,9 @@ class Search:
         by_effect: dict[str, list[Screened]] = {}
         for one in scores:
             by_effect.setdefault(one.candidate.effect, []).append(one)
-        least = _FIRST_OF_TWO if _near(base) else WORTH
-        order = [own for own in by_effect.values() if own[0].share > least][:count]
-        if (
-            not _near(base) and not base.members
-        ):  # a score to first order says nothing of an effect that is large
+        order = [own for own in by_effect.values() if own[0].share > WORTH][:count]
+        if not _near(base) and not base.members:
+            # a score to first order says nothing of an effect that is large
             order += [own for own in by_effect.values() if own not in order and own[0].candidate.scanned]
         simpler = [name for own in order for name in own[0].candidate.contains]
         return order + [
@@ -195,7 +192,7 @@ class Search:
         """Where the fit of an effect begins: of its best variants the one that promises most."""
         kept = variants[: _VARIANTS if variants[0].candidate.shapes else 1]
         self.setting.simulations.stage = f"fit with {variants[0].candidate.effect}"
-        if not far and _near(base):
+        if not far and _near(base) and not base.members:
             return Begun(kept[0], [], 0.0)
         best = sorted(self.hypotheses.values(), key=self._total, reverse=True)
         others = basins(base, best, self.setting.calibrated[0].name, _BASINS)
@@ -256,7 +253,12 @@ class Search:
             )
             if again is not None and (known is None or again.left < known.left):
                 self.hypotheses[_names(rest)] = known = again
-            if known is None or not known.members or self._total(known) >= self._total(larger):
+            if (
+                _near(larger)
+                or known is None
+                or not known.members
+                or self._total(known) >= self._total(larger)
+            ):
                 continue
             if self._removes(self.hypotheses[()], known) >= _FIRST_OF_TWO:
                 self._add(known, self.additions)
