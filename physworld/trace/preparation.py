@@ -17,13 +17,13 @@ import numpy as np
 
 from physworld.calibrate import Journal, calibrate
 from physworld.engine.formulations import RODS
+from physworld.estimation.faults import Faults, find_faults
 from physworld.estimation.noise import noise_sigma
 from physworld.estimation.simulations import Job, Ledger, Memory, Progress, Runner
 from physworld.geometry.reference import ROD_KINDS
 from physworld.scene import Scene
 from physworld.trace.answer import Verdict
 from physworld.trace.config import TraceConfig
-from physworld.trace.faults import Faults, find_faults
 from physworld.trace.recordings import JointSimulations, Recordings
 from physworld.twin.grips import softly_held
 from physworld.twin.twin import Twin

@@ -23,6 +23,7 @@ from physworld.calibrate.rod_parameters import LOSSES, lossless, rod_parameters
 from physworld.engine.formulations import RODS
 from physworld.engine.thin.triangles import TriangleLattice
 from physworld.errors import SceneUnsupported
+from physworld.estimation.faults import Faults, without_faults
 from physworld.estimation.noise import noise_sigma
 from physworld.estimation.simulations import Job, Memory, Progress, Runner, in_turn, stage_s
 from physworld.estimation.unknowns import Unknown
@@ -33,7 +34,6 @@ from physworld.trace.answer import DATA as FAULTY
 from physworld.trace.answer import NOTHING, UNEXPLAINED, Verdict, decided
 from physworld.trace.candidates import candidates
 from physworld.trace.config import TraceConfig
-from physworld.trace.faults import Faults, without_faults
 from physworld.trace.held_out import HeldOut, Outcomes
 from physworld.trace.hypotheses import Hypothesis, Setting
 from physworld.trace.intervals import calibrated, named, spread_of
@@ -44,7 +44,7 @@ from physworld.trace.report import describe
 from physworld.trace.result import Stage, Supported, TraceResult
 from physworld.trace.search import Search
 from physworld.trace.sensitivity import numerical_directions
-from physworld.trace.starts import Starts, early_part, other_places
+from physworld.trace.starts import Starts, early_part, elsewhere
 from physworld.trace.unknowns import KNOWN_BEFOREHAND, hold_unknowns, of_parameter
 from physworld.twin.twin import Twin
 
@@ -266,7 +266,7 @@ class _Trace:
         rows = sum(len(own) for own in ground.blocks)
         scale = np.sqrt(max(first, 1.0) * rows / independent(max(first, 1.0), rows, len(ground.blocks)))
         start = {u.name: u.start for u in unknowns}
-        places = [place for basin in other_places(unknowns, start) for place in basin]
+        places = [place for about in elsewhere(unknowns, start) for place in about]
         declared = thorough.fitted((), start, places, scale=float(scale))
         if declared is None:
             raise RuntimeError("the calibrated twin cannot be simulated again")

@@ -22,7 +22,7 @@ from physworld.trace.candidates import Candidate
 from physworld.trace.hypotheses import Hypothesis, Setting, Values
 from physworld.trace.posterior import MOST, posterior, removes
 from physworld.trace.screening import Screened, screened
-from physworld.trace.starts import NO_WORSE, Begun, Starts, basins, elsewhere, scale_at
+from physworld.trace.starts import NO_WORSE, Begun, Starts, distinct, elsewhere, scale_at
 
 _VARIANTS = 3  # shapes of an effect that are begun before its best is freed
 WORTH = 0.1  # share of the error above the noise that an effect removes to first order, to be fitted
@@ -195,7 +195,9 @@ class Search:
         if not far and _near(base) and not base.members:
             return Begun(kept[0], [], 0.0)
         best = sorted(self.hypotheses.values(), key=self._total, reverse=True)
-        others = basins(base, best, self.setting.calibrated[0].name, _BASINS)
+        first = self.setting.calibrated[0].name
+        other = distinct([h.values.get(first, 0.0) for h in best], [base.values.get(first, 0.0)])
+        others = [best[k] for k in other][:_BASINS]
         begun = [
             self.starts.far(base, one, others, 1.0 / len(kept))
             if far
@@ -213,8 +215,8 @@ class Search:
             return
         best = ranked[0]
         if size not in self.settled:
-            for shape in elsewhere(self.setting.calibrated, best.values):
-                best = self._again(best, shape, np.inf)
+            for places in elsewhere(self.setting.calibrated, best.values)[1:]:
+                best = self._again(best, places, np.inf)
         shared = {u.name: best.values[u.name] for u in self.setting.calibrated if u.name in best.values}
         for known in ranked:
             if known.members == best.members:

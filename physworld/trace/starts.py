@@ -94,7 +94,8 @@ class Starts:
         white, frames = self.early
         first = [u.name for u in unknowns].index(self.setting.calibrated[0].name)
         fits: list[tuple[float, Values]] = []
-        for k in apart(errors, [place[first] for place in places], _FOLLOWED):
+        order = [int(k) for k in np.argsort(errors) if errors[k] <= NO_WORSE * min(errors)]
+        for k in [order[j] for j in distinct([places[k][first] for k in order])][:_FOLLOWED]:
             here = starting_at(unknowns, places[k])
             scaled = ScaledWhitener(white, scale_at(base, self.setting, errors[k]))
             found = refit(self.setting.simulations, scaled, twin, here, frames, _ITERATIONS, hopeless=0.0)
@@ -167,64 +168,34 @@ def early_part(white: Whitener, split: Split) -> tuple[Whitener, int]:
     return white.until(end), end
 
 
-def other_places(unknowns: Sequence[Unknown], own: Values) -> list[list[Values]]:
+def elsewhere(unknowns: Sequence[Unknown], own: Values) -> list[list[Values]]:
     """Where calibrated numbers are looked for beside where they are, as lists of places over the stiffness, for a phase
-    that has slipped by a period is a local minimum. The first list is about the place itself; one more each from other
-    values of what decides in which of these minima it lies (:func:`elsewhere`).
+    that has slipped by a period is a local minimum. The first list is about the place itself; one more each has another
+    value of what decides in which of these minima it lies: the shapes of a sheet's stiffness, one deviation of their
+    priors away, and what is not known at all beforehand, as how sharply grips hold, a quarter of its range from its
+    lower end.
 
     Args:
         unknowns: what is calibrated, the stiffness first.
         own: where they are, by name, in the scale of the search.
     """
-    return [_over_stiffness(unknowns[0], own), *elsewhere(unknowns, own)]
-
-
-def elsewhere(unknowns: Sequence[Unknown], own: Values) -> list[list[Values]]:
-    """Places over the stiffness with other shapes of a sheet's stiffness, one deviation of their priors away, and with
-    another value of what is not known at all beforehand, as how sharply grips hold: a quarter of its range from its
-    lower end."""
-    found = []
+    bases = [own]
     for u in unknowns[1:]:
         if u.name in own and u.prior is None:
-            other = u.bounds[0] + 0.25 * (u.bounds[1] - u.bounds[0])
+            bases.append({**own, u.name: u.bounds[0] + 0.25 * (u.bounds[1] - u.bounds[0])})
         elif u.name in own and u.name in _SHAPES and u.prior is not None:
-            other = own[u.name] + u.prior[1]
-        else:
-            continue
-        found.append(_over_stiffness(unknowns[0], {**own, u.name: other}))
-    return found
+            bases.append({**own, u.name: own[u.name] + u.prior[1]})
+    first = unknowns[0].name
+    return [[{**base, first: own[first] + shift} for shift in _SHIFTS] for base in bases]
 
 
-def _over_stiffness(stiffness: Unknown, own: Values) -> list[Values]:
-    return [{**own, stiffness.name: own[stiffness.name] + shift} for shift in _SHIFTS]
-
-
-def basins(base: Hypothesis, known: Sequence[Hypothesis], stiffness: str, most: int) -> list[Hypothesis]:
-    """The first hypotheses of ``known`` whose stiffness is another one than that of ``base`` and of each other.
-
-    Args:
-        base: where a search begins.
-        known: other hypotheses, the best first.
-        stiffness: name of the unknown.
-        most: so many.
-    """
-    found: list[Hypothesis] = []
-    for other in known:
-        here = [base.values.get(stiffness, 0.0), *(h.values.get(stiffness, 0.0) for h in found)]
-        if other is not base and all(abs(other.values.get(stiffness, 0.0) - t) > _APART for t in here):
-            found.append(other)
-    return found[:most]
-
-
-def apart(errors: Sequence[float], stiffnesses: Sequence[float], most: int) -> list[int]:
-    """The best of all places, no two of them at the same stiffness (a logarithm), and none far worse than the best."""
+def distinct(stiffnesses: Sequence[float], taken: Sequence[float] = ()) -> list[int]:
+    """Which of these stiffnesses (logarithms) lie in other basins than those taken and those before them."""
     found: list[int] = []
-    for k in np.argsort(errors):
-        if errors[k] <= NO_WORSE * min(errors) and all(
-            abs(stiffnesses[int(k)] - stiffnesses[other]) > _APART for other in found
-        ):
-            found.append(int(k))
-    return found[:most]
+    for k, own in enumerate(stiffnesses):
+        if all(abs(own - other) > _APART for other in [*taken, *(stiffnesses[j] for j in found)]):
+            found.append(k)
+    return found
 
 
 def scale_at(base: Hypothesis, setting: Setting, error: float) -> float:

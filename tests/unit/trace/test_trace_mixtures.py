@@ -12,6 +12,9 @@ from physworld.calibrate import CalibrationConfig
 from physworld.effects.registry import effect
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
 from physworld.trace import TraceConfig, TraceResult, document, trace
+from physworld.trace.hypotheses import Hypothesis
+from physworld.trace.screening import Screened
+from physworld.trace.starts import Begun, Starts, distinct
 from physworld.twin.build import build_twin
 
 pytestmark = pytest.mark.slow
@@ -76,7 +79,27 @@ def test_a_viscosity_behind_a_drag_is_named_beside_it() -> None:
     assert numbers["viscosity_kelvin_voigt"]["viscosity_pa_s"].value == pytest.approx(90.0, rel=0.25)
 
 
+def test_places_of_one_stiffness_are_in_one_basin() -> None:
+    assert distinct([9.0, 9.05, 9.2, 8.95, 10.0]) == [0, 2, 4]
+    assert distinct([9.0, 9.2, 10.0], taken=[9.25]) == [0, 2]
+
+
 @pytest.mark.parametrize("strengths", [{"rate_per_s": 4.0}, {"viscosity_pa_s": 90.0}])
 def test_one_that_acts_alone_stays_alone(strengths: dict[str, float]) -> None:
     found = traced(**strengths)
     assert len(found.effects) == 1 and len(found.verdict.model.members) == 1
+
+
+def test_no_other_basin_is_looked_for_where_a_near_start_comes_near_the_noise(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[str] = []
+
+    def far(self: Starts, base: Hypothesis, one: Screened, *rest: object) -> Begun:
+        asked.append(one.candidate.effect)
+        return begin(self, base, one, *rest)  # type: ignore[arg-type]
+
+    begin = Starts.far
+    monkeypatch.setattr(Starts, "far", far)
+    assert [e.name for e in traced(rate_per_s=4.0).effects] == ["air_drag_linear"]
+    assert asked == []

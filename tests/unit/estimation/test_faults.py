@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from physworld.estimation.faults import find_faults
 from physworld.estimation.noise import Split
-from physworld.trace.faults import find_faults
 
 FRAMES, TRAIN, SIGMA = 60, 42, 1e-3
 SPLIT = Split((1, TRAIN), (TRAIN, FRAMES), np.array([1, 20, TRAIN]))
