@@ -21,7 +21,7 @@ from physworld.estimation.simulations import Job
 from physworld.estimation.unknowns import Unknown, at
 from physworld.estimation.whitening import ScaledWhitener, Whitener
 from physworld.trace.candidates import Candidate
-from physworld.trace.left_out import LeftOut, Linear, left_out
+from physworld.trace.left_out import LeftOut, Linear, counted, left_out
 from physworld.trace.recordings import JointSimulations
 from physworld.twin.twin import Twin
 
@@ -118,6 +118,10 @@ class Setting:
         unknowns = [*(u for u in self.calibrated if u.name not in names), *own]
         unknowns = [u.starting(values.get(u.name, u.start)) for u in unknowns]
         return twin, unknowns
+
+    def counted(self, error: float) -> float:
+        """Deviations of the noise that a sighting counts as at a mean squared residual of ``error``."""
+        return counted(error, sum(len(rows) for rows in self.blocks), len(self.blocks))
 
     def best_of(
         self, members: Sequence[Candidate], places: Sequence[Values], white: Whitener

@@ -73,8 +73,13 @@ class LeftOut:
 
     @property
     def scale(self) -> float:
-        """Deviations of the noise that a sighting counts as: sqrt(e M / n)."""
-        return float(np.sqrt(max(self.mean, 1.0) * self.sizes.sum() / self.count))
+        """Deviations of the noise that a sighting counts as."""
+        return counted(self.mean, int(self.sizes.sum()), len(self.sizes))
+
+
+def counted(error: float, rows: int, blocks: int) -> float:
+    """Deviations of the noise that a sighting counts as, sqrt(e M / n); arguments of :func:`independent`."""
+    return float(np.sqrt(max(error, 1.0) * rows / independent(max(error, 1.0), rows, blocks)))
 
 
 def independent(error: float, rows: int, blocks: int) -> float:

@@ -37,7 +37,6 @@ from physworld.trace.config import TraceConfig
 from physworld.trace.held_out import HeldOut, Outcomes
 from physworld.trace.hypotheses import Hypothesis, Setting
 from physworld.trace.intervals import calibrated, named, spread_of
-from physworld.trace.left_out import independent
 from physworld.trace.preparation import EXPERIMENT, SEARCH, Beginning, Clock, remarks, taken_with
 from physworld.trace.recordings import FITTED, HELD_OUT, JointSimulations, Recordings, side_by_side
 from physworld.trace.report import describe
@@ -263,11 +262,9 @@ class _Trace:
             self._setting(ground, self.twin, unknowns), iterations=_THOROUGH * self.config.iterations
         )
         first = float(np.mean(ground.white.residual(ground.tracks) ** 2))
-        rows = sum(len(own) for own in ground.blocks)
-        scale = np.sqrt(max(first, 1.0) * rows / independent(max(first, 1.0), rows, len(ground.blocks)))
         start = {u.name: u.start for u in unknowns}
         places = [place for about in elsewhere(unknowns, start) for place in about]
-        declared = thorough.fitted((), start, places, scale=float(scale))
+        declared = thorough.fitted((), start, places, scale=thorough.counted(first))
         if declared is None:
             raise RuntimeError("the calibrated twin cannot be simulated again")
         return declared

@@ -22,7 +22,7 @@ from physworld.trace.candidates import Candidate
 from physworld.trace.hypotheses import Hypothesis, Setting, Values
 from physworld.trace.posterior import MOST, posterior, removes
 from physworld.trace.screening import Screened, screened
-from physworld.trace.starts import NO_WORSE, Begun, Starts, distinct, elsewhere, scale_at
+from physworld.trace.starts import NO_WORSE, Begun, Starts, distinct, elsewhere
 
 _VARIANTS = 3  # shapes of an effect that are begun before its best is freed
 WORTH = 0.1  # share of the error above the noise that an effect removes to first order, to be fitted
@@ -218,16 +218,10 @@ class Search:
             for places in elsewhere(self.setting.calibrated, best.values)[1:]:
                 best = self._again(best, places, np.inf)
         shared = {u.name: best.values[u.name] for u in self.setting.calibrated if u.name in best.values}
-        for known in ranked:
-            if known.members == best.members:
-                continue
+        for known in ranked[1:]:
             own = {n: v for n, v in known.values.items() if n not in shared}
-            scaled = [{n: f * v for n, v in own.items()} for f in _MULTIPLES]
-            self._again(
-                known,
-                [{**known.values, **shared, **one} for one in scaled],
-                NO_WORSE * known.fitted.misfit**2,
-            )
+            places = [{**shared, **{n: factor * v for n, v in own.items()}} for factor in _MULTIPLES]
+            self._again(known, places, NO_WORSE * known.fitted.misfit**2)
         self.settled[size] = sorted(h.left for h in self._of_size(size))
 
     def _again(self, known: Hypothesis, places: Sequence[Values], most: float) -> Hypothesis:
@@ -236,33 +230,31 @@ class Search:
         place, error = self.setting.best_of(known.members, places, known.white)
         if error >= most:
             return known
-        scale = scale_at(known, self.setting, error)
+        scale = self.setting.counted(error)
         hopeless = known.fitted.misfit**2 * len(known.fitted.residual)
         found = self.setting.fitted(known.members, place, scale=scale, hopeless=hopeless, white=known.white)
-        if found is None or found.left >= known.left:
+        return self._kept(found) or known
+
+    def _kept(self, found: Hypothesis | None) -> Hypothesis | None:
+        """The better one of a fit and what is known of its set."""
+        known = None if found is None else self.hypotheses.get(found.names)
+        if found is None or (known is not None and known.left <= found.left):
             return known
-        self.hypotheses[known.names] = found
+        self.hypotheses[found.names] = found
         return found
 
     def _take_out(self, larger: Hypothesis) -> None:
         """Fits without one of the effects of a set, and with another one in its place, from the set's basin."""
+        scale, white, declared = larger.unseen.scale, larger.white, self.hypotheses[()]
         for member in larger.members:
             rest = tuple(m for m in larger.members if m is not member)
             known = self.hypotheses.get(_names(rest))
-            values = larger.values
-            again = self.setting.fitted(
-                rest, values, [known.values] if known else [], scale=larger.unseen.scale, white=larger.white
-            )
-            if again is not None and (known is None or again.left < known.left):
-                self.hypotheses[_names(rest)] = known = again
-            if (
-                _near(larger)
-                or known is None
-                or not known.members
-                or self._total(known) >= self._total(larger)
-            ):
+            places = [known.values] if known else []
+            found = self.setting.fitted(rest, larger.values, places, True, scale, white=white)
+            known = self._kept(found) or known
+            if known is None or _near(larger) or self._total(known) >= self._total(larger):
                 continue
-            if self._removes(self.hypotheses[()], known) >= _FIRST_OF_TWO:
+            if known.members and self._removes(declared, known) >= _FIRST_OF_TWO:
                 self._add(known, self.additions)
 
     def _fit(self, base: Hypothesis, begun: Begun) -> None:
@@ -270,7 +262,7 @@ class Search:
         candidate, hopeless = begun.screened.candidate, self._hopeless(base)
         members = (*base.members, candidate)
         first, *others = begun.starts or [{**base.values, **begun.screened.values}]
-        scale = scale_at(base, self.setting, begun.screened.error)
+        scale = self.setting.counted(begun.screened.error)
         shaped = bool(candidate.shapes)
         best = self.setting.fitted(members, first, others, not shaped, scale, hopeless, base.white)
         if best is not None and shaped and self._removes(base, best) >= WORTH:
@@ -282,9 +274,7 @@ class Search:
                 found = self.setting.fitted(best.members, place, scale=best.unseen.scale, white=best.white)
                 if found is not None and found.left < best.left:
                     best = found
-        known = self.hypotheses.get(_names(members))
-        if best is not None and (known is None or best.left < known.left):
-            self.hypotheses[_names(members)] = best
+        self._kept(best)
 
     def _hopeless(self, base: Hypothesis) -> float:
         """Squared residual above which a fit is left: it is far from removing a half of what ``base`` leaves, and the

@@ -22,7 +22,6 @@ from physworld.estimation.simulations import Job
 from physworld.estimation.unknowns import Unknown, at, bounds_of, starting_at
 from physworld.estimation.whitening import ScaledWhitener, Whitener
 from physworld.trace.hypotheses import Hypothesis, Setting, Values
-from physworld.trace.left_out import independent
 from physworld.trace.posterior import removes
 from physworld.trace.screening import Screened
 
@@ -97,7 +96,7 @@ class Starts:
         order = [int(k) for k in np.argsort(errors) if errors[k] <= NO_WORSE * min(errors)]
         for k in [order[j] for j in distinct([places[k][first] for k in order])][:_FOLLOWED]:
             here = starting_at(unknowns, places[k])
-            scaled = ScaledWhitener(white, scale_at(base, self.setting, errors[k]))
+            scaled = ScaledWhitener(white, self.setting.counted(errors[k]))
             found = refit(self.setting.simulations, scaled, twin, here, frames, _ITERATIONS, hopeless=0.0)
             if found is not None:
                 fits.append(((scaled.scale * found.misfit) ** 2, _named(found.unknowns, found.theta)))
@@ -106,25 +105,28 @@ class Starts:
 
     def promised(self, base: Hypothesis, known: Hypothesis) -> float:
         """Share of what ``base`` leaves on the early frames that goes with a hypothesis that is fitted."""
-        white, frames = self.early
-        return self._promised(base, float(np.mean(white.residual(known.fitted.tracks[:frames]) ** 2)))
+        return self._promised(base, self._error(known.fitted.tracks))
 
     def _promised(self, base: Hypothesis, error: float) -> float:
+        return removes(self._error(base.fitted.tracks), error)
+
+    def _error(self, tracks: Array | None) -> float:
+        """Mean squared residual on the early frames; infinite for a run that failed."""
         white, frames = self.early
-        return removes(float(np.mean(white.residual(base.fitted.tracks[:frames]) ** 2)), error)
+        return np.inf if tracks is None else float(np.mean(white.residual(tracks[:frames]) ** 2))
 
     def _ranked(
         self, base: Hypothesis, one: Screened, starts: Sequence[Values]
     ) -> tuple[list[Unknown], list[Array], list[float]]:
         """Unknowns, places (p,) of the starts, and mean squared residuals of each on the early frames."""
-        white, frames = self.early
         members = (*base.members, one.candidate)
         twin, unknowns = self.setting.assembled(members, base.values, shapes=bool(base.members))
         low, high = bounds_of(unknowns)
         places = [np.clip([start.get(u.name, u.start) for u in unknowns], low, high) for start in starts]
-        runs = self.setting.simulations.run([Job(at(twin, unknowns, place), frames) for place in places])
-        errors = [np.inf if t is None else float(np.mean(white.residual(t) ** 2)) for t in runs]
-        return unknowns, places, errors
+        runs = self.setting.simulations.run(
+            [Job(at(twin, unknowns, place), self.early[1]) for place in places]
+        )
+        return unknowns, places, [self._error(tracks) for tracks in runs]
 
     @staticmethod
     def _near(base: Hypothesis, one: Screened, basins: Sequence[Hypothesis]) -> list[Values]:
@@ -196,12 +198,6 @@ def distinct(stiffnesses: Sequence[float], taken: Sequence[float] = ()) -> list[
         if all(abs(own - other) > _APART for other in [*taken, *(stiffnesses[j] for j in found)]):
             found.append(k)
     return found
-
-
-def scale_at(base: Hypothesis, setting: Setting, error: float) -> float:
-    """Deviations of the noise that a sighting counts as at a mean squared residual of ``error``."""
-    rows, blocks = len(base.fitted.residual), len(setting.blocks)
-    return float(np.sqrt(max(error, 1.0) * rows / independent(max(error, 1.0), rows, blocks)))
 
 
 def _named(unknowns: Sequence[Unknown], theta: Array) -> dict[str, float]:
