@@ -6,11 +6,12 @@ import re
 from collections.abc import Iterable, Iterator
 from datetime import datetime
 from html import escape
-from typing import Annotated, Any, Generic, Literal, Self, TypeVar, get_args
+from typing import Annotated, Any, Generic, Literal, Self, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
+from physworld_schemas.arrays import single_values
 from physworld_schemas.wording import meant
 
 ObjectKind = Literal[
@@ -54,7 +55,10 @@ class Request(BaseModel):
             raise ValueError("holds a NUL character or half of a surrogate pair")
         if isinstance(value, dict):
             for name, field in cls.model_fields.items():
-                if isinstance(value.get(name), bool) and _is_number(field.annotation):
+                given = value.get(name)
+                if _asks_for_numbers(field.annotation) and any(
+                    isinstance(item, bool) for item in single_values(given)
+                ):
                     raise ValueError(f"{name}: true and false are no numbers")
         return value
 
@@ -190,10 +194,22 @@ def _holds_unstorable(value: Any) -> bool:
     return False
 
 
-def _is_number(annotation: Any) -> bool:
-    """Whether a field takes numbers and neither true nor false."""
-    kinds = get_args(annotation) or (annotation,)
-    return bool not in kinds and (int in kinds or float in kinds)
+def _asks_for_numbers(annotation: Any) -> bool:
+    """Whether a field takes numbers, alone or in lists, and neither true nor false."""
+    kinds = set(_kinds(annotation))
+    return bool not in kinds and bool(kinds & {int, float})
+
+
+def _kinds(annotation: Any) -> Iterator[Any]:
+    """The types of the single values of a field, whatever they are listed in."""
+    parts, origin = get_args(annotation), get_origin(annotation)
+    if not parts or origin is Literal:
+        yield annotation
+    elif origin is Annotated:
+        yield from _kinds(parts[0])
+    else:
+        for part in parts[1:] if origin is dict else parts:
+            yield from _kinds(part)
 
 
 def _told(fault: ErrorDetails, known: Iterable[str]) -> InitErrorDetails:

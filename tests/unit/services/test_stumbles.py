@@ -5,12 +5,17 @@ from __future__ import annotations
 import json
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from physworld_schemas.base import Request
+from physworld_schemas.dataset import DatasetConfig
 from physworld_schemas.fit import Fit
 from physworld_schemas.hints import hint_of
 from physworld_schemas.key import KeyRotate
+from physworld_schemas.live import LiveTicketCreate
+from physworld_schemas.plan import PlanLimits, PointGoal
 from physworld_services.api.errors import problem_response
 from physworld_services.dashboard import text
 from physworld_services.dashboard.site import environment_of_pages
@@ -70,3 +75,20 @@ def test_true_is_no_number_of_minutes() -> None:
     with pytest.raises(ValueError, match="grace_minutes: true and false are no numbers"):
         KeyRotate.model_validate({"grace_minutes": True})
     assert KeyRotate.model_validate({"grace_minutes": 3}).grace_minutes == 3
+
+
+@pytest.mark.parametrize(
+    ("model", "body", "place"),
+    [
+        (PlanLimits, {"workspace_max_m": [0.1, False, 0.1]}, "workspace_max_m"),
+        (PointGoal, {"kind": "points", "index": [0], "places": [[0.0, 0.0, True]]}, "places"),
+        (PointGoal, {"kind": "points", "index": [True], "places": [[0.0, 0.0, 0.0]]}, "index"),
+        (DatasetConfig, {"patterns": {"lift": True}}, "patterns"),
+        (LiveTicketCreate, {"model": "beam", "version": True}, "version"),
+    ],
+)
+def test_true_and_false_are_no_numbers_in_lists_either(
+    model: type[Request], body: dict[str, Any], place: str
+) -> None:
+    with pytest.raises(ValueError, match=f"{place}: true and false are no numbers"):
+        model.model_validate(body)
