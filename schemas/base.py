@@ -8,7 +8,15 @@ from datetime import datetime
 from html import escape
 from typing import Annotated, Any, Generic, Literal, Self, TypeVar, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ModelWrapValidatorHandler,
+    ValidationError,
+    ValidationInfo,
+    model_validator,
+)
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
 from physworld_schemas.arrays import single_values
@@ -24,7 +32,10 @@ STORABLE_TEXT = r"^[^\x00]*$"
 LINE, LONGEST_TEXT = 120, 40
 """Characters of the line that an object is shown in, and of a text in it."""
 _LITERAL = "{said}"
-_PLAIN = frozenset({float, int, bool, type(None)})
+_SINGLE = frozenset({float, int, bool})
+_PLAIN = _SINGLE | {type(None)}
+TEXTS = {"texts": True}
+"""Context of a validation that reads numbers, true and false from texts, as a form of a browser sends them."""
 Seed = Annotated[int, Field(ge=0, lt=2**63, json_schema_extra={"format": "int64"})]
 
 
@@ -53,24 +64,22 @@ class Request(BaseModel):
         """Refuse text that Postgres keeps neither as text nor in JSON: NUL, and halves of surrogate pairs."""
         if _holds_unstorable(value):
             raise ValueError("holds a NUL character or half of a surrogate pair")
-        if isinstance(value, dict):
-            for name, field in cls.model_fields.items():
-                given = value.get(name)
-                if _asks_for_numbers(field.annotation) and any(
-                    isinstance(item, bool) for item in single_values(given)
-                ):
-                    raise ValueError(f"{name}: true and false are no numbers")
         return value
 
     @model_validator(mode="wrap")
     @classmethod
-    def _nearest_key(cls, value: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
-        """Say of an unknown key which one was probably meant."""
+    def _every_fault(cls, value: Any, handler: ModelWrapValidatorHandler[Self], info: ValidationInfo) -> Self:
+        """Say of an unknown key which one was probably meant, and refuse values of another kind."""
         try:
-            return handler(value)
+            made, faults = handler(value), []
         except ValidationError as error:
-            faults = [_told(fault, cls.model_fields) for fault in error.errors(include_url=False)]
-            raise ValidationError.from_exception_data(error.title, faults) from None
+            made, faults = None, [_told(fault, cls.model_fields) for fault in error.errors(include_url=False)]
+        if isinstance(value, dict):
+            known = {fault["loc"][0] for fault in faults if fault["loc"]}
+            faults += _confused({name: value[name] for name in value.keys() - known}, cls, bool(info.context))
+        if made is None or faults:
+            raise ValidationError.from_exception_data(cls.__name__, faults)
+        return made
 
 
 class _More:
@@ -194,10 +203,28 @@ def _holds_unstorable(value: Any) -> bool:
     return False
 
 
-def _asks_for_numbers(annotation: Any) -> bool:
-    """Whether a field takes numbers, alone or in lists, and neither true nor false."""
-    kinds = set(_kinds(annotation))
-    return bool not in kinds and bool(kinds & {int, float})
+def _confused(body: dict[str, Any], model: type[BaseModel], texts: bool) -> list[InitErrorDetails]:
+    """Values that Pydantic would turn into the numbers, or into the true and false, that their fields ask for."""
+    found = []
+    for name, field in model.model_fields.items():
+        said = _mistaken(set(_kinds(field.annotation)), body.get(name), texts)
+        if said:
+            text = PydanticCustomError("another_kind", _LITERAL, {"said": said})
+            found.append(InitErrorDetails(type=text, loc=(name,), input=body[name]))
+    return found
+
+
+def _mistaken(kinds: set[Any], given: Any, texts: bool) -> str:
+    """How one of the given values is of another kind than those; empty: none is."""
+    wanted = kinds & _SINGLE
+    for item in single_values(given) if wanted else ():
+        if isinstance(item, bool) and bool not in wanted:
+            return "true and false are no numbers"
+        if isinstance(item, int | float) and not isinstance(item, bool) and wanted == {bool}:
+            return f"{item} is neither true nor false"
+        if isinstance(item, str) and kinds <= _PLAIN and not texts:
+            return "a text where " + ("true or false" if wanted == {bool} else "a number") + " is asked for"
+    return ""
 
 
 def _kinds(annotation: Any) -> Iterator[Any]:

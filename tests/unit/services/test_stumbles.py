@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 
-from physworld_schemas.base import Request
+from physworld_schemas.assessment import AssessmentCreate
+from physworld_schemas.base import TEXTS, Request
 from physworld_schemas.dataset import DatasetConfig
 from physworld_schemas.fit import Fit
 from physworld_schemas.hints import hint_of
@@ -72,7 +73,7 @@ def test_the_port_of_the_last_run_is_remembered(tmp_path: Path, kept: str | None
 
 
 def test_true_is_no_number_of_minutes() -> None:
-    with pytest.raises(ValueError, match="grace_minutes: true and false are no numbers"):
+    with pytest.raises(ValueError, match="grace_minutes\n  true and false are no numbers"):
         KeyRotate.model_validate({"grace_minutes": True})
     assert KeyRotate.model_validate({"grace_minutes": 3}).grace_minutes == 3
 
@@ -90,5 +91,16 @@ def test_true_is_no_number_of_minutes() -> None:
 def test_true_and_false_are_no_numbers_in_lists_either(
     model: type[Request], body: dict[str, Any], place: str
 ) -> None:
-    with pytest.raises(ValueError, match=f"{place}: true and false are no numbers"):
+    with pytest.raises(ValueError, match=f"{place}\n  true and false are no numbers"):
         model.model_validate(body)
+
+
+def test_numbers_and_texts_are_not_read_as_true_and_false_nor_texts_as_numbers() -> None:
+    with pytest.raises(ValueError, match="open_trace\n  0 is neither true nor false"):
+        AssessmentCreate.model_validate({"scene_id": "scn_1", "open_trace": 0})
+    with pytest.raises(ValueError, match="open_trace\n  a text where true or false is asked for"):
+        AssessmentCreate.model_validate({"scene_id": "scn_1", "open_trace": "false"})
+    with pytest.raises(ValueError, match="grace_minutes\n  a text where a number is asked for"):
+        KeyRotate.model_validate({"grace_minutes": "3"})
+    assert KeyRotate.model_validate({"grace_minutes": "3"}, context=TEXTS).grace_minutes == 3
+    assert LiveTicketCreate.model_validate({"model": "beam", "version": "3"}).version == "3"
