@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import math
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, WithJsonSchema
@@ -84,6 +85,17 @@ class EncodedArray(BaseModel):
 ArrayInput = EncodedArray | Nested
 
 
+def single_values(value: Any) -> Iterator[Any]:
+    """What a field of a body lists, whatever it is listed in; not by recursion, a body may be nested deeply."""
+    waiting = [value]
+    while waiting:
+        part = waiting.pop()
+        if isinstance(part, dict | list | tuple):
+            waiting += part.values() if isinstance(part, dict) else part
+        else:
+            yield part
+
+
 def array_of(
     value: ArrayInput, name: str, dimensions: tuple[int, ...], most: float | None = None
 ) -> np.ndarray:
@@ -104,6 +116,8 @@ def array_of(
         values = value.numpy().astype(np.float64)
     else:
         try:
+            if not all(type(item) in (int, float) for item in single_values(value)):
+                raise TypeError
             values = np.asarray(value, dtype=np.float64)
         except (TypeError, ValueError, OverflowError) as error:
             raise ValueError(f"{name} is not a regular array of numbers") from error

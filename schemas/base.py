@@ -6,11 +6,20 @@ import re
 from collections.abc import Iterable, Iterator
 from datetime import datetime
 from html import escape
-from typing import Annotated, Any, Generic, Literal, Self, TypeVar, get_args
+from typing import Annotated, Any, Generic, Literal, Self, TypeVar, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ModelWrapValidatorHandler,
+    ValidationError,
+    ValidationInfo,
+    model_validator,
+)
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
+from physworld_schemas.arrays import single_values
 from physworld_schemas.wording import meant
 
 ObjectKind = Literal[
@@ -23,7 +32,10 @@ STORABLE_TEXT = r"^[^\x00]*$"
 LINE, LONGEST_TEXT = 120, 40
 """Characters of the line that an object is shown in, and of a text in it."""
 _LITERAL = "{said}"
-_PLAIN = frozenset({float, int, bool, type(None)})
+_SINGLE = frozenset({float, int, bool})
+_PLAIN = _SINGLE | {type(None)}
+TEXTS = {"texts": True}
+"""Context of a validation that reads numbers, true and false from texts, as a form of a browser sends them."""
 Seed = Annotated[int, Field(ge=0, lt=2**63, json_schema_extra={"format": "int64"})]
 
 
@@ -52,21 +64,22 @@ class Request(BaseModel):
         """Refuse text that Postgres keeps neither as text nor in JSON: NUL, and halves of surrogate pairs."""
         if _holds_unstorable(value):
             raise ValueError("holds a NUL character or half of a surrogate pair")
-        if isinstance(value, dict):
-            for name, field in cls.model_fields.items():
-                if isinstance(value.get(name), bool) and _is_number(field.annotation):
-                    raise ValueError(f"{name}: true and false are no numbers")
         return value
 
     @model_validator(mode="wrap")
     @classmethod
-    def _nearest_key(cls, value: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
-        """Say of an unknown key which one was probably meant."""
+    def _every_fault(cls, value: Any, handler: ModelWrapValidatorHandler[Self], info: ValidationInfo) -> Self:
+        """Say of an unknown key which one was probably meant, and refuse values of another kind."""
         try:
-            return handler(value)
+            made, faults = handler(value), []
         except ValidationError as error:
-            faults = [_told(fault, cls.model_fields) for fault in error.errors(include_url=False)]
-            raise ValidationError.from_exception_data(error.title, faults) from None
+            made, faults = None, [_told(fault, cls.model_fields) for fault in error.errors(include_url=False)]
+        if isinstance(value, dict):
+            known = {fault["loc"][0] for fault in faults if fault["loc"]}
+            faults += _confused({name: value[name] for name in value.keys() - known}, cls, bool(info.context))
+        if made is None or faults:
+            raise ValidationError.from_exception_data(cls.__name__, faults)
+        return made
 
 
 class _More:
@@ -190,10 +203,40 @@ def _holds_unstorable(value: Any) -> bool:
     return False
 
 
-def _is_number(annotation: Any) -> bool:
-    """Whether a field takes numbers and neither true nor false."""
-    kinds = get_args(annotation) or (annotation,)
-    return bool not in kinds and (int in kinds or float in kinds)
+def _confused(body: dict[str, Any], model: type[BaseModel], texts: bool) -> list[InitErrorDetails]:
+    """Values that Pydantic would turn into the numbers, or into the true and false, that their fields ask for."""
+    found = []
+    for name, field in model.model_fields.items():
+        said = _mistaken(set(_kinds(field.annotation)), body.get(name), texts)
+        if said:
+            text = PydanticCustomError("another_kind", _LITERAL, {"said": said})
+            found.append(InitErrorDetails(type=text, loc=(name,), input=body[name]))
+    return found
+
+
+def _mistaken(kinds: set[Any], given: Any, texts: bool) -> str:
+    """How one of the given values is of another kind than those; empty: none is."""
+    wanted = kinds & _SINGLE
+    for item in single_values(given) if wanted else ():
+        if isinstance(item, bool) and bool not in wanted:
+            return "true and false are no numbers"
+        if isinstance(item, int | float) and not isinstance(item, bool) and wanted == {bool}:
+            return f"{item} is neither true nor false"
+        if isinstance(item, str) and kinds <= _PLAIN and not texts:
+            return "a text where " + ("true or false" if wanted == {bool} else "a number") + " is asked for"
+    return ""
+
+
+def _kinds(annotation: Any) -> Iterator[Any]:
+    """The types of the single values of a field, whatever they are listed in."""
+    parts, origin = get_args(annotation), get_origin(annotation)
+    if not parts or origin is Literal:
+        yield annotation
+    elif origin is Annotated:
+        yield from _kinds(parts[0])
+    else:
+        for part in parts[1:] if origin is dict else parts:
+            yield from _kinds(part)
 
 
 def _told(fault: ErrorDetails, known: Iterable[str]) -> InitErrorDetails:

@@ -18,6 +18,9 @@ from physworld.materials.plastic import DruckerPrager, VonMises
 from physworld.scene import UNDEFORMED_AT_REST, Body, DeclaredCollider, Grip, Ground, Scene
 from physworld.twin.build import build_twin
 from physworld_scenes.bundle import read_bundle
+from physworld_services.dashboard.surfaces import Surface
+from physworld_services.dashboard.tubes import Tubes
+from scripts.gallery_surface import surface_of_twin
 
 SAMPLES = Path(__file__).resolve().parents[1] / "sample"
 GRAVITY = np.array([0.0, 0.0, -9.81])
@@ -33,6 +36,7 @@ class Motion:
     Attributes:
         times: of the frames [s], (T,).
         particles: of the simulation [m], (T, P, 3).
+        surface: of the body, carried by the particles; None draws the particles themselves.
         measured: points with where they are visible, (T, N, 3) and (T, N); None where nothing was measured.
         ball: middle of a ball of ``BALL_RADIUS_M`` [m], (T, 3), or None.
         ground_m: height of the ground, or None.
@@ -43,6 +47,7 @@ class Motion:
 
     times: Array
     particles: Array
+    surface: Surface | Tubes | None = None
     measured: tuple[Array, Array] | None = None
     ball: Array | None = None
     ground_m: float | None = None
@@ -87,6 +92,7 @@ def calibrated(name: str, budget: int, simulations: int = 400) -> Motion:
     return Motion(
         scene.times,
         found.particles,
+        surface_of_twin(found.twin),
         measured=(scene.points, scene.visible),
         held_out=(float(errors[slice(*scene.test)].mean()), floor),
         first_held_out=scene.test[0],
@@ -113,7 +119,7 @@ def cloth(budget: int) -> Motion:
         grips=tuple(Grip(tuple(range(4 * k, 4 * k + 4)), low[k], high[k]) for k in range(2)),
     )
     twin = build_twin(scene, budget).with_parameters(membrane_n_m=100.0, bending_n_m=1e-5, air_drag_per_s=1.5)
-    return Motion(times, twin.simulate(times, scene.controllers, times))
+    return Motion(times, twin.simulate(times, scene.controllers, times), surface_of_twin(twin))
 
 
 def clay(budget: int) -> Motion:
@@ -123,7 +129,8 @@ def clay(budget: int) -> Motion:
     middle[:, 2] = 0.085 - 0.045 * _ramp(times, 0.2, 0.9) + 0.06 * _ramp(times, 1.2, 1.9)
     scene = _on_a_table("block", np.array([0.12, 0.12, 0.05]), times, middle, density=1200.0)
     twin = build_twin(scene, budget, plasticity=VonMises(3e3)).with_parameters(youngs_modulus_pa=2e5)
-    return Motion(times, twin.simulate(times, scene.controllers, times), ball=middle, ground_m=0.0)
+    particles = twin.simulate(times, scene.controllers, times)
+    return Motion(times, particles, surface_of_twin(twin), ball=middle, ground_m=0.0)
 
 
 def sand(budget: int) -> Motion:
@@ -142,7 +149,8 @@ def pushed(budget: int) -> Motion:
     middle[:, 0] += 0.10 * _ramp(times, 0.1, 1.0) - 0.08 * _ramp(times, 1.2, 1.8)
     scene = _on_a_table("block", np.array([0.1, 0.08, 0.08]), times, middle, density=300.0, friction=0.9)
     twin = build_twin(scene, budget).with_parameters(youngs_modulus_pa=4e3)
-    return Motion(times, twin.simulate(times, scene.controllers, times), ball=middle, ground_m=0.0)
+    particles = twin.simulate(times, scene.controllers, times)
+    return Motion(times, particles, surface_of_twin(twin), ball=middle, ground_m=0.0)
 
 
 EXHIBITS = (

@@ -1,14 +1,16 @@
 """``python -m scripts.make_gallery [NAME ...]``: make the films and the page of the gallery, ``docs/gallery.md``.
 
-Every film is simulated anew (``gallery_objects.py``) and drawn by the renderer of ``physworld video``: particles as
-spheres that carry their colour with them, measured points dark on top. ``docs/images/gallery`` gets NAME.mp4 and the
-picture NAME.webp that stands for it, and ``figures.json`` what was measured. With names, only these are made anew.
+Every film is simulated anew (``gallery_objects.py``) and drawn by the renderer of ``physworld video``: the body's
+surface (``gallery_surface.py``), or grains as spheres, with colours that are carried along, and measured points dark on
+top. ``docs/images/gallery`` gets NAME.mp4 and the picture NAME.webp that stands for it, and ``figures.json`` what was
+measured. With names, only these are made anew.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,6 +30,7 @@ from physworld.video import (
     orbit_view,
 )
 from scripts.gallery_objects import BALL_RADIUS_M, EXHIBITS, Exhibit, Motion
+from scripts.gallery_surface import DrawnSurface, lit
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "docs" / "images" / "gallery"
@@ -41,8 +44,9 @@ POSTER_AT = 0.55  # share of the film
 FRAMES_A_SECOND = 30.0  # at most; recordings have more
 HEAD = """# Gallery
 
-Six objects, simulated by the engine and drawn by the renderer of [physworld video](video.md). A click on a picture
-plays its film. `python -m scripts.make_gallery` makes the films and this page.
+Six objects, simulated by the engine and drawn by the renderer of [physworld video](video.md), with the surfaces that
+the dashboard gives them; sand is drawn grain by grain. A click on a picture plays its film.
+`python -m scripts.make_gallery` makes the films and this page.
 """
 
 
@@ -84,15 +88,15 @@ def drawn(exhibit: Exhibit, motion: Motion, size_px: tuple[int, int] = SIZE_PX) 
     renderer = Renderer(camera)
     toward = camera.centre - view.mean(axis=0)
     toward /= np.linalg.norm(toward)
-    body = gaussians_at_points(motion.particles[0], _checks(motion.particles[0], exhibit))
+    body = _body(exhibit, motion, camera)
     still = [_table(motion)] if motion.ground_m is not None else []
+    outward = _directions(2500)
+    ball = lit(np.array(BALL), outward, toward)
     pictures = []
     for frame in shown:
-        parts = [*still, _moved(body, motion.particles[frame])]
+        parts = [*still, body(motion.particles[frame])]
         if motion.ball is not None:
-            parts.append(
-                _spheres(motion.ball[frame] + BALL_RADIUS_M * _directions(900), 0.08 * BALL_RADIUS_M, BALL)
-            )
+            parts.append(_spheres(motion.ball[frame] + BALL_RADIUS_M * outward, 0.05 * BALL_RADIUS_M, ball))
         if motion.measured is not None:
             points, visible = motion.measured
             if visible[frame].any():
@@ -155,13 +159,19 @@ def _checks(points: Array, exhibit: Exhibit) -> Array:
     return np.where(odd[:, None], tone, 0.62 * tone)
 
 
-def _moved(body: Gaussians, points: Array) -> Gaussians:
-    return Gaussians(points, body.log_scales, body.rotations, body.opacity_logits, body.harmonics)
+def _body(exhibit: Exhibit, motion: Motion, camera: Camera) -> Callable[[Array], Gaussians]:
+    """What draws the body when its particles are at (P, 3) [m]."""
+    if motion.surface is None:
+        spheres = gaussians_at_points(motion.particles[0], _checks(motion.particles[0], exhibit))
+        return lambda particles: replace(spheres, means=particles)
+    surface = DrawnSurface(motion.surface, motion.particles[0], camera.centre)
+    colours = _checks(surface.middles, exhibit)
+    return lambda particles: surface.at(particles, colours)
 
 
-def _spheres(points: Array, radius_m: float, colour: tuple[float, float, float]) -> Gaussians:
-    """Points (P, 3) of one size and colour."""
-    made = gaussians_at_points(points, np.tile(colour, (len(points), 1)))
+def _spheres(points: Array, radius_m: float, colour: Array | tuple[float, float, float]) -> Gaussians:
+    """Points (P, 3) of one size, in one colour or in one each, (P, 3)."""
+    made = gaussians_at_points(points, np.broadcast_to(colour, (len(points), 3)))
     return Gaussians(
         made.means,
         np.full((len(points), 3), np.log(radius_m)),
@@ -176,7 +186,7 @@ def _table(motion: Motion) -> Gaussians:
     assert motion.ground_m is not None
     low, high = motion.particles.min(axis=(0, 1)), motion.particles.max(axis=(0, 1))
     middle, reach = 0.5 * (low + high), 0.75 * float(np.max(high - low))
-    line = np.linspace(-reach, reach, 61)
+    line = np.linspace(-reach, reach, 121)
     grid = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
     grid = grid[np.linalg.norm(grid, axis=1) <= reach]
     points = np.column_stack([grid + middle[:2], np.full(len(grid), motion.ground_m)])

@@ -8,6 +8,7 @@ from fastapi import FastAPI
 from pydantic.json_schema import models_json_schema
 
 from physworld_schemas.base import Page, Problem
+from physworld_schemas.job import Event
 from physworld_services.api.errors import documented
 
 INTRODUCTION = """
@@ -47,13 +48,15 @@ REFERENCE = "#/components/schemas/{model}"
 
 
 def describe(app: FastAPI) -> None:
-    """Make ``app.openapi`` add the problem schema that ``errors.documented`` refers to."""
+    """Make ``app.openapi`` add what no model of a route names, and the words that are missing."""
     generate = app.openapi
 
     def openapi() -> dict[str, Any]:
         if app.openapi_schema is None:
             document = generate()
-            _, definitions = models_json_schema([(Problem, "serialization")], ref_template=REFERENCE)
+            _, definitions = models_json_schema(
+                [(Problem, "serialization"), (Event, "serialization")], ref_template=REFERENCE
+            )
             schemas = document.setdefault("components", {}).setdefault("schemas", {})
             for name, schema in definitions["$defs"].items():
                 schemas.setdefault(name, schema)

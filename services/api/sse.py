@@ -12,6 +12,25 @@ from collections.abc import AsyncIterator
 import anyio
 from sse_starlette import EventSourceResponse, ServerSentEvent
 
+STREAMED = {
+    "type": "object",
+    "required": ["id", "event", "data"],
+    "properties": {
+        "id": {"type": "string", "description": "The event's `seq`.", "pattern": "^[0-9]+$"},
+        "event": {
+            "type": "string",
+            "description": "The event's `type`.",
+            "enum": ["state", "progress", "log"],
+        },
+        "data": {
+            "type": "string",
+            "description": "The event as JSON.",
+            "contentMediaType": "application/json",
+            "contentSchema": {"$ref": "#/components/schemas/Event"},
+        },
+    },
+}
+"""How the OpenAPI document describes each event of the stream."""
 HEARTBEAT_S = 15
 CLOSING_S = 2.0  # for the streams to end by themselves when the server stops
 

@@ -10,6 +10,7 @@ from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from pydantic import ValidationError
 from starlette.exceptions import HTTPException
 
+from physworld_schemas.base import TEXTS
 from physworld_schemas.key import DEFAULT_GRACE_MINUTES, KeyCreate, Role
 from physworld_services.dashboard.access import actor_of, require_same_origin
 from physworld_services.dashboard.lists import Asked, Looked
@@ -58,7 +59,7 @@ def router(site: Site) -> APIRouter:
     ) -> HTMLResponse:
         try:
             asked = KeyCreate.model_validate(
-                {"name": name.strip(), "role": role, "expires_in_days": days or None}
+                {"name": name.strip(), "role": role, "expires_in_days": days or None}, context=TEXTS
             )
         except ValidationError as error:
             fault = "; ".join(f"{fault['loc'][0]}: {fault['msg']}" for fault in error.errors())

@@ -10,6 +10,7 @@ from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 
+from physworld_schemas.base import TEXTS
 from physworld_services.api.errors import ApiProblem
 from physworld_services.dashboard.access import require_same_origin, require_writer
 from physworld_services.dashboard.forms import faults_of, form_of, values_of
@@ -60,7 +61,7 @@ def _start(site: Site, request: Request, kind: str, sent: Mapping[str, list[str]
     known = _known(kind)
     values = values_of(known.body, sent)
     try:
-        opening = known.open(site, known.body.model_validate(values))
+        opening = known.open(site, known.body.model_validate(values, context=TEXTS))
         with site.database.session() as session:
             opened = opening(session)
     except ValidationError as error:

@@ -35,6 +35,7 @@ def pages(world: World) -> list[str]:
     starts = (
         "pipeline",
         "fit",
+        "check",
         "trace",
         "dataset",
         "training",

@@ -10,9 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from dashboard_browser import FLAGS, WATCH_POLICY
+from dashboard_browser import FLAGS, WATCH_POLICY, Visit
 from inference_serving import Served, serve_inference
 from playwright.sync_api import Page, expect, sync_playwright
+from test_dashboard_accessible import violations
 
 pytestmark = pytest.mark.browser
 
@@ -138,6 +139,13 @@ def test_a_slider_changes_the_body_and_a_new_session_keeps_it(served: Served, pa
     expect(page.locator("[data-note]")).to_contain_text("The session ended")
     page.click("[data-reset]")
     until(page, lambda: any("factors" in said and json.loads(said) == asked for said in sent))
+
+
+def test_axe_finds_nothing_beside_a_live_session(served: Served, page: Page) -> None:
+    page.set_viewport_size({"width": 360, "height": 900})
+    enter(served, page)
+    expect(page.locator("[data-factors] label")).to_have_count(2)
+    assert violations(Visit(page, served.url)) == []
 
 
 def test_a_still_pointer_leaves_a_still_grip(served: Served, page: Page) -> None:

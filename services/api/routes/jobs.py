@@ -6,7 +6,6 @@ from typing import Annotated
 
 from fastapi import APIRouter, Header, Query, Response
 from sqlalchemy.orm import Session
-from sse_starlette import EventSourceResponse
 from starlette.concurrency import run_in_threadpool
 
 from physworld_schemas.base import Page
@@ -21,7 +20,7 @@ from physworld_services.api.dependencies import (
 )
 from physworld_services.api.errors import documented
 from physworld_services.api.idempotency import IdempotencyDep, accepted, job_links
-from physworld_services.api.sse import event_response
+from physworld_services.api.sse import STREAMED, event_response
 from physworld_storage.access import audit
 from physworld_storage.database import Database
 from physworld_storage.idempotency import Answer
@@ -95,11 +94,11 @@ def retry_job(job_id: ObjectId, idempotency: IdempotencyDep, actor: ActorDep) ->
 
 @router.get(
     "/{job_id}/events",
-    response_class=EventSourceResponse,
+    response_class=Response,
     responses={
         200: {
             "description": "Server-sent events; `id` is the event's seq, `data` an Event as JSON",
-            "content": {"text/event-stream": {"schema": {"type": "string"}}},
+            "content": {"text/event-stream": {"itemSchema": STREAMED}},
         },
         204: {"description": "The job has ended and the client has seen every event"},
         **documented(401, 403, 404, 422, 429, 503),

@@ -1,9 +1,10 @@
 """What no schema can say to a generator of requests, for ``st run`` with ``SCHEMATHESIS_HOOKS`` (docs/api.md).
 
 A cursor is what the page before gave out, an idempotency key is new for each request, an upload is a recording (any
-other is refused with 422 as documented), and what a path names is there: of most requests that are meant to be right,
-the ids in the path are those of something that the service has, found by listing the collection before them. What would
-delete or cancel it keeps made-up ids. The contract tests ask for these refusals themselves.
+other is refused with 422 as documented), a wait for a job's end is short, and what a path names is there: of most
+requests that are meant to be right, the ids in the path are those of something that the service has, found by listing
+the collection before them. What would delete or cancel it keeps made-up ids. The contract tests ask for these refusals
+and for long waits themselves.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from schemathesis import Case, GenerationMode, HookContext
 
 TOKEN = "PHYSWORLD_TOKEN"
 """Variable of the key; without it the ids stay made up."""
+MOST_WAIT_S, LONGEST_WAIT_S = 1.0, 60.0
+"""How long a request for a job waits here, lest queued jobs hold the run up, and how long it might."""
 KNOWN_S = 20.0
 """How long a listing is remembered."""
 SHARE = 0.8
@@ -29,7 +32,9 @@ _RANDOM = random.Random(0)
 
 @schemathesis.hook
 def before_call(context: HookContext, case: Case, kwargs: dict[str, object]) -> None:
-    """Put real values in the place of generated ones, in requests that are meant to be right."""
+    """Wait shortly, and put real values in the place of generated ones in requests that are meant to be right."""
+    if case.query and _number(case.query.get("wait")) <= LONGEST_WAIT_S:
+        case.query["wait"] = min(_number(case.query["wait"]), MOST_WAIT_S)
     if case.meta is None or case.meta.generation.mode is not GenerationMode.POSITIVE:
         return
     if case.query:
@@ -40,6 +45,14 @@ def before_call(context: HookContext, case: Case, kwargs: dict[str, object]) -> 
     asked = bool(case.path_parameters) and TOKEN in os.environ
     if asked and not ending and _RANDOM.random() < SHARE:
         _name_what_is_there(case)
+
+
+def _number(value: object) -> float:
+    """A number of a query, or infinity."""
+    try:
+        return float(str(value))
+    except ValueError:
+        return float("inf")
 
 
 def _name_what_is_there(case: Case) -> None:

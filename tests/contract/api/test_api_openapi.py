@@ -109,6 +109,23 @@ def test_requests_made_from_the_document_are_answered_as_it_says(
         _exercise(operation.as_strategy(), service.url, headers)
 
 
+def test_each_event_of_a_stream_is_what_the_document_says(service: Service, document: dict[str, Any]) -> None:
+    schema = schemathesis.openapi.from_dict(document)
+    operation = schema["/v1/jobs/{job_id}/events"]["GET"]
+    with service.client() as client:
+        body = {"scene_id": scene_id(client)}
+        job_id = client.post("/v1/checks", json=body).json()["id"]
+        service.work()
+        case = operation.Case(path_parameters={"job_id": job_id})
+        headers = {"Authorization": f"Bearer {service.token('admin')}"}
+        response = case.call(base_url=service.url, headers=headers)
+        assert response.status_code == 200
+        case.validate_response(response, checks=CHECKS)
+    events = document["paths"]["/v1/jobs/{job_id}/events"]["get"]["responses"]["200"]["content"]
+    told = events["text/event-stream"]["itemSchema"]["properties"]["data"]["contentSchema"]
+    assert document["components"]["schemas"][told["$ref"].rpartition("/")[2]]["title"] == "Event"
+
+
 def _exercise(cases: st.SearchStrategy[Case], url: str, headers: dict[str, str]) -> None:
     @seed(SEED)
     @settings(

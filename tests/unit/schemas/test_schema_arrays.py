@@ -34,3 +34,9 @@ def test_a_number_that_is_too_far_is_named_with_its_place_and_the_limit() -> Non
     with pytest.raises(ValueError, match=r"path reaches 1e\+300 at \[0, 1\]; 1000 is the farthest from 0"):
         array_of([[0.0, -1e300]], "path", (2,), 1000.0)
     assert array_of([[1000.0]], "path", (2,), 1000.0).tolist() == [[1000.0]]
+
+
+@pytest.mark.parametrize("value", [False, True, "1", None])
+def test_what_is_no_number_is_refused_in_lists_too(value: object) -> None:
+    with pytest.raises(ValueError, match="path is not a regular array of numbers"):
+        array_of([[0.0, value]], "path", (2,))

@@ -5,12 +5,18 @@ from __future__ import annotations
 import json
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from physworld_schemas.assessment import AssessmentCreate
+from physworld_schemas.base import TEXTS, Request
+from physworld_schemas.dataset import DatasetConfig
 from physworld_schemas.fit import Fit
 from physworld_schemas.hints import hint_of
 from physworld_schemas.key import KeyRotate
+from physworld_schemas.live import LiveTicketCreate
+from physworld_schemas.plan import PlanLimits, PointGoal
 from physworld_services.api.errors import problem_response
 from physworld_services.dashboard import text
 from physworld_services.dashboard.site import environment_of_pages
@@ -67,6 +73,34 @@ def test_the_port_of_the_last_run_is_remembered(tmp_path: Path, kept: str | None
 
 
 def test_true_is_no_number_of_minutes() -> None:
-    with pytest.raises(ValueError, match="grace_minutes: true and false are no numbers"):
+    with pytest.raises(ValueError, match="grace_minutes\n  true and false are no numbers"):
         KeyRotate.model_validate({"grace_minutes": True})
     assert KeyRotate.model_validate({"grace_minutes": 3}).grace_minutes == 3
+
+
+@pytest.mark.parametrize(
+    ("model", "body", "place"),
+    [
+        (PlanLimits, {"workspace_max_m": [0.1, False, 0.1]}, "workspace_max_m"),
+        (PointGoal, {"kind": "points", "index": [0], "places": [[0.0, 0.0, True]]}, "places"),
+        (PointGoal, {"kind": "points", "index": [True], "places": [[0.0, 0.0, 0.0]]}, "index"),
+        (DatasetConfig, {"patterns": {"lift": True}}, "patterns"),
+        (LiveTicketCreate, {"model": "beam", "version": True}, "version"),
+    ],
+)
+def test_true_and_false_are_no_numbers_in_lists_either(
+    model: type[Request], body: dict[str, Any], place: str
+) -> None:
+    with pytest.raises(ValueError, match=f"{place}\n  true and false are no numbers"):
+        model.model_validate(body)
+
+
+def test_numbers_and_texts_are_not_read_as_true_and_false_nor_texts_as_numbers() -> None:
+    with pytest.raises(ValueError, match="open_trace\n  0 is neither true nor false"):
+        AssessmentCreate.model_validate({"scene_id": "scn_1", "open_trace": 0})
+    with pytest.raises(ValueError, match="open_trace\n  a text where true or false is asked for"):
+        AssessmentCreate.model_validate({"scene_id": "scn_1", "open_trace": "false"})
+    with pytest.raises(ValueError, match="grace_minutes\n  a text where a number is asked for"):
+        KeyRotate.model_validate({"grace_minutes": "3"})
+    assert KeyRotate.model_validate({"grace_minutes": "3"}, context=TEXTS).grace_minutes == 3
+    assert LiveTicketCreate.model_validate({"model": "beam", "version": "3"}).version == "3"
