@@ -53,6 +53,7 @@ STARTS = (
     "dataset",
     "training",
     "assessment",
+    "loop",
     "rollout",
     "video",
     "plan",
