@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import io
+import json
 import os
 import shutil
 import subprocess
@@ -18,6 +19,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -36,12 +38,16 @@ from physworld_client.world_model import WorldModel
 from PIL import Image
 from playwright.sync_api import BrowserContext, Page, sync_playwright
 
+from physworld.video import Drawing, eight_bit, whole_motion_view
+from physworld_scenes.bundle import read_bundle
+
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "docs" / "images" / "dashboard"
 WIDTHS_PX = (360, 1440)
 THEMES = ("light", "dark")
 TALLEST_PX = 2400  # the rest of a longer page is left out
 QUALITY = 62  # of WebP
+FILM_PX = (480, 360)
 DRAWN_S = 1.5  # for plots and 3D views, once the network is quiet
 START_S = 180.0
 MODEL = "soft_beam"
@@ -163,7 +169,7 @@ def fill(client: Client) -> None:
     if not client.plans.list(limit=1).data:
         _predict(client)
     if not client.videos.list(limit=1).data:
-        _wait(client, client.videos.create("scene", beam))
+        _film(client, beam)
     if not client.jobs.list(state="cancelled").data:
         cancelled = client.jobs.cancel(client.fits.create(rope, SMALL_FIT).id)
         while cancelled.state not in TERMINAL_STATES:
@@ -243,6 +249,21 @@ def _predict(client: Client) -> None:
     end = int(np.argmax(np.linalg.norm(points[0] - controllers[0].mean(axis=0), axis=1)))
     goal = {end: [float(x) for x in points[0, end] + [0.0, 0.03, 0.0]]}
     _wait(client, client.plans.create(MODEL, points=goal, config=PlanConfig(samples=32, iterations=8)))
+
+
+def _film(client: Client, scene_id: str) -> None:
+    """A film of the beam's twin beside pictures of its recording, which has none: they are drawn of its points."""
+    points = read_bundle(ROOT / "sample" / MODEL).points
+    camera = whole_motion_view(points, -60.0, 20.0, *FILM_PX)
+    frames = np.stack([eight_bit(picture) for picture in Drawing(points, points[0], camera).frames()])
+    with tempfile.TemporaryDirectory() as temporary:
+        seen, drawn = Path(temporary) / "camera.json", Path(temporary) / "frames.npz"
+        seen.write_text(json.dumps(asdict(camera) | {"world_to_camera": camera.world_to_camera.tolist()}))
+        np.savez_compressed(drawn, frames=frames)
+        for path in (seen, drawn):
+            client.videos.put_picture(scene_id, path)
+    fit = next(fit for fit in client.fits.list().data if fit.scene_id == scene_id and fit.state == "ready")
+    _wait(client, client.videos.create("fit", fit.id))
 
 
 def _log_in(context: BrowserContext, page: Page, base: str, key: str) -> None:
