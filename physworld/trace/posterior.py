@@ -20,7 +20,7 @@ from physworld.arrays import Array
 from physworld.trace.left_out import LeftOut
 
 MOST = 0.42  # share of the root mean square, two thirds of the square: what an effect removes to be named
-_NOISE_KNOWN = 0.05  # share to which the variance of the noise is known
+_NOISE_KNOWN = 0.2  # share to which the variance of the noise is known: its deviation to a tenth
 _DRAWS = 4000
 
 
