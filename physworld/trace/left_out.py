@@ -12,8 +12,9 @@ left-out error e of which 1 is noise, M numbers in B blocks tell its mean as wel
 
 independent numbers would (the variance of a mean square is the sum of its parts' variances). So everything that weighs
 data against priors, or one hypothesis against another, counts n numbers instead of M: the likelihood is tempered
-(Miller and Dunson 2019, "Robust Bayesian inference via coarsening"), by a number that the data give. Where a twin is
-right to the noise n is M, and nothing is tempered.
+(Miller and Dunson 2019, "Robust Bayesian inference via coarsening"), by a number that the data give. Between
+hypotheses it is n(e + 0.2): the variance of the noise is known to a fifth, so that much error of the twin may hide in
+it.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from physworld.arrays import Array
 from physworld.estimation.refit import prior_rows
 from physworld.estimation.unknowns import Unknown, bounds_of
 
+NOISE_KNOWN = 0.2  # share to which the variance of the noise is known: its deviation to a tenth
 _WEAKEST = 1e-9  # of the normal matrix's diagonal: keeps it invertible where data say nothing of an unknown
 
 
@@ -68,8 +70,8 @@ class LeftOut:
 
     @property
     def count(self) -> float:
-        """Independent numbers that the rows are worth, at this error."""
-        return independent(self.mean, int(self.sizes.sum()), len(self.sizes))
+        """Independent numbers that the rows are worth between hypotheses."""
+        return independent(self.mean + NOISE_KNOWN, int(self.sizes.sum()), len(self.sizes))
 
     @property
     def scale(self) -> float:

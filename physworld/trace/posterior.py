@@ -17,10 +17,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.trace.left_out import LeftOut
+from physworld.trace.left_out import NOISE_KNOWN, LeftOut
 
 MOST = 0.42  # share of the root mean square, two thirds of the square: what an effect removes to be named
-_NOISE_KNOWN = 0.2  # share to which the variance of the noise is known: its deviation to a tenth
 _DRAWS = 4000
 
 
@@ -49,6 +48,6 @@ def removes(without: float, after: float) -> float:
     Args:
         without, after: mean squared errors of left-out blocks over the noise's, without and with an effect.
     """
-    if without - 1.0 <= _NOISE_KNOWN:
+    if without - 1.0 <= NOISE_KNOWN:
         return 0.0
     return 1.0 - float(np.sqrt(max(after - 1.0, 0.0) / (without - 1.0)))

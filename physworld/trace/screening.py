@@ -19,7 +19,9 @@ from physworld.trace.hypotheses import Hypothesis, Setting, Values
 from physworld.trace.posterior import removes
 from physworld.trace.sensitivity import Response, candidate_responses
 
-_REACH = 0.3  # of its range: how far a linear estimate moves an unknown
+_REACH = (
+    0.3  # of its range: how far a linear estimate moves a calibrated number; a strength moves over all of it
+)
 
 
 @dataclass(frozen=True)
@@ -60,14 +62,16 @@ def _score(base: Hypothesis, response: Response) -> Screened | None:
     start = np.concatenate([base.fitted.theta[kept], [base.values.get(g.name, 0.0) for g in gates]])
     unknowns = [u.starting(t) for u, t in zip([*known, *gates], start, strict=True)]
     jacobian = np.concatenate([base.fitted.jacobian[:, kept], columns], axis=1)
-    change = _bounded(base, jacobian, unknowns, start)
+    change = _bounded(base, jacobian, unknowns, start, len(gates))
     error = float(np.mean((base.fitted.residual - jacobian @ change) ** 2))
     values = {u.name: float(t) for u, t in zip(unknowns, start + change, strict=True)}
     return Screened(candidate, values, removes(base.fitted.misfit**2, error), error)
 
 
-def _bounded(base: Hypothesis, jacobian: Array, unknowns: list[Unknown], start: Array) -> Array:
-    """Linear change of all unknowns (p,) within their bounds, by what a sighting counts beside ``base``."""
+def _bounded(
+    base: Hypothesis, jacobian: Array, unknowns: list[Unknown], start: Array, strengths: int
+) -> Array:
+    """Linear change of all unknowns (p,) within their bounds, the last ones strengths, by what a sighting counts."""
     slope, residual = jacobian / base.unseen.scale, base.fitted.residual / base.unseen.scale
     prior_residual, prior_slope = prior_rows(unknowns, start)
     normal = slope.T @ slope + prior_slope.T @ prior_slope
@@ -75,7 +79,7 @@ def _bounded(base: Hypothesis, jacobian: Array, unknowns: list[Unknown], start: 
     scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
     root = np.linalg.cholesky(normal * scale * scale[:, None] + 1e-9 * np.eye(len(scale)))
     low, high = bounds_of(unknowns)
-    reach = _REACH * (high - low)
+    reach = np.where(np.arange(len(start)) < len(start) - strengths, _REACH, 1.0) * (high - low)
     low, high = np.maximum(low, start - reach), np.minimum(high, start + reach)
     bounds = np.minimum(low - start, 0.0) / scale, np.maximum(high - start, 1e-12) / scale
     target = np.linalg.solve(root, gradient * scale)

@@ -27,7 +27,7 @@ from physworld.trace.starts import NO_WORSE, Begun, Starts, distinct, elsewhere
 _VARIANTS = 3  # shapes of an effect that are begun before its best is freed
 WORTH = 0.1  # share of the error above the noise that an effect removes to first order, to be fitted
 _QUIET = (
-    1.2  # misfit over the noise up to which what is there is small, and a score to first order says enough
+    1.2  # misfit over the noise up to which what is left is small, and calibrated numbers are about right
 )
 _HALF = 0.5  # of what the best one promises: what a rival has to promise to be fitted to all frames
 _FIRST_OF_TWO = 0.29  # share of the root mean square that goes with one of two effects of the same size
@@ -167,7 +167,7 @@ class Search:
         for one in scores:
             by_effect.setdefault(one.candidate.effect, []).append(one)
         order = [own for own in by_effect.values() if own[0].share > WORTH][:count]
-        if not _near(base) and not base.members:
+        if not base.members:
             # a score to first order says nothing of an effect that is large
             order += [own for own in by_effect.values() if own not in order and own[0].candidate.scanned]
         simpler = [name for own in order for name in own[0].candidate.contains]
@@ -176,7 +176,8 @@ class Search:
         ]
 
     def _begin(self, base: Hypothesis, order: Sequence[list[Screened]], far: bool) -> None:
-        """Fits of ``base`` with each of the effects, those that promise at least half of what the best one does."""
+        """Fits of ``base`` with each of the effects: all where little is left, for the fits are cheap and shares of it
+        are small differences; else those that promise at least half of what the best one does."""
         begun = [self._begun(base, own, far) for own in order]
         most = max((one.promised for one in begun), default=0.0)
         scored = max((one.screened.share for one in begun), default=0.0)
@@ -184,7 +185,11 @@ class Search:
             known = self.hypotheses.get(_names((*base.members, one.screened.candidate)))
             if far and known is not None and one.promised <= self.starts.promised(base, known):
                 continue
-            if one.promised >= _HALF * most > 0.0 or (not far and one.screened.share >= _HALF * scored):
+            if (
+                _near(base)
+                or one.promised >= _HALF * most > 0.0
+                or (not far and one.screened.share >= _HALF * scored)
+            ):
                 self.setting.simulations.stage = f"fit with {one.screened.candidate.effect}"
                 self._fit(base, one)
 
@@ -192,8 +197,6 @@ class Search:
         """Where the fit of an effect begins: of its best variants the one that promises most."""
         kept = variants[: _VARIANTS if variants[0].candidate.shapes else 1]
         self.setting.simulations.stage = f"fit with {variants[0].candidate.effect}"
-        if not far and _near(base) and not base.members:
-            return Begun(kept[0], [], 0.0)
         best = sorted(self.hypotheses.values(), key=self._total, reverse=True)
         first = self.setting.calibrated[0].name
         other = distinct([h.values.get(first, 0.0) for h in best], [base.values.get(first, 0.0)])
@@ -261,7 +264,7 @@ class Search:
         """Fits ``base`` with an effect more, its shape first as it is, then free where that promises something."""
         candidate, hopeless = begun.screened.candidate, self._hopeless(base)
         members = (*base.members, candidate)
-        first, *others = begun.starts or [{**base.values, **begun.screened.values}]
+        first, *others = begun.starts
         scale = self.setting.counted(begun.screened.error)
         shaped = bool(candidate.shapes)
         best = self.setting.fitted(members, first, others, not shaped, scale, hopeless, base.white)
