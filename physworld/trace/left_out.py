@@ -13,8 +13,7 @@ left-out error e of which 1 is noise, M numbers in B blocks tell its mean as wel
 independent numbers would (the variance of a mean square is the sum of its parts' variances). So everything that weighs
 data against priors, or one hypothesis against another, counts n numbers instead of M: the likelihood is tempered
 (Miller and Dunson 2019, "Robust Bayesian inference via coarsening"), by a number that the data give. Between
-hypotheses it is n(e + 0.2): the variance of the noise is known to a fifth, so that much error of the twin may hide in
-it.
+hypotheses it is n(e + 0.2), for that much error of the twin may hide in a noise whose variance is known to a fifth.
 """
 
 from __future__ import annotations

@@ -26,9 +26,7 @@ from physworld.trace.starts import NO_WORSE, Begun, Starts, distinct, elsewhere
 
 _VARIANTS = 3  # shapes of an effect that are begun before its best is freed
 WORTH = 0.1  # share of the error above the noise that an effect removes to first order, to be fitted
-_QUIET = (
-    1.2  # misfit over the noise up to which what is left is small, and calibrated numbers are about right
-)
+_QUIET = 1.2  # misfit over the noise up to which what is left is small, and calibrated numbers are right
 _HALF = 0.5  # of what the best one promises: what a rival has to promise to be fitted to all frames
 _FIRST_OF_TWO = 0.29  # share of the root mean square that goes with one of two effects of the same size
 _BASINS = 3  # other hypotheses' optima from which a fit starts
@@ -185,11 +183,8 @@ class Search:
             known = self.hypotheses.get(_names((*base.members, one.screened.candidate)))
             if far and known is not None and one.promised <= self.starts.promised(base, known):
                 continue
-            if (
-                _near(base)
-                or one.promised >= _HALF * most > 0.0
-                or (not far and one.screened.share >= _HALF * scored)
-            ):
+            scores = not far and one.screened.share >= _HALF * scored
+            if scores or one.promised >= _HALF * most > 0.0 or _near(base):
                 self.setting.simulations.stage = f"fit with {one.screened.candidate.effect}"
                 self._fit(base, one)
 
