@@ -26,7 +26,7 @@ from typing import Any
 from benchmarks.harness import describe_machine, write_section
 from benchmarks.trace.power_effects import LEVELS, inject, refusal
 from benchmarks.trace.power_objects import GROUND_ONLY, NULLS_ONLY, OBJECTS, Object, observed, recorded
-from benchmarks.trace.power_picture import draw
+from benchmarks.trace.power_picture import draw, draw_calibration
 from benchmarks.trace.power_report import page, summary
 from physworld.effects.registry import EFFECTS
 from physworld.errors import PhysworldError
@@ -217,9 +217,11 @@ def main() -> int:
     given.json.parent.mkdir(parents=True, exist_ok=True)
     given.json.write_text(json.dumps({**figures, "machine": describe_machine()}, indent=2) + "\n")
     if given.docs is not None:
-        picture = given.docs.parent / "images" / "trace_power.svg"
-        draw(rows, picture)
-        write_section(page(rows, figures, len(asked), f"images/{picture.name}"), given.docs)
+        images = given.docs.parent / "images"
+        draw(rows, images / "trace_power.svg")
+        draw_calibration(figures["calibration"], images / "trace_calibration.svg")
+        pictures = ("images/trace_power.svg", "images/trace_calibration.svg")
+        write_section(page(rows, figures, len(asked), *pictures), given.docs)
     return 0
 
 

@@ -1,4 +1,4 @@
-"""The confusion matrix of ``benchmarks.trace.power`` as a picture, one panel a level."""
+"""Pictures of ``benchmarks.trace.power``: the confusion matrix, one panel a level; how often claims are right."""
 
 from __future__ import annotations
 
@@ -12,16 +12,12 @@ from benchmarks.trace.power_report import NOT_RUN, SILENT, column
 from physworld.effects.registry import EFFECTS
 
 _SIZE = (17.0, 7.5)
+_CURVE_SIZE = (4.5, 3.5)
 
 
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
     """Write the picture: rows what acts (last: nothing), columns what was answered; shade: share of the row."""
-    import matplotlib
-
-    matplotlib.use("agg")
-    matplotlib.rcParams["svg.hashsalt"] = "trace_power"
-    from matplotlib import pyplot
-
+    pyplot = _pyplot()
     acts, answers = [*EFFECTS, None], [*EFFECTS, *SILENT]
     figure, axes = pyplot.subplots(1, len(LEVELS), figsize=_SIZE, sharey=True, layout="constrained")
     for axis, level in zip(axes, LEVELS, strict=True):
@@ -44,6 +40,41 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
         axis.set_title(f"displaced by {level:g} times the noise", fontsize=9)
         axis.set_xlabel("answer", fontsize=8)
     axes[0].set_ylabel("what acts", fontsize=8)
+    _write(figure, path)
+
+
+def draw_calibration(bins: list[dict[str, float]], path: Path) -> None:
+    """Write the picture: the share of claims that are right, with its interval, over their mean posterior."""
+    pyplot = _pyplot()
+    figure, axis = pyplot.subplots(figsize=_CURVE_SIZE, layout="constrained")
+    axis.plot([0, 1], [0, 1], color="grey", linewidth=0.8, label="calibrated")
+    known = [one for one in bins if one["claims"]]
+    share = np.array([one["right"] / one["claims"] for one in known])
+    ends = np.array([[one["low"], one["high"]] for one in known]).reshape(-1, 2).T
+    axis.errorbar(
+        [one["claimed"] for one in known], share, yerr=np.abs(ends - share), fmt="o-", markersize=4, capsize=3
+    )
+    for one, right in zip(known, share, strict=True):
+        axis.annotate(
+            f"{one['claims']}", (one["claimed"], right), (4, -10), textcoords="offset points", fontsize=7
+        )
+    axis.set_xlabel("posterior of a claim", fontsize=8)
+    axis.set_ylabel("share that is right (95 %)", fontsize=8)
+    axis.legend(fontsize=7)
+    _write(figure, path)
+
+
+def _pyplot() -> Any:
+    import matplotlib
+
+    matplotlib.use("agg")
+    matplotlib.rcParams["svg.hashsalt"] = "trace_power"
+    from matplotlib import pyplot
+
+    return pyplot
+
+
+def _write(figure: Any, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, metadata={"Date": None})
-    pyplot.close(figure)
+    _pyplot().close(figure)

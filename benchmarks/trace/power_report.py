@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 from scipy.stats import beta
@@ -20,6 +21,7 @@ SILENT = ("unexplained", "numerical_issue", "nothing_to_explain")
 NOT_RUN = ("refused", "failed")
 _HALF = 0.5  # share of the objects on which an effect must be found at its detection limit
 _SMALL_SET = 2  # effects in an answer that still says something
+CLAIMED = (0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 1.0)  # edges of posteriors that are counted together
 
 
 def outcome(row: Row) -> str:
@@ -84,6 +86,27 @@ def limit(rows: list[Row], effect: str) -> Limit:
     return Limit(half, every, sizes)
 
 
+def calibration(rows: list[Row]) -> list[dict[str, float]]:
+    """How often what has a posterior is what acts: over all recordings but those of the engine that damps, every set of
+    effects with its posterior is a claim, and right where it is the one effect that acts."""
+    claims = [
+        (posterior, effects == [row["effect"]])
+        for row in rows
+        if row["outcome"] not in NOT_RUN and row["object"] != NULLS_ONLY
+        for effects, posterior in row.get("posterior", ())
+        if effects
+    ]
+    found = []
+    for low, high in pairwise(CLAIMED):
+        inside = [claim for claim in claims if low < claim[0] <= high]
+        right = sum(claim[1] for claim in inside)
+        claimed = sum(claim[0] for claim in inside) / max(len(inside), 1)
+        below, above = interval(right, len(inside))
+        found.append({"from": low, "to": high, "claims": len(inside), "claimed": claimed, "right": right,
+                      "low": below, "high": above})  # fmt: skip
+    return found
+
+
 def summary(rows: list[Row], planned: int) -> dict[str, Any]:
     """All counts."""
     nulls = [r for r in rows if r["effect"] is None and r["outcome"] not in NOT_RUN]
@@ -106,6 +129,7 @@ def summary(rows: list[Row], planned: int) -> dict[str, Any]:
         "outcomes": {
             f"{level:g}": dict(Counter(outcome(r) for r in injected if r["level"] == level)) for level in LEVELS
         },
+        "calibration": calibration(rows),
         "limits": {
             name: {"half": known.half, "every": known.every, "strengths": known.sizes} for name, known in limits.items()
         },
@@ -124,8 +148,8 @@ class Page(Report):
         return "\n".join([head, "", self.figures["lead"], rest])
 
 
-def page(rows: list[Row], figures: dict[str, Any], planned: int, picture: str) -> Report:
-    """The page in ``docs/``."""
+def page(rows: list[Row], figures: dict[str, Any], planned: int, picture: str, curve: str) -> Report:
+    """The page in ``docs/``, with the confusion matrix and the curve of how often claims are right."""
     nulls = figures["nulls"]
     low, high = nulls["ci95"]
     lead = (
@@ -134,6 +158,7 @@ def page(rows: list[Row], figures: dict[str, Any], planned: int, picture: str) -
         f"(95 % interval {low:.1%} to {high:.1%}, Clopper-Pearson); their verdicts: {_counts(nulls['verdicts'])}. "
         f"On those of the engine that damps: {_counts(nulls['damped'])}.\n\n"
         f"![Confusion matrix: what acts, and what was answered, at three strengths]({picture})\n\n"
+        f"![How often a claim is right, over its posterior]({curve})\n\n"
         "Level: displacement by the effect, root mean square per axis over the training frames, over the noise "
         f"(1 mm). Every cell lists the objects in the order beam, rope, sheet (ground effects: pad): "
         "**+** named, **(+)** in an equivalent set of two, **±** among more, **!** another name, **·** unexplained, "
@@ -151,6 +176,12 @@ def page(rows: list[Row], figures: dict[str, Any], planned: int, picture: str) -
     false = Counter(" + ".join(r["names"]) for r in rows if r["effect"] is None and r["outcome"] in CLAIMS)
     if false:
         notes.append(f"Named where nothing acts: {', '.join(f'{n} ({c})' for n, c in false.most_common())}.")
+    claims = "; ".join(
+        f"{bin['from']:g} to {bin['to']:g}: {bin['right']} of {bin['claims']}"
+        for bin in figures["calibration"]
+        if bin["claims"]
+    )
+    notes.append(f"Claims that are right, by posterior: {claims}.")
     notes.append(
         f"Commits of the method (+: with changes that were not committed): {_counts(figures['commits'])}; "
         f"{figures['cpu_s'] / 60:.0f} minutes of one core."

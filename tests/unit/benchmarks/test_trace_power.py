@@ -10,8 +10,18 @@ import pytest
 from benchmarks.trace.power import tasks
 from benchmarks.trace.power_effects import inject, refusal
 from benchmarks.trace.power_objects import OBJECTS, observed
-from benchmarks.trace.power_picture import draw
-from benchmarks.trace.power_report import RIGHT, SET, WRONG, interval, limit, outcome, page, summary
+from benchmarks.trace.power_picture import draw, draw_calibration
+from benchmarks.trace.power_report import (
+    RIGHT,
+    SET,
+    WRONG,
+    calibration,
+    interval,
+    limit,
+    outcome,
+    page,
+    summary,
+)
 from physworld.effects.registry import EFFECTS
 
 DRAG = "air_drag_linear"
@@ -48,6 +58,17 @@ def test_the_limit_is_the_smallest_level_found_on_half_of_the_objects() -> None:
     assert limit(rows, "tether").half is None
 
 
+def test_a_claim_is_right_where_it_is_the_one_effect_that_acts() -> None:
+    rows = [
+        {**answer(3.0, "named", DRAG), "posterior": [[[DRAG], 0.97], [["tether"], 0.03]]},
+        {**answer(3.0, "named", "tether"), "posterior": [[["tether"], 0.96], [[DRAG, "tether"], 0.04]]},
+        {**answer(0.0, "nothing_to_explain", effect=None), "posterior": [[[], 1.0]]},
+        {**answer(0.0, "named", DRAG, effect=None, body="damped"), "posterior": [[[DRAG], 1.0]]},
+    ]
+    found = {bin["to"]: (bin["right"], bin["claims"]) for bin in calibration(rows)}
+    assert found[1.0] == (1, 2) and found[0.1] == (0, 2) and sum(many for _, many in found.values()) == 4
+
+
 def test_the_interval_is_that_of_clopper_and_pearson() -> None:
     assert interval(0, 30) == pytest.approx((0.0, 1 - 0.025 ** (1 / 30)))
     low, high = interval(3, 30)
@@ -62,10 +83,12 @@ def test_a_partial_run_makes_a_page_with_its_counts_and_a_picture(tmp_path: Path
     ]
     found = summary(rows, 267)
     assert found["nulls"]["scenes"] == 2 and found["nulls"]["false_names"] == 1
-    text = page(rows, found, 267, "picture.svg").markdown()
+    text = page(rows, found, 267, "picture.svg", "curve.svg").markdown()
     assert "3 of 267" in text and "| `air_drag_linear` | ? ? ? | + ? ? | ? ? ? | 3 | 3 | beam 3 1/s |" in text
     draw(rows, tmp_path / "picture.svg")
-    assert (tmp_path / "picture.svg").read_text().startswith("<?xml")
+    draw_calibration(found["calibration"], tmp_path / "curve.svg")
+    for name in ("picture.svg", "curve.svg"):
+        assert (tmp_path / name).read_text().startswith("<?xml")
 
 
 def test_an_injection_displaces_by_its_level_and_a_rope_refuses_fibres() -> None:
