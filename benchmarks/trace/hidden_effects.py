@@ -27,6 +27,7 @@ from benchmarks.harness import Report, write_section
 from benchmarks.peers.finite_elements import Acting, Floats
 from benchmarks.trace.folder import CLAIMS, PRIMARY, score, traced
 from benchmarks.trace.hidden_bodies import OBJECTS, TOP_M, Hand
+from benchmarks.trace.hidden_kratos import KRATOS
 from physworld.scene import UNDEFORMED_AT_REST, Grip, Scene
 from physworld_scenes.bundle import write_bundle
 
@@ -113,6 +114,39 @@ def cases() -> tuple[Case, ...]:
     )  # fmt: skip
 
 
+def kratos_cases() -> tuple[Case, ...]:
+    """Recordings by Kratos, half of them without an effect."""
+
+    def drawn(number: int, low: float, high: float) -> float:
+        return float(np.random.default_rng(7100 + number).uniform(low, high))
+
+    def drag(number: int) -> dict[str, dict[str, Any]]:
+        return {"linear_drag": {"c": drawn(number, 1.5, 3.0)}}
+
+    def tilt(number: int, *axis: float) -> dict[str, dict[str, Any]]:
+        return {"gravity_tilt": {"degrees": drawn(number, 3.0, 6.0), "axis": list(axis)}}
+
+    def lag(number: int) -> dict[str, dict[str, Any]]:
+        return {"control_lag": {"seconds": drawn(number, 0.02, 0.05)}}
+
+    gust: dict[str, dict[str, Any]] = {"gust": {"m_s2": 10.0, "from_s": 0.7, "to_s": 0.8}}
+    bodies = ("taut rope", "thick rope", "lump", "hung slab")
+    acting = [("taut rope", drag(11)), ("taut rope", lag(12)), ("thick rope", drag(13)),
+              ("thick rope", tilt(14, 1.0, 0.4, 0.0)), ("thick rope", gust), ("lump", drag(16)),
+              ("lump", tilt(17, 0.3, 1.0, 0.0)), ("hung slab", drag(18)), ("hung slab", lag(19)),
+              ("hung slab", tilt(20, 1.0, 0.3, 0.0))]  # fmt: skip
+    silent = [
+        Case(f"k{k:02d}", bodies[(k - 1) % 4], 100 + k, answers=("nothing_to_explain",)) for k in range(1, 11)
+    ]
+    return tuple(silent) + tuple(
+        Case(f"k{k:02d}", body, 100 + k, acts, ("unexplained",) if "gust" in acts else CLAIMS)
+        for k, (body, acts) in enumerate(acting, start=11)
+    )
+
+
+SETS = {"hidden_effects": cases, "hidden_kratos": kratos_cases}
+
+
 def _acting(acts: dict[str, dict[str, Any]]) -> Acting:
     found = Acting(gravity_m_s2=GRAVITY)
     for name, law in acts.items():
@@ -143,7 +177,7 @@ def _gust(law: dict[str, float], time: float) -> Floats:
 
 def recording(case: Case) -> tuple[Scene, dict[str, Any]]:
     """What a camera saw, and the truth: what acts and how much it shows on the test frames, over the noise."""
-    known = OBJECTS[case.object]
+    known = (OBJECTS | KRATOS)[case.object]
     rng = np.random.default_rng(900 + case.seed)
     recorder = known.recorder(case.seed, rng)
     times = np.arange(FRAMES) / FPS
@@ -217,8 +251,8 @@ def scored(case: Case, scene: Path, report: dict[str, Any]) -> dict[str, Any]:
     return row
 
 
-def page(rows: list[dict[str, Any]]) -> Report:
-    """The table of the rows that there are."""
+def page(rows: list[dict[str, Any]], name: str = "hidden_effects") -> Report:
+    """The table of the rows that there are, of one of the ``SETS``."""
     header = ("scene", "object", "acts", "shows", "verdict", "named (or)", "right", "strength", "misfit", "before",
               "after", "removed", "seconds")  # fmt: skip
     table = []
@@ -234,7 +268,7 @@ def page(rows: list[dict[str, Any]]) -> Report:
     acting = [row for row in rows if row["truth"] != "none"]
     silent = [row for row in rows if row["truth"] == "none"]
     ratios = [r for row in acting if row["right"] for r in row["strength_ratio"].values()]
-    missing = sorted({case.name for case in cases()} - {row["scene"] for row in rows})
+    missing = sorted({case.name for case in SETS[name]()} - {row["scene"] for row in rows})
     notes = (
         f"{sum(row['right'] for row in acting)} of {len(acting)} with something in them right, "
         f"{sum(row['verdict'] in CLAIMS for row in silent)} of {len(silent)} without falsely named, "
@@ -244,8 +278,9 @@ def page(rows: list[dict[str, Any]]) -> Report:
         "errors in mm; strength is found over true.",
         f"Not traced: {', '.join(missing) or 'none'}.",
     )
-    return Report(name="hidden_effects", title="Recordings by other engines", figures={"scenes": rows}, header=header,
-                  rows=tuple(table), notes=notes, seed=0)  # fmt: skip
+    title = "Recordings by other engines" if name == "hidden_effects" else "Recordings by Kratos Multiphysics"
+    return Report(name=name, title=title, figures={"scenes": rows}, header=header, rows=tuple(table), notes=notes,
+                  seed=0)  # fmt: skip
 
 
 def main() -> int:
@@ -254,6 +289,7 @@ def main() -> int:
     parser.add_argument(
         "--json", type=Path, required=True, help="figures; rows of scenes not asked for stay in it"
     )
+    parser.add_argument("--set", choices=sorted(SETS), default="hidden_effects", help="which recordings")
     parser.add_argument("--scenes", type=Path, default=None, help="folder that keeps the recordings")
     parser.add_argument("--only", nargs="*", default=[], help="names of scenes; none given: all")
     parser.add_argument("--resume", type=Path, default=None, help="folder that remembers simulations")
@@ -270,7 +306,7 @@ def main() -> int:
     )
     failed = False
     with tempfile.TemporaryDirectory() as folder:
-        for case in cases():
+        for case in SETS[given.set]():
             if given.only and case.name not in given.only:
                 continue
             scene = _made(case, given.scenes or Path(folder, "made"))
@@ -283,7 +319,7 @@ def main() -> int:
                 json.dumps({"scenes": [rows[name] for name in sorted(rows)]}, indent=2) + "\n"
             )
     if given.docs is not None:
-        write_section(page([rows[name] for name in sorted(rows)]), given.docs)
+        write_section(page([rows[name] for name in sorted(rows)], given.set), given.docs)
     return 1 if failed else 0
 
 

@@ -221,7 +221,7 @@ def main() -> int:
         draw(rows, images / "trace_power.svg")
         draw_calibration(figures["calibration"], images / "trace_calibration.svg")
         pictures = ("images/trace_power.svg", "images/trace_calibration.svg")
-        write_section(page(rows, figures, len(asked), *pictures), given.docs)
+        write_section(page(rows, figures, len(asked), pictures, given.seed), given.docs)
     return 0
 
 

@@ -148,9 +148,11 @@ class Page(Report):
         return "\n".join([head, "", self.figures["lead"], rest])
 
 
-def page(rows: list[Row], figures: dict[str, Any], planned: int, picture: str, curve: str) -> Report:
+def page(
+    rows: list[Row], figures: dict[str, Any], planned: int, pictures: tuple[str, str], seed: int
+) -> Report:
     """The page in ``docs/``, with the confusion matrix and the curve of how often claims are right."""
-    nulls = figures["nulls"]
+    nulls, (picture, curve) = figures["nulls"], pictures
     low, high = nulls["ci95"]
     lead = (
         f"{len(rows)} of {planned} traces were run (refused ones included). **False names: {nulls['false_names']} on "
@@ -188,7 +190,7 @@ def page(rows: list[Row], figures: dict[str, Any], planned: int, picture: str, c
     )
     return Page(
         name="trace_power", title="Power and false names", figures={**figures, "lead": lead}, header=header,
-        rows=table, notes=notes, seed=0,
+        rows=table, notes=notes, seed=seed,
     )  # fmt: skip
 
 

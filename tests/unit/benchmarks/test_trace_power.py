@@ -83,7 +83,7 @@ def test_a_partial_run_makes_a_page_with_its_counts_and_a_picture(tmp_path: Path
     ]
     found = summary(rows, 267)
     assert found["nulls"]["scenes"] == 2 and found["nulls"]["false_names"] == 1
-    text = page(rows, found, 267, "picture.svg", "curve.svg").markdown()
+    text = page(rows, found, 267, ("picture.svg", "curve.svg"), 0).markdown()
     assert "3 of 267" in text and "| `air_drag_linear` | ? ? ? | + ? ? | ? ? ? | 3 | 3 | beam 3 1/s |" in text
     draw(rows, tmp_path / "picture.svg")
     draw_calibration(found["calibration"], tmp_path / "curve.svg")
