@@ -2,9 +2,10 @@
 
 A *level* says how far an effect moves the tracked points from where they would have been, root mean square per axis
 over the training frames, in units of the tracking noise. The strength that does it is found by simulation; bounds of
-the registry clip it. Shapes (fibre directions, places, relaxation times) lie between the variants that a trace tries,
-and where an effect has a group of components all of them act. A camera whose scale is off scales every frame, frame 0
-too, which is where a trace learns the points' places from; displacement counts from there.
+the registry clip it, and what the effect's own file does not believe. Shapes (fibre directions, places, relaxation
+times) lie between the variants that a trace tries, and where an effect has a group of components all of them act. A
+camera whose scale is off scales every frame, frame 0 too, which is where a trace learns the points' places from;
+displacement counts from there.
 """
 
 from __future__ import annotations
@@ -129,7 +130,25 @@ def _direction(name: str, twin: Twin) -> tuple[dict[str, float], dict[str, float
         gates = {next(s.name for s in known.values() if s.gate): 1.0}
     bounds = [(known[g].high if p > 0 else known[g].low) / p for g, p in gates.items()]
     start = max(known[g].probe / abs(p) for g, p in gates.items())
-    return gates, _shapes(name, twin, known), min(bounds), min(start, min(bounds))
+    shapes = _shapes(name, twin, known)
+    most = _believed(name, gates, shapes, min(bounds))
+    return gates, shapes, most, min(start, most)
+
+
+def _believed(name: str, gates: dict[str, float], shapes: dict[str, float], most: float) -> float:
+    """The largest scale up to ``most`` that is believed of the effect, within a percent of that."""
+
+    def doubted(scale: float) -> bool:
+        strengths = {gate: scale * part for gate, part in gates.items()}
+        return effect(name, **shapes, **strengths).implausible() is not None
+
+    if not doubted(most):
+        return most
+    low, high = 0.0, most
+    while high - low > 0.01 * low:
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if doubted(middle) else (middle, high)
+    return low
 
 
 def _shapes(name: str, twin: Twin, known: dict) -> dict[str, float]:

@@ -3,8 +3,7 @@
     measured(t) = x(0) + d + w x d        d = true(t) - x(0), to first order in the angles w
 
 Hand-eye calibrations are a few degrees off, and a body that is carried far shows it. Frame 0, which places the tracked
-points, comes from the same camera and is as measured. Calibrations of measured cloths set it; a trace does not look
-for it (a trace's own candidate is ``gravity_tilt``).
+points, comes from the same camera and is as measured.
 """
 
 from __future__ import annotations
@@ -15,10 +14,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.effects.base import Effect, Strength, Variant
+from physworld.effects.base import Effect, Strength
 
 if TYPE_CHECKING:
     from physworld.twin.twin import Twin
+
+_DEVIATION_RAD = 0.035  # two degrees, to which hand-eye calibrations are known
 
 
 @dataclass(frozen=True)
@@ -39,12 +40,9 @@ class MeasurementTurn(Effect):
     @classmethod
     def strengths(cls, twin: Twin) -> tuple[Strength, ...]:
         """Up to 9 degrees."""
-        return tuple(Strength(gate, "rad", -0.15, 0.15, 0.005) for gate in cls.gates)
-
-    @classmethod
-    def variants(cls, twin: Twin) -> list[Variant]:
-        """None: a calibration sets it."""
-        return []
+        return tuple(
+            Strength(gate, "rad", -0.15, 0.15, 0.005, prior_deviation=_DEVIATION_RAD) for gate in cls.gates
+        )
 
     def measured(self, times: Array, tracks: Array, twin: Twin) -> Array:
         """Displacements turned."""

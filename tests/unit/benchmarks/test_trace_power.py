@@ -22,7 +22,7 @@ from benchmarks.trace.power_report import (
     page,
     summary,
 )
-from physworld.effects.registry import EFFECTS
+from physworld.effects.registry import EFFECTS, effect
 
 DRAG = "air_drag_linear"
 
@@ -98,3 +98,11 @@ def test_an_injection_displaces_by_its_level_and_a_rope_refuses_fibres() -> None
     assert made is not None and made.displacement == pytest.approx(3.0, rel=0.15) and not made.clipped
     assert made.size == pytest.approx(np.hypot(*made.strengths.values())) and made.unit == "rad"
     assert refusal("anisotropy", rope) is not None and refusal("anisotropy", OBJECTS["sheet"](0)) is None
+
+
+def test_no_stronger_effect_is_injected_than_anybody_believes() -> None:
+    beam = OBJECTS["beam"](0)
+    made = inject("gravity_tilt", beam, observed(beam.truth, beam.scene), 30.0)
+    assert made is not None and made.clipped and made.size == pytest.approx(0.2, rel=0.02)
+    assert effect("gravity_tilt", **made.strengths).implausible() is None
+    assert effect("gravity_tilt", **{n: 1.1 * s for n, s in made.strengths.items()}).implausible() is not None
