@@ -51,6 +51,13 @@ def test_a_left_out_block_is_predicted_by_a_fit_to_the_others(
         assert found.errors[block] == pytest.approx(np.mean(left**2), rel=1e-4)
 
 
+def test_between_hypotheses_an_error_that_may_hide_in_the_noise_counts() -> None:
+    exact, wrong = (LeftOut(np.full(6, error), np.full(6, 100)) for error in (1.0, 40.0))
+    assert exact.count == pytest.approx(1.0 / ((1 / 1.2) ** 2 / 600 + (0.2 / 1.2) ** 2 / 6))
+    assert exact.scale == pytest.approx(1.0)  # intervals and priors take the noise as it is
+    assert 6.0 < wrong.count < 6.5
+
+
 @pytest.mark.parametrize("shared", [0.0, 0.3, 3.0])
 def test_sightings_are_worth_what_the_spread_of_their_mean_square_says(shared: float) -> None:
     """Noise in every number, and an error that all numbers of a block share: the mean square of n independent numbers

@@ -123,6 +123,15 @@ def test_a_clock_that_is_off_is_a_fault_of_the_data() -> None:
     assert found.effects[0].parameters["offset_s"].value == pytest.approx(0.03, rel=0.2)
 
 
+def test_a_camera_that_is_turned_against_the_grips_is_named() -> None:
+    config = replace(CONFIG, candidates=(*LIBRARY, "measurement_turn"))
+    found = traced(effect("measurement_turn", x_rad=0.08, z_rad=-0.05), stroke=0.04, config=config)
+    assert found.verdict.name == "data_issue" and [e.name for e in found.effects] == ["measurement_turn"]
+    turned = found.effects[0].parameters
+    assert turned["x_rad"].value == pytest.approx(0.08, abs=0.015)
+    assert turned["z_rad"].value == pytest.approx(-0.05, abs=0.015)
+
+
 def test_an_effect_outside_the_library_is_described_and_not_named() -> None:
     config = replace(CONFIG, candidates=("gravity_tilt", "measurement_scale"))
     found = traced(effect("air_drag_linear", rate_per_s=6.0), stroke=0.03, config=config)
