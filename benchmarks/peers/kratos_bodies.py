@@ -73,7 +73,7 @@ class Mesh:
             for node in nodes:
                 for variable in _components(_MOVING[0], _TURNING[0] if self.turning else None):
                     node.Fix(variable)
-        for node in part.Nodes:  # what is held lets go of it with the first step
+        for node in part.Nodes:  # the rule needs what a body that is let go begins with
             node.SetSolutionStepValue(Kratos.ACCELERATION, list(acting.gravity_m_s2))
         steps = int(np.ceil((times[1] - times[0]) / _STEP_S))
         found, time = [self.nodes.copy()], 0.0

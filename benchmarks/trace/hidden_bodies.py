@@ -17,7 +17,7 @@ from physworld.scene import Body, Ground
 
 TOP_M = 0.5  # height at which bodies are held
 POISSON, TRACKED = 0.35, 120
-_ROPE_TRACKED, _ROPE_POISSON, _FILLING = 40, 0.4, 3000
+_ROPE_TRACKED, _ROPE_POISSON, FILLING = 40, 0.4, 3000
 _RAMP_S = 0.15
 _CLOTH_TRACKED, _CLOTH_STEPS = 300, 460
 _BLOCK_TRACKED, _BLOCK_STEPS = 200, 240
@@ -128,7 +128,7 @@ class Object:
             Hand(box, elements.nodes[h].mean(axis=0), motion)
             for box, h, motion in zip(boxes, held, motions, strict=True)
         ]
-        return Recorder(hands, tracks, lambda r: self.shape(r.uniform(0.0, 1.0, (_FILLING, 3))))
+        return Recorder(hands, tracks, lambda r: self.shape(r.uniform(0.0, 1.0, (FILLING, 3))))
 
     def _box(self, box: Floats) -> Floats:
         """Of a grip, (2, 3) [m], that holds this box of the unit cube."""
@@ -153,7 +153,7 @@ class Cord:
         kind: of the scene.
         young_pa, density_kg_m3: of the material; density is declared.
         way: from the hand on, (3,).
-        stroke_m, turn_rad: how far the hand goes and turns.
+        stroke_m, turn_rad: how far the hand goes, along every axis or along each, and turns.
     """
 
     length_m: float
@@ -161,7 +161,7 @@ class Cord:
     young_pa: float
     density_kg_m3: float
     way: tuple[float, float, float]
-    stroke_m: float
+    stroke_m: float | tuple[float, ...]
     turn_rad: float
     kind: str = "rope"
 
@@ -186,17 +186,15 @@ class Cord:
         def tracks(acting: Acting, late_s: float, at: Floats) -> Floats:
             return rope.record(acting, partial(motion.place, late_s), at, seen)
 
-        def inside(r: np.random.Generator) -> Floats:
-            out = r.normal(size=(_FILLING, 3))
-            out -= (out @ rope.along)[:, None] * rope.along
-            out *= (
-                self.radius_m
-                * np.sqrt(r.uniform(size=(_FILLING, 1)))
-                / np.linalg.norm(out, axis=1, keepdims=True)
-            )
-            return rope.top + self.length_m * r.uniform(size=(_FILLING, 1)) * rope.along + out
+        return Recorder([Hand(box, rope.held[0], motion)], tracks, partial(self.inside, rope.along))
 
-        return Recorder([Hand(box, rope.held[0], motion)], tracks, inside)
+    def inside(self, along: Floats, rng: np.random.Generator) -> Floats:
+        """Points that fill the rope at rest, which goes along a unit vector (3,) from its top: (M, 3) [m]."""
+        out = rng.normal(size=(FILLING, 3))
+        out -= (out @ along)[:, None] * along
+        reach = np.sqrt(rng.uniform(size=(FILLING, 1)))
+        out *= self.radius_m * reach / np.linalg.norm(out, axis=1, keepdims=True)
+        return [0.0, 0.0, TOP_M] + self.length_m * rng.uniform(size=(FILLING, 1)) * along + out
 
 
 @dataclass(frozen=True)
@@ -246,9 +244,9 @@ class Cloth:
             return mesh.record(acting, grips, seen, at)
 
         def inside(r: np.random.Generator) -> Floats:
-            return rest.min(axis=0) + r.uniform(0.0, 1.0, (_FILLING, 3)) * [width, 0.0, height] + [
+            return rest.min(axis=0) + r.uniform(0.0, 1.0, (FILLING, 3)) * [width, 0.0, height] + [
                 0.0, 0.5 * thickness, 0.0,
-            ] * r.uniform(-1.0, 1.0, (_FILLING, 1))  # fmt: skip
+            ] * r.uniform(-1.0, 1.0, (FILLING, 1))  # fmt: skip
 
         hands = [
             Hand(box, rest[h].mean(axis=0), motion)
@@ -308,7 +306,7 @@ class Brick:
             return block.record(acting, [(held, partial(motion.place, late_s))], seen, at)
 
         def inside(r: np.random.Generator) -> Floats:
-            return low + r.uniform(0.0, 1.0, (_FILLING, 3)) * size
+            return low + r.uniform(0.0, 1.0, (FILLING, 3)) * size
 
         return Recorder([Hand(box, rest[held].mean(axis=0), motion)], tracks, inside)
 

@@ -1,4 +1,4 @@
-"""Bodies for ``benchmarks.trace.hidden_effects --set kratos``, which Kratos records and how they move.
+"""Bodies for ``benchmarks.trace.hidden_effects --set hidden_kratos``, which Kratos records and how they move.
 
 Ropes that both ends of are held, thick ropes, lumps in a small grip, slabs that hang by two corners.
 """
@@ -13,46 +13,38 @@ import numpy as np
 from scipy.interpolate import CubicSpline, RectBivariateSpline
 
 from benchmarks.peers.finite_elements import Acting, Floats, Place
-from benchmarks.trace.hidden_bodies import _FILLING, POISSON, TOP_M, TRACKED, Hand, Motion, Object, Recorder
+from benchmarks.trace.hidden_bodies import (
+    FILLING,
+    POISSON,
+    TOP_M,
+    TRACKED,
+    Cloth,
+    Cord,
+    Hand,
+    Motion,
+    Object,
+    Recorder,
+)
 from physworld.scene import Body
 
 _ROPE_POISSON, _ROPE_TRACKED, _HELD, _ELEMENTS = 0.4, 40, 3, 40
 _CORNER = 2  # cells of a slab that a hand holds
 
 
-@dataclass(frozen=True)
-class Strand:
-    """A round rope from ``TOP_M`` along x, held at both ends.
-
-    Attributes:
-        length_m, radius_m, young_pa, density_kg_m3: of the rope; density is declared.
-        stroke_m: how far hands go along the axes.
-        kind: of the scene.
-    """
-
-    length_m: float
-    radius_m: float
-    young_pa: float
-    density_kg_m3: float
-    stroke_m: tuple[float, float, float]
-    kind: str = "rope"
-
-    @property
-    def body(self) -> Body:
-        """What the scene declares."""
-        return Body(length_m=self.length_m, radius_m=self.radius_m, density_kg_m3=self.density_kg_m3)
+class Strand(Cord):
+    """A rope that is held at both ends."""
 
     def recorder(self, seed: int, rng: np.random.Generator) -> Recorder:
         """Corotational beams; a camera sees places of the axis."""
         from benchmarks.peers.kratos_bodies import rod
 
         top = np.array([0.0, 0.0, TOP_M])
-        along = np.array([1.0, 0.0, 0.0])
+        along = np.array(self.way) / np.linalg.norm(self.way)
         mesh = rod(top, along, self.length_m, self.radius_m, self.young_pa, _ROPE_POISSON, self.density_kg_m3,
                    _ELEMENTS)  # fmt: skip
         seen = np.sort(rng.uniform(0.0, 1.0, _ROPE_TRACKED))
         ends = [np.arange(_HELD), len(mesh.nodes) - 1 - np.arange(_HELD)]
-        motions = [Motion(10 * seed + g, self.stroke_m, 0.0) for g in range(len(ends))]
+        motions = [Motion(10 * seed + g, self.stroke_m, self.turn_rad) for g in range(len(ends))]
         room = self.radius_m * np.sqrt(1.0 - along**2)
         shares = np.linspace(0.0, 1.0, len(mesh.nodes))
 
@@ -61,48 +53,15 @@ class Strand:
             found: Floats = CubicSpline(shares, nodes, axis=1)(seen)
             return found
 
-        def inside(r: np.random.Generator) -> Floats:
-            out = r.normal(size=(_FILLING, 3))
-            out -= (out @ along)[:, None] * along
-            out *= (
-                self.radius_m
-                * np.sqrt(r.uniform(size=(_FILLING, 1)))
-                / np.linalg.norm(out, axis=1, keepdims=True)
-            )
-            return top + self.length_m * r.uniform(size=(_FILLING, 1)) * along + out
-
         hands = [
             Hand(np.array([at.min(axis=0) - room, at.max(axis=0) + room]), at.mean(axis=0), motion)
             for at, motion in zip([mesh.nodes[end] for end in ends], motions, strict=True)
         ]
-        return Recorder(hands, tracks, inside)
+        return Recorder(hands, tracks, partial(self.inside, along))
 
 
-@dataclass(frozen=True)
-class Slab:
-    """A plate that hangs by two corners.
-
-    Attributes:
-        size_m: width, thickness and height.
-        cells: across and up.
-        young_pa, density_kg_m3: of the material; density is declared.
-        stroke_m: how far hands go along the axes.
-        kind: of the scene.
-    """
-
-    size_m: tuple[float, float, float]
-    cells: tuple[int, int]
-    young_pa: float
-    density_kg_m3: float
-    stroke_m: tuple[float, float, float]
-    kind: str = "sheet"
-
-    @property
-    def body(self) -> Body:
-        """What the scene declares."""
-        return Body(
-            size_m=np.array(self.size_m), thickness_m=self.size_m[1], density_kg_m3=self.density_kg_m3
-        )
+class Slab(Cloth):
+    """A plate that hangs by two corners."""
 
     def recorder(self, seed: int, rng: np.random.Generator) -> Recorder:
         """Corotational shells; a camera sees places of the middle surface."""
@@ -139,7 +98,7 @@ class Slab:
 
         def inside(r: np.random.Generator) -> Floats:
             low = corner - room
-            return low + r.uniform(0.0, 1.0, (_FILLING, 3)) * self.size_m
+            return low + r.uniform(0.0, 1.0, (FILLING, 3)) * self.size_m
 
         hands = [
             Hand(
@@ -178,7 +137,7 @@ class Lump(Object):
             Hand(box, mesh.nodes[end].mean(axis=0), motion)
             for box, end, motion in zip(boxes, ends, motions, strict=True)
         ]
-        return Recorder(hands, tracks, lambda r: self.shape(r.uniform(0.0, 1.0, (_FILLING, 3))))
+        return Recorder(hands, tracks, lambda r: self.shape(r.uniform(0.0, 1.0, (FILLING, 3))))
 
 
 @dataclass(frozen=True)
@@ -218,7 +177,7 @@ def _between(unit: Floats, counts: tuple[int, int, int]) -> tuple[np.ndarray, Fl
 
 
 KRATOS: dict[str, Strand | Slab | Lump] = {
-    "taut rope": Strand(0.42, 0.006, 1e6, 900.0, (0.004, 0.03, 0.02)),
+    "taut rope": Strand(0.42, 0.006, 1e6, 900.0, (1.0, 0.0, 0.0), (0.004, 0.03, 0.02), 0.0),
     "thick rope": ThickRope("rope", (0.36, 0.032, 0.032), (24, 4, 4), 3e5, 800.0,
                             (((0.0, 0.0, 0.0), (1.0 / 12, 1.0, 1.0)),), 0.03, 0.15, around=True),
     "lump": Lump("blob", (0.2, 0.1, 0.09), (12, 6, 6), 5e4, 540.0,

@@ -179,9 +179,9 @@ def page(
     if false:
         notes.append(f"Named where nothing acts: {', '.join(f'{n} ({c})' for n, c in false.most_common())}.")
     claims = "; ".join(
-        f"{bin['from']:g} to {bin['to']:g}: {bin['right']} of {bin['claims']}"
-        for bin in figures["calibration"]
-        if bin["claims"]
+        f"{one['from']:g} to {one['to']:g}: {one['right']} of {one['claims']}"
+        for one in figures["calibration"]
+        if one["claims"]
     )
     notes.append(f"Claims that are right, by posterior: {claims}.")
     notes.append(

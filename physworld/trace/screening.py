@@ -19,9 +19,7 @@ from physworld.trace.hypotheses import Hypothesis, Setting, Values
 from physworld.trace.posterior import removes
 from physworld.trace.sensitivity import Response, candidate_responses
 
-_REACH = (
-    0.3  # of its range: how far a linear estimate moves a calibrated number; a strength moves over all of it
-)
+_REACH = 0.3  # of its range: how far a linear estimate moves a calibrated number; a strength has all of it
 
 
 @dataclass(frozen=True)
