@@ -6,8 +6,9 @@ SI units, world frame z up, axis order (time, entity, xyz). Reading and checking
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Self
 
 import numpy as np
 
@@ -121,6 +122,8 @@ class Scene:
         times: seconds from the first frame, (T,) float64, strictly increasing, not always even.
         gravity_m_s2: (3,).
         noise_sigma_m: tracking noise per axis, or None.
+        noise_covariance_m2: of every sighting of each point, in world axes, (N, 3, 3), or None: the same noise along
+            every axis. The root of a third of its mean trace is ``noise_sigma_m``.
         train, test: half-open frame ranges.
         initial_state: UNDEFORMED_AT_REST or AS_MEASURED.
         control_times, control_points: controllers at a higher rate, (Tc,) and (Tc, K, 3), or None.
@@ -157,6 +160,7 @@ class Scene:
     surface_points: Array | None = None
     colors: Array | None = None
     part_features: Array | None = None
+    noise_covariance_m2: Array | None = None
     extra_arrays: dict[str, Array] = field(default_factory=dict)
     declared: dict[str, Any] = field(default_factory=dict)
 
@@ -164,6 +168,34 @@ class Scene:
     def frame_count(self) -> int:
         """T."""
         return len(self.points)
+
+    @cached_property
+    def noise_factors(self) -> Array | None:
+        """Lower triangular L of every point, (N, 3, 3), with L L^T its covariance over the square of
+        ``noise_sigma_m``; None where every axis is as noisy.
+        """
+        if self.noise_covariance_m2 is None:
+            return None
+        return np.linalg.cholesky(self.noise_covariance_m2) / sigma_of(self.noise_covariance_m2)
+
+    @cached_property
+    def _weights(self) -> Array | None:
+        return None if self.noise_factors is None else np.linalg.inv(self.noise_factors)
+
+    def weighed(self, differences: Array) -> Array:
+        """Differences (…, N, 3) [m], each times L^-1: as noisy as ``noise_sigma_m`` says in every direction."""
+        return (
+            differences
+            if self._weights is None
+            else np.einsum("nij,...nj->...ni", self._weights, differences)
+        )
+
+    def with_noise(self, sigma_m: float) -> Self:
+        """The scene with this deviation per axis [m]; directions and points differ by the same factors as before."""
+        known = self.noise_covariance_m2
+        if known is not None:
+            known = known * (sigma_m / sigma_of(known)) ** 2
+        return replace(self, noise_sigma_m=sigma_m, noise_covariance_m2=known)
 
     def control_track(self) -> tuple[Array, Array]:
         """Times (Tc,) [s] and controller positions (Tc, K, 3) [m] at the best rate, none before the first frame."""
@@ -177,3 +209,8 @@ class Scene:
         share = (start - clock[after - 1]) / (clock[after] - clock[after - 1])
         begin = (1.0 - share) * points[after - 1] + share * points[after]
         return np.concatenate([[start], clock[after:]]), np.concatenate([begin[None], points[after:]])
+
+
+def sigma_of(covariances: Array) -> float:
+    """Deviation per axis [m] of covariances (N, 3, 3) [m^2]: the root of a third of their mean trace."""
+    return float(np.sqrt(np.trace(covariances, axis1=1, axis2=2).mean() / 3.0))

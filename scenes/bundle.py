@@ -20,7 +20,7 @@ from typing import IO, Any
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.scene import AS_MEASURED, UNDEFORMED_AT_REST, Body, Grip, Ground, Scene
+from physworld.scene import AS_MEASURED, UNDEFORMED_AT_REST, Body, Grip, Ground, Scene, sigma_of
 from physworld.shapes.surface_mesh import SurfaceMesh
 from physworld_scenes.archive_writing import Member, stream_arrays, stream_zip
 from physworld_scenes.archives import (
@@ -64,6 +64,7 @@ FIELD_OF_ARRAY = {
     "surface_points": "surface_points",
     "colors": "colors",
     "part_features": "part_features",
+    "noise_covariance": "noise_covariance_m2",
 }
 """Name in ``scene.npz`` to field of ``Scene``; every other array is kept in ``extra_arrays``."""
 
@@ -225,7 +226,7 @@ def scene_from_parts(
         description=declared.get("description", ""),
         fps=float(declared["fps"]),
         gravity_m_s2=_float64(declared["gravity_m_s2"]),
-        noise_sigma_m=_number(declared.get("noise_sigma_m")),
+        noise_sigma_m=_noise(declared, fields.get("noise_covariance_m2")),
         train=tuple(declared["split"]["train"]),
         test=tuple(declared["split"]["test"]),
         initial_state=_state(declared["initial_state"]),
@@ -237,6 +238,11 @@ def scene_from_parts(
         declared=declared,
         **fields,
     )
+
+
+def _noise(declared: dict[str, Any], covariances: Array | None) -> float | None:
+    """Deviation per axis [m]: that of the covariances where there are some, else what is declared."""
+    return _number(declared.get("noise_sigma_m")) if covariances is None else sigma_of(covariances)
 
 
 def parts_of(scene: Scene) -> tuple[dict[str, Any], dict[str, Array]]:

@@ -49,6 +49,7 @@ ARRAY_SHAPES = {
     "ctrl_points": ("C", "K", 3),
     "rest_volume_points": ("M", 3),
     "surface_points": ("S", 3),
+    "noise_covariance": ("N", 3, 3),
 }
 REQUIRED = ("points", "visible", "controllers", "times")
 NEVER_EMPTY = ("rest_volume_points", "ctrl_times", "ctrl_points")
@@ -213,10 +214,10 @@ def check_visibility(measured: Measured, findings: Findings) -> None:
         findings.fault(where, f"all {count} points are invisible in frame 0, where every prediction starts")
     blind = np.flatnonzero(~seen.any(axis=1))
     if len(blind):
-        findings.warn(where, f"nothing is visible in {len(blind)} of {frames} frames: {_some(blind)}")
+        findings.warn(where, f"nothing is visible in {len(blind)} of {frames} frames: {some(blind)}")
     never = np.flatnonzero(~seen.any(axis=0))
     if len(never):
-        findings.warn(where, f"{len(never)} of {count} points are never visible: {_some(never)}")
+        findings.warn(where, f"{len(never)} of {count} points are never visible: {some(never)}")
     zeros = seen & (measured.points == 0.0).all(axis=2)
     if zeros.sum() > 1:
         t, i = np.argwhere(zeros)[0]
@@ -264,7 +265,7 @@ def check_controllers(measured: Measured, object_size_m: float, findings: Findin
             report(
                 where,
                 f"{len(far)} of {len(sizes)} never come nearer to the object than {limit:g} of its sizes"
-                f" ({object_size_m:.3g} m): {_some(far)}; controller {worst} stays"
+                f" ({object_size_m:.3g} m): {some(far)}; controller {worst} stays"
                 f" {closest[worst]:.4g} m away, {sizes[worst]:.3g} sizes: another frame or unit?",
             )
             return
@@ -398,6 +399,7 @@ def _measure(arrays: dict[str, Array], findings: Findings) -> Measured:
     return Measured(cleaned, seen, controllers, times, size)
 
 
-def _some(indices: Array) -> str:
+def some(indices: Array) -> str:
+    """The first few of them, and how many there are."""
     shown = ", ".join(str(int(i)) for i in indices[:NAMED_AT_MOST])
     return shown if len(indices) <= NAMED_AT_MOST else f"{shown}, … ({len(indices)} in all)"

@@ -1,8 +1,8 @@
 """The scene validator: one pass that names every fault of a scene with its numbers.
 
 Faults make a scene unusable; warnings travel with it. The form of ``scene.json`` is checked in ``declaration``, the
-arrays in ``measured``, colliders in ``colliders``, and what is declared against the arrays here: split, gravity, noise,
-body, grips, ground. Thresholds stand at the top with their reasons.
+arrays in ``measured``, colliders in ``colliders``, noise in ``noise``, and what is declared against the arrays
+here: split, gravity, body, grips, ground. Thresholds stand at the top with their reasons.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from physworld_scenes.measured import (
     check_units,
     check_visibility,
 )
+from physworld_scenes.noise import check_covariances, check_noise
 from physworld_schemas.base import FieldError
 
 STANDARD_GRAVITY = 9.80665
@@ -36,8 +37,6 @@ GRAVITY_ALLOWED = (1.5, 15.0)
 GRAVITY_USUAL = (9.76, 9.84)
 """On the Earth's surface, pole to equator."""
 TILT_WARNING_DEGREES = 1.0
-
-NOISE_WARNING_SIZES = 0.1
 
 DENSITY_ALLOWED = (5.0, 25_000.0)
 """Aerogel excepted, lighter than any foam to heavier than osmium."""
@@ -99,6 +98,7 @@ def _check_measured(
         return
     check_split(declaration, measured, findings)
     check_noise(declaration, size, findings)
+    check_covariances(declaration, arrays, findings)
     check_body(declaration, measured, findings)
     check_grips(declaration, arrays, measured, findings)
     check_colliders(declaration, arrays, meshes, measured, size, findings)
@@ -149,20 +149,6 @@ def check_gravity(declaration: Declaration, findings: Findings) -> None:
         findings.fault(where, f"points up, {tilt:.1f} degrees from -z: the world frame is z up")
     elif tilt > TILT_WARNING_DEGREES:
         findings.warn(where, f"points {tilt:.1f} degrees away from -z: the world frame is z up")
-
-
-def check_noise(declaration: Declaration, object_size_m: float, findings: Findings) -> None:
-    """A positive deviation, smaller than the object."""
-    where = ["scene.json", "noise_sigma_m"]
-    sigma = declaration.noise_sigma_m
-    if sigma is None:
-        findings.warn(where, "is not declared: intervals and the noise floor cannot be given")
-    elif sigma <= 0.0:
-        findings.fault(where, f"is {sigma:g} m; no tracker is exact, leave it null if it is not known")
-    elif object_size_m > 0.0 and sigma > object_size_m:
-        findings.fault(where, f"is {sigma:g} m, more than the object's size {object_size_m:.4g} m")
-    elif object_size_m > 0.0 and sigma > NOISE_WARNING_SIZES * object_size_m:
-        findings.warn(where, f"is {sigma:g} m, {sigma / object_size_m:.0%} of the object's size")
 
 
 def check_body(declaration: Declaration, measured: Measured, findings: Findings) -> None:

@@ -1,6 +1,7 @@
 """Ropes recorded by an engine that is not ours: PyElastica's Cosserat rods (stretch, shear, bending, twist), undamped.
 
-A rope hangs askew from a hand that moves and turns its first two elements. A camera sees points on its surface.
+A rope hangs from a hand that moves and turns its first two elements, or between two of them. A camera sees points
+on its surface.
 """
 
 from __future__ import annotations
@@ -24,29 +25,30 @@ class _World(elastica.BaseSystemCollection, elastica.Constraints, elastica.Forci
 
 
 class _Hand(elastica.ConstraintBase):
-    """Nodes and elements that follow a place."""
+    """Nodes and elements of an end that follow a place."""
 
-    def __init__(self, *start: Floats, place: Place, **keywords: object) -> None:
+    def __init__(self, *start: Floats, place: Place, first: int, **keywords: object) -> None:
         super().__init__(**keywords)
         self.nodes = np.stack(start[: _HELD + 1], axis=-1)
         self.frames = np.stack(start[_HELD + 1 :], axis=-1)
-        self.place, self.centre = place, self.nodes[:, :1]
+        self.held, self.elements = slice(first, first + _HELD + 1), range(first, first + _HELD)
+        self.place, self.centre = place, self.nodes[:, -1:] if first else self.nodes[:, :1]
 
     def constrain_values(self, system: elastica.CosseratRod, time: float) -> None:
         """Where they are."""
         turn, shift = self.place(time)
         places = turn @ (self.nodes - self.centre) + self.centre + shift[:, None]
-        system.position_collection[:, : _HELD + 1] = places
-        for element in range(_HELD):
-            system.director_collection[..., element] = self.frames[..., element] @ turn.T
+        system.position_collection[:, self.held] = places
+        for k, element in enumerate(self.elements):
+            system.director_collection[..., element] = self.frames[..., k] @ turn.T
 
     def constrain_rates(self, system: elastica.CosseratRod, time: float) -> None:
         """How they move."""
         (turn, shift), (later, moved) = self.place(time), self.place(time + _INSTANT_S)
         rate = ((later - turn) @ (self.nodes - self.centre) + (moved - shift)[:, None]) / _INSTANT_S
-        system.velocity_collection[:, : _HELD + 1] = rate
+        system.velocity_collection[:, self.held] = rate
         spin = Rotation.from_matrix(later @ turn.T).as_rotvec() / _INSTANT_S
-        for element in range(_HELD):
+        for element in self.elements:
             system.omega_collection[:, element] = system.director_collection[..., element] @ spin
 
 
@@ -102,14 +104,17 @@ class Rope:
         """Nodes in the hand, (3, 3) [m]."""
         return self.nodes[: _HELD + 1]
 
-    def record(self, acting: Acting, place: Place, times: Floats, seen: Floats) -> Floats:
+    def record(
+        self, acting: Acting, place: Place, times: Floats, seen: Floats, far: Place | None = None
+    ) -> Floats:
         """Points (T, N, 3) [m] at evenly spaced ``times`` [s], undeformed and at rest at the first.
 
         Args:
-            place: how the hand moves.
+            place: how the hand moves, which turns about the end.
             seen: of every point its share of the length and its angle about the axis [rad], (N, 2).
+            far: how a hand at the other end moves; None: it is free.
         """
-        side = np.cross(self.along, [1.0, 0.0, 0.0])
+        side = np.cross(self.along, [1.0, 0.0, 0.0] if abs(self.along[0]) < 0.9 else [0.0, 1.0, 0.0])
         rod = elastica.CosseratRod.straight_rod(
             self.elements, self.top, self.along, side / np.linalg.norm(side), self.length_m, self.radius_m,
             density=self.density_kg_m3, youngs_modulus=self.young_pa,
@@ -119,10 +124,13 @@ class Rope:
         tied = np.where(near, rod.mass, 0.0) / max(float(rod.mass[near].sum()), 1e-30)
         world = _World()
         world.append(rod)
-        world.constrain(rod).using(
-            _Hand, place=place, constrained_position_idx=tuple(range(_HELD + 1)),
-            constrained_director_idx=tuple(range(_HELD)),
-        )  # fmt: skip
+        ends = [(place, 0)] + ([] if far is None else [(far, self.elements - _HELD)])
+        for hand, first in ends:
+            world.constrain(rod).using(
+                _Hand, place=hand, first=first,
+                constrained_position_idx=tuple(range(first, first + _HELD + 1)),
+                constrained_director_idx=tuple(range(first, first + _HELD)),
+            )  # fmt: skip
         world.add_forcing_to(rod).using(_Field, acting, tied)
         world.finalize()
         gap = float(times[1] - times[0])

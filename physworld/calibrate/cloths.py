@@ -147,8 +147,8 @@ class _Search:
         wanted = np.clip(self.times - lag, paths.x[0], paths.x[-1])
         begin, moved = paths(paths.x[0]), paths(wanted) - paths(paths.x[0])
         predicted = begin + (1.0 + scale) * (moved + np.cross(turn, moved))
-        off = np.where(self.seen[..., None], predicted - self.target, 0.0)
-        speed = np.where(self.seen[..., None], paths(wanted, 1), 0.0)
+        off = np.where(self.seen[..., None], self.scene.weighed(predicted - self.target), 0.0)
+        speed = np.where(self.seen[..., None], self.scene.weighed(paths(wanted, 1)), 0.0)
         share = np.minimum(_POINTS / np.maximum(self.seen.sum(axis=1), 1), 1.0) / self.sigma**2
         pull = share * np.einsum("tni,tni->t", speed, off)
         stamp = -pull / (share * np.einsum("tni,tni->t", speed, speed) + _STAMP_S**-2)

@@ -153,6 +153,7 @@ def training_losses(scene: Scene, tracks: Array) -> dict[str, Any]:
     chamfer = chamfer_l2(predicted, measured, visible)
     track = float(smooth.sum() / (3 * max(len(error), 1)))
     square = float(np.mean(error**2))
+    weighed = float(np.mean(scene.weighed(predicted - measured)[visible] ** 2))
     sigma = scene.noise_sigma_m
     return {
         "paper": {
@@ -162,6 +163,6 @@ def training_losses(scene: Scene, tracks: Array) -> dict[str, Any]:
         },
         "rms_m": float(np.sqrt(square)),
         "noise_sigma_m": sigma,
-        "chi2_per_residual": square / sigma**2 if sigma else None,
-        "rms_over_noise": float(np.sqrt(square)) / sigma if sigma else None,
+        "chi2_per_residual": weighed / sigma**2 if sigma else None,
+        "rms_over_noise": float(np.sqrt(weighed)) / sigma if sigma else None,
     }

@@ -55,7 +55,7 @@ _LOG_STEP = 0.02  # finite-difference step in the logarithm
 _POISSON_BOUNDS, _POISSON_STEP = (0.0, 0.48), 0.02
 _LEAST_GAIN = 0.02  # share of the training cost that an optional parameter must remove
 _POISSON_GAIN = 0.15  # the same of Poisson's ratio, which absorbs a little of whatever else is missing
-_TWIST_BOUNDS = (0.1, 10.0)
+_TWIST_BOUNDS, _STRETCHING_BOUNDS = (0.1, 10.0), (0.05, 20.0)  # the latter: factors on what it begins with
 _BENDING_BOUNDS, _COUPLING_BOUNDS = (0.1, 10.0), (-2.0, 2.0)
 _BENDING_GAIN = 0.1  # share of the training cost, of the shape of a sheet's bending energy
 _SHEET_STARTS = 14  # of a sheet's stiffness: its phase slips within a factor of two
@@ -129,6 +129,7 @@ def parameters_of(
         )  # fmt: skip
     return [
         *_stiffness(twin, separate_bending),
+        *_stretching(twin),
         *_torsion(twin),
         *_twist(twin),
         *_flow(twin),
@@ -174,6 +175,22 @@ def flow_law(name: str) -> Plasticity:
         raise ValueError(f"no flow law {name!r}; there are {sorted(PLASTICITIES)}")
     law = PLASTICITIES[name]
     return law(**_FLOW_PRIORS.get(law, {}))
+
+
+def _stretching(twin: Twin) -> list[Parameter]:
+    """E A of a rope that two grips hold: what hangs between them is as taut as it does not stretch.
+
+    A rope that one grip holds hardly stretches, whatever it is.
+    """
+    law = twin.law
+    if not isinstance(law, RodLaw) or sum(len(nodes) > 0 for nodes in twin.held_nodes) < 2:
+        return []
+    low, high = (law.stretching_n * factor for factor in _STRETCHING_BOUNDS)
+    starts = tuple(law.stretching_n * factor for factor in (1.0, 0.25, 4.0))
+    return [
+        Parameter("stretching_n", "N", low, high, _set("stretching_n"), step=0.05, starts=starts, stage="flow",
+                  held=law.stretching_n)
+    ]  # fmt: skip
 
 
 def _torsion(twin: Twin) -> list[Parameter]:

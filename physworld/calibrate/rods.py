@@ -143,9 +143,9 @@ class RodSearch:
     def residuals(self, twins: Sequence[Twin], end: int) -> list[Array | None]:
         """Residuals [m] of the visible points over the frames up to ``end``, frame 0 left out."""
         mask = self.scene.visible[1:end]
-        target = self.scene.points[1:end][mask]
+        target = self.scene.points[1:end]
         return [
-            None if tracks is None else (tracks[1:][mask] - target).ravel()
+            None if tracks is None else self.scene.weighed(tracks[1:] - target)[mask].ravel()
             for tracks in self.tracks(twins, end)
         ]
 

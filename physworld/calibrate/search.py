@@ -356,7 +356,7 @@ class Search:
             return self._nothing(job.frames), None
         visible = self.scene.visible[self.begin : job.frames]
         target = self.scene.points[self.begin : job.frames]
-        residual = (tracks[self.begin :][visible] - target[visible]).reshape(-1)
+        residual = self.scene.weighed(tracks[self.begin :] - target)[visible].reshape(-1)
         return residual, float(np.sqrt(np.mean(residual**2)))
 
     def _nothing(self, end: int | None) -> Array:

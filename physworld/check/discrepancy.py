@@ -84,7 +84,7 @@ def discrepancy_of(
     shapes = _factors(_squared_exponential(places, owners, _BODY_SHARE), _MOST_SHAPES * many)
     frames, block_of_row = white.frame_of_row, split.block_of(white.frame_of_row)
     points = np.repeat(white.points, 3)
-    axis = np.tile(np.arange(3), len(white.points))
+    along = [white.along(axis) for axis in range(3)]
     count = len(white.visible) + white.first
     blocks = []
     for number in range(split.blocks):
@@ -98,7 +98,7 @@ def discrepancy_of(
         courses[own] = some
         product = courses[frames[rows]][:, :, None] * shapes[points[rows]][:, None, :]
         product = product.reshape(len(rows), -1) / white.sigma
-        columns = np.concatenate([product * (axis[rows] == k)[:, None] for k in range(3)], axis=1)
+        columns = np.concatenate([product * part[rows][:, None] for part in along], axis=1)
         columns = _through(white, rows, columns)
         u, s, _ = np.linalg.svd(columns, full_matrices=False)
         kept = s > 1e-6 * max(float(s.max(initial=0.0)), 1e-300)

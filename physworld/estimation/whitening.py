@@ -2,8 +2,9 @@
 
 The covariance of measured minus predicted is sigma^2 (I + G G^T): sigma the tracking noise; G the response of a tracked
 point to its own place in the body, which frame 0 gives with the same noise (a rigid body shows it as a shift that turns
-with it). W with W^T W the inverse is applied to residuals and to sensitivities alike, so that ordinary least squares of
-whitened quantities is the generalised one. G acts point by point, so thin factors do.
+with it). Where a scene declares a covariance for every point, all of this holds after its factor is divided out
+(:meth:`physworld.scene.Scene.weighed`). W with W^T W the inverse is applied to residuals and to sensitivities alike, so
+that ordinary least squares of whitened quantities is the generalised one. G acts point by point, so thin factors do.
 
 A rope or a sheet that is declared undeformed lies along the line or in the plane of its first points. Their noise
 turns it as a whole: a rope of nine markers by about sigma / (2 L), and then it swings as under a tilted gravity. Turns
@@ -69,6 +70,10 @@ class Whitener:
         first: first of the training frames.
         places: one a tracked point.
         common: what all points share of an uncertain start: basis (M, k) and shrink (k,), after the places; or None.
+        weights: of every tracked point, (N, 3, 3): inverse factor of its covariance over sigma^2; None: the same noise
+            along every axis.
+        spreads: of every tracked point's own place along its material axes for a deviation of each of its noises,
+            (N, 3, 3), over sigma; None as above.
     """
 
     measured: Array
@@ -79,14 +84,16 @@ class Whitener:
     first: int
     places: tuple[Place, ...]
     common: tuple[Array, Array] | None = None
+    weights: Array | None = None
+    spreads: Array | None = None
 
     def residual(self, tracks: Array) -> Array:
         """Whitened measured minus predicted, (M,), of tracks (frames, N, 3) from frame 0."""
-        return self._whiten((self.measured - self._seen(tracks)) / self.sigma)
+        return self._whiten(self._weighed(self.measured - self._seen(tracks)) / self.sigma)
 
     def change(self, difference: Array) -> Array:
         """Whitened change of a prediction, (M,), of a difference of tracks (frames, N, 3)."""
-        return self._whiten(self._seen(difference) / self.sigma)
+        return self._whiten(self._weighed(self._seen(difference)) / self.sigma)
 
     def over_from(self, other: Whitener, columns: Array) -> Array:
         """Columns (M, p) that another whitener of the same sightings has whitened, by this one."""
@@ -102,13 +109,19 @@ class Whitener:
 
     def place_errors(self, tracks: Array) -> Array:
         """Most probable error of every point's own place [m], (N, r), given a prediction; within three sigma."""
-        error = (self.measured - self._seen(tracks)) / self.sigma
+        error = self._weighed(self.measured - self._seen(tracks)) / self.sigma
         found = []
         for place in self.places:
             normal = place.response.T @ place.response + np.eye(place.response.shape[1])
             found.append(np.linalg.solve(normal, place.response.T @ error[place.rows].reshape(-1)))
         errors: Array = np.clip(np.array(found), -3.0, 3.0) * self.sigma
-        return errors
+        return errors if self.spreads is None else np.einsum("nij,nj->ni", self.spreads, errors)
+
+    def along(self, axis: int) -> Array:
+        """What a unit along a world axis is in every row before places are taken out, (M,)."""
+        unit = np.zeros((len(self.measured), 3))
+        unit[:, axis] = 1.0
+        return self._weighed(unit).reshape(-1)
 
     def until(self, end: int) -> Whitener:
         """Of the sightings before frame ``end``, by their noise alone."""
@@ -122,6 +135,13 @@ class Whitener:
             places=(),
             common=None,
         )
+
+    def _weighed(self, values: Array) -> Array:
+        """Of sightings (V, 3)."""
+        if self.weights is None:
+            return values
+        weighed: Array = np.einsum("vij,vj->vi", self.weights[self.points], values)
+        return weighed
 
     def _seen(self, tracks: Array) -> Array:
         return tracks[self.first : self.first + len(self.visible)][self.visible]
@@ -193,6 +213,11 @@ def whitener(scene: Scene, split: Split, sigma: float, responses: Array) -> Whit
     placed = scene.visible[0] if scene.visible[0].any() else np.ones(scene.visible.shape[1], dtype=bool)
     visible = scene.visible[first:end] & placed
     frames, points = np.nonzero(visible)
+    weights = spreads = None
+    if (factors := scene.noise_factors) is not None:  # a place is as uncertain as its sighting in frame 0
+        weights = np.linalg.inv(factors)
+        spreads = np.linalg.pinv(responses[0]) @ factors
+        responses = weights @ responses @ spreads
     places = []
     for point in range(visible.shape[1]):
         rows = np.nonzero(points == point)[0]
@@ -200,7 +225,17 @@ def whitener(scene: Scene, split: Split, sigma: float, responses: Array) -> Whit
         u, s, _ = np.linalg.svd(response, full_matrices=False)
         places.append(Place(rows, response, u, 1.0 - 1.0 / np.sqrt(1.0 + s**2)))
     measured = scene.points[first:end][visible]
-    return Whitener(measured, visible, frames + first, points, sigma, first, tuple(places))
+    return Whitener(
+        measured,
+        visible,
+        frames + first,
+        points,
+        sigma,
+        first,
+        tuple(places),
+        weights=weights,
+        spreads=spreads,
+    )
 
 
 def responses(twin: Twin, nodes: Array) -> Array:

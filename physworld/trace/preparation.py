@@ -41,7 +41,7 @@ def taken_with(scenes: Sequence[Scene], noise_m: float | None) -> list[Scene]:
         return list(scenes)
     if not 0.0 < noise_m < np.inf:
         raise ValueError(f"noise of {noise_m} m: a positive number of metres is needed")
-    return [replace(scene, noise_sigma_m=noise_m) for scene in scenes]
+    return [scene.with_noise(noise_m) for scene in scenes]
 
 
 def remarks(sigma: float | None, asked: bool, numerics: Mapping[str, float]) -> list[str]:

@@ -25,9 +25,9 @@ _SLIP_STEP = 0.25  # of a sheared rope's compliance
 _SOFTNESS_SHARES = (0.1, 1.5)  # of ``AS_HELD``: finite elements as large as the grip hold so much harder
 _SOFTNESS_STEP = 0.1
 _CLAMP_STEP, _CLAMP_SPREAD = 0.25, 0.5  # cells: difference step, and deviation of what is known beforehand
-KNOWN_BEFOREHAND = {"poissons_ratio": 0.08, TWIST_RATIO: 0.7, BENDING_RATIO: 0.5}
+KNOWN_BEFOREHAND = {"poissons_ratio": 0.08, "stretching_n": 1.0, TWIST_RATIO: 0.7, BENDING_RATIO: 0.5}
 """Deviations of what is known of a parameter before any recording, about the twin's value, in the scale of the search:
-of soft solids, and of a sheet's bending over that of a homogeneous plate of its thickness."""
+of soft solids, of a taut rope, and of a sheet's bending over that of a homogeneous plate of its thickness."""
 
 
 def of_parameter(parameter: Parameter, twin: Twin, known: float | tuple[float, float] | None) -> Unknown:

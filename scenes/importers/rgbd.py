@@ -19,7 +19,7 @@ import numpy as np
 from physworld.arrays import Array
 from physworld.camera import Camera
 from physworld.errors import TrackingFailed
-from physworld.scene import Scene
+from physworld.scene import Scene, sigma_of
 from physworld.tracking.grips import (
     RigidPath,
     colour_middles,
@@ -31,12 +31,13 @@ from physworld.tracking.grips import (
 )
 from physworld.tracking.ground import Plane, ground_plane, world_over
 from physworld.tracking.mask import Box
+from physworld.tracking.noise import sighting_covariances
 from physworld.tracking.points import TrackConfig, follow
 from physworld.tracking.recording import Followed, follow_all, masks_of
 from physworld.tracking.view import View, cloud_of
 from physworld_scenes.bundle import checked, scene_from_parts
 from physworld_scenes.importers.axes import ROTATION_FROM_UP, axis_along
-from physworld_scenes.importers.options import ImportOptions, estimate_noise, split_of
+from physworld_scenes.importers.options import ImportOptions, split_of
 from physworld_scenes.importers.pictures import Pictures, read_pictures, refused
 
 DEFAULT_KIND, DEFAULT_FPS = "blob", 30.0
@@ -281,7 +282,10 @@ def _parts(
     controllers, grips = np.zeros((len(points), 0, 3)), None
     if path is not None and given.grip is not None:
         controllers, grips = _controllers(recording.views[0], given.grip, path, followed, warnings)
-    noise = options.noise_sigma_m or estimate_noise(points, visible)
+    covariances = sighting_covariances(points, visible, followed.cameras, followed.views)
+    if covariances is not None and options.noise_sigma_m is not None:
+        covariances *= (options.noise_sigma_m / sigma_of(covariances)) ** 2
+    noise = options.noise_sigma_m or (None if covariances is None else sigma_of(covariances))
     lowest = float(np.nanmin(np.where(visible, points[..., 2], np.nan)))
     near = ground is not None and lowest < ground.height + GROUND_NEAR_M
     unseen = 1.0 - float(visible.mean())
@@ -309,7 +313,7 @@ def _parts(
             "gripper": None if path is None else {
                 "frames_seen": int(path.seen.sum()), "deviation_from_rigid_m": path.misfit_m,
             },
-            "noise": "given" if options.noise_sigma_m else "upper estimate from third differences",
+            "noise": "given" if options.noise_sigma_m else "measured along and across the lines of sight",
         },
     }  # fmt: skip
     arrays = {
@@ -321,6 +325,8 @@ def _parts(
         "colors": followed.colours,
         "tracked_by_camera": followed.cameras,
     }
+    if covariances is not None:
+        arrays["noise_covariance"] = covariances
     if path is not None and (missing := 1.0 - float(path.seen.mean())) > UNSEEN_WARNING:
         warnings.append(f"the gripper is not seen in {missing:.0%} of the frames, where it is interpolated")
     return declared, arrays

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scene_parts import sound_parts
+from scene_parts import POINTS, SIGMA, sound_parts
 
 from physworld_scenes.declaration import parse_json
 from physworld_scenes.validation import check_scene
@@ -276,6 +276,41 @@ FAULTS: list[tuple[str, Break, str, str]] = [
         "covers 0 to 0.5 s, the recording 0 to 0.9667 s",
     ),
 ]
+
+
+def with_covariances(by: float, **facts: Any) -> Break:
+    """Covariances of the declared deviation, their third axis ``by`` times as wide in variance."""
+
+    def change(declared: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+        arrays["noise_covariance"] = np.tile(np.diag([1.0, 1.0, by]) * SIGMA**2, (POINTS, 1, 1))
+        declared.update(facts)
+
+    return change
+
+
+def test_covariances_that_agree_with_the_deviation_are_sound() -> None:
+    assert check_scene(*broken(with_covariances(1.0)))[0] == []
+    assert check_scene(*broken(with_covariances(30.0, noise_sigma_m=None)))[0] == []
+
+
+COVARIANCES: list[tuple[str, Break, str, str]] = [
+    ("of other points", lambda d, a: a.update(noise_covariance=np.ones((3, 3, 3))), "noise_covariance", "N is 3"),
+    ("as deviations", lambda d, a: a.update(noise_covariance=np.ones((POINTS, 3))), "noise_covariance", "shape"),
+    ("not symmetric", lambda d, a: a.update(noise_covariance=np.tile(np.triu(np.ones((3, 3))), (POINTS, 1, 1))),
+     "noise_covariance", "not symmetric at 25 of 25"),
+    ("not positive", with_covariances(-1.0), "noise_covariance", "not positive definite"),
+    ("flat", with_covariances(1e-9), "noise_covariance", "1e+06 times"),
+    ("not finite", with_covariances(float("nan")), "noise_covariance", "not finite"),
+    ("at odds with the deviation", with_covariances(30.0), "noise_sigma_m", "has 0.003266 m per axis"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("change", "where", "says"), [c[1:] for c in COVARIANCES], ids=[c[0] for c in COVARIANCES]
+)
+def test_covariances_that_cannot_be_are_named(change: Break, where: str, says: str) -> None:
+    faults, _ = check_scene(*broken(change))
+    assert any(says in fault.msg for fault in faults if str(fault.loc[-1]) == where), faults
 
 
 @pytest.mark.parametrize(("change", "where", "says"), [f[1:] for f in FAULTS], ids=[f[0] for f in FAULTS])

@@ -1,0 +1,58 @@
+"""What hangs taut between two grips is as stiff as it stretches; what one grip holds hardly does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_scene import FPS, made_scene, recorded_by
+
+from physworld.calibrate import CalibrationConfig, calibrate
+from physworld.calibrate.parameters import parameters_of
+from physworld.scene import UNDEFORMED_AT_REST, Body, Grip, Scene
+from physworld.twin.build import build_twin
+
+LENGTH, RADIUS, FRAMES = 0.4, 0.006, 40
+BODY = Body(length_m=LENGTH, radius_m=RADIUS, density_kg_m3=900.0)
+
+
+def _grip(first: int, low: float, high: float) -> Grip:
+    box = np.array([[low, -RADIUS, -RADIUS], [high, RADIUS, RADIUS]])
+    return Grip(tuple(range(first, first + 4)), *box)
+
+
+def _hung(grips: int) -> Scene:
+    """A level rope whose grips sway, each in its own way."""
+    points = np.zeros((21, 3))
+    points[:, 0] = np.linspace(0.0, LENGTH, 21)
+    hands = np.array([[x, y, z] for x in (0.0, 0.38) for y in (-RADIUS, RADIUS) for z in (-RADIUS, RADIUS)])
+    hands = hands[: 4 * grips]
+    at = np.arange(FRAMES) / FPS
+    ways = [
+        np.stack([0.002 * np.sin(4 * at), 0.03 * np.sin(p * at) ** 2, 0.02 * np.sin(p * at)], 1)
+        for p in (6.0, 8.0)
+    ]
+    moves = np.repeat(np.stack(ways[:grips], axis=1), 4, axis=1)
+    held = (_grip(0, 0.0, 0.02), _grip(4, 0.38, LENGTH))[:grips]
+    facts = {"body": BODY, "grips": held, "initial_state": UNDEFORMED_AT_REST}
+    return replace(made_scene(points, "rope", hands, FRAMES, **facts), controllers=hands + moves)
+
+
+def test_stretching_and_bending_of_a_taut_rope_are_found() -> None:
+    scene = _hung(2)
+    truth = build_twin(scene, refinement=1.4)
+    true = {"stretching_n": 0.45 * truth.parameters["stretching_n"], "bending_n_m2": 1e-3}
+    recorded = recorded_by(truth.with_parameters(**true), scene, 5e-4)
+    found = calibrate(recorded, CalibrationConfig(max_simulations=150))
+    for name, tolerance in (
+        ("stretching_n", 0.12),
+        ("bending_n_m2", 0.2),
+    ):  # the clamps end at a cell's end in each
+        assert found.parameters[name].value == pytest.approx(true[name], rel=tolerance)
+    assert found.losses["rms_over_noise"] < 1.6  # √2, for frame 0 is as noisy
+
+
+def test_a_rope_in_one_grip_keeps_its_stretching() -> None:
+    names = [[p.name for p in parameters_of(build_twin(_hung(grips)), False)] for grips in (1, 2)]
+    assert "stretching_n" not in names[0] and "stretching_n" in names[1]
