@@ -55,7 +55,7 @@ _LOG_STEP = 0.02  # finite-difference step in the logarithm
 _POISSON_BOUNDS, _POISSON_STEP = (0.0, 0.48), 0.02
 _LEAST_GAIN = 0.02  # share of the training cost that an optional parameter must remove
 _POISSON_GAIN = 0.15  # the same of Poisson's ratio, which absorbs a little of whatever else is missing
-_TWIST_BOUNDS, _STRETCHING_BOUNDS = (0.1, 10.0), (0.05, 20.0)  # the latter: factors on what it begins with
+_TWIST_BOUNDS, _STRETCHING_BOUNDS = (0.1, 10.0), (0.01, 20.0)  # the latter: factors on what it begins with
 _BENDING_BOUNDS, _COUPLING_BOUNDS = (0.1, 10.0), (-2.0, 2.0)
 _BENDING_GAIN = 0.1  # share of the training cost, of the shape of a sheet's bending energy
 _SHEET_STARTS = 14  # of a sheet's stiffness: its phase slips within a factor of two
@@ -186,7 +186,9 @@ def _stretching(twin: Twin) -> list[Parameter]:
     if not isinstance(law, RodLaw) or sum(len(nodes) > 0 for nodes in twin.held_nodes) < 2:
         return []
     low, high = (law.stretching_n * factor for factor in _STRETCHING_BOUNDS)
-    starts = tuple(law.stretching_n * factor for factor in (1.0, 0.25, 4.0))
+    starts = tuple(
+        law.stretching_n * 2.0**power for power in (0, -1, 1, -2, 2, -3, -4)
+    )  # its phase slips in between
     return [
         Parameter("stretching_n", "N", low, high, _set("stretching_n"), step=0.05, starts=starts, stage="flow",
                   held=law.stretching_n)

@@ -76,20 +76,25 @@ def gripped_nodes(body: ReferenceBody, controllers: Array, grip: Grip | None) ->
 def _through(body: ReferenceBody, particles: Array, low: Array, high: Array) -> Array:
     """Whether the body lies in the box from ``low`` to ``high`` (3,) at particles (P, 3), somewhere in its depth, (P,).
 
-    A sheet reaches half its thickness to either side along its normal, and nowhere else: a box that ends on it holds
-    nothing beyond its end. The material of a cell that is filled in part lies beside its particle.
+    A sheet reaches half its thickness to either side along its normal, and a rope its radius across its axis, nowhere
+    else: a box that ends on it holds nothing beyond its end. The material of a cell that is filled in part lies beside its particle.
     """
     lattice = body.lattice
-    if lattice.dim != 2:
-        margin = 0.5 * body.thickness_m if lattice.dim == 1 else 0.0
-        inside: Array = np.all((particles >= low - margin) & (particles <= high + margin), axis=1)
+    if lattice.dim == 3:
+        inside: Array = np.all((particles >= low) & (particles <= high), axis=1)
         return inside
+    if lattice.dim == 1:  # a box that cuts half of the section holds it
+        tangent = lattice.interpolation(lattice.particle_coordinates, (1,)) @ body.start
+        tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+        margin = 0.5 * body.half_thickness_m * np.sqrt(np.clip(1.0 - tangent**2, 0.0, 1.0))
+        beside: Array = np.all((particles >= low - margin) & (particles <= high + margin), axis=1)
+        return beside
     along, across = (
         lattice.interpolation(lattice.particle_coordinates, orders) @ body.start
         for orders in ((1, 0), (0, 1))
     )
-    beside = 0.25 * lattice.spacing.max() * (1.0 - lattice.fill.reshape(-1, 1))
-    low, high = low - beside, high + beside
+    room = 0.25 * lattice.spacing.max() * (1.0 - lattice.fill.reshape(-1, 1))
+    low, high = low - room, high + room
     normal = np.cross(along, across)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     # the depths along the normal between which each axis lies in the box; those at which all do

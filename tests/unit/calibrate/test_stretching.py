@@ -26,7 +26,7 @@ def _hung(grips: int) -> Scene:
     """A level rope whose grips sway, each in its own way."""
     points = np.zeros((21, 3))
     points[:, 0] = np.linspace(0.0, LENGTH, 21)
-    hands = np.array([[x, y, z] for x in (0.0, 0.38) for y in (-RADIUS, RADIUS) for z in (-RADIUS, RADIUS)])
+    hands = np.array([[x, y, z] for x in (0.02, 0.38) for y in (-RADIUS, RADIUS) for z in (-RADIUS, RADIUS)])
     hands = hands[: 4 * grips]
     at = np.arange(FRAMES) / FPS
     ways = [
