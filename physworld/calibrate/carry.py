@@ -7,7 +7,9 @@ natural curvature k0 within the section and add to the natural twist t0,
 
     k0'(s) = R(alpha - psi s / L) k0(s)        t0' = t0 - psi / L
 
-and are found on the training frames of the new recording; nothing else is.
+and so is its rest shape, which creeps and slips whenever somebody coils, carries or grips it: from the shape that was
+carried over it is found anew, with the deviations that a calibration gives a shape of which nothing is known. Both are
+found on the training frames of the new recording; nothing else is.
 """
 
 from __future__ import annotations
@@ -17,9 +19,11 @@ from dataclasses import replace
 import numpy as np
 
 from physworld.arrays import Array
+from physworld.calibrate.rod_parameters import rod_parameters
 from physworld.calibrate.rods import RodSearch
 from physworld.engine.rods.chain import Chain
 from physworld.errors import SceneUnsupported
+from physworld.estimation.unknowns import at
 from physworld.scene import Scene
 from physworld.twin.build import build_twin
 from physworld.twin.rods import first_mode, is_pose, shapes
@@ -28,6 +32,8 @@ from physworld.twin.twin import Twin
 _ROLLS, _FAR_ROLLS = 16, (0.0, -1.0, 1.0, -2.0, 2.0, -3.0, 3.0)
 _DESCENTS, _STEPS, _STEP_RAD = 3, 6, 0.02
 _EARLY = 0.43  # of the training frames, for the scan
+_SHAPE = ("curvature_", "natural_twist", "grip_angle_")
+_ROUNDS = 4  # descents, each with what the one before it leaves as the deviation of a residual
 
 
 def carried_over(twin: Twin, scene: Scene, particle_budget: int = 2000) -> Twin:
@@ -58,7 +64,23 @@ def carried_over(twin: Twin, scene: Scene, particle_budget: int = 2000) -> Twin:
         effects=twin.effects,
         properties=twin.properties if same else None,
     )
-    return taken if twin.natural is None else _rolled_as_seen(twin, taken, scene)
+    return taken if twin.natural is None else _shaped_as_seen(_rolled_as_seen(twin, taken, scene), scene)
+
+
+def _shaped_as_seen(own: Twin, scene: Scene) -> Twin:
+    """The rod with the rest shape of the training frames, near the one that it has."""
+    shape = []
+    for unknown in rod_parameters(scene, own):
+        if unknown.name.startswith(_SHAPE) and unknown.read is not None and unknown.prior is not None:
+            here = unknown.read(own)
+            shape.append(replace(unknown, start=here, prior=(here, unknown.prior[1])))
+    search = RodSearch(scene, own, 2 * _ROUNDS * (_STEPS + 1))
+    place = np.array([unknown.start for unknown in shape])
+    for _ in range(_ROUNDS):
+        place, _ = search.descend(shape, place, search.end, _STEPS)
+        left = _errors(search, [at(own, shape, place)], search.end)[0]
+        search.sigma = max(scene.noise_sigma_m or 0.0, float(np.sqrt(left)), 1e-9)
+    return at(own, shape, place)
 
 
 def _rolled_as_seen(twin: Twin, own: Twin, scene: Scene) -> Twin:

@@ -77,7 +77,8 @@ def _through(body: ReferenceBody, particles: Array, low: Array, high: Array) -> 
     """Whether the body lies in the box from ``low`` to ``high`` (3,) at particles (P, 3), somewhere in its depth, (P,).
 
     A sheet reaches half its thickness to either side along its normal, and a rope its radius across its axis, nowhere
-    else: a box that ends on it holds nothing beyond its end. The material of a cell that is filled in part lies beside its particle.
+    else: a box that ends on it holds nothing beyond its end. The material of a cell that is filled in part lies beside
+    its particle.
     """
     lattice = body.lattice
     if lattice.dim == 3:
