@@ -81,7 +81,7 @@ def transfer(
 ) -> dict[str, Any]:
     """A recording predicted with the material of another one (:func:`physworld.calibrate.carried_over`).
 
-    Of a discrete rod two angles, how it was rolled when it was gripped, are found on this recording's training frames;
+    Of a discrete rod the roll in which it was gripped and its rest shape are found on this recording's training frames;
     otherwise nothing of it is fitted to. The other models are those fitted to the other recording.
 
     Args:

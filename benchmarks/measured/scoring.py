@@ -214,7 +214,7 @@ def cut(scene: Scene, first: int) -> Scene:
 def with_material(fitted: Twin, scene: Scene, particle_budget: int) -> Twin:
     """A twin of the scene with the fitted law, drag, softness of grips and effects; nothing is fitted.
 
-    Unlike :func:`physworld.calibrate.carried_over`, which finds a rod's roll on training frames, it leaves a rod
+    Unlike :func:`physworld.calibrate.carried_over`, which finds a rod's rest shape on training frames, it leaves a rod
     without natural curvature: a restarted recording has no frame to find it on.
     """
     twin = build_twin(scene, particle_budget, fitted.device, formulation=fitted.formulation)
