@@ -6,6 +6,7 @@ SI units, world frame z up, axis order (time, entity, xyz). Reading and checking
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Self
@@ -214,3 +215,13 @@ class Scene:
 def sigma_of(covariances: Array) -> float:
     """Deviation per axis [m] of covariances (N, 3, 3) [m^2]: the root of a third of their mean trace."""
     return float(np.sqrt(np.trace(covariances, axis1=1, axis2=2).mean() / 3.0))
+
+
+def covariances_of(scenes: Sequence[Scene]) -> Array | None:
+    """Of the points of all scenes, (N1 + N2 + …, 3, 3) [m^2]; None where none has any."""
+    if all(scene.noise_covariance_m2 is None for scene in scenes):
+        return None
+    worst = max(scene.noise_sigma_m or 0.0 for scene in scenes)
+    alike = [np.tile(worst**2 * np.eye(3), (scene.points.shape[1], 1, 1)) for scene in scenes]
+    known = [scene.noise_covariance_m2 for scene in scenes]
+    return np.concatenate([own if one is None else one for one, own in zip(known, alike, strict=True)])

@@ -33,7 +33,7 @@ from physworld.estimation.simulations import (
 )
 from physworld.estimation.whitening import moved, responses
 from physworld.evaluate.numerics import refined
-from physworld.scene import Scene, sigma_of
+from physworld.scene import Scene, covariances_of, sigma_of
 from physworld.twin.build import build_twin, taken_over
 from physworld.twin.twin import Twin
 
@@ -224,7 +224,7 @@ def _joined(fitted: Sequence[Recording]) -> Scene:
         visible.append(np.concatenate([seen[:frames], np.zeros((missing, seen.shape[1]), dtype=bool)]))
     noises = [recording.scene.noise_sigma_m for recording in fitted]
     known = [noise for noise in noises if noise]
-    covariances = _covariances([recording.scene for recording in fitted])
+    covariances = covariances_of([recording.scene for recording in fitted])
     sigma = sigma_of(covariances) if covariances is not None else max(known, default=0.0)
     return replace(
         lead,
@@ -237,16 +237,6 @@ def _joined(fitted: Sequence[Recording]) -> Scene:
         train=(min(recording.split.train[0] for recording in fitted), frames),
         test=(frames, frames),
     )
-
-
-def _covariances(scenes: Sequence[Scene]) -> Array | None:
-    """Of the points of all scenes, (N1 + N2 + …, 3, 3) [m^2]; None where none has any."""
-    if all(scene.noise_covariance_m2 is None for scene in scenes):
-        return None
-    worst = max(scene.noise_sigma_m or 0.0 for scene in scenes)
-    alike = [np.tile(worst**2 * np.eye(3), (scene.points.shape[1], 1, 1)) for scene in scenes]
-    known = [scene.noise_covariance_m2 for scene in scenes]
-    return np.concatenate([own if one is None else one for one, own in zip(known, alike, strict=True)])
 
 
 def _common(fitted: Sequence[Recording]) -> Split:

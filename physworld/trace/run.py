@@ -171,7 +171,7 @@ class _Trace:
         search = Search(setting, chosen, starts, *sizes, config.seed)
         self.clock.start()
         with self.clock.until(SEARCH):
-            search.run(declared)
+            declared = search.run(declared)[0]
         known, weights = search.admitted(), search.weights()
         solver = float(np.linalg.norm([v for n, v in ground.numerics.items() if n in _RICHARDSON]))
         verdict = decided(known, weights, ground.sigma, solver, search.library)

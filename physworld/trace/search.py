@@ -205,9 +205,8 @@ class Search:
         return max(begun, key=lambda one: one.promised)
 
     def _settle(self, size: int) -> None:
-        """Fits the best set of a size from elsewhere too, and all others from its calibrated numbers: a material is the
-        same whatever else acts on it, and a fit that has come to rest in a valley of its own says nothing of its
-        effect."""
+        """Fits the best set of a size from elsewhere too, and all others and the declared physics from its calibrated
+        numbers: a material is the same whatever else acts on it, and a fit in a valley of its own says nothing."""
         ranked = sorted(self._of_size(size), key=lambda h: h.left)
         if not ranked or self.settled.get(size) == [h.left for h in ranked]:
             return
@@ -216,7 +215,7 @@ class Search:
             for places in elsewhere(self.setting.calibrated, best.values)[1:]:
                 best = self._again(best, places, np.inf)
         shared = {u.name: best.values[u.name] for u in self.setting.calibrated if u.name in best.values}
-        for known in ranked[1:]:
+        for known in [*ranked[1:], self.hypotheses[()]]:
             own = {n: v for n, v in known.values.items() if n not in shared}
             places = [{**shared, **{n: factor * v for n, v in own.items()}} for factor in _MULTIPLES]
             self._again(known, places, NO_WORSE * known.fitted.misfit**2)
