@@ -43,7 +43,14 @@ from physworld.calibrate.estimates import (
 )
 from physworld.calibrate.fibres import free_fibres
 from physworld.calibrate.local_stage import LocalResult
-from physworld.calibrate.parameters import Parameter, affordable, flow_law, parameters_of, relaxing
+from physworld.calibrate.parameters import (
+    Parameter,
+    affordable,
+    flow_law,
+    hangs_taut,
+    parameters_of,
+    relaxing,
+)
 from physworld.calibrate.rods import calibrate_rod
 from physworld.calibrate.search import Progress, Search
 from physworld.devices import default_device
@@ -234,6 +241,7 @@ def searched_parameters(scene: Scene, twin: Twin, config: CalibrationConfig) -> 
         separate_bending=scene.body.thickness_m is None and scene.body.size_m is None,
         damping=config.damping == "auto",
         ground_friction=scene.ground is not None and scene.ground.friction is None,
+        taut=hangs_taut(scene, twin),
     )
     if config.damping == "auto":
         found += relaxing(twin, scene.times[: scene.train[1]])
@@ -242,7 +250,7 @@ def searched_parameters(scene: Scene, twin: Twin, config: CalibrationConfig) -> 
 
 def select(search: Search, parameters: list[Parameter]) -> tuple[list[Parameter], Optimum, dict[str, float]]:
     """Steps 1 to 3: the parameters to keep, their optimum, and what the others would have removed."""
-    kept = [p for p in parameters if p.stage in ("stiffness", "flow")]
+    kept = [p for p in parameters if p.stage in ("stiffness", "flow", "taut")]
     optimum = search.scan(kept)
     rejected: dict[str, float] = {}
     shape = [p for p in parameters if p.stage == "shape"]

@@ -55,6 +55,7 @@ _LOG_STEP = 0.02  # finite-difference step in the logarithm
 _POISSON_BOUNDS, _POISSON_STEP = (0.0, 0.48), 0.02
 _LEAST_GAIN = 0.02  # share of the training cost that an optional parameter must remove
 _POISSON_GAIN = 0.15  # the same of Poisson's ratio, which absorbs a little of whatever else is missing
+_TAUT = 0.98  # of its length between two grips: closer together it is slack
 _TWIST_BOUNDS, _STRETCHING_BOUNDS = (0.1, 10.0), (0.01, 20.0)  # the latter: factors on what it begins with
 _BENDING_BOUNDS, _COUPLING_BOUNDS = (0.1, 10.0), (-2.0, 2.0)
 _BENDING_GAIN = 0.1  # share of the training cost, of the shape of a sheet's bending energy
@@ -84,15 +85,15 @@ class Parameter(Unknown):
     Attributes:
         starts: of the search, in its unit, best first by prior knowledge; an optional one has one.
         stage: "stiffness" parameters come first, and over a grid with them what a "flow" law or a twisted rope has,
-            which is dropped again if the data do not need it; those of a "shape" and of "fibres" are freed together,
-            "optional" ones one by one, if the data ask for them.
+            or a "taut" one, which are dropped again if the data do not need them; those of a "shape" and of "fibres"
+            are freed together, "optional" ones one by one, if the data ask for them.
         held: value of one that is not freed.
         least_gain: share of the training cost that freeing an optional one must remove.
         read: its value in a twin, in its unit; None: it is among the twin's ``parameters`` or follows from them.
     """
 
     starts: tuple[float, ...]
-    stage: Literal["stiffness", "flow", "shape", "fibres", "optional"]
+    stage: Literal["stiffness", "flow", "taut", "shape", "fibres", "optional"]
     transform: Transform = LOG
     step: float = _LOG_STEP
     held: float = 0.0
@@ -101,7 +102,11 @@ class Parameter(Unknown):
 
 
 def parameters_of(
-    twin: Twin, separate_bending: bool, damping: bool = True, ground_friction: bool = False
+    twin: Twin,
+    separate_bending: bool,
+    damping: bool = True,
+    ground_friction: bool = False,
+    taut: bool = False,
 ) -> list[Parameter]:
     """Parameters of the twin's shape, those of stiffness first.
 
@@ -110,6 +115,7 @@ def parameters_of(
         separate_bending: sheets only: bending is searched apart from stretch (no thickness is declared).
         damping: air drag and internal friction may be freed.
         ground_friction: the friction of the ground is not declared and may be freed.
+        taut: it hangs taut (:func:`hangs_taut`).
     """
     law = twin.law
     optional = []
@@ -129,7 +135,7 @@ def parameters_of(
         )  # fmt: skip
     return [
         *_stiffness(twin, separate_bending),
-        *_stretching(twin),
+        *(_stretching(twin) if taut else ()),
         *_torsion(twin),
         *_twist(twin),
         *_flow(twin),
@@ -177,20 +183,38 @@ def flow_law(name: str) -> Plasticity:
     return law(**_FLOW_PRIORS.get(law, {}))
 
 
-def _stretching(twin: Twin) -> list[Parameter]:
-    """E A of a rope that two grips hold: what hangs between them is as taut as it does not stretch.
+def hangs_taut(scene: Scene, twin: Twin) -> bool:
+    """Whether a body hangs between two grips that are as far apart as it is long, for half of the training frames.
 
-    A rope that one grip holds hardly stretches, whatever it is.
+    One that is slack by more hardly stretches, whatever it is.
     """
+    grips = [
+        (group, nodes)
+        for group, nodes in zip(twin.controller_groups, twin.held_nodes, strict=True)
+        if len(nodes)
+    ]
+    if len(grips) < 2:
+        return False
+    ends, middles = [], []
+    for group, nodes in (grips[0], grips[-1]):
+        went = scene.controllers[: scene.train[1], group].mean(axis=1)
+        ends.append(twin.body.start[nodes].mean(axis=0) + went - went[0])
+        middles.append(float(twin.lattice.node_coordinates[nodes, 0].mean()))
+    apart = np.linalg.norm(ends[1] - ends[0], axis=1)
+    return bool(np.median(apart) > _TAUT * abs(middles[1] - middles[0]))
+
+
+def _stretching(twin: Twin) -> list[Parameter]:
+    """E A of a rope that hangs taut: it sags as far as it stretches, and swings by its tension."""
     law = twin.law
-    if not isinstance(law, RodLaw) or sum(len(nodes) > 0 for nodes in twin.held_nodes) < 2:
+    if not isinstance(law, RodLaw):
         return []
     low, high = (law.stretching_n * factor for factor in _STRETCHING_BOUNDS)
     starts = tuple(
         law.stretching_n * 2.0**power for power in (0, -1, 1, -2, 2, -3, -4)
     )  # its phase slips in between
     return [
-        Parameter("stretching_n", "N", low, high, _set("stretching_n"), step=0.05, starts=starts, stage="flow",
+        Parameter("stretching_n", "N", low, high, _set("stretching_n"), step=0.05, starts=starts, stage="taut",
                   held=law.stretching_n)
     ]  # fmt: skip
 

@@ -131,20 +131,26 @@ class Search:
         return [*found, *(self._nothing(end) for _, _, end in places[allowed:])]
 
     def scan(self, parameters: list[Parameter]) -> Optimum:
-        """Multi-start over the starts of the first parameter and of a flow law's, then on all training frames."""
+        """Multi-start over the starts of the first parameter and of a flow law's, then on all training frames.
+
+        Of a taut rope over those of its stretching instead, and over the others' from the best of these.
+        """
         window = self.first_window()
-        tried = [p.starts if k == 0 or p.stage == "flow" else p.starts[:1] for k, p in enumerate(parameters)]
+        first = "taut" if any(p.stage == "taut" for p in parameters) else "flow"
+        tried = [p.starts if k == 0 or p.stage == first else p.starts[:1] for k, p in enumerate(parameters)]
         starts = [
             np.array([p.searched(value) for p, value in zip(parameters, values, strict=True)])
             for values in product(*tried)
         ]
-        costs = self.costs("scan", parameters, starts, window)
-        usable = sorted(
-            (cost, tuple(theta)) for cost, theta in zip(costs, starts, strict=True) if cost is not None
-        )
+        usable = self._usable("scan", parameters, starts, window)
+        for k, own in enumerate(parameters):
+            if usable and own.stage == "flow" != first:
+                best, here = np.array(usable[0][1]), np.arange(len(parameters)) == k
+                others = [np.where(here, own.searched(value), best) for value in own.starts[1:]]
+                usable = sorted(usable + self._usable(f"scan {own.name}", parameters, others, window))
         if not usable:
             raise CalibrationError(
-                f"none of {len(costs)} starts with {parameters[0].name} from {parameters[0].starts[0]:.3g} to "
+                f"none of {len(starts)} starts with {parameters[0].name} from {parameters[0].starts[0]:.3g} to "
                 f"{parameters[0].starts[-1]:.3g} {parameters[0].unit} gave a usable simulation"
             )
         early = self.solve_each([Descent(parameters, np.array(theta), 3, window) for _, theta in usable[:3]])
@@ -153,6 +159,13 @@ class Search:
             s for k, s in enumerate(early) if k == 0 or np.abs(s.theta - early[0].theta).max() > _DISTINCT
         ]
         return min(self.solve_each([Descent(parameters, s.theta, 5) for s in distinct[:2]]), key=cost_of)
+
+    def _usable(
+        self, name: str, parameters: list[Parameter], starts: list[Array], end: int
+    ) -> list[tuple[float, tuple[float, ...]]]:
+        """Costs and places of the starts whose run can be trusted, the best first; see :meth:`costs`."""
+        costs = self.costs(name, parameters, starts, end)
+        return sorted((c, tuple(theta)) for c, theta in zip(costs, starts, strict=True) if c is not None)
 
     def costs(
         self, name: str, parameters: list[Parameter], starts: list[Array], end: int

@@ -18,7 +18,7 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.calibrate import Journal
-from physworld.calibrate.parameters import BENDING_COUPLING, parameters_of
+from physworld.calibrate.parameters import BENDING_COUPLING, hangs_taut, parameters_of
 from physworld.calibrate.rod_parameters import LOSSES, lossless, rod_parameters
 from physworld.engine.formulations import RODS
 from physworld.engine.thin.triangles import TriangleLattice
@@ -284,6 +284,7 @@ class _Trace:
             separate_bending=body.thickness_m is None and body.size_m is None,
             damping=False,
             ground_friction=ground is not None and ground.friction is None,
+            taut=hangs_taut(self.lead, self.twin),
         )
         found = [
             of_parameter(p, self.twin, KNOWN_BEFOREHAND.get(p.name))
