@@ -222,8 +222,7 @@ def _joined(fitted: Sequence[Recording]) -> Scene:
         )
         missing = max(frames - len(seen), 0)
         visible.append(np.concatenate([seen[:frames], np.zeros((missing, seen.shape[1]), dtype=bool)]))
-    noises = [recording.scene.noise_sigma_m for recording in fitted]
-    known = [noise for noise in noises if noise]
+    known = [noise for recording in fitted if (noise := recording.scene.noise_sigma_m)]
     covariances = covariances_of([recording.scene for recording in fitted])
     sigma = sigma_of(covariances) if covariances is not None else max(known, default=0.0)
     return replace(
@@ -232,8 +231,8 @@ def _joined(fitted: Sequence[Recording]) -> Scene:
         visible=np.concatenate(visible, axis=1),
         controllers=side_by_side([lead.controllers], frames),
         times=longest.times[:frames],
-        noise_sigma_m=sigma if len(known) == len(noises) else None,
-        noise_covariance_m2=covariances if len(known) == len(noises) else None,
+        noise_sigma_m=sigma if len(known) == len(fitted) else None,
+        noise_covariance_m2=covariances if len(known) == len(fitted) else None,
         train=(min(recording.split.train[0] for recording in fitted), frames),
         test=(frames, frames),
     )
