@@ -80,8 +80,8 @@ def rod_parameters(scene: Scene, twin: Twin) -> list[Parameter]:
 
 
 def lossless(twin: Twin) -> Twin:
-    """The twin of a discrete rod without friction, drag and creep."""
-    return twin.with_parameters(**_LOSSLESS)
+    """The twin of a rope or rod without friction, drag and creep."""
+    return twin.with_parameters(**{n: v for n, v in _LOSSLESS.items() if n in twin.parameters})
 
 
 def steps_seen(scene: Scene) -> Array | None:

@@ -156,7 +156,7 @@ class _Trace:
         self.scene, self.split = recordings.scene, recordings.split
         self.config, self.simulations = config, simulations
         # what a rod loses is an effect here
-        self.frames, self.twin = self.split.train[1], lossless(twin) if twin.form is RODS else twin
+        self.frames, self.twin = self.split.train[1], lossless(twin) if twin.lattice.dim == 1 else twin
         self.faults = "; ".join(known.words for known in faults if known)
         self.notes = [f"left out as faulty sightings: {self.faults}"] if self.faults else []
 

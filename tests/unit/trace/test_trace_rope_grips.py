@@ -74,3 +74,15 @@ def test_a_hand_that_gives_as_a_sheared_rope_does_is_nothing_and_a_softer_one_is
     soft = traced(5.0 * sheared())
     assert [e.name for e in soft.effects] == ["grip_slip"]
     assert soft.effects[0].parameters["compliance_m_n"].value == pytest.approx(5.0 * sheared(), rel=0.15)
+
+
+def test_a_drag_that_a_calibration_may_free_is_named_all_the_same() -> None:
+    scene = rope()
+    twin = twin_of(scene).with_effect(effect("air_drag_linear", rate_per_s=2.0))
+    tracks = twin.observe(twin.simulate_nodes(*scene.control_track(), scene.times), scene.times)
+    noise = np.random.default_rng(0).normal(scale=SIGMA, size=tracks.shape)
+    found = trace(
+        replace(scene, points=tracks + noise), CONFIG
+    )  # which calibrates the declared physics first
+    assert [e.name for e in found.effects] == ["air_drag_linear"]
+    assert found.effects[0].parameters["rate_per_s"].value == pytest.approx(2.0, rel=0.1)
