@@ -20,8 +20,9 @@ from benchmarks.tracking.plays import MARKER_ID
 from physworld.arrays import Array
 from physworld.scene import Scene
 from physworld.tracking.mask import Box
+from physworld_scenes.importers.gripping import GripFrom
 from physworld_scenes.importers.options import ImportOptions
-from physworld_scenes.importers.rgbd import GripFrom, PictureOptions, read_folder
+from physworld_scenes.importers.rgbd import PictureOptions, read_folder
 
 MILLIMETRES = 1e3
 

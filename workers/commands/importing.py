@@ -96,6 +96,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--mask", action="append", default=[], help="instead: PNG, white on it: [CAMERA:]FILE"
     )
+    parser.add_argument(
+        "--tracks",
+        action="append",
+        default=[],
+        help="of another tracker, npz of tracks and visible: [CAMERA:]FILE; else tracks/CAMERA.npz",
+    )
     parser.add_argument("--marker", default=None, help="on the gripper: NUMBER[:DICTIONARY], or any")
     parser.add_argument("--patch", default=None, help="instead, of the gripper: LEFT,TOP,RIGHT,BOTTOM")
     parser.add_argument("--colour", default=None, help="instead, a pixel of its colour: COLUMN,ROW")
@@ -246,8 +252,9 @@ def _pictures(given: argparse.Namespace, options: ImportOptions) -> tuple[Scene,
 
 
 def _picture_options(given: argparse.Namespace) -> PictureOptions:
-    from physworld.tracking.points import TrackConfig
-    from physworld_scenes.importers.rgbd import GripFrom, PictureOptions
+    from physworld.tracking.places import TrackConfig
+    from physworld_scenes.importers.gripping import GripFrom
+    from physworld_scenes.importers.rgbd import PictureOptions
 
     told = [given.marker, given.patch, given.colour, given.log]
     if sum(each is not None for each in told) > 1:
@@ -271,6 +278,7 @@ def _picture_options(given: argparse.Namespace) -> PictureOptions:
     return PictureOptions(
         boxes={camera: _box("--box", text) for camera, text in map(_of_camera, given.box)},
         masks={camera: Path(text) for camera, text in map(_of_camera, given.mask)},
+        tracks={camera: Path(text) for camera, text in map(_of_camera, given.tracks)},
         grip=grip,
         up=given.up,
         depth_scale=given.depth_scale,
