@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -22,7 +23,7 @@ from physworld.tracking.view import View, cloud_of
 MOST_APART_M = 0.015
 """Clouds that are farther apart are refused."""
 WARNED_APART_M = 0.005
-SEEN_THROUGH_M = 0.03
+SEEN_THROUGH_M, BESIDE_PX = 0.03, 3
 MOST_SEEN_THROUGH = 0.3
 """Of the object's places that project onto depth."""
 AROUND_M, CELL_M = 0.1, 4e-3
@@ -53,18 +54,17 @@ class Agreement:
     seen_through: float
 
 
-def agreement(views: list[View], other: int, mask: Array) -> list[Agreement]:
+def agreement(views: list[View], other: int, object_cloud: Array) -> list[Agreement]:
     """How well all cameras agree with one in the first frame.
 
     Args:
         views: the cameras, in one world.
         other: number of the one that shows the object.
-        mask: the object there, (H, W) bool.
+        object_cloud: places on the object that it saw [m], (P, 3).
 
     Raises:
         TrackingFailed: clouds are too far apart, or a camera sees through the object; with the numbers.
     """
-    object_cloud = cloud_of(views[other].camera, views[other].depth(0), mask)[0]
     found = []
     for number, view in enumerate(views):
         if number == other:
@@ -78,8 +78,8 @@ def agreement(views: list[View], other: int, mask: Array) -> list[Agreement]:
             )
         if through > MOST_SEEN_THROUGH:
             raise TrackingFailed(
-                f"camera {number} sees through {through:.0%} of the object that camera {other} sees, by "
-                f"{1e3 * by:.0f} mm in the median: its place in the calibration is wrong"
+                f"camera {number} sees through {through:.0%} of the object that camera {other} sees (what it sees "
+                f"there lies {1e3 * by:.0f} mm behind in the median): one of their places in the calibration is wrong"
             )
         found.append(Agreement(number, other, apart, places, through))
     return found
@@ -90,7 +90,11 @@ def _seen_through(view: View, cloud: Array) -> tuple[float, float]:
     pixels, distance = view.camera.project(cloud)
     at = np.floor(np.where(distance[:, None] > 0, pixels, -1.0)).astype(int)
     shown = ((at >= 0) & (at < [view.camera.width, view.camera.height])).all(axis=1)
-    measured = view.depth(0)[at[shown, 1], at[shown, 0]]
+    # the nearest depth around: beside thin things the picture holds what is behind them
+    depth = view.depth(0)
+    kernel = np.ones((2 * BESIDE_PX + 1,) * 2, np.uint8)
+    nearest = cv2.erode(np.where(depth > 0, depth, np.inf).astype(np.float32), kernel)
+    measured = np.where(np.isfinite(nearest), nearest, 0.0)[at[shown, 1], at[shown, 0]]
     behind = (measured - distance[shown])[measured > 0]
     if len(behind) < LEAST_PLACES:
         return 0.0, 0.0

@@ -7,7 +7,6 @@ depth and neighbours say where it is in space and whether it is seen.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,54 +31,63 @@ class GivenTracks:
     visible: Array
 
 
-def follow_given(
-    view: View,
-    mask: Array,
-    given: GivenTracks,
-    config: TrackConfig | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Tracks:
-    """The tracks in space.
+class GivenFollower:
+    """Puts the tracks into space from frame to frame, as :class:`physworld.tracking.points.Follower` does its own.
 
     Args:
         view: the recording.
         mask: the object in the first frame, (H, W) bool.
         given: of as many frames.
         config: how many points at most, and how their places are found.
-        progress: told frames done and frames in all.
+
+    Attributes:
+        first: places in the first frame [m], (n, 3).
+        points, visible: places [m] and whether they are seen, of the frames so far, (T, n, 3) and (T, n).
 
     Raises:
         TrackingFailed: too few of them begin on the object, with depth.
     """
-    config = config or TrackConfig()
-    if len(given.pixels) != view.frames:
-        raise TrackingFailed(f"tracks have {len(given.pixels)} frames, the recording {view.frames}")
-    depth = view.depth(0)
-    chosen = _chosen(given, mask, config.points)
-    start = FirstPlaces(view.camera, mask, depth, given.pixels[0, chosen], config.depth_px)
-    measured = np.isfinite(start.distance)
-    if measured.sum() < LEAST_POINTS:
-        raise TrackingFailed(
-            f"{int(measured.sum())} tracks can be used, {LEAST_POINTS} are needed: of {given.visible.shape[1]} tracks "
-            f"{int(given.visible[0].sum())} are seen in the first frame, {len(chosen)} of them on the object's "
-            f"{int(mask.sum())} pixels and apart, {int(measured.sum())} with depth"
-        )
-    kept = chosen[measured]
-    places = Places(start, measured, config)
-    colours = view.colour(0)
-    row, column = (given.pixels[0, kept, axis].astype(int) for axis in (1, 0))
-    points = np.empty((view.frames, len(kept), 3))
-    visible = np.zeros((view.frames, len(kept)), dtype=bool)
-    pixels = np.empty((view.frames, len(kept), 2))
-    points[0], visible[0], pixels[0] = places.first, True, given.pixels[0, kept]
-    for frame in range(1, view.frames):
-        seen = given.visible[frame, kept]
-        now = np.where(seen[:, None], given.pixels[frame, kept], 0.0)
-        there, maps, _ = picture_motion(pixels[0], now, seen, places.neighbours)
-        pixels[frame] = np.where(seen[:, None], now, there)
-        points[frame], visible[frame] = places.at(view.depth(frame), pixels[frame], maps, seen)
-        progress(frame + 1, view.frames)
-    return Tracks(points, visible, pixels, colours[row, column])
+
+    def __init__(self, view: View, mask: Array, given: GivenTracks, config: TrackConfig) -> None:
+        if len(given.pixels) != view.frames:
+            raise TrackingFailed(f"tracks have {len(given.pixels)} frames, the recording {view.frames}")
+        chosen = _chosen(given, mask, config.points)
+        start = FirstPlaces(view.camera, mask, view.depth(0), given.pixels[0, chosen], config.depth_px)
+        measured = np.isfinite(start.distance)
+        if measured.sum() < LEAST_POINTS:
+            raise TrackingFailed(
+                f"{int(measured.sum())} tracks can be used, {LEAST_POINTS} are needed: of {given.visible.shape[1]} "
+                f"tracks {int(given.visible[0].sum())} are seen in the first frame, {len(chosen)} of them on the "
+                f"object's {int(mask.sum())} pixels and apart, {int(measured.sum())} with depth"
+            )
+        kept = chosen[measured]
+        self._view, self._places = view, Places(start, measured, config)
+        self._given, self._seen = given.pixels[:, kept], given.visible[:, kept]
+        self.first = self._places.first
+        self.points = np.full((view.frames, len(kept), 3), np.nan)
+        self.visible = np.zeros((view.frames, len(kept)), dtype=bool)
+        self._pixels = np.full((view.frames, len(kept), 2), np.nan)
+        self.points[0], self.visible[0], self._pixels[0] = self.first, True, self._given[0]
+
+    def step(self, frame: int, told: Array | None = None) -> None:
+        """The next frame.
+
+        Args:
+            frame: its number.
+            told: where other cameras put the points; the tracks are given, and it is not used.
+        """
+        seen = self._seen[frame]
+        now = np.where(seen[:, None], self._given[frame], 0.0)
+        there, maps, _ = picture_motion(self._pixels[0], now, seen, self._places.neighbours)
+        self._pixels[frame] = np.where(seen[:, None], now, there)
+        depth = self._view.depth(frame)
+        self.points[frame], self.visible[frame] = self._places.at(depth, self._pixels[frame], maps, seen)
+
+    def tracks(self) -> Tracks:
+        """What was found."""
+        colour = self._view.colour(0)
+        row, column = (self._given[0, :, axis].astype(int) for axis in (1, 0))
+        return Tracks(self.points, self.visible, self._pixels, colour[row, column])
 
 
 def _chosen(given: GivenTracks, mask: Array, count: int) -> Array:

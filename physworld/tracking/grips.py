@@ -169,7 +169,7 @@ def joined(paths: list[Array]) -> Array:
         np.median((path - paths[most])[both].mean(axis=1), axis=0) if both.any() else np.full(3, np.nan)
         for path, both in zip(paths, shared, strict=True)
     ]
-    told = np.isfinite(shifts).all(axis=1)
+    told: Array = np.asarray(np.isfinite(np.stack(shifts)).all(axis=1))
     shift = np.where(told[:, None], np.stack(shifts) - np.stack(shifts)[told].mean(axis=0), 0.0)
     count = known.sum(axis=0)
     total = np.where(known[..., None, None], stacked - shift[:, None, None], 0.0).sum(axis=0)

@@ -30,6 +30,8 @@ OUTLINE_PX = 2
 """Beside a mask; the error of depth moves a place so far in another picture."""
 BEFORE_M = 0.015
 """Before what is seen there; two cameras measure a place so far apart."""
+LEAST_BY_COLOUR = 0.5
+"""Of the pixels that outlines and depth leave; where colour leaves less, it is not asked."""
 GROUND_CLEARANCE_M = 0.006
 ROUNDS = 6
 LEAST_PIXELS = 60
@@ -77,7 +79,7 @@ def mask_in_box(
     height, width = depth.shape
     box = box.within(width, height)
     near = _near(depth, camera, box, ground_m)
-    return _by_colour(colour, depth, near, box)
+    return _by_colour(colour, near, depth == 0, box)
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,14 @@ class Outline:
     camera: Camera
     depth: Array
     mask: Array
+
+    def cloud(self) -> Array:
+        """Places on the object [m], (P, 3), without pixels that mix it with what is behind it where others are left."""
+        near = np.where((self.depth > 0) & self.mask, self.depth, np.inf).astype(np.float32)
+        nearest = cv2.erode(near, np.ones((2 * OUTLINE_PX + 1,) * 2, np.uint8))
+        clean = self.mask & (self.depth < nearest + BEFORE_M)
+        clean = clean if clean.sum() >= LEAST_PIXELS else self.mask
+        return cloud_of(self.camera, self.depth, clean)[0]
 
     def holds(self, places: Array) -> Array:
         """Which of some places (P, 3) [m] may be on the object, (P,) bool; those outside of the picture may."""
@@ -127,7 +137,7 @@ def mask_near_cloud(
     Raises:
         TrackingFailed: the object is outside of the picture, or nothing stands out.
     """
-    cloud = np.concatenate([cloud_of(o.camera, o.depth, o.mask)[0] for o in outlines])
+    cloud = np.concatenate([outline.cloud() for outline in outlines])
     pixels, distance = camera.project(cloud)
     seen = pixels[distance > 0]
     if not len(seen):
@@ -151,24 +161,30 @@ def mask_near_cloud(
         held &= outline.holds(places)
     near = np.zeros(depth.shape, dtype=bool)
     near[at[held, 0], at[held, 1]] = True
-    return _by_colour(colour, depth, near, box)
+    beside = cv2.dilate(near.astype(np.uint8), np.ones((2 * OUTLINE_PX + 1,) * 2, np.uint8)) > 0
+    try:
+        mask = _by_colour(colour, near, beside & (depth == 0), box)
+    except TrackingFailed:
+        mask = np.zeros(depth.shape, dtype=bool)
+    # of what is a few pixels wide colour leaves nothing
+    return mask if mask.sum() >= LEAST_BY_COLOUR * near.sum() else _largest(near)
 
 
-def _by_colour(colour: Array, depth: Array, near: Array, box: Box) -> Array:
+def _by_colour(colour: Array, near: Array, unknown: Array, box: Box) -> Array:
     """What of a box GrabCut leaves to the object, (H, W) bool.
 
     Args:
         colour: (H, W, 3) uint8.
-        depth: (H, W) [m], 0: none.
         near: pixels that depth leaves to it, (H, W) bool.
+        unknown: pixels without depth that may be on it, (H, W) bool.
         box: all around it is background.
 
     Raises:
         TrackingFailed: nothing stands out.
     """
     window = np.s_[box.top : box.bottom, box.left : box.right]
-    labels = np.full(depth.shape, cv2.GC_BGD, dtype=np.uint8)
-    labels[window] = np.where(near[window] | (depth[window] == 0), cv2.GC_PR_FGD, cv2.GC_BGD)
+    labels = np.full(near.shape, cv2.GC_BGD, dtype=np.uint8)
+    labels[window] = np.where((near | unknown)[window], cv2.GC_PR_FGD, cv2.GC_BGD)
     core = cv2.erode(near.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     if core[window].sum() < LEAST_PIXELS:
         raise TrackingFailed(
@@ -179,7 +195,7 @@ def _by_colour(colour: Array, depth: Array, near: Array, box: Box) -> Array:
     cv2.setRNGSeed(0)
     cv2.grabCut(bgr, labels, None, backward, forward, ROUNDS, cv2.GC_INIT_WITH_MASK)
     mask = (labels == cv2.GC_PR_FGD) | (labels == cv2.GC_FGD)
-    return _largest(mask & (near | (depth == 0)))
+    return _largest(mask & (near | unknown))
 
 
 def _near(depth: Array, camera: Camera, box: Box, ground_m: float | None) -> Array:

@@ -34,6 +34,7 @@ class TrackConfig:
         least_misfit_m: below which nobody is left out.
         least_area: of a patch, turned away, over its area in the first frame.
         rediscover_below: share of points seen from which the whole picture is searched for the others.
+        told_below: share from which points are sought where other cameras put them.
     """
 
     points: int = 150
@@ -46,6 +47,7 @@ class TrackConfig:
     least_misfit_m: float = 2e-3
     least_area: float = 0.2
     rediscover_below: float = 0.25
+    told_below: float = 0.5
 
 
 @dataclass(frozen=True)

@@ -62,15 +62,25 @@ def follow(
         TrackingFailed: too few points can be followed, or pictures differ in size.
     """
     config = config or TrackConfig()
-    tracker = _Tracker(view, mask, config)
+    follower = Follower(view, mask, config)
     for frame in range(1, view.frames):
-        tracker.step(frame)
+        follower.step(frame)
         progress(frame + 1, view.frames)
-    return tracker.tracks()
+    return follower.tracks()
 
 
-class _Tracker:
-    """State of ``follow`` between two frames."""
+class Follower:
+    """Follows points from frame to frame.
+
+    Args:
+        view: the recording.
+        mask: the object in the first frame, (H, W) bool.
+        config: how.
+
+    Attributes:
+        first: places in the first frame [m], (n, 3).
+        points, visible: places [m] and whether they are seen, of the frames so far, (T, n, 3) and (T, n).
+    """
 
     def __init__(self, view: View, mask: Array, config: TrackConfig) -> None:
         self._view, self._config = view, config
@@ -101,20 +111,25 @@ class _Tracker:
         self._fine, self._coarse = _kept(fine, kept), _kept(coarse, kept)
         self._start = pixels[kept]
         self._places = Places(first, kept, config)
-        self._first, self._neighbours = self._places.first, self._places.neighbours
+        self.first, self._neighbours = self._places.first, self._places.neighbours
         count, frames = int(kept.sum()), view.frames
-        self._points = np.full((frames, count, 3), np.nan)
+        self.points = np.full((frames, count, 3), np.nan)
         self._pixels = np.full((frames, count, 2), np.nan)
-        self._visible = np.zeros((frames, count), dtype=bool)
-        self._points[0], self._pixels[0], self._visible[0] = self._first, self._start, True
+        self.visible = np.zeros((frames, count), dtype=bool)
+        self.points[0], self._pixels[0], self.visible[0] = self.first, self._start, True
         row, column = self._start[:, 1].astype(int), self._start[:, 0].astype(int)
         self._colours = colour[row, column]
         self._before = grey
         self._last_maps = np.tile(np.eye(2), (count, 1, 1))
         self._features = Features(grey, self._start)
 
-    def step(self, frame: int) -> None:
-        """The next frame."""
+    def step(self, frame: int, told: Array | None = None) -> None:
+        """The next frame.
+
+        Args:
+            frame: its number.
+            told: where other cameras put the points now [m], (n, 3), or None.
+        """
         config = self._config
         colour, depth = self._view.colour(frame), self._view.depth(frame)
         if colour.shape[:2] != self._shape or depth.shape != self._shape:
@@ -122,7 +137,7 @@ class _Tracker:
                 f"frame {frame}: colours {colour.shape[:2]} and depth {depth.shape} are not {self._shape}"
             )
         grey = cv2.cvtColor(np.ascontiguousarray(colour), cv2.COLOR_RGB2GRAY)
-        guess, maps = self._guess(grey, frame)
+        guess, maps = self._guess(grey, frame, told)
         picture = grey.astype(np.float32)
         near, rough = find(picture, self._coarse, guess, maps, 2.0)
         onward = self._onward(frame)
@@ -146,14 +161,17 @@ class _Tracker:
             & _apart(refined, again, 6.0)
             & (np.abs(np.linalg.det(maps)) > config.least_area)
         )
-        self._points[frame], self._visible[frame] = self._places.at(depth, refined, maps, seen)
-        self._pixels[frame] = np.where(self._visible[frame][:, None], refined, again)
+        self.points[frame], self.visible[frame] = self._places.at(depth, refined, maps, seen)
+        self._pixels[frame] = np.where(self.visible[frame][:, None], refined, again)
         self._before, self._last_maps = grey, maps
 
-    def _guess(self, grey: Array, frame: int) -> tuple[Array, Array]:
+    def _guess(self, grey: Array, frame: int, told: Array | None) -> tuple[Array, Array]:
         """Where points should be by the flow from the last frame and by their neighbours; the maps of their patches."""
         last = self._pixels[frame - 1]
-        known = self._visible[frame - 1]
+        known = self.visible[frame - 1]
+        if told is not None and known.mean() < self._config.told_below:
+            hinted, distance = self._view.camera.project(told)
+            return self._surroundings(np.where(distance[:, None] > 0, hinted, last), distance > 0, last)
         if known.mean() < self._config.rediscover_below:
             return self._rediscovered(grey, frame)
         there = to_opencv(last)
@@ -180,7 +198,7 @@ class _Tracker:
 
     def _rediscovered(self, grey: Array, frame: int) -> tuple[Array, Array]:
         """The same from features of the first frame that are found anywhere in the picture."""
-        last, known = self._pixels[frame - 1], self._visible[frame - 1]
+        last, known = self._pixels[frame - 1], self.visible[frame - 1]
         found, sure = self._features.find(grey)
         places = np.where(sure[:, None], found, last)
         return self._surroundings(places, sure | known, last)
@@ -200,7 +218,7 @@ class _Tracker:
 
     def tracks(self) -> Tracks:
         """What was found."""
-        return Tracks(self._points, self._visible, self._pixels, self._colours)
+        return Tracks(self.points, self.visible, self._pixels, self._colours)
 
 
 def _apart(one: Array, other: Array, most: float) -> Array:

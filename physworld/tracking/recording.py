@@ -15,10 +15,11 @@ from scipy.spatial import cKDTree
 from physworld.arrays import Array
 from physworld.errors import TrackingFailed
 from physworld.tracking.agreement import Agreement, agreement
-from physworld.tracking.given import GivenTracks, follow_given
+from physworld.tracking.given import GivenFollower, GivenTracks
 from physworld.tracking.mask import Box, Outline, mask_in_box, mask_near_cloud
-from physworld.tracking.places import TrackConfig, Tracks
-from physworld.tracking.points import follow
+from physworld.tracking.neighbours import carried
+from physworld.tracking.places import TrackConfig
+from physworld.tracking.points import Follower, follow
 from physworld.tracking.view import View, cloud_of
 
 CLOUD_CELL_M = 2.5e-3
@@ -103,7 +104,7 @@ def masks_of(
     if not outlines:
         raise TrackingFailed("where is the object? Give a box or a mask in the first frame of a camera")
     first = next(number for number, mask in enumerate(masks) if mask is not None)
-    agreements = agreement(views, first, outlines[0].mask) if len(views) > 1 else []
+    agreements = agreement(views, first, outlines[0].cloud()) if len(views) > 1 else []
     left_out = {}
     for number, view in enumerate(views):
         if masks[number] is None:
@@ -137,54 +138,64 @@ def follow_all(
     Raises:
         TrackingFailed: no camera can follow enough points.
     """
-    kept: list[tuple[int, Tracks, Array]] = []
+    config = config or TrackConfig()
     left_out = dict(masks.left_out)
-    shown = [number for number, mask in enumerate(masks.each) if mask is not None]
-    total = sum(views[number].frames for number in shown)
-    for place, number in enumerate(shown):
-        view, mask = views[number], masks.each[number]
-        assert mask is not None
-
-        def told(done: int, _all: int, before: int = place * view.frames, number: int = number) -> None:
-            progress(before + done, total, f"camera {number}")
-
+    followers: dict[int, Follower | GivenFollower] = {}
+    for number, (view, mask) in enumerate(zip(views, masks.each, strict=True)):
+        if mask is None:
+            continue
         try:
-            tracks = (
-                follow_given(view, mask, given[number], config, told)
+            followers[number] = (
+                GivenFollower(view, mask, given[number], config)
                 if given and number in given
-                else follow(view, mask, config, told)
+                else Follower(view, mask, config)
             )
         except TrackingFailed as error:
             left_out[number] = str(error)
-            continue
-        kept.append((number, tracks, mask))
-    if not kept:
+    if not followers:
         reasons = "; ".join(f"camera {number}: {reason}" for number, reason in sorted(left_out.items()))
         raise TrackingFailed(reasons or "no camera shows the object")
-    points = np.concatenate([tracks.points for _, tracks, _ in kept], axis=1)
-    visible = np.concatenate([tracks.visible for _, tracks, _ in kept], axis=1)
-    owner = np.concatenate([np.full(tracks.visible.shape[1], number) for number, tracks, _ in kept])
+    for frame in range(1, views[0].frames):
+        _step(followers, frame, config)
+        progress(frame + 1, views[0].frames, f"{len(followers)} cameras")
+    found = [(number, follower.tracks()) for number, follower in followers.items()]
+    points = np.concatenate([tracks.points for _, tracks in found], axis=1)
+    visible = np.concatenate([tracks.visible for _, tracks in found], axis=1)
+    owner = np.concatenate([np.full(tracks.visible.shape[1], number) for number, tracks in found])
     noise: list[float | None] = [None] * len(views)
-    for number, tracks, _ in kept:
+    for number, tracks in found:
         noise[number] = noise_of(tracks.points, tracks.visible)
     known = [sigma for sigma in noise if sigma]
     usual = float(np.median(known)) if known else 1.0
-    sigmas = np.array([sigma or usual for sigma in noise])
-    chosen, shared = distinct(points, visible, owner, sigmas)
-    clouds = [cloud_of(views[n].camera, views[n].depth(0), mask)[0] for n, _, mask in kept]
+    chosen, shared = distinct(points, visible, owner, np.array([sigma or usual for sigma in noise]))
+    outlines = [
+        cloud_of(view.camera, view.depth(0), mask)[0]
+        for view, mask in zip(views, masks.each, strict=True)
+        if mask is not None
+    ]
     return Followed(
         points[:, chosen],
         visible[:, chosen],
-        np.concatenate([tracks.colours for _, tracks, _ in kept])[chosen],
+        np.concatenate([tracks.colours for _, tracks in found])[chosen],
         owner[chosen],
-        thinned(np.concatenate(clouds), CLOUD_CELL_M),
+        thinned(np.concatenate(outlines), CLOUD_CELL_M),
         [np.zeros((0, 0), dtype=bool) if mask is None else mask for mask in masks.each],
-        np.concatenate([tracks.pixels for _, tracks, _ in kept], axis=1)[:, chosen],
+        np.concatenate([tracks.pixels for _, tracks in found], axis=1)[:, chosen],
         views,
         shared,
         noise,
         left_out,
     )
+
+
+def _step(followers: dict[int, Follower | GivenFollower], frame: int, config: TrackConfig) -> None:
+    """The next frame of all cameras, those that saw most in the last one first: they tell the others where to look."""
+    before = sorted(followers.values(), key=lambda one: -float(one.visible[frame - 1].mean()))
+    start, now = np.zeros((0, 3)), np.zeros((0, 3))
+    for one in before:
+        one.step(frame, carried(one.first, start, now, config.neighbours))
+        seen = one.visible[frame]
+        start, now = np.concatenate([start, one.first[seen]]), np.concatenate([now, one.points[frame, seen]])
 
 
 def patch_points(views: list[View], box: Box) -> Array:
@@ -238,7 +249,7 @@ def distinct(points: Array, visible: Array, owner: Array, noise_m: Array) -> tup
     """Indices of points that are seen long enough, every place once, and how many counted for another camera's.
 
     Two cameras' points are one place if they lie on each other in the first frame and stay together where both are
-    seen. The one that tells more stays: its sightings over its camera's squared noise.
+    seen. The one that is seen longer stays; if both are by a tenth of the frames, the one of the better camera.
 
     Args:
         points: [m], (T, N, 3).
@@ -255,7 +266,8 @@ def distinct(points: Array, visible: Array, owner: Array, noise_m: Array) -> tup
     reach = SAME_PLACE * float(np.median(spacing)) if spacing else 0.0
     pairs = cKDTree(first).query_pairs(reach, output_type="ndarray") if reach > 0 else np.zeros((0, 2), int)
     pairs = pairs[owner[pairs[:, 0]] != owner[pairs[:, 1]]]
-    worth = seen / noise_m[owner] ** 2
+    tenths = np.round(10.0 * seen / len(points))
+    worth = tenths - 0.5 * noise_m[owner] / noise_m.max()
     dropped = seen < LEAST_SHARE_SEEN * len(points)
     shared = 0
     for one, other in pairs[np.argsort(-worth[pairs].max(axis=1), kind="stable")]:

@@ -171,7 +171,8 @@ def _lens(path: Path) -> Array:
     content = _json(path)
     if isinstance(content, dict):
         return _columns(content, path.name)
-    return _expect(path.name, lambda: _matrix(content, 3))
+    matrix: Array = _expect(path.name, lambda: _matrix(content, 3))
+    return matrix
 
 
 def _place(path: Path) -> Array:
