@@ -12,6 +12,7 @@ same in all of a camera.
 
 from __future__ import annotations
 
+import io
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -178,12 +179,13 @@ def _natural(path: Path) -> tuple[list[tuple[int, str]], str]:
     return [(int(part), "") if part.isdigit() and len(part) < 19 else (-1, part) for part in parts], path.name
 
 
-def _size(path: Path) -> tuple[int, int]:
-    """Width and height of a picture, from its head."""
+def _size(path: Path, content: bytes | None = None) -> tuple[int, int]:
+    """Width and height of a picture, from its head, which is read from the file where there is no content."""
     from PIL import Image
 
     try:
-        with Image.open(path, formats=("PNG", "JPEG")) as picture:
+        source = path if content is None else io.BytesIO(content)
+        with Image.open(source, formats=("PNG", "JPEG")) as picture:
             size = picture.size
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise refused(path.name, f"is no picture: {str(error)[:160]}") from error
@@ -199,11 +201,12 @@ def _picture(path: Path, shape: tuple[int, int], mode: str | None) -> Array:
 
     if path.stat().st_size > MOST_FILE_BYTES:
         raise refused(path.name, f"has {path.stat().st_size} bytes, at most {MOST_FILE_BYTES} are read")
-    width, height = _size(path)
+    content = path.read_bytes()
+    width, height = _size(path, content)
     if (height, width) != shape:
         raise refused(path.name, f"has {width} x {height} pixels, the first picture {shape[1]} x {shape[0]}")
     try:
-        with Image.open(path, formats=("PNG", "JPEG")) as picture:
+        with Image.open(io.BytesIO(content), formats=("PNG", "JPEG")) as picture:
             if mode is None and picture.mode not in ("I;16", "I;16B", "I", "L", "F"):
                 raise refused(path.name, f"is a picture of colours ({picture.mode}), not of depth")
             return np.asarray(picture if mode is None else picture.convert(mode))
