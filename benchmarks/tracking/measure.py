@@ -128,8 +128,8 @@ def followed_exactly(vertices: Array, triangles: Array, places: Array) -> Array:
 def table(figures: list[dict[str, Any]]) -> str:
     """Markdown."""
     lines = [
-        "| recording | points | seen at 30, 60, last frame | surface covered [%] | median error [mm] | 95 % below [mm] | "
-        "grip [mm] | s |",
+        "| recording | points | seen at 30, 60, last frame | surface covered [%] | median error [mm] | "
+        "95 % below [mm] | grip [mm] | s |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     for row in figures:

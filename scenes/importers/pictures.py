@@ -267,6 +267,6 @@ IMPORTER = FolderImporter(
     "folder of pictures with depth",
     (),
     "one or several calibrated cameras, PhysTwin's or Open3D's layout; what is in a box is "
-    "followed: by `physworld import` alone",
+    "followed, or tracks/CAMERA.npz of another tracker is taken: by `physworld import` alone",
     is_pictures,
 )

@@ -339,29 +339,30 @@ def _say(scene: Scene, warnings: list[str], out: Path) -> None:
 
 
 def _draw(given: argparse.Namespace, followed: Followed) -> None:
-    """First and last picture of the first camera with mask and points: green seen, red not."""
+    """First and last picture of every camera with mask and points: green seen, red not."""
     from PIL import Image, ImageDraw
 
-    view = followed.views[0]
-    pictures = []
-    for frame in (0, view.frames - 1):
-        colour = view.colour(frame).copy()
-        if frame == 0 and followed.masks[0].size:
-            colour[followed.masks[0]] = colour[followed.masks[0]] // 2 + np.array(
-                [0, 60, 110], dtype=np.uint8
-            )
-        picture = Image.fromarray(colour)
-        pen = ImageDraw.Draw(picture)
-        for point in np.flatnonzero(followed.cameras == 0):
-            x, y = followed.pixels[frame, point]
-            if np.isfinite([x, y]).all():
-                pen.ellipse(
-                    (x - 2, y - 2, x + 2, y + 2), fill="lime" if followed.visible[frame, point] else "red"
-                )
-        pictures.append(np.asarray(picture))
+    rows = []
+    for number, (view, mask) in enumerate(zip(followed.views, followed.masks, strict=True)):
+        pictures = []
+        for frame in (0, view.frames - 1):
+            colour = view.colour(frame).copy()
+            if frame == 0 and mask.size:
+                colour[mask] = colour[mask] // 2 + np.array([0, 60, 110], dtype=np.uint8)
+            picture = Image.fromarray(colour)
+            pen = ImageDraw.Draw(picture)
+            for point in np.flatnonzero(followed.cameras == number):
+                x, y = followed.pixels[frame, point]
+                if np.isfinite([x, y]).all():
+                    seen = followed.visible[frame, point]
+                    pen.ellipse((x - 2, y - 2, x + 2, y + 2), fill="lime" if seen else "red")
+            pictures.append(np.asarray(picture))
+        rows.append(np.hstack(pictures))
+    widest = max(row.shape[1] for row in rows)
+    rows = [np.pad(row, ((0, 0), (0, widest - row.shape[1]), (0, 0))) for row in rows]
     given.picture.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(np.hstack(pictures)).save(given.picture)
-    print(f"{given.picture}: the first frame with the object's pixels, and the last")
+    Image.fromarray(np.vstack(rows)).save(given.picture)
+    print(f"{given.picture}: the first frame of every camera with the object's pixels, and the last")
 
 
 def _keep_pictures(folder: Path, followed: Followed) -> None:

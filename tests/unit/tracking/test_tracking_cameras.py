@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from tracking_pictured import BOTTOM, CAMERA, LEFT, NEAR_M, RIGHT, TOP, affine, view
+from tracking_pictured import FRAMES as PLATE_FRAMES
 
-from physworld.tracking.grips import joined
+from physworld.tracking.grips import colour_middles, joined, rigid_path
+from physworld.tracking.mask import Box
 from physworld.tracking.neighbours import carried
-from physworld.tracking.recording import distinct
+from physworld.tracking.places import TrackConfig
+from physworld.tracking.points import Follower
+from physworld.tracking.recording import distinct, patch_points
+from physworld.tracking.view import View, back_project
 
 FRAMES = 20
 
@@ -79,3 +87,52 @@ def test_others_carry_a_point_that_a_camera_lost() -> None:
     assert places is not None
     assert np.linalg.norm(places - (at @ turn.T + [0.1, 0.0, 0.05]), axis=1) == pytest.approx(0.0, abs=3e-3)
     assert carried(at, start[:4], now[:4], 10) is None
+
+
+def shown_in(frames: range) -> View:
+    """The plate, in a picture without depth in all other frames."""
+    whole = view()
+    return replace(
+        whole, depth=lambda frame: whole.depth(frame) if frame in frames else 0.0 * whole.depth(frame)
+    )
+
+
+def test_a_colour_and_a_patch_are_followed_by_all_cameras() -> None:
+    exact = back_project(CAMERA, middle_of(range(PLATE_FRAMES)), np.full(PLATE_FRAMES, NEAR_M))
+    views = [shown_in(range(8)), shown_in(range(PLATE_FRAMES))]
+    path = colour_middles(views, (80, 60))
+    assert np.linalg.norm(path - exact, axis=1).max() < 2e-3
+    assert np.isnan(colour_middles(views[:1], (80, 60))[8:]).all()
+    box = Box(LEFT + 4, TOP + 4, RIGHT - 4, BOTTOM - 4)
+    one, both = patch_points(views[:1], box), patch_points(views, box)
+    assert both.shape[1] > 1.5 * one.shape[1]
+    assert np.isnan(one[8:]).all() and np.isfinite(both[-1]).all(axis=1).sum() > 8
+    path = rigid_path(both).carry(exact[:1])[:, 0]
+    assert np.linalg.norm(path - exact, axis=1).max() < 2e-3
+
+
+def test_a_camera_that_lost_the_object_finds_it_where_the_others_say() -> None:
+    whole = view(frames=21)
+    dark = replace(
+        whole, colour=lambda frame: whole.colour(frame) if frame in (0, 20) else 0 * whole.colour(frame)
+    )
+    mask = np.zeros((120, 160), dtype=bool)
+    mask[TOP:BOTTOM, LEFT:RIGHT] = True
+    config = TrackConfig(points=40, patch_px=7, depth_px=3)
+    alone, told = Follower(dark, mask, config), Follower(dark, mask, config)
+    pixels, depth = CAMERA.project(told.first)
+    there = (pixels - 0.5) @ affine(20)[:, :2].T + affine(20)[:, 2] + 0.5
+    exact = back_project(CAMERA, there, depth)
+    for frame in range(1, 21):
+        alone.step(frame)
+        told.step(frame, exact + np.array([0.01, 0.0, 0.0]) if frame == 20 else None)
+    assert alone.visible[20].mean() < 0.2 and not told.visible[1:20].any()
+    assert told.visible[20].mean() > 0.8
+    seen = told.visible[20]
+    assert np.linalg.norm(told.points[20, seen] - exact[seen], axis=1).max() < 2e-3
+
+
+def middle_of(frames: range) -> np.ndarray:
+    """Pixels (T, 2) of the plate's middle."""
+    start = np.array([(LEFT + RIGHT) / 2, (TOP + BOTTOM) / 2]) - 0.5
+    return np.stack([affine(frame)[:, :2] @ start + affine(frame)[:, 2] + 0.5 for frame in frames])
