@@ -59,6 +59,14 @@ class Topology(Form):
     n: Annotated[int, Field(ge=1)] | None = None
 
 
+class TipLoad(Form):
+    """A mass that hangs from a solid, at a point or along a line, or where a text says in its declared box."""
+
+    mass_kg: Positive
+    place_m: Vector | tuple[Vector, Vector] | None = None
+    where: str | None = None
+
+
 class BodyForm(Form):
     """What is known of the object."""
 
@@ -76,6 +84,8 @@ class BodyForm(Form):
     self_contact: bool | None = None
     self_friction: Annotated[float, Field(allow_inf_nan=False, ge=0)] | None = None
     topology_change: bool | None = None
+    torsion_ratio: Annotated[float, Field(allow_inf_nan=False, ge=0)] | None = None
+    tip_load: TipLoad | None = None
 
 
 class GroundForm(Form):

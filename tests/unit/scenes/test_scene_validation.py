@@ -85,6 +85,9 @@ def test_a_sound_scene_has_neither_fault_nor_warning() -> None:
 
 FAULTS: list[tuple[str, Break, str, str]] = [
     ("a word for a flag", set_body(self_contact="no"), "self_contact", "boolean"),
+    ("a torsion below zero", set_body(torsion_ratio=-1.0), "torsion_ratio", "greater than or equal to 0"),
+    ("a load without a mass", set_body(tip_load={"where": "x = 0"}), "mass_kg", "is missing"),
+    ("a load in grams", set_body(tip_load={"mass_kg": "52 g"}), "mass_kg", "number"),
     ("a friction below zero", set_body(self_friction=-0.1), "self_friction", "greater than or equal to 0"),
     (
         "millimetres",
