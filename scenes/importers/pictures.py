@@ -123,7 +123,7 @@ def _view(
     kept = list(range(count))[frames or slice(None)]
     if len(kept) < 2:
         raise refused("color", f"camera {number} has {len(kept)} frames; a motion needs 2 or more")
-    height, width = film[0].shape[:2] if film is not None else _size(colour[0])[::-1]
+    height, width = film[0].shape[:2] if film is not None else size_of(colour[0])[::-1]
     pose = np.eye(4) if calibration.poses is None else np.linalg.inv(calibration.poses[number])
     matrix = calibration.matrices[number]
     try:
@@ -151,18 +151,18 @@ def _cameras_in(root: Path) -> list[list[Path]]:
     folders = [entry for entry in entries if entry.is_dir()]
     films = [entry for entry in entries if entry.suffix.lower() in FILMS]
     cameras = (
-        [_frames_in(entry) for entry in folders]
+        [frames_in(entry) for entry in folders]
         if folders
         else [[film] for film in films]
         if films
-        else [_frames_in(root)]
+        else [frames_in(root)]
     )
     if len(cameras) > MOST_CAMERAS:
         raise refused(root.name, f"{len(cameras)} cameras, at most {MOST_CAMERAS} are read")
     return cameras
 
 
-def _frames_in(folder: Path) -> list[Path]:
+def frames_in(folder: Path) -> list[Path]:
     files = [path for path in folder.iterdir() if path.suffix.lower() in PICTURES + ARRAYS and path.is_file()]
     kinds = sorted({path.suffix.lower() for path in files})
     if not files or len(files) > MOST_FRAMES:
@@ -178,7 +178,7 @@ def _natural(path: Path) -> tuple[list[tuple[int, str]], str]:
     return [(int(part), "") if part.isdigit() and len(part) < 19 else (-1, part) for part in parts], path.name
 
 
-def _size(path: Path) -> tuple[int, int]:
+def size_of(path: Path) -> tuple[int, int]:
     """Width and height of a picture, from its head."""
     from PIL import Image
 
@@ -194,12 +194,12 @@ def _size(path: Path) -> tuple[int, int]:
     return size
 
 
-def _picture(path: Path, shape: tuple[int, int], mode: str | None) -> Array:
+def picture_of(path: Path, shape: tuple[int, int], mode: str | None) -> Array:
     from PIL import Image
 
     if path.stat().st_size > MOST_FILE_BYTES:
         raise refused(path.name, f"has {path.stat().st_size} bytes, at most {MOST_FILE_BYTES} are read")
-    width, height = _size(path)
+    width, height = size_of(path)
     if (height, width) != shape:
         raise refused(path.name, f"has {width} x {height} pixels, the first picture {shape[1]} x {shape[0]}")
     try:
@@ -212,7 +212,7 @@ def _picture(path: Path, shape: tuple[int, int], mode: str | None) -> Array:
 
 
 def _colours(path: Path, shape: tuple[int, int]) -> Array:
-    return _picture(path, shape, "RGB")
+    return picture_of(path, shape, "RGB")
 
 
 def _depth(path: Path, shape: tuple[int, int], scale: float | None) -> Array:
@@ -225,7 +225,7 @@ def _depth(path: Path, shape: tuple[int, int], scale: float | None) -> Array:
         except ArchiveRefused as error:
             raise refused(path.name, str(error)) from error
     else:
-        values = _picture(path, shape, None)
+        values = picture_of(path, shape, None)
     if values.shape != shape:
         raise refused(path.name, f"has shape {values.shape}, colours have {shape}")
     whole = values.dtype.kind in "iu"

@@ -125,7 +125,7 @@ def read_folder(
         recording, ground, up = _upright(recording, given, warnings)
         views = recording.views
         boxes = [given.boxes.get(number) for number in range(len(views))]
-        made = [_mask(given.masks.get(number), view.camera) for number, view in enumerate(views)]
+        made = [mask_file(given.masks.get(number), view.camera) for number, view in enumerate(views)]
         masks = masks_of(views, boxes, made, None if ground is None else ground.height)
         followed = follow_all(views, masks, TrackConfig(points=given.points), told)
         fps = options.fps or recording.fps
@@ -133,7 +133,7 @@ def read_folder(
             fps = DEFAULT_FPS
             warnings.append(f"the folder says no rate: {fps:g} frames per second are assumed")
         times = np.arange(views[0].frames) / fps
-        path = None if given.grip is None else _path(views, given.grip, times)
+        path = None if given.grip is None else gripper_path(views, given.grip, times)
     except TrackingFailed as error:
         raise refused(folder.name, str(error)) from error
     declared, arrays = _parts(folder, options, given, recording, followed, path, ground, fps, warnings)
@@ -198,7 +198,7 @@ def _in_world(view: View, world_to_camera: Array) -> View:
     return replace(view, camera=replace(view.camera, world_to_camera=world_to_camera))
 
 
-def _mask(path: Path | None, camera: Camera) -> Array | None:
+def mask_file(path: Path | None, camera: Camera) -> Array | None:
     from PIL import Image
 
     if path is None:
@@ -214,7 +214,7 @@ def _mask(path: Path | None, camera: Camera) -> Array | None:
         raise refused(path.name, f"is no mask: {str(error)[:160]}") from error
 
 
-def _path(views: list[View], grip: GripFrom, times: Array) -> RigidPath:
+def gripper_path(views: list[View], grip: GripFrom, times: Array) -> RigidPath:
     """The gripper's motion from what tells it."""
     if grip.marker is not None:
         number = None if grip.marker < 0 else grip.marker
