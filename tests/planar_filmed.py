@@ -15,11 +15,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-WIDTH, HEIGHT, FOCAL, FPS, FRAMES = 480, 360, 520.0, 50, 16
-SQUARES, SQUARE_M, MARKER_M = (5, 4), 0.06, 0.045
+WIDTH, HEIGHT, FOCAL, FPS, FRAMES = 480, 360, 520.0, 50, 9
+SQUARES, SQUARE_M, MARKER_M = (7, 5), 0.045, 0.034
 BOARD = f"charuco:{SQUARES[0]}x{SQUARES[1]}:{SQUARE_M}:{MARKER_M}"
 CLAMP, LENGTH_M, HALF_M = np.array([0.04, 0.13]), 0.2, 0.016
-CURVATURE = 3.5
+CURVATURE = 2.5
 """The largest [1/m]."""
 TEXEL_M = 0.5e-3
 
@@ -47,9 +47,9 @@ class Film:
 
     def frame(self, number: int) -> np.ndarray:
         """Colours (H, W, 3) uint8."""
-        rays, board = _background(self)
-        colour = board.copy()
-        material, inside = unbent(self.meet(rays, self.lean(number)), curvature(number))
+        rays, flat, board = _background(self)
+        colour, lean = board.copy(), self.lean(number)
+        material, inside = unbent(self.meet(rays, lean) if lean else flat, curvature(number))
         colour[inside] = _strip_colour(material[inside])
         picture = colour.reshape(2 * HEIGHT, 2 * WIDTH, 3)
         picture = cv2.resize(picture, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
@@ -101,7 +101,14 @@ class Film:
 
     def write_lens(self, path: Path) -> Path:
         """Its camera as JSON."""
-        facts = {"width": WIDTH, "height": HEIGHT, "fx": FOCAL, "fy": FOCAL, "cx": WIDTH / 2, "cy": HEIGHT / 2}
+        facts = {
+            "width": WIDTH,
+            "height": HEIGHT,
+            "fx": FOCAL,
+            "fy": FOCAL,
+            "cx": WIDTH / 2,
+            "cy": HEIGHT / 2,
+        }
         path.write_text(json.dumps({**facts, "distortion": [self.distortion, 0, 0, 0]}))
         return path
 
@@ -123,7 +130,9 @@ def bent(material: np.ndarray, bend: float) -> np.ndarray:
         return CLAMP + material
     radius = 1.0 / bend
     angle = along * bend
-    return CLAMP + np.stack([(radius - across) * np.sin(angle), radius - (radius - across) * np.cos(angle)], 1)
+    return CLAMP + np.stack(
+        [(radius - across) * np.sin(angle), radius - (radius - across) * np.cos(angle)], 1
+    )
 
 
 def unbent(places: np.ndarray, bend: float) -> tuple[np.ndarray, np.ndarray]:
@@ -141,14 +150,15 @@ def unbent(places: np.ndarray, bend: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 @lru_cache(maxsize=4)
-def _background(film: Film) -> tuple[np.ndarray, np.ndarray]:
-    """Rays (P, 3) of pixels twice as dense, and the board's colour there (P, 3)."""
+def _background(film: Film) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rays (P, 3) of pixels twice as dense, where they meet the plane (P, 2), and the board's colour there (P, 3)."""
     rows, columns = np.mgrid[: 2 * HEIGHT, : 2 * WIDTH]
     pixels = np.stack([columns.ravel(), rows.ravel()], axis=1) / 2.0 - 0.25
     bend = np.array([film.distortion, 0, 0, 0.0])
     rays = cv2.undistortPoints(pixels[:, None].astype(np.float64), lens_matrix(), bend)[:, 0]
     rays = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
-    return rays, _board_colour(film.meet(rays, 0.0))
+    flat = film.meet(rays, 0.0)
+    return rays, flat, _board_colour(flat)
 
 
 def _strip_colour(material: np.ndarray) -> np.ndarray:

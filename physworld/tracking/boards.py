@@ -97,14 +97,13 @@ def find_board(view: View, board: Board, focal_known: bool) -> BoardSeen:
         grey = cv2.cvtColor(np.ascontiguousarray(view.colour(int(frame))), cv2.COLOR_RGB2GRAY)
         corners, pixels, numbers = find(grey)
         others |= numbers
-        if len(corners) < LEAST_CORNERS:
-            continue
-        found += 1
+        found += len(corners) > 0
         for corner, pixel in zip(corners, pixels, strict=True):
             places.setdefault(tuple(np.round(corner[:2], 9)), []).append((int(frame), pixel))
-    if not found:
+    if len(places) < LEAST_CORNERS:
         raise TrackingFailed(
-            f"no {board} is found in {len(looked)} of {len(looked)} frames that were looked at; "
+            f"no {board} is found in {len(looked) - found} of {len(looked)} frames that were looked at, and "
+            f"{len(places)} of its corners in all, {LEAST_CORNERS} are needed; "
             f"markers seen of that dictionary: {sorted(others) or 'none'}"
         )
     corners = np.array([(*corner, 0.0) for corner in places])
@@ -163,7 +162,8 @@ def _drift(seen: list[list[tuple[int, Array]]], medians: Array) -> float:
     for places, median in zip(seen, medians, strict=True):
         for frame, pixel in places:
             off.setdefault(frame, []).append(pixel - median)
-    return max(float(np.linalg.norm(np.median(moved, axis=0))) for moved in off.values())
+    together = [np.median(moved, axis=0) for moved in off.values() if len(moved) >= LEAST_CORNERS]
+    return max((float(np.linalg.norm(shift)) for shift in together), default=0.0)
 
 
 def _pose(camera: Camera, corners: Array, pixels: Array) -> Plane:

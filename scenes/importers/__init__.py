@@ -93,9 +93,7 @@ def importer_of(data: bytes, name: str = "", options: ImportOptions | None = Non
         if importer.recognises(data, name):
             return importer
     if film.begins_as_film(data):
-        message = (
-            "is a film, in which the service follows nothing: `physworld import FILM` makes a scene of it to upload"
-        )
+        message = "is a film, in which the service follows nothing: `physworld import` makes a scene of it to upload"
         raise SceneInvalid([FieldError(loc=[name or "file"], msg=message)])
     start = data[:8].hex(" ") or "nothing"
     forms = ", nor ".join(importer.title for importer in IMPORTERS)

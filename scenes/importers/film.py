@@ -46,6 +46,7 @@ class Filmed:
 
     Attributes:
         view: pictures without the lens' distortion; the camera at the origin, no depth.
+        first: picture as it was taken, (H, W, 3) uint8.
         times: of the frames since the first [s], (T,), or None: the pictures do not say.
         lens_known: whether the focal length is a given one.
         matrix: with which it took its pictures, (3, 3), OpenCV's pixels.
@@ -53,6 +54,7 @@ class Filmed:
     """
 
     view: View
+    first: Array
     times: Array | None
     lens_known: bool
     matrix: Array
@@ -133,7 +135,7 @@ def read_film(path: Path, lens: Path | None = None, frames: slice | None = None)
         lambda frame: np.zeros((height, width), dtype=np.float32),
         count,
     )
-    return Filmed(view, times, lens is not None, matrix, distortion)
+    return Filmed(view, taken(0), times, lens is not None, matrix, distortion)
 
 
 def _at_least_two(name: str, all_of_them: list[Any], frames: slice) -> list[Any]:

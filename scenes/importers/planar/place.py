@@ -144,14 +144,13 @@ def mask_of(filmed: Filmed, placed: Placed, given: PictureOptions) -> Array:
     view = placed.view
     if others := sorted({*given.boxes, *given.masks} - {0}):
         raise refused("box", f"is of camera {others[0]}; a film has camera 0 alone")
-    made, box = mask_file(given.masks.get(0), view.camera), given.boxes.get(0)
-    if made is not None:
-        mask = filmed.straight_mask(made)
-    elif box is not None:
+    mask, box = mask_file(given.masks.get(0), view.camera), given.boxes.get(0)
+    if mask is None:
+        if box is None:
+            raise TrackingFailed("where is the object? Give a box or a mask in the first frame")
         flat = np.full((view.camera.height, view.camera.width), placed.distance_m)
-        mask = mask_in_box(view.colour(0), flat, view.camera, straight_box(filmed, box))
-    else:
-        raise TrackingFailed("where is the object? Give a box or a mask in the first frame")
+        mask = mask_in_box(filmed.first, flat, view.camera, box)
+    mask = filmed.straight_mask(mask)
     on_plane: Array = mask & (view.depth(0) > 0)
     if not on_plane.any():
         raise TrackingFailed(f"none of the object's {int(mask.sum())} pixels meets the plane")
