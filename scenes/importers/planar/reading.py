@@ -42,6 +42,8 @@ from physworld_scenes.importers.rgbd import (
 )
 
 STRETCH_WARNING = 0.03
+LEAST_NOISE_PX = 0.05
+"""Films repeat what hardly changes, so that places at rest differ by nothing; no patch is found better than this."""
 DESCRIPTION = (
     "tracked in the pictures of one camera, on a declared plane; motion out of the plane is not seen, and the noise is "
     "that in the plane"
@@ -171,8 +173,7 @@ def _declared(
     behind: float,
 ) -> dict[str, Any]:
     """What ``scene.json`` holds, but its grips."""
-    in_plane = np.flatnonzero(np.abs(placed.axes[2]) < 0.5)
-    noise = options.noise_sigma_m or estimate_noise(followed.points[..., in_plane], followed.visible)
+    noise, how = _noise(options, placed, followed)
     return {
         "schema_version": 1,
         "name": options.name or path.stem or "film",
@@ -195,6 +196,18 @@ def _declared(
             "gripper": None if way is None else {
                 "frames_seen": int(way.seen.sum()), "deviation_from_rigid_m": way.misfit_m,
             },
-            "noise": "given" if options.noise_sigma_m else "in the plane, upper estimate from third differences",
+            "noise": how,
         },
     }  # fmt: skip
+
+
+def _noise(options: ImportOptions, placed: Placed, followed: Followed) -> tuple[float | None, str]:
+    """Deviation per axis of the plane [m], and how it is known."""
+    if options.noise_sigma_m:
+        return options.noise_sigma_m, "given"
+    in_plane = np.flatnonzero(np.abs(placed.axes[2]) < 0.5)
+    noise = estimate_noise(followed.points[..., in_plane], followed.visible)
+    least = LEAST_NOISE_PX * placed.pixel_m(followed.masks[0])
+    if noise is None or noise < least:
+        return least, f"in the plane, {LEAST_NOISE_PX:g} px: frames of a film that repeat show none"
+    return noise, "in the plane, upper estimate from third differences"
