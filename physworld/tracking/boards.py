@@ -142,7 +142,7 @@ def _finder(board: Board) -> Finder:
 
         return squares
     numbers = np.arange(board.first, board.first + board.columns * board.rows)
-    grid = cv2.aruco.GridBoard(size, board.marker_m, max(board.gap_m, 1e-6), dictionary, numbers)
+    grid = cv2.aruco.GridBoard(size, board.marker_m, board.gap_m or board.marker_m, dictionary, numbers)
     detector = cv2.aruco.ArucoDetector(dictionary, parameters)
 
     def markers(grey: Array) -> tuple[Array, Array, set[int]]:

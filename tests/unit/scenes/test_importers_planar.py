@@ -118,7 +118,7 @@ def test_a_plumb_line_turns_the_world_and_a_table_lies_level(strip: Path, tmp_pa
     plumb = ",".join(f"{value:.3f}" for value in ends)
     hung = imported(strip, tmp_path / "hung", f"--board={BOARD}", f"--plumb={plumb}")
     along = np.linalg.svd(in_plane(hung)[0] - in_plane(hung)[0].mean(axis=0))[2][0]
-    assert abs(np.degrees(np.arctan(along[1] / along[0]))) == pytest.approx(30.0, abs=0.5)
+    assert np.degrees(np.arctan(along[1] / along[0])) == pytest.approx(-30.0, abs=0.5)
     flat = imported(strip, tmp_path / "flat", f"--board={BOARD}", "--up=z")
     assert np.abs(flat.points[flat.visible][:, 2]).max() < 1e-9
     assert flat.ground is not None and flat.ground.height_m == pytest.approx(-0.01)
@@ -139,6 +139,29 @@ def test_a_grip_holds_the_strip_where_it_is_clamped(strip: Path, tmp_path: Path)
     assert grip.region_min_m[1] < 0.0 and grip.region_max_m[1] > 0.01
     # it bends 30 mm of the strip by a millimetre
     assert np.abs(scene.controllers - scene.controllers[0]).max() < 2.5e-3
+
+
+def test_markers_and_colours_tell_a_gripper_on_the_plane(
+    strip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    still = imported(strip, tmp_path / "still", f"--board={BOARD}", "--up=y", "--marker=13")
+    assert still.controllers.shape == (FRAMES, 4, 3)
+    assert np.linalg.norm(still.controllers[0, 0] - still.controllers[0, 1]) == pytest.approx(
+        filmed.MARKER_M, rel=0.02
+    )
+    assert np.abs(still.controllers - still.controllers[0]).max() < 0.3e-3
+    assert "what the gripper holds is not said" in capsys.readouterr().out
+    at = Film().pixel(CLAMP + np.array([[0.1, 0.0]]))[0].round().astype(int)
+    moving = imported(strip, tmp_path / "moving", f"--board={BOARD}", "--up=y", f"--colour={at[0]},{at[1]}")
+    middle = np.stack([filmed.bent(_material(), filmed.curvature(t)).mean(axis=0) for t in range(FRAMES)])
+    gone = moving.controllers[:, 0, [0, 2]] - moving.controllers[0, 0, [0, 2]]
+    # a path is smoothed over five frames, which is half of this film
+    assert np.corrcoef(gone[:, 1], (middle - middle[0])[:, 1])[0, 1] > 0.9
+
+
+def _material() -> np.ndarray:
+    along, across = np.meshgrid(np.linspace(0, LENGTH_M, 50), np.linspace(-HALF_M, HALF_M, 9))
+    return np.stack([along.ravel(), across.ravel()], axis=1)
 
 
 def test_motion_out_of_the_plane_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
