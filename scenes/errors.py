@@ -16,3 +16,8 @@ class SceneInvalid(PhysworldError):
     def __init__(self, faults: Sequence[FieldError]) -> None:
         super().__init__("; ".join(f"{'.'.join(map(str, fault.loc))}: {fault.msg}" for fault in faults))
         self.faults = list(faults)
+
+
+def refused(where: str, message: str) -> SceneInvalid:
+    """The error of one fault at one place."""
+    return SceneInvalid([FieldError(loc=[where], msg=message)])

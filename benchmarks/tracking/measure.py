@@ -1,5 +1,5 @@
-"""How well a recording of known truth was followed: points seen and their error against the frame, the gripper,
-the time.
+"""How well a recording of known truth was followed: points seen and their error against the frame, how much of the
+body they cover, the gripper, the time.
 
 A point's truth is the material point of the surface that lies nearest to where it was measured in the first frame.
 Errors are distances [mm] of the points that are called visible.
@@ -15,15 +15,19 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from scipy.spatial import cKDTree
 
 from benchmarks.tracking.plays import MARKER_ID
 from physworld.arrays import Array
 from physworld.scene import Scene
 from physworld.tracking.mask import Box
+from physworld_scenes.importers.gripping import GripFrom
 from physworld_scenes.importers.options import ImportOptions
-from physworld_scenes.importers.rgbd import GripFrom, PictureOptions, read_folder
+from physworld_scenes.importers.rgbd import PictureOptions, read_folder
 
 MILLIMETRES = 1e3
+NEAR_M = 0.01
+"""From a seen point: what of the surface counts as covered."""
 
 
 @dataclass(frozen=True)
@@ -83,6 +87,8 @@ def score(folder: Path, scene: Scene, seconds: float) -> Score:
         {
             "recording": folder.name,
             "points": scene.points.shape[1],
+            "seen": {str(t): int(scene.visible[t].sum()) for t in asked},
+            "covered": {str(t): round(covered(vertices[t], scene, t), 3) for t in asked},
             "alive": {str(t): round(float(alive[t]), 3) for t in asked},
             "median_mm": {str(t): round(float(median[t]), 2) for t in asked},
             "p95_mm": {str(t): round(float(high[t]), 2) for t in asked},
@@ -93,6 +99,12 @@ def score(folder: Path, scene: Scene, seconds: float) -> Score:
             "seconds": round(seconds, 1),
         },
     )
+
+
+def covered(surface: Array, scene: Scene, frame: int) -> float:
+    """Share of the surface's vertices (V, 3) [m] of a frame with a seen point nearby."""
+    distance, _ = cKDTree(scene.points[frame, scene.visible[frame]]).query(surface)
+    return float((distance < NEAR_M).mean())
 
 
 def followed_exactly(vertices: Array, triangles: Array, places: Array) -> Array:
@@ -116,15 +128,17 @@ def followed_exactly(vertices: Array, triangles: Array, places: Array) -> Array:
 def table(figures: list[dict[str, Any]]) -> str:
     """Markdown."""
     lines = [
-        "| recording | points | seen at 30, 60, last frame [%] | median error [mm] | 95 % below [mm] | grip [mm] | s |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
+        "| recording | points | seen at 30, 60, last frame | surface covered [%] | median error [mm] | "
+        "95 % below [mm] | grip [mm] | s |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     for row in figures:
-        seen = ", ".join(f"{100 * value:.0f}" for value in row["alive"].values())
+        seen = ", ".join(str(value) for value in row["seen"].values())
+        near = ", ".join(f"{100 * value:.0f}" for value in row["covered"].values())
         median = ", ".join(f"{value:.2f}" for value in row["median_mm"].values())
         high = ", ".join(f"{value:.1f}" for value in row["p95_mm"].values())
         lines.append(
-            f"| {row['recording']} | {row['points']} | {seen} | {median} | {high} | "
+            f"| {row['recording']} | {row['points']} | {seen} | {near} | {median} | {high} | "
             f"{row['grip_rms_mm']:.2f} | {row['seconds']:.0f} |"
         )
     return "\n".join(lines) + "\n"

@@ -40,10 +40,10 @@ def score_splat(folder: Path, config: SplatConfig | None = None, whole: bool = F
     facts, truth = json.loads((folder / "truth.json").read_text()), np.load(folder / "truth.npz")
     vertices = truth["vertices"].astype(np.float64)
     views = read_pictures(folder, None, slice(0, None)).views
-    masks = [None] * len(views)
+    masks: list[Any] = [None] * len(views)
     if not whole:
         boxes = [Box(*facts["box_px"]) if number == 0 else None for number in range(len(views))]
-        masks = masks_of(views, boxes, [None] * len(views), None)
+        masks = masks_of(views, boxes, [None] * len(views), None).each
     shown = [
         SplatView(view.camera, view.colour(0), mask, view.depth(0))
         for view, mask in zip(views, masks, strict=True)

@@ -29,10 +29,11 @@ from physworld.scene import Scene
 from physworld.tracking.mask import Box
 from physworld.tracking.plane import stretch
 from physworld.tracking.recording import Followed
+from physworld_scenes.importers.gripping import GripFrom
 from physworld_scenes.importers.options import ImportOptions
 from physworld_scenes.importers.planar.place import PlaneFrom
 from physworld_scenes.importers.planar.reading import read_planar
-from physworld_scenes.importers.rgbd import GripFrom, PictureOptions
+from physworld_scenes.importers.rgbd import PictureOptions
 
 PACKAGE, MEMBER = "stytra==0.8.34", "stytra/examples/assets/fish_compressed.h5"
 ENLARGED = 4

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from physworld.arrays import Array
 from physworld.errors import TrackingFailed
 from physworld.tracking.depth import on_plane, plane_in
-from physworld.tracking.view import View, from_opencv
+from physworld.tracking.view import View, from_opencv, to_opencv
 
 SMOOTHED_FRAMES = 5
 """Of the Savitzky-Golay filter, of order 2: it leaves a constant acceleration as it is."""
@@ -54,12 +54,12 @@ class RigidPath:
         return carried
 
 
-def marker_corners(view: View, identity: int | None = None, dictionary: str = "4X4_50") -> Array:
-    """Corners of an ArUco or AprilTag marker in every frame [m], (T, 4, 3), nan where it is not seen.
+def marker_corners(views: list[View], identity: int | None = None, dictionary: str = "4X4_50") -> Array:
+    """Corners of an ArUco or AprilTag marker in every frame [m], (T, 4, 3), nan where no camera sees it.
 
     Args:
-        view: the recording.
-        identity: the marker's number; None: whichever is seen first.
+        views: the cameras.
+        identity: the marker's number; None: whichever the first camera that sees one sees first.
         dictionary: of ``DICTIONARIES``.
 
     Raises:
@@ -72,23 +72,27 @@ def marker_corners(view: View, identity: int | None = None, dictionary: str = "4
     detector = cv2.aruco.ArucoDetector(
         cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{dictionary}")), parameters
     )
-    corners, seen_of = np.full((view.frames, 4, 3), np.nan), set()
-    for frame in range(view.frames):
-        grey = cv2.cvtColor(np.ascontiguousarray(view.colour(frame)), cv2.COLOR_RGB2GRAY)
-        found, identities, _ = detector.detectMarkers(grey)
-        numbers = [] if identities is None else [int(n) for n in np.ravel(identities)]
-        seen_of |= set(numbers)
-        if identity is None and numbers:
-            identity = numbers[0]
-        if identity in numbers:
-            quad = np.asarray(found[numbers.index(identity)], dtype=np.float64).reshape(4, 2)
-            corners[frame] = _in_space(view, frame, quad)
-    if np.isnan(corners).all():
+    paths, seen_of = [], set()
+    for view in views:
+        corners = np.full((view.frames, 4, 3), np.nan)
+        for frame in range(view.frames):
+            grey = cv2.cvtColor(np.ascontiguousarray(view.colour(frame)), cv2.COLOR_RGB2GRAY)
+            found, identities, _ = detector.detectMarkers(grey)
+            numbers = [] if identities is None else [int(n) for n in np.ravel(identities)]
+            seen_of |= set(numbers)
+            if identity is None and numbers:
+                identity = numbers[0]
+            if identity in numbers:
+                quad = np.asarray(found[numbers.index(identity)], dtype=np.float64).reshape(4, 2)
+                corners[frame] = _in_space(view, frame, quad)
+        paths.append(corners)
+    if np.isnan(paths).all():
         named = "no marker" if identity is None else f"marker {identity} of {dictionary}"
         raise TrackingFailed(
-            f"{named} is seen; seen were {sorted(seen_of) or 'none'} in {view.frames} frames"
+            f"{named} is seen; seen were {sorted(seen_of) or 'none'} in {views[0].frames} frames"
+            + (f" of {len(views)} cameras" if len(views) > 1 else "")
         )
-    return corners
+    return joined(paths)
 
 
 def _in_space(view: View, frame: int, quad: Array) -> Array:
@@ -148,51 +152,92 @@ def rigid_path(points: Array, smoothed_frames: int = SMOOTHED_FRAMES) -> RigidPa
 
 
 def joined(paths: list[Array]) -> Array:
-    """Corners (T, 4, 3) of one marker seen by several cameras: the mean of those that see it."""
+    """One path (T, Q, 3) of points that several cameras see, nan where none does.
+
+    Cameras that are calibrated a little differently put the same points a little apart: without these shifts, which
+    are those of the frames that a camera shares with the one that sees most, the path does not jump where one loses
+    sight. The mean of the shifts stays.
+
+    Args:
+        paths: of each camera [m], (T, Q, 3), nan where it does not see them.
+    """
     stacked = np.stack(paths)
-    count = np.isfinite(stacked).all(axis=(2, 3)).sum(axis=0)
-    total = np.nansum(stacked, axis=0)
+    known: Array = np.asarray(np.isfinite(stacked).all(axis=(2, 3)))
+    most = int(np.argmax(known.sum(axis=1)))
+    shared = known & known[most]
+    shifts = [
+        np.median((path - paths[most])[both].mean(axis=1), axis=0) if both.any() else np.full(3, np.nan)
+        for path, both in zip(paths, shared, strict=True)
+    ]
+    told: Array = np.asarray(np.isfinite(np.stack(shifts)).all(axis=1))
+    shift = np.where(told[:, None], np.stack(shifts) - np.stack(shifts)[told].mean(axis=0), 0.0)
+    count = known.sum(axis=0)
+    total = np.where(known[..., None, None], stacked - shift[:, None, None], 0.0).sum(axis=0)
     return np.where(count[:, None, None] > 0, total / np.maximum(count, 1)[:, None, None], np.nan)
 
 
-def colour_middles(view: View, at: tuple[int, int], tolerance: int = 12, least_pixels: int = 20) -> Array:
-    """The middle of what has one colour, in every frame [m], (T, 3), nan where there is none.
+def colour_middles(
+    views: list[View], at: tuple[int, int], tolerance: int = 12, least_pixels: int = 20
+) -> Array:
+    """The middle of what has one colour, in every frame [m], (T, 3), nan where no camera sees any.
 
     Args:
-        view: the recording.
-        at: column and row of a pixel of the gripper in the first frame.
+        views: the cameras; the others look for the colour where the first one sees it.
+        at: column and row of a pixel of the gripper in the first camera's first frame.
         tolerance: of the hue, of 180; of saturation and brightness five times as much.
         least_pixels: fewer are nothing.
     """
-    first = cv2.cvtColor(np.ascontiguousarray(view.colour(0)), cv2.COLOR_RGB2HSV)
+    first = cv2.cvtColor(np.ascontiguousarray(views[0].colour(0)), cv2.COLOR_RGB2HSV)
     column, row = at
     patch = first[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3].reshape(-1, 3)
     if not len(patch):
         raise TrackingFailed(
             f"the pixel {column},{row} is outside of the picture {first.shape[1]} x {first.shape[0]}"
         )
-    wanted = np.median(patch, axis=0)
-    middles = np.full((view.frames, 3), np.nan)
-    place: Array = np.array([column, row], dtype=float)
-    for frame in range(view.frames):
-        hsv = cv2.cvtColor(np.ascontiguousarray(view.colour(frame)), cv2.COLOR_RGB2HSV).astype(int)
-        hue = np.abs((hsv[..., 0] - wanted[0] + 90) % 180 - 90)
-        alike = (hue <= tolerance) & (np.abs(hsv[..., 1:] - wanted[1:]) <= 5 * tolerance).all(axis=2)
-        count, labels, facts, centres = cv2.connectedComponentsWithStats(
-            alike.astype(np.uint8), connectivity=8
-        )
-        large = [n for n in range(1, count) if facts[n, cv2.CC_STAT_AREA] >= least_pixels]
-        if not large:
-            continue
-        near = min(large, key=lambda n: float(np.linalg.norm(centres[n] - place)))
-        depth = view.depth(frame)
-        rows, columns = np.nonzero((labels == near) & (depth > 0))
-        if len(rows) >= least_pixels // 2:
-            plane = plane_in(depth, view.camera, rows, columns)
-            place = centres[near]
-            if plane is not None:
-                middles[frame] = on_plane(plane, view.camera, from_opencv(place)[None])[0]
-    return middles
+    like = _Colour(np.median(patch, axis=0), tolerance, least_pixels)
+    paths = [like.middles(views[0], np.array([column, row], dtype=float))]
+    known = np.flatnonzero(np.isfinite(paths[0]).all(axis=1))
+    for view in views[1:]:
+        if not len(known) or known[0] > 0:
+            break
+        pixel, distance = view.camera.project(paths[0][:1])
+        if distance[0] > 0:
+            paths.append(like.middles(view, to_opencv(pixel[0]).astype(float)))
+    return joined([path[:, None] for path in paths])[:, 0]
+
+
+@dataclass(frozen=True)
+class _Colour:
+    """What is looked for: hue, saturation, brightness (3,), how near, and how many pixels at least."""
+
+    wanted: Array
+    tolerance: int
+    least_pixels: int
+
+    def middles(self, view: View, place: Array) -> Array:
+        """Of the part of that colour which is nearest to ``place`` [px], (2,), and to where it was in the last
+        frame; (T, 3)."""
+        middles = np.full((view.frames, 3), np.nan)
+        for frame in range(view.frames):
+            hsv = cv2.cvtColor(np.ascontiguousarray(view.colour(frame)), cv2.COLOR_RGB2HSV).astype(int)
+            hue = np.abs((hsv[..., 0] - self.wanted[0] + 90) % 180 - 90)
+            alike = hue <= self.tolerance
+            alike &= (np.abs(hsv[..., 1:] - self.wanted[1:]) <= 5 * self.tolerance).all(axis=2)
+            count, labels, facts, centres = cv2.connectedComponentsWithStats(
+                alike.astype(np.uint8), connectivity=8
+            )
+            large = [n for n in range(1, count) if facts[n, cv2.CC_STAT_AREA] >= self.least_pixels]
+            if not large:
+                continue
+            near = min(large, key=lambda n: float(np.linalg.norm(centres[n] - place)))
+            depth = view.depth(frame)
+            rows, columns = np.nonzero((labels == near) & (depth > 0))
+            if len(rows) >= self.least_pixels // 2:
+                plane = plane_in(depth, view.camera, rows, columns)
+                place = centres[near]
+                if plane is not None:
+                    middles[frame] = on_plane(plane, view.camera, from_opencv(place)[None])[0]
+        return middles
 
 
 def translated(middles: Array, smoothed_frames: int = SMOOTHED_FRAMES) -> RigidPath:

@@ -45,14 +45,16 @@ def ground_plane(points: Array, up: Array, eye: Array, steepest_deg: float = 60.
     Args:
         points: places of pixels outside of the object [m], (P, 3).
         up: about which direction is up, (3,); in a camera's frame -y.
-        eye: the camera's place [m], (3,).
+        eye: the camera's place [m], (3,), or of every point the place of the camera that saw it, (P, 3).
         steepest_deg: how far its normal may be from ``up``.
     """
     if len(points) < 100:
         return None
     rng = np.random.default_rng(0)
-    points = points[rng.permutation(len(points))[:SAMPLED]]
-    bound = INLIER_SHARE * ((points - eye) ** 2).sum(axis=1)
+    chosen = rng.permutation(len(points))[:SAMPLED]
+    eyes = np.broadcast_to(eye, points.shape)[chosen]
+    points, eye = points[chosen], eyes.mean(axis=0)
+    bound = INLIER_SHARE * ((points - eyes) ** 2).sum(axis=1)
     corners = points[rng.integers(0, len(points), (TRIES, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1)

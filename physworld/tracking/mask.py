@@ -4,6 +4,9 @@ Depth first: what stands in the box at another distance than its middle, or on t
 GrabCut (Rother, Kolmogorov, Blake 2004; OpenCV), which knows everything outside of the box as background, so that
 a gripper that reaches into the box goes with the gripper outside. Pixels without depth belong to the mask where
 colour says so.
+
+In another camera the object is within the outlines that the first ones saw: whatever of a place lies beside the mask
+there, or before what is seen there, is something else, such as the gripper that holds it.
 """
 
 from __future__ import annotations
@@ -16,13 +19,19 @@ import numpy as np
 from physworld.arrays import Array
 from physworld.camera import Camera
 from physworld.errors import TrackingFailed
-from physworld.tracking.view import back_project
+from physworld.tracking.view import back_project, cloud_of
 
 BEFORE_SHARE, BEHIND_SHARE = 0.4, 0.8
 """How far before and behind its nearest large part the object may reach, in diagonals of the box."""
 ROOM_M, ROOM_SHARE = 0.012, 0.1
 """Around the cloud of the other cameras: a length, and a share of its middle extent; a gripper beside it is none
 of it."""
+OUTLINE_PX = 2
+"""Beside a mask; the error of depth moves a place so far in another picture."""
+BEFORE_M = 0.015
+"""Before what is seen there; two cameras measure a place so far apart."""
+LEAST_BY_COLOUR = 0.5
+"""Of the pixels that outlines and depth leave; where colour leaves less, it is not asked."""
 GROUND_CLEARANCE_M = 0.006
 ROUNDS = 6
 LEAST_PIXELS = 60
@@ -69,10 +78,113 @@ def mask_in_box(
     """
     height, width = depth.shape
     box = box.within(width, height)
-    window = np.s_[box.top : box.bottom, box.left : box.right]
     near = _near(depth, camera, box, ground_m)
-    labels = np.full((height, width), cv2.GC_BGD, dtype=np.uint8)
-    labels[window] = np.where(near[window] | (depth[window] == 0), cv2.GC_PR_FGD, cv2.GC_BGD)
+    return _by_colour(colour, near, depth == 0, box)
+
+
+@dataclass(frozen=True)
+class Outline:
+    """The object in a camera's first picture.
+
+    Attributes:
+        camera: whose picture it is.
+        depth: (H, W) [m], 0: none.
+        mask: (H, W) bool.
+    """
+
+    camera: Camera
+    depth: Array
+    mask: Array
+
+    def cloud(self) -> Array:
+        """Places on the object [m], (P, 3), without pixels that mix it with what is behind it where others are left."""
+        near = np.where((self.depth > 0) & self.mask, self.depth, np.inf).astype(np.float32)
+        nearest = cv2.erode(near, np.ones((2 * OUTLINE_PX + 1,) * 2, np.uint8))
+        clean = self.mask & (self.depth < nearest + BEFORE_M)
+        clean = clean if clean.sum() >= LEAST_PIXELS else self.mask
+        return cloud_of(self.camera, self.depth, clean)[0]
+
+    def holds(self, places: Array) -> Array:
+        """Which of some places (P, 3) [m] may be on the object, (P,) bool; those outside of the picture may."""
+        kernel = np.ones((2 * OUTLINE_PX + 1,) * 2, np.uint8)
+        wide = cv2.dilate(self.mask.astype(np.uint8), kernel) > 0
+        pixels, distance = self.camera.project(places)
+        at = np.floor(np.where(distance[:, None] > 0, pixels, -1.0)).astype(int)
+        shown = ((at >= 0) & (at < [self.camera.width, self.camera.height])).all(axis=1)
+        row, column = at[shown, 1], at[shown, 0]
+        behind = distance[shown] > self.depth[row, column] - BEFORE_M
+        held = np.ones(len(places), dtype=bool)
+        held[shown] = wide[row, column] & behind
+        return held
+
+
+def mask_near_cloud(
+    colour: Array,
+    depth: Array,
+    camera: Camera,
+    outlines: list[Outline],
+    ground_m: float | None = None,
+) -> Array:
+    """The object's pixels (H, W) bool in another camera, by what the first ones saw of it.
+
+    Args:
+        colour: (H, W, 3) uint8.
+        depth: (H, W) [m], 0: none.
+        camera: this camera, in the world of the others.
+        outlines: of the others.
+        ground_m: as in ``mask_in_box``.
+
+    Raises:
+        TrackingFailed: the object is outside of the picture, or nothing stands out.
+    """
+    cloud = np.concatenate([outline.cloud() for outline in outlines])
+    pixels, distance = camera.project(cloud)
+    seen = pixels[distance > 0]
+    if not len(seen):
+        raise TrackingFailed("the object is behind the camera")
+    low, high = np.percentile(seen, 1, axis=0), np.percentile(seen, 99, axis=0)
+    margin = 0.08 * np.linalg.norm(high - low) + 4
+    left, top = (int(v) for v in np.floor(low - margin))
+    right, bottom = (int(v) for v in np.ceil(high + margin))
+    height, width = depth.shape
+    box = Box(left, top, right, bottom).within(width, height)
+    extent = np.sort(np.percentile(cloud, 99, axis=0) - np.percentile(cloud, 1, axis=0))
+    room = ROOM_M + ROOM_SHARE * extent[1]
+    low, high = np.percentile(cloud, 1, axis=0) - room, np.percentile(cloud, 99, axis=0) + room
+    inside = np.zeros(depth.shape, dtype=bool)
+    inside[box.top : box.bottom, box.left : box.right] = True
+    places, at = cloud_of(camera, depth, inside)
+    held = ((places > low) & (places < high)).all(axis=1)
+    if ground_m is not None:
+        held &= places[:, 2] > ground_m + GROUND_CLEARANCE_M
+    for outline in outlines:
+        held &= outline.holds(places)
+    near = np.zeros(depth.shape, dtype=bool)
+    near[at[held, 0], at[held, 1]] = True
+    beside = cv2.dilate(near.astype(np.uint8), np.ones((2 * OUTLINE_PX + 1,) * 2, np.uint8)) > 0
+    try:
+        mask = _by_colour(colour, near, beside & (depth == 0), box)
+    except TrackingFailed:
+        mask = np.zeros(depth.shape, dtype=bool)
+    # of what is a few pixels wide colour leaves nothing
+    return mask if mask.sum() >= LEAST_BY_COLOUR * near.sum() else _largest(near)
+
+
+def _by_colour(colour: Array, near: Array, unknown: Array, box: Box) -> Array:
+    """What of a box GrabCut leaves to the object, (H, W) bool.
+
+    Args:
+        colour: (H, W, 3) uint8.
+        near: pixels that depth leaves to it, (H, W) bool.
+        unknown: pixels without depth that may be on it, (H, W) bool.
+        box: all around it is background.
+
+    Raises:
+        TrackingFailed: nothing stands out.
+    """
+    window = np.s_[box.top : box.bottom, box.left : box.right]
+    labels = np.full(near.shape, cv2.GC_BGD, dtype=np.uint8)
+    labels[window] = np.where((near | unknown)[window], cv2.GC_PR_FGD, cv2.GC_BGD)
     core = cv2.erode(near.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     if core[window].sum() < LEAST_PIXELS:
         raise TrackingFailed(
@@ -83,41 +195,7 @@ def mask_in_box(
     cv2.setRNGSeed(0)
     cv2.grabCut(bgr, labels, None, backward, forward, ROUNDS, cv2.GC_INIT_WITH_MASK)
     mask = (labels == cv2.GC_PR_FGD) | (labels == cv2.GC_FGD)
-    return _largest(mask & (near | (depth == 0)))
-
-
-def mask_near_cloud(
-    colour: Array, depth: Array, camera: Camera, cloud: Array, ground_m: float | None = None
-) -> Array:
-    """The object's pixels (H, W) bool in another camera, by what the first one saw of it.
-
-    Args:
-        colour: (H, W, 3) uint8.
-        depth: (H, W) [m], 0: none.
-        camera: this camera, in the world of the cloud.
-        cloud: places on the object [m], (P, 3).
-        ground_m: as in ``mask_in_box``.
-
-    Raises:
-        TrackingFailed: the object is outside of the picture, or nothing stands out.
-    """
-    pixels, distance = camera.project(cloud)
-    seen = pixels[distance > 0]
-    if not len(seen):
-        raise TrackingFailed("the object is behind the camera")
-    low, high = np.percentile(seen, 1, axis=0), np.percentile(seen, 99, axis=0)
-    margin = 0.08 * np.linalg.norm(high - low) + 4
-    left, top = (int(v) for v in np.floor(low - margin))
-    right, bottom = (int(v) for v in np.ceil(high + margin))
-    mask = mask_in_box(colour, depth, camera, Box(left, top, right, bottom), ground_m)
-    extent = np.sort(np.percentile(cloud, 99, axis=0) - np.percentile(cloud, 1, axis=0))
-    room = ROOM_M + ROOM_SHARE * extent[1]
-    rows, columns = np.nonzero(mask & (depth > 0))
-    place = back_project(camera, np.stack([columns, rows], axis=1) + 0.5, depth[rows, columns])
-    low, high = np.percentile(cloud, 1, axis=0) - room, np.percentile(cloud, 99, axis=0) + room
-    within = np.zeros(mask.shape, dtype=bool)
-    within[rows, columns] = ((place > low) & (place < high)).all(axis=1)
-    return _largest(within)
+    return _largest(mask & (near | unknown))
 
 
 def _near(depth: Array, camera: Camera, box: Box, ground_m: float | None) -> Array:

@@ -87,22 +87,49 @@ def rigid_misfit(start: Array, now: Array, known: Array, neighbours: Array) -> t
     Returns:
         Distances (N,), inf where fewer than 3 neighbours are known, and places (N, 3).
     """
-    offsets, moved = start[neighbours] - start[:, None], now[neighbours]
     mine = known[neighbours]
-    base = mine / (np.linalg.norm(offsets, axis=2) + 1e-3)
+    places = _carried(start, start[neighbours], now[neighbours], mine)
+    distance = np.linalg.norm(now - places, axis=1)
+    return np.where(mine.sum(axis=1) >= LEAST, distance, np.inf), places
+
+
+def carried(at: Array, start: Array, now: Array, count: int) -> Array | None:
+    """Where places of the first frame are now, as the rigid motion of the nearest points carries them, (n, 3) [m].
+
+    Args:
+        at: the places [m], (n, 3).
+        start, now: of the points that are seen now [m], (M, 3); too few of them: None.
+        count: of points that carry each.
+    """
+    if len(start) < max(count // 2, LEAST):
+        return None
+    count = min(count, len(start))
+    _, nearest_ones = cKDTree(start).query(at, k=count)
+    return _carried(at, start[nearest_ones], now[nearest_ones], np.ones(nearest_ones.shape, dtype=bool))
+
+
+def _carried(at: Array, start: Array, moved: Array, known: Array) -> Array:
+    """Places (N, 3) that the rigid motion of each one's neighbours gives.
+
+    Args:
+        at: in the first frame [m], (N, 3).
+        start, moved: neighbours in the first frame and now [m], (N, K, 3).
+        known: which of them count, (N, K) bool.
+    """
+    offsets = start - at[:, None]
+    base = known / (np.linalg.norm(offsets, axis=2) + 1e-3)
     scale = np.median(np.linalg.norm(offsets, axis=2)) * 0.05 + 1e-4
-    weights, places = base, now.copy()
+    weights, places = base, at.copy()
     for _ in range(ROUNDS):
         total = np.maximum(weights.sum(axis=1), 1e-12)[:, None]
         mean_from = np.einsum("nk,nki->ni", weights, offsets) / total
         mean_to = np.einsum("nk,nki->ni", weights, moved) / total
         cross = np.einsum("nk,nki,nkj->nij", weights, moved - mean_to[:, None], offsets - mean_from[:, None])
         left, _, right = np.linalg.svd(cross)
-        sign = np.ones((len(start), 3))
+        sign = np.ones((len(at), 3))
         sign[:, 2] = np.sign(np.linalg.det(left @ right))
         turn = (left * sign[:, None]) @ right
         places = mean_to - np.einsum("nij,nj->ni", turn, mean_from)
         miss = np.linalg.norm(moved - places[:, None] - np.einsum("nij,nkj->nki", turn, offsets), axis=2)
         weights = base / (1.0 + (miss / scale) ** 2)
-    distance = np.linalg.norm(now - places, axis=1)
-    return np.where(mine.sum(axis=1) >= LEAST, distance, np.inf), places
+    return places

@@ -83,18 +83,18 @@ def find(
         blur_px: the same as of the patches.
     """
     picture = _blurred(grey, blur_px)
-    normal = np.einsum("np,npi,npj->nij", patches.weights, patches.slopes, patches.slopes)
+    weighted = patches.weights[..., None] * patches.slopes
+    normal = weighted.transpose(0, 2, 1) @ patches.slopes
     inverse = np.linalg.inv(normal + 1e-6 * np.eye(2))
-    spread = np.einsum("nij,pj->npi", maps, patches.offsets)
+    spread = np.tensordot(maps, patches.offsets, axes=(2, 1)).transpose(0, 2, 1)
     places, correlation = np.array(guess, dtype=np.float64), np.full(len(guess), -1.0)
     for _ in range(ITERATIONS):
         values, _ = _normalised(_sample(picture, places[:, None] + spread), patches.weights)
         miss = values - patches.values
-        step = np.einsum("nij,np,npj,np->ni", inverse, patches.weights, patches.slopes, miss)
-        step = np.clip(step, -2.0, 2.0)
-        places = places - np.einsum("nij,nj->ni", maps, step)
+        step = np.clip((miss[:, None] @ weighted @ inverse.transpose(0, 2, 1))[:, 0], -2.0, 2.0)
+        places = places - (maps @ step[..., None])[..., 0]
     values, _ = _normalised(_sample(picture, places[:, None] + spread), patches.weights)
-    correlation = np.einsum("np,np,np->n", patches.weights, values, patches.values)
+    correlation = (patches.weights * values * patches.values).sum(axis=1)
     height, width = grey.shape
     inside = ((places > 2) & (places < [width - 2, height - 2])).all(axis=1)
     return places, np.where(inside & patches.usable, correlation, -1.0)
@@ -119,6 +119,6 @@ def _sample(picture: Array, at: Array) -> Array:
 
 def _normalised(values: Array, weights: Array) -> tuple[Array, Array]:
     """Values of weighted mean 0 and deviation 1 (N, P), and the deviation (N,)."""
-    centred = values - np.einsum("np,np->n", weights, values)[:, None]
-    deviation = np.sqrt(np.einsum("np,np->n", weights, centred**2))
+    centred = values - np.vecdot(weights, values)[:, None]
+    deviation = np.sqrt(np.vecdot(weights, centred * centred))
     return centred / np.maximum(deviation, 1e-6)[:, None], deviation

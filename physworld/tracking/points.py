@@ -11,7 +11,6 @@ frame's patch alone: nothing adds up from frame to frame.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -19,60 +18,10 @@ import numpy as np
 from physworld.arrays import Array
 from physworld.errors import TrackingFailed
 from physworld.tracking.anywhere import Features
-from physworld.tracking.depth import patch_depth
-from physworld.tracking.neighbours import nearest, picture_motion, rigid_misfit
+from physworld.tracking.neighbours import picture_motion
 from physworld.tracking.patches import Patches, cut, find
-from physworld.tracking.view import View, back_project, from_opencv, to_opencv
-
-LEAST_POINTS = 4
-
-
-@dataclass(frozen=True)
-class TrackConfig:
-    """How points are chosen and followed.
-
-    Attributes:
-        points: wanted in one camera.
-        patch_px: half the side of a patch.
-        depth_px: half the side of the part of it whose depth counts.
-        neighbours: that a point is compared with.
-        least_correlation: of the patch of the first frame with where it is found.
-        backward_px: how far the check backwards may miss.
-        misfit_sigmas: how far a point may be from its neighbours' rigid motion, in robust deviations of all.
-        least_misfit_m: below which nobody is left out.
-        least_area: of a patch, turned away, over its area in the first frame.
-        rediscover_below: share of points seen from which the whole picture is searched for the others.
-    """
-
-    points: int = 150
-    patch_px: int = 9
-    depth_px: int = 5
-    neighbours: int = 10
-    least_correlation: float = 0.75
-    backward_px: float = 1.0
-    misfit_sigmas: float = 4.0
-    least_misfit_m: float = 2e-3
-    least_area: float = 0.2
-    rediscover_below: float = 0.25
-
-
-@dataclass(frozen=True)
-class Tracks:
-    """Points of one camera.
-
-    Attributes:
-        points: [m], (T, N, 3); where not visible, where the neighbours put it, or nan.
-        visible: (T, N) bool.
-        pixels: (T, N, 2).
-        colours: of the first frame, (N, 3) uint8.
-        correlation: of the patch, (T, N).
-    """
-
-    points: Array
-    visible: Array
-    pixels: Array
-    colours: Array
-    correlation: Array
+from physworld.tracking.places import LEAST_POINTS, FirstPlaces, Places, TrackConfig, Tracks
+from physworld.tracking.view import View, from_opencv, to_opencv
 
 
 def choose(grey: Array, mask: Array, depth: Array, count: int) -> Array:
@@ -113,15 +62,25 @@ def follow(
         TrackingFailed: too few points can be followed, or pictures differ in size.
     """
     config = config or TrackConfig()
-    tracker = _Tracker(view, mask, config)
+    follower = Follower(view, mask, config)
     for frame in range(1, view.frames):
-        tracker.step(frame)
+        follower.step(frame)
         progress(frame + 1, view.frames)
-    return tracker.tracks()
+    return follower.tracks()
 
 
-class _Tracker:
-    """State of ``follow`` between two frames."""
+class Follower:
+    """Follows points from frame to frame.
+
+    Args:
+        view: the recording.
+        mask: the object in the first frame, (H, W) bool.
+        config: how.
+
+    Attributes:
+        first: places in the first frame [m], (n, 3).
+        points, visible: places [m] and whether they are seen, of the frames so far, (T, n, 3) and (T, n).
+    """
 
     def __init__(self, view: View, mask: Array, config: TrackConfig) -> None:
         self._view, self._config = view, config
@@ -140,15 +99,8 @@ class _Tracker:
             )
         fine = cut(grey.astype(np.float32), mask, pixels, config.patch_px)
         coarse = cut(grey.astype(np.float32), mask, pixels, config.patch_px + 3, 2.0)
-        close = np.abs(fine.offsets).max(axis=1) <= config.depth_px
-        inside = fine.weights[:, close] > 0
-        distance = patch_depth(
-            depth,
-            pixels,
-            np.tile(fine.offsets[close], (len(pixels), 1, 1)),
-            inside,
-            np.full(len(pixels), np.nan),
-        )
+        first = FirstPlaces(view.camera, mask, depth, pixels, config.depth_px)
+        distance = first.distance
         kept = fine.usable & np.isfinite(distance)
         if kept.sum() < LEAST_POINTS:
             raise TrackingFailed(
@@ -157,25 +109,27 @@ class _Tracker:
                 f"{int(np.isfinite(distance).sum())} with depth"
             )
         self._fine, self._coarse = _kept(fine, kept), _kept(coarse, kept)
-        self._close, self._inside = close, inside[kept]
         self._start = pixels[kept]
-        self._first = back_project(view.camera, self._start, distance[kept])
-        self._neighbours = nearest(self._first, config.neighbours)
+        self._places = Places(first, kept, config)
+        self.first, self._neighbours = self._places.first, self._places.neighbours
         count, frames = int(kept.sum()), view.frames
-        self._points = np.full((frames, count, 3), np.nan)
+        self.points = np.full((frames, count, 3), np.nan)
         self._pixels = np.full((frames, count, 2), np.nan)
-        self._visible = np.zeros((frames, count), dtype=bool)
-        self._correlation = np.zeros((frames, count))
-        self._points[0], self._pixels[0], self._visible[0] = self._first, self._start, True
-        self._correlation[0] = 1.0
+        self.visible = np.zeros((frames, count), dtype=bool)
+        self.points[0], self._pixels[0], self.visible[0] = self.first, self._start, True
         row, column = self._start[:, 1].astype(int), self._start[:, 0].astype(int)
         self._colours = colour[row, column]
         self._before = grey
         self._last_maps = np.tile(np.eye(2), (count, 1, 1))
         self._features = Features(grey, self._start)
 
-    def step(self, frame: int) -> None:
-        """The next frame."""
+    def step(self, frame: int, told: Array | None = None) -> None:
+        """The next frame.
+
+        Args:
+            frame: its number.
+            told: where other cameras put the points now [m], (n, 3), or None.
+        """
         config = self._config
         colour, depth = self._view.colour(frame), self._view.depth(frame)
         if colour.shape[:2] != self._shape or depth.shape != self._shape:
@@ -183,7 +137,7 @@ class _Tracker:
                 f"frame {frame}: colours {colour.shape[:2]} and depth {depth.shape} are not {self._shape}"
             )
         grey = cv2.cvtColor(np.ascontiguousarray(colour), cv2.COLOR_RGB2GRAY)
-        guess, maps = self._guess(grey, frame)
+        guess, maps = self._guess(grey, frame, told)
         picture = grey.astype(np.float32)
         near, rough = find(picture, self._coarse, guess, maps, 2.0)
         onward = self._onward(frame)
@@ -207,15 +161,17 @@ class _Tracker:
             & _apart(refined, again, 6.0)
             & (np.abs(np.linalg.det(maps)) > config.least_area)
         )
-        self._locate(frame, depth, refined, maps, seen)
-        self._correlation[frame] = correlation
-        self._pixels[frame] = np.where(self._visible[frame][:, None], refined, again)
+        self.points[frame], self.visible[frame] = self._places.at(depth, refined, maps, seen)
+        self._pixels[frame] = np.where(self.visible[frame][:, None], refined, again)
         self._before, self._last_maps = grey, maps
 
-    def _guess(self, grey: Array, frame: int) -> tuple[Array, Array]:
+    def _guess(self, grey: Array, frame: int, told: Array | None) -> tuple[Array, Array]:
         """Where points should be by the flow from the last frame and by their neighbours; the maps of their patches."""
         last = self._pixels[frame - 1]
-        known = self._visible[frame - 1]
+        known = self.visible[frame - 1]
+        if told is not None and known.mean() < self._config.told_below:
+            hinted, distance = self._view.camera.project(told)
+            return self._surroundings(np.where(distance[:, None] > 0, hinted, last), distance > 0, last)
         if known.mean() < self._config.rediscover_below:
             return self._rediscovered(grey, frame)
         there = to_opencv(last)
@@ -242,7 +198,7 @@ class _Tracker:
 
     def _rediscovered(self, grey: Array, frame: int) -> tuple[Array, Array]:
         """The same from features of the first frame that are found anywhere in the picture."""
-        last, known = self._pixels[frame - 1], self._visible[frame - 1]
+        last, known = self._pixels[frame - 1], self.visible[frame - 1]
         found, sure = self._features.find(grey)
         places = np.where(sure[:, None], found, last)
         return self._surroundings(places, sure | known, last)
@@ -260,27 +216,9 @@ class _Tracker:
             there[alone], maps[alone] = whole[alone], turned[alone]
         return there, maps
 
-    def _locate(self, frame: int, depth: Array, pixels: Array, maps: Array, seen: Array) -> None:
-        """Places in space of the points that are seen, without those that leave their neighbours."""
-        config, camera = self._config, self._view.camera
-        spread = np.einsum("nij,pj->npi", maps, self._fine.offsets[self._close])
-        distance = patch_depth(depth, pixels, spread, self._inside, np.full(len(pixels), np.nan))
-        seen = seen & np.isfinite(distance)
-        points = back_project(camera, pixels, np.where(seen, distance, 1.0))
-        for _ in range(2):
-            misfit, places = rigid_misfit(self._first, points, seen, self._neighbours)
-            within = seen & np.isfinite(misfit)
-            if not within.any():
-                break
-            scale = 1.4826 * float(np.median(misfit[within]))
-            bound = max(config.misfit_sigmas * scale, config.least_misfit_m)
-            seen = seen & (misfit <= bound)
-        self._visible[frame] = seen
-        self._points[frame] = np.where(seen[:, None], points, places)
-
     def tracks(self) -> Tracks:
         """What was found."""
-        return Tracks(self._points, self._visible, self._pixels, self._colours, self._correlation)
+        return Tracks(self.points, self.visible, self._pixels, self._colours)
 
 
 def _apart(one: Array, other: Array, most: float) -> Array:

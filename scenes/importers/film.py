@@ -18,6 +18,7 @@ import numpy as np
 from physworld.arrays import Array
 from physworld.camera import MOST_PIXELS, Camera
 from physworld.tracking.view import View, from_opencv, to_opencv
+from physworld_scenes.errors import refused
 from physworld_scenes.importers.options import FolderImporter
 from physworld_scenes.importers.pictures import (
     FILMS,
@@ -26,7 +27,6 @@ from physworld_scenes.importers.pictures import (
     frames_in,
     is_pictures,
     picture_of,
-    refused,
     size_of,
 )
 from physworld_schemas.wording import reason

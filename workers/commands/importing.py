@@ -100,6 +100,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--mask", action="append", default=[], help="instead: PNG, white on it: [CAMERA:]FILE"
     )
+    parser.add_argument(
+        "--tracks",
+        action="append",
+        default=[],
+        help="of another tracker, npz of tracks and visible: [CAMERA:]FILE; else tracks/CAMERA.npz",
+    )
     parser.add_argument("--marker", default=None, help="on the gripper: NUMBER[:DICTIONARY], or any")
     parser.add_argument("--patch", default=None, help="instead, of the gripper: LEFT,TOP,RIGHT,BOTTOM")
     parser.add_argument("--colour", default=None, help="instead, a pixel of its colour: COLUMN,ROW")
@@ -257,8 +263,9 @@ def _pictures(given: argparse.Namespace, options: ImportOptions) -> tuple[Scene,
 
 
 def _picture_options(given: argparse.Namespace) -> PictureOptions:
-    from physworld.tracking.points import TrackConfig
-    from physworld_scenes.importers.rgbd import GripFrom, PictureOptions
+    from physworld.tracking.places import TrackConfig
+    from physworld_scenes.importers.gripping import GripFrom
+    from physworld_scenes.importers.rgbd import PictureOptions
 
     told = [given.marker, given.patch, given.colour, given.log]
     if sum(each is not None for each in told) > 1:
@@ -282,6 +289,7 @@ def _picture_options(given: argparse.Namespace) -> PictureOptions:
     return PictureOptions(
         boxes={camera: _box("--box", text) for camera, text in map(_of_camera, given.box)},
         masks={camera: Path(text) for camera, text in map(_of_camera, given.mask)},
+        tracks={camera: Path(text) for camera, text in map(_of_camera, given.tracks)},
         grip=grip,
         up=given.up,
         depth_scale=given.depth_scale,
@@ -332,29 +340,30 @@ def _say(scene: Scene, warnings: list[str], out: Path) -> None:
 
 
 def _draw(given: argparse.Namespace, followed: Followed) -> None:
-    """First and last picture of the first camera with mask and points: green seen, red not."""
+    """First and last picture of every camera with mask and points: green seen, red not."""
     from PIL import Image, ImageDraw
 
-    view = followed.views[0]
-    pictures = []
-    for frame in (0, view.frames - 1):
-        colour = view.colour(frame).copy()
-        if frame == 0 and followed.masks[0].size:
-            colour[followed.masks[0]] = colour[followed.masks[0]] // 2 + np.array(
-                [0, 60, 110], dtype=np.uint8
-            )
-        picture = Image.fromarray(colour)
-        pen = ImageDraw.Draw(picture)
-        for point in np.flatnonzero(followed.cameras == 0):
-            x, y = followed.pixels[frame, point]
-            if np.isfinite([x, y]).all():
-                pen.ellipse(
-                    (x - 2, y - 2, x + 2, y + 2), fill="lime" if followed.visible[frame, point] else "red"
-                )
-        pictures.append(np.asarray(picture))
+    rows = []
+    for number, (view, mask) in enumerate(zip(followed.views, followed.masks, strict=True)):
+        pictures = []
+        for frame in (0, view.frames - 1):
+            colour = view.colour(frame).copy()
+            if frame == 0 and mask.size:
+                colour[mask] = colour[mask] // 2 + np.array([0, 60, 110], dtype=np.uint8)
+            picture = Image.fromarray(colour)
+            pen = ImageDraw.Draw(picture)
+            for point in np.flatnonzero(followed.cameras == number):
+                x, y = followed.pixels[frame, point]
+                if np.isfinite([x, y]).all():
+                    seen = followed.visible[frame, point]
+                    pen.ellipse((x - 2, y - 2, x + 2, y + 2), fill="lime" if seen else "red")
+            pictures.append(np.asarray(picture))
+        rows.append(np.hstack(pictures))
+    widest = max(row.shape[1] for row in rows)
+    rows = [np.pad(row, ((0, 0), (0, widest - row.shape[1]), (0, 0))) for row in rows]
     given.picture.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(np.hstack(pictures)).save(given.picture)
-    print(f"{given.picture}: the first frame with the object's pixels, and the last")
+    Image.fromarray(np.vstack(rows)).save(given.picture)
+    print(f"{given.picture}: the first frame of every camera with the object's pixels, and the last")
 
 
 def _keep_pictures(folder: Path, followed: Followed) -> None:

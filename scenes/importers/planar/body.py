@@ -11,10 +11,10 @@ from physworld.arrays import Array
 from physworld.tracking.grips import RigidPath
 from physworld.tracking.recording import Followed, thinned
 from physworld.tracking.view import View, cloud_of
+from physworld_scenes.errors import refused
 from physworld_scenes.importers.film import Filmed
-from physworld_scenes.importers.pictures import refused
+from physworld_scenes.importers.gripping import GripFrom, gripper_path
 from physworld_scenes.importers.planar.place import Placed, straight_box
-from physworld_scenes.importers.rgbd import GripFrom, gripper_path
 
 RODS, SHEETS, SOLIDS = ("rope", "rod", "branched_rope"), ("sheet",), ("beam", "block", "blob", "toy")
 MOST_FILLING, LAYERS = 20_000, 3

@@ -14,9 +14,9 @@ from physworld.tracking.boards import Board, find_board
 from physworld.tracking.mask import Box, mask_in_box
 from physworld.tracking.plane import Plane, frontal, view_of
 from physworld.tracking.view import View
+from physworld_scenes.errors import refused
 from physworld_scenes.importers.axes import ROTATION_FROM_UP
 from physworld_scenes.importers.film import Filmed
-from physworld_scenes.importers.pictures import refused
 from physworld_scenes.importers.rgbd import PictureOptions, mask_file
 
 LEAST_APART_PX = 10.0

@@ -18,13 +18,13 @@ from physworld.arrays import Array
 from physworld.errors import TrackingFailed
 from physworld.scene import Scene
 from physworld.tracking.grips import RigidPath
+from physworld.tracking.places import TrackConfig
 from physworld.tracking.plane import TRACKING_PIXEL_M, scaled, stretch
-from physworld.tracking.points import TrackConfig
-from physworld.tracking.recording import Followed, follow_all
+from physworld.tracking.recording import Followed, Masks, follow_all
 from physworld_scenes.bundle import checked, scene_from_parts
+from physworld_scenes.errors import refused
 from physworld_scenes.importers.film import Filmed, read_film
 from physworld_scenes.importers.options import ImportOptions, estimate_noise, split_of
-from physworld_scenes.importers.pictures import refused
 from physworld_scenes.importers.planar.body import (
     behind_m,
     controllers_of,
@@ -85,7 +85,7 @@ def read_planar(
         require_plausible(placed, mask, told_plane)
         factor = TRACKING_PIXEL_M / placed.pixel_m(mask)
         small = scaled(placed.view, factor)
-        followed = follow_all([small], [mask], TrackConfig(points=given.points), told)
+        followed = follow_all([small], Masks([mask], {}, []), TrackConfig(points=given.points), told)
         followed = _unscaled(followed, placed, factor)
         times, fps = _times(filmed, options, warnings)
         gripper = None if given.grip is None else straight_grip(filmed, given.grip)

@@ -9,7 +9,8 @@ from tracking_pictured import BOTTOM, COVERED, LEFT, RIGHT, TOP, affine, frame_o
 from physworld.errors import TrackingFailed
 from physworld.tracking.grips import kabsch, logged, rigid_path
 from physworld.tracking.mask import Box, mask_in_box
-from physworld.tracking.points import TrackConfig, follow
+from physworld.tracking.places import TrackConfig
+from physworld.tracking.points import follow
 
 pytestmark = pytest.mark.slow
 

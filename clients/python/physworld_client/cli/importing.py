@@ -48,6 +48,9 @@ def import_recording(
         list[str] | None, typer.Option(help="Around the object: [CAMERA:]LEFT,TOP,RIGHT,BOTTOM.")
     ] = None,
     mask: Annotated[list[str] | None, typer.Option(help="Instead: PNG, white on it: [CAMERA:]FILE.")] = None,
+    tracks: Annotated[
+        list[str] | None, typer.Option(help="Of another tracker, npz of tracks and visible: [CAMERA:]FILE.")
+    ] = None,
     marker: Annotated[str | None, typer.Option(help="On the gripper: NUMBER[:DICTIONARY], or any.")] = None,
     patch: Annotated[str | None, typer.Option(help="Of the gripper: LEFT,TOP,RIGHT,BOTTOM.")] = None,
     colour: Annotated[str | None, typer.Option(help="A pixel of the gripper's colour: COLUMN,ROW.")] = None,
@@ -116,6 +119,7 @@ def import_recording(
     }
     options = [f"{option}={value}" for option, value in given.items() if value is not None]
     options += [f"--box={value}" for value in box or []] + [f"--mask={value}" for value in mask or []]
+    options += [f"--tracks={value}" for value in tracks or []]
     options += [f"--body={value}" for value in body or []]
     flags = {"--undeformed": undeformed, "--look": look, "--assume": assume}
     become(MODULE, [*options, *(flag for flag, given in flags.items() if given), "--", str(source)])

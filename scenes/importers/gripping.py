@@ -1,0 +1,144 @@
+"""What holds the object in a folder of pictures: its motion from whatever tells it, and the scene's controllers."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from physworld.arrays import Array
+from physworld.errors import TrackingFailed
+from physworld.tracking.grips import RigidPath, colour_middles, logged, marker_corners, rigid_path, translated
+from physworld.tracking.mask import Box
+from physworld.tracking.recording import Followed, patch_points
+from physworld.tracking.view import View, cloud_of
+from physworld_scenes.errors import refused
+
+GRIP_MARGIN_M = 0.01
+MOST_LOG_BYTES = 64 << 20
+
+
+@dataclass(frozen=True)
+class GripFrom:
+    """What tells the gripper's motion; one of the first four.
+
+    Attributes:
+        marker: number of an ArUco or AprilTag marker on it; -1: the first that is seen.
+        dictionary: of the marker.
+        patch: a box on it in the first camera's first picture: its texture is followed.
+        colour: column and row of a pixel of its colour there; such a gripper does not turn.
+        log: CSV of a robot with a head: t, x, y, z and, if it turns, qw, qx, qy, qz; the scene's world, SI units.
+        log_delay_s: of the pictures' clock behind the log's.
+        held_px: a box around what it holds of the object, in the same picture.
+        held_m: instead, the corners of a box of undeformed material [m], (2, 3), in the scene's world.
+    """
+
+    marker: int | None = None
+    dictionary: str = "4X4_50"
+    patch: Box | None = None
+    colour: tuple[int, int] | None = None
+    log: Path | None = None
+    log_delay_s: float = 0.0
+    held_px: Box | None = None
+    held_m: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
+
+
+def gripper_path(views: list[View], grip: GripFrom, times: Array) -> RigidPath:
+    """The gripper's motion from what tells it, seen by all cameras.
+
+    Args:
+        views: the cameras.
+        grip: what tells it.
+        times: of the frames [s], (T,).
+
+    Raises:
+        TrackingFailed: it is not seen, or the log does not cover the recording.
+        SceneInvalid: the log is no log.
+    """
+    if grip.marker is not None:
+        number = None if grip.marker < 0 else grip.marker
+        return rigid_path(marker_corners(views, number, grip.dictionary))
+    if grip.patch is not None:
+        box = grip.patch.within(views[0].camera.width, views[0].camera.height)
+        return rigid_path(patch_points(views, box))
+    if grip.colour is not None:
+        return translated(colour_middles(views, grip.colour))
+    if grip.log is not None:
+        clock, places, quaternions = _log(grip.log)
+        return logged(clock - grip.log_delay_s, places, quaternions, times)
+    raise TrackingFailed("what tells the gripper's motion? A marker, a patch, a colour or a log")
+
+
+def _log(path: Path) -> tuple[Array, Array, Array | None]:
+    """Times (L,) [s], places (L, 3) [m] and quaternions (L, 4), scalar first, or None, of a robot's log."""
+    if path.stat().st_size > MOST_LOG_BYTES:
+        raise refused(path.name, f"has {path.stat().st_size} bytes, at most {MOST_LOG_BYTES} are read")
+    with path.open(newline="", encoding="utf-8", errors="replace") as stream:
+        reader = csv.reader(stream)
+        head = [name.strip().lower() for name in next(reader, [])]
+        wanted = ["t", "x", "y", "z"]
+        turning = ["qw", "qx", "qy", "qz"]
+        missing = [name for name in wanted if name not in head]
+        if missing:
+            raise refused(path.name, f"has no column {', '.join(missing)}; it has {', '.join(head)[:160]}")
+        columns = [head.index(n) for n in (wanted + turning if set(turning) <= set(head) else wanted)]
+        try:
+            rows = np.array([[float(row[c]) for c in columns] for row in reader if row], dtype=np.float64)
+        except (ValueError, IndexError) as error:
+            raise refused(path.name, f"holds what is no number: {str(error)[:160]}") from error
+    if len(rows) < 2 or not np.isfinite(rows).all() or (np.diff(rows[:, 0]) <= 0).any():
+        raise refused(path.name, f"holds {len(rows)} rows; finite ones in the order of time are needed")
+    turns = rows[:, 4:8] if rows.shape[1] == 8 else None
+    if turns is not None and (np.abs(np.linalg.norm(turns, axis=1) - 1.0) > 1e-2).any():
+        raise refused(path.name, "holds quaternions that are not of length 1")
+    return rows[:, 0], rows[:, 1:4], turns
+
+
+def gripper_controllers(
+    view: View, grip: GripFrom, path: RigidPath, followed: Followed, warnings: list[str]
+) -> tuple[Array, list[dict[str, Any]]]:
+    """Controllers (T, K, 3) [m], and the entry of ``grips``.
+
+    Args:
+        view: the first camera.
+        grip: what it holds.
+        path: of the gripper.
+        followed: the object.
+        warnings: what is not said is added.
+
+    Raises:
+        SceneInvalid: the box around what is held shows nothing of the object.
+    """
+    region = None if grip.held_m is None else np.array(grip.held_m, dtype=np.float64)
+    if grip.held_px is not None:
+        box = grip.held_px.within(view.camera.width, view.camera.height)
+        window = np.zeros((view.camera.height, view.camera.width), dtype=bool)
+        window[box.top : box.bottom, box.left : box.right] = True
+        mask = followed.masks[0]
+        held = cloud_of(view.camera, view.depth(0), window & mask if mask.size else window)[0]
+        if len(held) < 4:
+            raise refused(
+                "held", f"the box around what is held has {len(held)} pixels of the object with depth"
+            )
+        region = np.stack([held.min(axis=0) - GRIP_MARGIN_M, held.max(axis=0) + GRIP_MARGIN_M])
+    if region is not None:
+        corners = np.array(
+            [[region[i, 0], region[j, 1], region[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+        )
+        entry = {
+            "controllers": list(range(8)),
+            "region_min_m": region[0].tolist(),
+            "region_max_m": region[1].tolist(),
+        }
+        return path.carry(corners), [entry]
+    controllers = path.carry(path.reference)
+    gap = np.linalg.norm(followed.cloud[:, None] - controllers[0][None], axis=2).min()
+    size = float(np.linalg.norm(np.ptp(followed.cloud, axis=0)))
+    radius = float(gap + 0.1 * size)
+    warnings.append(
+        f"what the gripper holds is not said: all within {radius:.3f} m of the points that were followed on it is taken"
+    )
+    return controllers, [{"controllers": list(range(len(controllers[0]))), "radius_m": radius}]
