@@ -186,8 +186,6 @@ def test_options_of_a_camera_that_there_is_not_are_refused(folder: Path) -> None
 
 
 def test_a_camera_that_does_not_show_the_object_is_left_out_and_said(folder: Path) -> None:
-    away = np.eye(4)
-    away[:3, :3] = np.array([[-1.0, 0, 0], [0, -1, 0], [0, 0, 1]])
     poses = json.loads((folder / "calibrate.json").read_text())
     poses[2] = (np.array(poses[2]) @ np.diag([-1.0, 1, -1, 1])).tolist()  # it looks the other way
     (folder / "calibrate.json").write_text(json.dumps(poses))

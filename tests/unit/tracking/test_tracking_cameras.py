@@ -10,7 +10,7 @@ from tracking_pictured import BOTTOM, CAMERA, LEFT, NEAR_M, RIGHT, TOP, affine, 
 from tracking_pictured import FRAMES as PLATE_FRAMES
 
 from physworld.tracking.grips import colour_middles, joined, rigid_path
-from physworld.tracking.mask import Box
+from physworld.tracking.mask import Box, Outline
 from physworld.tracking.neighbours import carried
 from physworld.tracking.places import TrackConfig
 from physworld.tracking.points import Follower
@@ -130,6 +130,26 @@ def test_a_camera_that_lost_the_object_finds_it_where_the_others_say() -> None:
     assert told.visible[20].mean() > 0.8
     seen = told.visible[20]
     assert np.linalg.norm(told.points[20, seen] - exact[seen], axis=1).max() < 2e-3
+
+
+def test_the_object_is_within_the_outline_that_another_camera_saw() -> None:
+    depth = np.full((120, 160), 1.2, dtype=np.float32)
+    mask = np.zeros((120, 160), dtype=bool)
+    mask[TOP:BOTTOM, LEFT:RIGHT] = True
+    depth[mask] = NEAR_M
+    outline = Outline(CAMERA, depth, mask)
+    pixels = np.array(
+        [[80.0, 60.0]] * 3 + [[LEFT - 10.0, 60.0], [LEFT - 1.0, 60.0], [500.0, 60.0], [80.0, 60.0]]
+    )
+    # on the surface, behind it, before it, beside it, within the error of its rim, outside of the picture
+    distance = np.array([NEAR_M, NEAR_M + 0.1, NEAR_M - 0.05, NEAR_M, NEAR_M, NEAR_M, -NEAR_M])
+    held = outline.holds(back_project(CAMERA, pixels, distance))
+    assert held[:6].tolist() == [True, True, False, False, False, True]
+    depth[:, LEFT - 2 : LEFT] = 0.0  # without depth there the rim may be the object's
+    assert outline.holds(back_project(CAMERA, pixels[4:5], distance[4:5])).all()
+    # pixels that mix the object with what is behind it are none of its cloud
+    depth[TOP:BOTTOM, LEFT : LEFT + 2] = 0.8
+    assert np.allclose(outline.cloud()[:, 2], NEAR_M)
 
 
 def middle_of(frames: range) -> np.ndarray:
