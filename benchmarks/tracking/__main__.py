@@ -1,5 +1,5 @@
 """``python -m benchmarks.tracking render NAME FOLDER [--cameras N]`` and ``... measure FOLDER... [--json FILE]``,
-and ``... splat FOLDER...``."""
+and ``... splat FOLDER...`` and ``... tail [--picture PNG] [--over PNG]``."""
 
 from __future__ import annotations
 
@@ -30,7 +30,15 @@ def main() -> None:
     splat.add_argument("--most", type=int, default=None, help="Gaussians")
     splat.add_argument("--whole", action="store_true", help="the whole picture instead of the object")
     splat.add_argument("--json", type=Path, default=None, help="write the figures to this file")
+    tail = commands.add_parser("tail", help="follow a real film, fetched as part of a package")
+    tail.add_argument("--points", type=int, default=80)
+    tail.add_argument("--picture", type=Path, default=None, help="PNG of what was followed")
+    tail.add_argument("--over", type=Path, default=None, help="the same over the film's frames")
+    tail.add_argument("--json", type=Path, default=None, help="write the figures to this file")
     given = parser.parse_args()
+    if given.command == "tail":
+        _tail(given)
+        return
     if given.command == "render":
         from benchmarks.tracking.render import write
 
@@ -50,6 +58,26 @@ def main() -> None:
         if given.scenes is not None:
             write_bundle(scene, given.scenes / folder.name)
     print(table(figures))
+    if given.json is not None:
+        given.json.write_text(json.dumps(figures, indent=1) + "\n")
+
+
+def _tail(given: argparse.Namespace) -> None:
+    import time
+
+    from benchmarks.tracking import tail
+
+    frames, rate = tail.film()
+    began = time.perf_counter()
+    scene, warnings, followed = tail.scene_of(frames, rate, given.points)
+    seconds = time.perf_counter() - began
+    figures = {**tail.score(frames, scene, followed), "frames": len(frames), "seconds": round(seconds, 1)}
+    print(json.dumps(figures, indent=1))
+    for warning in warnings:
+        print(f"warning: {warning}")
+    for path, over in ((given.picture, False), (given.over, True)):
+        if path is not None:
+            tail.draw(frames, scene, followed, path, over)
     if given.json is not None:
         given.json.write_text(json.dumps(figures, indent=1) + "\n")
 

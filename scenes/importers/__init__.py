@@ -11,7 +11,7 @@ from physworld.scene import Scene
 from physworld_scenes.archives import is_tar, is_zip
 from physworld_scenes.bundle import bundle_from_bytes
 from physworld_scenes.errors import SceneInvalid
-from physworld_scenes.importers import phystwin, pictures
+from physworld_scenes.importers import film, phystwin, pictures
 from physworld_scenes.importers.options import FolderImporter, Importer, ImportOptions
 from physworld_scenes.importers.tables.forms import FORMS, NPZ, PLAIN
 from physworld_schemas.base import FieldError
@@ -37,8 +37,8 @@ BUNDLE = Importer(
 )
 IMPORTERS = (NPZ, BUNDLE, *FORMS, phystwin.IMPORTER, PLAIN)
 """The first that recognises a file reads it."""
-FOLDERS = (pictures.IMPORTER,)
-"""Forms that are folders: the command ``physworld import`` reads them, the service does not."""
+FOLDERS = (pictures.IMPORTER, film.IMPORTER)
+"""Forms that are folders or films: the command ``physworld import`` reads them, the service does not."""
 
 
 def import_any(
@@ -92,6 +92,9 @@ def importer_of(data: bytes, name: str = "", options: ImportOptions | None = Non
     for importer in IMPORTERS:
         if importer.recognises(data, name):
             return importer
+    if film.begins_as_film(data):
+        message = "is a film, in which the service follows nothing: `physworld import` makes a scene of it to upload"
+        raise SceneInvalid([FieldError(loc=[name or "file"], msg=message)])
     start = data[:8].hex(" ") or "nothing"
     forms = ", nor ".join(importer.title for importer in IMPORTERS)
     message = f"is neither {forms}: {len(data)} bytes that begin with {start}"

@@ -129,7 +129,7 @@ def _view(
         kept: numbers of the frames that are read.
     """
     film, colour, depth = files
-    height, width = film[0].shape[:2] if film is not None else _size(colour[0])[::-1]
+    height, width = film[0].shape[:2] if film is not None else size_of(colour[0])[::-1]
     pose = np.eye(4) if calibration.poses is None else np.linalg.inv(calibration.poses[number])
     matrix = calibration.matrices[number]
     try:
@@ -159,11 +159,11 @@ def _cameras_in(root: Path) -> dict[str, list[Path]]:
     if len(folders or films) > MOST_CAMERAS:
         raise refused(root.name, f"{len(folders or films)} cameras, at most {MOST_CAMERAS} are read")
     if folders:
-        return {entry.name: _frames_in(entry) for entry in folders}
-    return {film.stem: [film] for film in films} or {"0": _frames_in(root)}
+        return {entry.name: frames_in(entry) for entry in folders}
+    return {film.stem: [film] for film in films} or {"0": frames_in(root)}
 
 
-def _frames_in(folder: Path) -> list[Path]:
+def frames_in(folder: Path) -> list[Path]:
     files = [path for path in folder.iterdir() if path.suffix.lower() in PICTURES + ARRAYS and path.is_file()]
     kinds = sorted({path.suffix.lower() for path in files})
     if not files or len(files) > MOST_FRAMES:
@@ -179,7 +179,7 @@ def _natural(path: Path) -> tuple[list[tuple[int, str]], str]:
     return [(int(part), "") if part.isdigit() and len(part) < 19 else (-1, part) for part in parts], path.name
 
 
-def _size(path: Path, content: bytes | None = None) -> tuple[int, int]:
+def size_of(path: Path, content: bytes | None = None) -> tuple[int, int]:
     """Width and height of a picture, from its head, which is read from the file where there is no content."""
     from PIL import Image
 
@@ -196,13 +196,13 @@ def _size(path: Path, content: bytes | None = None) -> tuple[int, int]:
     return size
 
 
-def _picture(path: Path, shape: tuple[int, int], mode: str | None) -> Array:
+def picture_of(path: Path, shape: tuple[int, int], mode: str | None) -> Array:
     from PIL import Image
 
     if path.stat().st_size > MOST_FILE_BYTES:
         raise refused(path.name, f"has {path.stat().st_size} bytes, at most {MOST_FILE_BYTES} are read")
     content = path.read_bytes()
-    width, height = _size(path, content)
+    width, height = size_of(path, content)
     if (height, width) != shape:
         raise refused(path.name, f"has {width} x {height} pixels, the first picture {shape[1]} x {shape[0]}")
     try:
@@ -215,7 +215,7 @@ def _picture(path: Path, shape: tuple[int, int], mode: str | None) -> Array:
 
 
 def _colours(path: Path, shape: tuple[int, int]) -> Array:
-    return _picture(path, shape, "RGB")
+    return picture_of(path, shape, "RGB")
 
 
 def _depth(path: Path, shape: tuple[int, int], scale: float | None) -> Array:
@@ -228,7 +228,7 @@ def _depth(path: Path, shape: tuple[int, int], scale: float | None) -> Array:
         except ArchiveRefused as error:
             raise refused(path.name, str(error)) from error
     else:
-        values = _picture(path, shape, None)
+        values = picture_of(path, shape, None)
     if values.shape != shape:
         raise refused(path.name, f"has shape {values.shape}, colours have {shape}")
     whole = values.dtype.kind in "iu"

@@ -102,7 +102,7 @@ def read_folder(
         recording, ground, up = _upright(recording, given, warnings)
         views = recording.views
         boxes = [given.boxes.get(number) for number in range(len(views))]
-        made = [_mask(given.masks.get(number), view.camera) for number, view in enumerate(views)]
+        made = [mask_file(given.masks.get(number), view.camera) for number, view in enumerate(views)]
         masks = masks_of(views, boxes, made, None if ground is None else ground.height)
         config = TrackConfig(points=given.points)
         followed = follow_all(views, masks, config, told, tracks, estimate_noise)
@@ -207,7 +207,7 @@ def _in_world(view: View, world_to_camera: Array) -> View:
     return replace(view, camera=replace(view.camera, world_to_camera=world_to_camera))
 
 
-def _mask(path: Path | None, camera: Camera) -> Array | None:
+def mask_file(path: Path | None, camera: Camera) -> Array | None:
     from PIL import Image
 
     if path is None:

@@ -1,8 +1,9 @@
 """``python -m physworld_workers.commands.importing SOURCE --out SCENE``: a recording of any form to a scene.
 
-SOURCE is a file of marker tracks, an archive, or a folder of pictures with depth, in which the object is
-followed (``--box``). What was found and guessed is printed; what a person knows better is an option. ``--look`` prints
-it and writes nothing. ``--picture`` draws the first frame with the object's pixels and points, and the last one.
+SOURCE is a file of marker tracks, an archive, or a folder of pictures with depth or a film of a motion in a plane, in
+which the object is followed (``--box``). What was found and guessed is printed; what a person knows better is an
+option. ``--look`` prints it and writes nothing. ``--picture`` draws the first frame with the object's pixels and
+points, and the last one.
 """
 
 from __future__ import annotations
@@ -17,6 +18,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from physworld_workers.commands import importing_planar as planar
+from physworld_workers.commands.importing_planar import numbers
 
 if TYPE_CHECKING:
     from physworld.scene import Scene
@@ -122,12 +126,15 @@ def _parser() -> argparse.ArgumentParser:
         default=None,
         help="folder for what films need: a fitted splat, camera, frames",
     )
+    planar.add_options(parser)
     return parser
 
 
 def _import(given: argparse.Namespace) -> None:
     from physworld_scenes.bundle import read_bundle
-    from physworld_scenes.importers import FOLDERS, import_any
+    from physworld_scenes.importers import import_any
+    from physworld_scenes.importers.film import is_film
+    from physworld_scenes.importers.pictures import is_pictures
 
     if given.out is None and not given.look:
         raise ValueError("--out is missing: the folder for the scene; or --look")
@@ -135,15 +142,19 @@ def _import(given: argparse.Namespace) -> None:
     if given.look:
         _look(given, options)
         return
-    of_pictures = given.source.is_dir() and any(form.recognises(given.source) for form in FOLDERS)
-    for option, value in (("--picture", given.picture), ("--pictures", given.pictures)):
-        if value is not None and not of_pictures:
-            raise ValueError(
-                f"{option} {value} needs pictures with depth, which {given.source} does not hold"
-            )
+    with_depth, filmed = is_pictures(given.source), is_film(given.source)
+    if given.pictures is not None and not with_depth:
+        raise ValueError(
+            f"--pictures {given.pictures} needs pictures with depth, which {given.source} does not hold"
+        )
+    if given.picture is not None and not (with_depth or filmed):
+        raise ValueError(f"--picture {given.picture} needs pictures, which {given.source} does not hold")
+    planar.require_film(given, filmed)
     followed = None
-    if of_pictures:
+    if with_depth:
         scene, warnings, followed = _pictures(given, options)
+    elif filmed:
+        scene, warnings, followed = planar.read(given, options, _picture_options(given))
     elif given.source.is_dir():
         scene, warnings = read_bundle(given.source), []
     else:
@@ -184,7 +195,7 @@ def _options(given: argparse.Namespace) -> ImportOptions:
         if getattr(given, key.partition("_")[0]) is not None:
             facts[key] = getattr(given, key.partition("_")[0])
     if given.box_m is not None:
-        corners = _numbers("--box-m", given.box_m, 6)
+        corners = numbers("--box-m", given.box_m, 6)
         facts |= {"box_min_m": corners[:3], "box_max_m": corners[3:]}
     known |= {"body": facts or None, "markers": tuple(names) or None}
     return ImportOptions(**{name: value for name, value in known.items() if value is not None})
@@ -262,8 +273,8 @@ def _picture_options(given: argparse.Namespace) -> PictureOptions:
     grip = None
     if any(each is not None for each in told):
         number, _, dictionary = (given.marker or "").partition(":")
-        metres = None if given.held_m is None else _numbers("--held-m", given.held_m, 6)
-        colour = None if given.colour is None else _numbers("--colour", given.colour, 2)
+        metres = None if given.held_m is None else numbers("--held-m", given.held_m, 6)
+        colour = None if given.colour is None else numbers("--colour", given.colour, 2)
         grip = GripFrom(
             marker=None if given.marker is None else -1 if number == "any" else _whole("--marker", number),
             dictionary=dictionary or "4X4_50",
@@ -297,17 +308,7 @@ def _of_camera(text: str) -> tuple[int, str]:
 def _box(option: str, text: str | None) -> Any:
     from physworld.tracking.mask import Box
 
-    return None if text is None else Box(*(int(value) for value in _numbers(option, text, 4)))
-
-
-def _numbers(option: str, text: str, count: int) -> list[float]:
-    try:
-        values = [float(part) for part in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) != count or not np.isfinite(values).all():
-        raise ValueError(f"{option} takes {count} numbers with commas between, got {text!r}")
-    return values
+    return None if text is None else Box(*(int(value) for value in numbers(option, text, 4)))
 
 
 def _whole(option: str, text: str) -> int:

@@ -72,7 +72,7 @@ def test_pictures_of_a_source_without_any_are_refused_before_a_scene_is_written(
     table.write_text("t,x,y,z\n0,0,0,0\n0.1,0,0,0\n")
     out = tmp_path / "scene"
     assert importing.main([str(table), f"--out={out}", f"{option}={tmp_path / 'kept.png'}"]) == 2
-    assert f"{option} {tmp_path / 'kept.png'} needs pictures with depth" in capsys.readouterr().err
+    assert f"{option} {tmp_path / 'kept.png'} needs pictures" in capsys.readouterr().err
     assert not out.exists()
 
 

@@ -16,7 +16,7 @@ MODULE = "physworld_workers.commands.importing"
 
 def import_recording(
     source: Annotated[
-        Path, typer.Argument(help="File of tracks or markers, archive, or folder of pictures.")
+        Path, typer.Argument(help="File of tracks or markers, archive, film, or folder of pictures.")
     ],
     out: Annotated[Path | None, typer.Option(help="Folder for the scene.")] = None,
     look: Annotated[bool, typer.Option("--look", help="Say what would be guessed, write nothing.")] = False,
@@ -58,6 +58,18 @@ def import_recording(
     log_delay: Annotated[float | None, typer.Option(help="Pictures' clock behind the log's [s].")] = None,
     held: Annotated[str | None, typer.Option(help="Box around what is held: LEFT,TOP,RIGHT,BOTTOM.")] = None,
     held_m: Annotated[str | None, typer.Option(help="Instead, in the world [m]: X,Y,Z,X,Y,Z.")] = None,
+    board: Annotated[
+        str | None,
+        typer.Option(help="In the plane of a film: charuco:COLUMNSxROWS:SQUARE:MARKER, aruco:… or marker:…"),
+    ] = None,
+    scale: Annotated[
+        str | None, typer.Option(help="Instead, two of its pixels and metres: COLUMN,ROW,COLUMN,ROW,METRES.")
+    ] = None,
+    camera: Annotated[Path | None, typer.Option(help="JSON of a film's camera.")] = None,
+    plumb: Annotated[
+        str | None, typer.Option(help="Line along which gravity pulls: COLUMN,ROW,COLUMN,ROW.")
+    ] = None,
+    before: Annotated[float | None, typer.Option(help="How far the object is before the plane [m].")] = None,
     depth_scale: Annotated[float | None, typer.Option(help="Depth values a metre.")] = None,
     frames: Annotated[str | None, typer.Option(help="FIRST:LAST of the pictures.")] = None,
     points: Annotated[int | None, typer.Option(min=8, help="To follow in each camera.")] = None,
@@ -94,6 +106,11 @@ def import_recording(
         "--log-delay": log_delay,
         "--held": held,
         "--held-m": held_m,
+        "--board": board,
+        "--scale": scale,
+        "--camera": camera,
+        "--plumb": plumb,
+        "--before": before,
         "--depth-scale": depth_scale,
         "--frames": frames,
         "--points": points,
