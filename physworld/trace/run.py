@@ -258,13 +258,15 @@ class _Trace:
         """The declared physics."""
         self.simulations.stage = "declared physics"
         unknowns = self._unknowns()
-        thorough = replace(
-            self._setting(ground, self.twin, unknowns), iterations=_THOROUGH * self.config.iterations
-        )
-        first = float(np.mean(ground.white.residual(ground.tracks) ** 2))
+        setting = self._setting(ground, self.twin, unknowns)
+        thorough = replace(setting, iterations=_THOROUGH * self.config.iterations)
+        scale = thorough.counted(float(np.mean(ground.white.residual(ground.tracks) ** 2)))
         start = {u.name: u.start for u in unknowns}
         places = [place for about in elsewhere(unknowns, start) for place in about]
-        declared = thorough.fitted((), start, places, scale=thorough.counted(first))
+        places.append(
+            start | {u.name: u.prior[0] for u in hold_unknowns(self.twin) if u.prior}
+        )  # as calibrated
+        declared = thorough.fitted((), start, places, scale=scale)
         if declared is None:
             raise RuntimeError("the calibrated twin cannot be simulated again")
         return declared
