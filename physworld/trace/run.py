@@ -255,7 +255,7 @@ class _Trace:
         return _Ground(bare, white, whitening, blocks, sigma, numerics, finer, tracks)
 
     def _declared(self, ground: _Ground) -> Hypothesis:
-        """The declared physics."""
+        """The declared physics, begun where the calibration ended too."""
         self.simulations.stage = "declared physics"
         unknowns = self._unknowns()
         setting = self._setting(ground, self.twin, unknowns)
@@ -263,9 +263,7 @@ class _Trace:
         scale = thorough.counted(float(np.mean(ground.white.residual(ground.tracks) ** 2)))
         start = {u.name: u.start for u in unknowns}
         places = [place for about in elsewhere(unknowns, start) for place in about]
-        places.append(
-            start | {u.name: u.prior[0] for u in hold_unknowns(self.twin) if u.prior}
-        )  # as calibrated
+        places.append(start | {u.name: u.prior[0] for u in hold_unknowns(self.twin) if u.prior})
         declared = thorough.fitted((), start, places, scale=scale)
         if declared is None:
             raise RuntimeError("the calibrated twin cannot be simulated again")
