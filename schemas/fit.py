@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 
 from physworld_schemas.base import Artifact, Lineage, Request, Resource
 from physworld_schemas.library import NamesOf
+from physworld_schemas.standing import standing_of
 
 MOST_PARTICLES = 200_000
 
@@ -253,3 +254,8 @@ class Fit(Resource):
     artifacts: list[Artifact] = Field(
         default_factory=list, description="Files, by name and SHA-256; download them from /v1/artifacts."
     )
+
+    @property
+    def standing(self) -> str:
+        """Its state, or "not converged" where a search spent its budget."""
+        return standing_of(self.state, converged=self.search.converged if self.search else None)

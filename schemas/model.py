@@ -9,6 +9,7 @@ from pydantic import Field, computed_field
 
 from physworld_schemas.base import Artifact, Lineage, Request, Resource, Seed
 from physworld_schemas.quality import Quality, quality_of
+from physworld_schemas.standing import standing_of
 
 Format = Literal["torch_export", "onnx"]
 FORMATS: tuple[Format, ...] = get_args(Format)
@@ -180,6 +181,11 @@ class ModelVersion(Resource):
     def quality(self) -> Quality:
         """The verdict of the gate, from the metrics."""
         return quality_of(self.metrics)
+
+    @property
+    def standing(self) -> str:
+        """Its state, or "failed the gate" where it is ready and worse than a baseline."""
+        return standing_of(self.state, verdict=self.quality.verdict)
 
 
 class Model(Resource):
