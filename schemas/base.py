@@ -36,6 +36,10 @@ _SINGLE = frozenset({float, int, bool})
 _PLAIN = _SINGLE | {type(None)}
 TEXTS = {"texts": True}
 """Context of a validation that reads numbers, true and false from texts, as a form of a browser sends them."""
+RATIO: dict[str, Any] = {"unit": "1"}
+UNIT_BESIDE: dict[str, Any] = {"unit": "that of the field `unit`"}
+UNIT_OF_METRIC: dict[str, Any] = {"unit": "that of the metric"}
+"""What the schema of a number says of its unit: it has none, or it depends on what is measured."""
 Seed = Annotated[int, Field(ge=0, lt=2**63, json_schema_extra={"format": "int64"})]
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from physworld_schemas.base import Lineage, Request, Resource, Seed
+from physworld_schemas.base import RATIO, UNIT_BESIDE, Lineage, Request, Resource, Seed
 from physworld_schemas.library import NamesOf
 
 CheckState = Literal["pending", "ready", "failed", "cancelled"]
@@ -36,6 +36,7 @@ class CheckConfig(Request):
         lt=1.0,
         description="How far a calibrated twin is assumed to be off, over the motion's extent.",
         examples=[0.03],
+        json_schema_extra=RATIO,
     )
     candidates: list[Annotated[str, NamesOf("effect")]] = Field(
         default_factory=list, max_length=64, description="Effects that are asked; empty: all."
@@ -70,12 +71,17 @@ class CheckedParameter(Resource):
 
     name: str = Field(description="Name of the number.")
     unit: str = Field(description="Its unit; `1` has none.", examples=["Pa"])
-    value: float = Field(description="Value at which the check was made.")
+    value: float = Field(description="Value at which the check was made.", json_schema_extra=UNIT_BESIDE)
     value_is: Literal["prior", "given"] = Field(description="Where the value comes from.")
-    prior95: tuple[float, float] = Field(description="95 % interval of what is known beforehand, in `unit`.")
-    expected95: tuple[float, float] = Field(description="95 % interval after a calibration, in `unit`.")
+    prior95: tuple[float, float] = Field(
+        description="95 % interval of what is known beforehand, in `unit`.", json_schema_extra=UNIT_BESIDE
+    )
+    expected95: tuple[float, float] = Field(
+        description="95 % interval after a calibration, in `unit`.", json_schema_extra=UNIT_BESIDE
+    )
     ratio: float = Field(
-        description="Width of the second interval over the first, in the scale of the search."
+        description="Width of the second interval over the first, in the scale of the search.",
+        json_schema_extra=RATIO,
     )
     optional: bool = Field(description="A calibration frees it only where data ask for it.")
 
@@ -85,9 +91,11 @@ class CheckedGate(Resource):
 
     name: str = Field(description="Name of the strength.")
     unit: str = Field(description="Its unit; `1` has none.", examples=["1/s"])
-    plausible: float = Field(description="Plausible size, in `unit`.")
-    most: float = Field(description="Most that is plausible, in `unit`.")
-    detectable: float | None = Field(description="Smallest strength that is detected; null: none is.")
+    plausible: float = Field(description="Plausible size, in `unit`.", json_schema_extra=UNIT_BESIDE)
+    most: float = Field(description="Most that is plausible, in `unit`.", json_schema_extra=UNIT_BESIDE)
+    detectable: float | None = Field(
+        description="Smallest strength that is detected; null: none is.", json_schema_extra=UNIT_BESIDE
+    )
 
 
 class CheckedEffect(Resource):
@@ -97,12 +105,15 @@ class CheckedEffect(Resource):
     label: str = Field(description="Its name, with the strength where it is asked in parts.")
     title: str = Field(description="For people.")
     status: Visibility = Field(description="Whether a plausible one would be detected.")
-    multiple: float | None = Field(description="Multiple of a plausible one that is detected; null: none is.")
+    multiple: float | None = Field(
+        description="Multiple of a plausible one that is detected; null: none is.", json_schema_extra=RATIO
+    )
     gates: list[CheckedGate] = Field(description="Its strengths.")
     shapes: int = Field(description="Shapes that were asked.")
     visible_shapes: int = Field(description="Shapes in which it is visible.")
     hidden_by: dict[str, float] = Field(
-        description="Numbers that hide it: it would be visible if any one were known. With the correlation."
+        description="Numbers that hide it: it would be visible if any one were known. With the correlation.",
+        json_schema_extra=RATIO,
     )
 
 
@@ -110,9 +121,12 @@ class CheckedPair(Resource):
     """Two effects that look alike."""
 
     labels: tuple[str, str] = Field(description="Both effects.")
-    correlation: float = Field(description="Of what they do beyond the calibrated numbers.")
+    correlation: float = Field(
+        description="Of what they do beyond the calibrated numbers.", json_schema_extra=RATIO
+    )
     apart_from_multiple: float | None = Field(
-        description="Multiple of the plausible size from which they are told apart; null: never."
+        description="Multiple of the plausible size from which they are told apart; null: never.",
+        json_schema_extra=RATIO,
     )
 
 
@@ -122,7 +136,9 @@ class CheckView(Resource):
     discrepancy_m: float = Field(
         description="Deviation per axis of the model's own error.", json_schema_extra={"unit": "m"}
     )
-    discrepancy_share: float = Field(description="The same over the motion's extent.")
+    discrepancy_share: float = Field(
+        description="The same over the motion's extent.", json_schema_extra=RATIO
+    )
     parameters: list[CheckedParameter] = Field(description="Numbers that a calibration would search.")
     effects: list[CheckedEffect] = Field(description="Effects of the registry.")
     pairs: list[CheckedPair] = Field(description="Effects that look alike.")
@@ -133,8 +149,12 @@ class MotionChange(Resource):
     """What a motion does for an effect or a pair: multiples of the plausible size before and after."""
 
     labels: list[str] = Field(description="The effect, or both effects.")
-    before_multiple: float | None = Field(description="With this recording alone; null: never.")
-    after_multiple: float | None = Field(description="With the motion as well; null: never.")
+    before_multiple: float | None = Field(
+        description="With this recording alone; null: never.", json_schema_extra=RATIO
+    )
+    after_multiple: float | None = Field(
+        description="With the motion as well; null: never.", json_schema_extra=RATIO
+    )
     shown: bool = Field(description="Whether the motion makes the difference.")
 
 

@@ -8,8 +8,9 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from physworld_schemas.base import Artifact, Lineage, Request, Resource
+from physworld_schemas.base import UNIT_BESIDE, Artifact, Lineage, Request, Resource
 from physworld_schemas.library import NamesOf
+from physworld_schemas.standing import standing_of
 
 MOST_PARTICLES = 200_000
 
@@ -125,10 +126,12 @@ class Parameter(Resource):
     search did not end by itself.
     """
 
-    value: float = Field(description="Calibrated value.")
+    value: float = Field(description="Calibrated value.", json_schema_extra=UNIT_BESIDE)
     unit: str = Field(description="Unit of the value; `1` has none.", examples=["Pa"])
     ci95: tuple[float, float] | None = Field(
-        default=None, description="95 % interval, in the same unit; null where none can be given."
+        default=None,
+        description="95 % interval, in the same unit; null where none can be given.",
+        json_schema_extra=UNIT_BESIDE,
     )
     identified: bool = Field(
         default=True,
@@ -253,3 +256,8 @@ class Fit(Resource):
     artifacts: list[Artifact] = Field(
         default_factory=list, description="Files, by name and SHA-256; download them from /v1/artifacts."
     )
+
+    @property
+    def standing(self) -> str:
+        """Its state, or "not converged" where a search spent its budget."""
+        return standing_of(self.state, converged=self.search.converged if self.search else None)

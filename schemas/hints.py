@@ -10,7 +10,7 @@ HINTS = {
     "not_found": "The lists of the API, of the dashboard and of the command line hold what there is.",
     "invalid_cursor": "Begin the list anew without a cursor.",
     "idempotency_key_reused": "Send a new Idempotency-Key with a new body.",
-    "content_too_large": "Send less at once; GET /health/ready and docs/operations.md name the limits.",
+    "content_too_large": "Send less at once; docs/api.md names the limits under Upload.",
     "too_many_requests": "Wait for as long as Retry-After says.",
     "unavailable": "Try again in a moment; nothing was changed.",
     "database_unavailable": "Try again in a moment; nothing was changed.",

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from physworld_schemas.base import Problem, Reference, Resource
+from physworld_schemas.base import RATIO, UNIT_BESIDE, Problem, Reference, Resource
 
 JobKind = Literal[
     "check",
@@ -32,8 +32,10 @@ class Progress(Resource):
     Units are frames, simulations, episodes, steps.
     """
 
-    done: float = Field(default=0, description="How much is done.")
-    total: float = Field(default=0, description="Of how much; 0: not known yet.")
+    done: float = Field(default=0, description="How much is done.", json_schema_extra=UNIT_BESIDE)
+    total: float = Field(
+        default=0, description="Of how much; 0: not known yet.", json_schema_extra=UNIT_BESIDE
+    )
     unit: str = Field(default="", description="What is counted.", examples=["simulations"])
     message: str = Field(default="", description="What is being done.")
     fraction: float | None = Field(
@@ -41,6 +43,7 @@ class Progress(Resource):
         ge=0,
         le=1,
         description="Share of the whole job that is done, all its stages together; it never falls. null: not known.",
+        json_schema_extra=RATIO,
     )
     eta_s: float | None = Field(
         default=None,

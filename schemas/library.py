@@ -21,7 +21,7 @@ from typing import Any, Literal
 from pydantic import Field, GetJsonSchemaHandler
 from pydantic.json_schema import JsonSchemaValue
 
-from physworld_schemas.base import Resource
+from physworld_schemas.base import UNIT_BESIDE, Resource
 
 BodyShape = Literal["solid", "sheet", "rod"]
 NameKind = Literal["law", "flow law", "effect"]
@@ -39,10 +39,14 @@ class Quantity(Resource):
     unit: str = Field(description="Unit of the value; `1` has none.", examples=["Pa"])
     help: str = Field(default="", description="What it means, in a sentence.")
     default: float | None = Field(
-        default=None, description="Value without a choice; null: it must be given, or the body decides."
+        default=None,
+        description="Value without a choice; null: it must be given, or the body decides.",
+        json_schema_extra=UNIT_BESIDE,
     )
     bounds: dict[BodyShape, tuple[float | None, float | None]] = Field(
-        default_factory=dict, description="Least and greatest value by the body's shape; null: none."
+        default_factory=dict,
+        description="Least and greatest value by the body's shape; null: none.",
+        json_schema_extra=UNIT_BESIDE,
     )
     gate: bool = Field(default=False, description="Zero switches the effect off.")
 
@@ -77,7 +81,7 @@ class Metric(Resource):
 
     name: str = Field(description="Name in results.")
     title: str = Field(description="Name for people.")
-    unit: str = Field(description="Unit of the value; `1` has none.", examples=["Pa"])
+    unit: str = Field(description="Unit of the value; `1` has none.", examples=["m"])
     help: str = Field(default="", description="What it means, in a sentence.")
     lower_is_better: bool = Field(default=True, description="Which way is better.")
     listed: bool = Field(default=True, description="Whether tables show it.")

@@ -7,8 +7,9 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field, computed_field
 
-from physworld_schemas.base import Artifact, Lineage, Request, Resource, Seed
+from physworld_schemas.base import UNIT_OF_METRIC, Artifact, Lineage, Request, Resource, Seed
 from physworld_schemas.quality import Quality, quality_of
+from physworld_schemas.standing import standing_of
 
 Format = Literal["torch_export", "onnx"]
 FORMATS: tuple[Format, ...] = get_args(Format)
@@ -181,6 +182,11 @@ class ModelVersion(Resource):
         """The verdict of the gate, from the metrics."""
         return quality_of(self.metrics)
 
+    @property
+    def standing(self) -> str:
+        """Its state, or "failed the gate" where it is ready and worse than a baseline."""
+        return standing_of(self.state, verdict=self.quality.verdict)
+
 
 class Model(Resource):
     """A registered name with its aliases.
@@ -216,9 +222,11 @@ class VersionPatch(Request):
 class MeasuredError(Resource):
     """A mean error, in its metric's unit, and its 95 % interval by blocks of frames; None where it is not known."""
 
-    value: float = Field(description="Mean error, in its metric's unit.")
+    value: float = Field(description="Mean error, in its metric's unit.", json_schema_extra=UNIT_OF_METRIC)
     ci95: tuple[float, float] | None = Field(
-        default=None, description="95 % interval, in the same unit; null where none can be given."
+        default=None,
+        description="95 % interval, in the same unit; null where none can be given.",
+        json_schema_extra=UNIT_OF_METRIC,
     )
 
 

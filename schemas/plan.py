@@ -183,7 +183,9 @@ class Plan(Resource):
     model_against_twin_end_m: float | None = Field(
         default=None, description="The same at the end.", json_schema_extra={"unit": "m"}
     )
-    cost_history: list[float] = Field(default_factory=list, description="Best cost of every iteration.")
+    cost_history: list[float] = Field(
+        default_factory=list, description="Best cost of every iteration.", json_schema_extra={"unit": "m"}
+    )
     limits: dict[str, Any] = Field(default_factory=dict, description="Limits that held.")
     peak_speed_m_s: float | None = Field(
         default=None, description="Greatest speed of a grip.", json_schema_extra={"unit": "m/s"}

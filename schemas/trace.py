@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import ConfigDict, Field, model_validator
 
-from physworld_schemas.base import Artifact, Lineage, Request, Resource, Seed
+from physworld_schemas.base import UNIT_BESIDE, Artifact, Lineage, Request, Resource, Seed
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.library import NamesOf
 
@@ -133,10 +133,12 @@ class Figure(Resource):
 
     model_config = ConfigDict(extra="allow")
 
-    value: float | None = Field(description="Value; null: not known.")
-    unit: str = Field(description="Unit of the value; `1` has none.", examples=["Pa"])
+    value: float | None = Field(description="Value; null: not known.", json_schema_extra=UNIT_BESIDE)
+    unit: str = Field(description="Unit of the value; `1` has none.", examples=["1/s"])
     ci95: tuple[float | None, float | None] | None = Field(
-        default=None, description="95 % interval, in the same unit; null where none can be given."
+        default=None,
+        description="95 % interval, in the same unit; null where none can be given.",
+        json_schema_extra=UNIT_BESIDE,
     )
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from physworld_schemas.base import Artifact, Lineage, Request, Resource
+from physworld_schemas.base import RATIO, Artifact, Lineage, Request, Resource
 from physworld_schemas.rollout import MAX_CANDIDATES
 
 VideoOf = Literal["scene", "fit", "model", "rollout"]
@@ -96,20 +96,29 @@ class VideoScores(Resource):
     psnr_db: float | None = Field(
         description="Mean over the frames that are not equal.", json_schema_extra={"unit": "dB"}
     )
-    ssim: float = Field(description="Mean over the frames.")
-    iou: float | None = Field(default=None, description="Mean over the frames; null: no masks.")
+    ssim: float = Field(description="Mean over the frames.", json_schema_extra=RATIO)
+    iou: float | None = Field(
+        default=None, description="Mean over the frames; null: no masks.", json_schema_extra=RATIO
+    )
     psnr_db_per_frame: list[float | None] = Field(
         description="Null where both pictures are equal.", json_schema_extra={"unit": "dB"}
     )
-    ssim_per_frame: list[float] = Field(description="1 where both pictures are equal.")
-    iou_per_frame: list[float] | None = Field(default=None, description="Null: no masks.")
+    ssim_per_frame: list[float] = Field(
+        description="1 where both pictures are equal.", json_schema_extra=RATIO
+    )
+    iou_per_frame: list[float] | None = Field(
+        default=None, description="Null: no masks.", json_schema_extra=RATIO
+    )
     lpips: float | None = Field(
         default=None,
         description="Mean over the frames, by AlexNet; null: the worker has no weights of LPIPS, or a side of "
         "the film is less than 31 px.",
+        json_schema_extra=RATIO,
     )
     lpips_per_frame: list[float] | None = Field(
-        default=None, description="0 where both pictures are equal; null: not measured."
+        default=None,
+        description="0 where both pictures are equal; null: not measured.",
+        json_schema_extra=RATIO,
     )
 
 

@@ -18,7 +18,7 @@ import unasync
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "clients" / "python" / "physworld_client"
-HALVES = ("artifacts", "client", "keys", "live", "loop", "predict", "resources", "videos")
+HALVES = ("artifacts", "base", "client", "keys", "live", "loop", "predict", "resources", "videos")
 HEADER = "# Made of async_{name}.py by `make sdk`: change that file.\n"
 WORDS = {
     "AsyncExitStack": "ExitStack",

@@ -12,6 +12,8 @@ from typing import Any
 from sqlalchemy import Select, and_, or_, select
 from sqlalchemy.orm import Session
 
+from physworld_schemas.quality import quality_of
+from physworld_schemas.standing import standing_of
 from physworld_storage.tables import (
     AssessmentRow,
     DatasetRow,
@@ -37,7 +39,7 @@ class Member:
         kind: of the object.
         column: its place among ``KINDS``.
         label: for people.
-        state: of the object; empty for a scene.
+        state: of the object, as lists call it (``schemas/standing.py``); empty for a scene.
         parents: keys of what it was made from.
     """
 
@@ -55,8 +57,10 @@ def family_of(session: Session, scene_id: str) -> list[Member]:
     if name is None:
         return []
     found = [Member(scene_id, "scene", 0, name, "", ())]
-    fits = select(FitRow.id, FitRow.state).where(FitRow.scene_id == scene_id)
-    found += [Member(i, "fit", 1, _short(i), s, (scene_id,)) for i, s in _newest(session, fits, FitRow)]
+    fits = select(FitRow.id, FitRow.state, FitRow.metrics["search"]).where(FitRow.scene_id == scene_id)
+    for key, state, search in _newest(session, fits, FitRow):
+        standing = standing_of(state, converged=(search or {}).get("converged"))
+        found.append(Member(key, "fit", 1, _short(key), standing, (scene_id,)))
     asked = select(TraceRow.id, TraceRow.state, TraceRow.verdict, TraceRow.fit_id).where(
         TraceRow.scene_id == scene_id
     )
@@ -69,14 +73,16 @@ def family_of(session: Session, scene_id: str) -> list[Member]:
     for key, state, fit, trace in _newest(session, made, DatasetRow):
         found.append(Member(key, "dataset", 3, _short(key), state, tuple(filter(None, (fit, trace)))))
     version = ModelVersionRow
-    trained = select(version.name, version.version, version.state, version.dataset_id).where(
+    judged = version.metrics["held_out"], version.metrics["energy"]
+    trained = select(version.name, version.version, version.state, version.dataset_id, *judged).where(
         version.scene_id == scene_id
     )
     versions = _newest(session, trained, version)
-    for model, number, state, dataset in versions:
+    for model, number, state, dataset, held_out, energy in versions:
         parents = (dataset,) if dataset else (scene_id,)
-        found.append(Member(f"{model}:{number}", "model", 4, f"{model} {number}", state, parents))
-    return found + _uses(session, [(model, number) for model, number, _, _ in versions[:MOST]])
+        standing = standing_of(state, verdict=quality_of({"held_out": held_out, "energy": energy}).verdict)
+        found.append(Member(f"{model}:{number}", "model", 4, f"{model} {number}", standing, parents))
+    return found + _uses(session, [(one.name, one.version) for one in versions])
 
 
 def related(members: Sequence[Member], focus: str) -> list[Member]:

@@ -1,4 +1,4 @@
-"""What the generated OpenAPI document lacks: an introduction, words for parameters and pages, problems, 429."""
+"""What the generated OpenAPI document lacks: an introduction, words for parameters and pages, problems, examples."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pydantic.json_schema import models_json_schema
 from physworld_schemas.base import Page, Problem
 from physworld_schemas.job import Event
 from physworld_services.api.errors import documented
+from physworld_services.api.examples import illustrate
 
 INTRODUCTION = """
 Send a recording (`POST /v1/scenes`), start the whole chain (`POST /v1/pipelines`), follow its job
@@ -27,8 +28,8 @@ with an `Idempotency-Key` can be sent again without starting work twice.
 **Problems** are RFC 9457 documents: `code` is stable, `detail` has the numbers that broke, `errors` the place of each
 fault.
 
-**Numbers** are in SI units; a field's `unit` says which, names end in it (`track_m`). Identifiers are a prefix and
-26 characters that sort by time. Seeds are whole numbers from 0 to 2⁶³ − 1.
+**Numbers** are in SI units; a field's `unit` says which (`1`: none), names end in it (`track_m`). Identifiers are a
+prefix and 26 characters that sort by time. Seeds are whole numbers from 0 to 2⁶³ − 1.
 """.strip()
 PARAMETERS = {
     "state": "Only those in this state.",
@@ -72,6 +73,7 @@ def describe(app: FastAPI) -> None:
                             parameter.setdefault("description", PARAMETERS[parameter["name"]])
                     if operation.get("security"):
                         operation["responses"].setdefault("429", documented(429)[429])
+            illustrate(document)
             app.openapi_schema = document
         return app.openapi_schema
 

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from urllib.parse import quote, urlencode
 
 from physworld.report.markup import Html, tag
+from physworld_schemas.standing import look_of
 from physworld_services.dashboard.site import BASE, Site
 from physworld_storage.family import Member, ancestors, family_of, related
 
@@ -100,7 +101,7 @@ def _box(member: Member, x: float, y: float, here: bool) -> Html:
     said = f"{member.kind} {member.label}{f', {member.state}' if member.state else ''}"
     texts = [tag("text", _cut(member.label), y=18 if member.state else 26)]
     if member.state:
-        texts.append(tag("text", member.state, y=34, class_=f"state {member.state}"))
+        texts.append(tag("text", member.state, y=34, class_=f"state {look_of(member.state)}"))
     parts = [
         tag("title", f"{member.kind} {member.key}{f', {member.state}' if member.state else ''}"),
         tag("rect", x=x, y=y, width=BOX_WIDTH, height=BOX_HEIGHT, rx=7),

@@ -9,6 +9,7 @@ from markupsafe import Markup, escape
 
 from physworld.report import names
 from physworld.report.markup import Html
+from physworld_schemas.standing import look_of
 from physworld_schemas.wording import roughly
 from physworld_services.dashboard.tables import label_of
 
@@ -206,5 +207,6 @@ FILTERS = {
     "sentence": names.sentence,
     "predictor": label_of,
     "identifier": identifier,
+    "look": look_of,
     "plain": plain,
 }

@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 
 from physworld_scenes.bundle import FIELD_OF_ARRAY
 from physworld_scenes.declaration import BodyForm, ColliderForm, Declaration, GripForm, GroundForm
+from physworld_schemas.hints import HINTS
 from physworld_services.web import create_app
 from physworld_storage.settings import Settings
 
@@ -92,6 +93,26 @@ def test_the_table_of_addresses_is_the_api(tmp_path: Path) -> None:
     page = (ROOT / "docs" / "api.md").read_text()
     documented = {pair for pair in ADDRESS.findall(page) if pair[1] != "/metrics"}
     assert documented == served
+
+
+def test_a_hint_names_a_page_that_says_it() -> None:
+    pages = set(re.findall(r"docs/\w+\.md", " ".join(HINTS.values())))
+    assert {page for page in pages if not (ROOT / page).is_file()} == set()
+    upload = (ROOT / "docs" / "api.md").read_text().partition("## Upload\n")[2].partition("\n## ")[0]
+    assert HINTS["content_too_large"].endswith("docs/api.md names the limits under Upload.")
+    assert "PHYSWORLD_MAX_UPLOAD_BYTES" in upload and "1 MiB" in upload
+
+
+def test_the_commands_of_a_worker_elsewhere_name_every_variable_of_its_store() -> None:
+    page = (ROOT / "docs" / "howto" / "twenty_machines.md").read_text()
+    wanted = {
+        "DATABASE_URL",
+        "BROKER_URL",
+        "STORE_URL",
+        *(n.upper() for n in Settings.model_fields if "s3_" in n),
+    }
+    [block] = [one for one in CODE_BLOCK.findall(page) if "physworld_workers" in one]
+    assert set(re.findall(r"PHYSWORLD_(\w+)=", block)) == wanted
 
 
 def test_every_key_of_a_scene_is_documented() -> None:

@@ -15,6 +15,7 @@ from __future__ import annotations
 from physworld_client.async_client import AsyncClient
 from physworld_client.client import Client
 from physworld_client.errors import (
+    AmbiguousName,
     ApiError,
     AuthenticationFailed,
     BadRequest,
@@ -40,6 +41,7 @@ from physworld_client.errors import (
     ServerError,
     SignatureInvalid,
     SigningKeyUntrusted,
+    UnknownName,
     WaitTimedOut,
 )
 from physworld_client.tables import to_pandas
@@ -47,6 +49,7 @@ from physworld_client.tables import to_pandas
 __version__ = "0.2.0"
 
 __all__ = [
+    "AmbiguousName",
     "ApiError",
     "AsyncClient",
     "AuthenticationFailed",
@@ -74,6 +77,7 @@ __all__ = [
     "ServerError",
     "SignatureInvalid",
     "SigningKeyUntrusted",
+    "UnknownName",
     "WaitTimedOut",
     "__version__",
     "to_pandas",

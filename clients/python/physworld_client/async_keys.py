@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from physworld_client import calls
-from physworld_client.async_resources import AsyncResource
+from physworld_client.async_base import AsyncListed
 from physworld_client.pages import AsyncListPage
 from physworld_client.types import ApiKey
 from physworld_schemas.key import DEFAULT_LIFETIME_DAYS, Role
 
 
-class AsyncKeys(AsyncResource):
+class AsyncKeys(AsyncListed):
     """API keys: made, listed, given another token, revoked."""
+
+    resource = "keys"
 
     async def create(
         self, name: str, role: Role = "read", *, expires_in_days: int | None = DEFAULT_LIFETIME_DAYS
@@ -30,8 +32,8 @@ class AsyncKeys(AsyncResource):
 
     async def rotate(self, key_id: str, *, grace_minutes: int | None = None) -> ApiKey:
         """Gives a key another token and its whole term again; the old token stays good for the grace."""
-        return await self._client.send(calls.key_rotate(key_id, grace_minutes))
+        return await self._client.send(calls.key_rotate(await self.id_of(key_id), grace_minutes))
 
     async def revoke(self, key_id: str) -> ApiKey:
         """Ends a key, and what it opened, at once."""
-        return await self._client.send(calls.key_revoke(key_id))
+        return await self._client.send(calls.key_revoke(await self.id_of(key_id)))

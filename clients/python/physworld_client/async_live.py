@@ -19,7 +19,8 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
 from physworld_client import live_frames
-from physworld_client.async_resources import LATEST, AsyncResource
+from physworld_client.async_base import AsyncResource
+from physworld_client.async_resources import LATEST
 from physworld_client.errors import ConnectionFailed
 from physworld_client.live_frames import LiveFrame, LiveStart
 from physworld_client.transport import is_loopback

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 from physworld_client import calls
 from physworld_client.arrays import arrays_of
-from physworld_client.async_resources import LATEST, AsyncResource
+from physworld_client.async_base import AsyncListed
+from physworld_client.async_resources import LATEST
 from physworld_client.pages import AsyncListPage
 from physworld_client.types import Array, Assessment, Check, Job, Loop, Trace
 from physworld_schemas.assessment import AssessmentCreate, Frames
@@ -18,28 +19,32 @@ from physworld_schemas.model import TrainingConfig
 from physworld_schemas.trace import TraceConfig
 
 
-class AsyncChecks(AsyncResource):
+class AsyncChecks(AsyncListed):
     """What recordings can show before any fit."""
+
+    resource = "checks"
 
     async def create(self, scene_id: str, config: CheckConfig | None = None) -> Job:
         """Starts a check; its job's output is the check."""
-        return await self._client.send(calls.check_create(scene_id, config))
+        scene = await self._client.scenes.id_of(scene_id)
+        return await self._client.send(calls.check_create(scene, config))
 
     async def get(self, check_id: str) -> Check:
         """One check: once it is ready, its report."""
-        return await self._client.send(calls.check_get(check_id))
+        return await self._client.send(calls.check_get(await self.id_of(check_id)))
 
     async def list(
         self, *, limit: int | None = None, cursor: str | None = None, scene_id: str | None = None
     ) -> AsyncListPage[Check]:
         """Checks, newest first."""
-        return await self._page(
-            lambda at: calls.check_list(limit=limit, cursor=at, scene_id=scene_id), cursor
-        )
+        scene = None if scene_id is None else await self._client.scenes.id_of(scene_id)
+        return await self._page(lambda at: calls.check_list(limit=limit, cursor=at, scene_id=scene), cursor)
 
 
-class AsyncTraces(AsyncResource):
+class AsyncTraces(AsyncListed):
     """Residuals traced to effects."""
+
+    resource = "traces"
 
     async def create(
         self,
@@ -56,13 +61,16 @@ class AsyncTraces(AsyncResource):
         ``scene_ids`` are further recordings of the object, fitted together with the scene; ``held_out_scene_ids`` are
         recordings that only the report sees.
         """
-        return await self._client.send(
-            calls.trace_create(scene_id, config, fit, fit_id, scene_ids, held_out_scene_ids)
-        )
+        scenes = self._client.scenes
+        first = await scenes.id_of(scene_id)
+        further = [await scenes.id_of(one) for one in scene_ids]
+        held_out = [await scenes.id_of(one) for one in held_out_scene_ids]
+        twin = None if fit_id is None else await self._client.fits.id_of(fit_id)
+        return await self._client.send(calls.trace_create(first, config, fit, twin, further, held_out))
 
     async def get(self, trace_id: str) -> Trace:
         """One trace: the verdict and every figure of its report."""
-        return await self._client.send(calls.trace_get(trace_id))
+        return await self._client.send(calls.trace_get(await self.id_of(trace_id)))
 
     async def list(
         self,
@@ -73,13 +81,14 @@ class AsyncTraces(AsyncResource):
         verdict: str | None = None,
     ) -> AsyncListPage[Trace]:
         """Traces, newest first."""
+        scene = None if scene_id is None else await self._client.scenes.id_of(scene_id)
         return await self._page(
-            lambda at: calls.trace_list(limit=limit, cursor=at, scene_id=scene_id, verdict=verdict), cursor
+            lambda at: calls.trace_list(limit=limit, cursor=at, scene_id=scene, verdict=verdict), cursor
         )
 
     async def tracks(self, trace_id: str) -> dict[str, Array]:
         """``times`` (T,) [s], ``before`` and ``after`` (T, N, 3) [m]: open-loop tracks without and with the effects."""
-        return arrays_of(await self._client.send(calls.trace_tracks(trace_id)))
+        return arrays_of(await self._client.send(calls.trace_tracks(await self.id_of(trace_id))))
 
     async def cancel(self, trace_id: str) -> Job:
         """Asks for the end of the trace's job."""
@@ -87,8 +96,10 @@ class AsyncTraces(AsyncResource):
         return await self._client.send(calls.job_cancel(trace.job_id))
 
 
-class AsyncAssessments(AsyncResource):
+class AsyncAssessments(AsyncListed):
     """New recordings held against published models."""
+
+    resource = "assessments"
 
     async def create(
         self,
@@ -113,7 +124,7 @@ class AsyncAssessments(AsyncResource):
             compared_with: another version of the model, measured on the same frames; None: none.
         """
         body = AssessmentCreate(
-            scene_id=scene_id,
+            scene_id=await self._client.scenes.id_of(scene_id),
             open_trace=open_trace,
             trace=trace or TraceConfig(),
             frames=frames,
@@ -123,7 +134,7 @@ class AsyncAssessments(AsyncResource):
 
     async def get(self, assessment_id: str) -> Assessment:
         """One assessment."""
-        return await self._client.send(calls.assessment_get(assessment_id))
+        return await self._client.send(calls.assessment_get(await self.id_of(assessment_id)))
 
     async def list(
         self,
@@ -149,8 +160,10 @@ class AsyncAssessments(AsyncResource):
         )
 
 
-class AsyncLoops(AsyncResource):
+class AsyncLoops(AsyncListed):
     """From a recording that a model predicts badly to the next version of the model."""
+
+    resource = "loops"
 
     async def create(
         self,
@@ -174,11 +187,13 @@ class AsyncLoops(AsyncResource):
             dataset: settings of the demonstrations; None has the version's.
             training: settings of the training; None has the version's.
         """
+        recording = None if scene_id is None else await self._client.scenes.id_of(scene_id)
+        found = None if assessment_id is None else await self._client.assessments.id_of(assessment_id)
         body = LoopCreate(
             model=model,
             version=version,
-            scene_id=scene_id,
-            assessment_id=assessment_id,
+            scene_id=recording,
+            assessment_id=found,
             trace=trace or TraceConfig(),
             dataset=dataset,
             training=training,
@@ -187,7 +202,7 @@ class AsyncLoops(AsyncResource):
 
     async def get(self, loop_id: str) -> Loop:
         """One loop: how it ended, what it made, and the errors of both versions."""
-        return await self._client.send(calls.loop_get(loop_id))
+        return await self._client.send(calls.loop_get(await self.id_of(loop_id)))
 
     async def list(
         self,

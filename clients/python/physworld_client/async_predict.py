@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from physworld_client import predictions
-from physworld_client.async_resources import LATEST, AsyncResource
+from physworld_client.async_base import AsyncListed
+from physworld_client.async_resources import LATEST
 from physworld_client.pages import AsyncListPage
 from physworld_client.predictions import Planned, Predicted
 from physworld_client.types import Array, Job, Plan, Rollout
@@ -13,8 +14,10 @@ from physworld_schemas.plan import PlanConfig, PlanLimits
 from physworld_schemas.rollout import Part, Start
 
 
-class AsyncRollouts(AsyncResource):
+class AsyncRollouts(AsyncListed):
     """What published models predict."""
+
+    resource = "rollouts"
 
     async def create(
         self,
@@ -71,7 +74,7 @@ class AsyncRollouts(AsyncResource):
 
     async def get(self, rollout_id: str) -> Rollout:
         """A rollout that was a job."""
-        return await self._client.send(predictions.rollout_get(rollout_id))
+        return await self._client.send(predictions.rollout_get(await self.id_of(rollout_id)))
 
     async def result(self, rollout_id: str) -> Predicted:
         """The arrays of a rollout that was a job."""
@@ -90,8 +93,10 @@ class AsyncRollouts(AsyncResource):
         )
 
 
-class AsyncPlans(AsyncResource):
+class AsyncPlans(AsyncListed):
     """Motions of the grips that bring the object to a goal."""
+
+    resource = "plans"
 
     async def create(
         self,
@@ -115,7 +120,7 @@ class AsyncPlans(AsyncResource):
 
     async def get(self, plan_id: str) -> Plan:
         """One plan: errors of the prediction and of its execution in the twin."""
-        return await self._client.send(predictions.plan_get(plan_id))
+        return await self._client.send(predictions.plan_get(await self.id_of(plan_id)))
 
     async def result(self, plan_id: str) -> Planned:
         """A plan with its arrays: control path, predicted and executed paths."""

@@ -6,13 +6,12 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
 
 import httpx
-from pydantic import BaseModel
 
 from physworld_client import calls, transport
 from physworld_client.arrays import arrays_of
+from physworld_client.async_base import AsyncListed, AsyncResource
 from physworld_client.bundle import open_bundle
 from physworld_client.errors import PhysWorldError, WaitTimedOut
 from physworld_client.export import open_export
@@ -43,29 +42,13 @@ from physworld_schemas.model import TrainingConfig
 from physworld_schemas.pipeline import PipelineCreate
 from physworld_schemas.scene import SceneImport
 
-if TYPE_CHECKING:
-    from physworld_client.async_client import AsyncClient
-
-Item = TypeVar("Item", bound=BaseModel)
 LATEST = "latest"
 
 
-class AsyncResource:
-    """What the resources share: the client they send through."""
-
-    def __init__(self, client: AsyncClient) -> None:
-        self._client = client
-
-    def __repr__(self) -> str:
-        return f"<{type(self).__name__} of {self._client.base_url}>"
-
-    async def _page(self, call_at: calls.ListCall[Item], cursor: str | None) -> AsyncListPage[Item]:
-        page = await self._client.send(call_at(cursor))
-        return AsyncListPage(page.data, page.has_more, page.next_cursor, lambda at: self._page(call_at, at))
-
-
-class AsyncScenes(AsyncResource):
+class AsyncScenes(AsyncListed):
     """Measured scenes."""
+
+    resource = "scenes"
 
     async def create(self, path: str | Path, options: SceneImport | None = None) -> Scene:
         """Uploads a scene: a folder (packed to a zip), an archive, a ``final_data.pkl`` or a table of markers.
@@ -84,7 +67,7 @@ class AsyncScenes(AsyncResource):
 
     async def get(self, scene_id: str) -> Scene:
         """One scene."""
-        return await self._client.send(calls.scene_get(scene_id))
+        return await self._client.send(calls.scene_get(await self.id_of(scene_id)))
 
     async def list(
         self, *, limit: int | None = None, cursor: str | None = None, kind: str | None = None
@@ -93,16 +76,19 @@ class AsyncScenes(AsyncResource):
         return await self._page(lambda at: calls.scene_list(limit=limit, cursor=at, kind=kind), cursor)
 
 
-class AsyncFits(AsyncResource):
+class AsyncFits(AsyncListed):
     """Calibrated twins."""
+
+    resource = "fits"
 
     async def create(self, scene_id: str, config: FitConfig | None = None) -> Job:
         """Starts a fit; its job's output is the fit."""
-        return await self._client.send(calls.fit_create(scene_id, config))
+        scene = await self._client.scenes.id_of(scene_id)
+        return await self._client.send(calls.fit_create(scene, config))
 
     async def get(self, fit_id: str) -> Fit:
         """One fit."""
-        return await self._client.send(calls.fit_get(fit_id))
+        return await self._client.send(calls.fit_get(await self.id_of(fit_id)))
 
     async def list(
         self, *, limit: int | None = None, cursor: str | None = None, state: str | None = None
@@ -111,18 +97,22 @@ class AsyncFits(AsyncResource):
         return await self._page(lambda at: calls.fit_list(limit=limit, cursor=at, state=state), cursor)
 
 
-class AsyncDatasets(AsyncResource):
+class AsyncDatasets(AsyncListed):
     """Datasets of demonstration episodes."""
+
+    resource = "datasets"
 
     async def create(
         self, fit_id: str, config: DatasetConfig | None = None, *, trace_id: str | None = None
     ) -> Job:
         """Starts writing a dataset, in the twin that the trace made where it added an effect."""
-        return await self._client.send(calls.dataset_create(fit_id, config, trace_id))
+        fit = await self._client.fits.id_of(fit_id)
+        trace = None if trace_id is None else await self._client.traces.id_of(trace_id)
+        return await self._client.send(calls.dataset_create(fit, config, trace))
 
     async def get(self, dataset_id: str) -> Dataset:
         """One dataset."""
-        return await self._client.send(calls.dataset_get(dataset_id))
+        return await self._client.send(calls.dataset_get(await self.id_of(dataset_id)))
 
     async def list(
         self, *, limit: int | None = None, cursor: str | None = None, state: str | None = None
@@ -134,7 +124,8 @@ class AsyncDatasets(AsyncResource):
         self, dataset_id: str, *, limit: int | None = None, cursor: str | None = None
     ) -> AsyncListPage[Episode]:
         """The committed episodes of a dataset."""
-        return await self._page(lambda at: calls.dataset_episodes(dataset_id, limit=limit, cursor=at), cursor)
+        dataset = await self.id_of(dataset_id)
+        return await self._page(lambda at: calls.dataset_episodes(dataset, limit=limit, cursor=at), cursor)
 
     async def episode(self, dataset_id: str, index: int) -> dict[str, Array]:
         """The arrays of one committed episode.
@@ -146,7 +137,8 @@ class AsyncDatasets(AsyncResource):
         Raises:
             NotFound: no such episode is committed.
         """
-        return arrays_of(await self._client.send(calls.dataset_episode(dataset_id, index)))
+        dataset = await self.id_of(dataset_id)
+        return arrays_of(await self._client.send(calls.dataset_episode(dataset, index)))
 
     async def export(
         self,
@@ -174,15 +166,17 @@ class AsyncDatasets(AsyncResource):
         writer = open_export(format, folder, dataset, points)
         count = dataset.episodes_done if episodes is None else min(episodes, dataset.episodes_done)
         for index in range(count):
-            writer.add(index, await self.episode(dataset_id, index))
+            writer.add(index, await self.episode(dataset.id, index))
             if on_progress is not None:
                 on_progress(index + 1, count)
         writer.finish()
         return Path(folder)
 
 
-class AsyncModels(AsyncResource):
+class AsyncModels(AsyncListed):
     """Published world models: names, integer versions, aliases."""
+
+    resource = "models"
 
     async def create(
         self,
@@ -194,7 +188,8 @@ class AsyncModels(AsyncResource):
         tags: tuple[str, ...] = (),
     ) -> Job:
         """Trains on a sealed dataset and publishes the next version of ``name``."""
-        return await self._client.send(calls.training_create(name, dataset_id, config, description, [*tags]))
+        dataset = await self._client.datasets.id_of(dataset_id)
+        return await self._client.send(calls.training_create(name, dataset, config, description, [*tags]))
 
     async def get(self, name: str) -> Model:
         """One registered name with its newest version and aliases."""
@@ -306,15 +301,19 @@ class AsyncPipelines(AsyncResource):
 
     async def create(self, body: PipelineCreate | None = None, *, scene_id: str | None = None) -> Job:
         """Starts fit, dataset and training; from a full body, or with the defaults for a scene."""
-        return await self._client.send(calls.pipeline_create(calls.pipeline_body(body, scene_id)))
+        asked = calls.pipeline_body(body, scene_id)
+        scene = await self._client.scenes.id_of(asked.scene_id)
+        return await self._client.send(calls.pipeline_create(asked.model_copy(update={"scene_id": scene})))
 
 
-class AsyncJobs(AsyncResource):
+class AsyncJobs(AsyncListed):
     """Jobs: their state, events, cancellation, and the wait for their end."""
+
+    resource = "jobs"
 
     async def get(self, job_id: str, *, wait_s: float | None = None) -> Job:
         """One job; with ``wait_s`` the answer comes at the job's end or after that many seconds."""
-        return await self._client.send(calls.job_get(job_id, wait_s=wait_s))
+        return await self._client.send(calls.job_get(await self.id_of(job_id), wait_s=wait_s))
 
     async def list(
         self,
@@ -331,11 +330,11 @@ class AsyncJobs(AsyncResource):
 
     async def retry(self, job_id: str) -> Job:
         """Takes a failed job up again, with its pipeline: stored episodes, journals and checkpoints are kept."""
-        return await self._client.send(calls.job_retry(job_id))
+        return await self._client.send(calls.job_retry(await self.id_of(job_id)))
 
     async def cancel(self, job_id: str) -> Job:
         """Asks for the job's end; it is ``cancelling`` until its workers have let go."""
-        return await self._client.send(calls.job_cancel(job_id))
+        return await self._client.send(calls.job_cancel(await self.id_of(job_id)))
 
     async def events(self, job_id: str, *, after: int | None = None) -> AsyncIterator[Event]:
         """The job's events, past and coming, until the one that ends the job.
@@ -343,6 +342,7 @@ class AsyncJobs(AsyncResource):
         A broken stream is resumed after the last event seen; more than ``max_retries`` breaks without an
         event between them raise ``ConnectionFailed``.
         """
+        job_id = await self.id_of(job_id)
         decoder = EventDecoder(after)
         retry = transport.Retry(self._client.max_retries)
         while True:

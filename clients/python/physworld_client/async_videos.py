@@ -5,14 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 
 from physworld_client import films
-from physworld_client.async_resources import AsyncResource
+from physworld_client.async_base import AsyncListed
 from physworld_client.pages import AsyncListPage
 from physworld_client.types import Job, Scene, Video
 from physworld_schemas.video import FILM, FilmName, VideoConfig, VideoOf
 
 
-class AsyncVideos(AsyncResource):
+class AsyncVideos(AsyncListed):
     """Films: of a scene's recording, a fit's twin, a model's prediction of its recording, a rollout."""
+
+    resource = "videos"
 
     async def create(self, of: VideoOf, id: str, config: VideoConfig | None = None) -> Job:
         """Starts a film; its job's output is the film.
@@ -22,11 +24,11 @@ class AsyncVideos(AsyncResource):
             id: of that; of a model "name", "name:3" or "name:alias".
             config: camera, size and what is drawn; by default the scene's own camera and splat, where it has them.
         """
-        return await self._client.send(films.create(of, id, config))
+        return await self._client.send(films.create(of, await self._source(of, id), config))
 
     async def get(self, video_id: str) -> Video:
         """One film: what was drawn, and its scores against the scene's pictures."""
-        return await self._client.send(films.get(video_id))
+        return await self._client.send(films.get(await self.id_of(video_id)))
 
     async def list(
         self,
@@ -44,11 +46,12 @@ class AsyncVideos(AsyncResource):
             cursor: of the page before.
             scene_id: only films that belong to this scene.
             of: only films of this kind of object.
-            source_id: only films of this object.
+            source_id: only films of this object; with ``of``, as in ``create``.
         """
+        scene = None if scene_id is None else await self._client.scenes.id_of(scene_id)
+        source = source_id if source_id is None or of is None else await self._source(of, source_id)
         return await self._page(
-            lambda at: films.listed(limit=limit, cursor=at, scene_id=scene_id, of=of, source_id=source_id),
-            cursor,
+            lambda at: films.listed(limit=limit, cursor=at, scene_id=scene, of=of, source_id=source), cursor
         )
 
     async def download(self, video_id: str, path: str | Path, name: FilmName = FILM) -> Path:
@@ -83,6 +86,16 @@ class AsyncVideos(AsyncResource):
         Raises:
             BundleUnreadable: nothing is there, or a file of another kind.
         """
+        scene = await self._client.scenes.id_of(scene_id)
         name, upload = films.picture_at(path)
         with upload, self._client.bars.sending(upload) as sent:
-            return await self._client.send(films.put_picture(scene_id, name, sent))
+            return await self._client.send(films.put_picture(scene, name, sent))
+
+    async def _source(self, of: VideoOf, given: str) -> str:
+        """The id of what a film is of; a model's name, with or without a version, is taken as it is."""
+        sources: dict[str, AsyncListed] = {
+            "scene": self._client.scenes,
+            "fit": self._client.fits,
+            "rollout": self._client.rollouts,
+        }
+        return await sources[of].id_of(given) if of in sources else given

@@ -8,12 +8,14 @@
     │   ├── AuthenticationFailed    401  the token is missing or unknown
     │   ├── PermissionDenied        403  the key's role does not reach
     │   ├── NotFound                404, 410
+    │   │   └── UnknownName         a text is no id and nothing is called that; ``.candidates``
     │   ├── Conflict                409
     │   ├── PayloadTooLarge         413
     │   ├── InvalidRequest          422, 415  ``.problem.errors`` names every fault with its place
     │   │   └── SceneInvalid        the code ``scene_invalid``: the validator's faults with their numbers
     │   ├── RateLimited             429
     │   └── ServerError             5xx
+    ├── AmbiguousName               a text is no id and several objects are called that; ``.candidates``
     ├── JobFailed                   a job waited for has failed; ``.job``, ``.problem``
     ├── JobCancelled                a job waited for was cancelled; ``.job``
     ├── LiveSessionEnded            a live session is over; ``.code``, ``.reason`` of its WebSocket
@@ -85,6 +87,31 @@ class PermissionDenied(ApiError):
 
 class NotFound(ApiError):
     """404 or 410."""
+
+
+class UnknownName(NotFound):
+    """A text in the place of an id names nothing: neither an id nor the beginning of one, nor a name.
+
+    Attributes:
+        candidates: ids of what is called nearly so, or of the newest objects.
+    """
+
+    def __init__(self, text: str, candidates: tuple[str, ...]) -> None:
+        super().__init__(Problem(title="Unknown name", status=404, code="not_found", detail=text))
+        self.args = (text,)  # the service never saw it, so that a code and a request say nothing
+        self.candidates = candidates
+
+
+class AmbiguousName(PhysWorldError):
+    """A text in the place of an id fits several objects.
+
+    Attributes:
+        candidates: their ids, newest first.
+    """
+
+    def __init__(self, text: str, candidates: tuple[str, ...]) -> None:
+        super().__init__(text)
+        self.candidates = candidates
 
 
 class Conflict(ApiError):

@@ -4,14 +4,16 @@
 from __future__ import annotations
 
 from physworld_client import calls
+from physworld_client.base import Listed
 from physworld_client.pages import ListPage
-from physworld_client.resources import Resource
 from physworld_client.types import ApiKey
 from physworld_schemas.key import DEFAULT_LIFETIME_DAYS, Role
 
 
-class Keys(Resource):
+class Keys(Listed):
     """API keys: made, listed, given another token, revoked."""
+
+    resource = "keys"
 
     def create(
         self, name: str, role: Role = "read", *, expires_in_days: int | None = DEFAULT_LIFETIME_DAYS
@@ -31,8 +33,8 @@ class Keys(Resource):
 
     def rotate(self, key_id: str, *, grace_minutes: int | None = None) -> ApiKey:
         """Gives a key another token and its whole term again; the old token stays good for the grace."""
-        return self._client.send(calls.key_rotate(key_id, grace_minutes))
+        return self._client.send(calls.key_rotate(self.id_of(key_id), grace_minutes))
 
     def revoke(self, key_id: str) -> ApiKey:
         """Ends a key, and what it opened, at once."""
-        return self._client.send(calls.key_revoke(key_id))
+        return self._client.send(calls.key_revoke(self.id_of(key_id)))

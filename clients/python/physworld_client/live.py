@@ -20,9 +20,10 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.sync.client import ClientConnection, connect
 
 from physworld_client import live_frames
+from physworld_client.base import Resource
 from physworld_client.errors import ConnectionFailed
 from physworld_client.live_frames import LiveFrame, LiveStart
-from physworld_client.resources import LATEST, Resource
+from physworld_client.resources import LATEST
 from physworld_client.transport import is_loopback
 from physworld_schemas.rollout import Part
 from physworld_schemas.wording import reason

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 
 from physworld_client import calls
 from physworld_client.arrays import arrays_of
+from physworld_client.base import Listed
 from physworld_client.pages import ListPage
-from physworld_client.resources import LATEST, Resource
+from physworld_client.resources import LATEST
 from physworld_client.types import Array, Assessment, Check, Job, Loop, Trace
 from physworld_schemas.assessment import AssessmentCreate, Frames
 from physworld_schemas.check import CheckConfig
@@ -19,26 +20,32 @@ from physworld_schemas.model import TrainingConfig
 from physworld_schemas.trace import TraceConfig
 
 
-class Checks(Resource):
+class Checks(Listed):
     """What recordings can show before any fit."""
+
+    resource = "checks"
 
     def create(self, scene_id: str, config: CheckConfig | None = None) -> Job:
         """Starts a check; its job's output is the check."""
-        return self._client.send(calls.check_create(scene_id, config))
+        scene = self._client.scenes.id_of(scene_id)
+        return self._client.send(calls.check_create(scene, config))
 
     def get(self, check_id: str) -> Check:
         """One check: once it is ready, its report."""
-        return self._client.send(calls.check_get(check_id))
+        return self._client.send(calls.check_get(self.id_of(check_id)))
 
     def list(
         self, *, limit: int | None = None, cursor: str | None = None, scene_id: str | None = None
     ) -> ListPage[Check]:
         """Checks, newest first."""
-        return self._page(lambda at: calls.check_list(limit=limit, cursor=at, scene_id=scene_id), cursor)
+        scene = None if scene_id is None else self._client.scenes.id_of(scene_id)
+        return self._page(lambda at: calls.check_list(limit=limit, cursor=at, scene_id=scene), cursor)
 
 
-class Traces(Resource):
+class Traces(Listed):
     """Residuals traced to effects."""
+
+    resource = "traces"
 
     def create(
         self,
@@ -55,13 +62,16 @@ class Traces(Resource):
         ``scene_ids`` are further recordings of the object, fitted together with the scene; ``held_out_scene_ids`` are
         recordings that only the report sees.
         """
-        return self._client.send(
-            calls.trace_create(scene_id, config, fit, fit_id, scene_ids, held_out_scene_ids)
-        )
+        scenes = self._client.scenes
+        first = scenes.id_of(scene_id)
+        further = [scenes.id_of(one) for one in scene_ids]
+        held_out = [scenes.id_of(one) for one in held_out_scene_ids]
+        twin = None if fit_id is None else self._client.fits.id_of(fit_id)
+        return self._client.send(calls.trace_create(first, config, fit, twin, further, held_out))
 
     def get(self, trace_id: str) -> Trace:
         """One trace: the verdict and every figure of its report."""
-        return self._client.send(calls.trace_get(trace_id))
+        return self._client.send(calls.trace_get(self.id_of(trace_id)))
 
     def list(
         self,
@@ -72,13 +82,14 @@ class Traces(Resource):
         verdict: str | None = None,
     ) -> ListPage[Trace]:
         """Traces, newest first."""
+        scene = None if scene_id is None else self._client.scenes.id_of(scene_id)
         return self._page(
-            lambda at: calls.trace_list(limit=limit, cursor=at, scene_id=scene_id, verdict=verdict), cursor
+            lambda at: calls.trace_list(limit=limit, cursor=at, scene_id=scene, verdict=verdict), cursor
         )
 
     def tracks(self, trace_id: str) -> dict[str, Array]:
         """``times`` (T,) [s], ``before`` and ``after`` (T, N, 3) [m]: open-loop tracks without and with the effects."""
-        return arrays_of(self._client.send(calls.trace_tracks(trace_id)))
+        return arrays_of(self._client.send(calls.trace_tracks(self.id_of(trace_id))))
 
     def cancel(self, trace_id: str) -> Job:
         """Asks for the end of the trace's job."""
@@ -86,8 +97,10 @@ class Traces(Resource):
         return self._client.send(calls.job_cancel(trace.job_id))
 
 
-class Assessments(Resource):
+class Assessments(Listed):
     """New recordings held against published models."""
+
+    resource = "assessments"
 
     def create(
         self,
@@ -112,7 +125,7 @@ class Assessments(Resource):
             compared_with: another version of the model, measured on the same frames; None: none.
         """
         body = AssessmentCreate(
-            scene_id=scene_id,
+            scene_id=self._client.scenes.id_of(scene_id),
             open_trace=open_trace,
             trace=trace or TraceConfig(),
             frames=frames,
@@ -122,7 +135,7 @@ class Assessments(Resource):
 
     def get(self, assessment_id: str) -> Assessment:
         """One assessment."""
-        return self._client.send(calls.assessment_get(assessment_id))
+        return self._client.send(calls.assessment_get(self.id_of(assessment_id)))
 
     def list(
         self,
@@ -146,8 +159,10 @@ class Assessments(Resource):
         return self._page(lambda at: calls.assessment_list(name, version, limit=limit, cursor=at), cursor)
 
 
-class Loops(Resource):
+class Loops(Listed):
     """From a recording that a model predicts badly to the next version of the model."""
+
+    resource = "loops"
 
     def create(
         self,
@@ -171,11 +186,13 @@ class Loops(Resource):
             dataset: settings of the demonstrations; None has the version's.
             training: settings of the training; None has the version's.
         """
+        recording = None if scene_id is None else self._client.scenes.id_of(scene_id)
+        found = None if assessment_id is None else self._client.assessments.id_of(assessment_id)
         body = LoopCreate(
             model=model,
             version=version,
-            scene_id=scene_id,
-            assessment_id=assessment_id,
+            scene_id=recording,
+            assessment_id=found,
             trace=trace or TraceConfig(),
             dataset=dataset,
             training=training,
@@ -184,7 +201,7 @@ class Loops(Resource):
 
     def get(self, loop_id: str) -> Loop:
         """One loop: how it ended, what it made, and the errors of both versions."""
-        return self._client.send(calls.loop_get(loop_id))
+        return self._client.send(calls.loop_get(self.id_of(loop_id)))
 
     def list(
         self,

@@ -6,16 +6,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from physworld_client import predictions
+from physworld_client.base import Listed
 from physworld_client.pages import ListPage
 from physworld_client.predictions import Planned, Predicted
-from physworld_client.resources import LATEST, Resource
+from physworld_client.resources import LATEST
 from physworld_client.types import Array, Job, Plan, Rollout
 from physworld_schemas.plan import PlanConfig, PlanLimits
 from physworld_schemas.rollout import Part, Start
 
 
-class Rollouts(Resource):
+class Rollouts(Listed):
     """What published models predict."""
+
+    resource = "rollouts"
 
     def create(
         self,
@@ -72,7 +75,7 @@ class Rollouts(Resource):
 
     def get(self, rollout_id: str) -> Rollout:
         """A rollout that was a job."""
-        return self._client.send(predictions.rollout_get(rollout_id))
+        return self._client.send(predictions.rollout_get(self.id_of(rollout_id)))
 
     def result(self, rollout_id: str) -> Predicted:
         """The arrays of a rollout that was a job."""
@@ -87,8 +90,10 @@ class Rollouts(Resource):
         return self._page(lambda at: predictions.rollout_list(limit=limit, cursor=at, model=model), cursor)
 
 
-class Plans(Resource):
+class Plans(Listed):
     """Motions of the grips that bring the object to a goal."""
+
+    resource = "plans"
 
     def create(
         self,
@@ -112,7 +117,7 @@ class Plans(Resource):
 
     def get(self, plan_id: str) -> Plan:
         """One plan: errors of the prediction and of its execution in the twin."""
-        return self._client.send(predictions.plan_get(plan_id))
+        return self._client.send(predictions.plan_get(self.id_of(plan_id)))
 
     def result(self, plan_id: str) -> Planned:
         """A plan with its arrays: control path, predicted and executed paths."""

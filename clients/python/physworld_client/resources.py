@@ -7,13 +7,12 @@ import contextlib
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
 
 import httpx
-from pydantic import BaseModel
 
 from physworld_client import calls, transport
 from physworld_client.arrays import arrays_of
+from physworld_client.base import Listed, Resource
 from physworld_client.bundle import open_bundle
 from physworld_client.errors import PhysWorldError, WaitTimedOut
 from physworld_client.export import open_export
@@ -44,29 +43,13 @@ from physworld_schemas.model import TrainingConfig
 from physworld_schemas.pipeline import PipelineCreate
 from physworld_schemas.scene import SceneImport
 
-if TYPE_CHECKING:
-    from physworld_client.client import Client
-
-Item = TypeVar("Item", bound=BaseModel)
 LATEST = "latest"
 
 
-class Resource:
-    """What the resources share: the client they send through."""
-
-    def __init__(self, client: Client) -> None:
-        self._client = client
-
-    def __repr__(self) -> str:
-        return f"<{type(self).__name__} of {self._client.base_url}>"
-
-    def _page(self, call_at: calls.ListCall[Item], cursor: str | None) -> ListPage[Item]:
-        page = self._client.send(call_at(cursor))
-        return ListPage(page.data, page.has_more, page.next_cursor, lambda at: self._page(call_at, at))
-
-
-class Scenes(Resource):
+class Scenes(Listed):
     """Measured scenes."""
+
+    resource = "scenes"
 
     def create(self, path: str | Path, options: SceneImport | None = None) -> Scene:
         """Uploads a scene: a folder (packed to a zip), an archive, a ``final_data.pkl`` or a table of markers.
@@ -85,7 +68,7 @@ class Scenes(Resource):
 
     def get(self, scene_id: str) -> Scene:
         """One scene."""
-        return self._client.send(calls.scene_get(scene_id))
+        return self._client.send(calls.scene_get(self.id_of(scene_id)))
 
     def list(
         self, *, limit: int | None = None, cursor: str | None = None, kind: str | None = None
@@ -94,16 +77,19 @@ class Scenes(Resource):
         return self._page(lambda at: calls.scene_list(limit=limit, cursor=at, kind=kind), cursor)
 
 
-class Fits(Resource):
+class Fits(Listed):
     """Calibrated twins."""
+
+    resource = "fits"
 
     def create(self, scene_id: str, config: FitConfig | None = None) -> Job:
         """Starts a fit; its job's output is the fit."""
-        return self._client.send(calls.fit_create(scene_id, config))
+        scene = self._client.scenes.id_of(scene_id)
+        return self._client.send(calls.fit_create(scene, config))
 
     def get(self, fit_id: str) -> Fit:
         """One fit."""
-        return self._client.send(calls.fit_get(fit_id))
+        return self._client.send(calls.fit_get(self.id_of(fit_id)))
 
     def list(
         self, *, limit: int | None = None, cursor: str | None = None, state: str | None = None
@@ -112,16 +98,20 @@ class Fits(Resource):
         return self._page(lambda at: calls.fit_list(limit=limit, cursor=at, state=state), cursor)
 
 
-class Datasets(Resource):
+class Datasets(Listed):
     """Datasets of demonstration episodes."""
+
+    resource = "datasets"
 
     def create(self, fit_id: str, config: DatasetConfig | None = None, *, trace_id: str | None = None) -> Job:
         """Starts writing a dataset, in the twin that the trace made where it added an effect."""
-        return self._client.send(calls.dataset_create(fit_id, config, trace_id))
+        fit = self._client.fits.id_of(fit_id)
+        trace = None if trace_id is None else self._client.traces.id_of(trace_id)
+        return self._client.send(calls.dataset_create(fit, config, trace))
 
     def get(self, dataset_id: str) -> Dataset:
         """One dataset."""
-        return self._client.send(calls.dataset_get(dataset_id))
+        return self._client.send(calls.dataset_get(self.id_of(dataset_id)))
 
     def list(
         self, *, limit: int | None = None, cursor: str | None = None, state: str | None = None
@@ -133,7 +123,8 @@ class Datasets(Resource):
         self, dataset_id: str, *, limit: int | None = None, cursor: str | None = None
     ) -> ListPage[Episode]:
         """The committed episodes of a dataset."""
-        return self._page(lambda at: calls.dataset_episodes(dataset_id, limit=limit, cursor=at), cursor)
+        dataset = self.id_of(dataset_id)
+        return self._page(lambda at: calls.dataset_episodes(dataset, limit=limit, cursor=at), cursor)
 
     def episode(self, dataset_id: str, index: int) -> dict[str, Array]:
         """The arrays of one committed episode.
@@ -145,7 +136,8 @@ class Datasets(Resource):
         Raises:
             NotFound: no such episode is committed.
         """
-        return arrays_of(self._client.send(calls.dataset_episode(dataset_id, index)))
+        dataset = self.id_of(dataset_id)
+        return arrays_of(self._client.send(calls.dataset_episode(dataset, index)))
 
     def export(
         self,
@@ -173,15 +165,17 @@ class Datasets(Resource):
         writer = open_export(format, folder, dataset, points)
         count = dataset.episodes_done if episodes is None else min(episodes, dataset.episodes_done)
         for index in range(count):
-            writer.add(index, self.episode(dataset_id, index))
+            writer.add(index, self.episode(dataset.id, index))
             if on_progress is not None:
                 on_progress(index + 1, count)
         writer.finish()
         return Path(folder)
 
 
-class Models(Resource):
+class Models(Listed):
     """Published world models: names, integer versions, aliases."""
+
+    resource = "models"
 
     def create(
         self,
@@ -193,7 +187,8 @@ class Models(Resource):
         tags: tuple[str, ...] = (),
     ) -> Job:
         """Trains on a sealed dataset and publishes the next version of ``name``."""
-        return self._client.send(calls.training_create(name, dataset_id, config, description, [*tags]))
+        dataset = self._client.datasets.id_of(dataset_id)
+        return self._client.send(calls.training_create(name, dataset, config, description, [*tags]))
 
     def get(self, name: str) -> Model:
         """One registered name with its newest version and aliases."""
@@ -305,15 +300,19 @@ class Pipelines(Resource):
 
     def create(self, body: PipelineCreate | None = None, *, scene_id: str | None = None) -> Job:
         """Starts fit, dataset and training; from a full body, or with the defaults for a scene."""
-        return self._client.send(calls.pipeline_create(calls.pipeline_body(body, scene_id)))
+        asked = calls.pipeline_body(body, scene_id)
+        scene = self._client.scenes.id_of(asked.scene_id)
+        return self._client.send(calls.pipeline_create(asked.model_copy(update={"scene_id": scene})))
 
 
-class Jobs(Resource):
+class Jobs(Listed):
     """Jobs: their state, events, cancellation, and the wait for their end."""
+
+    resource = "jobs"
 
     def get(self, job_id: str, *, wait_s: float | None = None) -> Job:
         """One job; with ``wait_s`` the answer comes at the job's end or after that many seconds."""
-        return self._client.send(calls.job_get(job_id, wait_s=wait_s))
+        return self._client.send(calls.job_get(self.id_of(job_id), wait_s=wait_s))
 
     def list(
         self,
@@ -328,11 +327,11 @@ class Jobs(Resource):
 
     def retry(self, job_id: str) -> Job:
         """Takes a failed job up again, with its pipeline: stored episodes, journals and checkpoints are kept."""
-        return self._client.send(calls.job_retry(job_id))
+        return self._client.send(calls.job_retry(self.id_of(job_id)))
 
     def cancel(self, job_id: str) -> Job:
         """Asks for the job's end; it is ``cancelling`` until its workers have let go."""
-        return self._client.send(calls.job_cancel(job_id))
+        return self._client.send(calls.job_cancel(self.id_of(job_id)))
 
     def events(self, job_id: str, *, after: int | None = None) -> Iterator[Event]:
         """The job's events, past and coming, until the one that ends the job.
@@ -340,6 +339,7 @@ class Jobs(Resource):
         A broken stream is resumed after the last event seen; more than ``max_retries`` breaks without an
         event between them raise ``ConnectionFailed``.
         """
+        job_id = self.id_of(job_id)
         decoder = EventDecoder(after)
         retry = transport.Retry(self._client.max_retries)
         while True:

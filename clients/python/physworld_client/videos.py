@@ -6,14 +6,16 @@ from __future__ import annotations
 from pathlib import Path
 
 from physworld_client import films
+from physworld_client.base import Listed
 from physworld_client.pages import ListPage
-from physworld_client.resources import Resource
 from physworld_client.types import Job, Scene, Video
 from physworld_schemas.video import FILM, FilmName, VideoConfig, VideoOf
 
 
-class Videos(Resource):
+class Videos(Listed):
     """Films: of a scene's recording, a fit's twin, a model's prediction of its recording, a rollout."""
+
+    resource = "videos"
 
     def create(self, of: VideoOf, id: str, config: VideoConfig | None = None) -> Job:
         """Starts a film; its job's output is the film.
@@ -23,11 +25,11 @@ class Videos(Resource):
             id: of that; of a model "name", "name:3" or "name:alias".
             config: camera, size and what is drawn; by default the scene's own camera and splat, where it has them.
         """
-        return self._client.send(films.create(of, id, config))
+        return self._client.send(films.create(of, self._source(of, id), config))
 
     def get(self, video_id: str) -> Video:
         """One film: what was drawn, and its scores against the scene's pictures."""
-        return self._client.send(films.get(video_id))
+        return self._client.send(films.get(self.id_of(video_id)))
 
     def list(
         self,
@@ -45,11 +47,12 @@ class Videos(Resource):
             cursor: of the page before.
             scene_id: only films that belong to this scene.
             of: only films of this kind of object.
-            source_id: only films of this object.
+            source_id: only films of this object; with ``of``, as in ``create``.
         """
+        scene = None if scene_id is None else self._client.scenes.id_of(scene_id)
+        source = source_id if source_id is None or of is None else self._source(of, source_id)
         return self._page(
-            lambda at: films.listed(limit=limit, cursor=at, scene_id=scene_id, of=of, source_id=source_id),
-            cursor,
+            lambda at: films.listed(limit=limit, cursor=at, scene_id=scene, of=of, source_id=source), cursor
         )
 
     def download(self, video_id: str, path: str | Path, name: FilmName = FILM) -> Path:
@@ -84,6 +87,16 @@ class Videos(Resource):
         Raises:
             BundleUnreadable: nothing is there, or a file of another kind.
         """
+        scene = self._client.scenes.id_of(scene_id)
         name, upload = films.picture_at(path)
         with upload, self._client.bars.sending(upload) as sent:
-            return self._client.send(films.put_picture(scene_id, name, sent))
+            return self._client.send(films.put_picture(scene, name, sent))
+
+    def _source(self, of: VideoOf, given: str) -> str:
+        """The id of what a film is of; a model's name, with or without a version, is taken as it is."""
+        sources: dict[str, Listed] = {
+            "scene": self._client.scenes,
+            "fit": self._client.fits,
+            "rollout": self._client.rollouts,
+        }
+        return sources[of].id_of(given) if of in sources else given

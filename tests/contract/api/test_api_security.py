@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import httpx
 import pytest
 from api_service import Service, assert_problem
 
 from physworld_services.api.security import required_role
+from physworld_services.web import create_app
+from physworld_storage.settings import Settings
 
 
 @pytest.mark.parametrize(
@@ -24,6 +29,20 @@ def test_unknown_addresses_below_v1_are_hidden_from_strangers(service: Service) 
     with service.client(None) as client:
         for path in ("/v1/nothing", "/v1", "/v1/"):
             assert_problem(client.get(path), 401, "unauthenticated")
+
+
+def test_the_security_policy_names_all_that_needs_no_key(service: Service, tmp_path: Path) -> None:
+    text = (Path(__file__).resolve().parents[3] / "SECURITY.md").read_text()
+    named = set(re.findall(r"`(/[^`]*)`", text.partition("## What counts")[2].partition("None of them")[0]))
+    app = create_app(Settings(data_dir=tmp_path))
+    served = {*app.openapi()["paths"], *(getattr(one, "path", "") for one in app.routes), *named, "/metrics"}
+    with service.client(None) as stranger:
+        plain = {path for path in served if path.startswith("/") and "{" not in path}
+        opened = {path for path in plain if stranger.get(path).status_code < 400}
+        assert stranger.get("/dashboard/scenes").status_code == 401
+    assert {"/health/ready", "/metrics", "/openapi.json", "/docs", "/dashboard/login"} <= opened
+    unnamed = {path for path in opened if not any(f"{path}/".startswith(f"{one}/") for one in named - {"/"})}
+    assert unnamed == {"/", "/dashboard"}, "they lead to the login page"
 
 
 def test_a_body_is_not_read_before_the_key(service: Service) -> None:

@@ -106,6 +106,24 @@ def test_keys_are_made_listed_and_revoked(service: Service, tmp_path: Path) -> N
         robot.jobs.list(limit=1)
 
 
+def test_a_key_is_rotated_and_its_old_token_lasts_for_the_grace(service: Service, tmp_path: Path) -> None:
+    made = physworld(service, tmp_path, "keys", "create", "robot-2")
+    old = made.stdout.split()[-1]
+    turned = physworld(service, tmp_path, "keys", "rotate", "robot-2", "--grace", "5")
+    assert turned.returncode == 0 and "its old token ends 20" in turned.stdout, turned.stderr
+    new = turned.stdout.split()[-1]
+    assert new != old
+    for token in (old, new):
+        with Client(service.url, token, max_retries=0) as robot:
+            robot.jobs.list(limit=1)
+    newest = output_of(service, tmp_path, "keys", "rotate", "robot-2", "--grace", "0")
+    for token in (old, new):
+        with Client(service.url, token, max_retries=0) as robot, pytest.raises(AuthenticationFailed):
+            robot.jobs.list(limit=1)
+    with Client(service.url, newest["token"], max_retries=0) as robot:
+        robot.jobs.list(limit=1)
+
+
 def test_the_status_names_what_runs_and_the_jobs(service: Service, scene_id: str, tmp_path: Path) -> None:
     with service.client() as client:
         job = client.fits.create(scene_id)

@@ -7,9 +7,9 @@ import inspect
 import pytest
 from physworld_client.cli.app import app
 from physworld_client.cli.lists import RESOURCES, Resource
-from physworld_client.cli.names import SINGULAR
 from physworld_client.cli.output import print_fields
 from physworld_client.client import Client
+from physworld_client.names import SINGULAR
 from pydantic import BaseModel
 from typer.testing import CliRunner
 

@@ -32,6 +32,18 @@ def test_a_list_shows_whole_ids_that_the_next_command_takes() -> None:
     assert SCENE_ID in captured.get()
 
 
+def test_a_fit_whose_search_spent_its_budget_is_not_called_ready() -> None:
+    listing = next(one for one in RESOURCES if one.name == "fits").lists[0]
+    fields = {"id": FIT_ID, "scene_id": SCENE_ID, "state": "ready", "created_at": AT, "job_id": "job_1"}
+    for search, said in (
+        ({"converged": False}, "not converged"),
+        ({"converged": True}, "ready"),
+        (None, "ready"),
+    ):
+        fit = Fit.model_validate({**fields, "config": {}, "search": search})
+        assert listing.row(fit)[listing.headings.index("state")] == said
+
+
 def test_the_time_left_and_the_share_are_of_the_whole_job() -> None:
     progress = {"done": 3, "total": 40, "unit": "episodes", "fraction": 0.63, "eta_s": 240.0}
     running = Job(id="job_1", kind="pipeline", state="running", created_at=AT, progress=progress)  # type: ignore[arg-type]

@@ -35,11 +35,12 @@ def shown(search: dict[str, object] | None) -> str:
         "config": {},
     }
     macros = environment_of_pages().get_template("macros.html").make_module({"may_write": True})
-    return str(macros.fit_state(Fit.model_validate({**fields, "search": search})))  # type: ignore[attr-defined]
+    fit = Fit.model_validate({**fields, "search": search})
+    return str(macros.badge(fit.standing))  # type: ignore[attr-defined]
 
 
 def test_a_search_that_spent_its_budget_is_not_called_ready() -> None:
-    assert "not converged" in shown({"converged": False})
+    assert 'class="badge cancelling">not converged<' in shown({"converged": False})
     assert ">ready<" in shown({"converged": True})
     assert ">ready<" in shown(None)
 

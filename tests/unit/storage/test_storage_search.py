@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import pytest
 from conftest import Work
+from sqlalchemy import select
 
 from physworld_schemas.base import Page
 from physworld_schemas.fit import FitConfig
@@ -15,6 +16,7 @@ from physworld_storage.access import api_keys
 from physworld_storage.database import Database
 from physworld_storage.family import ancestors, family_of, related
 from physworld_storage.jobs import jobs
+from physworld_storage.tables import FitRow, ModelVersionRow
 
 
 @pytest.fixture
@@ -92,3 +94,21 @@ def test_the_family_of_a_scene_leads_from_the_recording_to_the_version(
     assert [member.key for member in related(members, other)] == [scene, other]
     assert related(members, "unknown") == members
     assert ancestors(members, kinds["dataset"].key) == {scene, kinds["fit"].key, kinds["dataset"].key}
+
+
+def test_the_family_says_of_a_ready_fit_and_version_what_is_wrong_with_them(
+    database: Database, work: Work
+) -> None:
+    scene = work.finish(work.pipeline(episodes=1)).inputs[0].id
+    with database.session() as session:
+        fit, version = session.scalars(select(FitRow)).one(), session.scalars(select(ModelVersionRow)).one()
+        fit.metrics = {"search": {"converged": False}}
+        version.metrics = {"held_out": {"track_m": {"world_model": 0.02, "static": 0.01}}}
+        assert version.state == "ready"
+    with database.reading() as session:
+        standing = {member.kind: member.state for member in family_of(session, scene)}
+    assert (standing["fit"], standing["model"]) == ("not converged", "failed the gate")
+    with database.session() as session:
+        session.scalars(select(FitRow)).one().metrics = {"search": {"converged": True}}
+    with database.reading() as session:
+        assert {m.kind: m.state for m in family_of(session, scene)}["fit"] == "ready"

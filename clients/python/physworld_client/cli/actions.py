@@ -25,7 +25,7 @@ from physworld_client.cli.output import (
 from physworld_client.client import Client
 from physworld_client.export import FORMATS
 from physworld_client.types import Job
-from physworld_schemas.key import DEFAULT_LIFETIME_DAYS, KeyCreate
+from physworld_schemas.key import DEFAULT_GRACE_MINUTES, DEFAULT_LIFETIME_DAYS, MAX_GRACE_MINUTES, KeyCreate
 from physworld_schemas.library import catalogue
 from physworld_schemas.scene import SceneImport
 
@@ -164,6 +164,29 @@ def keys_create(
     else:
         stdout.print(f"{made.id}  {made.name}, {made.role}, until {ending(made)}", markup=False)
         print(made.token)
+
+
+@connected(GROUPS["keys"], "rotate")
+def keys_rotate(
+    client: Client,
+    key_id: KeyName,
+    grace: Annotated[
+        int,
+        typer.Option(
+            "--grace", min=0, max=MAX_GRACE_MINUTES, help="Minutes that the old token stays good; 0: none."
+        ),
+    ] = DEFAULT_GRACE_MINUTES,
+    json: Json = False,
+) -> None:
+    """Give a key another token and its whole term again; the token is printed once and kept nowhere."""
+    made = client.keys.rotate(key_id, grace_minutes=grace)
+    if json:
+        print_json(made)
+        return
+    old = f"{made.old_token_until:%Y-%m-%d %H:%M} UTC" if grace and made.old_token_until else "at once"
+    text = f"{made.id}  {made.name}, {made.role}, until {ending(made)}; its old token ends {old}"
+    stdout.print(text, markup=False, soft_wrap=True)
+    print(made.token)
 
 
 @connected(GROUPS["keys"], "revoke")

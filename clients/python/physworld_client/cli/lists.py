@@ -109,7 +109,7 @@ def _scene(scene: Scene) -> Sequence[object]:
 
 def _fit(fit: Fit) -> Sequence[object]:
     parameters = (f"{name} {value.value:.4g} {value.unit}" for name, value in fit.parameters.items())
-    return (fit.id, fit.scene_id, fit.state, ", ".join(parameters), ago(fit.created_at))
+    return (fit.id, fit.scene_id, fit.standing, ", ".join(parameters), ago(fit.created_at))
 
 
 def _check(check: Check) -> Sequence[object]:

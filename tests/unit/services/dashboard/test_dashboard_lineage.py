@@ -26,6 +26,14 @@ def test_every_box_is_a_link_with_words_and_the_object_itself_is_marked() -> Non
     assert address_of(VERSION) == "/dashboard/models/soft%20beam/2"
 
 
+def test_what_is_ready_and_wrong_has_the_colour_of_what_is_wrong() -> None:
+    unfinished = Member("fit_u", "fit", 1, "…u", "not converged", ("scn_1",))
+    refused = Member("soft beam:3", "model", 4, "soft beam 3", "failed the gate", ("fit_u",))
+    picture = drawn([SCENE, unfinished, refused], "fit_u")
+    assert 'class="state cancelling">not converged<' in picture
+    assert 'class="state failed">failed the gate<' in picture
+
+
 def test_text_is_cut_off_at_the_side_of_its_box() -> None:
     wide = Member("fit_w", "fit", 1, "W" * 60, "ready", ("scn_1",))
     picture = drawn([SCENE, wide], "fit_w")
