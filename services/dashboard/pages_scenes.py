@@ -70,6 +70,13 @@ def router(site: Site) -> APIRouter:
             check = checks.get_check(session, check_id)
         return RedirectResponse(f"{BASE}/scenes/{check.scene_id}#check", 303)
 
+    @routes.get("/checks/{check_id}/json")
+    def check_file(check_id: str) -> Response:
+        with site.database.reading() as session:
+            check = checks.get_check(session, check_id)
+        headers = {"Content-Disposition": f'attachment; filename="{check_id}.json"'}
+        return Response(check.model_dump_json(indent=1), headers=headers, media_type="application/json")
+
     @routes.get("/scenes/{scene_id}")
     def page(request: Request, scene_id: str, fit: FitId = None) -> HTMLResponse:
         record, shown = _load(site, scene_id, fit)

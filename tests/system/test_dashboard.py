@@ -194,8 +194,8 @@ def test_maps_of_residuals_are_drawn_follow_the_view_and_seek_in_it(
 def test_a_dataset_shows_its_episodes_and_one_of_them_in_3d(visit: Visit, world: World) -> None:
     visit.open(f"/datasets/{world.dataset_id}")
     visit.points_shown()
-    expect(visit.page.locator("tbody tr:has(a)")).to_have_count(EPISODES)
-    visit.page.locator("tbody a").last.click()
+    expect(visit.page.locator("#episodes tbody tr:has(a)")).to_have_count(EPISODES)
+    visit.page.locator("#episodes tbody td:first-child a").last.click()
     visit.points_shown()
     expect(visit.page.locator("figure canvas")).to_have_attribute(
         "aria-label", "Particles of episode 2 in 3D"
