@@ -329,7 +329,8 @@ def _trace(world: World, recording: Scene) -> None:
 def _assess(world: World) -> str:
     """An assessment that found the model worse than it promised."""
     with world.database.session() as session:
-        job = jobs.create_assessment(session, "chain_swing", 1, AssessmentCreate(scene_id=world.scene_id))
+        asked = AssessmentCreate(scene_id=world.scene_id, open_trace=False)
+        job = jobs.create_assessment(session, "chain_swing", 1, asked)
     measured = {"error_m": 0.006, "ci95_m": [0.005, 0.007], "noise_floor_m": 3.2e-4, "frames": 27}
     answer = {
         "outcome": "worse_than_expected", "reason": "It errs by more than was promised", "measured": measured,
