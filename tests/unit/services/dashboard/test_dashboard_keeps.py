@@ -15,6 +15,7 @@ from serving import log_in, serve
 
 from physworld_schemas.fit import FitConfig
 from physworld_schemas.job import Job
+from physworld_services.api.limits import PICTURE_PATH
 from physworld_services.dashboard import mount
 from physworld_services.dashboard.lists import Looked
 from physworld_services.dashboard.pages_jobs import Entry
@@ -136,6 +137,7 @@ def test_pictures_come_in_beside_a_scene_and_a_wrong_one_is_refused(
     assert wrong.status_code == 422 and wrong.text.count("begins with") == 1
     assert writer.post(f"{place}/pictures/cat.gif", files=sent).status_code == 422
     assert writer.post("/scenes/scn_unknown/pictures/camera.json", files=sent).status_code == 404
+    assert PICTURE_PATH.fullmatch(f"/dashboard{place}/pictures/splat.ply"), "as long as an upload may be"
     with browser(origin, world.reader_token) as reader:
         assert "/pictures/" not in reader.get(place).text
         assert reader.post(f"{place}/pictures/camera.json", files=sent).status_code == 403
