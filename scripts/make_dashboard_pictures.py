@@ -19,7 +19,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +39,7 @@ from PIL import Image
 from playwright.sync_api import BrowserContext, Page, sync_playwright
 
 from physworld.video import Drawing, eight_bit, whole_motion_view
-from physworld_scenes.bundle import read_bundle
+from physworld_scenes.bundle import canonical_archive, read_bundle
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "docs" / "images" / "dashboard"
@@ -51,6 +51,8 @@ FILM_PX = (480, 360)
 DRAWN_S = 1.5  # for plots and 3D views, once the network is quiet
 START_S = 180.0
 MODEL = "soft_beam"
+LARGER = 1.2
+"""Displacements of a recording that the model errs on, relative to those of the one that it was made of."""
 STARTS = (
     "pipeline",
     "fit",
@@ -71,12 +73,15 @@ PAGES = {
     "overview": "/",
     "job": "/jobs/{job}",
     "job-training": "/jobs/{training}",
+    "job-loop": "/jobs/{loop}",
     "job-cancelled": "/jobs/{cancelled}",
     "scenes": "/scenes",
+    "upload-refused": "/scenes",
     "scene": "/scenes/{scene}",
     "fits": "/fits",
     "traces": "/traces",
     "trace": "/traces/{trace}",
+    "trace-report": "/traces/{trace}/report",
     "assessment": "/assessments/{assessment}",
     "datasets": "/datasets",
     "dataset": "/datasets/{dataset}",
@@ -90,6 +95,7 @@ PAGES = {
     "plans": "/plans",
     "plan": "/plans/{plan}",
     "keys": "/keys",
+    "audit": "/keys/audit",
     "sessions": "/sessions",
     "not-found": "/nothing",
 } | {f"start-{kind}": f"/start/{kind}" for kind in STARTS}
@@ -166,6 +172,8 @@ def fill(client: Client) -> None:
         _wait(client, client.assessments.create(MODEL, beam, open_trace=False))
     if not client.traces.list(limit=1).data:
         _wait(client, client.traces.create(rope, TraceConfig(time_limit_s=120, confirmed=3), fit=SMALL_FIT))
+    if not client.loops.list(limit=1).data:
+        _close_the_loop(client)
     if not client.plans.list(limit=1).data:
         _predict(client)
     if not client.videos.list(limit=1).data:
@@ -180,14 +188,17 @@ def fill(client: Client) -> None:
 def pages(client: Client) -> dict[str, str]:
     """Addresses of all pages below the dashboard's, by the name of their pictures."""
     jobs = client.jobs.list(limit=100).data
+    scenes = {scene.name: scene.id for scene in client.scenes.list().data}
+    beam, rope = scenes[MODEL], scenes["hanging_rope"]
     ids = {
         "job": next(job.id for job in jobs if job.kind == "pipeline"),
+        "loop": next(job.id for job in jobs if job.kind == "loop"),
         "training": next(job.id for job in jobs if job.kind == "training"),
         "cancelled": next(job.id for job in jobs if job.state == "cancelled"),
-        "scene": next(scene.id for scene in client.scenes.list().data if scene.name == MODEL),
-        "trace": client.traces.list(limit=1).data[0].id,
-        "assessment": client.assessments.list(limit=1).data[0].id,
-        "dataset": client.datasets.list(limit=1).data[0].id,
+        "scene": beam,
+        "trace": client.traces.list(scene_id=rope, limit=1).data[0].id,
+        "assessment": next(item.id for item in client.assessments.list().data if item.scene_id == beam),
+        "dataset": next(item.id for item in client.datasets.list().data if item.scene_id == beam),
         "rollout": client.rollouts.list(limit=1).data[0].id,
         "plan": client.plans.list(limit=1).data[0].id,
         "model": MODEL,
@@ -235,6 +246,18 @@ def _wait(client: Client, job: Job) -> None:
     print(f"{job.kind}: {time.monotonic() - begun:.0f} s", flush=True)
 
 
+def _close_the_loop(client: Client) -> None:
+    """A loop of the beam's first version over its recording with larger displacements, as if that were another one."""
+    known = read_bundle(ROOT / "sample" / MODEL)
+    start = known.points[:1]
+    larger = replace(known, name=f"{MODEL}_larger", points=start + LARGER * (known.points - start))
+    with tempfile.TemporaryDirectory() as temporary:
+        packed = Path(temporary) / f"{larger.name}.zip"
+        packed.write_bytes(canonical_archive(larger))
+        scene = client.scenes.create(packed).id
+    _wait(client, client.loops.create(MODEL, scene, TraceConfig(time_limit_s=60, confirmed=1), version=1))
+
+
 def _predict(client: Client) -> None:
     """A rollout and a plan of the newest version: grips that go up by 4 cm, and the free end 3 cm aside."""
     with tempfile.TemporaryDirectory() as temporary:
@@ -273,11 +296,22 @@ def _log_in(context: BrowserContext, page: Page, base: str, key: str) -> None:
     page.wait_for_selector(".top nav")
 
 
+def _refuse(page: Page) -> None:
+    """What the form of the page answers to a file that is no recording, sent as a browser without scripts sends it."""
+    page.set_input_files(
+        "#bundle", {"name": "notes.txt", "mimeType": "text/plain", "buffer": b"no recording"}
+    )
+    with page.expect_navigation():
+        page.evaluate("HTMLFormElement.prototype.submit.call(document.querySelector('[data-upload]'))")
+
+
 def _both_widths(page: Page, address: str, out: Path, name: str) -> int:
     total = 0
     for width in WIDTHS_PX:
         page.set_viewport_size({"width": width, "height": 900})
         page.goto(address)
+        if name.startswith("upload-refused"):
+            _refuse(page)
         if page.locator("[data-cloud]").count():
             page.wait_for_selector("[data-cloud][data-ready]")
         for curve in page.locator("[data-curve]").all():

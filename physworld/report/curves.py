@@ -58,19 +58,31 @@ def residuals(scene: Scene, before: Array, after: Array, split: int) -> Residual
         if tracks.shape != scene.points.shape:
             raise ValueError(f"tracks of shape {tracks.shape} for points of shape {scene.points.shape}")
     seen = scene.visible[..., None]
-    first = scene.points[0] - scene.points[0].mean(axis=0)
-    axis = np.linalg.svd(first, full_matrices=False)[2][0]
     return Residuals(
         times=scene.times,
-        before=np.where(seen, scene.points - before, np.nan),
-        after=np.where(seen, scene.points - after, np.nan),
+        before=measured_minus(scene, before),
+        after=measured_minus(scene, after),
         baselines={
             name: per_frame(np.where(seen, scene.points - predict(scene), np.nan))
             for name, predict in BASELINES.items()
         },
         split=split,
-        order=np.argsort(first @ axis, kind="stable"),
+        order=along_body(scene),
     )
+
+
+def measured_minus(scene: Scene, tracks: Array) -> Array:
+    """Measured minus predicted (T, N, 3) [m], NaN where a point was not seen."""
+    return np.where(scene.visible[..., None], scene.points - tracks, np.nan)
+
+
+def along_body(scene: Scene) -> Array:
+    """Tracked points along the body's longest axis in the first frame, (N,); unseen ones are in its middle."""
+    seen = scene.visible[0][:, None]
+    middle = np.where(seen, scene.points[0], 0.0).sum(axis=0) / max(int(seen.sum()), 1)
+    first = np.where(seen, scene.points[0] - middle, 0.0)
+    axis = np.linalg.svd(first, full_matrices=False)[2][0]
+    return np.argsort(first @ axis, kind="stable")
 
 
 def per_frame(residual: Array) -> Array:

@@ -16,6 +16,7 @@ from typing import Any
 from physworld.arrays import Array
 from physworld.report import pictures, words
 from physworld.report.curves import Residuals, residuals
+from physworld.report.maps import carpets
 from physworld.report.markup import Child, Html, scrolled, tag
 from physworld.report.names import label
 from physworld.report.view import script, view
@@ -60,7 +61,7 @@ def render(report: dict[str, Any], scene: Scene, before: Array, after: Array) ->
             "Where and when the residual is",
             "Measured minus predicted: its mean along each axis, and its length for every point in every frame.",
             pictures.components(found),
-            pictures.carpets(found),
+            carpets(found),
             linked=True,
         ),
         _chosen(report),

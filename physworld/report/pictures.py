@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-import base64
 import math
-import struct
-import zlib
 from typing import Any
 
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.report.curves import Residuals, carpet, mean_component, per_frame
-from physworld.report.markup import Child, Html, scrolled, tag
+from physworld.report.curves import Residuals, mean_component, per_frame
+from physworld.report.markup import Html, scrolled, tag
 from physworld.report.predictors import PREDICTORS
 from physworld.report.svg import Axes, Series, legend_of, line_chart, picture
-from physworld.report.words import number, title
+from physworld.report.words import title
 
 MM = 1e3
 MOST_FRAMES = 600
 LEAST_SHARE = 0.005  # of the residual: candidates below it share a line
-_HEAT = (224, 72, 47)  # on white and on black; its opacity is the value
-_UNSEEN = (128, 128, 128, 46)
 
 
 def horizon(found: Residuals, sigma: float | None) -> Html:
@@ -61,26 +56,6 @@ def components(found: Residuals) -> Html:
             )
         )  # fmt: skip
     return tag("div", tag("div", *charts, class_="three"), legend_of(series))
-
-
-def carpets(found: Residuals) -> Html:
-    """Length of the residual of every point in every frame, before and after in one scale."""
-    values = {"before": found.before} if found.same else {"before": found.before, "after": found.after}
-    maps = {name: carpet(residual, found.order) for name, residual in values.items()}
-    finite = np.concatenate([m[np.isfinite(m)] for m in maps.values()])
-    top = float(np.quantile(finite, 0.99)) if finite.size else 1.0
-    figures = [
-        tag("figure", tag("figcaption", _CARPET_TITLES[name] if not found.same else "Twin"), _carpet(m, top, found))
-        for name, m in maps.items()
-    ]  # fmt: skip
-    scale = tag(
-        "div", tag("span", "0"), tag("i", class_="ramp"), tag("span", f"{number(MM * top)} mm"),
-        tag("span", "not seen", class_="unseen"), class_="legend",
-    )  # fmt: skip
-    return tag("div", tag("div", *figures, class_="two"), scale)
-
-
-_CARPET_TITLES = {"before": "Before: declared physics, calibrated", "after": "After: with what was found"}
 
 
 def candidates(report: dict[str, Any]) -> Html:
@@ -158,46 +133,6 @@ def experiment(suggested: dict[str, Any], sigma: float | None) -> Html | None:
             )
         )  # fmt: skip
     return tag("div", *charts, class_="two")
-
-
-def png(rgba: Array) -> str:
-    """A picture (H, W, 4) uint8 as a data address."""
-    height, width, _ = rgba.shape
-    rows = np.concatenate([np.zeros((height, 1), np.uint8), rgba.reshape(height, -1)], axis=1)
-    chunks = [
-        (b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 6, 0, 0, 0)),
-        (b"IDAT", zlib.compress(rows.tobytes(), 9)),
-        (b"IEND", b""),
-    ]
-    data = b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-        for kind, body in chunks
-    )
-    return "data:image/png;base64," + base64.b64encode(data).decode()
-
-
-def _carpet(values: Array, top: float, found: Residuals) -> Html:
-    """Points (rows) over frames (columns); uneven times are drawn as they are."""
-    points, frames = values.shape
-    rgba = np.zeros((points, frames, 4), np.uint8)
-    rgba[..., :3] = _HEAT
-    seen = np.isfinite(values)
-    rgba[..., 3] = np.where(seen, 255 * np.sqrt(np.clip(np.where(seen, values, 0.0) / (top or 1.0), 0, 1)), 0)
-    rgba[~seen] = _UNSEEN
-    times = found.times
-    axes = Axes(540, 230, (float(times[0]), float(times[-1])), (0.0, float(points)))
-    evenly = np.linspace(times[0], times[-1], min(max(frames, 2), MOST_FRAMES))
-    column = np.clip(np.searchsorted(times, evenly, side="right") - 1, 0, frames - 1)
-    parts: list[Child] = [
-        tag("image", x=axes.left, y=axes.top, width=axes.width - axes.left - axes.right,
-            height=axes.height - axes.top - axes.bottom, preserveAspectRatio="none", class_="pixels",
-            href=png(rgba[::-1][:, column])),
-        *(p for p in axes.grid("time [s]", "points along the body") if "grid" not in p[:20]),
-    ]  # fmt: skip
-    if found.split_s is not None:
-        x = axes.x(found.split_s)
-        parts.append(tag("line", class_="split", x1=x, x2=x, y1=axes.top, y2=axes.height - axes.bottom))
-    return picture(axes.width, axes.height, "Residual over points and time", *parts)
 
 
 def _telling(row: dict[str, Any], also: set[Any]) -> bool:

@@ -21,8 +21,8 @@ UPLOAD_PATHS = frozenset(
     {"/v1/scenes", "/v1/scenes/preview", "/dashboard/scenes", "/dashboard/scenes/preview"}
 )
 """Of the API, and of the dashboard, whose forms bring the same files."""
-PICTURE_PATH = re.compile(r"/v1/scenes/[^/]+/pictures/[^/]+")
-"""Of a splat, a camera or pictures beside a scene."""
+PICTURE_PATH = re.compile(r"/(v1|dashboard)/scenes/[^/]+/pictures/[^/]+")
+"""Of a splat, a camera or pictures beside a scene, for both."""
 ARRAY_PATHS = frozenset({"/v1/rollouts"})
 
 

@@ -175,6 +175,12 @@ def training_charts(points: Sequence[tuple[float, Mapping[str, float]]]) -> list
     return charts
 
 
+def split_time(recording: Scene) -> float | None:
+    """When the held-out frames begin [s], None where none are held out."""
+    first, last = recording.test
+    return float(recording.times[first]) if first < last else None
+
+
 def given_curves(metrics: Mapping[str, Any]) -> tuple[Array, dict[str, Array]] | None:
     """The curves of the track error that a result stored: times (T,) [s], errors (T,) [m] by predictor.
 

@@ -9,6 +9,8 @@ import numpy as np
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import HTMLResponse, JSONResponse, Response
 
+from physworld_schemas.library import catalogue
+from physworld_services.api.routes.datasets import EpisodeIndex, episode_file
 from physworld_services.dashboard import live
 from physworld_services.dashboard.clouds import Cloud, Layer, thinned
 from physworld_services.dashboard.lineage import lineage_graph
@@ -65,6 +67,7 @@ def router(site: Site) -> APIRouter:
             chosen=chosen,
             episodes=episodes.data,
             files=files,
+            exports=catalogue().exports,
             rejections=_rejections(site, files),
             cursor=cursor,
             next_cursor=episodes.next_cursor,
@@ -97,6 +100,10 @@ def router(site: Site) -> APIRouter:
     @routes.get("/datasets/{dataset_id}/episodes/{index}/cloud/{layer}")
     def cloud_layer(dataset_id: str, index: int, layer: str) -> Response:
         return layer_response(_cloud(site, dataset_id, index), layer)
+
+    @routes.get("/datasets/{dataset_id}/episodes/{index}/npz")
+    def npz(dataset_id: str, index: EpisodeIndex) -> Response:
+        return episode_file(dataset_id, index, site.database, site.stores)
 
     return routes
 

@@ -1,4 +1,5 @@
-"""API keys, for administrators: the list, a new one (its token is shown once), another token, the end of one."""
+"""API keys, for administrators: the list, a new one (its token is shown once), another token, the end of one; the keys
+that sign models, and the audit log."""
 
 from __future__ import annotations
 
@@ -15,7 +16,8 @@ from physworld_schemas.key import DEFAULT_GRACE_MINUTES, KeyCreate, Role
 from physworld_services.dashboard.access import actor_of, require_same_origin
 from physworld_services.dashboard.lists import Asked, Looked
 from physworld_services.dashboard.site import BASE, Site
-from physworld_storage.access import api_keys
+from physworld_storage import signing
+from physworld_storage.access import api_keys, audit
 
 PAGE_SIZE = 50
 EVERYTHING = Looked()
@@ -42,13 +44,22 @@ def router(site: Site) -> APIRouter:
     ) -> HTMLResponse:
         with site.database.reading() as session:
             found = api_keys.list_keys(session, limit=PAGE_SIZE, cursor=asked.cursor, search=asked.q)
+            signing_keys = signing.list_signing_keys(session, limit=PAGE_SIZE).data
         context: dict[str, Any] = {"keys": found.data, **asked.context(found.next_cursor)}
-        context |= {"roles": ROLES, "token": made, "fault": fault}
+        context |= {"roles": ROLES, "token": made, "fault": fault, "signing_keys": signing_keys}
         return site.page(request, "keys.html", status=status, **context)
 
     @routes.get("")
     def index(request: Request, asked: Asked) -> HTMLResponse:
         return page(request, asked)
+
+    @routes.get("/audit")
+    def audit_log(request: Request, asked: Asked) -> HTMLResponse:
+        with site.database.reading() as session:
+            found = audit.list_entries(session, limit=PAGE_SIZE, cursor=asked.cursor)
+            names = api_keys.names_of(session, (entry.actor for entry in found.data if entry.actor))
+        context = asked.context(found.next_cursor)
+        return site.page(request, "audit.html", entries=found.data, names=names, **context)
 
     @routes.post("", dependencies=[Depends(require_same_origin)])
     def create(

@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import HTMLResponse, JSONResponse, Response
 
-from physworld_schemas.model import Model, ModelComparison, ModelVersion
+from physworld.arrays import Array
+from physworld_schemas.model import Model, ModelVersion
 from physworld_services.dashboard.clouds import Cloud, Layer, measured_layers, resampled, scene_cloud, thinned
+from physworld_services.dashboard.comparisons import side_by_side
 from physworld_services.dashboard.curves import (
     chart,
     comparison_chart,
@@ -21,22 +23,24 @@ from physworld_services.dashboard.curves import (
 )
 from physworld_services.dashboard.lineage import lineage_graph
 from physworld_services.dashboard.lists import Asked
-from physworld_services.dashboard.pages_scenes import PREDICTION, layer_response, recording_of
+from physworld_services.dashboard.pages_scenes import PREDICTION, layer_response, predicted, recording_of
 from physworld_services.dashboard.pages_videos import films_of
+from physworld_services.dashboard.residuals import map_picture, maps_page
 from physworld_services.dashboard.site import BASE, Site
 from physworld_services.dashboard.tables import held_out_of, noise_floor_of
 from physworld_storage import loops, overview, registry, resources
-from physworld_storage.comparison import compare_versions
 from physworld_storage.errors import NotFound
 
-PAGE_SIZE = 50
+if TYPE_CHECKING:
+    from physworld.scene import Scene
 
+PAGE_SIZE = 50
 CHOICES = 200
 TURNS = 12
 """Newest loops of a model that its page shows."""
 BASELINES = ("static", "rigid_follow", "constant_velocity")
-MOST_COMPARED = 4
-"""Versions beside the two of a comparison that its plots show."""
+MOST_COMPARED = 12
+"""Versions beside the two of a comparison; its page offers the newest."""
 CARD = "card.json"
 
 Others = Annotated[Sequence[str], Query(max_length=MOST_COMPARED)]
@@ -92,8 +96,8 @@ def router(site: Site) -> APIRouter:
         choices = [*sorted(model.aliases), *numbers]
         first = a or (numbers[1] if len(numbers) > 1 else next(iter(numbers), None))
         second = b or next(iter(numbers), None)
-        found = None if first is None or second is None else _compared(site, name, first, second)
-        shown = [] if found is None else _distinct(site, name, (str(found.a), str(found.b), *also))
+        chosen = () if first is None or second is None else (first, second, *also)
+        shown = _distinct(site, name, chosen)
         floor = next((floor for one in shown if (floor := noise_floor_of(one.metrics)) is not None), None)
         return site.page(
             request,
@@ -103,8 +107,8 @@ def router(site: Site) -> APIRouter:
             a=first,
             b=second,
             also=[one.version for one in shown[2:]],
-            numbers=numbers,
-            found=found,
+            numbers=numbers[:MOST_COMPARED],
+            found=side_by_side(shown) if shown else None,
             plots=[chart for draw in (versions_chart, comparison_chart) if (chart := draw(shown, floor))],
         )
 
@@ -130,6 +134,15 @@ def router(site: Site) -> APIRouter:
             raise NotFound("curve of model version", f"{name}:{number}")
         return HTMLResponse(chart(*given, floor_m=noise_floor_of(version.metrics)))
 
+    @routes.get("/models/{name}/{number}/residuals")
+    def residuals(name: str, number: str) -> Response:
+        url = f"{BASE}/models/{name}/{number}/residuals"
+        return maps_page(*_residuals(site, _version(site, name, number)), url)
+
+    @routes.get("/models/{name}/{number}/residuals/{label}.png")
+    def residuals_picture(name: str, number: str, label: str) -> Response:
+        return map_picture(*_residuals(site, _version(site, name, number)), label)
+
     @routes.get("/models/{name}/{number}/cloud")
     def cloud(name: str, number: str) -> Response:
         url = f"{BASE}/models/{name}/{number}/cloud"
@@ -142,17 +155,11 @@ def router(site: Site) -> APIRouter:
     return routes
 
 
-def _compared(site: Site, name: str, a: str, b: str) -> ModelComparison:
-    with site.database.reading() as session:
-        pair = registry.get_version(session, name, a), registry.get_version(session, name, b)
-    return compare_versions(*pair)
-
-
 def _distinct(site: Site, name: str, chosen: Sequence[str]) -> list[ModelVersion]:
-    """The ready versions that are chosen, each once, in the order of the choice."""
+    """The versions that are chosen, each once, in the order of the choice."""
     with site.database.reading() as session:
         found = [registry.get_version(session, name, one) for one in chosen]
-    return list({one.version: one for one in found if one.state == "ready"}.values())
+    return list({one.version: one for one in found}.values())
 
 
 def _version(site: Site, name: str, number: int | str) -> ModelVersion:
@@ -172,14 +179,30 @@ def card_of(site: Site, version: ModelVersion) -> dict[str, Any]:
     return card if isinstance(card, dict) else {}
 
 
-def _cloud(site: Site, version: ModelVersion) -> Cloud:
-    """What the model predicted over what was measured, on the recording's time line."""
-    arrays = site.arrays(version.artifacts, PREDICTION)
-    if arrays is None or version.scene_id is None:
+def _recording(site: Site, version: ModelVersion) -> Scene:
+    """What the version was made of and its prediction is held against. Raises NotFound where it has neither."""
+    if version.scene_id is None or all(item.name != PREDICTION for item in version.artifacts):
         raise NotFound("prediction of model version", f"{version.name}:{version.version}")
     with site.database.reading() as session:
         record = resources.get_scene(session, version.scene_id)
-    recording = recording_of(site, record)
+    return recording_of(site, record)
+
+
+def _residuals(site: Site, version: ModelVersion) -> tuple[Scene, dict[str, Array]]:
+    """The recording, and what the version and its twin predict of it."""
+    recording = _recording(site, version)
+    found = {"World model": predicted(site, version, recording)}
+    if version.fit_id is not None:
+        with site.database.reading() as session:
+            fit = resources.get_fit(session, version.fit_id)
+        found["Twin"] = predicted(site, fit, recording)
+    return recording, {label: tracks for label, tracks in found.items() if tracks is not None}
+
+
+def _cloud(site: Site, version: ModelVersion) -> Cloud:
+    """What the model predicted over what was measured, on the recording's time line."""
+    recording = _recording(site, version)
+    arrays = site.arrays(version.artifacts, PREDICTION) or {}
     layers = measured_layers(recording)
     for key, label, role, opacity in (
         ("tracks", "World model", "model", 1.0),

@@ -85,7 +85,9 @@ def _ghost(site: Site, version: ModelVersion) -> Cloud | None:
     if arrays is not None:
         name = "particles" if "particles" in arrays else "tracks"
         points = resampled(arrays[name], arrays["times"], recording.times)
-        layers.append(thinned(Layer("twin", "Twin", "twin", points.astype(np.float32), shown=False)))
+        layers.append(
+            thinned(Layer("twin", "Twin (recorded motion)", "twin", points.astype(np.float32), shown=False))
+        )
     driven = recording.controllers.astype(np.float32)
     layers.append(Layer("controllers", "Recorded grips", "controllers", driven, shown=False))
     return scene_cloud(recording, layers)

@@ -10,6 +10,7 @@ from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse, Resp
 from physworld.arrays import Array
 from physworld.report import names
 from physworld_schemas.fit import Fit
+from physworld_schemas.model import ModelVersion
 from physworld_schemas.scene import Scene as SceneRecord
 from physworld_services.dashboard.clouds import (
     Cloud,
@@ -19,10 +20,11 @@ from physworld_services.dashboard.clouds import (
     scene_cloud,
     thinned,
 )
-from physworld_services.dashboard.curves import chart, frame_errors, given_curves, onto
+from physworld_services.dashboard.curves import chart, frame_errors, given_curves, onto, split_time
 from physworld_services.dashboard.lineage import lineage_graph
 from physworld_services.dashboard.lists import Asked
 from physworld_services.dashboard.pages_videos import films_of
+from physworld_services.dashboard.residuals import map_picture, maps_page
 from physworld_services.dashboard.samples import sample_folder
 from physworld_services.dashboard.site import BASE, Site
 from physworld_services.dashboard.tables import noise_floor_of
@@ -68,6 +70,13 @@ def router(site: Site) -> APIRouter:
             check = checks.get_check(session, check_id)
         return RedirectResponse(f"{BASE}/scenes/{check.scene_id}#check", 303)
 
+    @routes.get("/checks/{check_id}/json")
+    def check_file(check_id: str) -> Response:
+        with site.database.reading() as session:
+            check = checks.get_check(session, check_id)
+        headers = {"Content-Disposition": f'attachment; filename="{check_id}.json"'}
+        return Response(check.model_dump_json(indent=1), headers=headers, media_type="application/json")
+
     @routes.get("/scenes/{scene_id}")
     def page(request: Request, scene_id: str, fit: FitId = None) -> HTMLResponse:
         record, shown = _load(site, scene_id, fit)
@@ -82,6 +91,7 @@ def router(site: Site) -> APIRouter:
             scene=record,
             fit=shown,
             has_curve=shown is not None and _has_curve(shown),
+            has_maps=shown is not None and _has_prediction(shown),
             fits=fits,
             datasets=datasets,
             traces=traced,
@@ -113,12 +123,21 @@ def router(site: Site) -> APIRouter:
             errors.update(
                 {name: onto(given[0], values, recording.times) for name, values in given[1].items()}
             )
-        arrays = site.arrays(shown.artifacts, PREDICTION) if shown else None
-        if arrays is not None:
-            tracks = resampled(arrays["tracks"], arrays["times"], recording.times)
+        tracks = predicted(site, shown, recording)
+        if tracks is not None:
             errors["twin"] = frame_errors(recording, tracks)
         floor = noise_floor_of(shown.metrics) if shown else None
         return HTMLResponse(chart(recording.times, errors, split=split_time(recording), floor_m=floor))
+
+    @routes.get("/scenes/{scene_id}/residuals")
+    def residuals(scene_id: str, fit: FitId = None) -> Response:
+        record, shown = _load(site, scene_id, fit)
+        query = f"?fit={shown.id}" if shown else ""
+        return maps_page(*_residuals(site, record, shown), f"{BASE}/scenes/{scene_id}/residuals", query)
+
+    @routes.get("/scenes/{scene_id}/residuals/{label}.png")
+    def residuals_picture(scene_id: str, label: str, fit: FitId = None) -> Response:
+        return map_picture(*_residuals(site, *_load(site, scene_id, fit)), label)
 
     return routes
 
@@ -131,6 +150,12 @@ def recording_of(site: Site, record: SceneRecord) -> Scene:
     return recording
 
 
+def predicted(site: Site, made: Fit | ModelVersion | None, recording: Scene) -> Array | None:
+    """The stored prediction of a fit or a version at the recording's times, (T, N, 3) [m]; None without one."""
+    arrays = site.arrays(made.artifacts, PREDICTION) if made else None
+    return None if arrays is None else resampled(arrays["tracks"], arrays["times"], recording.times)
+
+
 def layer_response(cloud: Cloud, name: str) -> Response:
     """A layer's buffer. What is under its address never changes, so the browser may keep it for a while."""
     layer = cloud.layer(name)
@@ -138,12 +163,6 @@ def layer_response(cloud: Cloud, name: str) -> Response:
         raise NotFound("layer", name)
     headers = {"Cache-Control": "private, max-age=600"}
     return Response(layer.buffer(), media_type="application/octet-stream", headers=headers)
-
-
-def split_time(recording: Scene) -> float | None:
-    """When the held-out frames begin [s], None where none are held out."""
-    first, last = recording.test
-    return float(recording.times[first]) if first < last else None
 
 
 def _load(site: Site, scene_id: str, fit_id: str | None) -> tuple[SceneRecord, Fit | None]:
@@ -156,6 +175,14 @@ def _load(site: Site, scene_id: str, fit_id: str | None) -> tuple[SceneRecord, F
                 return record, fit
         newest = resources.list_fits(session, scene_id=scene_id, state="ready", limit=1).data
     return record, newest[0] if newest else None
+
+
+def _residuals(site: Site, record: SceneRecord, fit: Fit | None) -> tuple[Scene, dict[str, Array]]:
+    recording = recording_of(site, record)
+    tracks = predicted(site, fit, recording)
+    if tracks is None:
+        raise NotFound("prediction of scene", record.id)
+    return recording, {"Twin": tracks}
 
 
 def _cloud(site: Site, record: SceneRecord, fit: Fit | None) -> Cloud:
@@ -172,7 +199,11 @@ def _cloud(site: Site, record: SceneRecord, fit: Fit | None) -> Cloud:
 
 
 def _has_curve(fit: Fit) -> bool:
-    return any(item.name == PREDICTION for item in fit.artifacts) or given_curves(fit.metrics) is not None
+    return _has_prediction(fit) or given_curves(fit.metrics) is not None
+
+
+def _has_prediction(fit: Fit) -> bool:
+    return any(item.name == PREDICTION for item in fit.artifacts)
 
 
 def _declared(record: SceneRecord) -> list[tuple[str, object]]:

@@ -15,7 +15,7 @@ from physworld_services.api.errors import ApiProblem
 from physworld_services.dashboard.access import require_same_origin, require_writer
 from physworld_services.dashboard.forms import faults_of, form_of, values_of
 from physworld_services.dashboard.site import BASE, Site
-from physworld_services.dashboard.starts import STARTS, Start, body_of, choices_of
+from physworld_services.dashboard.starts import STARTS, Start, body_of, choices_of, not_taken_over
 from physworld_storage.errors import Conflict, NotFound
 from physworld_storage.jobs import jobs
 
@@ -40,13 +40,15 @@ def router(site: Site) -> APIRouter:
         name: ObjectId = None,
     ) -> HTMLResponse:
         values: dict[str, Any] = {}
+        note = ""
         if job is not None:
             with site.database.reading() as session:
-                values = body_of(jobs.get_job(session, job))
+                before = jobs.get_job(session, job)
+            values, note = body_of(before), not_taken_over(before)
         named = {"scene_id": scene_id, "fit_id": fit_id, "trace_id": trace_id, "dataset_id": dataset_id}
         named |= {"model": model, "version": version, "name": name}
         values |= {key: value for key, value in named.items() if value}
-        return _page(site, request, kind, values, {}, 200)
+        return _page(site, request, kind, values, {}, 200, note)
 
     @routes.post("/{kind}", dependencies=[Depends(require_same_origin)])
     async def start(request: Request, kind: str) -> Response:
@@ -76,11 +78,18 @@ def _start(site: Site, request: Request, kind: str, sent: Mapping[str, list[str]
 
 
 def _page(
-    site: Site, request: Request, kind: str, values: Mapping[str, Any], faults: Mapping[str, str], status: int
+    site: Site,
+    request: Request,
+    kind: str,
+    values: Mapping[str, Any],
+    faults: Mapping[str, str],
+    status: int,
+    note: str = "",
 ) -> HTMLResponse:
     known = _known(kind)
     form = form_of(known.body, values, choices_of(site), faults)
     context = {"kind": kind, "start": known, "form": form, "told": faults.get("", ""), "starts": STARTS}
+    context["note"] = note
     return site.page(request, "start.html", status=status, **context)
 
 

@@ -10,10 +10,10 @@ from fastapi.responses import HTMLResponse, JSONResponse, Response
 from physworld_schemas.scene import Scene as SceneRecord
 from physworld_schemas.trace import Trace
 from physworld_services.dashboard.clouds import Cloud, Layer, measured_layers, resampled, scene_cloud, thinned
-from physworld_services.dashboard.curves import chart, frame_errors
+from physworld_services.dashboard.curves import chart, frame_errors, split_time
 from physworld_services.dashboard.lineage import lineage_graph
 from physworld_services.dashboard.lists import Asked
-from physworld_services.dashboard.pages_scenes import layer_response, recording_of, split_time
+from physworld_services.dashboard.pages_scenes import layer_response, recording_of
 from physworld_services.dashboard.site import BASE, Site
 from physworld_storage import overview, resources, traces
 from physworld_storage.errors import NotFound

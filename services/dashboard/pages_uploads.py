@@ -1,4 +1,4 @@
-"""Recordings that come in through a page: a file or an archive, and the sample scene in one click.
+"""Recordings that come in through a page: a file or an archive, the sample scene in one click, pictures beside a scene.
 
 A folder that is dropped on the page is packed in the browser (``frontend/src/upload.js``); here every upload is one
 file, read as the REST API reads it: by another process, under limits.
@@ -13,17 +13,21 @@ from tempfile import TemporaryDirectory
 from fastapi import APIRouter, Depends, Request
 from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
 from starlette.concurrency import run_in_threadpool
+from starlette.datastructures import UploadFile
+from starlette.exceptions import HTTPException
 
 from physworld_scenes.errors import SceneInvalid
 from physworld_schemas.base import FieldError
 from physworld_schemas.scene import Scene
+from physworld_schemas.video import PictureName
 from physworld_services.api.errors import ApiProblem
 from physworld_services.api.parsing import Found, Parsers
+from physworld_services.api.routes.videos import picture_of, stored_picture
 from physworld_services.api.uploads import Upload, looked_at, parsed, read_form, upload_of
 from physworld_services.dashboard.access import require_same_origin, require_writer
 from physworld_services.dashboard.samples import PACKED, SAMPLE, sample_folder
 from physworld_services.dashboard.site import BASE, Site
-from physworld_storage import resources
+from physworld_storage import resources, videos
 
 ARCHIVE_NAME = "scene.zip"
 
@@ -71,7 +75,30 @@ def router(site: Site, parsers: Parsers) -> APIRouter:
             return _refused(site, request, "This installation has no sample scene", [], 404)
         return _done(request, await run_in_threadpool(_sample, site, folder, parsers))
 
+    @routes.post("/scenes/{scene_id}/pictures/{name}")
+    async def picture(request: Request, scene_id: str, name: PictureName) -> Response:
+        try:
+            form = await read_form(request)
+            try:
+                file = picture_of(form, site.settings.max_upload_bytes)
+                await run_in_threadpool(_pictured, site, scene_id, name, file)
+            finally:
+                await form.close()
+        except ApiProblem as problem:
+            faults = [fault for fault in problem.errors if fault.msg != problem.detail]
+            told = "; ".join([str(problem.detail), *_lines(faults)])
+            raise HTTPException(problem.status_code, f"{told}.") from problem
+        return RedirectResponse(f"{BASE}/scenes/{scene_id}#pictures", 303)
+
     return routes
+
+
+def _pictured(site: Site, scene_id: str, name: PictureName, file: UploadFile) -> None:
+    with site.database.reading() as session:
+        resources.get_scene(session, scene_id)
+    artifact = stored_picture(file, name, site.stores)
+    with site.database.session() as session:
+        videos.put_picture(session, scene_id, artifact)
 
 
 def _uploaded(site: Site, given: Upload, parsers: Parsers) -> Scene:

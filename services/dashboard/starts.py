@@ -37,6 +37,8 @@ from physworld_storage.errors import NotFound
 from physworld_storage.jobs import jobs
 
 MOST_CHOICES = 200
+MADE_OF = {"rollout": {"motion_scale"}, "plan": {"shift_x_m", "shift_y_m", "shift_z_m"}}
+"""Fields of forms that arrays are made of, by the kind of the job, which keeps them beside its settings."""
 
 Opening = Callable[[Session], Job]
 
@@ -164,7 +166,7 @@ def _rollout(site: Site, body: RolloutForm) -> Opening:
         returns=["points", "vertices"],
         mode="job",
     )
-    return rollout_opening(asked, site.database, site.stores)
+    return rollout_opening(asked, site.database, site.stores, body.model_dump(include=MADE_OF["rollout"]))
 
 
 def _plan(site: Site, body: PlanForm) -> Opening:
@@ -179,7 +181,7 @@ def _plan(site: Site, body: PlanForm) -> Opening:
     asked = PlanCreate(
         model=body.model, version=body.version, goal=goal, limits=PlanLimits(), config=body.config
     )
-    return plan_opening(asked, site.database, site.stores)
+    return plan_opening(asked, site.database, site.stores, body.model_dump(include=MADE_OF["plan"]))
 
 
 STARTS: dict[str, Start] = {
@@ -281,6 +283,17 @@ def body_of(job: Job) -> dict[str, Any]:
     if job.kind == "loop":
         return {name: job.config[name] for name in LoopForm.model_fields}
     return dict(job.config)
+
+
+def not_taken_over(job: Job) -> str:
+    """What a job was asked for and its form cannot show, in a sentence; empty where it shows everything."""
+    if MADE_OF.get(job.kind, set()) <= job.config.keys():
+        return ""
+    asked, shown = {
+        "rollout": ("The motion of this rollout", "the recording's own"),
+        "plan": ("The goal of this plan", "a shift of the measured points"),
+    }[job.kind]
+    return f"{asked} was given as arrays, which a form does not show: it begins with {shown}."
 
 
 def _recording_of(site: Site, name: str, version: str | int) -> Any:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import secrets
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from typing import Literal, get_args
@@ -234,6 +234,12 @@ def list_keys(
     statement = matching(select(ApiKeyRow), search, ApiKeyRow.id, ApiKeyRow.name, ApiKeyRow.role)
     keys = (ApiKeyRow.created_at, ApiKeyRow.id)
     return page_of(session, statement, keys, key_of_row, limit=limit, cursor=cursor)
+
+
+def names_of(session: Session, ids: Iterable[str]) -> dict[str, str]:
+    """Names of these keys by their ids; unknown ones are left out."""
+    rows = session.execute(select(ApiKeyRow.id, ApiKeyRow.name).where(ApiKeyRow.id.in_(set(ids))))
+    return {row.id: row.name for row in rows}
 
 
 def count_active_admins(session: Session) -> int:

@@ -43,6 +43,7 @@ STEP = 0.01
 WEIGHT = 0.5
 """Of how long the same took before, in shares of a job's time: as much counts the pace so far when so much is over."""
 NAMES = {"name", "model_name", "description", "tags", "dataset_id", "fit_id", "trace_id"}
+NAMES |= {"motion_scale", "shift_x_m", "shift_y_m", "shift_z_m"}  # how far, not how long
 """Settings that say nothing of the time."""
 ORIGINS: dict[str, type[FitRow | TraceRow | DatasetRow]] = {
     "fit": FitRow,

@@ -153,13 +153,13 @@ def test_the_scene_plays(visit: Visit, world: World) -> None:
 def test_the_error_curve_and_the_parameters_of_the_twin_are_there(visit: Visit, world: World) -> None:
     visit.open(f"/scenes/{world.scene_id}")
     visit.page.wait_for_selector("[data-curve][data-ready]")
-    legend = visit.page.locator(".curve .legend")
+    legend = visit.page.locator(".curve .legend").first
     for name in ("twin", "static", "rigid follow", "constant velocity"):
         expect(legend).to_contain_text(name)
     table = visit.page.locator("section", has_text="Calibrated parameters").last
     expect(table).to_contain_text("171,000 to 198,000")
     expect(table).to_contain_text("no, held at its prior")
-    told = visit.page.locator(".curve figure").get_attribute("data-series")
+    told = visit.page.locator(".curve figure[data-series]").get_attribute("data-series")
     assert told is not None
     with world.database.reading() as session:
         fit = resources.list_fits(session, scene_id=world.scene_id, state="ready").data[0]
@@ -170,11 +170,32 @@ def test_the_error_curve_and_the_parameters_of_the_twin_are_there(visit: Visit, 
     visit.points_shown()
 
 
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_maps_of_residuals_are_drawn_follow_the_view_and_seek_in_it(
+    visit: Visit, world: World, scheme: str
+) -> None:
+    visit.page.emulate_media(color_scheme=scheme)
+    for path, maps in ((f"/scenes/{world.scene_id}", 1), ("/models/chain_swing/1", 2)):
+        visit.open(path)
+        visit.points_shown()
+        part = visit.page.locator('[data-curve*="/residuals"][data-ready]')
+        expect(part.locator("figure")).to_have_count(maps)
+        expect(part.locator(".legend")).to_contain_text("not seen")
+        chart = part.locator("svg.chart.wide").first
+        chart.scroll_into_view_if_needed()
+        assert coloured_pixels(visit.page, chart.screenshot()) > 2000, "the policy lets the picture in"
+        box = chart.bounding_box()
+        assert box is not None
+        chart.click(position={"x": 0.9 * box["width"], "y": 0.5 * box["height"]})
+        expect(visit.page.locator("[data-clock]")).to_contain_text("held out")
+        expect(chart.locator(".playhead")).to_have_css("display", "inline")
+
+
 def test_a_dataset_shows_its_episodes_and_one_of_them_in_3d(visit: Visit, world: World) -> None:
     visit.open(f"/datasets/{world.dataset_id}")
     visit.points_shown()
-    expect(visit.page.locator("tbody tr:has(a)")).to_have_count(EPISODES)
-    visit.page.locator("tbody a").last.click()
+    expect(visit.page.locator("#episodes tbody tr:has(a)")).to_have_count(EPISODES)
+    visit.page.locator("#episodes tbody td:first-child a").last.click()
     visit.points_shown()
     expect(visit.page.locator("figure canvas")).to_have_attribute(
         "aria-label", "Particles of episode 2 in 3D"

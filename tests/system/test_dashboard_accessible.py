@@ -17,6 +17,7 @@ pytestmark = pytest.mark.browser
 AXE = (files("axe_playwright_python") / "axe.min.js").read_text()
 TAGS = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"]
 WIDTHS = (360, 1440)
+REFUSED = "a refused upload"
 CLIPPED = """() => [...document.querySelectorAll(".top nav a")].filter((link) => {
   const [box, bar] = [link.getBoundingClientRect(), link.parentElement.getBoundingClientRect()];
   return box.left < 0 || box.right > Math.min(innerWidth, bar.right) + 1 || box.width < 1;
@@ -55,6 +56,7 @@ def pages(world: World) -> list[str]:
         "/fits",
         "/traces",
         f"/traces/{world.trace_id}",
+        f"/assessments/{world.assessment_id}",
         "/datasets",
         f"/datasets/{world.dataset_id}",
         "/models",
@@ -67,6 +69,7 @@ def pages(world: World) -> list[str]:
         "/plans",
         f"/plans/{world.plan_id}",
         "/keys",
+        "/keys/audit",
         "/sessions",
         *(f"/start/{kind}" for kind in starts),
     ]
@@ -77,6 +80,15 @@ def violations(visit: Visit) -> list[Any]:
     visit.page.evaluate(AXE)
     found: list[Any] = visit.page.evaluate(RUN, TAGS)
     return found
+
+
+def refuse(visit: Visit) -> None:
+    """Go to the page that answers a form with a file that is no recording, as a browser without scripts sends it."""
+    visit.open("/scenes")
+    visit.page.set_input_files("#bundle", {"name": "notes.txt", "mimeType": "text/plain", "buffer": b"none"})
+    with visit.page.expect_navigation():
+        visit.page.evaluate("HTMLFormElement.prototype.submit.call(document.querySelector('[data-upload]'))")
+    visit.page.get_by_role("heading", name="This recording cannot be used").wait_for()
 
 
 def settle(visit: Visit) -> None:
@@ -93,8 +105,11 @@ def test_axe_finds_nothing_on_any_page(stranger: Visit, world: World, scheme: st
     stranger.open("/login")
     found = {"/login": violations(stranger)}
     stranger.login(world.admin_token)
-    for path in pages(world):
-        stranger.open(path)
+    for path in [*pages(world), REFUSED]:
+        if path == REFUSED:
+            refuse(stranger)
+        else:
+            stranger.open(path)
         settle(stranger)
         found[path] = violations(stranger)
         wide = stranger.page.evaluate("document.documentElement.scrollWidth")

@@ -144,7 +144,7 @@ def test_from_an_empty_folder_to_a_model_that_is_played_with_and_back(life: Visi
     fill(visit, **{f"config__{name}": value for name, value in small.items()})
     done(visit)
     visit.open("/models/bar")
-    page.get_by_role("link", name="Compare two versions").click()
+    page.get_by_role("link", name="Compare versions").click()
     expect(page.locator("main")).to_contain_text("Error on the held-out frames")
     expect(page.locator(".curve svg").first).to_be_visible()
 

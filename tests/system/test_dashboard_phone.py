@@ -39,16 +39,17 @@ def test_the_text_of_a_plot_can_be_read_and_nothing_is_empty_below_it(
 ) -> None:
     visit.page.set_viewport_size({"width": width, "height": 900})
     visit.open(f"/scenes/{world.scene_id}")
-    curve = visit.page.locator("[data-curve][data-ready]")
-    curve.wait_for()
-    sizes: list[float] = curve.evaluate("""(curve) => [...curve.querySelectorAll("svg.chart text")]
-        .filter((text) => text.checkVisibility())
-        .map((text) => parseFloat(getComputedStyle(text).fontSize) * text.getScreenCTM().d)
-        .filter((size) => size > 0)""")
-    assert sizes and min(sizes) >= READABLE_PX
-    empty = curve.evaluate("(curve) => curve.getBoundingClientRect().bottom"
-                           " - curve.querySelector('figure').getBoundingClientRect().bottom")  # fmt: skip
-    assert empty <= 1
+    curves = visit.page.locator("[data-curve][data-ready]")
+    expect(curves).to_have_count(2)
+    for curve in curves.all():
+        sizes: list[float] = curve.evaluate("""(curve) => [...curve.querySelectorAll("svg.chart text")]
+            .filter((text) => text.checkVisibility())
+            .map((text) => parseFloat(getComputedStyle(text).fontSize) * text.getScreenCTM().d)
+            .filter((size) => size > 0)""")
+        assert sizes and min(sizes) >= READABLE_PX
+        empty = curve.evaluate("(curve) => curve.getBoundingClientRect().bottom"
+                               " - curve.lastElementChild.getBoundingClientRect().bottom")  # fmt: skip
+        assert empty <= 1
 
 
 def test_the_lineage_fits_its_panel_although_its_columns_are_wider(visit: Visit) -> None:

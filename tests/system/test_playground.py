@@ -7,13 +7,14 @@ import shutil
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
 from dashboard_browser import FLAGS, WATCH_POLICY, Visit
 from inference_serving import Served, serve_inference
 from playwright.sync_api import Page, expect, sync_playwright
-from test_dashboard_accessible import violations
+from test_dashboard_accessible import WIDTHS, violations
 
 pytestmark = pytest.mark.browser
 
@@ -141,10 +142,16 @@ def test_a_slider_changes_the_body_and_a_new_session_keeps_it(served: Served, pa
     until(page, lambda: any("factors" in said and json.loads(said) == asked for said in sent))
 
 
-def test_axe_finds_nothing_beside_a_live_session(served: Served, page: Page) -> None:
-    page.set_viewport_size({"width": 360, "height": 900})
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", WIDTHS)
+def test_axe_finds_nothing_beside_a_live_session(
+    served: Served, page: Page, scheme: Literal["light", "dark"], width: int
+) -> None:
+    page.emulate_media(color_scheme=scheme)
+    page.set_viewport_size({"width": width, "height": 900})
     enter(served, page)
     expect(page.locator("[data-factors] label")).to_have_count(2)
+    expect(page.locator("label[data-for=twin]")).to_have_text("Twin (recorded motion)")
     assert violations(Visit(page, served.url)) == []
 
 

@@ -15,7 +15,9 @@ from physworld_schemas.job import Job
 from physworld_services.api.dependencies import ID_PATTERN, DatabaseDep, ObjectId, PageDep, StoresDep
 from physworld_services.api.errors import documented
 from physworld_services.api.idempotency import IdempotencyDep, accepted
+from physworld_services.stores import Stores
 from physworld_storage import resources
+from physworld_storage.database import Database
 from physworld_storage.jobs import jobs
 
 router = APIRouter(prefix="/datasets", tags=["datasets"])
@@ -78,6 +80,11 @@ def get_episode(
     dataset_id: ObjectId, index: EpisodeIndex, database: DatabaseDep, stores: StoresDep
 ) -> Response:
     """The arrays of one episode as npz (no pickles), checked against the digest that was committed."""
+    return episode_file(dataset_id, index, database, stores)
+
+
+def episode_file(dataset_id: str, index: int, database: Database, stores: Stores) -> Response:
+    """An episode as a file to keep. Raises NotFound and EpisodeCorrupt."""
     with database.reading() as session:
         episode = resources.get_episode(session, dataset_id, index)
     arrays, attributes = stores.episodes.verified(episode.path, episode.digest)

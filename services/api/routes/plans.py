@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Annotated
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Response
 from sqlalchemy.orm import Session
@@ -52,14 +52,23 @@ def get_plan(plan_id: ObjectId, database: DatabaseDep) -> Plan:
         return runs.get_plan(session, plan_id)
 
 
-def plan_opening(body: PlanCreate, database: Database, stores: Stores) -> Callable[[Session], Job]:
-    """What opens the plan's job, its request checked and stored. Raises ApiProblem, 409 or 422."""
+def plan_opening(
+    body: PlanCreate, database: Database, stores: Stores, made_of: Mapping[str, Any] | None = None
+) -> Callable[[Session], Job]:
+    """What opens the plan's job, its request checked and stored. Raises ApiProblem, 409 or 422.
+
+    Args:
+        body: of the request.
+        database, stores: of the installation.
+        made_of: what the goal of the body was made of, kept among the job's settings.
+    """
     with database.reading() as session:
         version = ready_version(registry.get_version(session, body.model, body.version))
         points = resources.get_scene(session, str(version.scene_id)).points
     asked = _checked(body, points).model_copy(update={"version": version.version})
     request = stores.artifacts.put_bytes(asked.model_dump_json().encode(), runs.REQUEST, "application/json")
     config = asked.model_dump(mode="json", exclude={"goal"}) | {"goal": body.goal.kind}
+    config |= made_of or {}
     return lambda session: jobs.create_run(
         session, "plan", body.model, version.version, config, request, body.config.iterations
     )

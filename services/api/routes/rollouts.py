@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any
 
 import numpy as np
@@ -94,14 +94,22 @@ def get_rollout(rollout_id: ObjectId, database: DatabaseDep) -> Rollout:
         return runs.get_rollout(session, rollout_id)
 
 
-def rollout_opening(body: RolloutCreate, database: Database, stores: Stores) -> Callable[[Session], Job]:
-    """What opens the rollout's job, its request checked and stored. Raises ApiProblem, 409 or 422."""
+def rollout_opening(
+    body: RolloutCreate, database: Database, stores: Stores, made_of: Mapping[str, Any] | None = None
+) -> Callable[[Session], Job]:
+    """What opens the rollout's job, its request checked and stored. Raises ApiProblem, 409 or 422.
+
+    Args:
+        body: of the request.
+        database, stores: of the installation.
+        made_of: what the arrays of the body were made of, kept among the job's settings.
+    """
     with database.reading() as session:
         version = ready_version(registry.get_version(session, body.model, body.version))
         scene = resources.get_scene(session, str(version.scene_id))
     shape = _shape(body, scene.controllers)
     asked = _encoded(body).model_copy(update={"version": version.version})
-    return _opening(asked, shape, _ticks(body, shape), version.version, stores)
+    return _opening(asked, shape, _ticks(body, shape), version.version, stores, made_of)
 
 
 def _ticks(body: RolloutCreate, shape: tuple[int, int]) -> int:
@@ -109,10 +117,16 @@ def _ticks(body: RolloutCreate, shape: tuple[int, int]) -> int:
 
 
 def _opening(
-    asked: RolloutCreate, shape: tuple[int, int], ticks: int, version: int, stores: Stores
+    asked: RolloutCreate,
+    shape: tuple[int, int],
+    ticks: int,
+    version: int,
+    stores: Stores,
+    made_of: Mapping[str, Any] | None = None,
 ) -> Callable[[Session], Job]:
     request = stores.artifacts.put_bytes(asked.model_dump_json().encode(), runs.REQUEST, "application/json")
     config = asked.model_dump(mode="json", exclude={"controllers", "phi", "times"}) | {"shape": list(shape)}
+    config |= made_of or {}
     return lambda session: jobs.create_run(
         session, "rollout", asked.model, version, config, request, shape[0] * ticks
     )

@@ -10,9 +10,9 @@ import anyio
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import ValidationError
 from sqlalchemy.orm import Session
-from starlette.datastructures import UploadFile
+from starlette.datastructures import FormData, UploadFile
 
-from physworld_schemas.base import FieldError, Page
+from physworld_schemas.base import Artifact, FieldError, Page
 from physworld_schemas.job import Job
 from physworld_schemas.scene import Scene
 from physworld_schemas.video import MAX_CAMERA_BYTES, CameraView, PictureName, Video, VideoCreate, VideoOf
@@ -106,11 +106,7 @@ async def put_picture(
     slots = cast(anyio.CapacityLimiter, request.app.state.upload_slots)
     form = await read_form(request)
     try:
-        file = form.get("bundle")
-        if not isinstance(file, UploadFile) or len(form) != 1:
-            raise _refused("send one file in the field bundle and nothing else")
-        if file.size is not None and file.size > settings.max_upload_bytes:
-            raise too_large(file.size, settings.max_upload_bytes)
+        file = picture_of(form, settings.max_upload_bytes)
         with database.reading() as session:
             resources.get_scene(session, scene_id)
         return await anyio.to_thread.run_sync(_kept, file, name, scene_id, stores, idempotency, limiter=slots)
@@ -118,7 +114,18 @@ async def put_picture(
         await form.close()
 
 
-def _kept(file: UploadFile, name: str, scene_id: str, stores: Stores, idempotency: Idempotency) -> Response:
+def picture_of(form: FormData, most_bytes: int) -> UploadFile:
+    """The one file of a form. Raises ApiProblem, 413 or 422."""
+    file = form.get("bundle")
+    if not isinstance(file, UploadFile) or len(form) != 1:
+        raise _refused("send one file in the field bundle and nothing else")
+    if file.size is not None and file.size > most_bytes:
+        raise too_large(file.size, most_bytes)
+    return file
+
+
+def stored_picture(file: UploadFile, name: str, stores: Stores) -> Artifact:
+    """The file in the store, once it was looked at. Raises ApiProblem, 422."""
     file.file.seek(0)
     if name in BEGINS:
         magic, what = BEGINS[name]
@@ -131,7 +138,11 @@ def _kept(file: UploadFile, name: str, scene_id: str, stores: Stores, idempotenc
     with tempfile.NamedTemporaryFile(prefix="physworld-upload-") as copy:
         shutil.copyfileobj(file.file, copy, COPIED_BYTES)
         copy.flush()
-        artifact = stores.artifacts.put_file(copy.name, name, MEDIA_TYPES[name])
+        return stores.artifacts.put_file(copy.name, name, MEDIA_TYPES[name])
+
+
+def _kept(file: UploadFile, name: str, scene_id: str, stores: Stores, idempotency: Idempotency) -> Response:
+    artifact = stored_picture(file, name, stores)
 
     def work(session: Session) -> Answer:
         return answer_of(200, videos.put_picture(session, scene_id, artifact))

@@ -19,8 +19,8 @@ from PIL import Image
 
 from physworld.report import render
 from physworld.report.curves import per_frame, residuals
+from physworld.report.maps import png
 from physworld.report.markup import Html, tag
-from physworld.report.pictures import png
 from physworld.report.svg import decades, round_ticks
 from physworld.report.words import VERDICTS, headline, interval, label, number, quantity
 from physworld.scene import Scene
@@ -244,7 +244,7 @@ def test_numbers_are_short_and_carry_units_that_suit_them() -> None:
 
 def test_a_picture_survives_its_encoding() -> None:
     rgba = np.random.default_rng(0).integers(0, 256, (7, 5, 4), dtype=np.uint8)
-    content = base64.b64decode(png(rgba).split(",", 1)[1])
+    content = png(rgba)
     assert np.array_equal(np.asarray(Image.open(io.BytesIO(content))), rgba)
 
 

@@ -47,9 +47,9 @@ function tellNumbers(figure, charts) {
 
 function wire(element) {
   const follows = element.dataset.follow !== undefined;
-  for (const figure of element.querySelectorAll("figure[data-series]")) {
+  for (const figure of element.querySelectorAll("figure.plot")) {
     const charts = figure.querySelectorAll("svg[data-time]"); // one for wide windows, one for narrow ones
-    tellNumbers(figure, charts);
+    if (figure.dataset.series) tellNumbers(figure, charts); // a map of residuals has none
     if (!follows) continue;
     for (const chart of charts) {
       chart.classList.add("seeks");

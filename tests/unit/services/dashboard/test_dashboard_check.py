@@ -70,6 +70,10 @@ def test_the_button_of_the_card_starts_a_check_and_the_card_shows_its_answer(
     assert f"/dashboard/checks/{check.id}" in client.get(job_page).text
     there = client.get(f"/dashboard/checks/{check.id}")
     assert there.status_code == 303 and there.headers["location"] == f"/dashboard/scenes/{scene}#check"
+    place = f"/dashboard/checks/{check.id}/json"
+    kept = client.get(place)
+    assert f'href="{place}"' in card and kept.json()["report"]["noise_m"] == check.report.noise_m
+    assert f'filename="{check.id}.json"' in kept.headers["content-disposition"]
     assert client.post(f"/dashboard/delete/check/{check.id}", headers=own).status_code == 303
     assert "Not checked yet" in client.get(f"/dashboard/scenes/{scene}").text
 

@@ -97,6 +97,24 @@ def test_any_number_of_versions_is_plotted_with_intervals(client: httpx.Client) 
     assert 'name="also" value="3" checked' in page
 
 
+def test_any_number_of_versions_is_tabled_with_intervals_and_gains_against_the_first(
+    client: httpx.Client,
+) -> None:
+    page = client.get("/dashboard/models/beam/compare?a=1&b=2&also=3&also=1").text
+    head = re.search(r"<th>Predictor</th>(.*?)</tr>", page)
+    assert head is not None
+    told = re.findall(r">([^<]+)</th>", head[1])
+    assert told == ["Version 1", "Version 2", "Gain", "Version 3", "Gain"]
+    row = re.search(r"<td>World model, fine-tuned</td>(.*?)</tr>", page)
+    assert row is not None
+    shown = [re.sub(r"<[^>]*>", "", cell) for cell in re.findall(r"<td[^>]*>(.*?)</td>", row[1])]
+    assert [cell.split(" ")[0] for cell in shown] == ["4.00", "3.10", "0.900", "3.50", "0.500"]
+    assert all(" to " in cell for cell in shown)
+    seeds = re.search(r"<td>Settings: seed</td>(.*?)</tr>", page)
+    assert seeds is not None and re.findall(r">(\d+)<", seeds[1]) == ["400", "310", "350"]
+    assert client.get("/dashboard/models/beam/compare?a=1&b=1").status_code == 200
+
+
 def test_without_a_choice_the_two_newest_are_taken(client: httpx.Client) -> None:
     page = client.get("/dashboard/models/beam/compare").text
     assert '<option value="2" selected>' in page and '<option value="3" selected>' in page

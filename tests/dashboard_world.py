@@ -18,6 +18,7 @@ from physworld.demonstrate.coverage import Coverage
 from physworld.scene import Body, Scene
 from physworld_scenes.bundle import canonical_archive
 from physworld_schemas.arrays import EncodedArray
+from physworld_schemas.assessment import AssessmentCreate
 from physworld_schemas.base import Artifact, Problem
 from physworld_schemas.dataset import DatasetConfig
 from physworld_schemas.fit import FitConfig
@@ -55,6 +56,7 @@ class World:
     rollout_id: str = ""
     plan_id: str = ""
     trace_id: str = ""
+    assessment_id: str = ""
     scene_id: str = ""
     pipeline_id: str = ""
     dataset_id: str = ""
@@ -82,6 +84,7 @@ def build_world(folder: Path) -> World:
     world.failed_id = _fail_fit(world, add_scene(world, replace(recording, name="chain_failed")))
     _start_fit(world, add_scene(world, replace(recording, name="chain_running")))
     _trace(world, recording)
+    world.assessment_id = _assess(world)
     world.rollout_id = _run(world, recording, "rollout")
     world.plan_id = _run(world, recording, "plan")
     return world
@@ -321,6 +324,22 @@ def _trace(world: World, recording: Scene) -> None:
         claim(world, job.id),
         {"verdict": "named", "report": report, "artifacts": [stored.model_dump()]},
     )
+
+
+def _assess(world: World) -> str:
+    """An assessment that found the model worse than it promised."""
+    with world.database.session() as session:
+        asked = AssessmentCreate(scene_id=world.scene_id, open_trace=False)
+        job = jobs.create_assessment(session, "chain_swing", 1, asked)
+    measured = {"error_m": 0.006, "ci95_m": [0.005, 0.007], "noise_floor_m": 3.2e-4, "frames": 27}
+    answer = {
+        "outcome": "worse_than_expected", "reason": "It errs by more than was promised", "measured": measured,
+        "expected": {**measured, "error_m": 0.004, "ci95_m": [0.003, 0.005]}, "excess_m": 0.002,
+        "excess_ci95_m": [0.001, 0.003], "start_mismatch_m": 0.0, "twin_m": 0.005,
+        "baselines_m": {"static": 0.03, "rigid_follow": 0.02, "constant_velocity": 0.01},
+    }  # fmt: skip
+    complete(world, claim(world, job.id), answer)
+    return str(job.outputs[0].id)
 
 
 def _run(world: World, recording: Scene, kind: RunKind) -> str:
