@@ -166,7 +166,15 @@ def run_alone(measure: Callable[[int, int], Report]) -> None:
 def folded(lines: Sequence[str]) -> list[str]:
     """Lines of Markdown behind a line to click on; between two empty lines, as GitHub and the guide want it."""
     inner = "\n".join(lines).strip("\n").split("\n")
-    return ["", '<details markdown="1">', "<summary>How this was measured</summary>", "", *inner, "", "</details>"]
+    return [
+        "",
+        '<details markdown="1">',
+        "<summary>How this was measured</summary>",
+        "",
+        *inner,
+        "",
+        "</details>",
+    ]
 
 
 def _row(cells: Sequence[str]) -> str:
