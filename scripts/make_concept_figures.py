@@ -1,7 +1,7 @@
 """``python -m scripts.make_concept_figures [--measure]``: the figures of the pages that explain the concepts.
 
-``docs/images/concept_NAME.svg`` of the pages method, calibration, trace and models. Curves and bars are measured: of the
-sample scene, and of the bar of ``docs/notebooks/missing_effect.ipynb``. ``--measure`` measures them anew (some
+``docs/images/concept_NAME.svg`` of the pages method, calibration, trace and models. Curves and bars are measured: of
+the sample scene, and of the bar of ``docs/notebooks/missing_effect.ipynb``. ``--measure`` measures them anew (some
 minutes) and keeps them in ``docs/images/concepts.json``; without it the figures are drawn from that file. Every
 figure stands on a light card, so that it reads on a dark page too.
 """
@@ -94,7 +94,7 @@ def _trace() -> dict[str, Any]:
     cells = [cell for cell in json.loads(NOTEBOOK.read_text())["cells"] if cell["cell_type"] == "code"]
     names: dict[str, Any] = {}
     for cell in cells[:2]:
-        exec("".join(cell["source"]), names)  # noqa: S102
+        exec("".join(cell["source"]), names)
     found = names["trace"](names["scene"], names["config"])
     scene, report = names["scene"], names["report"]
     return {
@@ -144,7 +144,8 @@ def _method() -> str:
         start = (middle[2] - 62, 108)
         parts.append(
             f'<path d="M{start[0]} {start[1]} C{middle[2] - 20} {96 - 2 * rise} {middle[2] + 8} {100 + 2 * rise} '
-            f'{middle[2] + 60 - 6 * number} {104 + rise}" fill="none" stroke="{GRIP}" stroke-width="2" opacity="{colour}"/>'
+            f'{middle[2] + 60 - 6 * number} {104 + rise}" fill="none" stroke="{GRIP}" stroke-width="2" '
+            f'opacity="{colour}"/>'
         )
     parts.append(_grip(middle[2]))
     nodes = _bent(middle[3], 44.0)[::2]
@@ -279,14 +280,16 @@ def _trace_figure(found: dict[str, Any]) -> str:
 def _models() -> str:
     """One step: history and grips go through the prior and the network; the sum is the next history."""
     width, height = 880, 250
-    boxes = {
-        "in": (20, 70, 206, 96, INK, "what a step sees", ("the last places of all vertices", "the grips' next motion", "properties Φ")),
-        "prior": (286, 36, 230, 66, GRIP, "prior", ("linear, in closed form: x̂",)),
-        "net": (286, 134, 230, 66, MODEL, "graph network", ("what the prior leaves: σ · y",)),
-        "out": (630, 70, 226, 96, INK, "the next tick", ("x = x̂ + σ · y", "places of all vertices, 1/30 s later", "measured points by the skin")),
-    }  # fmt: skip
+    seen = ("the last places of all vertices", "the grips' next motion", "properties Φ")
+    following = ("x = x̂ + σ · y", "places of all vertices, 1/30 s later", "measured points by the skin")
+    boxes = (
+        (20, 70, 206, 96, INK, "what a step sees", seen),
+        (286, 36, 230, 66, GRIP, "prior", ("linear, in closed form: x̂",)),
+        (286, 134, 230, 66, MODEL, "graph network", ("what the prior leaves: σ · y",)),
+        (630, 70, 226, 96, INK, "the next tick", following),
+    )
     parts = []
-    for left, top, wide, high, colour, title, lines in boxes.values():
+    for left, top, wide, high, colour, title, lines in boxes:
         parts.append(_box(left, top, wide, high, colour))
         parts.append(_text(left + wide / 2, top + 24, title, colour, 14, weight=600))
         parts += [

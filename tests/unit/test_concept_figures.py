@@ -1,4 +1,4 @@
-"""The figures of the concepts: they are what their script draws, well-formed, light, and said in words where they stand."""
+"""The figures of the concepts: they are what their script draws, well-formed, and told in words where they stand."""
 
 from __future__ import annotations
 
