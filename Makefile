@@ -2,7 +2,7 @@
 # make test [JOBS=n]       everything the tests need, then linters and tests in n processes (2)
 # make test-fast           the tests that neither are slow nor need a service, in JOBS processes; no linters
 # make bench               the figures of docs/benchmarks.md
-# make up                  the embedded service in the foreground
+# make up                  the embedded service in the foreground, with the guide (built where it is older than its pages)
 # make lock [UPGRADE=name] write requirements.lock anew; UPGRADE=all moves every package to its newest release
 # make catalogue           schemas/catalogue.json and the tables of it in docs/
 # make docs                the guide of docs/, which a running service serves at /docs/guide
@@ -16,6 +16,8 @@ DATA ?= .demo
 JOBS ?= 2
 BIN := .venv/bin
 export OMP_NUM_THREADS ?= 1
+SITE ?= services/guide/site
+MKDOCS := NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --clean --site-dir $(SITE)
 
 .PHONY: demo test test-fast bench lint up clean install dev catalogue docs reference wheels sdk lock audit
 
@@ -28,7 +30,7 @@ dev:
 demo: install
 	@$(BIN)/physworld run "$(SCENE)" --data "$(DATA)" --json "$(DATA)/report.json"
 
-up: install
+up: install $(SITE)/index.html
 	@exec $(BIN)/physworld up --data "$(DATA)"
 
 lint: dev
@@ -52,7 +54,11 @@ catalogue: dev
 	$(BIN)/python -m scripts.catalogue
 
 docs: dev
-	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --clean
+	$(MKDOCS) --strict
+
+# a service runs without its guide too: a page that does not build stops nothing
+$(SITE)/index.html: mkdocs.yml scripts/guide_pages.py README.md CONTRIBUTING.md CHANGELOG.md SECURITY.md $(shell find docs -type f) | install
+	-@$(MKDOCS) --quiet && echo "guide: built"
 
 reference: dev
 	$(BIN)/python -m scripts.make_reference

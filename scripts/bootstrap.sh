@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Builds .venv with the dependencies of requirements.lock, by digest, and both distributions, editable.
 #
-#   scripts/bootstrap.sh          what the service and the command line need
+#   scripts/bootstrap.sh          what the service, the command line and the build of the guide need
 #   scripts/bootstrap.sh --dev    also what the tests and the linters need, Chromium among it
 #   scripts/bootstrap.sh --bench  also the peers that the benchmarks measure beside us
 #
@@ -65,7 +65,7 @@ install_chromium() {
     fi
 }
 
-EXTRAS=api,sim,train,video,tables
+EXTRAS=api,sim,train,video,tables,guide
 case "${1:-}" in
     "") ;;
     --dev) EXTRAS=$EXTRAS,dev ;;

@@ -1,20 +1,23 @@
-"""``python -m scripts.make_gallery [NAME ...]``: make the films and the page of the gallery, ``docs/gallery.md``.
+"""``python -m scripts.make_gallery [--readme] [NAME ...]``: the films and the page of the gallery, ``docs/gallery.md``.
 
 Every film is simulated anew (``gallery_objects.py``) and drawn by the renderer of ``physworld video``: the body's
 surface (``gallery_surface.py``), or grains as spheres, with colours that are carried along, and measured points dark on
 top. ``docs/images/gallery`` gets NAME.mp4 and the picture NAME.webp that stands for it, and ``figures.json`` what was
-measured. With names, only these are made anew.
+measured. With names, only these are made anew. ``--readme`` simulates nothing: it makes the picture that moves at the
+top of the README from the film that is there; every other call makes it too.
 """
 
 from __future__ import annotations
 
 import argparse
+import io
 import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import warp as wp
 from PIL import Image
@@ -42,6 +45,9 @@ MARK = 0.006  # size of a measured point, as a share of what is shown
 BEFORE = 2.0  # sizes that a measured point is drawn nearer to the camera, lest the body around it hides it
 POSTER_AT = 0.55  # share of the film
 FRAMES_A_SECOND = 30.0  # at most; recordings have more
+README_FILM = ROOT / "docs" / "images" / "soft_beam_film.webp"
+README_SIZE_PX = (480, 360)
+README_RATE = 15.0  # frames a second
 HEAD = """# Gallery
 
 Six objects, simulated by the engine and drawn by the renderer of [physworld video](video.md), with the surfaces that
@@ -56,7 +62,12 @@ def main() -> None:
     parser.add_argument(
         "names", nargs="*", help=f"of {', '.join(one.name for one in EXHIBITS)}; default: all"
     )
-    names = set(parser.parse_args().names)
+    parser.add_argument("--readme", action="store_true", help="only the moving picture of the README")
+    given = parser.parse_args()
+    if given.readme:
+        README_FILM.write_bytes(moving_picture(FOLDER / "soft_beam.mp4"))
+        return
+    names = set(given.names)
     unknown = names - {one.name for one in EXHIBITS}
     if unknown:
         parser.error(f"no exhibit is called {', '.join(sorted(unknown))}")
@@ -76,6 +87,26 @@ def main() -> None:
             )
             (FOLDER / "figures.json").write_text(json.dumps(figures, indent=1) + "\n")
     PAGE.write_text(page(figures))
+    README_FILM.write_bytes(moving_picture(FOLDER / "soft_beam.mp4"))
+
+
+def moving_picture(film: Path, size_px: tuple[int, int] = README_SIZE_PX) -> bytes:
+    """A film as an animated WebP that starts by itself and repeats: GitHub shows no MP4 of a repository in a page."""
+    with av.open(str(film)) as opened:
+        stream = opened.streams.video[0]
+        every = max(1, round(float(stream.average_rate or FRAMES_A_SECOND) / README_RATE))
+        pictures = [
+            frame.to_image().resize(size_px, Image.Resampling.LANCZOS)
+            for number, frame in enumerate(opened.decode(stream))
+            if number % every == 0
+        ]
+        rate = float(stream.average_rate or FRAMES_A_SECOND) / every
+    written = io.BytesIO()
+    pictures[0].save(
+        written, format="WEBP", save_all=True, append_images=pictures[1:], duration=round(1e3 / rate), loop=0,
+        quality=70, method=6,
+    )  # fmt: skip
+    return written.getvalue()
 
 
 def drawn(exhibit: Exhibit, motion: Motion, size_px: tuple[int, int] = SIZE_PX) -> tuple[bytes, Array]:

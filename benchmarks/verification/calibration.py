@@ -1,8 +1,8 @@
 """``python -m benchmarks.verification.calibration --json FILE``: what calibration recovers, and what it says of its own
 doubt.
 
-Every part is one table of ``docs/calibration.md`` (``--docs`` replaces it there); ``--only NAME ...`` runs some of
-them. Parts that need the recordings beside the repository are left out, and said so, where these are absent.
+Every part is one table of ``docs/calibration_results.md`` (``--docs`` replaces it there); ``--only NAME ...`` runs
+some of them. Parts that need the recordings beside the repository are left out, and said so, where these are absent.
 With ``--resume DIR`` the fits of recordings keep their finished steps there, and a run that was ended goes on.
 """
 

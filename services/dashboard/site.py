@@ -19,6 +19,7 @@ from physworld_scenes.bundle import bundle_from_bytes
 from physworld_scenes.declaration import KINDS
 from physworld_schemas.base import Artifact
 from physworld_schemas.library import catalogue
+from physworld_services import guide
 from physworld_services.dashboard import text
 from physworld_services.dashboard.byte_cache import ByteCache
 from physworld_services.dashboard.tables import held_out_columns, held_out_of, held_out_rows, noise_floor_of
@@ -103,6 +104,7 @@ def environment_of_pages() -> Environment:
         base=BASE,
         kinds=KINDS,
         static=_static_url,
+        guide_is_built=guide.is_built,
         lasted=text.lasted,
         progress_told=text.progress_told,
         held_out_of=held_out_of,

@@ -1,7 +1,8 @@
 """The guide at ``/docs/guide``: the pages that ``make docs`` builds from ``docs/`` into ``site/`` beside this file.
 
-A wheel carries what was built before it was made (``make wheels`` builds both). Where nothing was built the address
-answers 404 and says what to do. Pages need no key: they are the documentation, the same for everybody.
+``make up`` builds it too, and a wheel carries what was built before it was made (``make wheels`` builds both). Where
+nothing was built the address answers 404 and says what to do, and the dashboard has no link to it. Pages need no key:
+they are the documentation, the same for everybody.
 """
 
 from __future__ import annotations
@@ -26,6 +27,11 @@ NOT_BUILT = (
     "a wheel holds the guide if it was made by `make wheels`. The sources of all pages are in docs/.\n"
 )
 INLINE_SCRIPT = re.compile(rb"<script>(.*?)</script>", re.DOTALL)
+
+
+def is_built(site: Path | None = None) -> bool:
+    """Whether there is a guide to serve; what links to it asks first."""
+    return ((site or SITE) / "index.html").is_file()
 
 
 def mount(app: FastAPI, site: Path = SITE) -> None:
@@ -60,7 +66,7 @@ class Guide:
         await (await self._answer(scope))(scope, receive, with_policy)
 
     async def _answer(self, scope: Scope) -> Response:
-        if not (self._site / "index.html").is_file():
+        if not is_built(self._site):
             return PlainTextResponse(NOT_BUILT, 404)
         try:
             return await self._files.get_response(self._files.get_path(scope), scope)

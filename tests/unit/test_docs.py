@@ -30,6 +30,12 @@ LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 HEADING = re.compile(r"^#+ +(.+)$", re.MULTILINE)
 COMMAND = re.compile(r"^ *(physworld [^\n]*)$", re.MULTILINE)
 INLINE_COMMAND = re.compile(r"`(physworld [^`]*)`")
+GENERATED = re.compile(
+    r"<!-- (?:catalogue )?(?P<name>[\w. ]+?):? ?(?:begin )?-->.*?<!-- (?:(?P=name):? ?end|end of (?P=name)) -->",
+    re.DOTALL,
+)
+MOST_WORDS = 26_700
+MOST_WORDS_OF_A_PAGE = 2_300
 ADDRESS = re.compile(r"`(GET|POST|PUT|PATCH|DELETE) (/[^`]*)`")
 
 
@@ -120,3 +126,27 @@ def test_every_key_of_a_scene_is_documented() -> None:
     forms = (Declaration, BodyForm, GroundForm, GripForm, ColliderForm)
     keys = {key for form in forms for key in form.model_fields} | set(FIELD_OF_ARRAY)
     assert {key for key in keys if f"`{key}`" not in page} == set()
+
+
+def test_the_pages_that_teach_have_no_more_words_than_they_may() -> None:
+    """Outside what scripts write between their marks, and outside the section Evidence of the guide."""
+    navigation = (ROOT / "mkdocs.yml").read_text().partition("\nnav:")[2]
+    evidence = set(re.findall(r": (\S+\.md)$", navigation.partition("- Evidence:")[2], re.MULTILINE))
+    assert {"benchmarks.md", "measured.md", "verification.md", "paper.md"} <= evidence
+    pages = [*ROOT.glob("docs/*.md"), *ROOT.glob("docs/howto/*.md"), ROOT / "README.md"]
+    taught = [page for page in pages if page.name not in evidence]
+    words = {page.name: len(GENERATED.sub("", page.read_text()).split()) for page in taught}
+    assert sum(words.values()) <= MOST_WORDS, sorted(words.items(), key=lambda pair: -pair[1])
+    assert max(words.values()) <= MOST_WORDS_OF_A_PAGE, sorted(words.items(), key=lambda pair: -pair[1])[:3]
+
+
+def test_what_scripts_write_below_their_tables_is_folded() -> None:
+    """Machine and versions of a measurement stand in no page's readable flow."""
+    open_lines = []
+    for page, name in zip(PAGES, NAMES, strict=True):
+        shown = re.sub(r"<details.*?</details>", "", page.read_text(), flags=re.DOTALL)
+        open_lines += [name for line in shown.splitlines() if re.match(r"_`python -m benchmarks\S*`;", line)]
+    assert open_lines in (
+        [],
+        ["docs/measured.md"],
+    )  # of the terms of a rod, a table that stands there by hand

@@ -8,10 +8,11 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+from PIL import Image
 
 from physworld.video import orbit_view
 from scripts.gallery_objects import EXHIBITS, Exhibit, Motion
-from scripts.make_gallery import FOLDER, MARGIN, PAGE, drawn, filled, page
+from scripts.make_gallery import FOLDER, MARGIN, PAGE, README_FILM, drawn, filled, moving_picture, page
 
 pytestmark = pytest.mark.slow
 
@@ -60,6 +61,29 @@ def test_a_film_moves_and_is_small(name: str, tmp_path: Path) -> None:
     pictures = frames(path, tmp_path).astype(int)
     assert len(pictures) > 20
     assert (np.abs(pictures[len(pictures) // 2] - pictures[0]).max(axis=-1) > 40).mean() > 0.005
+
+
+def test_the_film_of_the_readme_is_the_first_one_of_the_gallery() -> None:
+    assert README_FILM.stat().st_size <= 1_500_000
+    readme = (README_FILM.parents[2] / "README.md").read_text()
+    assert f"](docs/images/{README_FILM.name})" in readme
+    with Image.open(README_FILM) as film:
+        assert film.is_animated and film.n_frames > 20 and film.info["loop"] == 0  # type: ignore[attr-defined]
+        shown = np.asarray(film.convert("RGB").resize((48, 36))).astype(int)
+    with av.open(str(FOLDER / "soft_beam.mp4")) as opened:
+        first = next(opened.decode(video=0)).to_image().resize((48, 36))
+    assert np.abs(shown - np.asarray(first).astype(int)).mean() < 5
+
+
+def test_a_moving_picture_moves(tmp_path: Path) -> None:
+    (tmp_path / "film.mp4").write_bytes(drawn(EXHIBIT, rising(), (96, 72))[0])
+    (tmp_path / "film.webp").write_bytes(moving_picture(tmp_path / "film.mp4", (96, 72)))
+    with Image.open(tmp_path / "film.webp") as film:
+        count = film.n_frames  # type: ignore[attr-defined]
+        first = np.asarray(film.convert("RGB"))
+        film.seek(count - 1)
+        last = np.asarray(film.convert("RGB"))
+    assert count == FRAMES // 2 and middle(first) - middle(last) > 10
 
 
 def test_what_rises_rises_in_the_film(tmp_path: Path) -> None:

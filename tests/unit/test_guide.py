@@ -14,6 +14,7 @@ from fastapi import FastAPI
 from serving import serve
 
 from physworld_services import guide
+from physworld_services.dashboard.site import environment_of_pages
 from physworld_services.web import create_app
 from physworld_storage.settings import Settings
 from scripts.guide_pages import notebook_page, with_films, with_links, with_lists
@@ -98,11 +99,32 @@ def test_without_a_built_guide_the_answer_says_what_to_do(site: Path, tmp_path: 
         assert client.get("/docs/guide/").status_code == 200  # without a restart
 
 
-def test_the_service_has_the_route_and_the_dashboard_the_link(tmp_path: Path) -> None:
+def test_the_service_has_the_route_and_the_dashboard_the_link_where_it_is_built(
+    site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     app = create_app(Settings(data_dir=tmp_path))
     assert "/docs/guide" in {getattr(route, "path", None) for route in app.routes}
-    page = (ROOT / "services" / "dashboard" / "templates" / "base.html").read_text()
-    assert f'href="{guide.BASE}/"' in page
+    head = environment_of_pages().get_template("base.html")
+    links = []
+    for folder in (site, tmp_path / "nothing"):
+        monkeypatch.setattr(guide, "SITE", folder)
+        links.append(f'href="{guide.BASE}/"' in head.render(viewer="me", may_manage=False, title="Jobs"))
+    assert links == [True, False]
+
+
+def test_make_up_builds_the_guide_where_there_is_none(tmp_path: Path) -> None:
+    def planned() -> str:
+        command = ["make", "--dry-run", "up", f"SITE={tmp_path}"]
+        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+
+    steps = planned().splitlines()
+    (build,) = [number for number, line in enumerate(steps) if "mkdocs build" in line]
+    (start,) = [number for number, line in enumerate(steps) if "physworld up" in line]
+    assert build < start and str(tmp_path) in steps[build]
+    target = ["make", "--silent", f"{tmp_path}/index.html", f"SITE={tmp_path}", "--assume-old=install"]
+    subprocess.run(target, cwd=ROOT, check=True)
+    assert guide.is_built(tmp_path)
+    assert "mkdocs" not in planned()
 
 
 def test_the_reference_pages_are_what_the_code_says() -> None:

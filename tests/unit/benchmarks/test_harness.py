@@ -59,3 +59,12 @@ def test_a_section_is_replaced_between_its_markers_and_the_rest_is_left_alone(ha
     assert text.index("First again") < text.index("## Second")
     assert text.count("<!-- one: begin -->") == 1
     assert "| 3 |" in text
+
+
+def test_all_but_the_first_notes_and_the_machine_fold_away(harness):
+    notes = [f"note {number}" for number in range(4)]
+    shown, _, hidden = (
+        harness.Report("one", "First", {}, ["a"], [["1"]], notes).markdown().partition("<details")
+    )
+    assert "- note 1" in shown and "note 2" not in shown and "python -m" not in shown
+    assert "- note 2\n- note 3\n\n_`python -m" in hidden and hidden.endswith("_\n\n</details>\n")
