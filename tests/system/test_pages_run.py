@@ -1,7 +1,7 @@
 """What two pages of the guide claim is run: every shell block of the tutorial and of the how-to for OptiTrack.
 
 The commands run as they are printed, in the order of the page, in a folder of their own, with a real service and real
-files. Only sizes are smaller: the recordings are short, and ``SMALL`` has the settings that are put in for the page's or
+files. Only sizes are smaller: the recordings are short, and ``SMALL`` has settings that are put in for the page's or
 behind them. Installing is left out: the tests run in what it made.
 """
 

@@ -34,7 +34,7 @@ GENERATED = re.compile(
     r"<!-- (?:catalogue )?(?P<name>[\w. ]+?):? ?(?:begin )?-->.*?<!-- (?:(?P=name):? ?end|end of (?P=name)) -->",
     re.DOTALL,
 )
-MOST_WORDS = 26_700
+MOST_WORDS = 28_200
 MOST_WORDS_OF_A_PAGE = 2_300
 ADDRESS = re.compile(r"`(GET|POST|PUT|PATCH|DELETE) (/[^`]*)`")
 
