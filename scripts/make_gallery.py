@@ -53,6 +53,8 @@ HEAD = """# Gallery
 Six objects, simulated by the engine and drawn by the renderer of [physworld video](video.md), with the surfaces that
 the dashboard gives them; sand is drawn grain by grain. A click on a picture plays its film.
 `python -m scripts.make_gallery` makes the films and this page.
+
+<!-- gallery: begin -->
 """
 
 
@@ -165,7 +167,7 @@ def page(figures: dict[str, Any]) -> str:
                 f" {found['noise_floor_mm']:.2f} mm."
             )
         parts.append(f"## {exhibit.title}\n\n[![{exhibit.title}]({film}.webp)]({film}.mp4)\n\n{text}\n")
-    return "\n".join(parts)
+    return "\n".join([*parts, "<!-- gallery: end -->\n"])
 
 
 def _figures() -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What no schema can say to a generator of requests, for ``st run`` with ``SCHEMATHESIS_HOOKS`` (docs/api.md).
+"""What no schema can say to a generator of requests, for ``st run`` with ``SCHEMATHESIS_HOOKS`` (CONTRIBUTING.md).
 
 A cursor is what the page before gave out, an idempotency key is new for each request, an upload is a recording (any
 other is refused with 422 as documented), a wait for a job's end is short, and what a path names is there: of most
