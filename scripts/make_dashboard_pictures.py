@@ -255,7 +255,7 @@ def _close_the_loop(client: Client) -> None:
         packed = Path(temporary) / f"{larger.name}.zip"
         packed.write_bytes(canonical_archive(larger))
         scene = client.scenes.create(packed).id
-    _wait(client, client.loops.create(MODEL, scene, TraceConfig(time_limit_s=60, confirmed=1), version=1))
+    _wait(client, client.loops.create(MODEL, scene, 1, trace=TraceConfig(time_limit_s=60, confirmed=1)))
 
 
 def _predict(client: Client) -> None:

@@ -89,7 +89,7 @@ def test_every_call_that_takes_an_id_takes_a_name(service: Service, client: Clie
     assert [check.scene_id for check in client.checks.list(scene_id="strip").data] == [scene_id]
     assert [trace.scene_id for trace in client.traces.list(scene_id="strip").data] == [scene_id]
     assert client.videos.create("scene", "strip").kind == "video"
-    assert client.jobs.cancel(client.pipelines.create(scene_id="strip").id[:-1]).kind == "pipeline"
+    assert client.jobs.cancel(client.pipelines.create(scene_id="strip").id[4:]).kind == "pipeline"
     assert client.pipelines.create(PipelineCreate(scene_id="strip")).kind == "pipeline"
     key = client.keys.create("robot")
     assert client.keys.revoke("robot").id == key.id
