@@ -35,7 +35,7 @@ GENERATED = re.compile(
     re.DOTALL,
 )
 MOST_WORDS = 23_000
-MOST_WORDS_OF_A_PAGE = 2_200
+MOST_WORDS_OF_A_PAGE = 1_800
 ADDRESS = re.compile(r"`(GET|POST|PUT|PATCH|DELETE) (/[^`]*)`")
 
 
