@@ -2,6 +2,10 @@
 
 A texture is a function of the place in the undeformed body, so that it moves as painted material does. One light from
 above, no shadows, Lambert's law: brightness changes as a surface turns, which a tracker has to bear.
+
+A pixel is the mean over its area, as of a sensor: nine rays of which no two share a row or a column (rooks on a chess
+board), shifted by chance in every pixel (Cranley & Patterson 1976). A regular grid of rays would put every edge that
+runs along a row of pixels at the next ray, up to half a ray's distance away, all along it.
 """
 
 from __future__ import annotations
@@ -15,8 +19,8 @@ from physworld.arrays import Array
 from physworld.camera import Camera
 
 FAR_M = 10.0
-SAMPLES = 2
-"""Rays a pixel along each axis; their mean is the colour."""
+SAMPLES = 3
+"""Its square is the number of a pixel's rays; their mean is the colour."""
 
 SPECKLED, PLAIN, MARKER = 0, 1, 2
 """What a triangle is painted with: speckles of its material, one colour, or the picture of a marker."""
@@ -63,12 +67,13 @@ class Stage:
         self._marker = wp.array(np.full((1, 1), 255) if marker is None else marker, dtype=wp.uint8)
         self._table_m = table_m
 
-    def show(self, vertices: Array, camera: Camera) -> tuple[Array, Array, Array]:
+    def show(self, vertices: Array, camera: Camera, seed: int = 0) -> tuple[Array, Array, Array]:
         """Colour (H, W, 3) uint8, depth along the axis (H, W) float32 [m], and the surface seen (H, W), -1 for none.
 
         Args:
             vertices: of all surfaces [m], (V, 3).
             camera: from where.
+            seed: of the shifts of the rays.
         """
         mesh = wp.Mesh(points=wp.array(vertices, dtype=wp.vec3), indices=self._triangles)
         pose = camera.world_to_camera
@@ -93,6 +98,7 @@ class Stage:
                 wp.vec3(*camera.centre.tolist()),
                 wp.vec4(camera.fx, camera.fy, camera.cx, camera.cy),
                 self._table_m,
+                seed,
             ],
             outputs=[colour, depth, seen],
         )
@@ -122,6 +128,7 @@ def _cast(
     eye: wp.vec3,
     lens: wp.vec4,
     table: float,
+    seed: int,
     # out
     colour_out: wp.array2d(dtype=wp.vec3),
     depth_out: wp.array2d(dtype=wp.float32),
@@ -130,10 +137,15 @@ def _cast(
     row, column = wp.tid()
     light = wp.normalize(wp.vec3(0.3, -0.5, 0.8))
     total = wp.vec3(0.0, 0.0, 0.0)
+    chance = wp.rand_init(seed, row * 65536 + column)
+    shift_x = wp.randf(chance)
+    shift_y = wp.randf(chance)
     for sample in range(SAMPLES * SAMPLES + 1):
         # the last ray goes through the middle and measures
-        dx = (float(sample % SAMPLES) + 0.5) / float(SAMPLES)
-        dy = (float(sample // SAMPLES) + 0.5) / float(SAMPLES)
+        dx = float(sample) / float(SAMPLES * SAMPLES) + shift_x
+        dy = float(SAMPLES * (sample % SAMPLES) + sample // SAMPLES) / float(SAMPLES * SAMPLES) + shift_y
+        dx -= wp.floor(dx)
+        dy -= wp.floor(dy)
         if sample == SAMPLES * SAMPLES:
             dx = 0.5
             dy = 0.5

@@ -12,9 +12,11 @@ import numpy as np
 
 from physworld.arrays import Array
 from physworld.errors import TrackingFailed
-from physworld.tracking.grips import RigidPath, colour_middles, logged, marker_corners, rigid_path, translated
+from physworld.tracking.grips import colour_middles, logged, translated
 from physworld.tracking.mask import Box
+from physworld.tracking.poses import marker_path
 from physworld.tracking.recording import Followed, patch_points
+from physworld.tracking.rigid import RigidPath, rigid_path
 from physworld.tracking.view import View, cloud_of
 from physworld_scenes.errors import refused
 
@@ -64,7 +66,7 @@ def gripper_path(views: list[View], grip: GripFrom, times: Array) -> RigidPath:
     """
     if grip.marker is not None:
         number = None if grip.marker < 0 else grip.marker
-        return rigid_path(marker_corners(views, number, grip.dictionary))
+        return marker_path(views, number, grip.dictionary)
     if grip.patch is not None:
         box = grip.patch.within(views[0].camera.width, views[0].camera.height)
         return rigid_path(patch_points(views, box))

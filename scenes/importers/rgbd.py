@@ -20,12 +20,12 @@ from physworld.camera import Camera
 from physworld.errors import TrackingFailed
 from physworld.scene import Scene, sigma_of
 from physworld.tracking.agreement import WARNED_APART_M
-from physworld.tracking.grips import RigidPath
 from physworld.tracking.ground import Plane, ground_plane, world_over
 from physworld.tracking.mask import Box
 from physworld.tracking.noise import sighting_covariances
 from physworld.tracking.places import TrackConfig
 from physworld.tracking.recording import Followed, Masks, follow_all, masks_of
+from physworld.tracking.rigid import RigidPath
 from physworld.tracking.view import View, cloud_of
 from physworld_scenes.bundle import checked, scene_from_parts
 from physworld_scenes.errors import refused

@@ -3,8 +3,8 @@
 ``/live?model=NAME&version=N&ticket=…&frames=2&part=points``: first a JSON text ``{"type": "ready", …}``, then binary
 frames (``session``), ``frames`` of them a tick, interpolated; ``part=vertices`` for the graph's vertices. The client
 sends binary control messages, and as JSON text ``{"type": "reset"}`` and ``{"type": "factors", "factors": {NAME: x}}``,
-properties of the body relative to the model's. Velocities last ``HOLD_S``: a client that falls
-silent stops its grips.
+properties of the body relative to the model's, beside which ``"strengths": {NAME: x}`` may stand, strengths of effects
+in their units. Velocities last ``HOLD_S``: a client that falls silent stops its grips.
 
 The model is stepped in a thread, never on the event loop. A slow reader gets fewer frames, the newest each time:
 nothing queues up here, only in the connection's buffers. A session ends after ``IDLE_S`` without a message (4408), at
@@ -132,7 +132,7 @@ class _Connection:
                 if message.get("bytes") is not None:
                     self._control, self._steered_at = self._session.read(message["bytes"]), clock()
                 else:
-                    self._told(json.loads(message["text"]))
+                    await self._told(json.loads(message["text"]))
             except (
                 ControlRefused,
                 ValueError,
@@ -143,11 +143,14 @@ class _Connection:
             ) as error:
                 return UNREADABLE, str(error)[:120]
 
-    def _told(self, message: dict[str, Any]) -> None:
+    async def _told(self, message: dict[str, Any]) -> None:
         if message.get("type") == "reset":
             self._reset = True
         elif message.get("type") == "factors":
             self._session.set_factors(dict(message["factors"]))
+            if "strengths" in message:  # the weights are prepared anew
+                set_strengths, strengths = self._session.set_strengths, dict(message["strengths"])
+                await asyncio.get_running_loop().run_in_executor(self._pool, set_strengths, strengths)
 
     async def _step(self) -> tuple[int, str]:
         loop = asyncio.get_running_loop()

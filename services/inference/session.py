@@ -16,8 +16,10 @@ from typing import Any
 import numpy as np
 
 from physworld.arrays import Array
+from physworld.report.names import label
 from physworld.worldmodel.controls import grip_groups
 from physworld.worldmodel.live import LiveRollout
+from physworld.worldmodel.model.properties import PhiColumn
 from physworld.worldmodel.published import PublishedModel
 
 HEAD = struct.Struct("<IIfI")
@@ -28,6 +30,19 @@ SPEED_PER_SIZE, REACH_PER_SIZE = 4.0, 1.5
 
 MOST_FACTOR = 100.0
 """Of a property of the body, and one over the least."""
+
+
+def strength_told(model: PublishedModel, column: PhiColumn) -> dict[str, Any]:
+    """A strength as a client learns of it: its unit, the range that the training covered, and the model's own value."""
+    assert model.strengths is not None
+    low, high = model.strengths.range_of(column)
+    value = model.strengths.quantities[column.name]
+    named = {"name": column.name, "label": label(column.name), "unit": column.unit}
+    return {**named, "low": low, "high": high, "value": value}
+
+
+def _is_number(value: Any) -> bool:
+    return not isinstance(value, bool) and isinstance(value, int | float) and math.isfinite(value)
 
 
 class ControlRefused(ValueError):
@@ -55,6 +70,7 @@ class LiveSession:
         size = float(np.ptp(model.spec.rest_vertices, axis=0).max())
         self.speed_m_s, self.reach_m = SPEED_PER_SIZE * size, REACH_PER_SIZE * size
         self._start, self._flags = start, 0
+        self._strengths = () if model.strengths is None else model.strengths.columns
         self._rollout = LiveRollout(model)
         self._before = self._now = self._places()
 
@@ -68,6 +84,7 @@ class LiveSession:
             "speed_m_s": self.speed_m_s,
             "reach_m": self.reach_m,
             "factors": [column.name for column in self._model.columns],
+            "strengths": [strength_told(self._model, column) for column in self._strengths],
             "start": self._now[: -len(self._start)].astype(np.float32).tolist(),
         }
 
@@ -97,7 +114,7 @@ class LiveSession:
         They hold from the next tick on, and after a reset. Raises ControlRefused.
         """
         for name, factor in factors.items():
-            if isinstance(factor, bool) or not isinstance(factor, int | float) or not math.isfinite(factor):
+            if not _is_number(factor):
                 raise ControlRefused(f"the factor of {name!r} is not a finite number")
             if not 1 / MOST_FACTOR <= factor <= MOST_FACTOR:
                 raise ControlRefused(
@@ -108,6 +125,19 @@ class LiveSession:
         if unknown:
             raise ControlRefused(f"there is no property {unknown[0]!r}; there are {', '.join(columns)}")
         self._rollout.set_phi(self._model.phi + [math.log(factors.get(name, 1.0)) for name in columns])
+
+    def set_strengths(self, strengths: Mapping[str, Any]) -> None:
+        """Strengths of effects by name in their units, within what the model was trained over; the others as in it.
+
+        They hold from the next tick on, and after a reset. Raises ControlRefused.
+        """
+        for name, value in strengths.items():
+            if not _is_number(value):
+                raise ControlRefused(f"the strength {name!r} is not a finite number")
+        try:
+            self._rollout.set_model(self._model.at_strengths(strengths))
+        except ValueError as error:
+            raise ControlRefused(str(error)) from error
 
     def reset(self) -> None:
         """Back to the start."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 import time
@@ -14,6 +15,7 @@ import pytest
 from dashboard_browser import FLAGS, WATCH_POLICY, Visit
 from inference_serving import Served, serve_inference
 from playwright.sync_api import Page, expect, sync_playwright
+from published_tiny import DRAG, publish_tiny
 from test_dashboard_accessible import WIDTHS, violations
 
 pytestmark = pytest.mark.browser
@@ -131,7 +133,7 @@ def test_a_slider_changes_the_body_and_a_new_session_keeps_it(served: Served, pa
     slider.focus()
     slider.press("End")
     expect(sliders.nth(0)).to_contain_text("× 4.00")
-    asked = {"type": "factors", "factors": {"stiffness": 4, "density": 1}}
+    asked = {"type": "factors", "factors": {"stiffness": 4, "density": 1}, "strengths": {}}
     until(page, lambda: any("factors" in said and json.loads(said) == asked for said in sent))
     frames = int(page.get_attribute("[data-playground]", "data-frames") or 0)
     until(page, lambda: int(page.get_attribute("[data-playground]", "data-frames") or 0) > frames + 10)
@@ -140,6 +142,35 @@ def test_a_slider_changes_the_body_and_a_new_session_keeps_it(served: Served, pa
     expect(page.locator("[data-note]")).to_contain_text("The session ended")
     page.click("[data-reset]")
     until(page, lambda: any("factors" in said and json.loads(said) == asked for said in sent))
+
+
+def test_a_strength_of_an_effect_has_a_slider_over_what_the_training_covered(
+    served: Served, page: Page
+) -> None:
+    model, version = publish_tiny(served.database, served.stores.artifacts, name="tiny-dragged", dragged=True)
+    sent: list[str] = []
+    page.on("websocket", lambda socket: socket.on("framesent", lambda said: sent.append(str(said))))
+    enter(dataclasses.replace(served, model=model, version=version), page)
+    label = page.locator("[data-factors] label", has_text="Air drag linear: rate")
+    expect(label).to_have_text("Air drag linear: rate2 1/s")
+    expect(label).to_have_attribute("title", "0.5 to 3.5 1/s are what the training covered")
+    slider = label.locator("input")
+    for key, words, value in (("End", "3.5 1/s", 3.5), ("Home", "0.5 1/s", 0.5)):
+        slider.press(key)
+        expect(label).to_contain_text(words)
+        asked = {
+            "factors": {"stiffness": 1, "density": 1},
+            "strengths": {f"{DRAG.effect}.{DRAG.name}": value},
+        }
+        until(
+            page,
+            lambda asked=asked: any(
+                "strengths" in said and json.loads(said) == {"type": "factors"} | asked for said in sent
+            ),
+        )
+    frames = int(page.get_attribute("[data-playground]", "data-frames") or 0)
+    until(page, lambda: int(page.get_attribute("[data-playground]", "data-frames") or 0) > frames + 30)
+    expect(page.locator("[data-note]")).to_be_hidden()
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

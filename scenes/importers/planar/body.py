@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from physworld.arrays import Array
-from physworld.tracking.grips import RigidPath
 from physworld.tracking.recording import Followed, thinned
+from physworld.tracking.rigid import RigidPath
 from physworld.tracking.view import View, cloud_of
 from physworld_scenes.errors import refused
 from physworld_scenes.importers.film import Filmed

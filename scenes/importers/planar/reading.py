@@ -17,10 +17,10 @@ import numpy as np
 from physworld.arrays import Array
 from physworld.errors import TrackingFailed
 from physworld.scene import Scene
-from physworld.tracking.grips import RigidPath
 from physworld.tracking.places import TrackConfig
 from physworld.tracking.plane import TRACKING_PIXEL_M, scaled, stretch
 from physworld.tracking.recording import Followed, Masks, follow_all
+from physworld.tracking.rigid import RigidPath
 from physworld_scenes.bundle import checked, scene_from_parts
 from physworld_scenes.errors import refused
 from physworld_scenes.importers.film import Filmed, read_film

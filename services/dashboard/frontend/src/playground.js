@@ -1,6 +1,7 @@
 // The playground: `<figure data-playground="URL">` opens a live session of a world model and draws its answers.
 // POST to URL gives { path }, the WebSocket's address with a ticket. The first message is JSON: { dt_s, points,
-//   controllers [[x, y, z]], grips [[index]], speed_m_s, reach_m, factors [name], start [[x, y, z]] }. Then binary frames, little-endian:
+//   controllers [[x, y, z]], grips [[index]], speed_m_s, reach_m, factors [name], strengths [{ name, label, unit,
+//   low, high, value }], start [[x, y, z]] }. Then binary frames, little-endian:
 //   uint32 tick, uint32 number of the last control, float32 time, uint32 flags, float32 points and controllers [m].
 // A control is uint32 number, float32 velocities (grips, 3) [m/s]: a dragged grip is steered towards the pointer.
 
@@ -61,7 +62,7 @@ class Playground {
     this.number = 0;
     this.frames = 0;
     this.clouds = [];
-    this.factors = new Factors(figure.querySelector("[data-factors]"), (factors) => this.tell({ type: "factors", factors }));
+    this.factors = new Factors(figure.querySelector("[data-factors]"), (factors, strengths) => this.tell({ type: "factors", factors, strengths }));
     const pressed = (name, then) => figure.querySelector(`[data-${name}]`).addEventListener("click", then);
     pressed("reset", () => this.again());
     pressed("view", () => this.look());
@@ -176,7 +177,7 @@ class Playground {
     this.place(this.latest);
     this.dress();
     this.places = this.grips(new Float32Array(ready.controllers.flat()));
-    this.factors.offer(ready.factors);
+    this.factors.offer(ready.factors, ready.strengths ?? []);
     this.say("");
     this.figure.dataset.ready = "true";
   }
