@@ -4,7 +4,7 @@ A beam, a rope and a sheet, each recorded by the project's engine with a linear 
 go through the library (``physworld fit``, ``physworld trace``) and through the service (upload, fit, demonstrations,
 training, published model, trace). What comes out is reduced to SHA-256 digests: of every array, and of every report
 without what differs from run to run (times, ids, dates). The same code on the same machine gives the same digests;
-another processor need not. ``--check`` compares with the digests of an earlier run, names what differs, and ends with 1.
+another processor need not. ``--check`` compares with those of an earlier run, names what differs, and ends with 1.
 
 Only the command line and the SDK are used, so that this script stays as it is while the rooms behind them move.
 """
