@@ -187,7 +187,8 @@ class LiveSession:
     @property
     def controllers(self) -> Array:
         """Control points now [m], (K, 3)."""
-        return self._rollout.controllers
+        places: Array = self._rollout.controllers
+        return places
 
     def twin_frame(self, tick: int, vertices: Array, controllers: Array) -> bytes:
         """The frame of the twin at a tick: its vertices (n, 3) under control points (K, 3) [m]."""

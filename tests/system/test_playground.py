@@ -325,7 +325,7 @@ def test_the_splat_of_the_scene_is_drawn_and_moves_with_the_model(served: Served
     content = to_ply(gaussians_at_points(points, np.tile([0.9, 0.1, 0.8], (len(points), 1))))
     with served.client() as client:
         scene_id = client.get(f"/v1/models/{served.model}/versions/{served.version}").json()["scene_id"]
-        files = {"file": ("splat.ply", content, "application/x-ply")}
+        files = {"bundle": ("splat.ply", content, "application/x-ply")}
         assert client.post(f"/v1/scenes/{scene_id}/pictures/splat.ply", files=files).status_code == 200
     enter(served, page)
     expect(page.get_by_label("as its splat")).to_be_checked()

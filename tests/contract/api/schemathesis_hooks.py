@@ -79,7 +79,7 @@ def _body(case: Case, real: Real) -> dict[str, Any]:
         return {"bundle": real.archive()}
     if case.path.endswith("/pictures/{name}"):
         case.path_parameters["name"] = "splat.ply"
-        return {"file": b"ply\nformat binary_little_endian 1.0\nend_header\n"}
+        return {"bundle": b"ply\nformat binary_little_endian 1.0\nend_header\n"}
     if case.path == "/v1/videos":
         return {**case.body, "of": "scene", "id": real.one("/v1/scenes")}
     if case.path == "/v1/loops":
