@@ -338,7 +338,7 @@ def test_the_splat_of_the_scene_is_drawn_and_moves_with_the_model(served: Served
     assert shown["shown"] == [True, False, False] and shown["count"] == len(points)
     assert shown["tint"] == pytest.approx([0.9, 0.1, 0.8], abs=0.01)
     until(page, lambda: bool(np.linalg.norm(page.evaluate(state)["mean"] - place(page, "centre")) < 0.01))
-    assert purple(page) > 200
+    assert purple(page) > 1000
     before = page.evaluate(state)["mean"]
     page.focus("[data-playground] canvas")
     page.keyboard.down("PageUp")
@@ -347,7 +347,7 @@ def test_the_splat_of_the_scene_is_drawn_and_moves_with_the_model(served: Served
     assert page.evaluate(state)["mean"][2] - before[2] > 5e-3
     page.get_by_label("as its splat").uncheck()
     assert page.evaluate(state)["shown"] == [False, True, False]
-    until(page, lambda: purple(page) == 0)
+    until(page, lambda: purple(page) < 150)  # the grips' own colour is near
 
 
 def purple(page: Page) -> int:

@@ -186,6 +186,7 @@ class Playground {
     this.clouds = [this.body, this.markers, this.handles];
     for (const cloud of [this.markers, this.handles]) { // a grip may lie inside the body
       cloud.material.depthTest = false;
+      cloud.material.transparent = true; // drawn after a twin that is seen through, and after a splat
       cloud.points.renderOrder = 2;
     }
     for (const cloud of this.clouds) this.view.scene.add(cloud.points);
