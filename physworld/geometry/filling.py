@@ -2,9 +2,11 @@
 
 Points that fill a body: an alpha shape, the Delaunay tetrahedra whose circumsphere is no larger than a few point
 distances (Edelsbrunner, Muecke 1994). Strewn points stop short of the surface, so the shape is too small, by 10 to 20 %
-for a few thousand points. Every point stands for the same volume, and deep inside the tetrahedra around the points
-show how much that is: the shape is grown evenly until it holds as much as its points stand for. With few points that
-volume is itself uncertain; then the growth is drawn towards the usual one, measured on strewn balls, boxes and tori.
+for a few thousand points. It is grown by a share of the distance between points, as large as that is about each place of
+the surface. Which share: where every point stands for the same volume, the tetrahedra around the points deep inside show
+how much that is, and the shape is grown until it holds as much as its points stand for. With few points, or where they lie
+closer in one part than in another, that volume is itself uncertain; then the share is drawn towards the usual one,
+measured on strewn balls, boxes and tori.
 
 Points that only bound a body: a voxel shell that closes around a core; within the shell the planes through neighbouring
 points are the surface. An open surface stays a shell one voxel thick.
@@ -12,7 +14,7 @@ points are the surface. An open surface stays a shell one voxel thick.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import binary_fill_holes, distance_transform_edt, gaussian_filter, map_coordinates
@@ -22,7 +24,7 @@ from physworld.arrays import Array
 
 _ALPHA = 2.5  # circumradius limit in point distances
 _DEEP = 1.0  # points this many distances inside the shape show the volume of one point
-_FEW = 50  # with fewer such points the usual growth is taken
+_FEW = 50  # with fewer such points the usual growth is taken; and as many show how close points lie about a place
 _USUAL_GROWTH, _USUAL_SPREAD = (
     0.31,
     0.04,
@@ -45,22 +47,34 @@ class FilledBody:
         mesh: Delaunay tetrahedra of the points.
         kept: which of them belong to the shape, bool.
         surface: samples of the shape's boundary.
-        growth_m: how far around the shape material still lies [m].
+        distances: of points about each of them [m].
+        growth: how far around the shape material still lies, in these distances.
         volume_m3: what the points stand for.
     """
 
     mesh: Delaunay
     kept: Array
     surface: cKDTree
-    growth_m: float
+    distances: Array
+    growth: float
     volume_m3: float
+
+    @property
+    def reach_m(self) -> float:
+        """The farthest from the shape that material lies [m]."""
+        return self.growth * float(self.distances.max())
 
     def contains(self, query: Array) -> Array:
         """Which of ``query`` (Q, 3) lie inside, (Q,) bool."""
         inside = self._inside_shape(query)
-        gap, _ = self.surface.query(query[~inside], distance_upper_bound=self.growth_m * (1 + 1e-9))
-        inside[~inside] = gap <= self.growth_m
+        inside[~inside] = self._gaps(query[~inside]) <= self.growth
         return inside
+
+    def _gaps(self, query: Array) -> Array:
+        """How far from the shape's boundary places (Q, 3) are, in distances of points there, (Q,)."""
+        gap, nearest = self.surface.query(query)
+        found: Array = gap / self.distances[nearest]
+        return found
 
     def _inside_shape(self, query: Array) -> Array:
         found = self.mesh.find_simplex(query)
@@ -87,15 +101,29 @@ def filled_body(points: Array) -> FilledBody:
     radius = 0.5 * np.where(flat, np.sqrt(squares.max(axis=1)), np.linalg.norm(centre, axis=1))
     kept = radius <= _ALPHA * spacing
     volumes = np.where(kept, np.abs(determinant) / 6.0, 0.0)
-    surface = cKDTree(_boundary_samples(points, mesh, kept, _TRIANGLE_STEP * spacing))
-    shape = FilledBody(mesh, kept, surface, 0.0, float(volumes.sum()))
-    deep = surface.query(points)[0] > _DEEP * spacing
+    boundary = _boundary_samples(points, mesh, kept, _TRIANGLE_STEP * spacing)
+    middles, solid = points[mesh.simplices[kept]].mean(axis=1), volumes[kept]
+    sizes = [np.cbrt(_mean_about(middles, solid, places)) for places in (boundary, points)]
+    distances = sizes[0] * (spacing / max(float(np.median(sizes[1])), 1e-30))
+    shape = FilledBody(mesh, kept, cKDTree(boundary), distances, 0.0, float(volumes.sum()))
+    deep = shape._gaps(points) > _DEEP
     if deep.sum() < _FEW:
-        return _grown(shape, points, spacing, None)
+        return _grown(shape, points, None)
     share = np.zeros(len(points))
     np.add.at(share, mesh.simplices, np.repeat(volumes[:, None] / 4.0, 4, axis=1))
-    error = float(share[deep].std() / np.sqrt(deep.sum()))
-    return _grown(shape, points, spacing, (len(points) * float(share[deep].mean()), len(points) * error))
+    own, count = share[deep], len(points)
+    uneven = (
+        _mean_about(points[deep], own, points[deep]).var() - 2.0 * own.var() / _FEW
+    )  # twice what chance gives
+    error = float(np.sqrt(own.var() / len(own) + max(float(uneven), 0.0)))
+    return _grown(shape, points, (count * float(own.mean()), count * error))
+
+
+def _mean_about(places: Array, values: Array, query: Array) -> Array:
+    """Mean of the values (M,) of the nearest places (M, 3) to each of ``query`` (Q, 3), (Q,)."""
+    near = cKDTree(places).query(query, k=min(_FEW, len(places)))[1]
+    found: Array = values[near.reshape(len(query), -1)].mean(axis=1)
+    return found
 
 
 def inside_surface_points(points: Array, query: Array, cell: float) -> Array:
@@ -167,27 +195,23 @@ def _inside_closed(
     return inside
 
 
-def _grown(
-    shape: FilledBody, points: Array, spacing: float, estimate: tuple[float, float] | None
-) -> FilledBody:
+def _grown(shape: FilledBody, points: Array, estimate: tuple[float, float] | None) -> FilledBody:
     """The shape grown to an estimated volume and error [m^3], as far as these beat the usual growth."""
-    query, each = _probes(points, spacing)
-    inside = shape._inside_shape(query)
-    gap = np.sort(shape.surface.query(query[~inside])[0])
-    growth, most = _USUAL_GROWTH * spacing, _MOST_GROWTH * spacing
+    query, each = _probes(points, _MOST_GROWTH * float(shape.distances.max()))
+    gap = np.sort(shape._gaps(query[~shape._inside_shape(query)]))
+    growth = _USUAL_GROWTH
     if estimate is not None:
         volume, error = estimate
         wanted = gap[np.clip(round((volume - shape.volume_m3) / each), 0, len(gap) - 1)]
-        area = each * np.searchsorted(gap, most) / most
-        trust = 1.0 / (1.0 + (error / area / (_USUAL_SPREAD * spacing)) ** 2)
-        growth += trust * (float(np.clip(wanted, 0.0, most)) - growth)
+        added = each * np.searchsorted(gap, _MOST_GROWTH) / _MOST_GROWTH
+        trust = 1.0 / (1.0 + (error / added / _USUAL_SPREAD) ** 2)
+        growth += trust * (float(np.clip(wanted, 0.0, _MOST_GROWTH)) - growth)
     held = shape.volume_m3 + each * float(np.searchsorted(gap, growth, side="right"))
-    return FilledBody(shape.mesh, shape.kept, shape.surface, growth, held)
+    return replace(shape, growth=growth, volume_m3=held)
 
 
-def _probes(points: Array, spacing: float) -> tuple[Array, float]:
-    """Places (Q, 3) spread over the box of the points and the most that may be added, and the volume of each [m^3]."""
-    margin = _MOST_GROWTH * spacing
+def _probes(points: Array, margin: float) -> tuple[Array, float]:
+    """Places (Q, 3) spread over the box of the points and a margin [m] about it, and the volume of each [m^3]."""
     low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
     query = np.random.default_rng(0).uniform(low, high, size=(_PROBES, 3))
     return query, float(np.prod(high - low)) / _PROBES

@@ -105,7 +105,7 @@ def _solid(scene: Scene, budget: int) -> ReferenceBody:
         if cloud is not None and len(cloud) >= 20:
             _require_volume(cloud, scene.kind)
             filled = filled_body(cloud)
-            test, reach, volume = filled.contains, filled.growth_m, filled.volume_m3
+            test, reach, volume = filled.contains, filled.reach_m, filled.volume_m3
         else:
             cloud = points if scene.surface_points is None else np.concatenate([points, scene.surface_points])
             if len(cloud) < 30:

@@ -108,7 +108,7 @@ def test_randomly_strewn_points_stand_for_their_whole_volume(name: str, count: i
 def test_a_few_points_grow_by_the_usual_amount() -> None:
     cloud = np.random.default_rng(0).uniform(0, 1, size=(40, 3))
     body = filled_body(cloud)
-    assert 0.05 < body.growth_m < 0.12
+    assert 0.05 < body.reach_m < 0.14
     assert np.prod(np.ptp(cloud, axis=0)) * 0.6 < body.volume_m3 < 1.3
 
 
@@ -120,3 +120,16 @@ def test_points_on_a_closed_surface_bound_its_volume(count: int, even: bool) -> 
     probe = np.random.default_rng(5).uniform(-1.4, 1.4, size=(20000, 3))
     volume = inside_surface_points(surface, probe, cell=0.1).mean() * 2.8**3
     assert volume == pytest.approx(4 / 3 * np.pi, rel=0.05)
+
+
+def test_points_that_lie_closer_at_the_ends_make_the_ends_no_thicker() -> None:
+    """A spindle whose points are spread evenly over its length though its section is a tenth at the ends."""
+    ends = []
+    for seed in range(3):
+        unit = np.random.default_rng(seed).uniform(-1.0, 1.0, size=(2500, 3))
+        cloud = np.hstack([2.0 * unit[:, :1], unit[:, 1:] * np.sqrt(1.0 - 0.9 * unit[:, :1] ** 2)])
+        query = np.random.default_rng(9).uniform([-2.0, -1.0, -1.0], [2.0, 1.0, 1.0], size=(100_000, 3))
+        held = filled_body(cloud).contains(query)
+        along = np.abs(query[:, 0]) / 2.0
+        ends.append(held[along > 0.8].mean() / (1.0 - 0.9 * along[along > 0.8] ** 2).mean())
+    assert np.mean(ends) == pytest.approx(1.0, abs=0.04)
