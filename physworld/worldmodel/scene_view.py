@@ -88,7 +88,14 @@ class SceneView:
     def published(
         self, model: WorldModel, phi: Array, phi_calibrated: Array, strengths: Conditioning | None = None
     ) -> PublishedModel:
-        """The model with this scene's start and skin, and the strengths at which it stands."""
+        """The model with this scene's start and skin.
+
+        Args:
+            model: the trained network.
+            phi: properties of its vertices after fine-tuning, (n, P).
+            phi_calibrated: the same before it.
+            strengths: of traced effects, at which it stands; None: it has none.
+        """
         window = slice(self.first, self.first + self.history + 1)
         return PublishedModel(
             model=model,

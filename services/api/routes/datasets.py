@@ -135,7 +135,18 @@ def get_episode(
 
 
 def episode_file(dataset_id: str, index: int, database: Database, stores: Stores) -> Response:
-    """An episode as a file to keep. Raises NotFound and EpisodeCorrupt."""
+    """An episode as a file to keep.
+
+    Args:
+        dataset_id: the dataset.
+        index: of the episode.
+        database: that names its file.
+        stores: that hold it.
+
+    Raises:
+        NotFound: there is no such episode.
+        EpisodeCorrupt: its file is not the one that was committed.
+    """
     with database.reading() as session:
         episode = resources.get_episode(session, dataset_id, index)
     arrays, attributes = stores.episodes.verified(episode.path, episode.digest)

@@ -1,8 +1,10 @@
-"""The kernels' CUDA text compiles (no GPU is needed for that); what it computes is tested where a GPU is."""
+"""The CUDA text of every law of solids compiles (no GPU is needed for that); what it computes is tested where a GPU is.
+
+The modules of kernels that are not made once a law: ``test_cuda_source_everywhere``.
+"""
 
 from __future__ import annotations
 
-from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -12,34 +14,13 @@ from physworld.engine.gradients.solid_tangent_kernels import solid_tangent
 from physworld.engine.total.solid_kernels import solid_forces
 from physworld.materials.library import SOLID_LAWS
 
-pytestmark = pytest.mark.slow  # CUDA's compiler, over a hundred kernels
+pytestmark = pytest.mark.slow  # CUDA's compiler
 
 
 def compiles(module: object, folder: Path) -> bool:
     wp.init()
     wp.compile_aot_module(module, arch=80, module_dir=str(folder), use_ptx=True)
     return bool(list(folder.glob("*.ptx")))
-
-
-PLAIN = (
-    "thin.sheet_kernels",
-    "thin.rod_kernels",
-    "gradients.thin_tangent_kernels",
-    "total.node_kernels",
-    "thin.twist_kernels",
-    "terms.ground_kernels",
-    "total.energy_kernels",
-    "thin.self_contact_kernels",
-    "thin.self_contact_search",
-    "total.friction_kernels",
-    "total.relaxation_kernels",
-    "updated.energy_kernels",
-)
-
-
-@pytest.mark.parametrize("name", PLAIN)
-def test_the_kernels_compile_for_cuda(name: str, tmp_path: Path) -> None:
-    assert compiles(import_module(f"physworld.engine.{name}"), tmp_path)
 
 
 @pytest.mark.parametrize("name", sorted({law.stress.name for law in SOLID_LAWS.values()}))

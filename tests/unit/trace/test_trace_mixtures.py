@@ -84,13 +84,12 @@ def test_places_of_one_stiffness_are_in_one_basin() -> None:
     assert distinct([9.0, 9.2, 10.0], taken=[9.25]) == [0, 2]
 
 
-@pytest.mark.parametrize("strengths", [{"rate_per_s": 4.0}, {"viscosity_pa_s": 90.0}])
-def test_one_that_acts_alone_stays_alone(strengths: dict[str, float]) -> None:
-    found = traced(**strengths)
+def test_a_viscosity_that_acts_alone_stays_alone() -> None:
+    found = traced(viscosity_pa_s=90.0)
     assert len(found.effects) == 1 and len(found.verdict.model.members) == 1
 
 
-def test_no_other_basin_is_looked_for_where_a_near_start_comes_near_the_noise(
+def test_a_drag_stays_alone_and_no_other_basin_is_looked_for_where_a_near_start_comes_near_the_noise(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     asked: list[str] = []
@@ -101,5 +100,6 @@ def test_no_other_basin_is_looked_for_where_a_near_start_comes_near_the_noise(
 
     begin = Starts.far
     monkeypatch.setattr(Starts, "far", far)
-    assert [e.name for e in traced(rate_per_s=4.0).effects] == ["air_drag_linear"]
+    found = traced(rate_per_s=4.0)
+    assert [e.name for e in found.effects] == ["air_drag_linear"] and len(found.verdict.model.members) == 1
     assert asked == []

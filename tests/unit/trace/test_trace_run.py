@@ -107,6 +107,10 @@ def test_a_drag_is_named_with_its_strength_and_the_held_out_error_falls() -> Non
     rate = report["effects"][0]["parameters"]["rate_per_s"]
     assert rate["value"] == pytest.approx(6.0, rel=0.15) and rate["unit"] == "1/s"
     assert rate["ci95"][0] <= rate["value"] <= rate["ci95"][1]
+    assert report["effects"][0]["posterior"] > 0.95
+    assert 0.5 < report["effects"][0]["share_of_held_out_error"] <= 1.0
+    assert report["remainder"]["over_noise"] < 1.3
+    assert sum(h["posterior"] for h in report["hypotheses"]) == pytest.approx(1.0)
     out = report["held_out"]
     assert out["explained_fraction"] > 0.8 and out["after_ci95"][0] <= out["after"] <= out["after_ci95"][1]
     assert out["noise_floor"] == SIGMA and set(out["baselines"]) == {
