@@ -71,7 +71,10 @@ def list_scenes(
     database: DatabaseDep,
     page: PageDep,
     kind: Annotated[str | None, Query(max_length=32, pattern=r"^[a-z_]+$")] = None,
-    tag: Annotated[str | None, Query(min_length=1, max_length=64)] = None,
+    tag: Annotated[
+        str | None,
+        Query(min_length=1, max_length=64, description="Only scenes with this tag.", examples=["soft"]),
+    ] = None,
 ) -> Page[Scene]:
     """Scenes, newest first."""
     with database.reading() as session:

@@ -25,8 +25,8 @@ MOST_WAIT_S, LONGEST_WAIT_S = 1.0, 60.0
 """How long a request for a job waits here, lest queued jobs hold the run up, and how long it might."""
 SHARE = 0.8
 """Of the requests that are meant to be right, those that ask for what is there."""
-WHOLE = {"/v1/rollouts": Real.rollout, "/v1/plans": Real.plan}
-"""Bodies whose arrays have to be of the model's sizes: half of the requests take these."""
+WHOLE = {"/v1/rollouts": Real.rollout, "/v1/plans": Real.plan, "/v1/loops": Real.loop}
+"""Bodies that have to fit a model: half of the requests take these."""
 _SERVICES: dict[str, Real] = {}
 _RANDOM = random.Random(0)
 _ANSWERS = Answers()
@@ -82,8 +82,6 @@ def _body(case: Case, real: Real) -> dict[str, Any]:
         return {"bundle": b"ply\nformat binary_little_endian 1.0\nend_header\n"}
     if case.path == "/v1/videos":
         return {**case.body, "of": "scene", "id": real.one("/v1/scenes")}
-    if case.path == "/v1/loops":
-        return {"model": real.one("/v1/models", "name"), "scene_id": real.one("/v1/scenes")}
     return real.named(case.body)
 
 
@@ -106,7 +104,10 @@ def _name_what_is_there(case: Case, real: Real) -> None:
                 return
             if parameter in case.path_parameters and path.endswith("/pictures"):
                 return
-            known = real.listed(path, "id" if parameter.endswith("_id") else parameter)
+            known = real.listed(
+                f"{path}?state=ready" if case.path.endswith("/tracks") else path,
+                "id" if parameter.endswith("_id") else parameter,
+            )
             if not known:
                 return
             part = case.path_parameters[parameter] = _RANDOM.choice(known)

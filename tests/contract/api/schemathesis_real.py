@@ -7,10 +7,12 @@ operations were ever answered with success.
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import random
 import time
+import zipfile
 from collections import Counter, defaultdict
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +20,7 @@ from typing import Any
 from uuid import uuid4
 
 import httpx
+import numpy as np
 
 KNOWN_S = 20.0
 """How long a listing is remembered."""
@@ -31,6 +34,8 @@ BODY_IDS = {
 UNNAMED = ("trace_id", "scene_ids", "held_out_scene_ids", "assessment_id", "compared_with", "fit_ids")
 """Keys that have to fit what else a body names; a request without them is right as well."""
 TICKS = 8
+ENDED = "ended-"
+"""How the names begin of what is made here to be deleted."""
 
 
 class Real:
@@ -44,11 +49,11 @@ class Real:
         self.ends: dict[tuple[str, str], Callable[[], dict[str, str] | None]] = {
             ("DELETE", "/v1/keys/{key_id}"): self._key,
             ("POST", "/v1/keys/{key_id}/rotate"): self._key,
-            ("POST", "/v1/jobs/{job_id}/cancel"): lambda: self._job(cancelled=False),
-            ("POST", "/v1/jobs/{job_id}/retry"): lambda: self._job(cancelled=True),
+            ("POST", "/v1/jobs/{job_id}/cancel"): self._job,
+            ("POST", "/v1/jobs/{job_id}/retry"): lambda: {"job_id": self.one("/v1/jobs?state=failed")},
             ("DELETE", "/v1/models/{name}/aliases/{alias}"): self._alias,
             ("DELETE", "/v1/models/{name}/versions/{version}"): self._version,
-            ("DELETE", "/v1/scenes/{scene_id}"): lambda: None,
+            ("DELETE", "/v1/scenes/{scene_id}"): lambda: {"scene_id": self.uploaded()},
         }
         for kind, body in {
             "fit": lambda: self.named({"scene_id": ""}),
@@ -71,7 +76,7 @@ class Real:
             return known
         answer = self._client.get(path)
         data = answer.json().get("data", []) if answer.status_code == 200 else []
-        known = [str(item[key]) for item in data if key in item]
+        known = [str(item[key]) for item in data if not str(item.get(key, ENDED)).startswith(ENDED)]
         self._listed[path] = (time.monotonic(), known)
         return known
 
@@ -89,35 +94,49 @@ class Real:
             real["version"] = "latest"
         return real
 
-    def digest(self) -> str:
+    def digest(self, scene: str | None = None) -> str:
         """Digest of a scene's archive."""
-        scene = self._client.get(f"/v1/scenes/{self.one('/v1/scenes')}").json()
-        return next((str(item["sha256"]) for item in scene.get("artifacts", [])), "none")
+        told = self._client.get(f"/v1/scenes/{scene or self.one('/v1/scenes')}").json()
+        return next((str(item["sha256"]) for item in told.get("artifacts", [])), "none")
 
-    def archive(self) -> bytes:
+    def archive(self, scene: str | None = None) -> bytes:
         """A recording that the service has: uploaded again it is the same scene."""
-        return self._client.get(f"/v1/artifacts/{self.digest()}").content
+        return self._client.get(f"/v1/artifacts/{self.digest(scene)}").content
 
     def latest(self, model: str) -> int:
         """Number of a model's newest ready version."""
         return int(self._client.get(f"/v1/models/{model}/versions/latest").json().get("version", 1))
 
     def rollout(self) -> dict[str, Any]:
-        """A rollout from rest under still grips, of a model that has so many."""
-        model, count, _ = self._model()
-        return {"model": model, "start": "rest", "controllers": [[[0.0, 0.0, 0.0]] * count] * TICKS}
+        """A rollout from rest under grips that stay where the recording begins."""
+        model, scene = self._model()
+        with zipfile.ZipFile(io.BytesIO(self.archive(scene))) as archive:
+            arrays = np.load(
+                io.BytesIO(archive.read(next(n for n in archive.namelist() if n.endswith(".npz"))))
+            )
+        return {"model": model, "start": "rest", "controllers": [arrays["controllers"][0].tolist()] * TICKS}
 
     def plan(self) -> dict[str, Any]:
         """A plan that brings the first point somewhere near."""
-        model, _, _ = self._model()
-        return {"model": model, "goal": {"kind": "points", "points": [0], "positions": [[0.05, 0.0, 0.05]]}}
+        goal = {"kind": "points", "points": {"index": [0], "places": [[0.05, 0.0, 0.05]]}}
+        return {"model": self._model()[0], "goal": goal}
 
-    def _model(self) -> tuple[str, int, str]:
-        """A model, the control points of its scene, and the scene."""
+    def loop(self) -> dict[str, Any]:
+        """A loop of a model and another recording of its object."""
+        model, scene = self._model()
+        return {"model": model, "scene_id": self.uploaded(scene)}
+
+    def uploaded(self, scene: str | None = None) -> str:
+        """A new scene: a known recording under another name."""
+        files = {"bundle": ("scene.zip", self.archive(scene), "application/zip")}
+        made = self._client.post("/v1/scenes", files=files, data={"name": f"{ENDED}{uuid4().hex[:8]}"})
+        return str(made.json().get("id", "none"))
+
+    def _model(self) -> tuple[str, str]:
+        """A model and the scene that it was made of."""
         name = self.one("/v1/models", "name")
         version = self._client.get(f"/v1/models/{name}/versions/latest").json()
-        scene = version.get("scene_id") or self.one("/v1/scenes")
-        return name, self._client.get(f"/v1/scenes/{scene}").json().get("controllers", 1), scene
+        return name, version.get("scene_id") or self.one("/v1/scenes")
 
     def _posted(self, path: str, body: dict[str, Any]) -> dict[str, Any]:
         answer = self._client.post(path, json=body, headers={"Idempotency-Key": uuid4().hex})
@@ -133,17 +152,17 @@ class Real:
         )
 
     def _assessment(self) -> dict[str, str] | None:
-        name, _, scene = self._model()
+        name, scene = self._model()
         path = f"/v1/models/{name}/versions/latest/assessments"
         return self._object("assessment", {"scene_id": scene, "open_trace": False}, path)
 
     def _version(self) -> dict[str, str] | None:
-        name = f"ended-{uuid4().hex[:8]}"
+        name = f"{ENDED}{uuid4().hex[:8]}"
         body = self.named({"name": name, "dataset_id": ""})
         return None if self._object("model", body) is None else {"name": name, "version": "1"}
 
     def _alias(self) -> dict[str, str] | None:
-        name, _, _ = self._model()
+        name, _ = self._model()
         answer = self._client.put(f"/v1/models/{name}/aliases/ended", json={"version": self.latest(name)})
         return {"name": name, "alias": "ended"} if answer.status_code == 200 else None
 
@@ -152,13 +171,9 @@ class Real:
         found = made.get("id") or made.get("key", {}).get("id")
         return {"key_id": found} if found else None
 
-    def _job(self, *, cancelled: bool) -> dict[str, str] | None:
+    def _job(self) -> dict[str, str] | None:
         job = self._posted("/v1/checks", self.named({"scene_id": ""}))
-        if "id" not in job:
-            return None
-        if cancelled:
-            self._posted(f"/v1/jobs/{job['id']}/cancel", {})
-        return {"job_id": job["id"]}
+        return {"job_id": job["id"]} if "id" in job else None
 
 
 class Answers:
